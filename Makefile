@@ -1,0 +1,28 @@
+# Two commands on a fresh machine (git, make and Python 3.10+ with venv): `make tables` and `make test`.
+# Each builds .venv first when it is missing or when the dependencies have changed.
+PYTHON ?= python3
+ENV := .venv/.installed
+
+.PHONY: tables test lint clean
+
+tables: $(ENV)  ## The paper's Tables 1 and 2 beside ours; settings: make tables SET="draws=50 data.folder=DIR"
+	.venv/bin/gpmpc tables $(SET)
+
+test: $(ENV)  ## The whole test suite; options: make test ARGS="-k gaussian"
+	.venv/bin/python -m pytest $(ARGS)
+
+lint: $(ENV)  ## Format check, linter and import contracts
+	.venv/bin/ruff format --check .
+	.venv/bin/ruff check .
+	.venv/bin/lint-imports
+
+$(ENV): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' \
+		|| { echo "gpmpc needs Python 3.10 or newer; point PYTHON to one: make PYTHON=/path/to/python3.11"; exit 2; }
+	$(PYTHON) -m venv .venv
+	.venv/bin/python -m pip install --quiet --constraint constraints.txt torch
+	.venv/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	@touch $@
+
+clean:
+	rm -rf .venv outputs

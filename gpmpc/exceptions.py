@@ -1,0 +1,45 @@
+"""The two roads of failure, first half: misuse raises, with the rule that was broken and what was got instead.
+
+A numerical outcome (a solver that stops early, an infeasible problem) is no exception but a ``gpmpc.status.Status``.
+Every error of this package derives from ``GpmpcError``; its text is one line that a user can act on.
+"""
+
+
+class GpmpcError(Exception):
+    """Any error that gpmpc raises on purpose."""
+
+
+class ShapeError(GpmpcError, ValueError):
+    """An array or tensor has another shape than the rule says."""
+
+
+class SettingError(GpmpcError, ValueError):
+    """A setting is unknown, of the wrong type, or outside its range.
+
+    Attributes:
+        key: The name of the setting, as the user writes it.
+    """
+
+    def __init__(self, key: str, message: str):
+        super().__init__(f"{key}: {message}")
+        self.key = key
+
+
+class DataError(GpmpcError, ValueError):
+    """A data file or data set cannot be used; the text names the file, the row and the column."""
+
+
+class TrainingError(GpmpcError, RuntimeError):
+    """Every start of the hyperparameter optimisation failed for at least one output.
+
+    Attributes:
+        outputs: Indices of the outputs (from 0) that could not be trained.
+    """
+
+    def __init__(self, outputs: list[int], message: str):
+        super().__init__(message)
+        self.outputs = outputs
+
+
+class ProblemError(GpmpcError, ValueError):
+    """An optimisation problem is malformed: shapes, symmetry, definiteness, crossed bounds, NaN."""

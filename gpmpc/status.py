@@ -1,0 +1,27 @@
+"""The two roads of failure, second half: how a numerical method ended, with advice on what to try.
+
+A solver that stops without a solution has not been misused; it reports a ``Status``, and the caller's declared policy
+acts on it. (Misuse raises: see ``gpmpc.exceptions``.)
+"""
+
+from enum import Enum
+
+
+class Status(Enum):
+    """How a solve ended; the value is the advice to the user."""
+
+    SOLVED = "solved to the requested tolerance"
+    INFEASIBLE = "no point satisfies the constraints: soften state constraints, or loosen the bounds"
+    ITERATION_LIMIT = "stopped at the iteration limit: raise the limit, or check the scaling of the problem"
+    TIME_LIMIT = "stopped at the time limit: raise the limit, shorten the horizon, or warm-start"
+    NUMERICAL_TROUBLE = "the residuals could not be brought to the tolerance: check the scaling of the problem"
+
+    @property
+    def solved(self) -> bool:
+        """True only for a solution whose residuals meet the tolerance."""
+        return self is Status.SOLVED
+
+    @property
+    def advice(self) -> str:
+        """What the outcome means and what to try next."""
+        return self.value
