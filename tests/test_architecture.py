@@ -1,4 +1,4 @@
-"""The house keeps its shape: layers look downwards, each heavy library has one door, importing the GP modules is light."""
+"""The house keeps its shape: layers look downwards, and importing a module loads no library it does not need."""
 
 import subprocess
 import sys

@@ -1,0 +1,18 @@
+"""Gaussian process dynamics models: data, training (GPyTorch), and the frozen posterior that predicts."""
+
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp.scaling import Scaling, identity, min_max, standardize
+from gpmpc.gp.training import SoftLimits, Training, train
+from gpmpc.gp.transitions import Transitions
+
+__all__ = [
+    "GPPosterior",
+    "Scaling",
+    "SoftLimits",
+    "Training",
+    "Transitions",
+    "identity",
+    "min_max",
+    "standardize",
+    "train",
+]

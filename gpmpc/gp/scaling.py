@@ -1,0 +1,101 @@
+"""Problem: columns of very different ranges have to be brought to one scale before a GP is trained, and back after.
+
+A ``Scaling`` is one affine map a column, scaled = (value - offset) / factor. The three in use: none at all, zero mean
+and unit standard deviation, and a range onto an interval (the paper's rotational data: [0.1, 0.9]).
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gpmpc.exceptions import SettingError, ShapeError
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """One affine map a column.
+
+    Attributes:
+        offset: (d,), in the units of the data.
+        factor: (d,), in the units of the data; positive.
+    """
+
+    offset: Tensor
+    factor: Tensor
+
+    def __post_init__(self) -> None:
+        if self.offset.shape != self.factor.shape or self.offset.dim() != 1:
+            raise ShapeError(
+                f"offset and factor must both be (d,); got {tuple(self.offset.shape)} and {tuple(self.factor.shape)}"
+            )
+        if not bool((self.factor > 0).all()):
+            raise SettingError("factor", f"must be positive in every column; got {self.factor.tolist()}")
+
+    def scale(self, values: Tensor) -> Tensor:
+        """Scaled values (..., d) from values in the units of the data."""
+        return (values - self.offset) / self.factor
+
+    def restore(self, scaled: Tensor) -> Tensor:
+        """Values (..., d) in the units of the data from scaled values."""
+        return scaled * self.factor + self.offset
+
+
+def identity(columns: Tensor, names: Sequence[str]) -> Scaling:
+    """Leaves columns (N, d) as they are."""
+    return Scaling(torch.zeros_like(columns[0]), torch.ones_like(columns[0]))
+
+
+def standardize(columns: Tensor, names: Sequence[str], resolution: float = 0.0) -> Scaling:
+    """Maps columns (N, d) to mean zero and standard deviation one; a constant column to zero.
+
+    Args:
+        columns: (N, d).
+        names: Names of the d columns, for the log.
+        resolution: A column whose range is at most this, in the units of the data, counts as constant.
+    """
+    constant = _constant(columns, names, resolution)
+    deviation = columns.std(dim=0, correction=0)
+    return Scaling(columns.mean(dim=0), torch.where(constant, 1.0, deviation))
+
+
+def min_max(
+    columns: Tensor, names: Sequence[str], low: float = 0.1, high: float = 0.9, resolution: float = 0.0
+) -> Scaling:
+    """Maps the range of each column (N, d) onto [low, high]; a constant column to the middle.
+
+    Args:
+        columns: (N, d).
+        names: Names of the d columns, for the log.
+        low: Where the smallest value goes.
+        high: Where the largest value goes.
+        resolution: A column whose range is at most this, in the units of the data, counts as constant. Without it,
+            a solver's round-off in a channel at rest would be blown up to the full interval.
+
+    Raises:
+        SettingError: low is not below high.
+    """
+    if not low < high:
+        raise SettingError("low, high", f"low must be below high; got {low}, {high}")
+    constant = _constant(columns, names, resolution)
+    smallest, largest = columns.min(dim=0).values, columns.max(dim=0).values
+    # A constant column keeps its unit, so that what little it moves stays as little.
+    factor = torch.where(constant, 1.0, (largest - smallest) / (high - low))
+    middle = (low + high) / 2
+    offset = torch.where(constant, (smallest + largest) / 2 - middle, smallest - low * factor)
+    return Scaling(offset, factor)
+
+
+def _constant(columns: Tensor, names: Sequence[str], resolution: float) -> Tensor:
+    """Which columns (d,) do not move; a note in the log names them."""
+    if columns.dim() != 2 or len(names) != columns.shape[1]:
+        raise ShapeError(f"columns (N, d) need d names; got {tuple(columns.shape)} and {len(names)} names")
+    moved = columns.max(dim=0).values - columns.min(dim=0).values
+    constant = moved <= resolution
+    for index in torch.nonzero(constant).flatten().tolist():
+        log.info("column %s is constant (it moves by %.1e): centred, not scaled", names[index], float(moved[index]))
+    return constant

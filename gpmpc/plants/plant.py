@@ -1,0 +1,108 @@
+"""Problem: a right-hand side f(x, u) has to become a discrete-time plant that controllers and simulations can step.
+
+There are two readings, and an experiment has to say which one it means. ``Map`` takes the next state to *be* the
+right-hand side, x[k+1] = f(x[k], u[k]); this is what the data of Cao, Lai and Alam (2017) obey to 1e-6. ``Integrated``
+integrates the same right-hand side over the sampling time with the input held constant, which is the physical system.
+
+A right-hand side is written once, with plain arithmetic on the entries of x and u, so that floats, NumPy arrays and
+CasADi expressions all pass through the same formula.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from gpmpc.exceptions import SettingError
+
+
+class Dynamics(Protocol):
+    """A continuous-time right-hand side f(x, u) with named states and inputs."""
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the n states, in order."""
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the m inputs, in order."""
+
+    def derivative(self, x: Any, u: Any) -> Sequence[Any]:
+        """The n entries of f(x, u), from anything that is indexed from 0 and knows arithmetic."""
+
+
+class Plant(Protocol):
+    """A discrete-time system."""
+
+    dynamics: Dynamics
+    time_step: float  # [s]
+
+    def successor(self, x: Any, u: Any) -> Sequence[Any]:
+        """The n entries of x[k+1], symbolic or numeric, like ``Dynamics.derivative``."""
+
+
+@dataclass(frozen=True)
+class Map:
+    """The paper's reading: x[k+1] = f(x[k], u[k]).
+
+    Attributes:
+        dynamics: The right-hand side f.
+        time_step: Time that one step stands for [s]; it labels the axis and does not enter the equations.
+    """
+
+    dynamics: Dynamics
+    time_step: float = 1.0  # [s]
+
+    def __post_init__(self) -> None:
+        _check_positive("time_step", self.time_step)
+
+    def successor(self, x: Any, u: Any) -> list[Any]:
+        """x[k+1] = f(x[k], u[k])."""
+        return list(self.dynamics.derivative(x, u))
+
+
+@dataclass(frozen=True)
+class Integrated:
+    """The physical reading: f integrated over the sampling time, the input held constant (zero-order hold).
+
+    Classical Runge-Kutta of order four on equal substeps; exact for the translational quadrotor, whose acceleration
+    depends on the input alone.
+
+    Attributes:
+        dynamics: The right-hand side f.
+        time_step: Sampling time [s].
+        substeps: Runge-Kutta steps a sampling time.
+    """
+
+    dynamics: Dynamics
+    time_step: float = 1.0  # [s]
+    substeps: int = 10
+
+    def __post_init__(self) -> None:
+        _check_positive("time_step", self.time_step)
+        if self.substeps < 1:
+            raise SettingError("substeps", f"must be 1 or more; got {self.substeps}")
+
+    def successor(self, x: Any, u: Any) -> list[Any]:
+        """x[k+1] = x[k] + the integral of f(x(t), u[k]) over one sampling time."""
+        f, h = self.dynamics.derivative, self.time_step / self.substeps
+        n = len(self.dynamics.state_names)
+        x = [x[i] for i in range(n)]
+        for _ in range(self.substeps):
+            k1 = f(x, u)
+            k2 = f([x[i] + h / 2 * k1[i] for i in range(n)], u)
+            k3 = f([x[i] + h / 2 * k2[i] for i in range(n)], u)
+            k4 = f([x[i] + h * k3[i] for i in range(n)], u)
+            x = [x[i] + h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]) for i in range(n)]
+        return x
+
+
+def step(plant: Plant, state: np.ndarray, input: np.ndarray) -> np.ndarray:
+    """The next state (n,) of a plant from a state (n,) and an input (m,)."""
+    return np.array(plant.successor(state, input), dtype=float)
+
+
+def _check_positive(key: str, value: float) -> None:
+    if not value > 0:
+        raise SettingError(key, f"must be positive; got {value}")

@@ -1,0 +1,141 @@
+r"""Problem: the mean and covariance of f(x~) when f is a GP and its input x~ is itself Gaussian.
+
+Exact moments of an SE-ARD posterior at x~ = (x, u), x ~ N(mu, S), u certain (Girard, 2004; Deisenroth, 2010, section
+2.3.2; Cao, Lai and Alam, 2017, eqs. (11)-(17)). With nu_i = x_i - mu, Lam_a = diag(l_a^2) on the states, and
+
+    q_ai  = E[k_a(x~_i, x~)],   Q_ij = E[k_a(x~_i, x~) k_b(x~_j, x~)] = q_ai q_bj exp(delta_ij)
+
+the textbook form of the covariance, beta_a' Q beta_b - M_a M_b, subtracts two numbers that agree to many digits where S
+is small. Here each product is centred before it is summed, which loses nothing:
+
+    mean          M_a = sum_i beta_ai q_ai
+    input-output  Cov[x, f_a] = T_a sum_i beta_ai q_ai z_ai
+    covariance    V_ab = sum_ij beta_ai beta_bj q_ai q_bj expm1(delta_ij)
+                  V_aa = ... + sf2_a - |L_a^-1 q_a|^2 - sum_ij [(K_a + sn2_a I)^-1]_ij q_ai q_aj expm1(delta_ij)
+    delta_ij      = r_ab - 1/2 z_ai' T_ab Lam_b^-1 T_a z_ai - 1/2 z_bj' T_ab Lam_a^-1 T_b z_bj + z_ai' T_ab z_bj
+    r_ab          = 1/2 (log|I + S Lam_a^-1| + log|I + S Lam_b^-1| - log|I + S (Lam_a^-1 + Lam_b^-1)|)
+    z_ai          = Lam_a^-1 nu_i,  T_a = (I + S Lam_a^-1)^-1 S,  T_ab = (I + S (Lam_a^-1 + Lam_b^-1))^-1 S
+
+(delta follows from T_ab - T_a = -T_ab Lam_b^-1 T_a.) The controls carry no uncertainty: they only weigh the points.
+"""
+
+import torch
+from torch import Tensor
+
+from gpmpc.exceptions import ShapeError
+from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.propagation.propagator import Propagation
+
+
+class MomentMatching:
+    """Exact moment matching through a ``GPPosterior``.
+
+    Args:
+        observation_noise: Adds the noise variance sn2 to the predicted covariance. The paper's tables do not.
+    """
+
+    def __init__(self, observation_noise: bool = False):
+        self.observation_noise = observation_noise
+
+    def __call__(self, model: GPPosterior, belief: Gaussian, input: Tensor) -> Gaussian:
+        """The next state's belief; see ``propagate``."""
+        return self.propagate(model, belief, input).belief
+
+    def propagate(self, model: GPPosterior, belief: Gaussian, input: Tensor) -> Propagation:
+        """Moves a belief N(mu, S) one step on.
+
+        Args:
+            model: The GPs.
+            belief: Over the state: mean (*batch, n), covariance (*batch, n, n).
+            input: The certain control (*batch, m).
+
+        Returns:
+            The next belief, Cov[x, x+] (*batch, n, n), and how far the covariance was from positive semidefinite.
+
+        Raises:
+            ShapeError: Belief or input do not fit the model.
+        """
+        n, m = model.state_dim, model.input_dim
+        if belief.dim != n or input.shape[-1] != m:
+            raise ShapeError(f"the model has {n} states and {m} inputs; got {belief.dim} and {input.shape[-1]}")
+        mean, covariance, cross = moments(model, belief, input)
+        if self.observation_noise:
+            covariance = covariance + torch.diag(model.noise_variance)
+        if model.predicts == "difference":
+            mean = belief.mean + mean
+            covariance = belief.covariance + covariance + cross + cross.mT
+            cross = belief.covariance + cross
+        covariance, deficit = nearest_positive_semidefinite(covariance)
+        return Propagation(Gaussian(mean, covariance), cross, deficit)
+
+
+def moments(model: GPPosterior, belief: Gaussian, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """M (*batch, n), V (*batch, n, n) and Cov[x, f] (*batch, n, n) of the latent functions f, as in the module's text."""
+    n, S = model.state_dim, belief.covariance[..., None, :, :]  # S: (*batch, 1, n, n), one copy an output or pair
+    inverse_squares = model.lengthscales[:, :n].square().reciprocal()  # the diagonals of Lam_a^-1, (n, n)
+    nu = (model.features[:, :n] - belief.mean[..., None, :])[..., None, :, :]  # (*batch, 1, N, n)
+    control = (model.features[:, n:] - input[..., None, :])[..., None, :, :] / model.lengthscales[:, None, n:]
+    z = nu * inverse_squares[:, None, :]  # (*batch, n, N, n)
+
+    half_logdet, T, whitened = _against(S, inverse_squares, nu)
+    log_q = (
+        model.signal_variance.log()[:, None]
+        - (control.square().sum(-1) + whitened.square().sum(-1)) / 2
+        - half_logdet[..., None]
+    )  # (*batch, n, N)
+    q = log_q.exp()
+    mean = (model.weights * q).sum(-1)
+    cross = (T @ ((model.weights * q)[..., None, :] @ z).mT)[..., 0].mT  # Cov[x_k, f_a] at [..., k, a]
+
+    a, b = torch.triu_indices(n, n, device=nu.device)  # the pairs of outputs a <= b
+    half_logdet_ab, T_ab, _ = _against(S, inverse_squares[a] + inverse_squares[b])
+    z_a, z_b = z[..., a, :, :], z[..., b, :, :]
+    of_i = _quadratic(z_a, T_ab @ (inverse_squares[b][:, :, None] * T[..., a, :, :])) / 2
+    of_j = _quadratic(z_b, T_ab @ (inverse_squares[a][:, :, None] * T[..., b, :, :])) / 2
+    r = half_logdet[..., a] + half_logdet[..., b] - half_logdet_ab
+    of_i, z_a = r[..., None] - of_i, z_a @ T_ab
+    explained = torch.linalg.solve_triangular(model.cholesky, q[..., None], upper=False)[..., 0].square().sum(-1)
+
+    entries = {}
+    for pair, (i, j) in enumerate(zip(a.tolist(), b.tolist(), strict=True)):  # one at a time: (N, N) fits the cache
+        delta = of_i[..., pair, :, None] - of_j[..., pair, None, :] + z_a[..., pair, :, :] @ z_b[..., pair, :, :].mT
+        centred = _centred_product(log_q[..., i, :, None] + log_q[..., j, None, :], delta)
+        entry = ((centred @ model.weights[j]) * model.weights[i]).sum(-1)
+        if i == j:
+            reduction = (model.precision[i] * centred).sum((-2, -1))
+            entry = entry + model.signal_variance[i] - explained[..., i] - reduction
+        entries[i, j] = entries[j, i] = entry
+    rows = [torch.stack([entries[i, j] for j in range(n)], dim=-1) for i in range(n)]
+    return mean, torch.stack(rows, dim=-2), cross
+
+
+def _against(S: Tensor, D: Tensor, nu: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """1/2 log|I + S D|, T = (I + S D)^-1 S and vectors w of nu with |w|^2 = nu' (S + D^-1)^-1 nu, for diagonal D.
+
+    Through B = D^1/2 S D^1/2, whose I + B is well conditioned; log1p keeps the digits of a small S.
+    """
+    root = D.sqrt()
+    B = root[..., :, None] * S * root[..., None, :]
+    half_logdet = torch.linalg.eigvalsh(B).log1p().sum(-1) / 2
+    factor = torch.linalg.cholesky(B + torch.eye(B.shape[-1], dtype=B.dtype, device=B.device))
+    T = torch.cholesky_solve(B, factor) / (root[..., :, None] * root[..., None, :])
+    if nu is None:
+        return half_logdet, T, None
+    whitened = torch.linalg.solve_triangular(factor, (nu * root[..., None, :]).mT, upper=False).mT
+    return half_logdet, T, whitened
+
+
+def _quadratic(z: Tensor, M: Tensor) -> Tensor:
+    """z_i' M z_i of the rows of z (..., N, n), (..., N)."""
+    return ((z @ M) * z).sum(-1)
+
+
+def _centred_product(log_qq: Tensor, delta: Tensor) -> Tensor:
+    """q_i q_j expm1(delta_ij) from logarithms, without overflow or cancellation for either sign of delta.
+
+    expm1(d) = exp(d) (-expm1(-d)) for d > 0: every exponential is of a product's own logarithm or of -|d|.
+    """
+    positive = (delta > 0).to(delta.dtype)
+    sign = 2 * positive - 1
+    return -sign * (log_qq + positive * delta).exp() * torch.expm1(-sign * delta)

@@ -1,0 +1,233 @@
+"""Problem: the position that a vehicle is to follow, as a function of time.
+
+Every trajectory is called with times t [s] of any shape and returns positions (..., 3) [m]; ``velocity`` returns their
+time derivative (..., 3) [m/s]. ``Elliptical`` and ``Lorenz`` are those of Cao, Lai and Alam (2017), section 5, decoded
+from the authors' data (the paper's z axis points downwards); the others are for everyday use.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from scipy.integrate import RK45
+from scipy.interpolate import PchipInterpolator
+
+from gpmpc.exceptions import SettingError
+
+
+class Trajectory(Protocol):
+    """A position over time."""
+
+    def __call__(self, time: np.ndarray) -> np.ndarray:
+        """Positions (..., 3) [m] at times (...) [s]."""
+
+    def velocity(self, time: np.ndarray) -> np.ndarray:
+        """Velocities (..., 3) [m/s] at times (...) [s]."""
+
+
+@dataclass(frozen=True)
+class Elliptical:
+    """The paper's helix: x = a sin(w t), y = b cos(w t), z = z0 + c t.
+
+    Attributes:
+        radius_x: Semi-axis a [m].
+        radius_y: Semi-axis b [m].
+        rate: Angular rate w [rad/s].
+        start_z: z0 [m].
+        climb_rate: c [m/s], negative upwards because z points down.
+    """
+
+    radius_x: float = 15.0  # [m]
+    radius_y: float = 15.0  # [m]
+    rate: float = 0.1  # [rad/s]
+    start_z: float = -5.0  # [m]
+    climb_rate: float = -0.25  # [m/s]
+
+    def __call__(self, time: np.ndarray) -> np.ndarray:
+        """Positions (..., 3) [m] at times (...) [s]."""
+        t = np.asarray(time, dtype=float)
+        angle = self.rate * t
+        return np.stack(
+            [self.radius_x * np.sin(angle), self.radius_y * np.cos(angle), self.start_z + self.climb_rate * t], axis=-1
+        )
+
+    def velocity(self, time: np.ndarray) -> np.ndarray:
+        """Velocities (..., 3) [m/s] at times (...) [s]."""
+        t = np.asarray(time, dtype=float)
+        angle = self.rate * t
+        along_x, along_y = self.radius_x * self.rate * np.cos(angle), -self.radius_y * self.rate * np.sin(angle)
+        return np.stack([along_x, along_y, np.full_like(t, self.climb_rate)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Lorenz:
+    """The paper's chaotic path: (0.7 X, -0.7 Y, Z) of the Lorenz system (Lorenz, 1963, eqs. (25)-(27)).
+
+    The authors sampled an adaptive Dormand-Prince 5(4) integration at its natural output points, four a step, so
+    equal steps of flight time are unequal steps of Lorenz time. Between samples the flight follows the integrator's
+    dense output, Lorenz time running linearly from one sample to the next.
+
+    Attributes:
+        sigma: Prandtl number of the Lorenz system.
+        rho: Rayleigh number of the Lorenz system.
+        beta: Geometric factor of the Lorenz system.
+        start: (X, Y, Z) at time zero.
+        scale: Factors from (X, Y, Z) to metres [m].
+        relative_tolerance: Of the adaptive integration; it sets the sampling.
+        samples_per_step: Output points of one accepted integration step.
+        sampling_time: Flight time from one output point to the next [s].
+        duration: Flight time that the trajectory is defined for [s].
+    """
+
+    sigma: float = 10.0
+    rho: float = 28.0
+    beta: float = 8 / 3
+    start: tuple[float, float, float] = (-1.79, -3.13, 12.74)
+    scale: tuple[float, float, float] = (0.7, -0.7, 1.0)  # [m]
+    relative_tolerance: float = 1e-3
+    samples_per_step: int = 4
+    sampling_time: float = 1.0  # [s]
+    duration: float = 400.0  # [s]
+
+    def __call__(self, time: np.ndarray) -> np.ndarray:
+        """Positions (..., 3) [m] at times (...) [s]."""
+        lorenz_time, _ = self._lorenz_time(time)
+        return self._dense(lorenz_time) * np.array(self.scale)
+
+    def velocity(self, time: np.ndarray) -> np.ndarray:
+        """Velocities (..., 3) [m/s] at times (...) [s]; at a sample, that of the interval that begins there."""
+        lorenz_time, speed = self._lorenz_time(time)
+        rate = np.moveaxis(self._derivative(0.0, np.moveaxis(self._dense(lorenz_time), -1, 0)), 0, -1)
+        return rate * speed[..., None] * np.array(self.scale)
+
+    def _derivative(self, _: float, state: np.ndarray) -> np.ndarray:
+        x, y, z = state
+        return np.array([self.sigma * (y - x), x * (self.rho - z) - y, x * y - self.beta * z])
+
+    @cached_property
+    def _integration(self) -> tuple[np.ndarray, list]:
+        """Lorenz times of the samples, and the dense output of every accepted step."""
+        steps = int(np.ceil(self.duration / self.sampling_time / self.samples_per_step))
+        solver = RK45(self._derivative, 0.0, np.array(self.start), np.inf, rtol=self.relative_tolerance, atol=1e-6)
+        fractions = np.arange(1, self.samples_per_step + 1) / self.samples_per_step
+        times, pieces = [np.zeros(1)], []
+        for _ in range(steps):
+            solver.step()
+            times.append(solver.t_old + fractions * (solver.t - solver.t_old))
+            pieces.append(solver.dense_output())
+        return np.concatenate(times), pieces
+
+    def _lorenz_time(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lorenz time at flight times, and its rate of change."""
+        t = np.asarray(time, dtype=float)
+        if np.any(t < 0) or np.any(t > self.duration):
+            raise SettingError("duration", f"this Lorenz trajectory is defined from 0 to {self.duration} s; got {t}")
+        samples, _ = self._integration
+        position = t / self.sampling_time
+        index = np.minimum(position.astype(int), len(samples) - 2)
+        spacing = samples[index + 1] - samples[index]
+        return samples[index] + (position - index) * spacing, spacing / self.sampling_time
+
+    def _dense(self, lorenz_time: np.ndarray) -> np.ndarray:
+        samples, pieces = self._integration
+        ends = samples[self.samples_per_step :: self.samples_per_step]
+        piece = np.minimum(np.searchsorted(ends, lorenz_time), len(pieces) - 1)
+        state = [pieces[i](t) for i, t in zip(np.ravel(piece), np.ravel(lorenz_time), strict=True)]
+        return np.reshape(state, (*np.shape(lorenz_time), 3))
+
+
+@dataclass(frozen=True)
+class Step:
+    """A jump from one position to another.
+
+    Attributes:
+        before: Position until the jump [m].
+        after: Position from the jump on [m].
+        at: Time of the jump [s].
+    """
+
+    before: Sequence[float] = (0.0, 0.0, 0.0)  # [m]
+    after: Sequence[float] = (1.0, 1.0, -1.0)  # [m]
+    at: float = 0.0  # [s]
+
+    def __post_init__(self) -> None:
+        _check_positions("before", [self.before])
+        _check_positions("after", [self.after])
+
+    def __call__(self, time: np.ndarray) -> np.ndarray:
+        """Positions (..., 3) [m] at times (...) [s]."""
+        reached = np.asarray(time, dtype=float)[..., None] >= self.at
+        return np.where(reached, np.asarray(self.after, dtype=float), np.asarray(self.before, dtype=float))
+
+    def velocity(self, time: np.ndarray) -> np.ndarray:
+        """Zero (..., 3) [m/s]: the jump has no velocity."""
+        return np.zeros((*np.shape(time), 3))
+
+
+@dataclass(frozen=True)
+class Hover:
+    """One position, held.
+
+    Attributes:
+        position: Where to hover [m].
+    """
+
+    position: Sequence[float] = (0.0, 0.0, 0.0)  # [m]
+
+    def __post_init__(self) -> None:
+        _check_positions("position", [self.position])
+
+    def __call__(self, time: np.ndarray) -> np.ndarray:
+        """Positions (..., 3) [m] at times (...) [s]."""
+        return np.broadcast_to(np.asarray(self.position, dtype=float), (*np.shape(time), 3)).copy()
+
+    def velocity(self, time: np.ndarray) -> np.ndarray:
+        """Zero (..., 3) [m/s]."""
+        return np.zeros((*np.shape(time), 3))
+
+
+@dataclass(frozen=True)
+class Waypoints:
+    """A smooth path through given positions at given times; the first and the last one are held outside.
+
+    A monotone cubic (Fritsch and Carlson, 1980) a coordinate: it passes every waypoint and overshoots none.
+
+    Attributes:
+        times: Strictly increasing times of the waypoints [s].
+        positions: One position (3) a time [m].
+    """
+
+    times: Sequence[float]  # [s]
+    positions: Sequence[Sequence[float]]  # [m]
+
+    def __post_init__(self) -> None:
+        _check_positions("positions", self.positions)
+        times = np.asarray(self.times, dtype=float)
+        if len(times) < 2 or len(times) != len(self.positions):
+            raise SettingError(
+                "times", f"must be two or more, one a position; got {len(times)} times, {len(self.positions)} positions"
+            )
+        if not np.all(np.diff(times) > 0):
+            raise SettingError("times", f"must be strictly increasing [s]; got {list(self.times)}")
+
+    @cached_property
+    def _path(self) -> PchipInterpolator:
+        return PchipInterpolator(np.asarray(self.times, dtype=float), np.asarray(self.positions, dtype=float))
+
+    def __call__(self, time: np.ndarray) -> np.ndarray:
+        """Positions (..., 3) [m] at times (...) [s]."""
+        return self._path(np.clip(time, self.times[0], self.times[-1]))
+
+    def velocity(self, time: np.ndarray) -> np.ndarray:
+        """Velocities (..., 3) [m/s] at times (...) [s]; zero before the first and after the last waypoint."""
+        t = np.asarray(time, dtype=float)
+        inside = (t >= self.times[0]) & (t <= self.times[-1])
+        return self._path.derivative()(np.clip(t, self.times[0], self.times[-1])) * inside[..., None]
+
+
+def _check_positions(key: str, positions: Sequence[Sequence[float]]) -> None:
+    for position in positions:
+        if np.shape(position) != (3,) or not np.all(np.isfinite(np.asarray(position, dtype=float))):
+            raise SettingError(key, f"a position is three finite numbers x, y, z [m]; got {position}")
