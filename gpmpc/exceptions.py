@@ -43,3 +43,15 @@ class TrainingError(GpmpcError, RuntimeError):
 
 class ProblemError(GpmpcError, ValueError):
     """An optimisation problem is malformed: shapes, symmetry, definiteness, crossed bounds, NaN."""
+
+
+class SolverFailure(GpmpcError, RuntimeError):
+    """A controller's solver did not succeed where its caller had declared no other policy.
+
+    Attributes:
+        step: The time step (from 0).
+    """
+
+    def __init__(self, step: int, advice: str):
+        super().__init__(f"the controller's solver failed at step {step}: {advice}")
+        self.step = step

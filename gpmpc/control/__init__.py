@@ -1,0 +1,1 @@
+"""Controllers: from a state and a reference to an input."""

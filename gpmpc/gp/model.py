@@ -37,9 +37,7 @@ class BatchExactGP(gpytorch.models.ExactGP):
         likelihood = gpytorch.likelihoods.GaussianLikelihood(batch_shape=batch, noise_constraint=_log_parameter())
         super().__init__(features, targets.T.contiguous(), likelihood)
         self.mean_module = gpytorch.means.ZeroMean(batch_shape=batch)
-        kernel = gpytorch.kernels.RBFKernel(
-            ard_num_dims=d, batch_shape=batch, lengthscale_constraint=_log_parameter()
-        )
+        kernel = gpytorch.kernels.RBFKernel(ard_num_dims=d, batch_shape=batch, lengthscale_constraint=_log_parameter())
         self.covar_module = gpytorch.kernels.ScaleKernel(
             kernel, batch_shape=batch, outputscale_constraint=_log_parameter()
         )

@@ -45,7 +45,7 @@ class Scaling:
         return scaled * self.factor + self.offset
 
 
-def identity(columns: Tensor, names: Sequence[str]) -> Scaling:
+def identity(columns: Tensor, names: Sequence[str] = ()) -> Scaling:
     """Leaves columns (N, d) as they are."""
     return Scaling(torch.zeros_like(columns[0]), torch.ones_like(columns[0]))
 
@@ -96,6 +96,7 @@ def _constant(columns: Tensor, names: Sequence[str], resolution: float) -> Tenso
         raise ShapeError(f"columns (N, d) need d names; got {tuple(columns.shape)} and {len(names)} names")
     moved = columns.max(dim=0).values - columns.min(dim=0).values
     constant = moved <= resolution
-    for index in torch.nonzero(constant).flatten().tolist():
-        log.info("column %s is constant (it moves by %.1e): centred, not scaled", names[index], float(moved[index]))
+    if bool(constant.any()):
+        which = ", ".join(f"{name} (moves by {m:.0e})" for name, m, c in zip(names, moved, constant, strict=True) if c)
+        log.info("constant columns are centred, not scaled: %s", which)
     return constant

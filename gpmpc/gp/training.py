@@ -1,9 +1,9 @@
-"""Problem: find the hyperparameters of every output's GP by maximum marginal likelihood, reliably, on nearly noise-free data.
+"""Problem: find every output's hyperparameters by maximum marginal likelihood, reliably, on nearly noise-free data.
 
 Each output is fitted on its own by L-BFGS (Byrd, Lu, Nocedal and Zhu, 1995; scipy's L-BFGS-B) over
 theta = (log length-scales, log sf, log(sf / sn)) inside a wide box. The likelihood has local optima that differ by a
-factor of a hundred in prediction error, so the search explores a few iterations from the paper's starting point and from
-random perturbations of it, and goes on to convergence from the best two. (On the paper's data that finds the best
+factor of a hundred in prediction error, so the search explores a few iterations from the paper's starting point and
+from random perturbations of it, and goes on to convergence from the best two. (On the paper's data that finds the best
 optimum for 98.6 % of the outputs at three restarts; one finalist 94 %, a single start without exploration 86 %.)
 
 Cao, Lai and Alam (2017), eq. (9); the penalty is the one of their experiment.
@@ -205,7 +205,7 @@ def _objective(end: tuple[np.ndarray, float]) -> float:
 
 
 def spread(columns: np.ndarray) -> np.ndarray:
-    """The standard deviation of columns (N, d), (d,); the magnitude of a column that is constant, or 1 where that is 0."""
+    """The standard deviation (d,) of columns (N, d); of a constant column its magnitude, or 1 where that is 0."""
     magnitude = np.abs(columns).max(axis=0)
     deviation = columns.std(axis=0, ddof=1) if len(columns) > 1 else np.zeros_like(magnitude)
     deviation = np.where(deviation > CONSTANT * magnitude, deviation, magnitude)

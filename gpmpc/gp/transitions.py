@@ -7,7 +7,6 @@ what is wrong with a file is said with its name, row and column.
 
 import csv
 import io
-import os
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import DataError, ShapeError
+from gpmpc.files import write_whole
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,12 @@ class Transitions:
 
     @property
     def state_dim(self) -> int:
-        """n."""
+        """N."""
         return self.states.shape[1]
 
     @property
     def input_dim(self) -> int:
-        """m."""
+        """M."""
         return self.inputs.shape[1]
 
     @property
@@ -87,14 +87,9 @@ class Transitions:
 
     def save(self, path: str | Path) -> None:
         """Writes an uncompressed ``.npz`` (no pickle), in one piece or not at all."""
-        path = Path(path)
         buffer = io.BytesIO()
-        np.savez(
-            buffer, states=self.states.numpy(), inputs=self.inputs.numpy(), next_states=self.next_states.numpy()
-        )
-        partial = path.with_name(path.name + ".partial")
-        partial.write_bytes(buffer.getvalue())
-        os.replace(partial, path)
+        np.savez(buffer, states=self.states.numpy(), inputs=self.inputs.numpy(), next_states=self.next_states.numpy())
+        write_whole(path, buffer.getvalue())
 
     @classmethod
     def load(cls, path: str | Path) -> "Transitions":

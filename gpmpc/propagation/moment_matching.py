@@ -71,7 +71,7 @@ class MomentMatching:
 
 
 def moments(model: GPPosterior, belief: Gaussian, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """M (*batch, n), V (*batch, n, n) and Cov[x, f] (*batch, n, n) of the latent functions f, as in the module's text."""
+    """M (*batch, n), V (*batch, n, n) and Cov[x, f] (*batch, n, n) of the latent functions f; the module's text."""
     n, S = model.state_dim, belief.covariance[..., None, :, :]  # S: (*batch, 1, n, n), one copy an output or pair
     inverse_squares = model.lengthscales[:, :n].square().reciprocal()  # the diagonals of Lam_a^-1, (n, n)
     nu = (model.features[:, :n] - belief.mean[..., None, :])[..., None, :, :]  # (*batch, 1, N, n)

@@ -1,0 +1,74 @@
+"""``gpmpc tables``: computes Tables 1 and 2 and writes them as Markdown, CSV, LaTeX, JSON and a figure."""
+
+import logging
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+
+from gpmpc.exceptions import GpmpcError, SettingError
+
+
+def tables(config: DictConfig) -> None:
+    """The task behind ``conf/tables.yaml``."""
+    from hydra.utils import instantiate
+    from rich.console import Console
+    from rich.logging import RichHandler
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from gpmpc.experiments.tables import FitStore, Tables
+    from gpmpc.experiments.tables_report import documents, render, summarise
+    from gpmpc.files import write_whole
+    from gpmpc.provenance import provenance
+
+    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    console = Console()
+    log = logging.getLogger("gpmpc")
+    log.setLevel(logging.INFO)
+    log.handlers = [RichHandler(console=console, show_path=False, show_time=False, show_level=False)]
+    log.propagate = False
+
+    # Everything that a user can get wrong is found out before anything is written.
+    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "trajectory", "subsystem", "model")}
+    experiment = Tables(
+        data=parts["data"],
+        trajectories=parts["trajectory"],
+        subsystems=parts["subsystem"],
+        model=parts["model"],
+        model_settings=settings["model"],
+        **{key: settings[key] for key in ("sizes", "draws", "seed", "state_std", "workers")},
+    )
+    with console.status("generating or reading the data"):
+        fits = experiment.fits()
+
+    folder = Path(settings["folder"])
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
+        store = FitStore(folder / "fits.jsonl")
+        columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
+        columns += [TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()]
+        with Progress(*columns, console=console) as progress:
+            task = progress.add_task("training GPs", total=len(fits))
+            draws = experiment.run(store, fits, progress=lambda _: progress.advance(task))
+        rows = summarise(draws)
+        meta = provenance() | {"settings": settings}
+        for name, content in documents(rows, draws, meta).items():
+            write_whole(folder / name, content)
+    except OSError as error:
+        raise SettingError("folder", f"cannot write to {folder}: {error.strerror or error}") from error
+    except BrokenProcessPool as error:
+        raise GpmpcError("a worker process died (out of memory?); the same command goes on where it stopped") from error
+
+    console.print(render(rows))
+    failed = [draw for draw in draws if "error" in draw]
+    for draw in failed:
+        console.print(f"failed: {draw['trajectory']} {draw['subsystem']} N={draw['size']}: {draw['error']}")
+    console.print(f"\nwritten to {folder}: {', '.join(sorted(documents(rows, draws, meta)))}", soft_wrap=True)

@@ -1,0 +1,139 @@
+"""Problem: where the transitions of an experiment come from.
+
+``NMPCData`` flies the experiment of Cao, Lai and Alam (2017), section 5, itself: unconstrained NMPC on the true plant,
+first along the trajectory with the translational subsystem, then along the attitude that those controls ask for with
+the rotational one. ``PaperData`` reads the four files that the authors published. Either is asked for one trajectory
+and one subsystem at a time.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from gpmpc.control.nmpc import NMPC
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.gp.transitions import Transitions
+from gpmpc.plants import Plant, attitude_for_thrust_direction
+from gpmpc.simulation import Rollout, closed_loop
+from gpmpc.trajectories import Trajectory
+
+SUBSYSTEMS = ("translational", "rotational")
+
+
+class DataSource(Protocol):
+    """Transitions by the names of a trajectory and a subsystem."""
+
+    def transitions(self, name: str, trajectory: Trajectory, subsystem: str) -> Transitions:
+        """The transitions of one subsystem ("translational" or "rotational") along the trajectory called ``name``."""
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How one subsystem is flown.
+
+    Attributes:
+        plant: The true system.
+        Q: State weights, the diagonal (n,).
+        R: Input weights, the diagonal (m,).
+        initial_input: First guess of the solver (m,).
+    """
+
+    plant: Plant
+    Q: Sequence[float]
+    R: Sequence[float]
+    initial_input: Sequence[float]
+
+    def fly(self, references: np.ndarray, horizon: int, steps: int) -> Rollout:
+        """Unconstrained NMPC from rest along references (steps + horizon - 1, n)."""
+        controller = NMPC(self.plant, horizon, self.Q, self.R, self.initial_input)
+        return closed_loop(self.plant, controller, references, np.zeros(len(self.Q)), steps)
+
+
+@dataclass(frozen=True)
+class NMPCData:
+    """Transitions of unconstrained NMPC on the true plant.
+
+    Attributes:
+        translational: How the outer subsystem is flown.
+        rotational: How the inner subsystem is flown.
+        samples: Transitions of either subsystem.
+        horizon: Of the controller.
+        attitude: How thrust direction becomes attitude: ``"paper"`` or ``"exact"``; see
+            ``attitude_for_thrust_direction``.
+    """
+
+    translational: Tracking
+    rotational: Tracking
+    samples: int = 189
+    horizon: int = 3
+    attitude: str = "paper"
+
+    def __post_init__(self) -> None:
+        if self.samples < 1:
+            raise SettingError("samples", f"must be 1 or more; got {self.samples}")
+
+    def transitions(self, name: str, trajectory: Trajectory, subsystem: str) -> Transitions:
+        """Flies the trajectory, and for the rotational subsystem the attitude it asks for.
+
+        Raises:
+            SettingError: No such subsystem.
+            SolverFailure: The controller's solver failed.
+        """
+        if subsystem not in SUBSYSTEMS:
+            raise SettingError("subsystem", f"must be one of {', '.join(SUBSYSTEMS)}; got {subsystem!r}")
+        ahead = self.horizon - 1  # the attitude's references reach this far beyond its last step
+        outer = self._fly_translational(trajectory, self.samples + ahead)
+        if subsystem == "translational":
+            return _transitions(outer, self.samples)
+        angles = attitude_for_thrust_direction(outer.inputs[:, 1], outer.inputs[:, 2], self.attitude)
+        references = np.zeros((len(angles), 6))
+        references[:, [0, 2]] = angles  # phi, theta; psi and the rates are to be zero
+        return _transitions(self.rotational.fly(references, self.horizon, self.samples), self.samples)
+
+    def _fly_translational(self, trajectory: Trajectory, steps: int) -> Rollout:
+        times = self.translational.plant.time_step * np.arange(steps + self.horizon - 1)
+        references = np.zeros((len(times), 6))
+        references[:, ::2] = trajectory(times)  # x, y, z; the velocities are asked to be zero, with little weight
+        return self.translational.fly(references, self.horizon, steps)
+
+
+@dataclass(frozen=True)
+class PaperData:
+    """The authors' published files, ``ds_nmpc_<Trajectory>_<trans|rotate>.txt``.
+
+    Attributes:
+        folder: Where the files lie.
+        samples: Rows to use from the top of each file.
+    """
+
+    folder: str | Path
+    samples: int = 189
+
+    def __post_init__(self) -> None:
+        if not Path(self.folder).is_dir():
+            raise DataError(f"{self.folder}: no such folder; data.folder must hold the authors' four text files")
+
+    def transitions(self, name: str, trajectory: Trajectory, subsystem: str) -> Transitions:
+        """Reads one file.
+
+        Raises:
+            SettingError: No such subsystem.
+            DataError: The file is missing, malformed, or shorter than ``samples``.
+        """
+        if subsystem not in SUBSYSTEMS:
+            raise SettingError("subsystem", f"must be one of {', '.join(SUBSYSTEMS)}; got {subsystem!r}")
+        part = {"translational": "trans", "rotational": "rotate"}[subsystem]
+        path = Path(self.folder) / f"ds_nmpc_{name.capitalize()}_{part}.txt"
+        data = Transitions.from_text(path)
+        if len(data) < self.samples:
+            raise DataError(f"{path}: the file holds {len(data)} rows; data.samples asks for {self.samples}")
+        return data[: self.samples]
+
+
+def _transitions(flight: Rollout, samples: int) -> Transitions:
+    states, inputs = torch.from_numpy(flight.states), torch.from_numpy(flight.inputs)
+    return Transitions(states[:samples], inputs[:samples], states[1 : samples + 1])

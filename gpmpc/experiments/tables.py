@@ -1,0 +1,325 @@
+"""Tables 1 and 2 of Cao, Lai and Alam (2017): how good the GP models are, by trajectory, subsystem and training size.
+
+One *fit* is one draw of a training set: six GPs are trained on a random subset (sorted) of the 189 rows and predict the
+subset and all rows, one step ahead each, by moment matching. The state that goes into the first prediction has
+covariance 0.1^2 I, in the units of the model; every later one has the covariance predicted one sample earlier, while
+its mean is the data's. Reported are
+
+    MSE               squared error summed over the six outputs, averaged over the samples, in the units of the data
+    average variance  of x, y, z (phi, theta, psi) in the covariance fed in, averaged over the samples, in model units
+
+What the paper leaves open is added: the same errors of plain predictions, and whether those are calibrated.
+
+Fits are independent; they run in worker processes of one thread each, and every finished one is appended to
+``fits.jsonl`` under the fingerprint of all that it depends on, so a run that was killed goes on where it stopped.
+"""
+
+import hashlib
+import json
+import os
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gpmpc import __version__
+from gpmpc.datasets import DataSource
+from gpmpc.exceptions import SettingError, TrainingError
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import Scaling, Training, Transitions
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
+from gpmpc.propagation import MomentMatching
+from gpmpc.trajectories import Trajectory
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+PROTOCOL = 1  # raised when a change of this module changes its numbers: older fits.jsonl entries are then not reused
+
+
+@dataclass(frozen=True)
+class Subsystem:
+    """What the tables need to know of a subsystem.
+
+    Attributes:
+        columns: Names of the columns x (n), u (m), x+ (n) of its data.
+        reported: The states whose variance is averaged.
+        scaling: From columns (N, d) and their names to the scaling in whose units the model works.
+    """
+
+    columns: Sequence[str]
+    reported: Sequence[str]
+    scaling: Callable[[Tensor, Sequence[str]], Scaling]
+
+    def __post_init__(self) -> None:
+        for name in self.reported:
+            if name not in self.columns:
+                raise SettingError("reported", f"must be among {', '.join(self.columns)}; got {name!r}")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One trajectory and one subsystem: the data in the units of the model, and the way back."""
+
+    trajectory: str
+    subsystem: str
+    data: Transitions
+    scaling: Scaling  # of the next states
+    reported: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One draw; ``fingerprint`` names everything that its numbers depend on."""
+
+    cell: Cell
+    size: int
+    draw: int
+    seed: int
+    fingerprint: str
+
+
+@dataclass(frozen=True)
+class Tables:
+    """The whole experiment; one row of the tables is one cell and one size.
+
+    Attributes:
+        data: Where transitions come from.
+        trajectories: By name.
+        subsystems: By name.
+        model: From transitions and a ``seed`` to a ``Training``.
+        model_settings: The same as plain data, for the fingerprint.
+        sizes: Training set sizes.
+        draws: Training sets a row.
+        seed: Every draw's own seed derives from it.
+        state_std: Standard deviation of the state in the first prediction, in the units of the model.
+        workers: Processes; None takes one a core.
+
+    Raises:
+        SettingError: A size, a draw count, a seed, a deviation or a worker count out of range.
+    """
+
+    data: DataSource
+    trajectories: Mapping[str, Trajectory]
+    subsystems: Mapping[str, Subsystem]
+    model: Callable[..., Training]
+    model_settings: Any
+    sizes: Sequence[int] = (10, 50, 100, 189)
+    draws: int = 5
+    seed: int = 0
+    state_std: float = 0.1
+    workers: int | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sizes", _whole_numbers("sizes", self.sizes))
+        for key, least in (("draws", 1), ("seed", 0), ("workers", 1)):
+            value = getattr(self, key)
+            if value is None and key == "workers":
+                continue
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise SettingError(key, f"must be a whole number, {least} or more; got {value!r}")
+        if not isinstance(self.state_std, int | float) or not 0 <= self.state_std < float("inf"):
+            raise SettingError("state_std", f"must be a number, 0 or more; got {self.state_std!r}")
+
+    def fits(self) -> list[Fit]:
+        """Every fit of the experiment, in the order of the tables.
+
+        Raises:
+            DataError: The data cannot be read.
+            SettingError: A size is larger than the data.
+        """
+        return list(self._fits())
+
+    def _fits(self) -> Iterator[Fit]:
+        for name, trajectory in self.trajectories.items():
+            for part, subsystem in self.subsystems.items():
+                cell = _cell(name, part, self.data.transitions(name, trajectory, part), subsystem)
+                rows = _digest(*(a.numpy().tobytes() for a in (cell.data.features, cell.data.next_states)))
+                factors = _digest(cell.scaling.factor.numpy().tobytes())
+                for size in self.sizes:
+                    if size > len(cell.data):
+                        raise SettingError(
+                            "sizes", f"must be at most {len(cell.data)}, the rows of {name} {part}; got {size}"
+                        )
+                    for draw in range(self.draws):
+                        sequence = [self.seed, zlib.crc32(name.encode()), zlib.crc32(part.encode()), size, draw]
+                        seed = int(np.random.SeedSequence(sequence).generate_state(1)[0])
+                        depends = [PROTOCOL, __version__, self.model_settings, self.state_std, cell.reported]
+                        depends += [rows, factors, size, seed]
+                        yield Fit(cell, size, draw, seed, _digest(json.dumps(depends, sort_keys=True).encode()))
+
+    def run(self, store: "FitStore", fits: Sequence[Fit], progress: Callable[[dict | None], None]) -> list[dict]:
+        """Computes the fits that the store does not hold yet.
+
+        Args:
+            store: Where finished fits are kept.
+            fits: From ``fits()``.
+            progress: Called with every record, found or computed; a failed fit counts as well.
+
+        Returns:
+            One record a fit, in the order of ``fits``.
+        """
+        found = {}
+        for fit in fits:
+            if fit.fingerprint in store.records:
+                found[fit.fingerprint] = store.records[fit.fingerprint]
+                progress(found[fit.fingerprint])
+        missing = [fit for fit in fits if fit.fingerprint not in found]
+        if missing:
+            workers = min(self.workers or os.cpu_count() or 1, len(missing))
+            evaluate = partial(_evaluate, model=self.model, state_std=float(self.state_std))
+            with _one_thread_each(), ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+                # The largest first: the last fits to run are then short ones.
+                order = sorted(missing, key=lambda fit: -fit.size)
+                running = {pool.submit(evaluate, fit): fit for fit in order}
+                try:
+                    for done in as_completed(running):
+                        record = done.result()
+                        store.append(running[done].fingerprint, record)
+                        found[running[done].fingerprint] = record
+                        progress(record)
+                except BaseException:
+                    pool.shutdown(wait=False, cancel_futures=True)
+                    raise
+        return [found[fit.fingerprint] | {"draw": fit.draw} for fit in fits]
+
+
+class FitStore:
+    """Finished fits in a file of one JSON object a line; a line that a crash cut short is passed over.
+
+    Args:
+        path: The file; it is made at the first ``append``.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.records: dict[str, dict] = {}
+        if path.exists():
+            text = path.read_text(encoding="utf-8")
+            for line in text.splitlines():
+                try:
+                    entry = json.loads(line)
+                    self.records[entry["fingerprint"]] = entry["record"]
+                except (ValueError, KeyError, TypeError):
+                    continue
+            if text and not text.endswith("\n"):
+                with path.open("a", encoding="utf-8") as file:
+                    file.write("\n")
+
+    def append(self, fingerprint: str, record: dict) -> None:
+        """Keeps one record for good: it is on the disk when this returns."""
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"fingerprint": fingerprint, "record": record}) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        self.records[fingerprint] = record
+
+
+def predict_all(posterior: GPPosterior, data: Transitions, state_std: float) -> tuple[Tensor, Tensor]:
+    """The tables' one-step predictions along the rows of ``data``.
+
+    Returns:
+        Predicted means (N, n), and the variances of the states that were fed in (N, n).
+    """
+    propagator = MomentMatching()
+    covariance = state_std**2 * torch.eye(data.state_dim, dtype=torch.float64)
+    means, fed = [], []
+    for state, control in zip(data.states, data.inputs, strict=True):
+        belief = Gaussian(state, covariance)
+        fed.append(belief.variance)
+        prediction = propagator(posterior, belief, control)
+        means.append(prediction.mean)
+        covariance = prediction.covariance
+    return torch.stack(means), torch.stack(fed)
+
+
+def _evaluate(fit: Fit, model: Callable[..., Training], state_std: float) -> dict:
+    """Trains and scores one draw, in a worker process."""
+    torch.set_num_threads(1)
+    cell = fit.cell
+    subset = np.sort(np.random.default_rng(fit.seed).permutation(len(cell.data))[: fit.size])
+    training_rows = cell.data[subset.tolist()]
+    record = {
+        "table": {"elliptical": 1, "lorenz": 2}.get(cell.trajectory),
+        "trajectory": cell.trajectory,
+        "subsystem": cell.subsystem,
+        "size": fit.size,
+        "draw": fit.draw,
+        "seed": fit.seed,
+    }
+    try:
+        training = model(training_rows, seed=fit.seed)
+    except TrainingError as error:
+        return record | {"error": str(error)}
+    posterior, restore = training.posterior, cell.scaling.restore
+
+    means, fed = predict_all(posterior, cell.data, state_std)
+    own = means if fit.size == len(cell.data) else predict_all(posterior, training_rows, state_std)[0]
+    plain = posterior.predict(cell.data.states, cell.data.inputs)
+    mean, variance = restore(plain.mean), (plain.variance + posterior.noise_variance) * cell.scaling.factor**2
+    observed = restore(cell.data.next_states)
+    held_out = np.setdiff1d(np.arange(len(cell.data)), subset).tolist()
+    return record | {
+        "training_mse": mean_squared_error(restore(own), observed[subset.tolist()]),
+        "test_mse": mean_squared_error(restore(means), observed),
+        "average_variance": float(fed[:, list(cell.reported)].mean()),
+        "training_seconds": training.seconds,
+        "plain_training_mse": mean_squared_error(mean[subset.tolist()], observed[subset.tolist()]),
+        "plain_test_mse": mean_squared_error(mean, observed),
+        "nlpd": negative_log_predictive_density(mean, variance, observed),
+        "coverage_95": interval_coverage(mean, variance, observed),
+        "held_out_coverage_95": (
+            interval_coverage(mean[held_out], variance[held_out], observed[held_out]) if held_out else None
+        ),
+        "negative_log_evidence": training.objective.tolist(),
+        "likelihood_evaluations": training.evaluations,
+    }
+
+
+def _cell(name: str, part: str, raw: Transitions, subsystem: Subsystem) -> Cell:
+    n, m = raw.state_dim, raw.input_dim
+    scaling = subsystem.scaling(torch.cat([raw.features, raw.next_states], dim=1), list(subsystem.columns))
+    pieces = [slice(0, n), slice(n, n + m), slice(n + m, None)]
+    states, inputs, next_states = (Scaling(scaling.offset[piece], scaling.factor[piece]) for piece in pieces)
+    data = Transitions(states.scale(raw.states), inputs.scale(raw.inputs), next_states.scale(raw.next_states))
+    return Cell(name, part, data, next_states, tuple(list(subsystem.columns).index(r) for r in subsystem.reported))
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Worker processes started inside use one thread each, whatever library asks."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _whole_numbers(key: str, values: Any) -> tuple[int, ...]:
+    values = (values,) if isinstance(values, int) else values
+    if not isinstance(values, list | tuple) or not values:
+        raise SettingError(key, f"must be a list of whole numbers such as [10,50]; got {values!r}")
+    for value in values:
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise SettingError(key, f"must be whole numbers, 1 or more; got {value!r}")
+    return tuple(dict.fromkeys(values))
+
+
+def _digest(*parts: bytes) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part)
+    return digest.hexdigest()[:32]
