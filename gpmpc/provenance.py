@@ -15,7 +15,7 @@ def provenance() -> dict:
     """What a reader needs to run the same again, as plain data."""
     return {
         "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "command": " ".join(["gpmpc", *sys.argv[1:]]),
+        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "git": git_commit(),
         "python": platform.python_version(),
         "versions": {name: _version(name) for name in PACKAGES},
