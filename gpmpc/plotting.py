@@ -26,7 +26,7 @@ class Panel:
 
 
 def error_over_size(panels: Sequence[Panel], label: str) -> Figure:
-    """Boxes of an error over the training size, with the paper's points on them; logarithmic."""
+    """Boxes and draws of an error over the training size, with the paper's points on them; logarithmic."""
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
@@ -45,6 +45,10 @@ def error_over_size(panels: Sequence[Panel], label: str) -> Figure:
             capprops={"color": "#1f4e79"},
             medianprops={"color": "#1f4e79", "linewidth": 1.8},
         )
+        for position, size in enumerate(sizes):  # the draws themselves: a box hides that there are two modes
+            draws = list(panel.draws[size])
+            aside = [0.18 * ((7 * i) % 11 / 5 - 1) for i in range(len(draws))]
+            axis.plot([position + a for a in aside], draws, ".", color="#1f4e79", alpha=0.55, markersize=4)
         known = [(position, panel.paper[size]) for position, size in enumerate(sizes) if size in panel.paper]
         if known:
             axis.plot(*zip(*known, strict=True), "o", color="#c0392b", markersize=6, zorder=3, label="paper")

@@ -1,21 +1,31 @@
 """Every test runs in float64 from a fixed seed, on one torch thread; warnings are errors (see pyproject.toml)."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 torch.set_num_threads(1)
+torch.set_default_dtype(torch.float64)
 
 
 @pytest.fixture(autouse=True)
 def _reproducible_double_precision():
-    default = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     torch.manual_seed(0)
-    yield
-    torch.set_default_dtype(default)
 
 
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="session")
+def paper_data() -> Path:
+    """The authors' four files, which are theirs and not part of this repository."""
+    folder = os.environ.get("GPMPC_PAPER_DATA")
+    if not folder:
+        pytest.skip("GPMPC_PAPER_DATA names no folder with the authors' data")
+    return Path(folder)

@@ -138,6 +138,8 @@ def train(
             "lengthscale_limit, signal_to_noise_limit",
             f"must be above 1; got {lengthscale_limit}, {signal_to_noise_limit}",
         )
+    if not tolerance > 0:
+        raise SettingError("tolerance", f"must be positive; got {tolerance}")
     if predicts not in ("next_state", "difference"):
         raise SettingError("predicts", f"must be 'next_state' or 'difference'; got {predicts!r}")
     begin = time.perf_counter()
@@ -210,9 +212,9 @@ def _objective(end: tuple[np.ndarray, float]) -> float:
 def spread(columns: np.ndarray) -> np.ndarray:
     """The standard deviation (d,) of columns (N, d); of a constant column its magnitude, or 1 where that is 0."""
     magnitude = np.abs(columns).max(axis=0)
-    deviation = columns.std(axis=0, ddof=1) if len(columns) > 1 else np.zeros_like(magnitude)
-    deviation = np.where(deviation > CONSTANT * magnitude, deviation, magnitude)
-    return np.where(deviation > 0, deviation, 1.0)
+    magnitude = np.where(magnitude > 0, magnitude, 1.0)
+    relative = (columns / magnitude).std(axis=0, ddof=1) if len(columns) > 1 else np.zeros_like(magnitude)
+    return magnitude * np.where(relative > CONSTANT, relative, 1.0)
 
 
 def _evidence(likelihood: str, features: torch.Tensor, targets: torch.Tensor) -> Objective:
@@ -232,8 +234,9 @@ def _evidence(likelihood: str, features: torch.Tensor, targets: torch.Tensor) ->
 
 def _penalised(evidence: Objective, penalty: Penalty | None, log_spread: np.ndarray) -> Objective:
     def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = evidence(theta)
-        if not np.isfinite(value):
+        with np.errstate(over="ignore", invalid="ignore"):
+            value, gradient = evidence(theta)
+        if not (np.isfinite(value) and np.isfinite(gradient).all()):
             return FAILED, np.zeros_like(theta)
         if penalty is not None:
             wall, slope = penalty(theta, log_spread)

@@ -101,7 +101,7 @@ class Transitions:
         path = _existing(path)
         names = ("states", "inputs", "next_states")
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                 missing = [name for name in names if name not in file]
                 if missing:
                     raise DataError(f"{path}: array {missing[0]!r} is missing; expected {', '.join(names)}")

@@ -1,0 +1,52 @@
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import approx_fprime
+
+from gpmpc.gp.evidence import LogEvidence
+from gpmpc.gp.model import BatchExactGP, GPyTorchEvidence
+
+
+def problem(size, d=4, outputs=2, seed=0):
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(size, d))
+    y = np.column_stack([np.sin(x[:, 0]) + x[:, 1] ** 2, x[:, 2] * x[:, 3]])[:, :outputs] + 0.01 * rng.normal(
+        size=(size, outputs)
+    )
+    theta = np.column_stack(
+        [rng.normal(0.3, 0.4, size=(outputs, d)), rng.normal(0.5, 0.3, outputs), rng.uniform(1, 4, outputs)]
+    )
+    return x, y, theta
+
+
+@pytest.mark.parametrize("size", [1, 2, 10, 64, 65, 189, 300])
+def test_the_closed_form_is_gpytorchs_marginal_likelihood(size):
+    x, y, theta = problem(size)
+    values, gradients = GPyTorchEvidence(BatchExactGP(torch.from_numpy(x), torch.from_numpy(y)))(theta)
+    for a in range(2):
+        value, gradient = LogEvidence(x, y[:, a])(theta[a])
+        assert value == pytest.approx(values[a], rel=1e-10, abs=1e-9)
+        assert np.allclose(gradient, gradients[a], rtol=1e-7, atol=1e-8 * (1 + np.abs(gradients[a]).max()))
+
+
+def test_the_gradient_is_that_of_the_value():
+    x, y, theta = problem(40)
+    evidence = LogEvidence(x, y[:, 0])
+    numeric = approx_fprime(theta[0], lambda t: evidence(t)[0], 1e-6)
+    assert np.allclose(evidence(theta[0])[1], numeric, rtol=2e-5, atol=1e-4)
+
+
+def test_the_value_is_minus_the_log_of_the_gaussian_density():
+    x, y, theta = problem(15)
+    length, sf2 = np.exp(theta[0, :4]), np.exp(2 * theta[0, 4])
+    squares = (((x[:, None] - x[None]) / length) ** 2).sum(-1)
+    covariance = sf2 * np.exp(-squares / 2) + np.exp(2 * (theta[0, 4] - theta[0, 5])) * np.eye(15)
+    density = torch.distributions.MultivariateNormal(torch.zeros(15), torch.from_numpy(covariance))
+    assert LogEvidence(x, y[:, 0])(theta[0])[0] == pytest.approx(-float(density.log_prob(torch.from_numpy(y[:, 0]))))
+
+
+def test_a_kernel_matrix_that_is_not_positive_definite_has_infinite_evidence():
+    x = np.zeros((5, 2))
+    value, gradient = LogEvidence(x, np.ones(5))(np.array([0.0, 0.0, 0.0, 20.0]))  # five equal points without noise
+    assert value == np.inf
+    assert not gradient.any()

@@ -1,0 +1,127 @@
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import approx_fprime
+
+from gpmpc.exceptions import SettingError, TrainingError
+from gpmpc.gp import SoftLimits, Transitions, train
+from gpmpc.gp.training import spread
+
+
+def pendulum(rows=60, noise=1e-3, seed=0):
+    rng = np.random.default_rng(seed)
+    x, u = rng.uniform(-2, 2, (rows, 2)), rng.uniform(-1, 1, (rows, 1))
+    moved = np.column_stack([x[:, 0] + 0.1 * x[:, 1], x[:, 1] - np.sin(x[:, 0]) + u[:, 0]])
+    return Transitions(*(torch.from_numpy(a) for a in (x, u, moved + noise * rng.normal(size=moved.shape))))
+
+
+def test_training_finds_the_noise_and_predicts_held_out_rows():
+    data, held_out = pendulum(120, noise=1e-2), pendulum(200, noise=0.0, seed=1)
+    gp = train(data).posterior
+    assert torch.allclose(gp.noise_variance.sqrt(), torch.full((2,), 1e-2), rtol=0.3)
+    error = gp.predict(held_out.states, held_out.inputs).mean - held_out.next_states
+    assert float(error.abs().max()) < 0.1
+    assert float(error.square().mean().sqrt()) < 1e-2
+
+
+def test_next_states_and_differences_are_learned_equally_well():
+    held_out = pendulum(100, noise=0.0, seed=1)
+    for predicts in ("next_state", "difference"):
+        gp = train(pendulum(), predicts=predicts).posterior
+        assert gp.predicts == predicts
+        error = gp.predict(held_out.states, held_out.inputs).mean - held_out.next_states
+        assert float(error.abs().max()) < 0.02
+
+
+def test_the_same_seed_gives_the_same_numbers_and_more_starts_never_a_worse_optimum():
+    first, second = train(pendulum(), seed=3), train(pendulum(), seed=3)
+    assert np.array_equal(first.theta, second.theta)
+    single = train(pendulum(), seed=3, restarts=0)
+    assert (first.objective <= single.objective + 1e-6).all()
+    assert first.explored.shape == (2, 4)
+    assert single.evaluations < first.evaluations
+
+
+def test_gpytorchs_likelihood_leads_to_the_same_optimum():
+    closed, automatic = train(pendulum(30), restarts=0), train(pendulum(30), restarts=0, likelihood="gpytorch")
+    assert np.allclose(closed.objective, automatic.objective, rtol=1e-7)
+
+
+def test_the_gpytorch_model_of_a_training_predicts_the_same():
+    training, states, inputs = train(pendulum(30)), torch.rand(4, 2), torch.rand(4, 1)
+    with torch.no_grad():
+        theirs = training.gpytorch_model()(torch.cat([states, inputs], dim=1).expand(2, -1, -1))
+    assert torch.allclose(training.posterior.predict(states, inputs).mean, theirs.mean.T, atol=1e-8)
+
+
+def test_the_penalty_keeps_signal_to_noise_and_lengthscales_within_its_limits():
+    data = pendulum(40, noise=0.0)
+    free, limited = train(data).theta, train(data, penalty=SoftLimits(signal_to_noise=50.0)).theta
+    assert (free[:, -1] > np.log(200)).all()
+    assert (limited[:, -1] < 1.2 * np.log(50)).all()
+    near = train(data, penalty=SoftLimits(lengthscale_factor=2.0)).theta
+    assert (np.abs(near[:, :-2] - np.log(spread(data.features.numpy()))) < 1.3 * np.log(2)).all()
+
+
+def test_the_penalty_is_the_papers_and_its_gradient_is_right():
+    theta, log_spread = np.array([1.0, -2.0, 0.5, 7.0]), np.array([0.3, 0.1])
+    value, gradient = SoftLimits()(theta, log_spread)
+    expected = sum(((theta[:2] - log_spread) / np.log(100)) ** 30) + (theta[3] / np.log(1000)) ** 30
+    assert value == pytest.approx(expected)
+    assert np.allclose(
+        gradient, approx_fprime(theta, lambda t: SoftLimits()(t, log_spread)[0], 1e-7), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_a_constant_input_has_no_influence_and_a_constant_target_is_predicted():
+    data = pendulum(40)
+    states, moved = data.states.clone(), data.next_states.clone()
+    states[:, 1], moved[:, 1] = 0.5, 0.5
+    gp = train(Transitions(states, data.inputs, moved), penalty=SoftLimits()).posterior
+    near, far = torch.tensor([[0.3, 0.5]]), torch.tensor([[0.3, 2.0]])
+    control = torch.tensor([[0.1]])
+    assert torch.allclose(gp.predict(near, control).mean, gp.predict(far, control).mean, atol=1e-9)
+    assert float(gp.predict(far, control).mean[0, 1]) == pytest.approx(0.5, abs=1e-3)
+
+
+def test_the_spread_of_a_constant_column_is_its_magnitude_or_one():
+    columns = np.column_stack([[1.0, 2.0, 3.0], [-4.0] * 3, [0.0] * 3, [0.5, 0.5 + 1e-12, 0.5]])
+    assert np.allclose(spread(columns), [1, 4, 1, 0.5])
+    assert np.allclose(spread(np.array([[2.0, 0.0]])), [2, 1])
+
+
+def test_one_row_can_be_trained_on():
+    gp = train(pendulum(1), penalty=SoftLimits()).posterior
+    assert torch.isfinite(gp.predict(torch.zeros(2), torch.zeros(1)).mean).all()
+
+
+def test_when_all_starts_fail_the_output_is_named():
+    data = pendulum(10)
+    moved = data.next_states.clone()
+    moved[:, 1] = 1e200 * torch.arange(1, 11)
+    with pytest.raises(TrainingError, match="no start of 4 .* for output 1:") as caught:
+        train(Transitions(data.states, data.inputs, moved))
+    assert caught.value.outputs == [1]
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"restarts": -1}, "restarts: must be 0 or more; got -1"),
+        ({"predicts": "delta"}, "'next_state' or 'difference'; got 'delta'"),
+        ({"likelihood": "exact"}, "'closed_form' or 'gpytorch'; got 'exact'"),
+        ({"signal_to_noise_limit": 1.0}, "must be above 1"),
+        ({"tolerance": 0.0}, "tolerance: must be positive; got 0.0"),
+    ],
+)
+def test_misuse_is_refused_with_the_rule(setting, message):
+    with pytest.raises(SettingError, match=message):
+        train(pendulum(5), **setting)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"), [((0.5,), "above 1; got 0.5"), ((2.0, 0.5), "above 1"), ((2.0, 2.0, 3), "even")]
+)
+def test_limits_that_are_none_are_refused(arguments, message):
+    with pytest.raises(SettingError, match=message):
+        SoftLimits(*arguments)

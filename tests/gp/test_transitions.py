@@ -1,0 +1,131 @@
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.exceptions import DataError, ShapeError
+from gpmpc.gp import Transitions
+
+ROW = " ".join(str(float(i)) for i in range(15))
+
+
+@pytest.fixture
+def transitions():
+    return Transitions(torch.randn(7, 3), torch.randn(7, 2), torch.randn(7, 3))
+
+
+def test_what_is_saved_is_loaded_to_the_bit(transitions, tmp_path):
+    transitions.save(tmp_path / "data.npz")
+    loaded = Transitions.load(tmp_path / "data.npz")
+    for name in ("states", "inputs", "next_states"):
+        assert torch.equal(getattr(loaded, name), getattr(transitions, name))
+    assert [path.name for path in tmp_path.iterdir()] == ["data.npz"]
+
+
+def test_single_precision_is_raised_to_double():
+    assert Transitions(torch.zeros(1, 1).float(), torch.zeros(1, 0), torch.zeros(1, 1)).states.dtype == torch.float64
+
+
+def test_features_are_states_beside_inputs_and_rows_can_be_chosen(transitions):
+    assert torch.equal(transitions.features[:, 3:], transitions.inputs)
+    assert torch.equal(transitions[[4, 1]].next_states, transitions.next_states[[4, 1]])
+    assert (len(transitions[:3]), transitions.state_dim, transitions.input_dim) == (3, 3, 2)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "error", "message"),
+    [
+        (((4, 2), (3, 1), (4, 2)), ShapeError, "same number of rows; got 4, 3 and 4"),
+        (((4, 2), (4, 1), (4, 3)), ShapeError, "same number of columns; got 2 and 3"),
+        (((4,), (4, 1), (4, 2)), ShapeError, r"states must have two dimensions \(rows, columns\); got shape \(4,\)"),
+        (((0, 2), (0, 1), (0, 2)), DataError, "at least one row; got none"),
+    ],
+)
+def test_shapes_that_do_not_belong_together_are_refused(shapes, error, message):
+    with pytest.raises(error, match=message):
+        Transitions(*(torch.zeros(*shape) for shape in shapes))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_an_entry_that_is_not_finite_is_named(value):
+    inputs = torch.zeros(5, 2)
+    inputs[3, 1] = value
+    with pytest.raises(DataError, match=f"inputs must be finite; got {value} in row 4, column 2"):
+        Transitions(torch.zeros(5, 2), inputs, torch.zeros(5, 2))
+
+
+@pytest.mark.parametrize("damage", [lambda b: b[: len(b) // 2], lambda b: b"not an archive", lambda b: b""])
+def test_a_damaged_archive_is_named(transitions, tmp_path, damage):
+    path = tmp_path / "data.npz"
+    transitions.save(path)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(DataError, match=r"data\.npz: not a readable"):
+        Transitions.load(path)
+
+
+def test_an_archive_of_something_else_is_named(tmp_path):
+    np.savez(tmp_path / "other.npz", states=np.zeros((1, 1)))
+    with pytest.raises(DataError, match="array 'inputs' is missing"):
+        Transitions.load(tmp_path / "other.npz")
+
+
+def test_the_authors_text_format_is_read(tmp_path):
+    (tmp_path / "data.txt").write_text(f"  {ROW}\n\n{ROW}\n")
+    data = Transitions.from_text(tmp_path / "data.txt")
+    assert len(data) == 2
+    assert data.states[0].tolist() == [0, 1, 2, 3, 4, 5]
+    assert data.inputs[0].tolist() == [6, 7, 8]
+    assert data.next_states[0].tolist() == [9, 10, 11, 12, 13, 14]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"{ROW}\n{ROW.rsplit(' ', 1)[0]}\n", "data.txt: row 2 has 14 columns; expected 15"),
+        (f"{ROW}\n\n{ROW.replace('3.0', 'NaN', 1)}\n", "data.txt: row 3, column 4 is 'NaN'; expected a finite number"),
+        (ROW.replace("7.0", "-inf"), "data.txt: row 1, column 8 is '-inf'; expected a finite number"),
+        (ROW.replace("7.0", "7,0"), "data.txt: row 1, column 8 is '7,0'; expected a finite number"),
+        ("\n \n", "data.txt: the file holds no rows; expected 15 columns"),
+    ],
+)
+def test_what_is_wrong_with_a_text_file_is_said_with_its_place(tmp_path, text, message):
+    (tmp_path / "data.txt").write_text(text)
+    with pytest.raises(DataError, match=message):
+        Transitions.from_text(tmp_path / "data.txt")
+
+
+def test_a_missing_file_and_a_binary_one_are_named(tmp_path):
+    with pytest.raises(DataError, match=r"gone\.txt: no such file"):
+        Transitions.from_text(tmp_path / "gone.txt")
+    (tmp_path / "binary.txt").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(DataError, match=r"binary\.txt: not a readable text file"):
+        Transitions.from_text(tmp_path / "binary.txt")
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_a_csv_file_gives_its_named_columns(tmp_path, delimiter):
+    lines = [["t", "v", "u", "x"], ["0", "2", "3", "1"], ["1", "5", "6", "4"], ["2", "8", "9", "7"]]
+    (tmp_path / "log.csv").write_text("\n".join(delimiter.join(line) for line in lines) + "\n")
+    data = Transitions.from_csv(tmp_path / "log.csv", states=["x", "v"], inputs=["u"])
+    assert data.states.tolist() == [[1, 2], [4, 5]]
+    assert data.inputs.tolist() == [[3], [6]]
+    assert data.next_states.tolist() == [[4, 5], [7, 8]]  # the next row
+    paired = Transitions.from_csv(tmp_path / "log.csv", states=["x"], inputs=[], next_states=["v"])
+    assert paired.next_states.tolist() == [[2], [5], [8]]
+    assert paired.inputs.shape == (3, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x,w\n1,2\n", "column 'u' is missing; the header has x, w"),
+        ("x,u,u\n1,2,3\n", "column 'u' stands there twice"),
+        ("x,u\n1,2\n3\n", "row 3 has 1 columns; expected 2 as in the header"),
+        ("x,u\n1,2\n3,nan\n", "row 3, column u is 'nan'; expected a finite number"),
+        ("x,u\n1,2\n", "the file holds 1 rows; expected 2 or more"),
+        ("", "column 'x' is missing; the header has no columns"),
+    ],
+)
+def test_what_is_wrong_with_a_csv_file_is_said_with_its_place(tmp_path, text, message):
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(DataError, match=f"log.csv: {message}"):
+        Transitions.from_csv(tmp_path / "log.csv", states=["x"], inputs=["u"])

@@ -1,0 +1,35 @@
+import pytest
+import torch
+
+from gpmpc.exceptions import ShapeError
+from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
+
+
+def test_mean_and_covariance_must_belong_together():
+    with pytest.raises(ShapeError, match=r"\(\*batch, n, n\); got \(3,\) and \(2, 2\)"):
+        Gaussian(torch.zeros(3), torch.eye(2))
+
+
+def test_the_variance_is_the_diagonal_of_every_covariance_in_a_batch():
+    covariance = torch.randn(4, 3, 3)
+    assert torch.equal(Gaussian(torch.zeros(4, 3), covariance).variance[2], covariance[2].diagonal())
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+def test_the_projection_is_semidefinite_nearest_and_says_how_far_it_went(batch):
+    generator = torch.Generator().manual_seed(1)
+    matrix = torch.randn(*batch, 4, 4, generator=generator)
+    projected, deficit = nearest_positive_semidefinite(matrix)
+    symmetric = (matrix + matrix.mT) / 2
+    eigenvalues = torch.linalg.eigvalsh(symmetric)
+    assert torch.linalg.eigvalsh(projected).min() > -1e-14
+    assert torch.allclose(deficit, (-eigenvalues[..., 0]).clamp_min(0))
+    distance = (projected - symmetric).square().sum((-2, -1))
+    assert torch.allclose(distance, eigenvalues.clamp_max(0).square().sum(-1))  # Higham (1988), theorem 2.1
+
+
+def test_a_semidefinite_matrix_is_returned_unchanged():
+    root = torch.randn(3, 3)
+    projected, deficit = nearest_positive_semidefinite(root @ root.T)
+    assert torch.equal(projected, (root @ root.T + (root @ root.T).T) / 2)
+    assert float(deficit) == 0
