@@ -1,7 +1,8 @@
 """The two roads of failure, first half: misuse raises, with the rule that was broken and what was got instead.
 
 A numerical outcome (a solver that stops early, an infeasible problem) is no exception but a ``gpmpc.status.Status``.
-Every error of this package derives from ``GpmpcError``; its text is one line that a user can act on.
+Every error of this package derives from ``GpmpcError``; its text is one line that a user can act on, and it survives
+the way back from a worker process (its constructor's arguments are its ``args``).
 """
 
 
@@ -21,8 +22,11 @@ class SettingError(GpmpcError, ValueError):
     """
 
     def __init__(self, key: str, message: str):
-        super().__init__(f"{key}: {message}")
+        super().__init__(key, message)
         self.key = key
+
+    def __str__(self) -> str:
+        return f"{self.args[0]}: {self.args[1]}"
 
 
 class DataError(GpmpcError, ValueError):
@@ -37,8 +41,11 @@ class TrainingError(GpmpcError, RuntimeError):
     """
 
     def __init__(self, outputs: list[int], message: str):
-        super().__init__(message)
+        super().__init__(outputs, message)
         self.outputs = outputs
+
+    def __str__(self) -> str:
+        return self.args[1]
 
 
 class ProblemError(GpmpcError, ValueError):
@@ -53,5 +60,8 @@ class SolverFailure(GpmpcError, RuntimeError):
     """
 
     def __init__(self, step: int, advice: str):
-        super().__init__(f"the controller's solver failed at step {step}: {advice}")
+        super().__init__(step, advice)
         self.step = step
+
+    def __str__(self) -> str:
+        return f"the controller's solver failed at step {self.args[0]}: {self.args[1]}"

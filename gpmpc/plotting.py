@@ -33,6 +33,10 @@ def error_over_size(panels: Sequence[Panel], label: str) -> Figure:
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis, panel in zip(axes, panels, strict=False):
         sizes = sorted(panel.draws)
+        axis.set_title(panel.title)
+        if not sizes:  # every fit failed
+            axis.set_axis_off()
+            continue
         positions = range(len(sizes))
         axis.boxplot(
             [list(panel.draws[size]) for size in sizes],
@@ -57,7 +61,6 @@ def error_over_size(panels: Sequence[Panel], label: str) -> Figure:
         axis.yaxis.set_minor_locator(NullLocator())
         axis.yaxis.set_minor_formatter(NullFormatter())
         axis.set_xticks(list(positions), [str(size) for size in sizes])
-        axis.set_title(panel.title)
         axis.grid(axis="y", color="0.9")
         axis.set_axisbelow(True)
         axis.spines[["top", "right"]].set_visible(False)

@@ -10,12 +10,13 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 import hydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 import gpmpc
 from gpmpc.cli.tables import tables
@@ -59,12 +60,19 @@ def config_folder() -> Path:
 def _run(task: Callable[[DictConfig], None], config_name: str) -> None:
     show_traceback = bool(os.environ.get("HYDRA_FULL_ERROR"))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # let Hydra raise, so that the message can be ours
+
+    def guarded(function: Callable, *arguments: DictConfig) -> None:
+        try:
+            function(*arguments)
+        except (GpmpcError, HydraException, OmegaConfBaseException) as error:
+            if show_traceback:
+                raise
+            _fail(_one_line(error, config_name))
+
+    # Twice: around composing the settings, and inside, where Hydra would add a line of its own to a task's error.
+    entry = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)
     try:
-        hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)(task)()
-    except (GpmpcError, HydraException, OmegaConfBaseException) as error:
-        if show_traceback:
-            raise
-        _fail(_one_line(error, config_name))
+        guarded(entry(partial(guarded, task)))
     except KeyboardInterrupt:
         print("\ninterrupted; the same command goes on where it stopped", file=sys.stderr)
         sys.exit(130)
@@ -89,9 +97,8 @@ def _one_line(error: Exception, config_name: str) -> str:
     option = re.search(r"Could not find '([^'/]+)/([^']+)'\s+Available options in '[^']+':\n((?:\t.*\n)+)", text)
     if option:
         return f"{option[1]}: no such option {option[2]!r}; available are {', '.join(option[3].split())}"
-    missing = re.search(r"Missing mandatory value: (\S+)", text)
-    if missing:
-        return f"{missing[1]}: this setting has no default; give it as {missing[1]}=VALUE"
+    if isinstance(error, MissingMandatoryValue):
+        return f"{error.full_key}: this setting has no default; give it as {error.full_key}=VALUE"
     ambiguous = re.match(r"Ambiguous value for argument '([^=]+)=([^']+)'", text)
     if ambiguous:
         return f"{ambiguous[1]}: a list is written in brackets, {ambiguous[1]}=[{ambiguous[2]}]"

@@ -33,7 +33,7 @@ from torch import Tensor
 
 from gpmpc import __version__
 from gpmpc.datasets import DataSource
-from gpmpc.exceptions import SettingError, TrainingError
+from gpmpc.exceptions import DataError, SettingError, TrainingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Scaling, Training, Transitions
 from gpmpc.gp.posterior import GPPosterior
@@ -126,6 +126,9 @@ class Tables:
                 continue
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise SettingError(key, f"must be a whole number, {least} or more; got {value!r}")
+        for key, chosen in (("trajectory", self.trajectories), ("subsystem", self.subsystems)):
+            if not chosen:
+                raise SettingError(key, "choose at least one")
         if not isinstance(self.state_std, int | float) or not 0 <= self.state_std < float("inf"):
             raise SettingError("state_std", f"must be a number, 0 or more; got {self.state_std!r}")
 
@@ -286,6 +289,10 @@ def _evaluate(fit: Fit, model: Callable[..., Training], state_std: float) -> dic
 
 def _cell(name: str, part: str, raw: Transitions, subsystem: Subsystem) -> Cell:
     n, m = raw.state_dim, raw.input_dim
+    if len(subsystem.columns) != 2 * n + m:
+        raise DataError(
+            f"{name} {part}: the data have {2 * n + m} columns; the subsystem names {len(subsystem.columns)}"
+        )
     scaling = subsystem.scaling(torch.cat([raw.features, raw.next_states], dim=1), list(subsystem.columns))
     pieces = [slice(0, n), slice(n, n + m), slice(n + m, None)]
     states, inputs, next_states = (Scaling(scaling.offset[piece], scaling.factor[piece]) for piece in pieces)

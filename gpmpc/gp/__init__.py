@@ -2,13 +2,14 @@
 
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.scaling import Scaling, identity, min_max, standardize
-from gpmpc.gp.training import SoftLimits, Training, train
+from gpmpc.gp.training import SoftLimits, Trainer, Training, train
 from gpmpc.gp.transitions import Transitions
 
 __all__ = [
     "GPPosterior",
     "Scaling",
     "SoftLimits",
+    "Trainer",
     "Training",
     "Transitions",
     "identity",

@@ -13,7 +13,7 @@ Cao, Lai and Alam (2017), eq. (9); the penalty is the one of their experiment.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -102,25 +102,14 @@ class Training:
         return model.eval()
 
 
-def train(
-    transitions: Transitions,
-    predicts: Predicts = "next_state",
-    penalty: Penalty | None = None,
-    restarts: int = 3,
-    seed: int = 0,
-    likelihood: Literal["closed_form", "gpytorch"] = "closed_form",
-    tolerance: float = 1e-9,
-    lengthscale_limit: float = 1e4,
-    signal_to_noise_limit: float = 1e4,
-) -> Training:
+@dataclass(frozen=True)
+class Trainer:
     """Fits one SE-ARD GP per output to observed transitions.
 
-    Args:
-        transitions: The data, in the units in which the GPs are to work.
+    Attributes:
         predicts: What the GPs learn: the next state, or the difference to it.
         penalty: Added to every output's negative log marginal likelihood; none by default.
         restarts: Random starts besides the first, which has l = std(x~), sf = std(y), sn = std(y) / 10.
-        seed: Of the random starts.
         likelihood: How it is evaluated: in closed form, or by GPyTorch's automatic differentiation (slower; the same).
         tolerance: Relative decrease of the objective at which L-BFGS stops.
         lengthscale_limit: The box holds length-scales within this factor of their input's spread.
@@ -128,60 +117,104 @@ def train(
             about 1e10 in double precision.
 
     Raises:
-        SettingError: Fewer than no restarts, an unknown ``likelihood`` or ``predicts``, or a limit below 1.
-        TrainingError: Every start failed for an output, which is named.
+        SettingError: Fewer than no restarts, an unknown ``likelihood`` or ``predicts``, a tolerance that is not
+            positive, or a limit of 1 or less.
     """
-    if restarts < 0:
-        raise SettingError("restarts", f"must be 0 or more; got {restarts}")
-    if min(lengthscale_limit, signal_to_noise_limit) <= 1:
-        raise SettingError(
-            "lengthscale_limit, signal_to_noise_limit",
-            f"must be above 1; got {lengthscale_limit}, {signal_to_noise_limit}",
-        )
-    if not tolerance > 0:
-        raise SettingError("tolerance", f"must be positive; got {tolerance}")
-    if predicts not in ("next_state", "difference"):
-        raise SettingError("predicts", f"must be 'next_state' or 'difference'; got {predicts!r}")
-    begin = time.perf_counter()
-    learned = transitions.next_states - transitions.states if predicts == "difference" else transitions.next_states
-    features, targets = transitions.features.numpy(), learned.numpy()
-    log_inputs, log_outputs = np.log(spread(features)), np.log(spread(targets))
-    outputs, d = targets.shape[1], features.shape[1]
 
-    perturbations = np.random.default_rng(seed).normal(size=(outputs, restarts + 1, d + 2))
-    perturbations[..., :-2] += LONGER
-    perturbations[:, 0] = 0.0
-    reach = np.append(np.full(d, np.log(lengthscale_limit)), [np.log(1e6), np.log(signal_to_noise_limit)])
-    theta, reached, explored, evaluations = np.zeros((outputs, d + 2)), np.zeros(outputs), [], 0
-    for a in range(outputs):
-        evidence = _evidence(likelihood, transitions.features, learned[:, a])
-        search = _Search(_penalised(evidence, penalty, log_inputs), np.append(log_inputs, [log_outputs[a], 0.0]), reach)
-        first = np.append(log_inputs, [log_outputs[a], np.log(10.0)])
-        ends = [search(first + shift, EXPLORATION, tolerance) for shift in perturbations[a]]
-        finalists = sorted(ends, key=_objective)[:FINALISTS]
-        theta[a], reached[a] = min((search(point, 1000, tolerance) for point, _ in finalists), key=_objective)
-        explored.append([value for _, value in ends])
-        evaluations += search.evaluations
-    failed = np.flatnonzero(reached >= FAILED).tolist()
-    if failed:
-        raise TrainingError(
-            failed,
-            f"no start of {restarts + 1} led to a positive definite kernel matrix for output "
-            f"{', '.join(str(a) for a in failed)}: lower signal_to_noise_limit, or remove duplicate rows",
+    predicts: Predicts = "next_state"
+    penalty: Penalty | None = None
+    restarts: int = 3
+    likelihood: Literal["closed_form", "gpytorch"] = "closed_form"
+    tolerance: float = 1e-9
+    lengthscale_limit: float = 1e4
+    signal_to_noise_limit: float = 1e4
+
+    def __post_init__(self) -> None:
+        if self.predicts not in ("next_state", "difference"):
+            raise SettingError("predicts", f"must be 'next_state' or 'difference'; got {self.predicts!r}")
+        if not isinstance(self.restarts, int) or self.restarts < 0:
+            raise SettingError("restarts", f"must be a whole number, 0 or more; got {self.restarts!r}")
+        if self.likelihood not in ("closed_form", "gpytorch"):
+            raise SettingError("likelihood", f"must be 'closed_form' or 'gpytorch'; got {self.likelihood!r}")
+        for key, least in (("tolerance", 0), ("lengthscale_limit", 1), ("signal_to_noise_limit", 1)):
+            value = getattr(self, key)
+            if not isinstance(value, int | float) or not value > least:
+                raise SettingError(key, f"must be a number above {least}; got {value!r}")
+
+    def __call__(self, transitions: Transitions, seed: int = 0) -> Training:
+        """Trains on transitions, in the units in which the GPs are to work; ``seed`` is that of the random starts.
+
+        Raises:
+            TrainingError: Every start failed for an output, which is named.
+        """
+        begin = time.perf_counter()
+        learned = transitions.next_states
+        if self.predicts == "difference":
+            learned = learned - transitions.states
+        inputs, targets = transitions.features.numpy(), learned.numpy()
+        outputs, d = targets.shape[1], inputs.shape[1]
+        rng = np.random.default_rng(seed)
+        fits = [self._fit(inputs, targets[:, a], rng.normal(size=(self.restarts + 1, d + 2))) for a in range(outputs)]
+        failed = [a for a, fit in enumerate(fits) if fit.objective >= FAILED]
+        if failed:
+            raise TrainingError(
+                failed,
+                f"no start of {self.restarts + 1} led to a positive definite kernel matrix for output "
+                f"{', '.join(str(a) for a in failed)}: lower signal_to_noise_limit, or remove duplicate rows",
+            )
+        theta = np.array([fit.theta for fit in fits])
+        found = torch.from_numpy(theta)
+        posterior = GPPosterior.from_hyperparameters(
+            transitions.features,
+            learned,
+            lengthscales=found[:, :-2].exp(),
+            signal_variance=(2 * found[:, -2]).exp(),
+            noise_variance=(2 * (found[:, -2] - found[:, -1])).exp(),
+            input_dim=transitions.input_dim,
+            predicts=self.predicts,
         )
-    # Nothing can be learned about an input that never moved, and nothing is: it drops out of the kernel.
-    theta[:, :-2][:, np.ptp(features, axis=0) <= CONSTANT * np.abs(features).max(axis=0)] = np.log(IGNORED)
-    found = torch.from_numpy(theta)
-    posterior = GPPosterior.from_hyperparameters(
-        transitions.features,
-        learned,
-        lengthscales=found[:, :-2].exp(),
-        signal_variance=(2 * found[:, -2]).exp(),
-        noise_variance=(2 * (found[:, -2] - found[:, -1])).exp(),
-        input_dim=transitions.input_dim,
-        predicts=predicts,
-    )
-    return Training(posterior, theta, reached, np.array(explored), evaluations, time.perf_counter() - begin)
+        return Training(
+            posterior,
+            theta,
+            objective=np.array([fit.objective for fit in fits]),
+            explored=np.array([fit.explored for fit in fits]),
+            evaluations=sum(fit.evaluations for fit in fits),
+            seconds=time.perf_counter() - begin,
+        )
+
+    def _fit(self, inputs: np.ndarray, targets: np.ndarray, perturbations: np.ndarray) -> "_Fit":
+        """Fits one output, targets (N,), from the first start and from perturbations (restarts + 1, d + 2) of it."""
+        log_inputs, log_output = np.log(spread(inputs)), np.log(spread(targets[:, None])[0])
+        centre = np.append(log_inputs, [log_output, 0.0])
+        reach = np.append(
+            np.full(inputs.shape[1], np.log(self.lengthscale_limit)), [np.log(1e6), np.log(self.signal_to_noise_limit)]
+        )
+        search = _Search(_objective(self.likelihood, inputs, targets, self.penalty, log_inputs), centre, reach)
+        first = np.append(log_inputs, [log_output, np.log(10.0)])
+        longer = np.append(np.full(inputs.shape[1], LONGER), [0.0, 0.0])
+        starts = [first, *(first + longer + shift for shift in perturbations[1:])]
+
+        ends = [search(start, EXPLORATION, self.tolerance) for start in starts]
+        finalists = sorted(ends, key=lambda end: end[1])[:FINALISTS]
+        theta, value = min((search(end, 1000, self.tolerance) for end, _ in finalists), key=lambda end: end[1])
+        # Nothing can be learned about an input that never moved, and nothing is: it drops out of the kernel.
+        theta[:-2][np.ptp(inputs, axis=0) <= CONSTANT * np.abs(inputs).max(axis=0)] = np.log(IGNORED)
+        return _Fit(theta, value, [end[1] for end in ends], search.evaluations)
+
+
+def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
+    """``Trainer(**settings)(transitions, seed)``: fits one GP per output in one call."""
+    return Trainer(**settings)(transitions, seed)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What was found for one output."""
+
+    theta: np.ndarray
+    objective: float
+    explored: list[float]
+    evaluations: int
 
 
 class _Search:
@@ -205,10 +238,6 @@ class _Search:
         return outcome.x, float(outcome.fun)
 
 
-def _objective(end: tuple[np.ndarray, float]) -> float:
-    return end[1]
-
-
 def spread(columns: np.ndarray) -> np.ndarray:
     """The standard deviation (d,) of columns (N, d); of a constant column its magnitude, or 1 where that is 0."""
     magnitude = np.abs(columns).max(axis=0)
@@ -217,22 +246,19 @@ def spread(columns: np.ndarray) -> np.ndarray:
     return magnitude * np.where(relative > CONSTANT, relative, 1.0)
 
 
-def _evidence(likelihood: str, features: torch.Tensor, targets: torch.Tensor) -> Objective:
-    """The negative log marginal likelihood of one output, targets (N,)."""
+def _objective(
+    likelihood: str, inputs: np.ndarray, targets: np.ndarray, penalty: Penalty | None, log_spread: np.ndarray
+) -> Objective:
+    """Negative log marginal likelihood plus penalty of one output over theta."""
     if likelihood == "closed_form":
-        return LogEvidence(features.numpy(), targets.numpy())
-    if likelihood == "gpytorch":
-        batch = GPyTorchEvidence(BatchExactGP(features, targets[:, None]))
+        evidence = LogEvidence(inputs, targets)
+    else:
+        batch = GPyTorchEvidence(BatchExactGP(torch.from_numpy(inputs), torch.from_numpy(targets)[:, None]))
 
-        def single(theta: np.ndarray) -> tuple[float, np.ndarray]:
+        def evidence(theta: np.ndarray) -> tuple[float, np.ndarray]:
             values, gradients = batch(theta[None])
             return values[0], gradients[0]
 
-        return single
-    raise SettingError("likelihood", f"must be 'closed_form' or 'gpytorch'; got {likelihood!r}")
-
-
-def _penalised(evidence: Objective, penalty: Penalty | None, log_spread: np.ndarray) -> Objective:
     def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
         with np.errstate(over="ignore", invalid="ignore"):
             value, gradient = evidence(theta)

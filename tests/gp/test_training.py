@@ -107,11 +107,11 @@ def test_when_all_starts_fail_the_output_is_named():
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ({"restarts": -1}, "restarts: must be 0 or more; got -1"),
+        ({"restarts": -1}, "restarts: must be a whole number, 0 or more; got -1"),
         ({"predicts": "delta"}, "'next_state' or 'difference'; got 'delta'"),
         ({"likelihood": "exact"}, "'closed_form' or 'gpytorch'; got 'exact'"),
-        ({"signal_to_noise_limit": 1.0}, "must be above 1"),
-        ({"tolerance": 0.0}, "tolerance: must be positive; got 0.0"),
+        ({"signal_to_noise_limit": 1.0}, "signal_to_noise_limit: must be a number above 1; got 1.0"),
+        ({"tolerance": 0.0}, "tolerance: must be a number above 0; got 0.0"),
     ],
 )
 def test_misuse_is_refused_with_the_rule(setting, message):

@@ -1,0 +1,150 @@
+"""The command line as a user meets it: help, results, and one clear line for every mistake."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROW = " ".join(str(i / 7) for i in range(15))
+FILES = [f"ds_nmpc_{t}_{s}.txt" for t in ("Elliptical", "Lorenz") for s in ("trans", "rotate")]
+
+
+def gpmpc(*arguments, cwd, **environment):
+    command = [str(Path(sys.executable).with_name("gpmpc")), *arguments]
+    return subprocess.run(
+        command, cwd=cwd, capture_output=True, text=True, env=os.environ | environment, timeout=300, check=False
+    )
+
+
+def authors_folder(folder, text=f"{ROW}\n" * 20, broken=None):
+    folder.mkdir()
+    for name in FILES:
+        (folder / name).write_text(text)
+    if broken:
+        (folder / FILES[0]).write_text(broken)
+    return folder
+
+
+def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
+    usage = gpmpc("--help", cwd=tmp_path)
+    assert usage.returncode == 0
+    assert "tables" in usage.stdout
+    settings = gpmpc("tables", "--help", cwd=tmp_path)
+    assert settings.returncode == 0
+    for setting in ("draws", "sizes", "trajectory", "subsystem", "seed", "data"):
+        assert setting in settings.stdout
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["table"], "unknown command 'table' (did you mean 'tables'?)"),
+        (["tables", "drawz=7"], "unknown setting 'drawz' (did you mean 'draws'?)"),
+        (["tables", "model.restart=3"], "unknown setting 'model.restart' (did you mean 'model.restarts'?)"),
+        (
+            ["tables", "trajectory=lorens"],
+            "trajectory: no such option 'lorens'; available are elliptical, hover, lorenz",
+        ),
+        (["tables", "data=paper"], "data.folder: this setting has no default"),
+        (["tables", "data=paper", "data.folder=nowhere"], "nowhere: no such folder"),
+        (["tables", "draws=0"], "draws: must be a whole number, 1 or more; got 0"),
+        (["tables", "draws=five"], "draws: must be a whole number, 1 or more; got 'five'"),
+        (["tables", "sizes=[0]"], "sizes: must be whole numbers, 1 or more; got 0"),
+        (["tables", "sizes=10,50"], "sizes: a list is written in brackets, sizes=[10,50]"),
+        (["tables", "sizes=[500]"], "sizes: must be at most 189, the rows of elliptical translational; got 500"),
+        (["tables", "data.samples=0"], "samples: must be 1 or more; got 0"),
+        (["tables", "data.attitude=exakt"], "attitude: must be 'paper' or 'exact'; got 'exakt'"),
+        (["tables", "model.restarts=-1"], "restarts: must be a whole number, 0 or more; got -1"),
+        (["tables", "model.penalty.power=3"], "power: must be even and positive; got 3"),
+        (["tables", "draws"], "missing EQUAL"),
+        (["tables", "seed="], "seed: must be a whole number"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_mistake_is_one_clear_line_and_leaves_nothing_behind(arguments, message, tmp_path):
+    result = gpmpc(*arguments, cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stderr.startswith("gpmpc: ")
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (f"{ROW}\n{ROW.rsplit(' ', 1)[0]}\n", "ds_nmpc_Elliptical_trans.txt: row 2 has 14 columns; expected 15"),
+        (f"{ROW}\n{ROW.replace('0.0', 'nan', 1)}\n", "ds_nmpc_Elliptical_trans.txt: row 2, column 1 is 'nan'"),
+        (ROW.replace("0.0", "inf", 1), "ds_nmpc_Elliptical_trans.txt: row 1, column 1 is 'inf'"),
+        (f"{ROW}\n" * 3, "ds_nmpc_Elliptical_trans.txt: the file holds 3 rows; data.samples asks for 20"),
+    ],
+    ids=["14 columns", "NaN", "infinite", "too few rows"],
+)
+def test_a_broken_data_file_is_named_with_row_and_column(broken, message, tmp_path):
+    folder = authors_folder(tmp_path / "data", broken=broken)
+    result = gpmpc("tables", "data=paper", f"data.folder={folder}", "data.samples=20", "sizes=[5]", cwd=tmp_path)
+    assert result.returncode == 2
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory):
+    """A small run on our own data."""
+    cwd = tmp_path_factory.mktemp("run")
+    arguments = ["tables", "draws=1", "sizes=[5]", "data.samples=12", "trajectory=elliptical", "model.restarts=0"]
+    return cwd, arguments, gpmpc(*arguments, cwd=cwd)
+
+
+def test_a_run_writes_every_document_and_prints_the_tables(small_run):
+    cwd, _, result = small_run
+    assert result.returncode == 0, result.stderr
+    folder = cwd / "outputs" / "tables" / "nmpc-seed0"
+    expected = ["config.yaml", "fits.jsonl", "tables.csv", "tables.json", "tables.md", "tables.png", "tables.tex"]
+    assert sorted(path.name for path in folder.iterdir()) == expected
+    assert "Table 1: elliptical trajectory" in result.stdout
+    assert "psi" in result.stdout  # the note on constant columns
+    data = json.loads((folder / "tables.json").read_text())
+    assert data["meta"]["command"].startswith("gpmpc tables draws=1")
+    assert data["meta"]["settings"]["seed"] == 0
+    assert data["meta"]["versions"]["torch"]
+    assert [draw["subsystem"] for draw in data["draws"]] == ["translational", "rotational"]
+    for key in (
+        "table",
+        "trajectory",
+        "size",
+        "draw",
+        "seed",
+        "training_mse",
+        "test_mse",
+        "average_variance",
+        "training_seconds",
+    ):
+        assert key in data["draws"][0]
+    assert [path.name for path in cwd.iterdir()] == ["outputs"]
+
+
+def test_the_same_command_again_computes_nothing_anew(small_run):
+    cwd, arguments, _ = small_run
+    before = json.loads((cwd / "outputs/tables/nmpc-seed0/tables.json").read_text())["draws"]
+    assert gpmpc(*arguments, cwd=cwd).returncode == 0
+    assert json.loads((cwd / "outputs/tables/nmpc-seed0/tables.json").read_text())["draws"] == before
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "taken").write_text("a file, not a folder")
+    result = gpmpc("tables", "draws=1", "sizes=[5]", "data.samples=12", "folder=taken", cwd=tmp_path)
+    assert result.returncode == 2
+    assert "folder: cannot write to taken" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_the_traceback_is_there_for_who_asks(tmp_path):
+    result = gpmpc("tables", "draws=0", cwd=tmp_path, HYDRA_FULL_ERROR="1")
+    assert result.returncode != 0
+    assert "Traceback" in result.stderr
