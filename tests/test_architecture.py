@@ -1,5 +1,6 @@
 """The house keeps its shape: layers look downwards, and importing a module loads no library it does not need."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -22,3 +23,37 @@ def test_the_qp_solvers_load_no_torch(module):
     code = f"import sys, {module}; print([m for m in {forbidden} if m in sys.modules])"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
     assert loaded == "[]"
+
+
+@pytest.mark.parametrize("module", ["gpmpc.gp", "gpmpc.propagation"])
+def test_the_gp_modules_load_neither_optimisation_nor_settings_nor_figures(module):
+    forbidden = ["hydra", "cvxpy", "casadi", "matplotlib", "rich"]
+    code = f"import sys, {module}; print([m for m in {forbidden} if m in sys.modules])"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+    assert loaded == "[]"
+
+
+@pytest.mark.parametrize(
+    ("library", "rooms"),
+    [
+        ("gpytorch", ["gp/model.py"]),
+        ("hydra", ["cli"]),
+        ("omegaconf", ["cli"]),
+        ("matplotlib", ["plotting.py"]),
+        ("casadi", ["control"]),
+        ("rich", ["cli", "experiments"]),
+    ],
+)
+def test_a_heavy_library_has_one_door(library, rooms):
+    package = ROOT / "gpmpc"
+    pattern = re.compile(rf"^\s*(import|from) {library}\b", re.MULTILINE)
+    users = [path.relative_to(package) for path in package.rglob("*.py") if pattern.search(path.read_text())]
+    assert users
+    assert not [str(path) for path in users if not any(str(path).startswith(room) for room in rooms)]
+
+
+def test_no_file_grows_past_400_lines():
+    long = {
+        str(p.relative_to(ROOT)): n for p in ROOT.glob("gpmpc/**/*.py") if (n := len(p.read_text().splitlines())) > 400
+    }
+    assert not long

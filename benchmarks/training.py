@@ -1,0 +1,90 @@
+"""How long the training of six GPs takes, beside GPyTorch's automatic differentiation and the paper's seconds.
+
+    .venv/bin/python benchmarks/training.py [--repeats 15] [--sizes 10 50 100 189]
+
+One process, one thread. For every trajectory, subsystem and size the closed-form trainer (as ``gpmpc tables`` runs it:
+four starts a GP) and GPyTorch's likelihood under the same search take turns on the same rows; the ratio is paired.
+Writes ``outputs/benchmarks/training.json``.
+"""
+
+import argparse
+import json
+import os
+import time
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[variable] = "1"
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from gpmpc.cli.main import config_folder
+from gpmpc.experiments.tables import Tables
+from gpmpc.gp import Trainer
+from gpmpc.provenance import provenance
+
+PAPER_SECONDS = {10: 1.12, 189: 4.01}  # Cao, Lai and Alam (2017), section 5.1
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=15, help="runs of the closed form a cell")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[10, 50, 100, 189])
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    with initialize_config_dir(version_base="1.3", config_dir=str(config_folder())):
+        config = compose("tables")
+    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "trajectory", "subsystem", "model")}
+    trainer = parts["model"]
+    experiment = Tables(
+        parts["data"], parts["trajectory"], parts["subsystem"], trainer, None, sizes=arguments.sizes, draws=1
+    )
+    reference = Trainer(penalty=trainer.penalty, restarts=trainer.restarts, likelihood="gpytorch")
+    results = []
+    print("six GPs, one thread; process time in seconds; ratio: GPyTorch's likelihood over the closed form")
+    print(f"{'data':28}{'N':>5}{'median':>9}{'p99':>9}{'GPyTorch':>10}{'ratio':>8}{'paper':>8}")
+    for fit in experiment.fits():
+        rows = np.sort(np.random.default_rng(fit.seed).permutation(len(fit.cell.data))[: fit.size]).tolist()
+        data = fit.cell.data[rows]
+        trainer(data, seed=0)
+        seconds = [process_seconds(trainer, data, seed) for seed in range(arguments.repeats)]
+        other = [process_seconds(reference, data, seed) for seed in range(min(3, arguments.repeats))]
+        ratio = float(np.median([b / a for a, b in zip(seconds, other, strict=False)]))
+        name = f"{fit.cell.trajectory} {fit.cell.subsystem}"
+        result = {
+            "data": name,
+            "size": fit.size,
+            "median": float(np.median(seconds)),
+            "p99": float(np.quantile(seconds, 0.99)),
+            "max": max(seconds),
+            "gpytorch_median": float(np.median(other)),
+            "ratio": ratio,
+            "paper": PAPER_SECONDS.get(fit.size),
+        }
+        results.append(result)
+        paper = PAPER_SECONDS.get(fit.size, "")
+        print(
+            f"{name:28}{fit.size:5}{result['median']:9.3f}{result['p99']:9.3f}"
+            f"{result['gpytorch_median']:10.2f}{ratio:8.1f}{paper:>8}",
+            flush=True,
+        )
+    path = Path("outputs/benchmarks/training.json")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
+    print(f"written to {path}")
+
+
+def process_seconds(trainer: Trainer, data, seed: int) -> float:
+    """CPU time of one training."""
+    start = time.process_time()
+    trainer(data, seed=seed)
+    return time.process_time() - start
+
+
+if __name__ == "__main__":
+    main()

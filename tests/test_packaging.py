@@ -1,0 +1,46 @@
+"""What ``pip install`` gives works outside the checkout, settings included."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+def test_the_wheel_carries_the_settings_and_the_printed_figures(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    settings = {str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml")}
+    assert {f"gpmpc/{name}" for name in settings} <= set(names)
+    assert "gpmpc/experiments/paper_tables.csv" in names
+    assert not [name for name in names if name.startswith(("tests/", "benchmarks/"))]
+
+
+def test_an_installed_package_finds_its_settings_from_an_empty_directory(wheel, tmp_path):
+    site, empty = tmp_path / "site", tmp_path / "empty"
+    empty.mkdir()
+    zipfile.ZipFile(wheel).extractall(site)
+    code = f"import gpmpc; assert gpmpc.__file__.startswith({str(site)!r}); from gpmpc.cli import main; main()"
+    result = subprocess.run(
+        [sys.executable, "-c", code, "tables", "--cfg", "job", "draws=3"],
+        cwd=empty,
+        env=os.environ | {"PYTHONPATH": str(site)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert "draws: 3" in result.stdout
+    assert not list(empty.iterdir())
