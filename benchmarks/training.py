@@ -27,7 +27,7 @@ from gpmpc.experiments.tables import Tables
 from gpmpc.gp import Trainer
 from gpmpc.provenance import provenance
 
-PAPER_SECONDS = {10: 1.12, 189: 4.01}  # Cao, Lai and Alam (2017), section 5.1
+PAPER_SECONDS = {10: 1.12, 189: 4.01}  # stated by Cao, Lai and Alam (2017)
 
 
 def main() -> None:

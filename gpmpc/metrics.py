@@ -16,7 +16,7 @@ def mean_squared_error(predicted: Tensor, observed: Tensor) -> float:
 def negative_log_predictive_density(mean: Tensor, variance: Tensor, observed: Tensor) -> float:
     """-log N(observed; mean, variance), averaged over samples and outputs; all (N, n). Lower is better.
 
-    Quinonero-Candela et al. (2006), "Evaluating predictive uncertainty challenge", eq. (4).
+    Quinonero-Candela et al. (2006), "Evaluating predictive uncertainty challenge".
     """
     return float(((2 * math.pi * variance).log() + (observed - mean).square() / variance).mean() / 2)
 

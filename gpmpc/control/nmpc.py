@@ -2,9 +2,9 @@
 
     minimise over u_0 .. u_{H-1}   sum_{i<H} |x_i - r_i|^2_Q + |u_i|^2_R,   x_0 measured,  x_{i+1} = plant(x_i, u_i)
 
-Cao, Lai and Alam (2017), section 3.1. The sum is theirs: it starts at the measured state (whose cost is constant) and
-ends at x_{H-1}, so the last input only pays for itself. Multiple shooting in CasADi (Andersson et al., 2019), solved by
-IPOPT (Waechter and Biegler, 2006) with exact derivatives.
+It generated the data of Cao, Lai and Alam (2017), and the sum is theirs: it starts at the measured state (whose cost is
+constant) and ends at x_{H-1}, so the last input only pays for itself. Multiple shooting in CasADi (Andersson et al.,
+2019), solved by IPOPT (Waechter and Biegler, 2006) with exact derivatives.
 """
 
 import time

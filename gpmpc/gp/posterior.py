@@ -5,7 +5,7 @@ GP per output with the squared exponential kernel with automatic relevance deter
 
     k_a(x~, x~') = sf2_a exp(-1/2 sum_d (x~_d - x~'_d)^2 / l_ad^2),   x~ = (x, u)
 
-Cao, Lai and Alam (2017), eqs. (7)-(10); Rasmussen and Williams (2006), eqs. (2.25)-(2.26), Algorithm 2.1.
+Rasmussen and Williams (2006), eqs. (2.25)-(2.26), Algorithm 2.1; the GP model of Cao, Lai and Alam (2017).
 """
 
 from dataclasses import dataclass
@@ -123,7 +123,7 @@ class GPPosterior:
         return torch.cholesky_inverse(self.cholesky)
 
     def predict(self, state: Tensor, input: Tensor) -> Gaussian:
-        """The next state's distribution at a certain state and input; Cao, Lai and Alam (2017), eq. (10).
+        """The next state's distribution at a certain state and input (Rasmussen and Williams, 2006, eqs. (2.25)-(2.26)).
 
         Args:
             state: x (*batch, n).

@@ -1,8 +1,9 @@
 """Problem: the right-hand sides of a quadrotor, split into its translational and its rotational subsystem.
 
-Cao, Lai and Alam (2017), eqs. (1)-(5). The z axis points downwards. The translational subsystem is driven by the total
-thrust U1 and by the direction (ux, uy) of the thrust, which the attitude has to provide; the rotational subsystem
-provides it, driven by the moments' forces U2, U3, U4. The plants that step these right-hand sides are in ``plant``.
+The model of Cao, Lai and Alam (2017), with the parameters decoded from their data. The z axis points downwards. The
+translational subsystem is driven by the total thrust U1 and by the direction (ux, uy) of the thrust, which the attitude
+has to provide; the rotational subsystem provides it, driven by the moments' forces U2, U3, U4. The plants that step these
+right-hand sides are in ``plant``.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ GRAVITY = 9.81  # [m/s^2]
 
 @dataclass(frozen=True)
 class Translational:
-    """Position and velocity, driven by thrust and thrust direction (Cao, Lai and Alam, 2017, eqs. (1)-(2)).
+    """Position and velocity, driven by thrust and thrust direction (Cao, Lai and Alam, 2017; ux, uy: eq. (2)).
 
     States x, vx, y, vy, z, vz [m, m/s]; inputs U1 [N], ux, uy [-].
 
@@ -45,7 +46,7 @@ class Translational:
             object.__setattr__(self, "frozen_attitude", attitude)
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
-        """d/dt (x, vx, y, vy, z, vz) [m/s, m/s^2]; eq. (1)."""
+        """d/dt (x, vx, y, vy, z, vz) [m/s, m/s^2]."""
         thrust = u[0] / self.mass  # U1 / m [m/s^2]
         if self.frozen_attitude is None:
             # No direction with ux^2 + uy^2 > 1 exists; there the thrust is horizontal: max(s, 0) = (s + |s|) / 2.
@@ -59,7 +60,7 @@ class Translational:
 
 @dataclass(frozen=True)
 class Rotational:
-    """Attitude and body rates, driven by the moments' forces (Cao, Lai and Alam, 2017, eqs. (3)-(5)).
+    """Attitude and body rates, driven by the moments' forces (Cao, Lai and Alam, 2017).
 
     States phi, p, theta, q, psi, r [rad, rad/s]; inputs U2, U3, U4 [N].
 
@@ -85,7 +86,7 @@ class Rotational:
             raise SettingError("arm", f"must be positive [m]; got {self.arm}")
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
-        """d/dt (phi, p, theta, q, psi, r) [rad/s, rad/s^2]; eq. (3)."""
+        """d/dt (phi, p, theta, q, psi, r) [rad/s, rad/s^2]."""
         p, q, r = x[1], x[3], x[5]
         ixx, iyy, izz = self.inertia
         a1, a3, a5 = (iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz  # [-]

@@ -1,7 +1,7 @@
 r"""Problem: the mean and covariance of f(x~) when f is a GP and its input x~ is itself Gaussian.
 
 Exact moments of an SE-ARD posterior at x~ = (x, u), x ~ N(mu, S), u certain (Girard, 2004; Deisenroth, 2010, section
-2.3.2; Cao, Lai and Alam, 2017, eqs. (11)-(17)). With nu_i = x_i - mu, Lam_a = diag(l_a^2) on the states, and
+2.3; Cao, Lai and Alam, 2017, section 2). With nu_i = x_i - mu, Lam_a = diag(l_a^2) on the states, and
 
     q_ai  = E[k_a(x~_i, x~)],   Q_ij = E[k_a(x~_i, x~) k_b(x~_j, x~)] = q_ai q_bj exp(delta_ij)
 
