@@ -1,6 +1,7 @@
 """``gpmpc tables``: computes Tables 1 and 2 and writes them as Markdown, CSV, LaTeX, JSON and a figure."""
 
 import logging
+import sys
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
@@ -51,7 +52,6 @@ def tables(config: DictConfig) -> None:
     folder = Path(settings["folder"])
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
         store = FitStore(folder / "fits.jsonl")
         columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
         columns += [TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()]
@@ -60,7 +60,8 @@ def tables(config: DictConfig) -> None:
             draws = experiment.run(store, fits, progress=lambda _: progress.advance(task))
         rows = summarise(draws)
         meta = provenance() | {"settings": settings}
-        for name, content in documents(rows, draws, meta).items():
+        written = documents(rows, draws, meta) | {"config.yaml": OmegaConf.to_yaml(config, resolve=True)}
+        for name, content in written.items():
             write_whole(folder / name, content)
     except OSError as error:
         raise SettingError("folder", f"cannot write to {folder}: {error.strerror or error}") from error
@@ -68,7 +69,10 @@ def tables(config: DictConfig) -> None:
         raise GpmpcError("a worker process died (out of memory?); the same command goes on where it stopped") from error
 
     console.print(render(rows))
+    console.print(f"\nwritten to {folder}: {', '.join(sorted(written))}", soft_wrap=True)
     failed = [draw for draw in draws if "error" in draw]
     for draw in failed:
-        console.print(f"failed: {draw['trajectory']} {draw['subsystem']} N={draw['size']}: {draw['error']}")
-    console.print(f"\nwritten to {folder}: {', '.join(sorted(documents(rows, draws, meta)))}", soft_wrap=True)
+        row = f"{draw['trajectory']} {draw['subsystem']} {draw['size']}, draw {draw['draw']}"
+        console.print(f"failed: {row}: {draw['error']}", soft_wrap=True)
+    if failed:
+        sys.exit(1)

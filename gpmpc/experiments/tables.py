@@ -17,6 +17,7 @@ Fits are independent; they run in worker processes of one thread each, and every
 import hashlib
 import json
 import os
+import signal
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -179,7 +180,7 @@ class Tables:
         if missing:
             workers = min(self.workers or os.cpu_count() or 1, len(missing))
             evaluate = partial(_evaluate, model=self.model, state_std=float(self.state_std))
-            with _one_thread_each(), ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), _quiet_on_interrupt) as pool:
                 # The largest first: the last fits to run are then short ones.
                 order = sorted(missing, key=lambda fit: -fit.size)
                 running = {pool.submit(evaluate, fit): fit for fit in order}
@@ -298,6 +299,11 @@ def _cell(name: str, part: str, raw: Transitions, subsystem: Subsystem) -> Cell:
     states, inputs, next_states = (Scaling(scaling.offset[piece], scaling.factor[piece]) for piece in pieces)
     data = Transitions(states.scale(raw.states), inputs.scale(raw.inputs), next_states.scale(raw.next_states))
     return Cell(name, part, data, next_states, tuple(list(subsystem.columns).index(r) for r in subsystem.reported))
+
+
+def _quiet_on_interrupt() -> None:
+    """Ctrl-C reaches the whole process group; the parent alone answers it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager

@@ -117,11 +117,14 @@ def differences(rows: Sequence[Row]) -> list[str]:
         for name, label in MEASURES.items():
             statistic = row.statistics.get(name)
             if statistic and statistic.position in ("below", "above"):
-                nearest = statistic.low if statistic.position == "below" else statistic.high
+                end, nearest = ("low", statistic.low) if statistic.position == "below" else ("high", statistic.high)
+                ratio = float(statistic.paper) / nearest
+                distance = (
+                    f"{100 * abs(ratio - 1):.2g} %" if 0.9 < ratio < 1.1 else f"a factor {max(ratio, 1 / ratio):.3g}"
+                )
                 lines.append(
                     f"{row.title}, {label}: the paper prints {_paper(statistic)}, "
-                    f"{statistic.position} our range at {float(statistic.paper) / nearest:.3g} times its "
-                    f"{'low' if statistic.position == 'below' else 'high'} end {number(nearest)}"
+                    f"{distance} {statistic.position} the {end} end of our range, {number(nearest)}"
                 )
     return lines
 

@@ -123,7 +123,7 @@ class GPPosterior:
         return torch.cholesky_inverse(self.cholesky)
 
     def predict(self, state: Tensor, input: Tensor) -> Gaussian:
-        """The next state's distribution at a certain state and input (Rasmussen and Williams, 2006, eqs. (2.25)-(2.26)).
+        """The next state's distribution at a certain state and input (Rasmussen and Williams, 2006, eq. (2.25)).
 
         Args:
             state: x (*batch, n).

@@ -2,8 +2,8 @@
 
 The model of Cao, Lai and Alam (2017), with the parameters decoded from their data. The z axis points downwards. The
 translational subsystem is driven by the total thrust U1 and by the direction (ux, uy) of the thrust, which the attitude
-has to provide; the rotational subsystem provides it, driven by the moments' forces U2, U3, U4. The plants that step these
-right-hand sides are in ``plant``.
+has to provide; the rotational subsystem provides it, driven by the moments' forces U2, U3, U4. The plants that step
+these right-hand sides are in ``plant``.
 """
 
 from dataclasses import dataclass
