@@ -27,6 +27,8 @@ SUBSYSTEMS = ("translational", "rotational")
 class DataSource(Protocol):
     """Transitions by the names of a trajectory and a subsystem."""
 
+    note: str  # what a reader has to know who compares results on these data with the paper's
+
     def transitions(self, name: str, trajectory: Trajectory, subsystem: str) -> Transitions:
         """The transitions of one subsystem ("translational" or "rotational") along the trajectory called ``name``."""
 
@@ -72,6 +74,12 @@ class NMPCData:
     horizon: int = 3
     attitude: str = "paper"
 
+    note = (
+        "Data: our own flights. Rotational: our yaw channels are at rest, the authors' hold their solver's residue, "
+        "scaled to full range; ours come out smaller. Lorenz: the authors' path is only approximately known; expect "
+        "the order of magnitude."
+    )
+
     def __post_init__(self) -> None:
         if self.samples < 1:
             raise SettingError("samples", f"must be 1 or more; got {self.samples}")
@@ -112,6 +120,8 @@ class PaperData:
 
     folder: str | Path
     samples: int = 189
+
+    note = "Data: the authors' own."
 
     def __post_init__(self) -> None:
         if not Path(self.folder).is_dir():

@@ -60,7 +60,9 @@ def tables(config: DictConfig) -> None:
             draws = experiment.run(store, fits, progress=lambda _: progress.advance(task))
         rows = summarise(draws)
         meta = provenance() | {"settings": settings}
-        written = documents(rows, draws, meta) | {"config.yaml": OmegaConf.to_yaml(config, resolve=True)}
+        written = documents(rows, draws, meta, experiment.data.note) | {
+            "config.yaml": OmegaConf.to_yaml(config, resolve=True)
+        }
         for name, content in written.items():
             write_whole(folder / name, content)
     except OSError as error:
@@ -68,7 +70,7 @@ def tables(config: DictConfig) -> None:
     except BrokenProcessPool as error:
         raise GpmpcError("a worker process died (out of memory?); the same command goes on where it stopped") from error
 
-    console.print(render(rows))
+    console.print(render(rows, experiment.data.note))
     console.print(f"\nwritten to {folder}: {', '.join(sorted(written))}", soft_wrap=True)
     failed = [draw for draw in draws if "error" in draw]
     for draw in failed:

@@ -129,10 +129,10 @@ def differences(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def documents(rows: Sequence[Row], draws: Sequence[dict], meta: dict) -> dict[str, str | bytes]:
+def documents(rows: Sequence[Row], draws: Sequence[dict], meta: dict, note: str) -> dict[str, str | bytes]:
     """Everything that is written of a run, by file name."""
     return {
-        "tables.md": markdown(rows, meta),
+        "tables.md": markdown(rows, meta, note),
         "tables.csv": comma_separated(rows),
         "tables.tex": latex(rows),
         "tables.json": json.dumps({"meta": meta, "draws": list(draws)}, indent=1),
@@ -140,7 +140,7 @@ def documents(rows: Sequence[Row], draws: Sequence[dict], meta: dict) -> dict[st
     }
 
 
-def render(rows: Sequence[Row]) -> Group:
+def render(rows: Sequence[Row], note: str) -> Group:
     """The tables for a terminal of 80 columns."""
     parts = []
     for trajectory in dict.fromkeys(row.trajectory for row in rows):
@@ -153,7 +153,7 @@ def render(rows: Sequence[Row]) -> Group:
             table, [row for row in rows if row.trajectory == trajectory], lambda row: row.subsystem, _two_lines
         )
         parts.append(table)
-    parts.append(Text(f"\nours: median\n[min, max] over the draws. {LEGEND}\n{PAPER_SECONDS}"))
+    parts.append(Text(f"\nours: median\n[min, max] over the draws. {LEGEND}\n{PAPER_SECONDS}\n{note}"))
 
     table = Table(title="\nplain predictions (no input covariance): medians over the draws", **STYLE)
     table.add_column("\nN", justify="right")
@@ -169,7 +169,7 @@ def title(trajectory: str) -> str:
     return f"{number_in_paper}{trajectory} trajectory"
 
 
-def markdown(rows: Sequence[Row], meta: dict) -> str:
+def markdown(rows: Sequence[Row], meta: dict, note: str) -> str:
     """The tables as Markdown, with what differs and what made them."""
     out = ["# Tables 1 and 2", ""]
     for trajectory in dict.fromkeys(row.trajectory for row in rows):
@@ -179,14 +179,8 @@ def markdown(rows: Sequence[Row], meta: dict) -> str:
             cells = [cell for name in MEASURES for cell in _with_paper(row.statistics.get(name), " ")]
             lines.append([row.subsystem, str(row.size), *cells, _seconds(row)])
         out += [f"## {title(trajectory)}", "", *_markdown_table(header, lines), ""]
-    out += [
-        "Ours: median [min, max] over the draws. " + LEGEND,
-        "",
-        PAPER_SECONDS,
-        "",
-        "## Plain predictions and calibration",
-        "",
-    ]
+    out += ["Ours: median [min, max] over the draws. " + LEGEND, "", PAPER_SECONDS, "", note, ""]
+    out += ["## Plain predictions and calibration", ""]
     lines = [
         [f"{row.trajectory} {row.subsystem}", str(row.size)]
         + [_range(row.statistics.get(name), " ") for name in CALIBRATION]

@@ -128,7 +128,7 @@ def test_a_fit_that_fails_is_kept_counted_and_does_not_stop_the_others(tmp_path)
     assert [record["error"] for record in records] == ["no start led anywhere"] * 8
     rows = summarise(records)
     assert [row.failed for row in rows] == [2, 2, 2, 2]
-    assert "(2 failed)" in documents(rows, records, {})["tables.md"]
+    assert "(2 failed)" in documents(rows, records, {}, "")["tables.md"]
 
 
 @pytest.mark.parametrize(
@@ -212,7 +212,7 @@ def test_every_document_tells_the_same_numbers(finished):
     _, _, records = finished
     named = [record | {"trajectory": "lorenz", "size": {5: 10, 25: 189}[record["size"]]} for record in records]
     rows = summarise(named)
-    written = documents(rows, named, {"seed": 0})
+    written = documents(rows, named, {"seed": 0}, "a note on the data")
     data = json.loads(written["tables.json"])
     assert data["meta"] == {"seed": 0}
     assert data["draws"] == named
@@ -227,6 +227,7 @@ def test_every_document_tells_the_same_numbers(finished):
         assert line["test_mse_paper_is"] == printed.position
         assert number(printed.median) in written["tables.md"]
         assert f"| {row.size} |" in written["tables.md"]
+    assert "a note on the data" in written["tables.md"]
     assert written["tables.tex"].count("\\toprule") == 1
     assert written["tables.png"].startswith(b"\x89PNG")
     outside = [s for row in rows for s in row.statistics.values() if s.position in ("below", "above")]
