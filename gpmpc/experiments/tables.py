@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc import __version__
+import gpmpc
 from gpmpc.datasets import DataSource
 from gpmpc.exceptions import DataError, SettingError, TrainingError
 from gpmpc.gaussian import Gaussian
@@ -43,7 +43,7 @@ from gpmpc.propagation import MomentMatching
 from gpmpc.trajectories import Trajectory
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-PROTOCOL = 1  # raised when a change of this module changes its numbers: older fits.jsonl entries are then not reused
+SOURCES = ("gaussian.py", "metrics.py", "gp/*.py", "propagation/*.py", "experiments/tables.py")
 
 
 @dataclass(frozen=True)
@@ -140,25 +140,26 @@ class Tables:
             DataError: The data cannot be read.
             SettingError: A size is larger than the data.
         """
-        return list(self._fits())
-
-    def _fits(self) -> Iterator[Fit]:
+        fits = []
         for name, trajectory in self.trajectories.items():
             for part, subsystem in self.subsystems.items():
                 cell = _cell(name, part, self.data.transitions(name, trajectory, part), subsystem)
-                rows = _digest(*(a.numpy().tobytes() for a in (cell.data.features, cell.data.next_states)))
-                factors = _digest(cell.scaling.factor.numpy().tobytes())
                 for size in self.sizes:
                     if size > len(cell.data):
-                        raise SettingError(
-                            "sizes", f"must be at most {len(cell.data)}, the rows of {name} {part}; got {size}"
-                        )
-                    for draw in range(self.draws):
-                        sequence = [self.seed, zlib.crc32(name.encode()), zlib.crc32(part.encode()), size, draw]
-                        seed = int(np.random.SeedSequence(sequence).generate_state(1)[0])
-                        depends = [PROTOCOL, __version__, self.model_settings, self.state_std, cell.reported]
-                        depends += [rows, factors, size, seed]
-                        yield Fit(cell, size, draw, seed, _digest(json.dumps(depends, sort_keys=True).encode()))
+                        rows = f"{len(cell.data)}, the rows of {name} {part}"
+                        raise SettingError("sizes", f"must be at most {rows}; got {size}")
+                    fits += [self._fit(cell, size, draw) for draw in range(self.draws)]
+        return fits
+
+    def _fit(self, cell: Cell, size: int, draw: int) -> Fit:
+        names = [zlib.crc32(name.encode()) for name in (cell.trajectory, cell.subsystem)]
+        seed = int(np.random.SeedSequence([self.seed, *names, size, draw]).generate_state(1)[0])
+        settings = [self.model_settings, self.state_std, cell.reported, size, seed]
+        arrays = (cell.data.features, cell.data.next_states, cell.scaling.factor)
+        fingerprint = _digest(
+            _source(), json.dumps(settings, sort_keys=True).encode(), *(array.numpy().tobytes() for array in arrays)
+        )
+        return Fit(cell, size, draw, seed, fingerprint)
 
     def run(self, store: "FitStore", fits: Sequence[Fit], progress: Callable[[dict | None], None]) -> list[dict]:
         """Computes the fits that the store does not hold yet.
@@ -329,6 +330,13 @@ def _whole_numbers(key: str, values: Any) -> tuple[int, ...]:
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise SettingError(key, f"must be whole numbers, 1 or more; got {value!r}")
     return tuple(dict.fromkeys(values))
+
+
+@cache
+def _source() -> bytes:
+    """The code that a fit's numbers come from: what other code computed is not taken for finished."""
+    package = Path(gpmpc.__file__).parent
+    return b"".join(path.read_bytes() for pattern in SOURCES for path in sorted(package.glob(pattern)))
 
 
 def _digest(*parts: bytes) -> str:
