@@ -125,7 +125,7 @@ class Trainer:
     penalty: Penalty | None = None
     restarts: int = 3
     likelihood: Literal["closed_form", "gpytorch"] = "closed_form"
-    tolerance: float = 1e-9
+    tolerance: float = 1e-8
     lengthscale_limit: float = 1e4
     signal_to_noise_limit: float = 1e4
 
