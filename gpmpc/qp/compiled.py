@@ -1,0 +1,19 @@
+"""How the kernels of this package are compiled: serially, without the interpreter's lock, and once per machine.
+
+numba keeps the machine code beside the source, or in the user's cache folder when the installation is read-only. When
+neither can be written it refuses to cache; the kernels are then compiled anew in each process. Sums may be reordered
+(that is what makes them vectorise); infinities and NaN keep their meaning.
+"""
+
+from collections.abc import Callable
+
+import numba
+
+
+def compiled(function: Callable) -> Callable:
+    """Compiles ``function`` at its first call."""
+    options = {"nogil": True, "fastmath": {"reassoc", "contract", "nsz"}}
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # "cannot cache function ...: no locator available"
+        return numba.njit(**options)(function)
