@@ -6,8 +6,11 @@ neither can be written it refuses to cache; the kernels are then compiled anew i
 """
 
 from collections.abc import Callable
+from threading import Lock
 
 import numba
+
+_compiling = Lock()
 
 
 def compiled(function: Callable) -> Callable:
@@ -17,3 +20,14 @@ def compiled(function: Callable) -> Callable:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # "cannot cache function ...: no locator available"
         return numba.njit(**options)(function)
+
+
+def compile_for(kernel: Callable, signature: str) -> None:
+    """Compiles ``kernel`` for one signature and no other: it then refuses other types with ``TypeError``.
+
+    Without this numba would quietly build a second kernel for Fortran-ordered or integer arrays.
+    """
+    with _compiling:
+        if not kernel.signatures:
+            kernel.compile(signature)
+            kernel.disable_compile()

@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import record as layout
-from gpmpc.qp.dual_kernels import solve_gram, solve_lazy
+from gpmpc.qp.compiled import compile_for
+from gpmpc.qp.dual_kernels import GRAM_SIGNATURE, LAZY_SIGNATURE, solve_gram, solve_lazy
 from gpmpc.qp.dual_rescue import rescue
 from gpmpc.qp.gram_system import gram_system
 from gpmpc.qp.problem import QuadraticProgram
@@ -58,6 +59,7 @@ class DualActiveSet:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ProblemError(f"{name} must be positive; got {value}")
+        compile_for(solve_lazy, LAZY_SIGNATURE)
 
     def solve(
         self, problem: QuadraticProgram, warm_start: WarmStart = None, soft: SoftRows | None = None
@@ -178,6 +180,7 @@ class Prepared:
     __slots__ = ("_M", "_settings", "_size", "_solver", "_system", "build_seconds", "terms")
 
     def __init__(self, solver: DualActiveSet, terms: Terms, settings: Array):
+        compile_for(solve_gram, GRAM_SIGNATURE)
         began = perf_counter()
         self.terms, self._solver, self._settings = terms, solver, settings
         self._system = gram_system(terms)
@@ -245,5 +248,7 @@ def _as_record(warm_start: WarmStart, n: int, M: int) -> Array:
         return warm_start.record
     active = np.asarray(warm_start)
     if active.shape != (M,) or active.dtype.kind not in "biuf":
-        raise ProblemError(f"a warm start must be a solution or an active set of shape {(M,)}; got shape {active.shape}")
+        raise ProblemError(
+            f"a warm start must be a solution or an active set of shape {(M,)}; got shape {active.shape}"
+        )
     return layout.warm_record(np.nan_to_num(active), n)

@@ -113,7 +113,9 @@ def place_state(state, n, L, G, y):
 
 
 @compiled
-def take_guess(lazy, n, codes, rows, L, G, lower, upper, slack, softness, caps, capacity, mu, lo, hi, W, places, b, ends, R):
+def take_guess(
+    lazy, n, codes, rows, L, G, lower, upper, slack, softness, caps, capacity, mu, lo, hi, W, places, b, ends, R
+):
     """Factors the guessed working set ``codes``, leaving out whatever is absurd, absent or dependent; returns its size."""
     M, size, k = len(lower), rows.shape[1], 0
     for code in codes:

@@ -33,6 +33,9 @@ STATUS, ITERATIONS, WORKING, HEADER = record.STATUS, record.ITERATIONS, record.W
 SOLVED, INFEASIBLE, ITERATION_LIMIT = record.SOLVED, record.INFEASIBLE, record.ITERATION_LIMIT
 NUMERICAL_TROUBLE, MISUSE = record.NUMERICAL_TROUBLE, record.MISUSE
 
+GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
+LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
+
 ABSENT = 1e20  # a bound of this size or more is none
 SLACK = 1e-10  # a violation below this share of the size of a constraint is none
 ROUNDS = 10  # returns from the residuals to the iteration
@@ -154,7 +157,9 @@ def write_ray(p, k, y, lower, upper, W, r, mu):
 
 
 @compiled
-def optimise(lazy, P, q, G, n, rows, L, start, norms, weights, softness, caps, given_lower, given_upper, warm, settings, out):
+def optimise(
+    lazy, P, q, G, n, rows, L, start, norms, weights, softness, caps, given_lower, given_upper, warm, settings, out
+):
     """Both modes after their set-up: ``start`` is the state of the unconstrained minimiser; it is overwritten."""
     M, size = len(given_lower), rows.shape[1]
     limit, tolerance, soft = int(settings[0]), settings[1], settings[2] != 0.0
@@ -163,7 +168,10 @@ def optimise(lazy, P, q, G, n, rows, L, start, norms, weights, softness, caps, g
     lower, upper, slack = floats[:M], floats[M : 2 * M], floats[2 * M : 3 * M]
     lo, hi, excess = floats[3 * M : 4 * M], floats[4 * M : 5 * M], floats[5 * M : 6 * M]
     at = 6 * M
-    b, ends = floats[at : at + capacity + 1], floats[at + capacity + 1 : at + 3 * (capacity + 1)].reshape(2, capacity + 1)
+    b, ends = (
+        floats[at : at + capacity + 1],
+        floats[at + capacity + 1 : at + 3 * (capacity + 1)].reshape(2, capacity + 1),
+    )
     at += 3 * (capacity + 1)
     wide = max(size, capacity + 1)
     scratch = floats[at : at + 6 * wide].reshape(6, wide)

@@ -94,14 +94,19 @@ class PrimalActiveSet:
         if ray is not None:
             multipliers = _stack(rows, np.arange(len(rows.h)), ray, M)
             proven = proves_infeasibility(
-                multipliers, problem.G, np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
+                multipliers,
+                problem.G,
+                np.where(lower <= -ABSENT, -np.inf, lower),
+                np.where(upper >= ABSENT, np.inf, upper),
             )
             return finish(Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE, x, multipliers, nothing, 0)
         limit = self.iteration_limit or 200 + 20 * len(rows.h)
         working = list(np.flatnonzero(rows.equality | _close_to_guess(rows, x, guess)))
         still = 0
         for iteration in range(limit):
-            d, multipliers = _minimise_on_rows(problem.P, problem.P @ x + problem.q, rows.A[working], rows.h[working] - rows.A[working] @ x)
+            d, multipliers = _minimise_on_rows(
+                problem.P, problem.P @ x + problem.q, rows.A[working], rows.h[working] - rows.A[working] @ x
+            )
             if np.abs(d).max() <= STILL * max(1.0, np.abs(x).max()):
                 droppable = np.where(rows.equality[working], np.inf, multipliers)
                 if not working or droppable.min() >= 0.0:

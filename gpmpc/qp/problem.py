@@ -23,9 +23,9 @@ SYMMETRY = 1e-10  # largest |P - P'| accepted, as a share of the largest diagona
 
 
 def as_float_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """``value`` as a contiguous float64 array of that shape, or a ``ProblemError`` with the name."""
+    """``value`` as a contiguous, writeable float64 array of that shape (no copy if it is one), or a ``ProblemError`` with the name."""
     try:
-        array = np.ascontiguousarray(value, dtype=np.float64)
+        array = np.require(value, np.float64, ["C", "A", "W"])
     except (TypeError, ValueError) as error:
         raise ProblemError(f"{name} must be an array of real numbers; got {value!r}") from error
     if array.shape != shape:
@@ -123,7 +123,9 @@ class QuadraticProgram:
             object.__setattr__(self, name, as_float_array(name, array, expected))
         for name in ("q", "G"):
             if not np.isfinite(getattr(self, name)).all():
-                raise ProblemError(f"{name} must be finite; it is not at index {_first(~np.isfinite(getattr(self, name)))}")
+                raise ProblemError(
+                    f"{name} must be finite; it is not at index {_first(~np.isfinite(getattr(self, name)))}"
+                )
         check_hessian(self.P)
         _check_bounds("row", self.h_lower, self.h_upper, ("h_lower", "h_upper"))
         _check_bounds("variable", self.lb, self.ub, ("lb", "ub"))

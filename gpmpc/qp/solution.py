@@ -178,10 +178,14 @@ def make_solution(
     x, multipliers = np.asarray(x, dtype=float), np.asarray(multipliers, dtype=float)
     n, M = len(problem.q), sum(problem.G.shape)
     if x.shape != (n,) or multipliers.shape != (M,):
-        raise ProblemError(f"a solution needs x of shape {(n,)} and multipliers {(M,)}; got {x.shape}, {multipliers.shape}")
+        raise ProblemError(
+            f"a solution needs x of shape {(n,)} and multipliers {(M,)}; got {x.shape}, {multipliers.shape}"
+        )
     active = np.sign(multipliers) if active_set is None else np.asarray(active_set)
     record = layout.warm_record(np.nan_to_num(active), n)
     record[layout.STATUS] = layout.STATUSES.index(status)
     record[layout.ITERATIONS] = iterations
     record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
-    return QPSolution(hard_terms(problem), problem.q, problem.lower, problem.upper, record, build_seconds, solve_seconds)
+    return QPSolution(
+        hard_terms(problem), problem.q, problem.lower, problem.upper, record, build_seconds, solve_seconds
+    )

@@ -167,8 +167,12 @@ def infeasible_problems() -> dict[str, QuadraticProgram]:
     """Problems that no point satisfies."""
     inf = np.inf
     return {
-        "two opposite rows": QuadraticProgram(np.eye(2), [0.0, 0.0], [[1.0, 1.0], [-1.0, -1.0]], [-inf, -inf], [1.0, -2.0]),
-        "a row against the box": QuadraticProgram(np.eye(2), [1.0, -3.0], [[1.0, 2.0]], [4.0], [inf], [-1, -1], [1.0, 1.0]),
+        "two opposite rows": QuadraticProgram(
+            np.eye(2), [0.0, 0.0], [[1.0, 1.0], [-1.0, -1.0]], [-inf, -inf], [1.0, -2.0]
+        ),
+        "a row against the box": QuadraticProgram(
+            np.eye(2), [1.0, -3.0], [[1.0, 2.0]], [4.0], [inf], [-1, -1], [1.0, 1.0]
+        ),
         "a zero row that should be one": QuadraticProgram(np.eye(3), np.ones(3), np.zeros((1, 3)), [1.0], [1.0]),
         "three equalities in two variables": QuadraticProgram(
             np.eye(2), [0.0, 0.0], [[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], [1.0, 1.0, 3.0], [1.0, 1.0, 3.0]
