@@ -15,7 +15,6 @@ Gram mode: row p = K_p, state = y (x is its first n entries). Lazy mode, P = L L
 enters, state = v = L'x, and y = C x is recomputed from it.
 """
 
-import math
 
 import numpy as np
 

@@ -16,7 +16,6 @@ from gpmpc.qp import record
 from gpmpc.qp.compiled import compiled
 from gpmpc.qp.dual_iteration import (
     CONTRADICTION,
-    NO_CONSTRAINT,
     NOISE,
     ignore,
     make_row,

@@ -201,7 +201,7 @@ def _minimise_on_rows(P: Array, gradient: Array, A: Array, gap: Array) -> tuple[
 
 
 def _step_length(rows: _Rows, x: Array, d: Array, working: list[int]) -> tuple[float, int | None]:
-    """kappa in [0, 1] and the row that blocks, if one does."""
+    """Kappa in [0, 1] and the row that blocks, if one does."""
     speed = rows.A @ d
     speed[working] = 0.0
     room = np.maximum(rows.h - rows.A @ x, 0.0)
