@@ -38,6 +38,26 @@ def subtract_rows(state, rows, places, factors, count, size):
 
 
 @compiled
+def multiply(A, first, last, vector, size, product):
+    """``product[i] = A[i] . vector`` for the rows ``first`` to ``last``, four at a time."""
+    i = first
+    while i + 4 <= last:
+        r0, r1, r2, r3 = A[i], A[i + 1], A[i + 2], A[i + 3]
+        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+        for j in range(size):
+            value = vector[j]
+            s0 += r0[j] * value
+            s1 += r1[j] * value
+            s2 += r2[j] * value
+            s3 += r3[j] * value
+        product[i], product[i + 1], product[i + 2], product[i + 3] = s0, s1, s2, s3
+        i += 4
+    while i < last:
+        product[i] = dot(A[i], vector, size)
+        i += 1
+
+
+@compiled
 def forward_solve(R, k, a):
     """``a <- R^-1 a`` in place."""
     start = 0

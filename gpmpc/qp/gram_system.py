@@ -1,8 +1,8 @@
 """What Gram mode needs to know about P and G, laid out in one array for the kernel.
 
 K = C P^-1 C' with C = [I; G] says how each constraint's value answers to each multiplier. The kernel reads one array:
-K (M rows, softness on the diagonal), then norms, selection weights, softness and caps (a row each), then P (n rows) and G
-(m rows), which only the residuals use; every row is M wide.
+K (M rows), then the constraints' traits (norms, selection weights, softness and caps, a row each), then P (n rows) and G
+(m rows); every row is M wide.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ def gram_system(terms: Terms) -> NDArray[np.float64]:
     K = 0.5 * (K + K.T)
     diagonal = np.diagonal(K).copy()
     system = np.zeros((2 * M + 4, M))
-    system[:M] = K + np.diag(softness)
+    system[:M] = K
     system[M] = np.linalg.norm(C, axis=1)
     system[M + 1] = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     system[M + 2 : M + 4] = softness, caps
