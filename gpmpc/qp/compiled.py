@@ -6,6 +6,7 @@ neither can be written it refuses to cache; the kernels are then compiled anew i
 """
 
 from collections.abc import Callable
+from functools import partial
 from threading import Lock
 
 import numba
@@ -13,9 +14,14 @@ import numba
 _compiling = Lock()
 
 
-def compiled(function: Callable) -> Callable:
-    """Compiles ``function`` at its first call."""
-    options = {"nogil": True, "fastmath": {"reassoc", "contract", "nsz"}}
+REORDERED = frozenset({"reassoc", "contract", "nsz"})
+
+
+def compiled(function: Callable | None = None, *, fastmath: frozenset[str] = REORDERED) -> Callable:
+    """Compiles ``function`` at its first call; ``fastmath`` names LLVM's flags for it."""
+    if function is None:
+        return partial(compiled, fastmath=fastmath)
+    options = {"nogil": True, "fastmath": set(fastmath)}
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # "cannot cache function ...: no locator available"

@@ -15,6 +15,7 @@ in lazy mode, then on the equilibrated problem; what still fails is reported as 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import count
 from time import perf_counter
 
 import numpy as np
@@ -33,6 +34,7 @@ from gpmpc.qp.solver import WarmStart
 
 Array = NDArray[np.float64]
 
+_tags = count(1)  # next() of a count is atomic
 ITERATIONS_PER_CONSTRAINT = 10  # default limit, beyond which the iteration is taken to cycle
 ITERATIONS_PER_LOOK = 25  # iterations between two looks at the clock
 
@@ -182,10 +184,12 @@ class Prepared:
     def __init__(self, solver: DualActiveSet, terms: Terms, settings: Array):
         compile_for(solve_gram, GRAM_SIGNATURE)
         began = perf_counter()
-        self.terms, self._solver, self._settings = terms, solver, settings
+        self.terms, self._solver = terms, solver
         self._system = gram_system(terms)
         self._M = self._system.shape[1]
-        self._size = layout.record_size(len(terms.P), self._M)
+        n = len(terms.P)
+        self._size = layout.record_size(n, self._M) + layout.factor_size(n, self._M)
+        self._settings = np.append(settings[:-1], next(_tags))  # a record's factor is good for the problem with its tag only
         self.build_seconds = perf_counter() - began
 
     def solve(self, q: Array, lower: Array, upper: Array, warm_start: WarmStart = None) -> QPSolution:
@@ -231,7 +235,7 @@ class Prepared:
 
 @lru_cache(maxsize=256)
 def _settings(limit: int, tolerance: float, soft: bool, n: int) -> Array:
-    return np.array([float(limit), tolerance, float(soft), float(n)])
+    return np.array([float(limit), tolerance, float(soft), float(n), layout.NO_TAG])
 
 
 @lru_cache(maxsize=256)

@@ -11,7 +11,7 @@ t = violation / d (p joins W), or where a multiplier reaches the end of its rang
 import numpy as np
 
 from gpmpc.qp.compiled import compiled
-from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, subtract_rows
+from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, largest, subtract_rows
 from gpmpc.qp.working_set import (
     BOUND,
     HIGH_WATCH,
@@ -44,11 +44,13 @@ def most_violated(y, weights, bounds, excess):
     lo, hi = bounds[LOW_WATCH], bounds[HIGH_WATCH]
     for p in range(len(y)):
         excess[p] = max(y[p] - hi[p], lo[p] - y[p]) * weights[p]
-    best, chosen = 0.0, NO_CONSTRAINT
-    for p in range(len(y)):
-        if excess[p] > best:
-            best, chosen = excess[p], p
-    return chosen
+    worst = largest(excess, len(y))
+    if not worst > 0.0:
+        return NO_CONSTRAINT
+    p = 0
+    while p < len(y) - 1 and excess[p] != worst:
+        p += 1
+    return p
 
 
 @compiled
@@ -66,10 +68,9 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
     row = rows[place]
     free = free_value(lazy, p, row, v, q, n)
     diagonal = (dot(row, row, n) if lazy else row[p]) + traits[SOFTNESS, p]
-    r = scratch[2]
+    solved, r = scratch[1], scratch[2]
     while True:
         admit(k, p, above, place, traits, free, bounds, slots, members)
-        solved = R[k * (k + 1) // 2 :]
         couple(lazy, row, k, rows, members, solved)
         forward_solve(R, k, solved)
         for i in range(k):
@@ -96,7 +97,7 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
         if blocking < k:
             leaving = abs(members[NAME, blocking]) - 1
             mu[leaving] = slots[LEAST if sense * r[blocking] > 0.0 else MOST, blocking]
-            evict(k, blocking, slots, members, R, scratch)
+            evict(k, blocking, slots, members, R, scratch[0])
             k -= 1
             members[PLACE, k + 1] = members[PLACE, k]  # the entering row keeps its place in slot k
             watch(leaving, mu, bounds)
@@ -124,13 +125,13 @@ def distance_to_span(row, k, n, rows, members, r, rest):
 @compiled
 def first_block(step, sense, k, mu, slots, members, r):
     """The longest step, up to ``step``, that keeps the working multipliers in range, and the slot that ends it (or k)."""
-    largest = 0.0
+    size = 0.0
     for i in range(k):
-        largest = max(largest, abs(r[i]))
+        size = max(size, abs(r[i]))
     blocking = k
     for i in range(k):
         rate = sense * r[i]
-        if abs(rate) > 1e-12 * largest:
+        if abs(rate) > 1e-12 * size:
             room = (mu[abs(members[NAME, i]) - 1] - slots[LEAST if rate > 0.0 else MOST, i]) / rate
             if room < step:
                 step, blocking = max(room, 0.0), i

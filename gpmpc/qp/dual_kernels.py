@@ -17,7 +17,7 @@ from gpmpc.qp import record
 from gpmpc.qp.compiled import compiled
 from gpmpc.qp.dual_iteration import CONTRADICTION, NO_CONSTRAINT, most_violated, step_to
 from gpmpc.qp.evaluation import add_pull, evaluate, follow, refine, residuals
-from gpmpc.qp.factor import dot
+from gpmpc.qp.factor import dot, multiply, pack, unpack
 from gpmpc.qp.working_set import (
     CAP,
     HIGH_WATCH,
@@ -30,15 +30,17 @@ from gpmpc.qp.working_set import (
     SOFTNESS,
     UPPER,
     WEIGHT,
+    admit,
     ignore,
     settle,
     take,
     watch,
 )
 
-STATUS, ITERATIONS, WORKING, HEADER = record.STATUS, record.ITERATIONS, record.WORKING, record.HEADER
+STATUS, ITERATIONS, VARIABLES, CONSTRAINTS = record.STATUS, record.ITERATIONS, record.VARIABLES, record.CONSTRAINTS
+WORKING, TAG, AGE, HEADER = record.WORKING, record.TAG, record.AGE, record.HEADER
 SOLVED, INFEASIBLE, ITERATION_LIMIT = record.SOLVED, record.INFEASIBLE, record.ITERATION_LIMIT
-NUMERICAL_TROUBLE, MISUSE = record.NUMERICAL_TROUBLE, record.MISUSE
+NUMERICAL_TROUBLE, MISUSE, NO_TAG = record.NUMERICAL_TROUBLE, record.MISUSE, record.NO_TAG
 
 GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
 LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
@@ -50,7 +52,8 @@ SWEEPS = 4  # times that all badly violated constraints are taken at once
 SWEPT = 0.3  # those violated by more than this share of the worst
 ROUNDS = 10  # returns from the residuals to the iteration
 REFINEMENTS = 3
-FINE = 1e-12  # scaled residual at which refinement stops
+FINE = 1e-11  # scaled residual at which refinement stops
+OLD = 1000  # changes after which a factor is computed anew
 
 
 @compiled
@@ -82,6 +85,16 @@ def keep_capped(n, warm, traits, bounds, mu):
 
 
 @compiled
+def all_present(names, bounds, mu):
+    """Whether every one of the named bounds is there to be held (it may have become absent since)."""
+    for name in names:
+        p = int(abs(name)) - 1
+        if mu[p] != 0.0 or abs(bounds[UPPER if name > 0.0 else LOWER, p]) == np.inf:
+            return False
+    return True
+
+
+@compiled
 def write_ray(p, k, y, bounds, members, r, mu):
     """Farkas' proof that constraint p contradicts the working ones, ``C' ray = 0`` and ``ray' bounds < 0``, into mu."""
     sense = 1.0 if y[p] > bounds[UPPER, p] else -1.0
@@ -101,10 +114,10 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
     limit, tolerance, soft = int(settings[0]), settings[1], settings[2] != 0.0
     capacity = M if soft else min(n, M)
     wide = max(M, capacity + 2)
-    work = np.empty((19, wide))
+    work = np.empty((20, wide))
     bounds, slots, scratch, y = work[:5], work[5:9], work[9:13], work[13, :M]
-    seen, excess, gradient, active, v = work[14], work[15], work[16], work[17], work[18]
-    R = np.empty((capacity + 1) * (capacity + 2) // 2)
+    seen, excess, gradient, active, v, slope = work[14], work[15], work[16], work[17], work[18], work[19]
+    R = np.empty((capacity + 1, capacity + 1))
     members, changed = np.empty((2, wide), np.int64), np.empty(M, np.int64)
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     for p in range(M):
@@ -113,23 +126,36 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
         members[PLACE, i] = i
     if read_bounds(lower, upper, traits[NORM], bounds):
         return MISUSE
-    guessed = len(warm) == len(out) and 0 <= warm[WORKING] <= M
+    guessed = len(warm) > HEADER and warm[VARIABLES] == n and warm[CONSTRAINTS] == M and 0 <= warm[WORKING] <= M
     pull = q
     if guessed and soft:
         keep_capped(n, warm, traits, bounds, mu)
-        pull = q.copy()
-        add_pull(G, n, mu, pull)
+        pull = np.empty(n)
+        add_pull(G, n, q, mu, pull)
     if lazy:
         for i in range(n):
             v[i] = -(pull[i] + dot(L[i], v, i)) * L[i, i]
     k = 0
+    tag, age = settings[4], 0.0
     if guessed:
-        for code in warm[HEADER + n + M : HEADER + n + M + int(warm[WORKING])]:
-            if 1.0 <= abs(code) <= M and k < capacity:
-                p = int(abs(code)) - 1
-                k = take(lazy, p, code > 0.0, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R)
+        names = warm[HEADER + n + M : HEADER + n + M + int(warm[WORKING])]
+        if tag != NO_TAG and warm[TAG] == tag and warm[AGE] < OLD and all_present(names, bounds, mu):
+            k = len(names)
+            unpack(warm[HEADER + n + 2 * M :], k, R)
+            age = warm[AGE]
+            for i in range(k):
+                p = int(abs(names[i])) - 1
+                admit(i, p, names[i] > 0.0, p, traits, -dot(rows[p], pull, n), bounds, slots, members)
+                ignore(p, bounds)
+        else:
+            for code in names:
+                if 1.0 <= abs(code) <= M and k < capacity:
+                    p, above = int(abs(code)) - 1, code > 0.0
+                    k = take(
+                        lazy, p, above, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch[1]
+                    )
         k = settle(k, bounds, mu, slots, members, R, scratch)
-    evaluate(lazy, n, q, rows, L, G, mu, seen, y, gradient)
+    evaluate(lazy, n, q, rows, L, G, mu, seen, y, slope)
     current, iterations, sweeps, rounds, status, worst = True, 0, 0, 0, NUMERICAL_TROUBLE, np.inf
     while True:
         p = most_violated(y, traits[WEIGHT], bounds, excess)
@@ -150,7 +176,9 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
                         if excess[j] > share and k < capacity:
                             size = k
                             above = y[j] > bounds[UPPER, j]
-                            k = take(lazy, j, above, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R)
+                            k = take(
+                                lazy, j, above, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch[1]
+                            )
                             iterations += k - size
                     k = settle(k, bounds, mu, slots, members, R, scratch)
             if iterations == before:
@@ -167,26 +195,33 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
                 if soft:
                     sweeps = SWEEPS  # caps may have changed what ``pull`` says
             if lazy:
-                evaluate(lazy, n, q, rows, L, G, mu, seen, y, gradient)
+                evaluate(lazy, n, q, rows, L, G, mu, seen, y, slope)
             else:
                 follow(rows, mu, seen, changed, gradient, y)
             continue
-        if not current:
-            evaluate(lazy, n, q, rows, L, G, mu, seen, y, gradient)
-            current = True
+        if not current and not lazy:
+            multiply(G, 0, len(G), y, n, y[n:])
+            add_pull(G, n, q, mu, slope)
         best = np.inf
         for attempt in range(REFINEMENTS + 1):
-            stationarity, feasibility = residuals(P, q, G, n, traits, mu, k, slots, members, y, gradient, active)
+            stationarity, feasibility = residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active)
             worst = max(stationarity, feasibility)
             if worst <= FINE or attempt == REFINEMENTS or not worst < 0.5 * best:
                 break
             best = worst
-            refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, scratch[0], scratch[2])
+            refine(
+                lazy, k, n, q, rows, L, G, slots, members, R, mu, y, slope, gradient, active, scratch[0], scratch[2]
+            )
         status = SOLVED if worst <= tolerance else NUMERICAL_TROUBLE
         rounds += 1
         if rounds == ROUNDS or most_violated(y, traits[WEIGHT], bounds, excess) < 0:
             break
     out[STATUS], out[ITERATIONS], out[WORKING] = status, iterations, k
+    out[VARIABLES], out[CONSTRAINTS], out[TAG], out[AGE] = n, M, NO_TAG, age + iterations
+    factor = out[HEADER + n + 2 * M :]
+    if tag != NO_TAG and k * (k + 1) // 2 <= len(factor):
+        pack(R, k, factor)
+        out[TAG] = tag
     for i in range(n):
         x[i] = y[i]
     for i in range(k):

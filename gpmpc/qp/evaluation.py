@@ -21,25 +21,26 @@ def solve_transposed(L, n, a):
 
 
 @compiled
-def add_pull(G, n, mu, target):
-    """``target += C' mu``."""
+def add_pull(G, n, q, mu, slope):
+    """``slope = q + C' mu``."""
     for i in range(n):
-        target[i] += mu[i]
+        slope[i] = q[i] + mu[i]
     for p in range(n, len(mu)):
         if mu[p] != 0.0:
             weight, row = mu[p], G[p - n]
             for i in range(n):
-                target[i] += weight * row[i]
+                slope[i] += weight * row[i]
 
 
 @compiled
 def evaluate(lazy, n, q, rows, L, G, mu, seen, y, slope):
-    """``y = C x`` for the multipliers, from scratch; ``seen`` (M) then holds the multipliers that y knows."""
+    """``y = C x`` for the multipliers, from scratch; ``seen`` (M) then holds the multipliers that y knows.
+
+    Leaves ``slope = q + C' mu``.
+    """
     for p in range(len(mu)):
         seen[p] = mu[p]
-    for i in range(n):
-        slope[i] = q[i]
-    add_pull(G, n, mu, slope)
+    add_pull(G, n, q, mu, slope)
     if lazy:
         for i in range(n):
             y[i] = -(slope[i] + dot(L[i], y, i)) * L[i, i]
@@ -64,18 +65,16 @@ def follow(rows, mu, seen, changed, amounts, y):
 
 
 @compiled
-def residuals(P, q, G, n, traits, mu, k, slots, members, y, gradient, active):
-    """The scaled residuals of (x, mu), x = y[:n]: stationarity and violation of the working set, from the problem's own data.
+def residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active):
+    """The scaled residuals of (x, mu), x = y[:n]: stationarity and violation of the working set, from P, q and G.
 
-    Fills ``gradient = P x + q + C' mu`` and ``active = y_W - softness mu_W - b``, where y = C x.
+    Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where y = C x and slope = q + C' mu.
     """
     multiply(P, 0, n, y, n, gradient)
     size, stationarity, infeasibility = 1.0, 0.0, 0.0
     for i in range(n):
         size = max(size, max(abs(gradient[i]), abs(q[i])))
-        gradient[i] += q[i]
-    add_pull(G, n, mu, gradient)
-    for i in range(n):
+        gradient[i] += slope[i]
         stationarity = max(stationarity, abs(gradient[i]))
     for i in range(k):
         p, b = abs(members[NAME, i]) - 1, slots[BOUND, i]
@@ -85,7 +84,7 @@ def residuals(P, q, G, n, traits, mu, k, slots, members, y, gradient, active):
 
 
 @compiled
-def refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, correction, trial):
+def refine(lazy, k, n, q, rows, L, G, slots, members, R, mu, y, slope, gradient, active, correction, trial):
     """One Newton step on the working set for the residuals ``gradient`` and ``active``; multipliers stay in range."""
     size = n if lazy else len(y)
     if lazy:
@@ -109,3 +108,4 @@ def refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, c
         p = abs(members[NAME, i]) - 1
         mu[p] = min(max(mu[p] + trial[i], slots[LEAST, i]), slots[MOST, i])
     multiply(G, 0, len(G), y, n, y[n:])
+    add_pull(G, n, q, mu, slope)

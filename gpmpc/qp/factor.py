@@ -1,14 +1,14 @@
 """The Cholesky factor of the working set's matrix, kept current while constraints enter and leave.
 
-``R R' = K_WW`` with R lower triangular, stored row after row without the zeros: row i starts at i (i + 1) / 2. A constraint
-that enters appends one row, found by the same forward solve that prices it; one that leaves deletes a row, and Givens
-rotations restore the triangle (Golub and Van Loan, Matrix Computations, 4th ed., section 6.5.2). The diagonal holds
-reciprocals, so that no solve divides.
+``L L' = K_WW`` with L lower triangular. Row j of the array R holds column j of L, from its diagonal on: R[j, i] = L_ij, i >= j.
+A constraint that enters appends one row to L, found by the same forward solve that prices it; one that leaves deletes a row,
+and Givens rotations restore the triangle (Golub and Van Loan, Matrix Computations, 4th ed., section 6.5.2). The diagonal
+holds reciprocals, so that no solve divides.
 """
 
 import math
 
-from gpmpc.qp.compiled import compiled
+from gpmpc.qp.compiled import REORDERED, compiled
 
 
 @compiled
@@ -18,6 +18,15 @@ def dot(a, b, size):
     for i in range(size):
         total += a[i] * b[i]
     return total
+
+
+@compiled(fastmath=REORDERED | {"nnan"})
+def largest(a, size):
+    """The largest of the first ``size`` entries, which vectorises only if none of them is NaN."""
+    found = a[0]
+    for i in range(size):
+        found = max(found, a[i])
+    return found
 
 
 @compiled
@@ -59,50 +68,71 @@ def multiply(A, first, last, vector, size, product):
 
 @compiled
 def forward_solve(R, k, a):
-    """``a <- R^-1 a`` in place."""
-    start = 0
-    for i in range(k):
-        row = R[start : start + i + 1]
-        a[i] = (a[i] - dot(row, a, i)) * row[i]
-        start += i + 1
+    """``a <- L^-1 a`` in place."""
+    for j in range(k):
+        value = a[j] * R[j, j]
+        a[j] = value
+        column, rest = R[j, j + 1 : k], a[j + 1 : k]
+        for i in range(len(column)):
+            rest[i] -= value * column[i]
 
 
 @compiled
 def backward_solve(R, k, a):
-    """``a <- R^-T a`` in place."""
-    start = k * (k + 1) // 2
-    for i in range(k - 1, -1, -1):
-        start -= i + 1
-        row = R[start : start + i + 1]
-        value = a[i] * row[i]
-        a[i] = value
-        for j in range(i):
-            a[j] -= value * row[j]
+    """``a <- L^-T a`` in place."""
+    for j in range(k - 1, -1, -1):
+        a[j] = (a[j] - dot(R[j, j + 1 :], a[j + 1 :], k - j - 1)) * R[j, j]
 
 
 @compiled
 def append_row(R, k, solved, pivot):
-    """Row k of the factor: ``solved = R^-1 K_Wp`` and ``pivot = K_pp - |solved|^2 > 0``."""
-    row = R[k * (k + 1) // 2 : (k + 1) * (k + 2) // 2]
+    """Row k of L: ``solved = L^-1 K_Wp`` and ``pivot = K_pp - |solved|^2 > 0``."""
     for j in range(k):
-        row[j] = solved[j]
-    row[k] = 1.0 / math.sqrt(pivot)
+        R[j, k] = solved[j]
+    R[k, k] = 1.0 / math.sqrt(pivot)
 
 
 @compiled
-def remove_row(R, k, gone, cosines, sines):
-    """Deletes row ``gone`` of a factor of k rows; ``cosines`` and ``sines`` are scratch of length k."""
-    for i in range(gone + 1, k):
-        old = R[i * (i + 1) // 2 : (i + 1) * (i + 2) // 2]
-        new = R[(i - 1) * i // 2 : i * (i + 1) // 2]
-        for j in range(gone):
-            new[j] = old[j]
-        carry = old[gone]
-        for j in range(gone, i - 1):
-            following = old[j + 1]
-            new[j] = cosines[j] * carry + sines[j] * following
-            carry = cosines[j] * following - sines[j] * carry
-        diagonal = 1.0 / old[i]
-        reciprocal = 1.0 / math.sqrt(carry * carry + diagonal * diagonal)
-        cosines[i - 1], sines[i - 1] = carry * reciprocal, diagonal * reciprocal
-        new[i - 1] = reciprocal
+def remove_row(R, k, gone, carry):
+    """Deletes row ``gone`` of L, which has k rows; ``carry`` is scratch of length k."""
+    for j in range(gone):
+        column = R[j, gone:k]
+        for i in range(len(column) - 1):
+            column[i] = column[i + 1]
+    rest = carry[: k - gone - 1]
+    column = R[gone, gone + 1 : k]
+    for i in range(len(rest)):
+        rest[i] = column[i]
+    for c in range(gone + 1, k):
+        diagonal = 1.0 / R[c, c]
+        reciprocal = 1.0 / math.sqrt(rest[0] * rest[0] + diagonal * diagonal)
+        cosine, sine = rest[0] * reciprocal, diagonal * reciprocal
+        R[c - 1, c - 1] = reciprocal
+        old, new = R[c, c + 1 : k], R[c - 1, c : k - 1]
+        for i in range(len(old)):
+            following, below = rest[i + 1], old[i]
+            new[i] = cosine * following + sine * below
+            rest[i] = cosine * below - sine * following
+        rest = rest[: len(old)]
+
+
+@compiled
+def pack(R, k, packed):
+    """Copies the triangle of k rows to a flat array of k (k + 1) / 2 entries."""
+    at = 0
+    for j in range(k):
+        column = R[j, j:k]
+        for i in range(len(column)):
+            packed[at + i] = column[i]
+        at += len(column)
+
+
+@compiled
+def unpack(packed, k, R):
+    """The inverse of ``pack``."""
+    at = 0
+    for j in range(k):
+        column = R[j, j:k]
+        for i in range(len(column)):
+            column[i] = packed[at + i]
+        at += len(column)

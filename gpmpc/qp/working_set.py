@@ -9,7 +9,7 @@ Everything lives in a few arrays that the kernels hand around, a column per cons
   unless the row is soft with a linear weight; a constraint that leaves at its cap stays violated.
 * ``members`` (2, capacity + 2) integers: the signed number +-(p + 1) of the constraint in each slot, and where its row is.
 * ``mu`` (M): multipliers; zero outside the working set except at a cap.
-* ``R``: the packed Cholesky factor of K_WW + softness (``gpmpc.qp.factor``).
+* ``R``: the Cholesky factor of K_WW + softness (``gpmpc.qp.factor``).
 
 A *row* represents a constraint in the metric of P^-1, K_pq = row_p . row_q or simply entry q of row p: in Gram mode row p
 is K_p, known beforehand; in lazy mode, P = L L', it is w_p = L^-1 c_p, made when p enters.
@@ -95,7 +95,7 @@ def admit(k, p, above, place, traits, free, bounds, slots, members):
 @compiled
 def evict(k, slot, slots, members, R, scratch):
     """Deletes a slot of the working set of k members and mends the factor; its place is free for the next row."""
-    remove_row(R, k, slot, scratch[0], scratch[1])
+    remove_row(R, k, slot, scratch)
     place = members[PLACE, slot]
     for i in range(slot, k - 1):
         members[NAME, i], members[PLACE, i] = members[NAME, i + 1], members[PLACE, i + 1]
@@ -111,13 +111,12 @@ def free_value(lazy, p, row, v, q, n):
 
 
 @compiled
-def take(lazy, p, above, k, n, q, v, rows, L, G, traits, bounds, mu, slots, members, R):
+def take(lazy, p, above, k, n, q, v, rows, L, G, traits, bounds, mu, slots, members, R, solved):
     """Takes constraint p into the working set unless it is absent, taken or dependent; returns the size."""
     if mu[p] != 0.0 or (bounds[LOW_WATCH, p] == -np.inf and bounds[HIGH_WATCH, p] == np.inf):
         return k
     if abs(bounds[UPPER if above else LOWER, p]) == np.inf:
         return k
-    solved = R[k * (k + 1) // 2 :]
     place = find_row(lazy, p, k, n, rows, L, G, members)
     row = rows[place]
     couple(lazy, row, k, rows, members, solved)
@@ -152,7 +151,7 @@ def settle(k, bounds, mu, slots, members, R, scratch):
         if slot < 0:
             break
         p = abs(members[NAME, slot]) - 1
-        evict(k, slot, slots, members, R, scratch)
+        evict(k, slot, slots, members, R, scratch[0])
         k -= 1
         mu[p] = 0.0
         watch(p, mu, bounds)
