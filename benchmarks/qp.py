@@ -197,7 +197,9 @@ def describe(cell: dict) -> str:
     text += f"{solvers[cell['best DAQP path']]['hot']['median']:8.2f} us, ratio {ratio['median']:.3f}"
     if cell["horizon"] in TARGETS[cell["mode"]]:
         text += f" (target {TARGETS[cell['mode']][cell['horizon']]:.2f})"
-    text += f", p99 {ratio['p99']:.3f}, flushed {cell['ratio flushed']['median']:.3f}, KKT {solvers[OURS]['residual']:.0e}"
+    text += (
+        f", p99 {ratio['p99']:.3f}, flushed {cell['ratio flushed']['median']:.3f}, KKT {solvers[OURS]['residual']:.0e}"
+    )
     if CVXPY in solvers:
         text += f", CVXPY {solvers[CVXPY]['hot']['median'] / solvers[OURS]['hot']['median']:.0f} times slower"
     return text
@@ -224,7 +226,9 @@ def draw(cells: list[dict], path: Path) -> None:
         x = [cell["horizon"] for cell in chosen]
         for key, style in (("median", "o-"), ("p99", "s--")):
             ratios.semilogx(x, [c["ratio hot"][key] for c in chosen], style, color="C0", ms=4, label=f"{key}, hot")
-        ratios.semilogx(x, [c["ratio flushed"]["median"] for c in chosen], "^:", color="C1", ms=4, label="median, flushed")
+        ratios.semilogx(
+            x, [c["ratio flushed"]["median"] for c in chosen], "^:", color="C1", ms=4, label="median, flushed"
+        )
         targets = TARGETS[mode]
         ratios.semilogx(list(targets), list(targets.values()), "k_", ms=14, label="target for the median, hot")
         ratios.set(xlabel="horizon H (n = 3H, m = 6H)", ylim=(0.0, 1.05), xticks=x, xticklabels=x)

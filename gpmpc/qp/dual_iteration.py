@@ -13,7 +13,6 @@ import numpy as np
 from gpmpc.qp.compiled import compiled
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, largest, subtract_rows
 from gpmpc.qp.working_set import (
-    BOUND,
     HIGH_WATCH,
     LEAST,
     LOW_WATCH,
@@ -66,7 +65,7 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
     violation = (value - bounds[UPPER if above else LOWER, p]) * sense
     place = find_row(lazy, p, k, n, rows, L, G, members)
     row = rows[place]
-    free = free_value(lazy, p, row, v, q, n)
+    free = free_value(lazy, row, v, q, n)
     diagonal = (dot(row, row, n) if lazy else row[p]) + traits[SOFTNESS, p]
     solved, r = scratch[1], scratch[2]
     while True:

@@ -15,9 +15,10 @@ import numpy as np
 
 from gpmpc.qp import record
 from gpmpc.qp.compiled import compiled
-from gpmpc.qp.dual_iteration import CONTRADICTION, NO_CONSTRAINT, most_violated, step_to
-from gpmpc.qp.evaluation import add_pull, evaluate, follow, refine, residuals
+from gpmpc.qp.dual_iteration import CONTRADICTION, most_violated, step_to
+from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, refine, residuals
 from gpmpc.qp.factor import dot, multiply, pack, unpack
+from gpmpc.qp.hessian import factorise, solve_lower
 from gpmpc.qp.working_set import (
     CAP,
     HIGH_WATCH,
@@ -31,6 +32,9 @@ from gpmpc.qp.working_set import (
     UPPER,
     WEIGHT,
     admit,
+    choose_guess,
+    choose_violated,
+    free_value,
     ignore,
     settle,
     take,
@@ -59,19 +63,17 @@ OLD = 1000  # changes after which a factor is computed anew
 @compiled
 def read_bounds(lower, upper, norms, bounds):
     """Copies the bounds, with absent ones infinite; True if any are crossed or undefined."""
-    bad = False
+    bad = 0
     for p in range(len(lower)):
         low, high = lower[p], upper[p]
-        bad |= not (low <= high and low < ABSENT and high > -ABSENT)
-        size = norms[p]
-        size = max(size, abs(low)) if low > -ABSENT else size
-        size = max(size, abs(high)) if high < ABSENT else size
-        low = low if low > -ABSENT else -np.inf
-        high = high if high < ABSENT else np.inf
+        bad += not ((low <= high) & (low < ABSENT) & (high > -ABSENT))
+        has_low, has_high = low > -ABSENT, high < ABSENT
+        size = max(norms[p], max(abs(low) if has_low else 0.0, abs(high) if has_high else 0.0))
+        low, high = low if has_low else -np.inf, high if has_high else np.inf
         slack = TOLERATED * size
         bounds[LOWER, p], bounds[UPPER, p], bounds[SLACK, p] = low, high, slack
         bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = low - slack, high + slack
-    return bad
+    return bad > 0
 
 
 @compiled
@@ -82,6 +84,15 @@ def keep_capped(n, warm, traits, bounds, mu):
         if abs(value) >= cap and abs(bounds[UPPER if value > 0.0 else LOWER, p]) < np.inf:
             mu[p] = cap if value > 0.0 else -cap
             watch(p, mu, bounds)
+
+
+@compiled
+def count_above(values, threshold, size):
+    """How many of the first ``size`` values are above the threshold."""
+    count = 0
+    for i in range(size):
+        count += values[i] > threshold
+    return count
 
 
 @compiled
@@ -110,15 +121,14 @@ def write_ray(p, k, y, bounds, members, r, mu):
 @compiled
 def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, out):
     """Both modes after their set-up."""
-    M = len(lower)
+    M, m = len(lower), len(lower) - n
     limit, tolerance, soft = int(settings[0]), settings[1], settings[2] != 0.0
     capacity = M if soft else min(n, M)
     wide = max(M, capacity + 2)
-    work = np.empty((20, wide))
+    work = np.empty((20 + capacity + 1, wide))
     bounds, slots, scratch, y = work[:5], work[5:9], work[9:13], work[13, :M]
-    seen, excess, gradient, active, v, slope = work[14], work[15], work[16], work[17], work[18], work[19]
-    R = np.empty((capacity + 1, capacity + 1))
-    members, changed = np.empty((2, wide), np.int64), np.empty(M, np.int64)
+    seen, excess, gradient, active, v, slope, R = work[14], work[15], work[16], work[17], work[18], work[19], work[20:]
+    members = np.empty((3, wide), np.int64)
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     for p in range(M):
         mu[p] = 0.0
@@ -131,31 +141,31 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
     if guessed and soft:
         keep_capped(n, warm, traits, bounds, mu)
         pull = np.empty(n)
-        add_pull(G, n, q, mu, pull)
+        add_pull(G, n, q, mu, 0, members, soft, pull)
     if lazy:
+        solve_lower(L, n, pull, v)
         for i in range(n):
-            v[i] = -(pull[i] + dot(L[i], v, i)) * L[i, i]
-    k = 0
-    tag, age = settings[4], 0.0
+            v[i] = -v[i]
+    k, age, tag, candidates = 0, 0.0, settings[4], members[2]
     if guessed:
         names = warm[HEADER + n + M : HEADER + n + M + int(warm[WORKING])]
         if tag != NO_TAG and warm[TAG] == tag and warm[AGE] < OLD and all_present(names, bounds, mu):
-            k = len(names)
+            k, age = len(names), warm[AGE]
             unpack(warm[HEADER + n + 2 * M :], k, R)
-            age = warm[AGE]
             for i in range(k):
                 p = int(abs(names[i])) - 1
-                admit(i, p, names[i] > 0.0, p, traits, -dot(rows[p], pull, n), bounds, slots, members)
+                admit(i, p, names[i] > 0.0, p, traits, free_value(lazy, rows[p], v, pull, n), bounds, slots, members)
                 ignore(p, bounds)
         else:
-            for code in names:
-                if 1.0 <= abs(code) <= M and k < capacity:
-                    p, above = int(abs(code)) - 1, code > 0.0
-                    k = take(
-                        lazy, p, above, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch[1]
-                    )
+            count = choose_guess(names, capacity, bounds, mu, candidates)
+            k = take(
+                lazy, candidates, count, 0, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch[1]
+            )
         k = settle(k, bounds, mu, slots, members, R, scratch)
-    evaluate(lazy, n, q, rows, L, G, mu, seen, y, slope)
+    evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y)
+    if not lazy:
+        for i in range(M):
+            seen[i] = mu[i]
     current, iterations, sweeps, rounds, status, worst = True, 0, 0, 0, NUMERICAL_TROUBLE, np.inf
     while True:
         p = most_violated(y, traits[WEIGHT], bounds, excess)
@@ -164,24 +174,35 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
                 status = ITERATION_LIMIT
                 break
             current = False
-            before = iterations
-            if sweeps < SWEEPS:
+            share = SWEPT * excess[p]
+            several = sweeps < SWEEPS and count_above(excess, share, M) > 1
+            if several:
                 sweeps += 1
-                share = SWEPT * excess[p]
-                count = 0
-                for j in range(M):
-                    count += excess[j] > share
-                if count > 1:
-                    for j in range(M):
-                        if excess[j] > share and k < capacity:
-                            size = k
-                            above = y[j] > bounds[UPPER, j]
-                            k = take(
-                                lazy, j, above, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch[1]
-                            )
-                            iterations += k - size
-                    k = settle(k, bounds, mu, slots, members, R, scratch)
-            if iterations == before:
+                before = k
+                count = choose_violated(share, capacity - k, y, excess, bounds, candidates)
+                k = take(
+                    lazy,
+                    candidates,
+                    count,
+                    k,
+                    n,
+                    pull,
+                    v,
+                    rows,
+                    L,
+                    G,
+                    traits,
+                    bounds,
+                    mu,
+                    slots,
+                    members,
+                    R,
+                    scratch[1],
+                )
+                several = k > before
+                iterations += k - before
+                k = settle(k, bounds, mu, slots, members, R, scratch)
+            if not several:
                 outcome, k, changes = step_to(
                     lazy, p, y[p], k, capacity, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch
                 )
@@ -194,14 +215,17 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
                     ignore(p, bounds)
                 if soft:
                     sweeps = SWEEPS  # caps may have changed what ``pull`` says
-            if lazy:
-                evaluate(lazy, n, q, rows, L, G, mu, seen, y, slope)
+            if not lazy:
+                follow(rows, mu, seen, candidates, gradient, y)
+            elif soft:
+                evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y)
             else:
-                follow(rows, mu, seen, changed, gradient, y)
+                follow_lazily(n, v, rows, L, G, mu, k, members, gradient, y)
             continue
-        if not current and not lazy:
-            multiply(G, 0, len(G), y, n, y[n:])
-            add_pull(G, n, q, mu, slope)
+        if not current:
+            if not lazy:
+                multiply(G, 0, m, y, n, y[n:])
+            add_pull(G, n, q, mu, k, members, soft, slope)
         best = np.inf
         for attempt in range(REFINEMENTS + 1):
             stationarity, feasibility = residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active)
@@ -209,9 +233,8 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
             if worst <= FINE or attempt == REFINEMENTS or not worst < 0.5 * best:
                 break
             best = worst
-            refine(
-                lazy, k, n, q, rows, L, G, slots, members, R, mu, y, slope, gradient, active, scratch[0], scratch[2]
-            )
+            refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, scratch[0], scratch[2])
+            add_pull(G, n, q, mu, k, members, soft, slope)
         status = SOLVED if worst <= tolerance else NUMERICAL_TROUBLE
         rounds += 1
         if rounds == ROUNDS or most_violated(y, traits[WEIGHT], bounds, excess) < 0:
@@ -242,28 +265,6 @@ def solve_gram(q, lower, upper, warm, system, settings, out):
         return MISUSE
     P, G = system[M + 4 : M + 4 + n], system[M + 4 + n :]
     return optimise(False, P, q, G, n, system[:M], P, system[M : M + 4], lower, upper, warm, settings, out)
-
-
-@compiled
-def factorise(P, L):
-    """``P = L L'``; the diagonal of L holds reciprocals. False if P is not symmetric, defined and positive definite."""
-    n = len(P)
-    largest, skew = 0.0, 0.0
-    for i in range(n):
-        for j in range(i):
-            skew = max(skew, abs(P[i, j] - P[j, i]))
-        largest = max(largest, P[i, i])
-    if not skew <= 1e-10 * largest:
-        return False
-    for i in range(n):
-        row = L[i]
-        for j in range(i):
-            row[j] = (P[i, j] - dot(row, L[j], j)) * L[j, j]
-        pivot = P[i, i] - dot(row, row, i)
-        if not (pivot > 0.0 and pivot < np.inf):
-            return False
-        row[i] = 1.0 / math.sqrt(pivot)
-    return True
 
 
 @compiled

@@ -23,7 +23,8 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, se
     candidates = []
     for attempt in (_given, _from_nothing, _equilibrated):
         record = attempt(terms, q, lower, upper, record, settings)
-        solution = QPSolution(terms, q, lower, upper, record, 0.0, 0.0)
+        x = record[layout.HEADER : layout.HEADER + len(q)]
+        solution = QPSolution(x, terms, q, lower, upper, record, 0.0, 0.0)
         if record[layout.STATUS] == layout.INFEASIBLE:
             if proves_infeasibility(solution.multipliers, terms.G, lower, upper):
                 return record

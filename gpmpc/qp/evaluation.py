@@ -6,55 +6,62 @@ the upper left corner of K, and may later move y by the rows of K whose multipli
 
 from gpmpc.qp.compiled import compiled
 from gpmpc.qp.factor import backward_solve, dot, forward_solve, multiply, subtract_rows
+from gpmpc.qp.hessian import solve_lower, solve_transposed
 from gpmpc.qp.working_set import BOUND, LEAST, MOST, NAME, PLACE, SOFTNESS
 
 
 @compiled
-def solve_transposed(L, n, a):
-    """``a <- L^-T a``; the diagonal of L holds reciprocals."""
-    for i in range(n - 1, -1, -1):
-        row = L[i]
-        value = a[i] * row[i]
-        a[i] = value
-        for j in range(i):
-            a[j] -= value * row[j]
-
-
-@compiled
-def add_pull(G, n, q, mu, slope):
-    """``slope = q + C' mu``."""
+def add_pull(G, n, q, mu, k, members, soft, slope):
+    """``slope = q + C' mu``; only where rows are soft can others than the working ones have a multiplier."""
     for i in range(n):
         slope[i] = q[i] + mu[i]
-    for p in range(n, len(mu)):
-        if mu[p] != 0.0:
-            weight, row = mu[p], G[p - n]
-            for i in range(n):
-                slope[i] += weight * row[i]
+    if soft:
+        for p in range(n, len(mu)):
+            if mu[p] != 0.0:
+                add_row(mu[p], G[p - n], n, slope)
+    else:
+        for i in range(k):
+            p = abs(members[NAME, i]) - 1
+            if p >= n:
+                add_row(mu[p], G[p - n], n, slope)
 
 
 @compiled
-def evaluate(lazy, n, q, rows, L, G, mu, seen, y, slope):
-    """``y = C x`` for the multipliers, from scratch; ``seen`` (M) then holds the multipliers that y knows.
+def add_row(weight, row, n, target):
+    """``target += weight row``."""
+    for i in range(n):
+        target[i] += weight * row[i]
 
-    Leaves ``slope = q + C' mu``.
-    """
-    for p in range(len(mu)):
-        seen[p] = mu[p]
-    add_pull(G, n, q, mu, slope)
+
+@compiled
+def evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y):
+    """``y = C x`` for the multipliers; leaves ``slope = q + C' mu``."""
+    add_pull(G, n, q, mu, k, members, soft, slope)
     if lazy:
-        for i in range(n):
-            y[i] = -(slope[i] + dot(L[i], y, i)) * L[i, i]
+        solve_lower(L, n, slope, y)
         solve_transposed(L, n, y)
     else:
         multiply(rows, 0, n, slope, n, y)
-        for i in range(n):
-            y[i] = -y[i]
+    for i in range(n):
+        y[i] = -y[i]
+    multiply(G, 0, len(G), y, n, y[n:])
+
+
+@compiled
+def follow_lazily(n, v, rows, L, G, mu, k, members, weights, y):
+    """Lazy mode without soft rows: ``y = C x`` from L'x = v - sum mu_i w_i."""
+    for i in range(n):
+        y[i] = v[i]
+    for i in range(k):
+        weights[i] = mu[abs(members[NAME, i]) - 1]
+    subtract_rows(y, rows, members[PLACE], weights, k, n)
+    solve_transposed(L, n, y)
     multiply(G, 0, len(G), y, n, y[n:])
 
 
 @compiled
 def follow(rows, mu, seen, changed, amounts, y):
-    """Gram mode: moves y by the rows of K whose multipliers are not those that y knows."""
+    """Gram mode: moves y by the rows of K whose multipliers are not those, ``seen``, that y knows."""
     count = 0
     for p in range(len(mu)):
         if mu[p] != seen[p]:
@@ -84,12 +91,11 @@ def residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active
 
 
 @compiled
-def refine(lazy, k, n, q, rows, L, G, slots, members, R, mu, y, slope, gradient, active, correction, trial):
+def refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, correction, trial):
     """One Newton step on the working set for the residuals ``gradient`` and ``active``; multipliers stay in range."""
     size = n if lazy else len(y)
     if lazy:
-        for i in range(n):
-            correction[i] = (gradient[i] - dot(L[i], correction, i)) * L[i, i]
+        solve_lower(L, n, gradient, correction)
     else:
         multiply(rows, 0, size, gradient, n, correction)
     for i in range(k):
@@ -108,4 +114,3 @@ def refine(lazy, k, n, q, rows, L, G, slots, members, R, mu, y, slope, gradient,
         p = abs(members[NAME, i]) - 1
         mu[p] = min(max(mu[p] + trial[i], slots[LEAST, i]), slots[MOST, i])
     multiply(G, 0, len(G), y, n, y[n:])
-    add_pull(G, n, q, mu, slope)

@@ -30,6 +30,7 @@ class QPSolution(NamedTuple):
     """The minimiser with its multipliers, status and residuals. Holds references to the problem's arrays, not copies.
 
     Attributes:
+        x: (n,) the minimiser; the best iterate if the status is not ``SOLVED``. A view of the record.
         terms: P, G and softness of the problem.
         q: (n,).
         lower: (M,) bounds of the stacked constraints ``[x; Gx]``.
@@ -39,6 +40,7 @@ class QPSolution(NamedTuple):
         solve_seconds: Time spent on solving it [s].
     """
 
+    x: Array
     terms: Terms
     q: Array
     lower: Array
@@ -46,12 +48,6 @@ class QPSolution(NamedTuple):
     record: Array
     build_seconds: float
     solve_seconds: float
-
-    @property
-    def x(self) -> Array:
-        """(n,) the minimiser; the best iterate if the status is not ``SOLVED``."""
-        start = layout.HEADER
-        return self.record[start : start + len(self.q)]
 
     @property
     def multipliers(self) -> Array:

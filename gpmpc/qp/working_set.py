@@ -19,6 +19,7 @@ import numpy as np
 
 from gpmpc.qp.compiled import compiled
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, remove_row
+from gpmpc.qp.hessian import make_row, make_rows
 
 LOWER, UPPER, SLACK, LOW_WATCH, HIGH_WATCH = 0, 1, 2, 3, 4  # rows of ``bounds``
 BOUND, FREE_VALUE, LEAST, MOST = 0, 1, 2, 3  # rows of ``slots``
@@ -46,21 +47,6 @@ def watch(p, mu, bounds):
 def ignore(p, bounds):
     """Takes constraint p out of the watch of ``most_violated``."""
     bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = -np.inf, np.inf
-
-
-@compiled
-def make_row(p, n, L, G, row):
-    """``row = L^-1 c_p`` for the stacked constraint p; the diagonal of L holds reciprocals."""
-    if p < n:
-        for i in range(p):
-            row[i] = 0.0
-        row[p] = L[p, p]
-        for i in range(p + 1, n):
-            row[i] = -dot(L[i, p:], row[p:], i - p) * L[i, i]
-    else:
-        c = G[p - n]
-        for i in range(n):
-            row[i] = (c[i] - dot(L[i], row, i)) * L[i, i]
 
 
 @compiled
@@ -105,30 +91,60 @@ def evict(k, slot, slots, members, R, scratch):
 
 
 @compiled
-def free_value(lazy, p, row, v, q, n):
+def free_value(lazy, row, v, q, n):
     """c_p'x_u, the constraint's value at the unconstrained minimiser: from v = -L^-1 q, or from row p of K and q."""
     return dot(row, v, n) if lazy else -dot(row, q, n)
 
 
 @compiled
-def take(lazy, p, above, k, n, q, v, rows, L, G, traits, bounds, mu, slots, members, R, solved):
-    """Takes constraint p into the working set unless it is absent, taken or dependent; returns the size."""
-    if mu[p] != 0.0 or (bounds[LOW_WATCH, p] == -np.inf and bounds[HIGH_WATCH, p] == np.inf):
-        return k
-    if abs(bounds[UPPER if above else LOWER, p]) == np.inf:
-        return k
-    place = find_row(lazy, p, k, n, rows, L, G, members)
-    row = rows[place]
-    couple(lazy, row, k, rows, members, solved)
-    forward_solve(R, k, solved)
-    diagonal = (dot(row, row, n) if lazy else row[p]) + traits[SOFTNESS, p]
-    pivot = diagonal - dot(solved, solved, k)
-    if not pivot > GUESSED_PIVOT * diagonal:
-        return k
-    append_row(R, k, solved, pivot)
-    admit(k, p, above, place, traits, free_value(lazy, p, row, v, q, n), bounds, slots, members)
-    ignore(p, bounds)
-    return k + 1
+def choose_guess(names, room, bounds, mu, candidates):
+    """Writes the guessed constraints that can be taken, at most ``room``, to ``candidates``; returns how many."""
+    count = 0
+    for name in names:
+        if 1.0 <= abs(name) <= len(mu) and count < room:
+            p = int(abs(name)) - 1
+            watched = bounds[LOW_WATCH, p] > -np.inf or bounds[HIGH_WATCH, p] < np.inf
+            if watched and mu[p] == 0.0 and abs(bounds[UPPER if name > 0.0 else LOWER, p]) < np.inf:
+                candidates[count] = int(name)
+                count += 1
+                ignore(p, bounds)
+    return count
+
+
+@compiled
+def choose_violated(share, room, y, excess, bounds, candidates):
+    """The same for the constraints whose weighted excess is above ``share``."""
+    count = 0
+    for p in range(len(y)):
+        if excess[p] > share and count < room:
+            candidates[count] = p + 1 if y[p] > bounds[UPPER, p] else -(p + 1)
+            count += 1
+            ignore(p, bounds)
+    return count
+
+
+@compiled
+def take(lazy, candidates, count, k, n, q, v, rows, L, G, traits, bounds, mu, slots, members, R, solved):
+    """Takes the candidates into the working set, but for those that depend on the others; returns its size."""
+    first = k
+    if lazy:
+        make_rows(candidates, count, n, L, G, rows, members[PLACE, first:])
+    for i in range(count):
+        p = abs(candidates[i]) - 1
+        place = members[PLACE, first + i] if lazy else p
+        row = rows[place]
+        couple(lazy, row, k, rows, members, solved)
+        forward_solve(R, k, solved)
+        diagonal = (dot(row, row, n) if lazy else row[p]) + traits[SOFTNESS, p]
+        pivot = diagonal - dot(solved, solved, k)
+        if pivot > GUESSED_PIVOT * diagonal:
+            members[PLACE, first + i] = members[PLACE, k]
+            admit(k, p, candidates[i] > 0, place, traits, free_value(lazy, row, v, q, n), bounds, slots, members)
+            append_row(R, k, solved, pivot)
+            k += 1
+        else:
+            watch(p, mu, bounds)
+    return k
 
 
 @compiled

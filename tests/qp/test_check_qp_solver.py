@@ -68,7 +68,7 @@ def reuses_its_memory(self, problem, warm_start):
         self.shared = np.zeros(len(solution.record))
     record = self.shared[: len(solution.record)]
     record[:] = solution.record
-    return QPSolution(*solution[:4], record, 0.0, 0.0)
+    return solution._replace(x=record[layout.HEADER : layout.HEADER + len(problem.q)], record=record)
 
 
 @pytest.mark.parametrize(
