@@ -70,7 +70,7 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
     solved, r = scratch[1], scratch[2]
     while True:
         admit(k, p, above, place, traits, free, bounds, slots, members)
-        couple(lazy, row, k, rows, members, solved)
+        couple(lazy, row, k, n, rows, members, solved)
         forward_solve(R, k, solved)
         for i in range(k):
             r[i] = solved[i]

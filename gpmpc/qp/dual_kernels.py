@@ -224,7 +224,7 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
             continue
         if not current:
             if not lazy:
-                multiply(G, 0, m, y, n, y[n:])
+                multiply(G, m, y, n, y[n:])
             add_pull(G, n, q, mu, k, members, soft, slope)
         best = np.inf
         for attempt in range(REFINEMENTS + 1):

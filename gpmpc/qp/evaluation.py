@@ -5,9 +5,9 @@ the upper left corner of K, and may later move y by the rows of K whose multipli
 """
 
 from gpmpc.qp.compiled import compiled
-from gpmpc.qp.factor import backward_solve, dot, forward_solve, multiply, subtract_rows
+from gpmpc.qp.factor import backward_solve, forward_solve, multiply, subtract_rows
 from gpmpc.qp.hessian import solve_lower, solve_transposed
-from gpmpc.qp.working_set import BOUND, LEAST, MOST, NAME, PLACE, SOFTNESS
+from gpmpc.qp.working_set import BOUND, LEAST, MOST, NAME, PLACE, SOFTNESS, couple
 
 
 @compiled
@@ -41,10 +41,10 @@ def evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y):
         solve_lower(L, n, slope, y)
         solve_transposed(L, n, y)
     else:
-        multiply(rows, 0, n, slope, n, y)
+        multiply(rows, n, slope, n, y)
     for i in range(n):
         y[i] = -y[i]
-    multiply(G, 0, len(G), y, n, y[n:])
+    multiply(G, len(G), y, n, y[n:])
 
 
 @compiled
@@ -56,7 +56,7 @@ def follow_lazily(n, v, rows, L, G, mu, k, members, weights, y):
         weights[i] = mu[abs(members[NAME, i]) - 1]
     subtract_rows(y, rows, members[PLACE], weights, k, n)
     solve_transposed(L, n, y)
-    multiply(G, 0, len(G), y, n, y[n:])
+    multiply(G, len(G), y, n, y[n:])
 
 
 @compiled
@@ -77,7 +77,7 @@ def residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active
 
     Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where y = C x and slope = q + C' mu.
     """
-    multiply(P, 0, n, y, n, gradient)
+    multiply(P, n, y, n, gradient)
     size, stationarity, infeasibility = 1.0, 0.0, 0.0
     for i in range(n):
         size = max(size, max(abs(gradient[i]), abs(q[i])))
@@ -97,10 +97,10 @@ def refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, c
     if lazy:
         solve_lower(L, n, gradient, correction)
     else:
-        multiply(rows, 0, size, gradient, n, correction)
+        multiply(rows, size, gradient, n, correction)
+    couple(lazy, correction, k, n, rows, members, trial)
     for i in range(k):
-        name, place = abs(members[NAME, i]) - 1, members[PLACE, i]
-        trial[i] = active[i] - (dot(rows[place], correction, n) if lazy else correction[name])
+        trial[i] = active[i] - trial[i]
     forward_solve(R, k, trial)
     backward_solve(R, k, trial)
     for j in range(size):
@@ -113,4 +113,4 @@ def refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, c
     for i in range(k):
         p = abs(members[NAME, i]) - 1
         mu[p] = min(max(mu[p] + trial[i], slots[LEAST, i]), slots[MOST, i])
-    multiply(G, 0, len(G), y, n, y[n:])
+    multiply(G, len(G), y, n, y[n:])

@@ -47,23 +47,41 @@ def subtract_rows(state, rows, places, factors, count, size):
 
 
 @compiled
-def multiply(A, first, last, vector, size, product):
-    """``product[i] = A[i] . vector`` for the rows ``first`` to ``last``, four at a time."""
-    i = first
-    while i + 4 <= last:
-        r0, r1, r2, r3 = A[i], A[i + 1], A[i + 2], A[i + 3]
-        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
-        for j in range(size):
-            value = vector[j]
-            s0 += r0[j] * value
-            s1 += r1[j] * value
-            s2 += r2[j] * value
-            s3 += r3[j] * value
-        product[i], product[i + 1], product[i + 2], product[i + 3] = s0, s1, s2, s3
+def multiply(A, count, vector, size, product):
+    """``product[i] = A[i] . vector`` for the first ``count`` rows, four at a time."""
+    i = 0
+    while i + 4 <= count:
+        four_dots(A[i], A[i + 1], A[i + 2], A[i + 3], vector, size, product[i:])
         i += 4
-    while i < last:
+    while i < count:
         product[i] = dot(A[i], vector, size)
         i += 1
+
+
+@compiled
+def multiply_at(A, places, count, vector, size, product):
+    """``product[i] = A[places[i]] . vector``, four at a time."""
+    i = 0
+    while i + 4 <= count:
+        r0, r1, r2, r3 = A[places[i]], A[places[i + 1]], A[places[i + 2]], A[places[i + 3]]
+        four_dots(r0, r1, r2, r3, vector, size, product[i:])
+        i += 4
+    while i < count:
+        product[i] = dot(A[places[i]], vector, size)
+        i += 1
+
+
+@compiled
+def four_dots(r0, r1, r2, r3, vector, size, product):
+    """Four inner products with one vector, which is read once and whose sums hide each other's latency."""
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    for j in range(size):
+        value = vector[j]
+        s0 += r0[j] * value
+        s1 += r1[j] * value
+        s2 += r2[j] * value
+        s3 += r3[j] * value
+    product[0], product[1], product[2], product[3] = s0, s1, s2, s3
 
 
 @compiled

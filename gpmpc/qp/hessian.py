@@ -16,12 +16,7 @@ from gpmpc.qp.factor import dot
 def factorise(P, L):
     """Fills L; False if P is not symmetric, finite and positive definite."""
     n = len(P)
-    largest, skew = 0.0, 0.0
-    for i in range(n):
-        for j in range(i):
-            skew = max(skew, abs(P[i, j] - P[j, i]))
-        largest = max(largest, P[i, i])
-    if not skew <= 1e-10 * largest:
+    if not is_symmetric(P):
         return False
     for top in range(0, n, 4):
         end = min(top + 4, n)
@@ -47,10 +42,26 @@ def factorise(P, L):
 
 
 @compiled
+def is_symmetric(P):
+    """Whether P equals its transpose but for rounding; read in blocks that stay in the cache."""
+    n = len(P)
+    largest, skew = 0.0, 0.0
+    for i in range(n):
+        largest = max(largest, abs(P[i, i]))
+    for left in range(0, n, 8):
+        right = min(left + 8, n)
+        for i in range(left, n):
+            for j in range(left, min(right, i)):
+                skew = max(skew, abs(P[i, j] - P[j, i]))
+    return skew <= 1e-10 * largest
+
+
+@compiled
 def eliminate(L, first, last, a, b, c, d):
-    """Solves L w = . in place for four right-hand sides, entries ``first`` to ``last``; entries before are solved."""
-    for j in range(first, last):
-        row = L[j]
+    """Solves ``L w = .`` in place for four right-hand sides whose entries before ``first`` are zero, up to ``last``."""
+    a, b, c, d = a[first:], b[first:], c[first:], d[first:]
+    for j in range(last - first):
+        row = L[first + j, first:]
         sa, sb, sc, sd = 0.0, 0.0, 0.0, 0.0
         for i in range(j):
             value = row[i]
@@ -95,7 +106,7 @@ def make_rows(names, count, n, L, G, rows, places):
         first = min(first, write_constraint(abs(names[i + 1]) - 1, n, G, b))
         first = min(first, write_constraint(abs(names[i + 2]) - 1, n, G, c))
         first = min(first, write_constraint(abs(names[i + 3]) - 1, n, G, d))
-        eliminate(L[first:, first:], 0, n - first, a[first:], b[first:], c[first:], d[first:])
+        eliminate(L, first, n, a, b, c, d)
         i += 4
     while i < count:
         make_row(abs(names[i]) - 1, n, L, G, rows[places[i]])

@@ -18,7 +18,7 @@ is K_p, known beforehand; in lazy mode, P = L L', it is w_p = L^-1 c_p, made whe
 import numpy as np
 
 from gpmpc.qp.compiled import compiled
-from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, remove_row
+from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, multiply_at, remove_row
 from gpmpc.qp.hessian import make_row, make_rows
 
 LOWER, UPPER, SLACK, LOW_WATCH, HIGH_WATCH = 0, 1, 2, 3, 4  # rows of ``bounds``
@@ -60,11 +60,13 @@ def find_row(lazy, p, k, n, rows, L, G, members):
 
 
 @compiled
-def couple(lazy, row, k, rows, members, solved):
-    """``solved = K_Wp`` for the constraint p whose row is given."""
-    size = rows.shape[1]
-    for i in range(k):
-        solved[i] = dot(rows[members[PLACE, i]], row, size) if lazy else row[abs(members[NAME, i]) - 1]
+def couple(lazy, row, k, n, rows, members, product):
+    """The products of a row with the rows of the working set, K_Wp if it is row p."""
+    if lazy:
+        multiply_at(rows, members[PLACE], k, row, n, product)
+    else:
+        for i in range(k):
+            product[i] = row[abs(members[NAME, i]) - 1]
 
 
 @compiled
@@ -133,7 +135,7 @@ def take(lazy, candidates, count, k, n, q, v, rows, L, G, traits, bounds, mu, sl
         p = abs(candidates[i]) - 1
         place = members[PLACE, first + i] if lazy else p
         row = rows[place]
-        couple(lazy, row, k, rows, members, solved)
+        couple(lazy, row, k, n, rows, members, solved)
         forward_solve(R, k, solved)
         diagonal = (dot(row, row, n) if lazy else row[p]) + traits[SOFTNESS, p]
         pivot = diagonal - dot(solved, solved, k)
