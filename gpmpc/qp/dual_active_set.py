@@ -13,8 +13,7 @@ in lazy mode, then on the equilibrated problem; what still fails is reported as 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field
 from itertools import count
 from time import perf_counter
 
@@ -57,6 +56,7 @@ class DualActiveSet:
     tolerance: float = 1e-9
     iteration_limit: int | None = None
     time_limit: float | None = None
+    _plans: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self):
         for name in ("tolerance", "iteration_limit", "time_limit"):
@@ -108,9 +108,9 @@ class DualActiveSet:
         began = perf_counter()
         try:
             n, m = len(P), len(G)
-            softness = _hard(n + m) if soft is None else stack_softness(soft, n, m)
-            settings = self._settings(n, n + m, soft is not None)
-            record = np.empty(layout.record_size(n, n + m))
+            plan = self._plans.get((n, m)) if soft is None else None
+            softness, settings, size, where = plan or self._plan(n, m, soft)
+            record = np.empty(size)
             warm = layout.NO_RECORD if warm_start is None else warm_start.record
             status = solve_lazy(P, q, G, lower, upper, warm, softness, settings, record)
         except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
@@ -119,19 +119,17 @@ class DualActiveSet:
             problem = QuadraticProgram.from_stacked(P, q, G, lower, upper)  # raises if it is misuse indeed
             P, q, G, lower, upper = problem.P, problem.q, problem.G, problem.lower, problem.upper
             n, m = len(P), len(G)
-            softness = stack_softness(soft, n, m)
-            settings = self._settings(n, n + m, soft is not None)
-            record, warm = np.empty(layout.record_size(n, n + m)), _as_record(warm_start, n, n + m)
+            softness, settings, size, where = self._plan(n, m, soft)
+            record, warm = np.empty(size), _as_record(warm_start, n, n + m)
             status = solve_lazy(P, q, G, lower, upper, warm, softness, settings, record)
-        terms = Terms(P, G, softness)
+        terms = new(Terms, (P, G, softness))
         if status != layout.SOLVED:
 
             def again(guess: Array, record: Array) -> int:
                 return solve_lazy(P, q, G, lower, upper, guess, softness, settings, record)
 
             record = self._settle(again, terms, q, lower, upper, record, began)
-        x = record[layout.HEADER : layout.HEADER + n]
-        return new(QPSolution, (x, terms, q, lower, upper, record, 0.0, perf_counter() - began))
+        return new(QPSolution, (record[where], terms, q, lower, upper, record, 0.0, perf_counter() - began))
 
     def prepare(self, P: ArrayLike, G: ArrayLike | None = None, soft: SoftRows | None = None) -> "Prepared":
         """Does once what depends on P, G and soft weights only.
@@ -148,6 +146,14 @@ class DualActiveSet:
         n, m = len(problem.P), len(problem.G)
         terms = Terms(problem.P, problem.G, stack_softness(soft, n, m))
         return Prepared(self, terms, self._settings(n, n + m, soft is not None))
+
+    def _plan(self, n: int, m: int, soft: SoftRows | None) -> tuple[Array, Array, int, slice]:
+        """What lazy mode needs to know about a shape: softness, settings, the record's length, and where x is in it."""
+        softness, settings = stack_softness(soft, n, m), self._settings(n, n + m, soft is not None)
+        plan = softness, settings, layout.record_size(n, n + m), slice(layout.HEADER, layout.HEADER + n)
+        if soft is None:
+            self._plans[n, m] = plan
+        return plan
 
     def _limit(self, M: int) -> int:
         return self.iteration_limit or 100 + ITERATIONS_PER_CONSTRAINT * M
@@ -239,15 +245,8 @@ class Prepared:
         return QPSolution(record[self._x], self.terms, q, lower, upper, record, 0.0, perf_counter() - began)
 
 
-@lru_cache(maxsize=256)
 def _settings(limit: int, tolerance: float, soft: bool, n: int) -> Array:
     return np.array([float(limit), tolerance, float(soft), float(n), layout.NO_TAG])
-
-
-@lru_cache(maxsize=256)
-def _hard(M: int) -> Array:
-    """The softness of M hard constraints; shared, never written."""
-    return np.vstack([np.zeros(M), np.full(M, np.inf)])
 
 
 def _as_record(warm_start: WarmStart, n: int, M: int) -> Array:

@@ -17,7 +17,7 @@ from gpmpc.qp import record
 from gpmpc.qp.compiled import compiled
 from gpmpc.qp.dual_iteration import CONTRADICTION, most_violated, step_to
 from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, refine, residuals
-from gpmpc.qp.factor import dot, multiply, pack, unpack
+from gpmpc.qp.factor import dot, multiply, multiply_at, pack, unpack
 from gpmpc.qp.hessian import factorise, solve_lower
 from gpmpc.qp.working_set import (
     CAP,
@@ -34,7 +34,6 @@ from gpmpc.qp.working_set import (
     admit,
     choose_guess,
     choose_violated,
-    free_value,
     ignore,
     settle,
     take,
@@ -53,7 +52,7 @@ ABSENT = 1e20  # a bound of this size or more is none
 TOLERATED = 1e-10  # a violation below this share of the size of a constraint is none
 NOISE = 1e-7  # share of the size of a constraint below which a contradiction is taken for rounding
 SWEEPS = 4  # times that all badly violated constraints are taken at once
-SWEPT = 0.3  # those violated by more than this share of the worst
+SWEPT = 0.5  # those violated by more than this share of the worst
 ROUNDS = 10  # returns from the residuals to the iteration
 REFINEMENTS = 3
 FINE = 1e-11  # scaled residual at which refinement stops
@@ -153,8 +152,11 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
             k, age = len(names), warm[AGE]
             unpack(warm[HEADER + n + 2 * M :], k, R)
             for i in range(k):
-                p = int(abs(names[i])) - 1
-                admit(i, p, names[i] > 0.0, p, traits, free_value(lazy, rows[p], v, pull, n), bounds, slots, members)
+                candidates[i] = int(abs(names[i])) - 1
+            multiply_at(rows, candidates, k, pull, n, gradient)
+            for i in range(k):
+                p = candidates[i]
+                admit(i, p, names[i] > 0.0, p, traits, -gradient[i], bounds, slots, members)
                 ignore(p, bounds)
         else:
             count = choose_guess(names, capacity, bounds, mu, candidates)
@@ -237,7 +239,8 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
             add_pull(G, n, q, mu, k, members, soft, slope)
         status = SOLVED if worst <= tolerance else NUMERICAL_TROUBLE
         rounds += 1
-        if rounds == ROUNDS or most_violated(y, traits[WEIGHT], bounds, excess) < 0:
+        unchanged = current and attempt == 0
+        if unchanged or rounds == ROUNDS or most_violated(y, traits[WEIGHT], bounds, excess) < 0:
             break
     out[STATUS], out[ITERATIONS], out[WORKING] = status, iterations, k
     out[VARIABLES], out[CONSTRAINTS], out[TAG], out[AGE] = n, M, NO_TAG, age + iterations
