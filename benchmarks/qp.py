@@ -4,10 +4,11 @@
     python benchmarks/qp.py --quick              # short sequences, horizons 1, 10, 20: about a minute
     python benchmarks/qp.py --horizons 50 --modes changing --slow-solvers 0
 
-Every solver meets the same sequence of QPs (``quadrotor_sequences``) in one process on one thread, warm-started from its own
-last solution. The solvers take turns, sequence by sequence, ``--passes`` times, and the fastest of a QP's passes counts:
-what another process on the machine does to one pass is not the solver's time. *Hot*: the problem has just been written
-to memory that stays the same, as a controller would. *Flushed*: all caches are overwritten before every call.
+Every solver meets the same sequence of QPs (``quadrotor_sequences``) in one process on one thread, warm-started from
+its own last solution. The solvers take turns, sequence by sequence, ``--passes`` times, and the fastest of a QP's
+passes counts: what another process on the machine does to one pass is not the solver's time. *Hot*: the problem has
+just been written to memory that stays the same, as a controller would. *Flushed*: all caches are overwritten before
+every call.
 
 Times include everything from contiguous arrays to x, so the Python layer of either side. DAQP has two paths, each with
 contiguous arrays: ``Model.update`` + ``Model.solve`` (warm), and ``daqp.solve`` from nothing; ratios are to the faster

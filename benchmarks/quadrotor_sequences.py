@@ -1,10 +1,11 @@
 """The quadratic programs that a quadrotor's model predictive controller meets, one after the other in closed loop.
 
-A solver that is warm-started is judged only by a sequence in which the next problem resembles the last one as it does in
-use. Here the translational subsystem of the quadrotor (thrust and two tilts in, positions and velocities out) follows a
-fast Lissajous curve under process noise. Its MPC is condensed to the inputs of the horizon: input bounds become the box
-of the QP (n = 3H), bounds on the six states of every stage its rows (6H). The bounds narrow and widen (a corridor that the
-vehicle passes), so that constraints come and go; they are never narrower than what a known feasible plan needs.
+A solver that is warm-started is judged only by a sequence in which the next problem resembles the last one as it does
+in use. Here the translational subsystem of the quadrotor (thrust and two tilts in, positions and velocities out)
+follows a fast Lissajous curve under process noise. Its MPC is condensed to the inputs of the horizon: input bounds
+become the box of the QP (n = 3H), bounds on the six states of every stage its rows (6H). The bounds narrow and widen
+(a corridor that the vehicle passes), so that constraints come and go; they are never narrower than what a known
+feasible plan needs.
 
 ``constant``: the model is linearised once, at hover; P and G stay. ``changing``: it is linearised at every step around
 the thrust and tilt of the reference motion, so P and G are new in each problem.

@@ -1,11 +1,11 @@
 """The same QP through CVXPY: any solver it knows, as a reference and for comparison.
 
 CVXPY turns a problem into a solver's standard form, which takes milliseconds; with Parameters in the places that the
-rules of disciplined parametrised programming allow (Agrawal et al., 2019) it does so once per shape. P enters through its
-Cholesky factor, ``|L'x|^2``, because a quadratic form with a parameter matrix is not among those places.
+rules of disciplined parametrised programming allow (Agrawal et al., 2019) it does so once per shape. P enters through
+its Cholesky factor, ``|L'x|^2``, because a quadratic form with a parameter matrix is not among those places.
 
-The compiled problem is kept per shape and per pattern of absent bounds and equalities, one set per thread. The duals come
-back signed as this package signs them, and the answer is ``SOLVED`` only if its own residuals say so.
+The compiled problem is kept per shape and per pattern of absent bounds and equalities, one set per thread. The duals
+come back signed as this package signs them, and the answer is ``SOLVED`` only if its own residuals say so.
 """
 
 import threading

@@ -1,15 +1,16 @@
 """The package's QP solver: which bounds of a strictly convex QP hold with equality, given a good guess?
 
 In model predictive control one QP follows another and little changes in between, so the working set of the last
-solution is nearly that of the next. A dual method can start from any guess: it needs no feasible point, only multipliers
-of the right sign. ``DualActiveSet`` is the method of Goldfarb and Idnani (1983), warm-started
+solution is nearly that of the next. A dual method can start from any guess: it needs no feasible point, only
+multipliers of the right sign. ``DualActiveSet`` is the method of Goldfarb and Idnani (1983), warm-started
 (``gpmpc.qp.dual_iteration``), in two modes that the caller chooses by what stays the same:
 
 * P and G stay: ``prepared = solver.prepare(P, G)`` once, then ``prepared.solve(q, lower, upper, last_solution)``.
 * P and G change: ``solver.solve(problem, last_solution)``, or ``solver.solve_stacked(...)`` without building a problem.
 
-An answer that its own residuals do not bear out, and an infeasibility without Farkas' proof, are tried again from nothing
-in lazy mode, then on the equilibrated problem; what still fails is reported as ``Status.NUMERICAL_TROUBLE``.
+An answer that its own residuals do not bear out, and an infeasibility without Farkas' proof, are tried again from
+nothing in lazy mode, on the equilibrated problem, and by the primal method; what still fails is reported as
+``Status.NUMERICAL_TROUBLE``.
 """
 
 from collections.abc import Callable

@@ -1,11 +1,11 @@
 """The dual active-set iteration: which constraints hold with equality at the minimum of a strictly convex QP?
 
 For a working set W the minimiser over ``c_p'x = b_p, p in W`` is x = x_u - P^-1 C_W' mu with K_WW mu = y_W - b_W, where
-x_u is the unconstrained minimiser, y = C x_u and K = C P^-1 C'. The method of Goldfarb and Idnani (Math. Programming 27,
-1983, algorithm 1) keeps every multiplier in its range and moves to the most violated constraint p until none is violated:
-with r = K_WW^-1 K_Wp and d = K_pp - K_pW r, a step t changes mu_p by t, mu_W by -t r and y_p by -t d. It ends at
-t = violation / d (p joins W), or where a multiplier reaches the end of its range (that constraint leaves W), or never
-(d = 0: the constraints contradict each other, and (r, -1) is Farkas' proof).
+x_u is the unconstrained minimiser, y = C x_u and K = C P^-1 C'. The method of Goldfarb and Idnani (Math. Programming
+27, 1983, algorithm 1) keeps every multiplier in its range and moves to the most violated constraint p until none is
+violated: with r = K_WW^-1 K_Wp and d = K_pp - K_pW r, a step t changes mu_p by t, mu_W by -t r and y_p by -t d. It
+ends at t = violation / d (p joins W), or where a multiplier reaches the end of its range (that constraint leaves W),
+or never (d = 0: the constraints contradict each other, and (r, -1) is Farkas' proof).
 """
 
 import numpy as np
@@ -123,7 +123,7 @@ def distance_to_span(row, k, n, rows, members, r, rest):
 
 @compiled
 def first_block(step, sense, k, mu, slots, members, r):
-    """The longest step, up to ``step``, that keeps the working multipliers in range, and the slot that ends it (or k)."""
+    """The longest step, up to ``step``, that keeps the multipliers in range, and the slot that ends it (or k)."""
     size = 0.0
     for i in range(k):
         size = max(size, abs(r[i]))

@@ -5,8 +5,9 @@ Both solve ``min 1/2 x'Px + q'x`` subject to ``lower <= [x; Gx] <= upper`` from 
 *Lazy mode* is for P and G that change: it factors P and makes the rows that it needs.
 
 The guess is corrected in a few sweeps that take all badly violated constraints at once, then by the dual iteration, one
-at a time. Nothing is believed without its residuals: the result is computed anew from P, q and G, refined on its working
-set by Newton's method (one step is exact but for rounding), and handed back to the iteration while a bound is violated.
+at a time. Nothing is believed without its residuals: the result is computed anew from P, q and G, refined on its
+working set by Newton's method (one step is exact but for rounding), and handed back to the iteration while a bound is
+violated.
 """
 
 import math
@@ -168,7 +169,9 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
     if not lazy:
         for i in range(M):
             seen[i] = mu[i]
-    current, iterations, sweeps, rounds, status, worst = True, 0, 0, 0, NUMERICAL_TROUBLE, np.inf
+    current, iterations, rounds, status, worst = True, 0, 0, NUMERICAL_TROUBLE, np.inf
+    interrupted = guessed and warm[STATUS] == ITERATION_LIMIT
+    sweeps = SWEEPS if interrupted else 0  # the dual objective climbs with single steps only, and so the end is sure
     while True:
         p = most_violated(y, traits[WEIGHT], bounds, excess)
         if p >= 0:
@@ -230,8 +233,7 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
             add_pull(G, n, q, mu, k, members, soft, slope)
         best = np.inf
         for attempt in range(REFINEMENTS + 1):
-            stationarity, feasibility = residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active)
-            worst = max(stationarity, feasibility)
+            worst = residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active)
             if worst <= FINE or attempt == REFINEMENTS or not worst < 0.5 * best:
                 break
             best = worst

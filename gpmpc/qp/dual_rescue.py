@@ -1,8 +1,8 @@
-"""What is tried when a solve did not convince: from nothing, then on the equilibrated problem, then give up honestly.
+"""What is tried when a solve did not convince: anew, equilibrated, by the primal method; then give up honestly.
 
-A claimed infeasibility is believed only with Farkas' proof, a solution only with its residuals. Bad scaling is the usual
-cause of either failing, so the last try has a unit diagonal in P and rows of unit length: x = D x', rows divided by their
-norms E.
+A claimed infeasibility is believed only with Farkas' proof, a solution only with its residuals. Bad scaling is the
+usual cause of either failing, so one try has a unit diagonal in P and rows of unit length: x = D x', rows
+divided by their norms E.
 """
 
 import numpy as np
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from gpmpc.qp import record as layout
 from gpmpc.qp.dual_kernels import solve_lazy
 from gpmpc.qp.farkas import proves_infeasibility
-from gpmpc.qp.problem import ABSENT
+from gpmpc.qp.primal_active_set import PrimalActiveSet
+from gpmpc.qp.problem import ABSENT, QuadraticProgram
 from gpmpc.qp.solution import QPSolution, Terms
 
 Array = NDArray[np.float64]
@@ -21,7 +22,7 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, se
     """The first convincing record; the one with the smallest residuals, as ``NUMERICAL_TROUBLE``, if none convinces."""
     lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
     candidates = []
-    for attempt in (_given, _from_nothing, _equilibrated):
+    for attempt in (_given, _from_nothing, _equilibrated, _by_algorithm_1):
         record = attempt(terms, q, lower, upper, record, settings)
         x = record[layout.HEADER : layout.HEADER + len(q)]
         solution = QPSolution(x, terms, q, lower, upper, record, 0.0, 0.0)
@@ -64,3 +65,12 @@ def _equilibrated(terms, q, lower, upper, record, settings) -> Array:
     result[layout.HEADER : layout.HEADER + n] *= D
     result[layout.HEADER + n : layout.HEADER + n + len(lower)] *= scale
     return result
+
+
+def _by_algorithm_1(terms, q, lower, upper, record, settings) -> Array:
+    """The primal method, whose QR bears rows that are all but parallel; it knows hard rows only."""
+    softness, caps = terms.softness
+    if softness.any() or np.isfinite(caps).any():
+        return record
+    problem = QuadraticProgram.from_stacked(terms.P, q, terms.G, lower, upper)
+    return PrimalActiveSet(tolerance=settings[1]).solve(problem).record

@@ -1,11 +1,12 @@
 """The point that belongs to a set of multipliers, and how well the two solve the QP.
 
 x minimises the Lagrangian, P x = -(q + C'mu), and y = C x are the constraints' values. Gram mode multiplies with P^-1,
-the upper left corner of K, and may later move y by the rows of K whose multipliers changed; lazy mode, P = L L', solves.
+the upper left corner of K, and may later move y by the rows of K whose multipliers changed; lazy mode, P = L L',
+solves.
 """
 
 from gpmpc.qp.compiled import compiled
-from gpmpc.qp.factor import backward_solve, forward_solve, multiply, subtract_rows
+from gpmpc.qp.factor import backward_solve, dot, forward_solve, multiply, subtract_rows
 from gpmpc.qp.hessian import solve_lower, solve_transposed
 from gpmpc.qp.working_set import BOUND, LEAST, MOST, NAME, PLACE, SOFTNESS, couple
 
@@ -73,12 +74,12 @@ def follow(rows, mu, seen, changed, amounts, y):
 
 @compiled
 def residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active):
-    """The scaled residuals of (x, mu), x = y[:n]: stationarity and violation of the working set, from P, q and G.
+    """The largest scaled residual of (x, mu), x = y[:n]: stationarity, violation of the working set, duality gap.
 
     Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where y = C x and slope = q + C' mu.
     """
     multiply(P, n, y, n, gradient)
-    size, stationarity, infeasibility = 1.0, 0.0, 0.0
+    size, stationarity, infeasibility, gap = 1.0, 0.0, 0.0, 0.0
     for i in range(n):
         size = max(size, max(abs(gradient[i]), abs(q[i])))
         gradient[i] += slope[i]
@@ -87,7 +88,8 @@ def residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active
         p, b = abs(members[NAME, i]) - 1, slots[BOUND, i]
         active[i] = y[p] - traits[SOFTNESS, p] * mu[p] - b
         infeasibility = max(infeasibility, abs(active[i]) / max(1.0, abs(b)))
-    return stationarity / size, infeasibility
+        gap += mu[p] * active[i]
+    return max(max(stationarity / size, infeasibility), abs(gap) / max(1.0, abs(dot(q, y, n))))
 
 
 @compiled

@@ -1,9 +1,9 @@
 """The Cholesky factor of the working set's matrix, kept current while constraints enter and leave.
 
-``L L' = K_WW`` with L lower triangular. Row j of the array R holds column j of L, from its diagonal on: R[j, i] = L_ij, i >= j.
-A constraint that enters appends one row to L, found by the same forward solve that prices it; one that leaves deletes a row,
-and Givens rotations restore the triangle (Golub and Van Loan, Matrix Computations, 4th ed., section 6.5.2). The diagonal
-holds reciprocals, so that no solve divides.
+``L L' = K_WW`` with L lower triangular. Row j of the array R holds column j of L, from its diagonal on: R[j, i] =
+L_ij, i >= j. A constraint that enters appends one row to L, found by the same forward solve that prices it; one that
+leaves deletes a row, and Givens rotations restore the triangle (Golub and Van Loan, Matrix Computations, 4th ed.,
+section 6.5.2). The diagonal holds reciprocals, so that no solve divides.
 """
 
 import math

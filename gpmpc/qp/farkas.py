@@ -1,8 +1,9 @@
 """Is a claim of infeasibility true?
 
 By Farkas' lemma ``lower <= C x <= upper`` has no solution if a ray y satisfies C'y = 0 and
-sum(y+ upper) + sum(y- lower) < 0: summing the constraints with these weights gives 0 < 0. In floating point C'y is not zero;
-what is left of it is moved onto the box where a variable has bounds, and must be rounding where it has none.
+sum(y+ upper) + sum(y- lower) < 0: summing the constraints with these weights gives 0 < 0. In floating point C'y is
+not zero; what is left of it is moved onto the box where a variable has bounds, and must be rounding where it has
+none.
 """
 
 import numpy as np

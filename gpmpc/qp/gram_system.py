@@ -1,8 +1,8 @@
 """What Gram mode needs to know about P and G, laid out in one array for the kernel.
 
 K = C P^-1 C' with C = [I; G] says how each constraint's value answers to each multiplier. The kernel reads one array:
-K (M rows), then the constraints' traits (norms, selection weights, softness and caps, a row each), then P (n rows) and G
-(m rows); every row is M wide.
+K (M rows), then the constraints' traits (norms, selection weights, softness and caps, a row each), then P (n rows)
+and G (m rows); every row is M wide.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
 """Lazy mode's work with P: its Cholesky factor, and the rows w_p = L^-1 c_p of the constraints that enter.
 
-``P = L L'``; the diagonal of the array L holds reciprocals, its upper triangle is undefined. Four rows are worked on at a
-time: each entry of L that is read then serves four sums, which hide each other's latency.
+``P = L L'``; the diagonal of the array L holds reciprocals, its upper triangle is undefined. Four rows are worked on
+at a time: each entry of L that is read then serves four sums, which hide each other's latency.
 """
 
 import math

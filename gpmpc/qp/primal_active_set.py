@@ -1,20 +1,21 @@
 """Algorithm 1 of Cao, Lai and Alam (2017), section 4.3: the primal active-set method, to be read beside the paper.
 
 Which inequalities of ``min 1/2 x'Px + q'x`` subject to ``A x <= h`` hold with equality at the minimum? Starting from a
-feasible x, the method minimises over the working rows as if they were equalities, goes there as far as the others allow,
-adds the row that blocks, and drops a row whose multiplier shows that the minimum lies inside its bound:
+feasible x, the method minimises over the working rows as if they were equalities, goes there as far as the others
+allow, adds the row that blocks, and drops a row whose multiplier shows that the minimum lies inside its bound:
 
     1  d <- argmin of the QP in x + d with ``A_W d = 0``                                   (the KKT system, eqs. 45-47)
     2  if d = 0: stop if no multiplier is negative, else drop the row of the most negative one
     3  else: kappa <- min(1, min over i outside W with a_i'd > 0 of (h_i - a_i'x) / a_i'd);  x <- x + kappa d
     4        if kappa < 1: add the row that blocks
 
-The printed (45b) lost the Hessian, which ``_minimise_on_rows`` keeps. ``A_W' = [Q1 Q2] [R; 0]`` (QR with column pivoting)
-covers rank-deficient working sets: d = -Q2 (Q2'PQ2)^-1 Q2'(P x + q) moves in their null space, and rows that depend on
-others get a zero multiplier. Plain NumPy, for reproduction and teaching; ``DualActiveSet`` is the one to control with.
+The printed (45b) lost the Hessian, which ``_minimise_on_rows`` keeps. ``A_W' = [Q1 Q2] [R; 0]`` (QR with column
+pivoting) covers rank-deficient working sets: d = -Q2 (Q2'PQ2)^-1 Q2'(P x + q) moves in their null space, and rows
+that depend on others get a zero multiplier. Plain NumPy, for reproduction and teaching; ``DualActiveSet`` is the one
+to control with.
 
-Phase 1, which the paper leaves open, is a linear program: the least t with ``A x - t <= h``. If t = 0 its x is feasible;
-if not, its multipliers are Farkas' proof that no x is.
+Phase 1, which the paper leaves open, is a linear program: the least t with ``A x - t <= h``. If t = 0 its x is
+feasible; if not, its multipliers are Farkas' proof that no x is.
 """
 
 from dataclasses import dataclass
@@ -153,7 +154,7 @@ def _read_warm_start(warm_start: WarmStart, n: int, M: int) -> tuple[Array, Arra
 
 
 def _phase_1(rows: _Rows, start: Array) -> tuple[Array, Array | None]:
-    """A feasible point (``start`` if it is one), or where none is found (start, a ray that may prove that there is none)."""
+    """A feasible point (``start`` if it is one) and None, or ``start`` and a ray that may prove that there is none."""
     A, h = np.vstack([rows.A, -rows.A[rows.equality]]), np.concatenate([rows.h, -rows.h[rows.equality]])
     if (A @ start <= h).all():
         return start, None

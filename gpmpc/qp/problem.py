@@ -3,8 +3,9 @@
     minimise    1/2 x'P x + q'x
     subject to  h_lower <= G x <= h_upper,   lb <= x <= ub
 
-with P symmetric and positive definite, so that the minimiser is unique whenever the constraints can be met. The rows of G
-may depend on each other, repeat, or be zero. A bound of size 1e20 or more is none, equal bounds make an equality.
+with P symmetric and positive definite, so that the minimiser is unique whenever the constraints can be met. The rows
+of G may depend on each other, repeat, or be zero. A bound of size 1e20 or more is none, equal bounds make an
+equality.
 
 Solvers see the constraints *stacked*, box first: ``lower <= C x <= upper`` with C = [I; G], M = n + m rows.
 """
@@ -23,7 +24,11 @@ SYMMETRY = 1e-10  # largest |P - P'| accepted, as a share of the largest diagona
 
 
 def as_float_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """``value`` as a contiguous, writeable float64 array of that shape (no copy if it is one), or a ``ProblemError`` with the name."""
+    """``value`` as a contiguous, writeable float64 array of that shape; itself if it is one.
+
+    Raises:
+        ProblemError: It is not; the message begins with ``name``.
+    """
     try:
         array = np.require(value, np.float64, ["C", "A", "W"])
     except (TypeError, ValueError) as error:

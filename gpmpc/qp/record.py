@@ -1,16 +1,18 @@
 """One flat array holds the whole result of a solve.
 
-At two microseconds a solve, every array that crosses between Python and compiled code costs a tenth of the time. The dual
-active set therefore writes all it found into a single record, which the next solve reads as its warm start:
+At two microseconds a solve, every array that crosses between Python and compiled code costs a tenth of the time. The
+dual active set therefore writes all it found into a single record, which the next solve reads as its warm start:
 
-    [status, iterations, n, M, number of working constraints, tag, age | x (n) | multipliers (M) | working set (M) | factor]
+    [status, iterations, n, M, number of working constraints, tag, age | x (n) | multipliers (M) | working set (M) |
+    factor]
 
-Constraints are stacked, box first: ``C = [I; G]``, M = n + m. A multiplier is positive at an upper and negative at a lower
-bound, so that ``P x + q + C' multipliers = 0``. The working set lists signed numbers: ``+(p + 1)`` for constraint p at
-its upper bound, ``-(p + 1)`` at its lower one. Entries past the number of working constraints are undefined.
+Constraints are stacked, box first: ``C = [I; G]``, M = n + m. A multiplier is positive at an upper and negative at a
+lower bound, so that ``P x + q + C' multipliers = 0``. The working set lists signed numbers: ``+(p + 1)`` for
+constraint p at its upper bound, ``-(p + 1)`` at its lower one. Entries past the number of working constraints are
+undefined.
 
-In Gram mode the factor of the working set's matrix comes along, if the working set is no larger than ``FACTOR_ROOM``, with
-the tag of the prepared problem that it belongs to and its age: the number of changes since it was computed anew.
+In Gram mode the factor of the working set's matrix comes along, if the working set is no larger than ``FACTOR_ROOM``,
+with the tag of the prepared problem that it belongs to and its age: the number of changes since it was computed anew.
 """
 
 import numpy as np

@@ -1,9 +1,9 @@
 """Rows that may be violated at a price.
 
-A row with a *quadratic* weight rho pays 1/2 rho v^2 for a violation v (its multiplier is rho v); one with a *linear* weight w
-pays w |v|, the exact L1 penalty (Fletcher, Practical Methods of Optimization, 1987, section 14.3): it is met exactly as long as its multiplier stays below w.
-In the dual both are simple: a quadratic weight adds 1/rho to the diagonal of K, a linear one caps the multiplier.
-A row that is to pay both prices is written twice, once with each.
+A row with a *quadratic* weight rho pays 1/2 rho v^2 for a violation v (its multiplier is rho v); one with a *linear*
+weight w pays w |v|, the exact L1 penalty (Fletcher, Practical Methods of Optimization, 1987, section 14.3): it is met
+exactly as long as its multiplier stays below w. In the dual both are simple: a quadratic weight adds 1/rho to the
+diagonal of K, a linear one caps the multiplier. A row that is to pay both prices is written twice, once with each.
 """
 
 from dataclasses import dataclass

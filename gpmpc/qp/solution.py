@@ -183,5 +183,12 @@ def make_solution(
     record[layout.ITERATIONS] = iterations
     record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
     return QPSolution(
-        hard_terms(problem), problem.q, problem.lower, problem.upper, record, build_seconds, solve_seconds
+        record[layout.HEADER : layout.HEADER + n],
+        hard_terms(problem),
+        problem.q,
+        problem.lower,
+        problem.upper,
+        record,
+        build_seconds,
+        solve_seconds,
     )

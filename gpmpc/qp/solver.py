@@ -13,7 +13,7 @@ WarmStart = QPSolution | NDArray[np.number] | None
 
 
 class QPSolver(Protocol):
-    """Solves strictly convex quadratic programs. ``gpmpc.testing.check_qp_solver`` says whether an object really does."""
+    """Solves strictly convex quadratic programs; ``gpmpc.testing.check_qp_solver`` says whether an object does."""
 
     def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
         """The minimiser, or the status that says why there is none. The same answer from any warm start."""

@@ -1,18 +1,20 @@
-"""The working set: which constraints are held at a bound, with what range of multiplier, and the factor that goes with it.
+"""The working set: which constraints are held at a bound, the ranges of their multipliers, and the factor.
 
 Everything lives in a few arrays that the kernels hand around, a column per constraint or per *slot* of the working set:
 
-* ``bounds`` (5, M): the bounds, how much violation counts as none, and the band outside which ``most_violated`` reports a
-  constraint (infinitely wide for a working one).
-* ``slots`` (4, capacity + 1): the bound b that holds, the constraint's value at the unconstrained minimiser, and the range of
-  its multiplier: [0, cap] at an upper bound, [-cap, 0] at a lower one, [-cap, cap] for an equality. The cap is infinite
-  unless the row is soft with a linear weight; a constraint that leaves at its cap stays violated.
-* ``members`` (2, capacity + 2) integers: the signed number +-(p + 1) of the constraint in each slot, and where its row is.
+* ``bounds`` (5, M): the bounds, how much violation counts as none, and the band outside which ``most_violated`` reports
+  a constraint (infinitely wide for a working one).
+* ``slots`` (4, capacity + 1): the bound b that holds, the constraint's value at the unconstrained minimiser, and the
+  range of its multiplier: [0, cap] at an upper bound, [-cap, 0] at a lower one, [-cap, cap] for an equality. The cap is
+  infinite unless the row is soft with a linear weight; a constraint that leaves at its cap stays violated.
+* ``members`` (3, capacity + 2) integers: the signed number +-(p + 1) of the constraint in each slot, where its row is,
+  and scratch for lists of candidates.
+* ``traits`` (4, M): norm, weight in the choice of the most violated, softness 1/rho and cap (``gpmpc.qp.soft_rows``).
 * ``mu`` (M): multipliers; zero outside the working set except at a cap.
 * ``R``: the Cholesky factor of K_WW + softness (``gpmpc.qp.factor``).
 
-A *row* represents a constraint in the metric of P^-1, K_pq = row_p . row_q or simply entry q of row p: in Gram mode row p
-is K_p, known beforehand; in lazy mode, P = L L', it is w_p = L^-1 c_p, made when p enters.
+A *row* represents a constraint in the metric of P^-1, K_pq = row_p . row_q or simply entry q of row p: in Gram mode row
+p is K_p, known beforehand; in lazy mode, P = L L', it is w_p = L^-1 c_p, made when p enters.
 """
 
 import numpy as np

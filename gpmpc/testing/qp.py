@@ -1,8 +1,8 @@
 """Does a QP solver keep its promises?
 
-``check_qp_solver(solver)`` gives it problems whose minimisers and multipliers are known, problems without a solution, warm
-starts that are right, wrong and absurd, and arrays in awkward layouts. It raises an ``AssertionError`` that names the
-problem and what was wrong with the answer, and returns nothing if all is well.
+``check_qp_solver(solver)`` gives it problems whose minimisers and multipliers are known, problems without a solution,
+warm starts that are right, wrong and absurd, and arrays in awkward layouts. It raises an ``AssertionError`` that
+names the problem and what was wrong with the answer, and returns nothing if all is well.
 """
 
 from dataclasses import dataclass, replace

@@ -117,7 +117,7 @@ def test_infeasibility_comes_with_a_farkas_proof(solve, rng):
 
 
 @DUAL
-@pytest.mark.parametrize("gap", [1e-3, 1e-5])
+@pytest.mark.parametrize("gap", [1e-3, 1e-5, 1e-6])
 def test_a_thin_but_real_feasible_set_is_not_called_infeasible(solve, gap):
     # two nearly parallel rows leave a sliver between them
     G = np.array([[1.0, 1.0], [1.0 + gap, 1.0], [0.0, 1.0]])

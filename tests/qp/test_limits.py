@@ -60,7 +60,7 @@ def test_the_time_limit_stops_a_long_solve_and_does_not_touch_a_short_one(mode, 
     assert hurried.dual_residual() < 1e-9
     patient = solve(DualActiveSet(time_limit=60.0))
     assert patient.status is Status.SOLVED
-    assert patient.iterations >= full.iterations
+    assert patient.iterations > 2 * hurried.iterations
     np.testing.assert_allclose(patient.x, full.x, atol=1e-9)
 
 
