@@ -99,6 +99,8 @@ def count_above(values, threshold, size):
 def all_present(names, bounds, mu):
     """Whether every one of the named bounds is there to be held (it may have become absent since)."""
     for name in names:
+        if not 1.0 <= abs(name) <= len(mu):
+            return False
         p = int(abs(name)) - 1
         if mu[p] != 0.0 or abs(bounds[UPPER if name > 0.0 else LOWER, p]) == np.inf:
             return False
@@ -149,7 +151,9 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
     k, age, tag, candidates = 0, 0.0, settings[4], members[2]
     if guessed:
         names = warm[HEADER + n + M : HEADER + n + M + int(warm[WORKING])]
-        if tag != NO_TAG and warm[TAG] == tag and warm[AGE] < OLD and all_present(names, bounds, mu):
+        fits = len(names) <= capacity and len(names) * (len(names) + 1) // 2 <= len(warm) - (HEADER + n + 2 * M)
+        known = tag != NO_TAG and warm[TAG] == tag and warm[AGE] < OLD
+        if known and fits and all_present(names, bounds, mu):
             k, age = len(names), warm[AGE]
             unpack(warm[HEADER + n + 2 * M :], k, R)
             for i in range(k):
@@ -184,26 +188,11 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
             if several:
                 sweeps += 1
                 before = k
-                count = choose_violated(share, capacity - k, y, excess, bounds, candidates)
+                count = choose_violated(share, capacity - k, y, excess, bounds, mu, candidates)
                 k = take(
-                    lazy,
-                    candidates,
-                    count,
-                    k,
-                    n,
-                    pull,
-                    v,
-                    rows,
-                    L,
-                    G,
-                    traits,
-                    bounds,
-                    mu,
-                    slots,
-                    members,
-                    R,
+                    lazy, candidates, count, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R,
                     scratch[1],
-                )
+                )  # fmt: skip
                 several = k > before
                 iterations += k - before
                 k = settle(k, bounds, mu, slots, members, R, scratch)

@@ -116,11 +116,11 @@ def choose_guess(names, room, bounds, mu, candidates):
 
 
 @compiled
-def choose_violated(share, room, y, excess, bounds, candidates):
-    """The same for the constraints whose weighted excess is above ``share``."""
+def choose_violated(share, room, y, excess, bounds, mu, candidates):
+    """The same for the violated constraints whose weighted excess is above ``share``, except those at a cap."""
     count = 0
     for p in range(len(y)):
-        if excess[p] > share and count < room:
+        if excess[p] > share and count < room and mu[p] == 0.0:
             candidates[count] = p + 1 if y[p] > bounds[UPPER, p] else -(p + 1)
             count += 1
             ignore(p, bounds)

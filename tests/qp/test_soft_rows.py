@@ -121,3 +121,26 @@ def test_both_prices_on_one_row_are_two_rows(solve):
     problem = QuadraticProgram(np.eye(1), [0.0], [[1.0], [1.0]], [3.0, 3.0], [np.inf, np.inf])
     solution = solve(problem, SoftRows([np.inf, rho], [w, np.inf]))
     assert solution.x[0] == pytest.approx((w + 3.0 * rho) / (1.0 + rho), abs=1e-12)
+
+
+@DUAL
+@pytest.mark.parametrize("kind", ["quadratic", "linear", "mixed"])
+def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(solve, kind, rng):
+    n, m = 8, 20
+    problem = conflicting_problem(rng, n, m)
+    weights = 10.0 ** rng.uniform(-1.0, 1.0, m)
+    chosen = {"quadratic": np.ones(m, bool), "linear": np.zeros(m, bool), "mixed": np.arange(m) % 2 == 0}[kind]
+    soft = SoftRows(np.where(chosen, weights, np.inf), np.where(chosen, np.inf, weights))
+    last, at_caps = None, 0
+    for _ in range(60):
+        shift, turn = rng.uniform(-2.0, 2.0, m), rng.standard_normal(n)
+        following = QuadraticProgram(
+            problem.P, problem.q + 3.0 * turn, problem.G, problem.h_lower + shift, problem.h_upper + shift, problem.lb,
+            problem.ub,
+        )  # fmt: skip
+        last, cold = solve(following, soft, last), solve(following, soft)
+        assert last.status is cold.status is Status.SOLVED
+        assert worst_residual(last) < 1e-9
+        np.testing.assert_allclose(last.x, cold.x, atol=1e-9)
+        at_caps += int((np.abs(last.z) == soft.linear).sum())
+    assert (at_caps > 0) == (kind != "quadratic")
