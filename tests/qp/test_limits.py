@@ -5,7 +5,6 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 import pytest
@@ -94,19 +93,18 @@ def test_one_solver_and_one_prepared_problem_serve_many_threads(rng):
 
 
 START = """
-import time
 import numpy as np
 from gpmpc.qp import DualActiveSet
-began = time.perf_counter()
+from gpmpc.qp.dual_kernels import solve_gram, solve_lazy
 solution = DualActiveSet().prepare(np.eye(3), np.ones((1, 3))).solve(np.ones(3), np.full(4, -0.5), np.full(4, 0.5))
 assert solution.is_optimal(1e-12), solution
-print(time.perf_counter() - began)
+print(sum(sum(kernel.stats.cache_misses.values()) for kernel in (solve_gram, solve_lazy)))
 """
 
 
 def first_solve(folder, **environment):
-    """Seconds that the first solve of a new process takes."""
-    return float(
+    """How many kernels a new process must compile for its first solve."""
+    return int(
         subprocess.run(
             [sys.executable, "-c", START], capture_output=True, text=True, check=True, cwd=folder,
             env=os.environ | {"PYTHONPATH": str(folder)} | environment,
@@ -121,11 +119,9 @@ def copy_of_the_package(folder):
         target.write_text(source.read_text())
 
 
-def test_a_new_process_solves_at_once_from_the_cache_of_the_last_one(tmp_path):
+def test_a_new_process_takes_its_kernels_from_the_cache_of_the_last_one():
     DualActiveSet().prepare(np.eye(2))  # fills the cache beside the source, unless it is there already
-    began = perf_counter()
-    cached = first_solve(PACKAGE.parent)
-    assert cached < 0.25 * max(perf_counter() - began, 8.0)  # compiling anew takes more than ten seconds
+    assert first_solve(PACKAGE.parent) == 0
 
 
 @pytest.mark.slow
