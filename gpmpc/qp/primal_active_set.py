@@ -38,6 +38,7 @@ Array = NDArray[np.float64]
 
 RANK = 1e-11  # share of the largest pivot of the QR below which a working row depends on the others
 STILL = 1e-13  # share of the size of x below which a direction is zero
+FULL_STEPS = 2  # unhindered steps on one working set after which what is left of d is rounding
 INSIDE = 1e-9  # share of the size of a row by which phase 1 may miss it
 ZERO_STEPS = 20  # steps of length zero in a row after which Bland's rule breaks a possible cycle
 
@@ -103,12 +104,12 @@ class PrimalActiveSet:
             return finish(Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE, x, multipliers, nothing, 0)
         limit = self.iteration_limit or 200 + 20 * len(rows.h)
         working = list(np.flatnonzero(rows.equality | _close_to_guess(rows, x, guess)))
-        still = 0
+        still = full_steps = 0
         for iteration in range(limit):
             d, multipliers = _minimise_on_rows(
                 problem.P, problem.P @ x + problem.q, rows.A[working], rows.h[working] - rows.A[working] @ x
             )
-            if np.abs(d).max() <= STILL * max(1.0, np.abs(x).max()):
+            if full_steps == FULL_STEPS or np.abs(d).max() <= STILL * max(1.0, np.abs(x).max()):
                 droppable = np.where(rows.equality[working], np.inf, multipliers)
                 if not working or droppable.min() >= 0.0:
                     stacked = _stack(rows, working, multipliers, M)
@@ -117,10 +118,12 @@ class PrimalActiveSet:
                     return finish(Status.SOLVED, x, stacked, active, iteration)
                 drop = np.argmax(droppable < 0.0) if still > ZERO_STEPS else np.argmin(droppable)
                 working.pop(int(drop))
+                full_steps = 0
                 continue
             kappa, blocking = _step_length(rows, x, d, working)
             x = x + kappa * d
             still = still + 1 if kappa == 0.0 else 0
+            full_steps = full_steps + 1 if blocking is None else 0
             if blocking is not None:
                 working = sorted([*working, blocking])
         return finish(Status.ITERATION_LIMIT, x, nothing, nothing, limit)

@@ -150,3 +150,11 @@ def test_a_fixed_variable_stays_where_it_is_put(solve, rng):
     solution = solve(QuadraticProgram(problem.P, problem.q, lb=lb, ub=ub))
     assert solution.x[2] == pytest.approx(0.7, abs=1e-12)
     assert solution.is_optimal(1e-9)
+
+
+def test_the_primal_method_does_not_mistake_rounding_for_a_direction(rng):
+    problem = feasible_problem(rng, 60, 60, condition=1e6)
+    solution = primal(problem)
+    assert solution.status is Status.SOLVED
+    assert worst_residual(solution) < 1e-9
+    assert solution.iterations < 500
