@@ -131,15 +131,15 @@ def run_pass(begin, problems: list[SequenceProblem], flush: bool, as_program: bo
         began = perf_counter()
         answer = solve(given)
         seconds[i] = perf_counter() - began
-        answers.append(answer)
+        x, rest = answer  # copied, so that no solver's memory grows with the sequence
+        answers.append((x.copy(), np.array(rest["lam"] if isinstance(rest, dict) else rest.multipliers)))
     gc.enable()
     return seconds, answers
 
 
 def worst_residual(problem: SequenceProblem, answer) -> float:
     """The largest scaled KKT residual of an answer."""
-    x, rest = answer
-    multipliers = rest["lam"] if isinstance(rest, dict) else rest.multipliers
+    x, multipliers = answer
     program = QuadraticProgram.from_stacked(*vars(problem).values())
     solution = make_solution(program, Status.SOLVED, x, multipliers)
     return max(solution.primal_residual(), solution.dual_residual(), solution.duality_gap())
