@@ -1,0 +1,39 @@
+"""How the kernels of this package are compiled: serially, without the interpreter's lock, and once per machine.
+
+numba keeps the machine code beside the source, or in the user's cache folder when the installation is read-only. When
+neither can be written it refuses to cache; the kernels are then compiled anew in each process. Sums may be reordered
+(that is what makes them vectorise); infinities and NaN keep their meaning.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from threading import Lock
+
+import numba
+
+_compiling = Lock()
+
+
+REORDERED = frozenset({"reassoc", "contract", "nsz"})
+
+
+def compiled(function: Callable | None = None, *, fastmath: frozenset[str] = REORDERED) -> Callable:
+    """Compiles ``function`` at its first call; ``fastmath`` names LLVM's flags for it."""
+    if function is None:
+        return partial(compiled, fastmath=fastmath)
+    options = {"nogil": True, "fastmath": set(fastmath)}
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # "cannot cache function ...: no locator available"
+        return numba.njit(**options)(function)
+
+
+def compile_for(kernel: Callable, signature: str) -> None:
+    """Compiles ``kernel`` for one signature and no other: it then refuses other types with ``TypeError``.
+
+    Without this numba would quietly build a second kernel for Fortran-ordered or integer arrays.
+    """
+    with _compiling:
+        if not kernel.signatures:
+            kernel.compile(signature)
+            kernel.disable_compile()

@@ -1,0 +1,165 @@
+"""The same QP through CVXPY: any solver it knows, as a reference and for comparison.
+
+CVXPY turns a problem into a solver's standard form, which takes milliseconds; with Parameters in the places that the
+rules of disciplined parametrised programming allow (Agrawal et al., 2019) it does so once per shape. P enters through
+its Cholesky factor, ``|L'x|^2``, because a quadratic form with a parameter matrix is not among those places.
+
+The compiled problem is kept per shape and per pattern of absent bounds and equalities, one set per thread. The duals
+come back signed as this package signs them, and the answer is ``SOLVED`` only if its own residuals say so.
+"""
+
+import threading
+import warnings
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpmpc.exceptions import ProblemError
+from gpmpc.qp.problem import ABSENT, QuadraticProgram
+from gpmpc.qp.solution import QPSolution, make_solution
+from gpmpc.qp.solver import WarmStart
+from gpmpc.status import Status
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+KEPT = 16  # compiled problems per thread
+STATUSES = {
+    "optimal": Status.SOLVED,
+    "optimal_inaccurate": Status.SOLVED,
+    "infeasible": Status.INFEASIBLE,
+    "infeasible_inaccurate": Status.INFEASIBLE,
+    "user_limit": Status.ITERATION_LIMIT,
+}
+TIGHT = {"CLARABEL": {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}}
+"""Options that make a solver as accurate as this package promises; others are passed by the caller."""
+
+
+@dataclass(frozen=True)
+class CvxpySolver:
+    """Solves through CVXPY.
+
+    Args:
+        name: An installed CVXPY solver ("CLARABEL", "OSQP", "SCS", "HIGHS", ...).
+        options: The solver's own options, by its own names; for Clarabel tight tolerances if omitted.
+        tolerance: Largest scaled KKT residual of a solution called ``SOLVED``.
+
+    Raises:
+        ProblemError: A solver that CVXPY does not find; the message lists those it finds.
+    """
+
+    name: str = "CLARABEL"
+    options: dict | None = None
+    tolerance: float = 1e-6
+    _compiled: threading.local = field(default_factory=threading.local, init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        import cvxpy
+
+        installed = cvxpy.installed_solvers()
+        if self.name not in installed:
+            raise ProblemError(f"CVXPY finds no solver named {self.name!r}; it finds {', '.join(installed)}")
+
+    def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
+        """The minimiser; a warm start's x is offered to solvers that take one. See ``gpmpc.qp.solver.QPSolver``."""
+        import cvxpy
+
+        began = perf_counter()
+        lower, upper = problem.lower, problem.upper
+        n, M = len(problem.q), len(lower)
+        form = self._form(n, lower, upper)
+        form.factor.value = np.linalg.cholesky(problem.P).T
+        form.q.value = problem.q
+        if form.G is not None:
+            form.G.value = problem.G
+        for side in form.sides:
+            side.bound.value = (lower if side.sign < 0 else upper)[side.members]
+        warm = isinstance(warm_start, QPSolution) and len(warm_start.q) == n
+        if warm:
+            form.x.value = warm_start.x
+        built = perf_counter()
+        options = TIGHT.get(self.name, {}) if self.options is None else self.options
+        try:
+            with warnings.catch_warnings():  # an inaccurate solution is judged by its residuals below
+                warnings.simplefilter("ignore")
+                form.problem.solve(solver=self.name, warm_start=warm, **options)
+            claim = form.problem.status
+        except cvxpy.error.SolverError:
+            claim = "solver_error"
+        x, multipliers = np.zeros(n), np.zeros(M)
+        if claim in ("optimal", "optimal_inaccurate", "user_limit") and form.x.value is not None:
+            x = np.array(form.x.value)
+            for side in form.sides:
+                if side.constraint.dual_value is not None:
+                    multipliers[side.members] += side.sign * np.ravel(side.constraint.dual_value)
+        status = STATUSES.get(claim, Status.NUMERICAL_TROUBLE)
+        if status is Status.SOLVED and not make_solution(problem, status, x, multipliers).is_optimal(self.tolerance):
+            status = Status.NUMERICAL_TROUBLE
+        return make_solution(
+            problem,
+            status,
+            x,
+            multipliers,
+            active_set=_working(multipliers),
+            iterations=(form.problem.solver_stats.num_iters or 0) if form.problem.solver_stats else 0,
+            build_seconds=built - began,
+            solve_seconds=perf_counter() - built,
+        )
+
+    def _form(self, n: int, lower: Array, upper: Array) -> "_Form":
+        """The compiled problem for this pattern of bounds, from the thread's own store."""
+        forms = self._compiled.__dict__.setdefault("forms", {})
+        equal = (lower == upper) & (upper < ABSENT)
+        below, above = (lower > -ABSENT) & ~equal, (upper < ABSENT) & ~equal
+        key = (n, equal.tobytes(), below.tobytes(), above.tobytes())
+        if key not in forms:
+            if len(forms) == KEPT:
+                del forms[next(iter(forms))]
+            forms[key] = _formulate(n, equal, below, above)
+        return forms[key]
+
+
+class _Side(NamedTuple):
+    """The constraints of one kind: equalities, upper bounds (sign +1) or lower bounds (sign -1)."""
+
+    members: Mask
+    sign: float
+    bound: Any
+    constraint: Any
+
+
+class _Form(NamedTuple):
+    """A CVXPY problem with its parameters."""
+
+    problem: Any
+    x: Any
+    factor: Any
+    q: Any
+    G: Any
+    sides: list[_Side]
+
+
+def _formulate(n: int, equal: Mask, below: Mask, above: Mask) -> _Form:
+    import cvxpy
+
+    m = len(equal) - n
+    x, factor, q = cvxpy.Variable(n), cvxpy.Parameter((n, n)), cvxpy.Parameter(n)
+    G = cvxpy.Parameter((m, n)) if m else None
+    values = cvxpy.hstack([x, G @ x]) if m else x
+    sides = []
+    for members, sign in ((equal, 1.0), (above, 1.0), (below, -1.0)):
+        if members.any():
+            bound, at = cvxpy.Parameter(int(members.sum())), values[np.flatnonzero(members)]
+            constraint = at == bound if members is equal else at <= bound if sign > 0 else bound <= at
+            sides.append(_Side(members, sign, bound, constraint))
+    cost = 0.5 * cvxpy.sum_squares(factor @ x) + q @ x
+    return _Form(cvxpy.Problem(cvxpy.Minimize(cost), [side.constraint for side in sides]), x, factor, q, G, sides)
+
+
+def _working(multipliers: Array) -> Array:
+    """The signs of the multipliers that are not an interior-point method's remains."""
+    size = max(1.0, np.abs(multipliers).max(initial=0.0))
+    return np.where(np.abs(multipliers) > 1e-7 * size, np.sign(multipliers), 0.0)

@@ -1,0 +1,137 @@
+"""The dual active-set iteration: which constraints hold with equality at the minimum of a strictly convex QP?
+
+For a working set W the minimiser over ``c_p'x = b_p, p in W`` is x = x_u - P^-1 C_W' mu with K_WW mu = y_W - b_W, where
+x_u is the unconstrained minimiser, y = C x_u and K = C P^-1 C'. The method of Goldfarb and Idnani (Math. Programming
+27, 1983, algorithm 1) keeps every multiplier in its range and moves to the most violated constraint p until none is
+violated: with r = K_WW^-1 K_Wp and d = K_pp - K_pW r, a step t changes mu_p by t, mu_W by -t r and y_p by -t d. It
+ends at t = violation / d (p joins W), or where a multiplier reaches the end of its range (that constraint leaves W),
+or never (d = 0: the constraints contradict each other, and (r, -1) is Farkas' proof).
+"""
+
+import numpy as np
+
+from gpmpc.qp.compiled import compiled
+from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, largest, subtract_rows
+from gpmpc.qp.working_set import (
+    HIGH_WATCH,
+    LEAST,
+    LOW_WATCH,
+    LOWER,
+    MOST,
+    NAME,
+    PLACE,
+    SOFTNESS,
+    UPPER,
+    admit,
+    couple,
+    evict,
+    find_row,
+    free_value,
+    ignore,
+    watch,
+)
+
+NO_CONSTRAINT = -1
+REACHED, CONTRADICTION = 0, 1
+DEPENDENT = 1e-12  # d below this share of K_pp: the constraint depends on the working ones
+DOUBTFUL = 1e-4  # d below this share of K_pp is computed again without cancellation (lazy mode)
+
+
+@compiled
+def most_violated(y, weights, bounds, excess):
+    """The constraint farthest outside its watch after weighting, or ``NO_CONSTRAINT``."""
+    lo, hi = bounds[LOW_WATCH], bounds[HIGH_WATCH]
+    for p in range(len(y)):
+        excess[p] = max(y[p] - hi[p], lo[p] - y[p]) * weights[p]
+    worst = largest(excess, len(y))
+    if not worst > 0.0:
+        return NO_CONSTRAINT
+    p = 0
+    while p < len(y) - 1 and excess[p] != worst:
+        p += 1
+    return p
+
+
+@compiled
+def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch):
+    """Changes multipliers until constraint p, whose value is given, is satisfied.
+
+    Returns:
+        The outcome, the size of the working set, and the number of constraints that entered or left.
+    """
+    changes = 0
+    above = mu[p] > 0.0 or (mu[p] == 0.0 and value > bounds[UPPER, p])
+    sense = 1.0 if above == (mu[p] == 0.0) else -1.0  # from a cap the multiplier comes back
+    violation = (value - bounds[UPPER if above else LOWER, p]) * sense
+    place = find_row(lazy, p, k, n, rows, L, G, members)
+    row = rows[place]
+    free = free_value(lazy, row, v, q, n)
+    diagonal = (dot(row, row, n) if lazy else row[p]) + traits[SOFTNESS, p]
+    solved, r = scratch[1], scratch[2]
+    while True:
+        admit(k, p, above, place, traits, free, bounds, slots, members)
+        couple(lazy, row, k, n, rows, members, solved)
+        forward_solve(R, k, solved)
+        for i in range(k):
+            r[i] = solved[i]
+        backward_solve(R, k, r)
+        d = diagonal - dot(solved, solved, k)
+        if lazy and d < DOUBTFUL * diagonal:
+            d = distance_to_span(row, k, n, rows, members, r, scratch[3]) + traits[SOFTNESS, p]
+            for i in range(k):
+                d += traits[SOFTNESS, abs(members[NAME, i]) - 1] * r[i] * r[i]
+        movable = d > DEPENDENT * diagonal and k < capacity
+        step = max(0.0, violation) / d if movable else np.inf
+        own_room = slots[MOST, k] - mu[p] if sense > 0.0 else mu[p] - slots[LEAST, k]
+        capped = own_room < step
+        if capped:
+            step = own_room
+        step, blocking = first_block(step, sense, k, mu, slots, members, r)
+        if step == np.inf:
+            return CONTRADICTION, k, changes
+        for i in range(k):
+            mu[abs(members[NAME, i]) - 1] -= sense * step * r[i]
+        mu[p] += sense * step
+        changes += 1
+        if blocking < k:
+            leaving = abs(members[NAME, blocking]) - 1
+            mu[leaving] = slots[LEAST if sense * r[blocking] > 0.0 else MOST, blocking]
+            evict(k, blocking, slots, members, R, scratch[0])
+            k -= 1
+            members[PLACE, k + 1] = members[PLACE, k]  # the entering row keeps its place in slot k
+            watch(leaving, mu, bounds)
+            violation -= step * d
+            continue
+        if capped:
+            mu[p] = slots[MOST if sense > 0.0 else LEAST, k]
+            watch(p, mu, bounds)
+        else:
+            append_row(R, k, solved, d)
+            ignore(p, bounds)
+            k += 1
+        return REACHED, k, changes
+
+
+@compiled
+def distance_to_span(row, k, n, rows, members, r, rest):
+    """|row - sum r_i row_i|^2: what is left of a row outside the span of the working ones (lazy mode)."""
+    for j in range(n):
+        rest[j] = row[j]
+    subtract_rows(rest, rows, members[PLACE], r, k, n)
+    return dot(rest, rest, n)
+
+
+@compiled
+def first_block(step, sense, k, mu, slots, members, r):
+    """The longest step, up to ``step``, that keeps the multipliers in range, and the slot that ends it (or k)."""
+    size = 0.0
+    for i in range(k):
+        size = max(size, abs(r[i]))
+    blocking = k
+    for i in range(k):
+        rate = sense * r[i]
+        if abs(rate) > 1e-12 * size:
+            room = (mu[abs(members[NAME, i]) - 1] - slots[LEAST if rate > 0.0 else MOST, i]) / rate
+            if room < step:
+                step, blocking = max(room, 0.0), i
+    return step, blocking

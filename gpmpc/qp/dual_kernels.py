@@ -1,0 +1,286 @@
+"""The two compiled entry points of the dual active set: Gram mode and lazy mode.
+
+Both solve ``min 1/2 x'Px + q'x`` subject to ``lower <= [x; Gx] <= upper`` from a guessed working set and write a record
+(``gpmpc.qp.record``). *Gram mode* is for P and G that stay: K = C P^-1 C' is known, and a solve only reads rows of it.
+*Lazy mode* is for P and G that change: it factors P and makes the rows that it needs.
+
+The guess is corrected in a few sweeps that take all badly violated constraints at once, then by the dual iteration, one
+at a time. Nothing is believed without its residuals: the result is computed anew from P, q and G, refined on its
+working set by Newton's method (one step is exact but for rounding), and handed back to the iteration while a bound is
+violated.
+"""
+
+import math
+
+import numpy as np
+
+from gpmpc.qp import record
+from gpmpc.qp.compiled import compiled
+from gpmpc.qp.dual_iteration import CONTRADICTION, most_violated, step_to
+from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, refine, residuals
+from gpmpc.qp.factor import dot, multiply, multiply_at, pack, unpack
+from gpmpc.qp.hessian import factorise, solve_lower
+from gpmpc.qp.working_set import (
+    CAP,
+    HIGH_WATCH,
+    LOW_WATCH,
+    LOWER,
+    NAME,
+    NORM,
+    PLACE,
+    SLACK,
+    SOFTNESS,
+    UPPER,
+    WEIGHT,
+    admit,
+    choose_guess,
+    choose_violated,
+    ignore,
+    settle,
+    take,
+    watch,
+)
+
+STATUS, ITERATIONS, VARIABLES, CONSTRAINTS = record.STATUS, record.ITERATIONS, record.VARIABLES, record.CONSTRAINTS
+WORKING, TAG, AGE, HEADER = record.WORKING, record.TAG, record.AGE, record.HEADER
+SOLVED, INFEASIBLE, ITERATION_LIMIT = record.SOLVED, record.INFEASIBLE, record.ITERATION_LIMIT
+NUMERICAL_TROUBLE, MISUSE, NO_TAG = record.NUMERICAL_TROUBLE, record.MISUSE, record.NO_TAG
+
+GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
+LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
+
+ABSENT = 1e20  # a bound of this size or more is none
+TOLERATED = 1e-10  # a violation below this share of the size of a constraint is none
+NOISE = 1e-7  # share of the size of a constraint below which a contradiction is taken for rounding
+SWEEPS = 4  # times that all badly violated constraints are taken at once
+SWEPT = 0.5  # those violated by more than this share of the worst
+ROUNDS = 10  # returns from the residuals to the iteration
+REFINEMENTS = 3
+FINE = 1e-11  # scaled residual at which refinement stops
+OLD = 1000  # changes after which a factor is computed anew
+
+
+@compiled
+def read_bounds(lower, upper, norms, bounds):
+    """Copies the bounds, with absent ones infinite; True if any are crossed or undefined."""
+    bad = 0
+    for p in range(len(lower)):
+        low, high = lower[p], upper[p]
+        bad += not ((low <= high) & (low < ABSENT) & (high > -ABSENT))
+        has_low, has_high = low > -ABSENT, high < ABSENT
+        size = max(norms[p], max(abs(low) if has_low else 0.0, abs(high) if has_high else 0.0))
+        low, high = low if has_low else -np.inf, high if has_high else np.inf
+        slack = TOLERATED * size
+        bounds[LOWER, p], bounds[UPPER, p], bounds[SLACK, p] = low, high, slack
+        bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = low - slack, high + slack
+    return bad > 0
+
+
+@compiled
+def keep_capped(n, warm, traits, bounds, mu):
+    """Starts with the guess's multipliers that are at their caps: soft rows that stay violated."""
+    for p in range(n, len(mu)):
+        value, cap = warm[HEADER + n + p], traits[CAP, p]
+        if abs(value) >= cap and abs(bounds[UPPER if value > 0.0 else LOWER, p]) < np.inf:
+            mu[p] = cap if value > 0.0 else -cap
+            watch(p, mu, bounds)
+
+
+@compiled
+def count_above(values, threshold, size):
+    """How many of the first ``size`` values are above the threshold."""
+    count = 0
+    for i in range(size):
+        count += values[i] > threshold
+    return count
+
+
+@compiled
+def all_present(names, bounds, mu):
+    """Whether every one of the named bounds is there to be held (it may have become absent since)."""
+    for name in names:
+        if not 1.0 <= abs(name) <= len(mu):
+            return False
+        p = int(abs(name)) - 1
+        if mu[p] != 0.0 or abs(bounds[UPPER if name > 0.0 else LOWER, p]) == np.inf:
+            return False
+    return True
+
+
+@compiled
+def write_ray(p, k, y, bounds, members, r, mu):
+    """Farkas' proof that constraint p contradicts the working ones, ``C' ray = 0`` and ``ray' bounds < 0``, into mu."""
+    sense = 1.0 if y[p] > bounds[UPPER, p] else -1.0
+    mu[:] = 0.0
+    for i in range(k):
+        at = abs(members[NAME, i]) - 1
+        mu[at] = -sense * r[i]
+        if mu[at] * members[NAME, i] < 0.0 and bounds[LOWER, at] < bounds[UPPER, at]:
+            mu[at] = 0.0  # rounding: this bound cannot pull that way
+    mu[p] = sense
+
+
+@compiled
+def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, out):
+    """Both modes after their set-up."""
+    M, m = len(lower), len(lower) - n
+    limit, tolerance, soft = int(settings[0]), settings[1], settings[2] != 0.0
+    capacity = M if soft else min(n, M)
+    wide = max(M, capacity + 2)
+    work = np.empty((20 + capacity + 1, wide))
+    bounds, slots, scratch, y = work[:5], work[5:9], work[9:13], work[13, :M]
+    seen, excess, gradient, active, v, slope, R = work[14], work[15], work[16], work[17], work[18], work[19], work[20:]
+    members = np.empty((3, wide), np.int64)
+    x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
+    for p in range(M):
+        mu[p] = 0.0
+    for i in range(capacity + 2):
+        members[PLACE, i] = i
+    if read_bounds(lower, upper, traits[NORM], bounds):
+        return MISUSE
+    guessed = len(warm) > HEADER and warm[VARIABLES] == n and warm[CONSTRAINTS] == M and 0 <= warm[WORKING] <= M
+    pull = q
+    if guessed and soft:
+        keep_capped(n, warm, traits, bounds, mu)
+        pull = np.empty(n)
+        add_pull(G, n, q, mu, 0, members, soft, pull)
+    if lazy:
+        solve_lower(L, n, pull, v)
+        for i in range(n):
+            v[i] = -v[i]
+    k, age, tag, candidates = 0, 0.0, settings[4], members[2]
+    if guessed:
+        names = warm[HEADER + n + M : HEADER + n + M + int(warm[WORKING])]
+        fits = len(names) <= capacity and len(names) * (len(names) + 1) // 2 <= len(warm) - (HEADER + n + 2 * M)
+        known = tag != NO_TAG and warm[TAG] == tag and warm[AGE] < OLD
+        if known and fits and all_present(names, bounds, mu):
+            k, age = len(names), warm[AGE]
+            unpack(warm[HEADER + n + 2 * M :], k, R)
+            for i in range(k):
+                candidates[i] = int(abs(names[i])) - 1
+            multiply_at(rows, candidates, k, pull, n, gradient)
+            for i in range(k):
+                p = candidates[i]
+                admit(i, p, names[i] > 0.0, p, traits, -gradient[i], bounds, slots, members)
+                ignore(p, bounds)
+        else:
+            count = choose_guess(names, capacity, bounds, mu, candidates)
+            k = take(
+                lazy, candidates, count, 0, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch[1]
+            )
+        k = settle(k, bounds, mu, slots, members, R, scratch)
+    evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y)
+    if not lazy:
+        for i in range(M):
+            seen[i] = mu[i]
+    current, iterations, rounds, status, worst = True, 0, 0, NUMERICAL_TROUBLE, np.inf
+    interrupted = guessed and warm[STATUS] == ITERATION_LIMIT
+    sweeps = SWEEPS if interrupted else 0  # the dual objective climbs with single steps only, and so the end is sure
+    while True:
+        p = most_violated(y, traits[WEIGHT], bounds, excess)
+        if p >= 0:
+            if iterations >= limit:
+                status = ITERATION_LIMIT
+                break
+            current = False
+            share = SWEPT * excess[p]
+            several = sweeps < SWEEPS and count_above(excess, share, M) > 1
+            if several:
+                sweeps += 1
+                before = k
+                count = choose_violated(share, capacity - k, y, excess, bounds, mu, candidates)
+                k = take(
+                    lazy, candidates, count, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R,
+                    scratch[1],
+                )  # fmt: skip
+                several = k > before
+                iterations += k - before
+                k = settle(k, bounds, mu, slots, members, R, scratch)
+            if not several:
+                outcome, k, changes = step_to(
+                    lazy, p, y[p], k, capacity, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch
+                )
+                iterations += changes
+                if outcome == CONTRADICTION:
+                    if excess[p] > NOISE * traits[WEIGHT, p] * bounds[SLACK, p] / TOLERATED:
+                        status = INFEASIBLE
+                        write_ray(p, k, y, bounds, members, scratch[2], mu)
+                        break
+                    ignore(p, bounds)
+                if soft:
+                    sweeps = SWEEPS  # caps may have changed what ``pull`` says
+            if not lazy:
+                follow(rows, mu, seen, candidates, gradient, y)
+            elif soft:
+                evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y)
+            else:
+                follow_lazily(n, v, rows, L, G, mu, k, members, gradient, y)
+            continue
+        if not current:
+            if not lazy:
+                multiply(G, m, y, n, y[n:])
+            add_pull(G, n, q, mu, k, members, soft, slope)
+        best = np.inf
+        for attempt in range(REFINEMENTS + 1):
+            worst = residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active)
+            if worst <= FINE or attempt == REFINEMENTS or not worst < 0.5 * best:
+                break
+            best = worst
+            refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, scratch[0], scratch[2])
+            add_pull(G, n, q, mu, k, members, soft, slope)
+        status = SOLVED if worst <= tolerance else NUMERICAL_TROUBLE
+        rounds += 1
+        unchanged = current and attempt == 0
+        if unchanged or rounds == ROUNDS or most_violated(y, traits[WEIGHT], bounds, excess) < 0:
+            break
+    out[STATUS], out[ITERATIONS], out[WORKING] = status, iterations, k
+    out[VARIABLES], out[CONSTRAINTS], out[TAG], out[AGE] = n, M, NO_TAG, age + iterations
+    factor = out[HEADER + n + 2 * M :]
+    if tag != NO_TAG and k * (k + 1) // 2 <= len(factor):
+        pack(R, k, factor)
+        out[TAG] = tag
+    for i in range(n):
+        x[i] = y[i]
+    for i in range(k):
+        out[HEADER + n + M + i] = members[NAME, i]
+    return status
+
+
+@compiled
+def solve_gram(q, lower, upper, warm, system, settings, out):
+    """Gram mode; ``system`` stacks K (M rows), traits (4 rows), P (n rows) and G (m rows), M wide."""
+    n, M = int(settings[3]), system.shape[1]
+    if len(q) != n or len(lower) != M or len(upper) != M:
+        return MISUSE
+    undefined = 0.0
+    for i in range(n):
+        undefined += q[i] * 0.0
+    if undefined != 0.0:
+        return MISUSE
+    P, G = system[M + 4 : M + 4 + n], system[M + 4 + n :]
+    return optimise(False, P, q, G, n, system[:M], P, system[M : M + 4], lower, upper, warm, settings, out)
+
+
+@compiled
+def solve_lazy(P, q, G, lower, upper, warm, soft, settings, out):
+    """Lazy mode; ``soft`` stacks softness and caps, M wide."""
+    n, m = P.shape[0], len(G)
+    M = n + m
+    shaped = P.shape[1] == n and len(q) == n and (m == 0 or G.shape[1] == n) and len(lower) == M and len(upper) == M
+    if not shaped or soft.shape[1] != M:
+        return MISUSE
+    L, traits = np.empty((n, n)), np.empty((4, M))
+    if not factorise(P, L):
+        return MISUSE
+    undefined = 0.0
+    for i in range(n):
+        undefined += q[i] * 0.0
+    for p in range(M):
+        norm = math.sqrt(dot(G[p - n], G[p - n], n)) if p >= n else 1.0
+        undefined += norm * 0.0
+        traits[NORM, p], traits[WEIGHT, p] = norm, 1.0 / norm if norm > 0.0 else 1.0
+        traits[SOFTNESS, p], traits[CAP, p] = soft[0, p], soft[1, p]
+    if undefined != 0.0:
+        return MISUSE
+    rows = np.empty((min(n, M) + 2 if settings[2] == 0.0 else M + 2, n))
+    return optimise(True, P, q, G, n, rows, L, traits, lower, upper, warm, settings, out)

@@ -1,0 +1,118 @@
+"""The point that belongs to a set of multipliers, and how well the two solve the QP.
+
+x minimises the Lagrangian, P x = -(q + C'mu), and y = C x are the constraints' values. Gram mode multiplies with P^-1,
+the upper left corner of K, and may later move y by the rows of K whose multipliers changed; lazy mode, P = L L',
+solves.
+"""
+
+from gpmpc.qp.compiled import compiled
+from gpmpc.qp.factor import backward_solve, dot, forward_solve, multiply, subtract_rows
+from gpmpc.qp.hessian import solve_lower, solve_transposed
+from gpmpc.qp.working_set import BOUND, LEAST, MOST, NAME, PLACE, SOFTNESS, couple
+
+
+@compiled
+def add_pull(G, n, q, mu, k, members, soft, slope):
+    """``slope = q + C' mu``; only where rows are soft can others than the working ones have a multiplier."""
+    for i in range(n):
+        slope[i] = q[i] + mu[i]
+    if soft:
+        for p in range(n, len(mu)):
+            if mu[p] != 0.0:
+                add_row(mu[p], G[p - n], n, slope)
+    else:
+        for i in range(k):
+            p = abs(members[NAME, i]) - 1
+            if p >= n:
+                add_row(mu[p], G[p - n], n, slope)
+
+
+@compiled
+def add_row(weight, row, n, target):
+    """``target += weight row``."""
+    for i in range(n):
+        target[i] += weight * row[i]
+
+
+@compiled
+def evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y):
+    """``y = C x`` for the multipliers; leaves ``slope = q + C' mu``."""
+    add_pull(G, n, q, mu, k, members, soft, slope)
+    if lazy:
+        solve_lower(L, n, slope, y)
+        solve_transposed(L, n, y)
+    else:
+        multiply(rows, n, slope, n, y)
+    for i in range(n):
+        y[i] = -y[i]
+    multiply(G, len(G), y, n, y[n:])
+
+
+@compiled
+def follow_lazily(n, v, rows, L, G, mu, k, members, weights, y):
+    """Lazy mode without soft rows: ``y = C x`` from L'x = v - sum mu_i w_i."""
+    for i in range(n):
+        y[i] = v[i]
+    for i in range(k):
+        weights[i] = mu[abs(members[NAME, i]) - 1]
+    subtract_rows(y, rows, members[PLACE], weights, k, n)
+    solve_transposed(L, n, y)
+    multiply(G, len(G), y, n, y[n:])
+
+
+@compiled
+def follow(rows, mu, seen, changed, amounts, y):
+    """Gram mode: moves y by the rows of K whose multipliers are not those, ``seen``, that y knows."""
+    count = 0
+    for p in range(len(mu)):
+        if mu[p] != seen[p]:
+            changed[count], amounts[count] = p, mu[p] - seen[p]
+            seen[p] = mu[p]
+            count += 1
+    subtract_rows(y, rows, changed, amounts, count, len(mu))
+
+
+@compiled
+def residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active):
+    """The largest scaled residual of (x, mu), x = y[:n]: stationarity, violation of the working set, duality gap.
+
+    Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where y = C x and slope = q + C' mu.
+    """
+    multiply(P, n, y, n, gradient)
+    size, stationarity, infeasibility, gap = 1.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        size = max(size, max(abs(gradient[i]), abs(q[i])))
+        gradient[i] += slope[i]
+        stationarity = max(stationarity, abs(gradient[i]))
+    for i in range(k):
+        p, b = abs(members[NAME, i]) - 1, slots[BOUND, i]
+        active[i] = y[p] - traits[SOFTNESS, p] * mu[p] - b
+        infeasibility = max(infeasibility, abs(active[i]) / max(1.0, abs(b)))
+        gap += mu[p] * active[i]
+    return max(max(stationarity / size, infeasibility), abs(gap) / max(1.0, abs(dot(q, y, n))))
+
+
+@compiled
+def refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, correction, trial):
+    """One Newton step on the working set for the residuals ``gradient`` and ``active``; multipliers stay in range."""
+    size = n if lazy else len(y)
+    if lazy:
+        solve_lower(L, n, gradient, correction)
+    else:
+        multiply(rows, size, gradient, n, correction)
+    couple(lazy, correction, k, n, rows, members, trial)
+    for i in range(k):
+        trial[i] = active[i] - trial[i]
+    forward_solve(R, k, trial)
+    backward_solve(R, k, trial)
+    for j in range(size):
+        correction[j] = -correction[j]
+    subtract_rows(correction, rows, members[PLACE], trial, k, size)
+    if lazy:
+        solve_transposed(L, n, correction)
+    for i in range(n):
+        y[i] += correction[i]
+    for i in range(k):
+        p = abs(members[NAME, i]) - 1
+        mu[p] = min(max(mu[p] + trial[i], slots[LEAST, i]), slots[MOST, i])
+    multiply(G, len(G), y, n, y[n:])

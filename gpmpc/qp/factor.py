@@ -1,0 +1,156 @@
+"""The Cholesky factor of the working set's matrix, kept current while constraints enter and leave.
+
+``L L' = K_WW`` with L lower triangular. Row j of the array R holds column j of L, from its diagonal on: R[j, i] =
+L_ij, i >= j. A constraint that enters appends one row to L, found by the same forward solve that prices it; one that
+leaves deletes a row, and Givens rotations restore the triangle (Golub and Van Loan, Matrix Computations, 4th ed.,
+section 6.5.2). The diagonal holds reciprocals, so that no solve divides.
+"""
+
+import math
+
+from gpmpc.qp.compiled import REORDERED, compiled
+
+
+@compiled
+def dot(a, b, size):
+    """Inner product of the first ``size`` entries."""
+    total = 0.0
+    for i in range(size):
+        total += a[i] * b[i]
+    return total
+
+
+@compiled(fastmath=REORDERED | {"nnan"})
+def largest(a, size):
+    """The largest of the first ``size`` entries, which vectorises only if none of them is NaN."""
+    found = a[0]
+    for i in range(size):
+        found = max(found, a[i])
+    return found
+
+
+@compiled
+def subtract_rows(state, rows, places, factors, count, size):
+    """``state -= sum_i factors[i] rows[places[i]]``, four rows at a time."""
+    i = 0
+    while i + 4 <= count:
+        r0, r1, r2, r3 = rows[places[i]], rows[places[i + 1]], rows[places[i + 2]], rows[places[i + 3]]
+        f0, f1, f2, f3 = factors[i], factors[i + 1], factors[i + 2], factors[i + 3]
+        for j in range(size):
+            state[j] -= f0 * r0[j] + f1 * r1[j] + f2 * r2[j] + f3 * r3[j]
+        i += 4
+    while i < count:
+        row, f = rows[places[i]], factors[i]
+        for j in range(size):
+            state[j] -= f * row[j]
+        i += 1
+
+
+@compiled
+def multiply(A, count, vector, size, product):
+    """``product[i] = A[i] . vector`` for the first ``count`` rows, four at a time."""
+    i = 0
+    while i + 4 <= count:
+        four_dots(A[i], A[i + 1], A[i + 2], A[i + 3], vector, size, product[i:])
+        i += 4
+    while i < count:
+        product[i] = dot(A[i], vector, size)
+        i += 1
+
+
+@compiled
+def multiply_at(A, places, count, vector, size, product):
+    """``product[i] = A[places[i]] . vector``, four at a time."""
+    i = 0
+    while i + 4 <= count:
+        r0, r1, r2, r3 = A[places[i]], A[places[i + 1]], A[places[i + 2]], A[places[i + 3]]
+        four_dots(r0, r1, r2, r3, vector, size, product[i:])
+        i += 4
+    while i < count:
+        product[i] = dot(A[places[i]], vector, size)
+        i += 1
+
+
+@compiled
+def four_dots(r0, r1, r2, r3, vector, size, product):
+    """Four inner products with one vector, which is read once and whose sums hide each other's latency."""
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    for j in range(size):
+        value = vector[j]
+        s0 += r0[j] * value
+        s1 += r1[j] * value
+        s2 += r2[j] * value
+        s3 += r3[j] * value
+    product[0], product[1], product[2], product[3] = s0, s1, s2, s3
+
+
+@compiled
+def forward_solve(R, k, a):
+    """``a <- L^-1 a`` in place."""
+    for j in range(k):
+        value = a[j] * R[j, j]
+        a[j] = value
+        column, rest = R[j, j + 1 : k], a[j + 1 : k]
+        for i in range(len(column)):
+            rest[i] -= value * column[i]
+
+
+@compiled
+def backward_solve(R, k, a):
+    """``a <- L^-T a`` in place."""
+    for j in range(k - 1, -1, -1):
+        a[j] = (a[j] - dot(R[j, j + 1 :], a[j + 1 :], k - j - 1)) * R[j, j]
+
+
+@compiled
+def append_row(R, k, solved, pivot):
+    """Row k of L: ``solved = L^-1 K_Wp`` and ``pivot = K_pp - |solved|^2 > 0``."""
+    for j in range(k):
+        R[j, k] = solved[j]
+    R[k, k] = 1.0 / math.sqrt(pivot)
+
+
+@compiled
+def remove_row(R, k, gone, carry):
+    """Deletes row ``gone`` of L, which has k rows; ``carry`` is scratch of length k."""
+    for j in range(gone):
+        column = R[j, gone:k]
+        for i in range(len(column) - 1):
+            column[i] = column[i + 1]
+    rest = carry[: k - gone - 1]
+    column = R[gone, gone + 1 : k]
+    for i in range(len(rest)):
+        rest[i] = column[i]
+    for c in range(gone + 1, k):
+        diagonal = 1.0 / R[c, c]
+        reciprocal = 1.0 / math.sqrt(rest[0] * rest[0] + diagonal * diagonal)
+        cosine, sine = rest[0] * reciprocal, diagonal * reciprocal
+        R[c - 1, c - 1] = reciprocal
+        old, new = R[c, c + 1 : k], R[c - 1, c : k - 1]
+        for i in range(len(old)):
+            following, below = rest[i + 1], old[i]
+            new[i] = cosine * following + sine * below
+            rest[i] = cosine * below - sine * following
+        rest = rest[: len(old)]
+
+
+@compiled
+def pack(R, k, packed):
+    """Copies the triangle of k rows to a flat array of k (k + 1) / 2 entries."""
+    at = 0
+    for j in range(k):
+        column = R[j, j:k]
+        for i in range(len(column)):
+            packed[at + i] = column[i]
+        at += len(column)
+
+
+@compiled
+def unpack(packed, k, R):
+    """The inverse of ``pack``."""
+    at = 0
+    for j in range(k):
+        column = R[j, j:k]
+        for i in range(len(column)):
+            column[i] = packed[at + i]
+        at += len(column)

@@ -1,0 +1,224 @@
+"""Algorithm 1 of Cao, Lai and Alam (2017), section 4.3: the primal active-set method, to be read beside the paper.
+
+Which inequalities of ``min 1/2 x'Px + q'x`` subject to ``A x <= h`` hold with equality at the minimum? Starting from a
+feasible x, the method minimises over the working rows as if they were equalities, goes there as far as the others
+allow, adds the row that blocks, and drops a row whose multiplier shows that the minimum lies inside its bound:
+
+    1  d <- argmin of the QP in x + d with ``A_W d = 0``                                   (the KKT system, eqs. 45-47)
+    2  if d = 0: stop if no multiplier is negative, else drop the row of the most negative one
+    3  else: kappa <- min(1, min over i outside W with a_i'd > 0 of (h_i - a_i'x) / a_i'd);  x <- x + kappa d
+    4        if kappa < 1: add the row that blocks
+
+The printed (45b) lost the Hessian, which ``_minimise_on_rows`` keeps. ``A_W' = [Q1 Q2] [R; 0]`` (QR with column
+pivoting) covers rank-deficient working sets: d = -Q2 (Q2'PQ2)^-1 Q2'(P x + q) moves in their null space, and rows
+that depend on others get a zero multiplier. Plain NumPy, for reproduction and teaching; ``DualActiveSet`` is the one
+to control with.
+
+Phase 1, which the paper leaves open, is a linear program: the least t with ``A x - t <= h``. If t = 0 its x is
+feasible; if not, its multipliers are Farkas' proof that no x is.
+"""
+
+from dataclasses import dataclass
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
+from scipy.optimize import linprog
+
+from gpmpc.exceptions import ProblemError
+from gpmpc.qp.farkas import proves_infeasibility
+from gpmpc.qp.problem import ABSENT, QuadraticProgram
+from gpmpc.qp.solution import QPSolution, make_solution
+from gpmpc.qp.solver import WarmStart
+from gpmpc.status import Status
+
+Array = NDArray[np.float64]
+
+RANK = 1e-11  # share of the largest pivot of the QR below which a working row depends on the others
+STILL = 1e-13  # share of the size of x below which a direction is zero
+FULL_STEPS = 2  # unhindered steps on one working set after which what is left of d is rounding
+INSIDE = 1e-9  # share of the size of a row by which phase 1 may miss it
+ZERO_STEPS = 20  # steps of length zero in a row after which Bland's rule breaks a possible cycle
+
+
+class _Rows(NamedTuple):
+    """One-sided rows ``A x <= h``; an equality is one row that never leaves the working set."""
+
+    A: Array  # (r, n), of unit length
+    h: Array  # (r,)
+    equality: NDArray[np.bool_]  # (r,)
+    stacked: NDArray[np.intp]  # (r,) which stacked constraint [x; Gx] it is,
+    factor: Array  # (r,) and by what that constraint was multiplied
+
+
+@dataclass(frozen=True)
+class PrimalActiveSet:
+    """The paper's Algorithm 1 with phase 1; an object holds settings only.
+
+    Args:
+        tolerance: Largest scaled KKT residual of a solution called ``SOLVED``.
+        iteration_limit: Iterations before ``ITERATION_LIMIT``; ample if omitted.
+
+    Raises:
+        ProblemError: A limit or tolerance that is not positive.
+    """
+
+    tolerance: float = 1e-9
+    iteration_limit: int | None = None
+
+    def __post_init__(self):
+        for name in ("tolerance", "iteration_limit"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ProblemError(f"{name} must be positive; got {value}")
+
+    def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
+        """The minimiser, from a warm start of any kind; see ``gpmpc.qp.solver.QPSolver``."""
+        began = perf_counter()
+        lower, upper = problem.lower, problem.upper
+        n, M = len(problem.q), len(lower)
+        rows = _one_sided(problem, lower, upper)
+        start, guess = _read_warm_start(warm_start, n, M)
+
+        def finish(status, x, multipliers, active, iterations):
+            solution = make_solution(
+                problem, status, x, multipliers, active_set=active, iterations=iterations,
+                solve_seconds=perf_counter() - began,
+            )  # fmt: skip
+            if status is Status.SOLVED and not solution.is_optimal(self.tolerance):
+                return finish(Status.NUMERICAL_TROUBLE, x, multipliers, active, iterations)
+            return solution
+
+        nothing = np.zeros(M)
+        x, ray = _phase_1(rows, start)
+        if ray is not None:
+            multipliers = _stack(rows, np.arange(len(rows.h)), ray, M)
+            proven = proves_infeasibility(
+                multipliers,
+                problem.G,
+                np.where(lower <= -ABSENT, -np.inf, lower),
+                np.where(upper >= ABSENT, np.inf, upper),
+            )
+            return finish(Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE, x, multipliers, nothing, 0)
+        limit = self.iteration_limit or 200 + 20 * len(rows.h)
+        working = list(np.flatnonzero(rows.equality | _close_to_guess(rows, x, guess)))
+        still = full_steps = 0
+        for iteration in range(limit):
+            d, multipliers = _minimise_on_rows(
+                problem.P, problem.P @ x + problem.q, rows.A[working], rows.h[working] - rows.A[working] @ x
+            )
+            if full_steps == FULL_STEPS or np.abs(d).max() <= STILL * max(1.0, np.abs(x).max()):
+                droppable = np.where(rows.equality[working], np.inf, multipliers)
+                if not working or droppable.min() >= 0.0:
+                    stacked = _stack(rows, working, multipliers, M)
+                    active = np.zeros(M)
+                    active[rows.stacked[working]] = np.sign(rows.factor[working])
+                    return finish(Status.SOLVED, x, stacked, active, iteration)
+                drop = np.argmax(droppable < 0.0) if still > ZERO_STEPS else np.argmin(droppable)
+                working.pop(int(drop))
+                full_steps = 0
+                continue
+            kappa, blocking = _step_length(rows, x, d, working)
+            x = x + kappa * d
+            still = still + 1 if kappa == 0.0 else 0
+            full_steps = full_steps + 1 if blocking is None else 0
+            if blocking is not None:
+                working = sorted([*working, blocking])
+        return finish(Status.ITERATION_LIMIT, x, nothing, nothing, limit)
+
+
+def _one_sided(problem: QuadraticProgram, lower: Array, upper: Array) -> _Rows:
+    """Every bound that is there as one row ``a'x <= h`` of unit length (zero rows stay zero)."""
+    C = np.vstack([np.eye(len(problem.q)), problem.G])
+    equal = lower == upper
+    above = np.flatnonzero(upper < ABSENT)
+    below = np.flatnonzero((lower > -ABSENT) & ~equal)
+    stacked = np.concatenate([above, below])
+    norms = np.linalg.norm(C, axis=1)[stacked]
+    factor = np.repeat([1.0, -1.0], [len(above), len(below)]) / np.where(norms > 0.0, norms, 1.0)
+    h = np.concatenate([upper[above], lower[below]]) * factor
+    return _Rows(C[stacked] * factor[:, None], h, equal[stacked], stacked, factor)
+
+
+def _read_warm_start(warm_start: WarmStart, n: int, M: int) -> tuple[Array, Array]:
+    """A point to start near, and an active set (M,) to start with; zeros where the warm start says nothing."""
+    x, active = np.zeros(n), np.zeros(M)
+    if isinstance(warm_start, QPSolution):
+        if len(warm_start.q) == n and len(warm_start.lower) == M:
+            active = warm_start.active_set
+            x = np.where(np.isfinite(warm_start.x), warm_start.x, 0.0)
+    elif warm_start is not None:
+        active = np.nan_to_num(np.asarray(warm_start, dtype=float))
+        if active.shape != (M,):
+            raise ProblemError(f"a warm start must be a solution or an active set of shape {(M,)}; got {active.shape}")
+    return x, active
+
+
+def _phase_1(rows: _Rows, start: Array) -> tuple[Array, Array | None]:
+    """A feasible point (``start`` if it is one) and None, or ``start`` and a ray that may prove that there is none."""
+    A, h = np.vstack([rows.A, -rows.A[rows.equality]]), np.concatenate([rows.h, -rows.h[rows.equality]])
+    if (A @ start <= h).all():
+        return start, None
+    n = len(start)
+    least = linprog(
+        np.append(np.zeros(n), 1.0),
+        A_ub=np.column_stack([A, np.full(len(A), -1.0)]),
+        b_ub=h - A @ start,
+        bounds=[(None, None)] * n + [(0.0, None)],
+        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+    )
+    if least.x is None:
+        return start, np.zeros(len(rows.h))
+    x = start + least.x[:n]
+    if (A @ x - h <= INSIDE * np.maximum(1.0, np.abs(h))).all():
+        return x, None
+    weights = -least.ineqlin.marginals
+    ray = weights[: len(rows.h)].copy()
+    ray[rows.equality] -= weights[len(rows.h) :]
+    return start, ray
+
+
+def _close_to_guess(rows: _Rows, x: Array, guess: Array) -> NDArray[np.bool_]:
+    """Which guessed rows hold with equality at x."""
+    guessed = np.sign(guess[rows.stacked]) == np.sign(rows.factor)
+    return guessed & (np.abs(rows.A @ x - rows.h) <= INSIDE * np.maximum(1.0, np.abs(rows.h)))
+
+
+def _minimise_on_rows(P: Array, gradient: Array, A: Array, gap: Array) -> tuple[Array, Array]:
+    """The minimiser d of ``1/2 d'Pd + gradient'd`` with ``A d = gap`` (zero but for rounding), and the multipliers.
+
+    ``P d + gradient + A' multipliers = 0``; rows of A that depend on others get multiplier zero.
+    """
+    Q, R, order = qr(A.T, pivoting=True)
+    pivots = np.abs(np.diagonal(R))
+    rank = int(np.sum(pivots > RANK * pivots[0])) if len(pivots) else 0
+    Q1, Q2, R = Q[:, :rank], Q[:, rank:], R[:rank, :rank]
+    d = Q1 @ solve_triangular(R, gap[order[:rank]], trans="T")
+    if Q2.shape[1]:
+        reduced = cho_factor(Q2.T @ P @ Q2)
+        d = d - Q2 @ cho_solve(reduced, Q2.T @ (gradient + P @ d))
+    multipliers = np.zeros(len(A))
+    multipliers[order[:rank]] = -solve_triangular(R, Q1.T @ (gradient + P @ d))
+    return d, multipliers
+
+
+def _step_length(rows: _Rows, x: Array, d: Array, working: list[int]) -> tuple[float, int | None]:
+    """Kappa in [0, 1] and the row that blocks, if one does."""
+    speed = rows.A @ d
+    speed[working] = 0.0
+    room = np.maximum(rows.h - rows.A @ x, 0.0)
+    towards = speed > STILL * np.linalg.norm(d)
+    if not towards.any():
+        return 1.0, None
+    kappas = np.where(towards, room / np.where(towards, speed, 1.0), np.inf)
+    blocking = int(np.argmin(kappas))
+    return (float(kappas[blocking]), blocking) if kappas[blocking] < 1.0 else (1.0, None)
+
+
+def _stack(rows: _Rows, which, multipliers: Array, M: int) -> Array:
+    """Multipliers (M,) of the stacked constraints from those of some one-sided rows."""
+    stacked = np.zeros(M)
+    np.add.at(stacked, rows.stacked[which], multipliers * rows.factor[which])
+    return stacked

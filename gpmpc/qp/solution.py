@@ -1,0 +1,194 @@
+"""What a solver hands back, and how good it is.
+
+A solution is judged by its residuals, which it computes from the problem's own data; a solver's flag is a claim, not a
+proof. With the stacked constraints C = [I; G] and multipliers y (positive at upper, negative at lower bounds) the
+conditions of Karush, Kuhn and Tucker are P x + q + C'y = 0, lower <= C x <= upper, and a zero duality gap.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpmpc.exceptions import ProblemError
+from gpmpc.qp import record as layout
+from gpmpc.qp.problem import ABSENT, QuadraticProgram
+from gpmpc.status import Status
+
+Array = NDArray[np.float64]
+
+
+class Terms(NamedTuple):
+    """What of a problem does not depend on q and the bounds."""
+
+    P: Array  # (n, n)
+    G: Array  # (m, n)
+    softness: Array  # (2, M), see gpmpc.qp.soft_rows
+
+
+class QPSolution(NamedTuple):
+    """The minimiser with its multipliers, status and residuals. Holds references to the problem's arrays, not copies.
+
+    Attributes:
+        x: (n,) the minimiser; the best iterate if the status is not ``SOLVED``. A view of the record.
+        terms: P, G and softness of the problem.
+        q: (n,).
+        lower: (M,) bounds of the stacked constraints ``[x; Gx]``.
+        upper: (M,).
+        record: The solver's whole result in one array, and a warm start for the next solve; see ``gpmpc.qp.record``.
+        build_seconds: Time spent on building or compiling the problem in this call [s].
+        solve_seconds: Time spent on solving it [s].
+    """
+
+    x: Array
+    terms: Terms
+    q: Array
+    lower: Array
+    upper: Array
+    record: Array
+    build_seconds: float
+    solve_seconds: float
+
+    @property
+    def multipliers(self) -> Array:
+        """(M,) multipliers of the stacked constraints; Farkas' proof if the status is ``INFEASIBLE``."""
+        start = layout.HEADER + len(self.q)
+        return self.record[start : start + len(self.lower)]
+
+    @property
+    def z(self) -> Array:
+        """(m,) multipliers of the rows of G: positive at h_upper, negative at h_lower."""
+        return self.multipliers[len(self.q) :]
+
+    @property
+    def z_box(self) -> Array:
+        """(n,) multipliers of the box: positive at ub, negative at lb."""
+        return self.multipliers[: len(self.q)]
+
+    @property
+    def status(self) -> Status:
+        """How the solve ended."""
+        return layout.STATUSES[int(self.record[layout.STATUS])]
+
+    @property
+    def iterations(self) -> int:
+        """Changes of the working set, or the iterations of the solver behind."""
+        return int(self.record[layout.ITERATIONS])
+
+    @property
+    def active_set(self) -> NDArray[np.int8]:
+        """(M,) -1 where a stacked constraint works at its lower bound, +1 at its upper bound, 0 elsewhere."""
+        active = np.zeros(len(self.lower), dtype=np.int8)
+        start = layout.HEADER + len(self.q) + len(self.lower)
+        codes = self.record[start : start + int(self.record[layout.WORKING])]
+        active[np.abs(codes).astype(int) - 1] = np.sign(codes)
+        return active
+
+    @property
+    def objective(self) -> float:
+        """1/2 x'Px + q'x, with the price of violated soft rows [the unit of the cost]."""
+        x = self.x
+        return float(0.5 * x @ self.terms.P @ x + self.q @ x + self._price())
+
+    def violation(self) -> Array:
+        """(M,) how far each stacked constraint lies outside its bounds, in the constraint's own unit; soft ones too."""
+        values = np.concatenate([self.x, self.terms.G @ self.x])
+        return np.maximum(0.0, np.maximum(values - self.upper, self.lower - values))
+
+    def primal_residual(self) -> float:
+        """The largest violation of a hard constraint, or of a soft one beyond what its multiplier pays for.
+
+        Scaled by max(1, |x|, |Gx|) (largest entries).
+        """
+        softness, caps = self.terms.softness
+        paid = np.where(np.abs(self.multipliers) >= caps, np.inf, softness * np.abs(self.multipliers))
+        beyond = np.maximum(0.0, self.violation() - paid)
+        return float(beyond.max() / max(1.0, _size(self.x), _size(self.terms.G @ self.x)))
+
+    def dual_residual(self) -> float:
+        """The largest entry of P x + q + G'z + z_box, or multiplier of an absent bound or beyond its weight.
+
+        Scaled by max(1, |Px|, |q|, |G'z|) (largest entries).
+        """
+        P, G, (_, caps) = self.terms
+        multipliers = self.multipliers
+        slope, pull = P @ self.x, G.T @ self.z
+        stationarity = slope + self.q + pull + self.z_box
+        absent = ((multipliers > 0) & (self.upper >= ABSENT)) | ((multipliers < 0) & (self.lower <= -ABSENT))
+        stray = np.where(absent, np.abs(multipliers), np.maximum(0.0, np.abs(multipliers) - caps))
+        return max(_size(stationarity), _size(stray)) / max(1.0, _size(slope), _size(self.q), _size(pull))
+
+    def duality_gap(self) -> float:
+        """|primal - dual objective|, scaled by max(1, |x'Px|, |q'x|, |sum of multipliers times bounds|)."""
+        multipliers, x = self.multipliers, self.x
+        bounds = np.where(multipliers > 0, self.upper, self.lower)
+        support = float(np.sum(multipliers[multipliers != 0] * bounds[multipliers != 0]))
+        curvature, slope = float(x @ self.terms.P @ x), float(self.q @ x)
+        soft = self._price() + 0.5 * float(np.sum(self.terms.softness[0] * multipliers**2))
+        return abs(curvature + slope + support + soft) / max(1.0, abs(curvature), abs(slope), abs(support))
+
+    def is_optimal(self, eps: float = 1e-9) -> bool:
+        """Whether the residuals, whatever the status says, are all at most ``eps``."""
+        return max(self.primal_residual(), self.dual_residual(), self.duality_gap()) <= eps
+
+    def _price(self) -> float:
+        softness, caps = self.terms.softness
+        violation, soft = self.violation(), softness > 0
+        linear = np.isfinite(caps)
+        return float(0.5 * np.sum(violation[soft] ** 2 / softness[soft]) + np.sum(caps[linear] * violation[linear]))
+
+
+def _size(vector: Array) -> float:
+    return float(np.abs(vector).max(initial=0.0))
+
+
+def hard_terms(problem: QuadraticProgram) -> Terms:
+    """The terms of a problem without soft rows."""
+    M = sum(problem.G.shape)
+    return Terms(problem.P, problem.G, np.vstack([np.zeros(M), np.full(M, np.inf)]))
+
+
+def make_solution(
+    problem: QuadraticProgram,
+    status: Status,
+    x: ArrayLike,
+    multipliers: ArrayLike,
+    *,
+    active_set: ArrayLike | None = None,
+    iterations: int = 0,
+    build_seconds: float = 0.0,
+    solve_seconds: float = 0.0,
+) -> QPSolution:
+    """A solution from the parts that any solver has.
+
+    Args:
+        problem: What was solved; its rows are hard.
+        status: How it ended.
+        x: (n,).
+        multipliers: (M,) box first, positive at upper and negative at lower bounds.
+        active_set: (M,) -1, 0, +1; the signs of the multipliers if omitted.
+        iterations: The solver's own count.
+        build_seconds: [s].
+        solve_seconds: [s].
+    """
+    x, multipliers = np.asarray(x, dtype=float), np.asarray(multipliers, dtype=float)
+    n, M = len(problem.q), sum(problem.G.shape)
+    if x.shape != (n,) or multipliers.shape != (M,):
+        raise ProblemError(
+            f"a solution needs x of shape {(n,)} and multipliers {(M,)}; got {x.shape}, {multipliers.shape}"
+        )
+    active = np.sign(multipliers) if active_set is None else np.asarray(active_set)
+    record = layout.warm_record(np.nan_to_num(active), n)
+    record[layout.STATUS] = layout.STATUSES.index(status)
+    record[layout.ITERATIONS] = iterations
+    record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
+    return QPSolution(
+        record[layout.HEADER : layout.HEADER + n],
+        hard_terms(problem),
+        problem.q,
+        problem.lower,
+        problem.upper,
+        record,
+        build_seconds,
+        solve_seconds,
+    )

@@ -1,0 +1,5 @@
+"""Checks for those who bring their own part: does it keep the promises that the rest of gpmpc relies on?"""
+
+from gpmpc.testing.qp import check_qp_solver
+
+__all__ = ["check_qp_solver"]

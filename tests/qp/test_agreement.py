@@ -1,0 +1,128 @@
+"""Our solvers against each other and against two that others wrote (DAQP, Clarabel), on problems made to be awkward."""
+
+import daqp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from problems import distance, feasible_problem, integer_problem, worst_residual
+
+from gpmpc.qp import CvxpySolver, DualActiveSet, PrimalActiveSet, QuadraticProgram
+from gpmpc.status import Status
+
+DAQP_SOLVED, DAQP_INFEASIBLE = (1, 2), (-1, -6)  # -6: infeasible by its presolve of equal or crossed bounds
+
+
+def daqp_solution(problem: QuadraticProgram):
+    """(x, solved or not) from DAQP, which reads only contiguous arrays rightly."""
+    lower, upper = np.maximum(problem.lower, -1e30), np.minimum(problem.upper, 1e30)
+    x, _, flag, _ = daqp.solve(
+        problem.P.copy(), problem.q.copy(), problem.G.copy(), upper, lower, np.zeros(len(lower), dtype=np.int32),
+        primal_tol=1e-9,
+    )  # fmt: skip
+    assert flag in DAQP_SOLVED + DAQP_INFEASIBLE
+    return x, flag in DAQP_SOLVED
+
+
+def gram(problem, warm_start=None):
+    return DualActiveSet().prepare(problem.P, problem.G).solve(problem.q, problem.lower, problem.upper, warm_start)
+
+
+def lazy(problem, warm_start=None):
+    return DualActiveSet().solve(problem, warm_start)
+
+
+@pytest.mark.parametrize("feasible", [True, None])
+@pytest.mark.parametrize("block", range(4))
+def test_no_disagreement_with_daqp_on_integer_problems_feasible_and_infeasible(block, feasible):
+    rng = np.random.default_rng([block, bool(feasible)])
+    outcomes = set()
+    for _ in range(600):
+        problem = integer_problem(rng, feasible)
+        guess = rng.integers(-1, 2, len(problem.lower)) if rng.random() < 0.5 else None
+        x, solved = daqp_solution(problem)
+        outcomes.add(solved)
+        for solve in (gram, lazy):
+            solution = solve(problem, guess)
+            assert solution.status is (Status.SOLVED if solved else Status.INFEASIBLE)
+            if solved:
+                assert distance(problem, solution.x, x) < 1e-6
+                assert worst_residual(solution) < 1e-9
+    assert outcomes == ({True} if feasible else {True, False})
+
+
+@pytest.mark.parametrize("feasible", [True, None])
+def test_no_disagreement_with_clarabel_on_integer_problems(feasible):
+    rng, clarabel = np.random.default_rng([7, bool(feasible)]), CvxpySolver()
+    for _ in range(60):
+        problem = integer_problem(rng, feasible)
+        theirs, ours = clarabel.solve(problem), lazy(problem)
+        assert ours.status is theirs.status
+        if ours.status.solved:
+            assert distance(problem, ours.x, theirs.x) < 1e-6
+
+
+@pytest.mark.parametrize("feasible", [True, None])
+def test_the_papers_algorithm_finds_what_the_dual_method_finds(feasible):
+    rng, primal = np.random.default_rng([8, bool(feasible)]), PrimalActiveSet()
+    for _ in range(600):
+        problem = integer_problem(rng, feasible)
+        guess = rng.integers(-1, 2, len(problem.lower)) if rng.random() < 0.5 else None
+        dual, solution = lazy(problem), primal.solve(problem, guess)
+        assert solution.status is dual.status
+        if dual.status.solved:
+            assert worst_residual(solution) < 1e-9
+            assert distance(problem, solution.x, dual.x) < 1e-8
+
+
+numbers = st.integers(-3, 3).map(float)
+
+
+@st.composite
+def small_problems(draw):
+    n, m = draw(st.integers(1, 4)), draw(st.integers(0, 6))
+    root = np.array(draw(st.lists(numbers, min_size=n * n, max_size=n * n))).reshape(n, n)
+    P = root.T @ root + draw(st.sampled_from([1e-3, 1.0, 100.0])) * np.eye(n)
+    q = np.array(draw(st.lists(numbers, min_size=n, max_size=n)))
+    G = np.array(draw(st.lists(numbers, min_size=m * n, max_size=m * n))).reshape(m, n)
+    bound = st.one_of(st.none(), numbers)
+    lower, upper = [], []
+    for _ in range(n + m):
+        low, width = draw(bound), draw(st.one_of(st.none(), st.sampled_from([0.0, 0.5, 2.0])))
+        lower.append(-np.inf if low is None else low)
+        upper.append(np.inf if width is None else (0.0 if low is None else low) + width)
+    guess = draw(st.lists(st.sampled_from([-1, 0, 1]), min_size=n + m, max_size=n + m))
+    return QuadraticProgram.from_stacked(P, q, G, np.array(lower), np.array(upper)), np.array(guess)
+
+
+@given(small_problems())
+@settings(max_examples=400, deadline=None, derandomize=True)
+def test_three_methods_agree_on_whatever_hypothesis_invents(case):
+    problem, guess = case
+    solutions = [gram(problem, guess), lazy(problem, guess), PrimalActiveSet().solve(problem, guess)]
+    assert len({solution.status for solution in solutions}) == 1
+    assert solutions[0].status in (Status.SOLVED, Status.INFEASIBLE)
+    if solutions[0].status.solved:
+        for solution in solutions:
+            assert worst_residual(solution) < 1e-9
+            assert distance(problem, solutions[0].x, solution.x) < 1e-8
+
+
+@pytest.mark.parametrize("solve", [gram, lazy])
+@pytest.mark.parametrize("condition", [1.0, 1e4, 1e8])
+@pytest.mark.parametrize("n", [1, 2, 3, 7, 20, 50, 150])
+def test_every_size_and_conditioning_is_solved_to_1e_9(solve, n, condition, rng):
+    for m in (0, n, 2 * n):
+        problem = feasible_problem(rng, n, m, condition)
+        solution = solve(problem)
+        assert solution.status is Status.SOLVED
+        assert worst_residual(solution) < 1e-9
+        x, _ = daqp_solution(problem)
+        assert distance(problem, solution.x, x) < 1e-6
+
+
+@pytest.mark.parametrize("n", range(1, 151, 7))
+def test_every_number_of_variables_from_1_to_150_without_rows(n, rng):
+    problem = feasible_problem(rng, n, 0)
+    for solution in (gram(problem), lazy(problem)):
+        assert solution.is_optimal(1e-9)

@@ -1,0 +1,92 @@
+"""The check itself: it passes the honest solvers and finds out each kind of liar."""
+
+import numpy as np
+import pytest
+
+from gpmpc.qp import CvxpySolver, DualActiveSet, PrimalActiveSet, make_solution
+from gpmpc.qp import record as layout
+from gpmpc.status import Status
+from gpmpc.testing import check_qp_solver
+
+HONEST = DualActiveSet()
+
+
+@pytest.mark.parametrize("solver", [DualActiveSet(), PrimalActiveSet(), CvxpySolver()], ids=lambda s: type(s).__name__)
+def test_the_packages_own_solvers_pass(solver):
+    check_qp_solver(solver)
+
+
+def test_the_packages_active_set_methods_pass_a_thousand_times_more_strictly():
+    check_qp_solver(DualActiveSet(), tolerance=1e-9)
+    check_qp_solver(PrimalActiveSet(), tolerance=1e-9)
+
+
+class Liar:
+    """An honest solver with one flaw."""
+
+    def __init__(self, flaw):
+        self.flaw, self.shared = flaw, np.zeros(0)
+
+    def solve(self, problem, warm_start=None):
+        return self.flaw(self, problem, warm_start)
+
+
+def multipliers_of_the_other_sign(_, problem, warm_start):
+    solution = HONEST.solve(problem, warm_start)
+    return make_solution(problem, solution.status, solution.x, -solution.multipliers)
+
+
+def slightly_off(_, problem, warm_start):
+    solution = HONEST.solve(problem, warm_start)
+    return make_solution(problem, solution.status, solution.x + 1e-4, solution.multipliers)
+
+
+def everything_is_solved(_, problem, warm_start):
+    solution = HONEST.solve(problem, warm_start)
+    return make_solution(problem, Status.SOLVED, solution.x, solution.multipliers)
+
+
+def nothing_is_feasible(_, problem, warm_start):
+    solution = HONEST.solve(problem, warm_start)
+    return make_solution(problem, Status.INFEASIBLE, solution.x, solution.multipliers)
+
+
+def scribbles_on_the_input(_, problem, warm_start):
+    problem.q[0] += 1e-12
+    return HONEST.solve(problem, warm_start)
+
+
+def believes_its_warm_start(_, problem, warm_start):
+    if isinstance(warm_start, np.ndarray) and (warm_start > 0).all():
+        return make_solution(problem, Status.SOLVED, np.minimum(problem.ub, 1.0), np.zeros(len(problem.lower)))
+    return HONEST.solve(problem, warm_start)
+
+
+def reuses_its_memory(self, problem, warm_start):
+    solution = HONEST.solve(problem, warm_start)
+    if len(self.shared) < len(solution.record):
+        self.shared = np.zeros(len(solution.record))
+    record = self.shared[: len(solution.record)]
+    record[:] = solution.record
+    return solution._replace(x=record[layout.HEADER : layout.HEADER + len(problem.q)], record=record)
+
+
+@pytest.mark.parametrize(
+    ("flaw", "message"),
+    [
+        (multipliers_of_the_other_sign, "should be"),
+        (slightly_off, "x is"),
+        (everything_is_solved, "expected INFEASIBLE"),
+        (nothing_is_feasible, "expected SOLVED"),
+        (scribbles_on_the_input, "modified q"),
+        (believes_its_warm_start, "warm-started from everything at the upper bounds"),
+        (reuses_its_memory, "a later solve changed"),
+    ],
+)
+def test_each_kind_of_liar_is_found_out(flaw, message):
+    with pytest.raises(AssertionError, match=message):
+        check_qp_solver(Liar(flaw))
+
+
+def test_a_status_is_one_of_five(rng):
+    assert len(layout.STATUSES) == len(set(layout.STATUSES)) == len(Status)

@@ -1,0 +1,68 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from problems import distance, feasible_problem
+
+from gpmpc.exceptions import ProblemError
+from gpmpc.qp import CvxpySolver, DualActiveSet, QuadraticProgram
+from gpmpc.status import Status
+
+
+def test_an_unknown_solver_is_refused_with_the_list_of_those_installed():
+    with pytest.raises(ProblemError, match=r"no solver named 'GUROBIX'; it finds .*CLARABEL"):
+        CvxpySolver("GUROBIX")
+
+
+def test_importing_the_solvers_does_not_load_cvxpy_until_one_is_used():
+    code = """
+import sys
+import gpmpc.qp, gpmpc.testing
+assert "cvxpy" not in sys.modules
+gpmpc.qp.CvxpySolver()
+assert "cvxpy" in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("name", ["CLARABEL", "DAQP", "OSQP"])
+def test_several_solvers_behind_cvxpy_find_our_minimiser_and_multipliers(name, rng):
+    options = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100000} if name == "OSQP" else None
+    solver = CvxpySolver(name, options)
+    for n, m in ((3, 0), (4, 6), (12, 20)):
+        problem = feasible_problem(rng, n, m)
+        ours, theirs = DualActiveSet().solve(problem), solver.solve(problem)
+        assert theirs.status is Status.SOLVED
+        assert distance(problem, ours.x, theirs.x) < 1e-6
+        np.testing.assert_allclose(theirs.multipliers, ours.multipliers, atol=1e-4)
+
+
+def test_a_second_problem_of_the_same_shape_is_not_compiled_again(rng):
+    solver = CvxpySolver()
+    first = solver.solve(feasible_problem(rng, 8, 10))
+    second_problem = feasible_problem(rng, 8, 10)
+    second = solver.solve(second_problem, first)
+    assert second.is_optimal(1e-6)
+    assert len(solver._compiled.forms) == 1
+    np.testing.assert_allclose(second.x, DualActiveSet().solve(second_problem).x, atol=1e-6)
+
+
+def test_the_store_of_compiled_problems_stays_small():
+    solver = CvxpySolver()
+    for n in range(1, 20):
+        assert solver.solve(QuadraticProgram(np.eye(n), np.ones(n), lb=np.zeros(n))).status.solved
+    assert len(solver._compiled.forms) == 16
+
+
+def test_an_answer_that_its_residuals_do_not_bear_out_is_not_called_solved(rng):
+    sloppy = CvxpySolver("OSQP", {"eps_abs": 1e-1, "eps_rel": 1e-1, "max_iter": 100000})
+    problem = feasible_problem(rng, 10, 15)
+    solution = sloppy.solve(problem)
+    assert not solution.is_optimal(1e-6)
+    assert solution.status is Status.NUMERICAL_TROUBLE
+
+
+def test_an_iteration_limit_is_translated(rng):
+    solution = CvxpySolver("CLARABEL", {"max_iter": 2}).solve(feasible_problem(rng, 10, 15))
+    assert solution.status is Status.ITERATION_LIMIT

@@ -1,0 +1,140 @@
+"""Limits, threads, start-up: what a solver in a control loop must withstand."""
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problems import feasible_problem, integer_problem
+
+from gpmpc.qp import DualActiveSet, PrimalActiveSet
+from gpmpc.status import Status
+
+PACKAGE = Path(__file__).resolve().parents[2] / "gpmpc"
+
+
+@pytest.mark.parametrize("mode", ["gram", "lazy"])
+def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_goes_on(mode, rng):
+    problem = feasible_problem(rng, 20, 30)
+    full = DualActiveSet().solve(problem)
+    assert full.iterations > 6
+    limited = DualActiveSet(iteration_limit=3)
+    prepared = limited.prepare(problem.P, problem.G)
+    solution, objectives = None, []
+    for _ in range(full.iterations):
+        if mode == "gram":
+            solution = prepared.solve(problem.q, problem.lower, problem.upper, solution)
+        else:
+            solution = limited.solve(problem, solution)
+        objectives.append(solution.objective)
+        assert solution.dual_residual() < 1e-9
+        if solution.status.solved:
+            break
+        assert solution.status is Status.ITERATION_LIMIT
+        assert solution.primal_residual() > 0.0
+    assert solution.status.solved
+    np.testing.assert_allclose(solution.x, full.x, atol=1e-9)
+    # a dual method climbs: each stop is a lower bound on the optimum, better than the one before
+    assert (np.diff(objectives) > 0.0).all()
+    assert len(objectives) > 2
+
+
+@pytest.mark.parametrize("mode", ["gram", "lazy"])
+def test_the_time_limit_stops_a_long_solve_and_does_not_touch_a_short_one(mode, rng):
+    problem = feasible_problem(rng, 120, 300)
+    full = DualActiveSet().solve(problem)
+    assert full.iterations > 50
+
+    def solve(solver):
+        if mode == "gram":
+            return solver.prepare(problem.P, problem.G).solve(problem.q, problem.lower, problem.upper)
+        return solver.solve(problem)
+
+    hurried = solve(DualActiveSet(time_limit=1e-7))
+    assert hurried.status is Status.TIME_LIMIT
+    assert hurried.iterations < full.iterations
+    assert hurried.dual_residual() < 1e-9
+    patient = solve(DualActiveSet(time_limit=60.0))
+    assert patient.status is Status.SOLVED
+    assert patient.iterations > 2 * hurried.iterations
+    np.testing.assert_allclose(patient.x, full.x, atol=1e-9)
+
+
+def test_the_primal_method_says_when_it_stops_early(rng):
+    solution = PrimalActiveSet(iteration_limit=2).solve(feasible_problem(rng, 10, 20))
+    assert solution.status is Status.ITERATION_LIMIT
+
+
+def test_one_solver_and_one_prepared_problem_serve_many_threads(rng):
+    problems = [feasible_problem(rng, 12, 20) for _ in range(8)]
+    shared = problems[0]
+    solver = DualActiveSet()
+    prepared = solver.prepare(shared.P, shared.G)
+    gradients = [shared.q + rng.standard_normal(12) for _ in range(8)]
+    expected = [
+        [solver.solve(p).x for p in problems],
+        [prepared.solve(q, shared.lower, shared.upper).x for q in gradients],
+    ]
+
+    def work(_):
+        own = DualActiveSet()
+        return [
+            [[own.solve(p).x for p in problems], [prepared.solve(q, shared.lower, shared.upper).x for q in gradients]]
+            for _ in range(50)
+        ]
+
+    with ThreadPoolExecutor(4) as pool:
+        for results in pool.map(work, range(4)):
+            for result in results:
+                np.testing.assert_array_equal(result, expected)
+
+
+START = """
+import numpy as np
+from gpmpc.qp import DualActiveSet
+from gpmpc.qp.dual_kernels import solve_gram, solve_lazy
+solution = DualActiveSet().prepare(np.eye(3), np.ones((1, 3))).solve(np.ones(3), np.full(4, -0.5), np.full(4, 0.5))
+assert solution.is_optimal(1e-12), solution
+print(sum(sum(kernel.stats.cache_misses.values()) for kernel in (solve_gram, solve_lazy)))
+"""
+
+
+def first_solve(folder, **environment):
+    """How many kernels a new process must compile for its first solve."""
+    return int(
+        subprocess.run(
+            [sys.executable, "-c", START], capture_output=True, text=True, check=True, cwd=folder,
+            env=os.environ | {"PYTHONPATH": str(folder)} | environment,
+        ).stdout
+    )  # fmt: skip
+
+
+def copy_of_the_package(folder):
+    for source in [PACKAGE / "__init__.py", PACKAGE / "status.py", PACKAGE / "exceptions.py", *PACKAGE.glob("qp/*.py")]:
+        target = folder / source.relative_to(PACKAGE.parent)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(source.read_text())
+
+
+def test_a_new_process_takes_its_kernels_from_the_cache_of_the_last_one():
+    DualActiveSet().prepare(np.eye(2))  # fills the cache beside the source, unless it is there already
+    assert first_solve(PACKAGE.parent) == 0
+
+
+@pytest.mark.slow
+def test_the_solver_works_where_no_compiled_code_can_be_kept(tmp_path):
+    copy_of_the_package(tmp_path)
+    (tmp_path / "gpmpc" / "qp" / "__pycache__").write_text("in the way of the cache beside the source")
+    nowhere = str(tmp_path / "gpmpc" / "status.py")  # a file: no cache folder can be made below it
+    first_solve(tmp_path, HOME=nowhere, XDG_CACHE_HOME=nowhere, NUMBA_CACHE_DIR="")
+
+
+@pytest.mark.slow
+def test_no_disagreement_on_twenty_thousand_more_integer_problems():
+    rng, primal = np.random.default_rng(99), PrimalActiveSet()
+    for _ in range(20000):
+        problem = integer_problem(rng, True if rng.random() < 0.5 else None)
+        assert DualActiveSet().solve(problem).status is primal.solve(problem).status

@@ -1,0 +1,137 @@
+import numpy as np
+import pytest
+
+from gpmpc.exceptions import ProblemError
+from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram, SoftRows
+
+EYE = np.eye(2)
+INDEFINITE = np.array([[1.0, 2.0], [2.0, 1.0]])  # eigenvalues -1 and 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"P": np.ones(2), "q": [0, 0]}, "square matrix"),
+        ({"P": np.zeros((0, 0)), "q": []}, "at least one row"),
+        ({"P": EYE, "q": [0, 0, 0]}, r"q must have shape \(2,\); got \(3,\)"),
+        ({"P": EYE, "q": [0, np.nan]}, "q must not contain NaN; it does at index 1"),
+        ({"P": EYE, "q": [0, np.inf]}, "q must be finite"),
+        ({"P": EYE, "q": ["a", "b"]}, "real numbers"),
+        ({"P": [[1.0, np.nan], [0.0, 1.0]], "q": [0, 0]}, "P must not contain NaN; it does at index 0, 1"),
+        ({"P": [[np.inf, 0.0], [0.0, 1.0]], "q": [0, 0]}, "P must be finite"),
+        ({"P": [[1.0, 0.5], [0.0, 1.0]], "q": [0, 0]}, r"symmetric; got P\[0, 1\] = 0.5 and P\[1, 0\] = 0"),
+        ({"P": INDEFINITE, "q": [0, 0]}, r"smallest eigenvalue \(number 0 of 2, in ascending order\) is -1,"),
+        ({"P": [[1.0, 1.0], [1.0, 1.0]], "q": [0, 0]}, "positive definite"),
+        ({"P": EYE, "q": [0, 0], "G": [1.0, 1.0]}, "matrix of 2 columns"),
+        ({"P": EYE, "q": [0, 0], "G": [[1.0, 1.0, 1.0]]}, r"G must have shape \(1, 2\); got \(1, 3\)"),
+        ({"P": EYE, "q": [0, 0], "G": [[1.0, np.inf]]}, "G must be finite"),
+        ({"P": EYE, "q": [0, 0], "h_upper": [1.0]}, "without G"),
+        (
+            {"P": EYE, "q": [0, 0], "G": [[1.0, 1.0]], "h_lower": [2.0], "h_upper": [1.0]},
+            "row 0: h_lower must not exceed",
+        ),
+        (
+            {"P": EYE, "q": [0, 0], "lb": [0.0, 1.0], "ub": [0.0, 0.5]},
+            r"variable 1: lb must not exceed ub; got 1 > 0.5",
+        ),
+        ({"P": EYE, "q": [0, 0], "lb": [np.inf, 0.0]}, "variable 0: no number satisfies lb = inf"),
+        ({"P": EYE, "q": [0, 0], "ub": [0.0, -1e20]}, "variable 1: no number satisfies ub"),
+        ({"P": EYE, "q": [0, 0], "ub": [0.0, np.nan]}, "ub must not contain NaN"),
+    ],
+)
+def test_a_malformed_problem_is_refused_with_the_rule_and_what_was_got(arguments, message):
+    with pytest.raises(ProblemError, match=message):
+        QuadraticProgram(**arguments)
+
+
+GOOD = {"P": EYE, "q": np.zeros(2), "G": np.ones((1, 2)), "lower": -np.ones(3), "upper": np.ones(3)}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("P", INDEFINITE, "smallest eigenvalue"),
+        ("P", np.array([[1.0, 0.5], [0.0, 1.0]]), "symmetric"),
+        ("P", np.array([[1.0, 0.0], [0.0, np.nan]]), "NaN"),
+        ("P", np.ones((2, 3)), "square"),
+        ("q", np.array([0.0, np.nan]), "NaN"),
+        ("q", np.array([0.0, -np.inf]), "finite"),
+        ("q", np.zeros(3), "shape"),
+        ("G", np.full((1, 2), np.nan), "NaN"),
+        ("G", np.ones((1, 3)), "shape"),
+        ("lower", np.array([-1.0, np.nan, -1.0]), "NaN"),
+        ("lower", np.array([-1.0, -1.0, 2.0]), "row 0"),
+        ("lower", -np.ones(2), "shape"),
+        ("upper", np.ones(4), "shape"),
+    ],
+)
+def test_the_fast_entries_refuse_the_same_misuse(name, value, message):
+    arguments = GOOD | {name: value}
+    with pytest.raises(ProblemError, match=message):
+        DualActiveSet().solve_stacked(**arguments)
+    with pytest.raises(ProblemError, match=message):
+        DualActiveSet().prepare(arguments.pop("P"), arguments.pop("G")).solve(**arguments)
+
+
+def test_the_good_problem_of_these_tests_is_good():
+    assert DualActiveSet().solve_stacked(**GOOD).status.solved
+
+
+@pytest.mark.parametrize("bound", [np.inf, 1e20, 1e25, 1e300])
+def test_a_bound_of_1e20_or_more_is_none(bound):
+    free = QuadraticProgram(EYE, [-3.0, 4.0], EYE, [-bound, -bound], [bound, bound], [-bound, -bound], [bound, bound])
+    for solver in (DualActiveSet(), PrimalActiveSet()):
+        solution = solver.solve(free)
+        assert solution.status.solved
+        np.testing.assert_allclose(solution.x, [3.0, -4.0])
+        assert not solution.multipliers.any()
+
+
+def test_lists_and_integers_are_converted_and_the_givers_arrays_stay_as_they_are():
+    P, G = [[2, 0], [0, 2]], np.asfortranarray([[1, 2], [3, 4]])
+    problem = QuadraticProgram(P, [1, 1], G, h_upper=[1, 1])
+    assert problem.G.flags.c_contiguous
+    assert problem.G.dtype == np.float64
+    assert G.flags.f_contiguous
+    assert G.dtype.kind == "i"
+
+
+def test_unstacking_and_stacking_bounds_are_inverse(rng):
+    lower, upper = -rng.random(5), rng.random(5)
+    problem = QuadraticProgram.from_stacked(EYE, np.zeros(2), rng.random((3, 2)), lower, upper)
+    np.testing.assert_array_equal(problem.lower, lower)
+    np.testing.assert_array_equal(problem.upper, upper)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({}, "neither"),
+        ({"quadratic": [1.0, 0.0]}, "quadratic weight of row 1 must be positive"),
+        ({"linear": [-1.0, 1.0]}, "linear weight of row 0 must be positive"),
+        ({"linear": [1.0, np.nan]}, "NaN"),
+        ({"quadratic": [np.inf, 1.0], "linear": [1.0, 1.0]}, "row 1 has a quadratic and a linear weight"),
+        ({"quadratic": [1.0, 1.0], "linear": [1.0]}, "shape"),
+    ],
+)
+def test_malformed_soft_weights_are_refused(arguments, message):
+    with pytest.raises(ProblemError, match=message):
+        SoftRows(**arguments)
+
+
+def test_soft_weights_must_cover_every_row():
+    with pytest.raises(ProblemError, match="got 1 for 2 rows"):
+        DualActiveSet().prepare(EYE, EYE, SoftRows(linear=[1.0]))
+
+
+@pytest.mark.parametrize("solver", [DualActiveSet, PrimalActiveSet])
+@pytest.mark.parametrize("settings", [{"tolerance": 0.0}, {"iteration_limit": -1}, {"tolerance": float("nan")}])
+def test_settings_that_make_no_sense_are_refused(solver, settings):
+    with pytest.raises(ProblemError, match="must be positive"):
+        solver(**settings)
+
+
+@pytest.mark.parametrize("solver", [DualActiveSet(), PrimalActiveSet()])
+def test_a_warm_start_of_another_shape_is_misuse(solver):
+    with pytest.raises(ProblemError, match="warm start"):
+        solver.solve(QuadraticProgram(EYE, [0.0, 0.0]), np.ones(5))
