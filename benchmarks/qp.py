@@ -28,12 +28,12 @@ from time import perf_counter
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
 
-import daqp  # noqa: E402
-import numpy as np  # noqa: E402
-from quadrotor_sequences import SequenceProblem, quadrotor_sequence  # noqa: E402
+import daqp
+import numpy as np
+from quadrotor_sequences import SequenceProblem, quadrotor_sequence
 
-from gpmpc.qp import CvxpySolver, DualActiveSet, PrimalActiveSet, QuadraticProgram, make_solution  # noqa: E402
-from gpmpc.status import Status  # noqa: E402
+from gpmpc.qp import CvxpySolver, DualActiveSet, PrimalActiveSet, QuadraticProgram, make_solution
+from gpmpc.status import Status
 
 OURS, DAQP_WARM, DAQP_COLD = "DualActiveSet", "DAQP update + solve", "DAQP solve"
 PRIMAL, CVXPY = "PrimalActiveSet", "CVXPY + Clarabel"
