@@ -4,7 +4,7 @@ Which inequalities of ``min 1/2 x'Px + q'x`` subject to ``A x <= h`` hold with e
 feasible x, the method minimises over the working rows as if they were equalities, goes there as far as the others
 allow, adds the row that blocks, and drops a row whose multiplier shows that the minimum lies inside its bound:
 
-    1  d <- argmin of the QP in x + d with ``A_W d = 0``                                   (the KKT system, eqs. 45-47)
+    1  d <- argmin of the QP in x + d with ``A_W d = 0``                                   (the KKT system, eq. (45))
     2  if d = 0: stop if no multiplier is negative, else drop the row of the most negative one
     3  else: kappa <- min(1, min over i outside W with a_i'd > 0 of (h_i - a_i'x) / a_i'd);  x <- x + kappa d
     4        if kappa < 1: add the row that blocks
