@@ -73,6 +73,9 @@ def _run(task: Callable[[DictConfig], None], config_name: str) -> None:
     entry = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)
     try:
         guarded(entry(partial(guarded, task)))
+    except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except KeyboardInterrupt:
         print("\ninterrupted; the same command goes on where it stopped", file=sys.stderr)
         sys.exit(130)
