@@ -5,7 +5,7 @@ ENV := .venv/.installed
 
 .PHONY: tables test lint clean
 
-tables: $(ENV)  ## The paper's Tables 1 and 2 beside ours; settings: make tables SET="draws=50 data.folder=DIR"
+tables: $(ENV)  ## The paper's Tables 1 and 2 beside ours; settings: make tables SET="draws=50 data=paper data.folder=DIR"
 	.venv/bin/gpmpc tables $(SET)
 
 test: $(ENV)  ## The whole test suite; options: make test ARGS="-k gaussian"

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from gpmpc.control.nmpc import NMPC
-from gpmpc.exceptions import DataError, SettingError
+from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gp.transitions import Transitions
-from gpmpc.plants import Plant, attitude_for_thrust_direction
+from gpmpc.plants import ATTITUDES, Plant, attitude_for_thrust_direction
 from gpmpc.simulation import Rollout, closed_loop
 from gpmpc.trajectories import Trajectory
 
@@ -81,8 +81,10 @@ class NMPCData:
     )
 
     def __post_init__(self) -> None:
-        if self.samples < 1:
-            raise SettingError("samples", f"must be 1 or more; got {self.samples}")
+        check_number("data.samples", self.samples, least=1, whole=True)
+        check_number("data.horizon", self.horizon, least=1, whole=True)
+        if self.attitude not in ATTITUDES:
+            raise SettingError("data.attitude", f"must be one of {', '.join(ATTITUDES)}; got {self.attitude!r}")
 
     def transitions(self, name: str, trajectory: Trajectory, subsystem: str) -> Transitions:
         """Flies the trajectory, and for the rotational subsystem the attitude it asks for.
@@ -124,7 +126,8 @@ class PaperData:
     note = "Data: the authors' own."
 
     def __post_init__(self) -> None:
-        if not Path(self.folder).is_dir():
+        check_number("data.samples", self.samples, least=1, whole=True)
+        if not isinstance(self.folder, str | Path) or not Path(self.folder).is_dir():
             raise DataError(f"{self.folder}: no such folder; data.folder must hold the authors' four text files")
 
     def transitions(self, name: str, trajectory: Trajectory, subsystem: str) -> Transitions:

@@ -5,6 +5,9 @@ Every error of this package derives from ``GpmpcError``; its text is one line th
 the way back from a worker process (its constructor's arguments are its ``args``).
 """
 
+import math
+from typing import Any
+
 
 class GpmpcError(Exception):
     """Any error that gpmpc raises on purpose."""
@@ -65,3 +68,45 @@ class SolverFailure(GpmpcError, RuntimeError):
 
     def __str__(self) -> str:
         return f"the controller's solver failed at step {self.args[0]}: {self.args[1]}"
+
+
+def check_number(
+    key: str, value: Any, *, above: float | None = None, least: float | None = None, whole: bool = False, unit: str = ""
+) -> None:
+    """Raises unless a setting is one finite number (not a truth value) of the kind and in the range asked for.
+
+    Args:
+        key: The setting's name.
+        value: What was given.
+        above: It must be larger than this.
+        least: It must be this or more.
+        whole: It must be an integer.
+        unit: Named in the message, such as "[kg]".
+
+    Raises:
+        SettingError: It is not.
+    """
+    right_type = isinstance(value, int) if whole else isinstance(value, int | float)
+    if (
+        right_type
+        and not isinstance(value, bool)
+        and math.isfinite(value)
+        and (above is None or value > above)
+        and (least is None or value >= least)
+    ):
+        return
+    kind = "a whole number" if whole else "a number"
+    limit = f" above {above}" if above is not None else f", {least} or more" if least is not None else ""
+    raise SettingError(key, f"must be {kind}{limit}{' ' + unit if unit else ''}; got {value!r}")
+
+
+def check_numbers(key: str, values: Any, length: int, **limits: Any) -> None:
+    """Raises unless a setting is a list of ``length`` numbers, each as ``check_number`` asks for.
+
+    Raises:
+        SettingError: It is not.
+    """
+    if isinstance(values, str) or not hasattr(values, "__len__") or len(values) != length:
+        raise SettingError(key, f"must be a list of {length} numbers; got {values!r}")
+    for value in values:
+        check_number(key, value, **limits)

@@ -53,7 +53,10 @@ def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:
         symmetrised matrix was positive semidefinite already, which is then returned unchanged.
     """
     symmetric = (covariance + covariance.mT) / 2
-    eigenvalues, vectors = torch.linalg.eigh(symmetric)
-    deficit = (-eigenvalues[..., 0]).clamp_min(0)
+    deficit = (-torch.linalg.eigvalsh(symmetric.detach())[..., 0]).clamp_min(0)
+    negative = deficit[..., None, None] > 0
+    # The derivative of eigh divides by differences of eigenvalues; where nothing is projected it gets distinct ones.
+    distinct = torch.arange(1, symmetric.shape[-1] + 1, dtype=symmetric.dtype, device=symmetric.device).diag()
+    eigenvalues, vectors = torch.linalg.eigh(torch.where(negative, symmetric, distinct))
     projected = vectors @ (eigenvalues.clamp_min(0)[..., None] * vectors.mT)
-    return torch.where(deficit[..., None, None] > 0, (projected + projected.mT) / 2, symmetric), deficit
+    return torch.where(negative, (projected + projected.mT) / 2, symmetric), deficit

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.integrate import RK45
 from scipy.interpolate import PchipInterpolator
 
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, check_number, check_numbers
 
 
 class Trajectory(Protocol):
@@ -44,6 +44,10 @@ class Elliptical:
     rate: float = 0.1  # [rad/s]
     start_z: float = -5.0  # [m]
     climb_rate: float = -0.25  # [m/s]
+
+    def __post_init__(self) -> None:
+        for key in ("radius_x", "radius_y", "rate", "start_z", "climb_rate"):
+            check_number(key, getattr(self, key))
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., 3) [m] at times (...) [s]."""
@@ -91,6 +95,15 @@ class Lorenz:
     sampling_time: float = 1.0  # [s]
     duration: float = 400.0  # [s]
 
+    def __post_init__(self) -> None:
+        for key in ("sigma", "rho", "beta"):
+            check_number(key, getattr(self, key))
+        for key in ("start", "scale"):
+            check_numbers(key, getattr(self, key), 3)
+        check_number("samples_per_step", self.samples_per_step, least=1, whole=True)
+        for key in ("relative_tolerance", "sampling_time", "duration"):
+            check_number(key, getattr(self, key), above=0)
+
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., 3) [m] at times (...) [s]."""
         lorenz_time, _ = self._lorenz_time(time)
@@ -123,7 +136,10 @@ class Lorenz:
         """Lorenz time at flight times, and its rate of change."""
         t = np.asarray(time, dtype=float)
         if np.any(t < 0) or np.any(t > self.duration):
-            raise SettingError("duration", f"this Lorenz trajectory is defined from 0 to {self.duration} s; got {t}")
+            asked = f"{t.min():g} to {t.max():g}"
+            raise SettingError(
+                "duration", f"this Lorenz trajectory is defined from 0 to {self.duration:g} s; got {asked} s"
+            )
         samples, _ = self._integration
         position = t / self.sampling_time
         index = np.minimum(position.astype(int), len(samples) - 2)
@@ -153,6 +169,7 @@ class Step:
     at: float = 0.0  # [s]
 
     def __post_init__(self) -> None:
+        check_number("at", self.at)
         _check_positions("before", [self.before])
         _check_positions("after", [self.after])
 
@@ -229,5 +246,7 @@ class Waypoints:
 
 def _check_positions(key: str, positions: Sequence[Sequence[float]]) -> None:
     for position in positions:
-        if np.shape(position) != (3,) or not np.all(np.isfinite(np.asarray(position, dtype=float))):
-            raise SettingError(key, f"a position is three finite numbers x, y, z [m]; got {position}")
+        try:
+            check_numbers(key, position, 3)
+        except SettingError:
+            raise SettingError(key, f"a position is three finite numbers x, y, z [m]; got {position}") from None

@@ -3,8 +3,8 @@ import pytest
 
 from gpmpc.datasets import NMPCData, PaperData, Tracking
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.plants import Map, Rotational, Translational, attitude_for_thrust_direction, step
-from gpmpc.trajectories import Elliptical, Lorenz
+from gpmpc.plants import Integrated, Map, Rotational, Translational, attitude_for_thrust_direction, step
+from gpmpc.trajectories import Elliptical, Hover, Lorenz
 
 TRANSLATIONAL = Map(Translational(frozen_attitude=(np.pi / 4, np.pi / 4)))
 NMPC_DATA = NMPCData(
@@ -78,6 +78,21 @@ def test_the_authors_files_are_asked_for_by_name(tmp_path):
         PaperData(tmp_path).transitions("lorenz", Lorenz(), "rotational")
 
 
+@pytest.mark.parametrize("samples", [0, -1, 1.5, None, "abc", True])
+def test_samples_of_the_authors_files_are_a_positive_whole_number(samples, tmp_path):
+    with pytest.raises(SettingError, match="data.samples: must be a whole number, 1 or more"):
+        PaperData(tmp_path, samples=samples)
+
+
+def test_an_integrated_plant_can_be_flown():
+    gentle = Tracking(
+        Integrated(Translational(), time_step=0.5, substeps=1), [1, 1, 1, 1, 1, 1], [0.1, 10, 10], [7.26, 0, 0]
+    )
+    flown = NMPCData(gentle, NMPC_DATA.rotational, samples=20, horizon=8)
+    data = flown.transitions("hover", Hover([1.0, -1.0, 2.0]), "translational")
+    assert np.abs(data.next_states[-1, ::2].numpy() - [1, -1, 2]).max() < 0.2
+
+
 def test_no_samples_are_refused():
-    with pytest.raises(SettingError, match="samples: must be 1 or more; got 0"):
+    with pytest.raises(SettingError, match="data.samples: must be a whole number, 1 or more; got 0"):
         NMPCData(NMPC_DATA.translational, NMPC_DATA.rotational, samples=0)

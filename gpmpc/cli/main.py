@@ -68,6 +68,11 @@ def _run(task: Callable[[DictConfig], None], config_name: str) -> None:
             if show_traceback:
                 raise
             _fail(_one_line(error, config_name))
+        except (TypeError, ValueError, ArithmeticError) as error:  # a value that no check foresaw
+            if show_traceback:
+                raise
+            reason = " ".join(str(error).split()) or type(error).__name__
+            _fail(f"{reason}; is a setting of the wrong kind? HYDRA_FULL_ERROR=1 shows where")
 
     # Twice: around composing the settings, and inside, where Hydra would add a line of its own to a task's error.
     entry = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)
@@ -106,7 +111,7 @@ def _one_line(error: Exception, config_name: str) -> str:
     if ambiguous:
         return f"{ambiguous[1]}: a list is written in brackets, {ambiguous[1]}=[{ambiguous[2]}]"
     lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc" not in line]
-    return "; ".join(lines) or type(error).__name__
+    return "; ".join(line.rstrip(":;") for line in lines) or type(error).__name__
 
 
 def _settings(config_name: str) -> list[str]:

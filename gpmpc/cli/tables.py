@@ -37,7 +37,11 @@ def tables(config: DictConfig) -> None:
     log.propagate = False
 
     # Everything that a user can get wrong is found out before anything is written.
-    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "trajectory", "subsystem", "model")}
+    groups = ("data", "trajectory", "subsystem", "model")
+    for key in groups:
+        if not config.get(key):
+            raise SettingError(key, "choose at least one" if key in ("trajectory", "subsystem") else "choose one")
+    parts = {key: instantiate(config[key], _convert_="all") for key in groups}
     experiment = Tables(
         data=parts["data"],
         trajectories=parts["trajectory"],
@@ -49,7 +53,9 @@ def tables(config: DictConfig) -> None:
     with console.status("generating or reading the data"):
         fits = experiment.fits()
 
-    folder = Path(settings["folder"])
+    if not isinstance(settings["folder"], str):
+        raise SettingError("folder", f"must be the path of a folder; got {settings['folder']!r}")
+    folder, meta = Path(settings["folder"]), provenance() | {"settings": settings}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         store = FitStore(folder / "fits.jsonl")
@@ -59,7 +65,6 @@ def tables(config: DictConfig) -> None:
             task = progress.add_task("training GPs", total=len(fits))
             draws = experiment.run(store, fits, progress=lambda _: progress.advance(task))
         rows = summarise(draws)
-        meta = provenance() | {"settings": settings}
         written = documents(rows, draws, meta, experiment.data.note) | {
             "config.yaml": OmegaConf.to_yaml(config, resolve=True)
         }

@@ -14,7 +14,7 @@ import casadi
 import numpy as np
 
 from gpmpc.control.controller import Decision
-from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.exceptions import ShapeError, check_number, check_numbers
 from gpmpc.plants import Plant
 from gpmpc.status import Status
 
@@ -39,8 +39,7 @@ class NMPC:
         tolerance: IPOPT's, on the scaled optimality conditions.
 
     Raises:
-        ShapeError: A weight or guess has the wrong length.
-        SettingError: Horizon below 1, or a negative weight.
+        SettingError: A horizon below 1, a negative weight, or a weight or guess of the wrong length.
     """
 
     def __init__(
@@ -53,13 +52,11 @@ class NMPC:
         tolerance: float = 1e-10,
     ):
         n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
-        if horizon < 1:
-            raise SettingError("horizon", f"must be 1 or more; got {horizon}")
-        for name, values, length in (("Q", Q, n), ("R", R, m), ("initial_input", initial_input, m)):
-            if len(values) != length:
-                raise ShapeError(f"{name} must have {length} entries; got {len(values)}")
-        if min(*Q, *R) < 0:
-            raise SettingError("Q, R", f"weights must not be negative; got {list(Q)}, {list(R)}")
+        check_number("horizon", horizon, least=1, whole=True)
+        check_numbers("Q", Q, n, least=0)
+        check_numbers("R", R, m, least=0)
+        check_numbers("initial_input", initial_input, m)
+        check_number("tolerance", tolerance, above=0)
         self.plant = plant
         self.horizon = horizon
         self.initial_input = np.array(initial_input, dtype=float)
@@ -104,7 +101,11 @@ def _build(plant: Plant, horizon: int, Q: np.ndarray, R: np.ndarray, tolerance: 
     gaps = [x[0] - measured]
     gaps += [x[i + 1] - casadi.vertcat(*plant.successor(x[i], u[i])) for i in range(horizon - 1)]
     problem = {"x": casadi.vertcat(*x, *u), "p": casadi.vertcat(measured, *r), "f": cost, "g": casadi.vertcat(*gaps)}
-    options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 500}}
+    options = {
+        "print_time": False,
+        "show_eval_warnings": False,
+        "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 500},
+    }
     return casadi.nlpsol("nmpc", "ipopt", problem, options)
 
 

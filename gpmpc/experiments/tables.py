@@ -34,7 +34,7 @@ from torch import Tensor
 
 import gpmpc
 from gpmpc.datasets import DataSource
-from gpmpc.exceptions import DataError, SettingError, TrainingError
+from gpmpc.exceptions import DataError, GpmpcError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Scaling, Training, Transitions
 from gpmpc.gp.posterior import GPPosterior
@@ -121,17 +121,14 @@ class Tables:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sizes", _whole_numbers("sizes", self.sizes))
-        for key, least in (("draws", 1), ("seed", 0), ("workers", 1)):
-            value = getattr(self, key)
-            if value is None and key == "workers":
-                continue
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise SettingError(key, f"must be a whole number, {least} or more; got {value!r}")
+        check_number("draws", self.draws, least=1, whole=True)
+        check_number("seed", self.seed, least=0, whole=True)
+        if self.workers is not None:
+            check_number("workers", self.workers, least=1, whole=True)
+        check_number("state_std", self.state_std, least=0)
         for key, chosen in (("trajectory", self.trajectories), ("subsystem", self.subsystems)):
             if not chosen:
                 raise SettingError(key, "choose at least one")
-        if not isinstance(self.state_std, int | float) or not 0 <= self.state_std < float("inf"):
-            raise SettingError("state_std", f"must be a number, 0 or more; got {self.state_std!r}")
 
     def fits(self) -> list[Fit]:
         """Every fit of the experiment, in the order of the tables.
@@ -179,7 +176,7 @@ class Tables:
                 progress(found[fit.fingerprint])
         missing = [fit for fit in fits if fit.fingerprint not in found]
         if missing:
-            workers = min(self.workers or os.cpu_count() or 1, len(missing))
+            workers = min(self.workers or _cores(), len(missing))
             evaluate = partial(_evaluate, model=self.model, state_std=float(self.state_std))
             with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), _quiet_on_interrupt) as pool:
                 # The largest first: the last fits to run are then short ones.
@@ -208,7 +205,7 @@ class FitStore:
         self.path = path
         self.records: dict[str, dict] = {}
         if path.exists():
-            text = path.read_text(encoding="utf-8")
+            text = path.read_text(encoding="utf-8", errors="replace")
             for line in text.splitlines():
                 try:
                     entry = json.loads(line)
@@ -228,22 +225,24 @@ class FitStore:
         self.records[fingerprint] = record
 
 
-def predict_all(posterior: GPPosterior, data: Transitions, state_std: float) -> tuple[Tensor, Tensor]:
+def predict_all(posterior: GPPosterior, data: Transitions, state_std: float) -> tuple[Tensor, Tensor, float]:
     """The tables' one-step predictions along the rows of ``data``.
 
     Returns:
-        Predicted means (N, n), and the variances of the states that were fed in (N, n).
+        Predicted means (N, n), the variances of the states that were fed in (N, n), and the largest amount by which a
+        predicted covariance had to be projected to be positive semidefinite.
     """
     propagator = MomentMatching()
     covariance = state_std**2 * torch.eye(data.state_dim, dtype=torch.float64)
-    means, fed = [], []
+    means, fed, projected = [], [], 0.0
     for state, control in zip(data.states, data.inputs, strict=True):
         belief = Gaussian(state, covariance)
         fed.append(belief.variance)
-        prediction = propagator(posterior, belief, control)
-        means.append(prediction.mean)
-        covariance = prediction.covariance
-    return torch.stack(means), torch.stack(fed)
+        step = propagator.propagate(posterior, belief, control)
+        means.append(step.belief.mean)
+        covariance = step.belief.covariance
+        projected = max(projected, float(step.deficit))
+    return torch.stack(means), torch.stack(fed), projected
 
 
 def _evaluate(fit: Fit, model: Callable[..., Training], state_std: float) -> dict:
@@ -262,12 +261,13 @@ def _evaluate(fit: Fit, model: Callable[..., Training], state_std: float) -> dic
     }
     try:
         training = model(training_rows, seed=fit.seed)
-    except TrainingError as error:
+        posterior = training.posterior
+        means, fed, projected = predict_all(posterior, cell.data, state_std)
+        own = means if fit.size == len(cell.data) else predict_all(posterior, training_rows, state_std)[0]
+    except (GpmpcError, torch.linalg.LinAlgError) as error:  # of this draw; the others go on
         return record | {"error": str(error)}
-    posterior, restore = training.posterior, cell.scaling.restore
 
-    means, fed = predict_all(posterior, cell.data, state_std)
-    own = means if fit.size == len(cell.data) else predict_all(posterior, training_rows, state_std)[0]
+    restore = cell.scaling.restore
     plain = posterior.predict(cell.data.states, cell.data.inputs)
     mean, variance = restore(plain.mean), (plain.variance + posterior.noise_variance) * cell.scaling.factor**2
     observed = restore(cell.data.next_states)
@@ -284,6 +284,7 @@ def _evaluate(fit: Fit, model: Callable[..., Training], state_std: float) -> dic
         "held_out_coverage_95": (
             interval_coverage(mean[held_out], variance[held_out], observed[held_out]) if held_out else None
         ),
+        "largest_projection": projected,
         "negative_log_evidence": training.objective.tolist(),
         "likelihood_evaluations": training.evaluations,
     }
@@ -307,6 +308,11 @@ def _quiet_on_interrupt() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
     """Worker processes started inside use one thread each, whatever library asks."""
@@ -327,8 +333,7 @@ def _whole_numbers(key: str, values: Any) -> tuple[int, ...]:
     if not isinstance(values, list | tuple) or not values:
         raise SettingError(key, f"must be a list of whole numbers such as [10,50]; got {values!r}")
     for value in values:
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise SettingError(key, f"must be whole numbers, 1 or more; got {value!r}")
+        check_number(key, value, least=1, whole=True)
     return tuple(dict.fromkeys(values))
 
 

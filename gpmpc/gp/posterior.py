@@ -106,12 +106,12 @@ class GPPosterior:
 
     @property
     def state_dim(self) -> int:
-        """N."""
+        """Number of states, n."""
         return self.targets.shape[1]
 
     @property
     def input_dim(self) -> int:
-        """M."""
+        """Number of inputs, m."""
         return self.features.shape[1] - self.state_dim
 
     def __len__(self) -> int:

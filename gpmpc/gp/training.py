@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from gpmpc.exceptions import SettingError, TrainingError
+from gpmpc.exceptions import SettingError, TrainingError, check_number
 from gpmpc.gp.evidence import LogEvidence
 from gpmpc.gp.model import BatchExactGP, GPyTorchEvidence
 from gpmpc.gp.posterior import GPPosterior, Predicts
@@ -62,10 +62,10 @@ class SoftLimits:
 
     def __post_init__(self) -> None:
         for key in ("lengthscale_factor", "signal_to_noise"):
-            if not getattr(self, key) > 1:
-                raise SettingError(key, f"must be above 1; got {getattr(self, key)}")
-        if self.power < 2 or self.power % 2:
-            raise SettingError("power", f"must be even and positive; got {self.power}")
+            check_number(key, getattr(self, key), above=1)
+        check_number("power", self.power, least=2, whole=True)
+        if self.power % 2:
+            raise SettingError("power", f"must be even; got {self.power}")
 
     def __call__(self, theta: np.ndarray, log_spread: np.ndarray) -> tuple[float, np.ndarray]:
         """Value and gradient (d + 2,) at theta."""
@@ -82,7 +82,7 @@ class Training:
     Attributes:
         posterior: The trained GPs, frozen.
         theta: Rows (log l, log sf, log(sf / sn)), one an output (n, d + 2).
-        objective: Negative log marginal likelihood plus penalty at theta (n,).
+        objective: Negative log marginal likelihood plus penalty where the search ended (n,).
         explored: The same where the exploration from every start ended (n, restarts + 1); ``FAILED`` where none could.
         evaluations: Likelihood evaluations, all starts and outputs together.
         seconds: Wall time [s].
@@ -132,14 +132,11 @@ class Trainer:
     def __post_init__(self) -> None:
         if self.predicts not in ("next_state", "difference"):
             raise SettingError("predicts", f"must be 'next_state' or 'difference'; got {self.predicts!r}")
-        if not isinstance(self.restarts, int) or self.restarts < 0:
-            raise SettingError("restarts", f"must be a whole number, 0 or more; got {self.restarts!r}")
+        check_number("restarts", self.restarts, least=0, whole=True)
         if self.likelihood not in ("closed_form", "gpytorch"):
             raise SettingError("likelihood", f"must be 'closed_form' or 'gpytorch'; got {self.likelihood!r}")
         for key, least in (("tolerance", 0), ("lengthscale_limit", 1), ("signal_to_noise_limit", 1)):
-            value = getattr(self, key)
-            if not isinstance(value, int | float) or not value > least:
-                raise SettingError(key, f"must be a number above {least}; got {value!r}")
+            check_number(key, getattr(self, key), above=least)
 
     def __call__(self, transitions: Transitions, seed: int = 0) -> Training:
         """Trains on transitions, in the units in which the GPs are to work; ``seed`` is that of the random starts.
@@ -198,7 +195,8 @@ class Trainer:
         finalists = sorted(ends, key=lambda end: end[1])[:FINALISTS]
         theta, value = min((search(end, 1000, self.tolerance) for end, _ in finalists), key=lambda end: end[1])
         # Nothing can be learned about an input that never moved, and nothing is: it drops out of the kernel.
-        theta[:-2][np.ptp(inputs, axis=0) <= CONSTANT * np.abs(inputs).max(axis=0)] = np.log(IGNORED)
+        constant = np.ptp(inputs, axis=0) <= CONSTANT * np.abs(inputs).max(axis=0)
+        theta[:-2][constant] = log_inputs[constant] + np.log(IGNORED)
         return _Fit(theta, value, [end[1] for end in ends], search.evaluations)
 
 

@@ -8,9 +8,10 @@ what is wrong with a file is said with its name, row and column.
 import csv
 import io
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -68,12 +69,12 @@ class Transitions:
 
     @property
     def state_dim(self) -> int:
-        """N."""
+        """Number of states, n."""
         return self.states.shape[1]
 
     @property
     def input_dim(self) -> int:
-        """M."""
+        """Number of inputs, m."""
         return self.inputs.shape[1]
 
     @property
@@ -167,7 +168,7 @@ class Transitions:
                 raise DataError(f"{path}: column {name!r} {problem}; the header has {', '.join(names) or 'no columns'}")
         positions = [names.index(name) for name in wanted]
         rows = []
-        for fields in reader:
+        for fields in _lines(path, reader):
             line = reader.line_num
             if not fields:
                 continue
@@ -195,6 +196,13 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: not a readable text file ({error})") from error
+
+
+def _lines(path: Path, reader: Any) -> Iterator[list[str]]:
+    try:
+        yield from reader
+    except csv.Error as error:
+        raise DataError(f"{path}: row {reader.line_num} cannot be read ({error})") from error
 
 
 def _number(path: Path, row: int, column: int | str, field: str) -> float:

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import check_number
 
 
 class Dynamics(Protocol):
@@ -55,7 +55,7 @@ class Map:
     time_step: float = 1.0  # [s]
 
     def __post_init__(self) -> None:
-        _check_positive("time_step", self.time_step)
+        check_number("time_step", self.time_step, above=0, unit="[s]")
 
     def successor(self, x: Any, u: Any) -> list[Any]:
         """x[k+1] = f(x[k], u[k])."""
@@ -80,9 +80,8 @@ class Integrated:
     substeps: int = 10
 
     def __post_init__(self) -> None:
-        _check_positive("time_step", self.time_step)
-        if self.substeps < 1:
-            raise SettingError("substeps", f"must be 1 or more; got {self.substeps}")
+        check_number("time_step", self.time_step, above=0, unit="[s]")
+        check_number("substeps", self.substeps, least=1, whole=True)
 
     def successor(self, x: Any, u: Any) -> list[Any]:
         """x[k+1] = x[k] + the integral of f(x(t), u[k]) over one sampling time."""
@@ -101,8 +100,3 @@ class Integrated:
 def step(plant: Plant, state: np.ndarray, input: np.ndarray) -> np.ndarray:
     """The next state (n,) of a plant from a state (n,) and an input (m,)."""
     return np.array(plant.successor(state, input), dtype=float)
-
-
-def _check_positive(key: str, value: float) -> None:
-    if not value > 0:
-        raise SettingError(key, f"must be positive; got {value}")

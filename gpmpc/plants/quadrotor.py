@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, check_number, check_numbers
 
 GRAVITY = 9.81  # [m/s^2]
+ATTITUDES = ("paper", "exact")  # how thrust direction becomes attitude
 
 
 @dataclass(frozen=True)
@@ -37,21 +38,19 @@ class Translational:
     input_names = ("U1", "ux", "uy")
 
     def __post_init__(self) -> None:
-        if not self.mass > 0:
-            raise SettingError("mass", f"must be positive [kg]; got {self.mass}")
+        check_number("mass", self.mass, above=0, unit="[kg]")
         if self.frozen_attitude is not None:
-            attitude = tuple(float(angle) for angle in self.frozen_attitude)
-            if len(attitude) != 2:
-                raise SettingError("frozen_attitude", f"must be roll and pitch [rad]; got {self.frozen_attitude}")
-            object.__setattr__(self, "frozen_attitude", attitude)
+            check_numbers("frozen_attitude", self.frozen_attitude, 2, unit="[rad]")
+            object.__setattr__(self, "frozen_attitude", tuple(self.frozen_attitude))
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (x, vx, y, vy, z, vz) [m/s, m/s^2]."""
         thrust = u[0] / self.mass  # U1 / m [m/s^2]
         if self.frozen_attitude is None:
             # No direction with ux^2 + uy^2 > 1 exists; there the thrust is horizontal: max(s, 0) = (s + |s|) / 2.
+            # The two small terms keep both roots differentiable where their argument would be zero.
             squared = 1 - u[1] * u[1] - u[2] * u[2]
-            vertical = ((squared + (squared * squared) ** 0.5) / 2) ** 0.5
+            vertical = ((squared + (squared * squared + 1e-24) ** 0.5) / 2 + 1e-12) ** 0.5
         else:
             roll, pitch = self.frozen_attitude
             vertical = cos(roll) * cos(pitch)
@@ -78,12 +77,9 @@ class Rotational:
     input_names = ("U2", "U3", "U4")
 
     def __post_init__(self) -> None:
-        if len(self.inertia) != 3 or not min(self.inertia) > 0:
-            raise SettingError("inertia", f"must be three positive moments [kg m^2]; got {self.inertia}")
-        if len(self.gyroscopic) != 2:
-            raise SettingError("gyroscopic", f"must be two numbers [1/s]; got {self.gyroscopic}")
-        if not self.arm > 0:
-            raise SettingError("arm", f"must be positive [m]; got {self.arm}")
+        check_number("arm", self.arm, above=0, unit="[m]")
+        check_numbers("inertia", self.inertia, 3, above=0, unit="[kg m^2]")
+        check_numbers("gyroscopic", self.gyroscopic, 2, unit="[1/s]")
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (phi, p, theta, q, psi, r) [rad/s, rad/s^2]."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 ROW = " ".join(str(i / 7) for i in range(15))
+RESULTS = Path("outputs/tables/nmpc-seed0/data.samples=12,model.restarts=0,sizes=[5],trajectory=elliptical")
 FILES = [f"ds_nmpc_{t}_{s}.txt" for t in ("Elliptical", "Lorenz") for s in ("trans", "rotate")]
 
 
@@ -53,13 +54,23 @@ def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
         (["tables", "data=paper", "data.folder=nowhere"], "nowhere: no such folder"),
         (["tables", "draws=0"], "draws: must be a whole number, 1 or more; got 0"),
         (["tables", "draws=five"], "draws: must be a whole number, 1 or more; got 'five'"),
-        (["tables", "sizes=[0]"], "sizes: must be whole numbers, 1 or more; got 0"),
+        (["tables", "sizes=[0]"], "sizes: must be a whole number, 1 or more; got 0"),
         (["tables", "sizes=10,50"], "sizes: a list is written in brackets, sizes=[10,50]"),
         (["tables", "sizes=[500]"], "sizes: must be at most 189, the rows of elliptical translational; got 500"),
-        (["tables", "data.samples=0"], "samples: must be 1 or more; got 0"),
-        (["tables", "data.attitude=exakt"], "attitude: must be 'paper' or 'exact'; got 'exakt'"),
+        (["tables", "data.samples=0"], "data.samples: must be a whole number, 1 or more; got 0"),
+        (["tables", "data.attitude=exakt"], "data.attitude: must be one of paper, exact; got 'exakt'"),
         (["tables", "model.restarts=-1"], "restarts: must be a whole number, 0 or more; got -1"),
-        (["tables", "model.penalty.power=3"], "power: must be even and positive; got 3"),
+        (["tables", "model.penalty.power=3"], "power: must be even; got 3"),
+        (["tables", "trajectory=[]"], "trajectory: choose at least one"),
+        (["tables", "trajectory.elliptical.rate=fast"], "rate: must be a number; got 'fast'"),
+        (["tables", "data.horizon=1.5"], "data.horizon: must be a whole number, 1 or more; got 1.5"),
+        (["tables", "data.translational.Q=[1,2]"], "Q: must be a list of 6 numbers; got [1, 2]"),
+        (
+            ["tables", "data.translational.plant.dynamics.mass=heavy"],
+            "mass: must be a number above 0 [kg]; got 'heavy'",
+        ),
+        (["tables", "folder=null"], "folder: must be the path of a folder; got None"),
+        (["tables", "data.rotational.Q=null"], "Q: must be a list of 6 numbers; got None"),
         (["tables", "draws"], "missing EQUAL"),
         (["tables", "seed="], "seed: must be a whole number"),
     ],
@@ -104,7 +115,7 @@ def small_run(tmp_path_factory):
 def test_a_run_writes_every_document_and_prints_the_tables(small_run):
     cwd, _, result = small_run
     assert result.returncode == 0, result.stderr
-    folder = cwd / "outputs" / "tables" / "nmpc-seed0"
+    folder = cwd / RESULTS
     expected = ["config.yaml", "fits.jsonl", "tables.csv", "tables.json", "tables.md", "tables.png", "tables.tex"]
     assert sorted(path.name for path in folder.iterdir()) == expected
     assert "Table 1: elliptical trajectory" in result.stdout
@@ -131,9 +142,9 @@ def test_a_run_writes_every_document_and_prints_the_tables(small_run):
 
 def test_the_same_command_again_computes_nothing_anew(small_run):
     cwd, arguments, _ = small_run
-    before = json.loads((cwd / "outputs/tables/nmpc-seed0/tables.json").read_text())["draws"]
+    before = json.loads((cwd / RESULTS / "tables.json").read_text())["draws"]
     assert gpmpc(*arguments, cwd=cwd).returncode == 0
-    assert json.loads((cwd / "outputs/tables/nmpc-seed0/tables.json").read_text())["draws"] == before
+    assert json.loads((cwd / RESULTS / "tables.json").read_text())["draws"] == before
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):

@@ -60,11 +60,11 @@ def test_no_small_change_of_the_plan_is_cheaper(plant, rng):
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"horizon": 0}, SettingError, "horizon: must be 1 or more; got 0"),
-        ({"Q": [1.0] * 5}, ShapeError, "Q must have 6 entries; got 5"),
-        ({"R": [1.0] * 4}, ShapeError, "R must have 3 entries; got 4"),
-        ({"R": [1.0, -1, 1]}, SettingError, "must not be negative"),
-        ({"initial_input": [0.0]}, ShapeError, "initial_input must have 3 entries; got 1"),
+        ({"horizon": 0}, SettingError, "horizon: must be a whole number, 1 or more; got 0"),
+        ({"Q": [1.0] * 5}, SettingError, "Q: must be a list of 6 numbers"),
+        ({"R": [1.0] * 4}, SettingError, "R: must be a list of 3 numbers"),
+        ({"R": [1.0, -1, 1]}, SettingError, "R: must be a number, 0 or more; got -1"),
+        ({"initial_input": [0.0]}, SettingError, "initial_input: must be a list of 3 numbers"),
     ],
 )
 def test_misuse_is_refused_at_construction(arguments, error, message):

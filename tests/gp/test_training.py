@@ -77,6 +77,8 @@ def test_a_constant_input_has_no_influence_and_a_constant_target_is_predicted():
     data = pendulum(40)
     states, moved = data.states.clone(), data.next_states.clone()
     states[:, 1], moved[:, 1] = 0.5, 0.5
+    huge = Transitions(states * torch.tensor([1.0, 1e10]), data.inputs, moved)
+    assert float(train(huge, restarts=0).posterior.lengthscales[0, 1]) > 1e17
     gp = train(Transitions(states, data.inputs, moved), penalty=SoftLimits()).posterior
     near, far = torch.tensor([[0.3, 0.5]]), torch.tensor([[0.3, 2.0]])
     control = torch.tensor([[0.1]])
@@ -120,7 +122,13 @@ def test_misuse_is_refused_with_the_rule(setting, message):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"), [((0.5,), "above 1; got 0.5"), ((2.0, 0.5), "above 1"), ((2.0, 2.0, 3), "even")]
+    ("arguments", "message"),
+    [
+        ((0.5,), "lengthscale_factor: must be a number above 1; got 0.5"),
+        ((2.0, 0.5), "signal_to_noise: must be a number above 1; got 0.5"),
+        ((2.0, "x"), "signal_to_noise: must be a number above 1; got 'x'"),
+        ((2.0, 2.0, 3), "power: must be even; got 3"),
+    ],
 )
 def test_limits_that_are_none_are_refused(arguments, message):
     with pytest.raises(SettingError, match=message):

@@ -201,6 +201,24 @@ def test_derivatives_by_torch_agree_with_finite_differences(spread):
     assert torch.allclose(reverse, forward, rtol=1e-10, atol=1e-11)
 
 
+def test_the_public_class_is_differentiable_where_covariances_have_equal_eigenvalues():
+    gp = model()
+    gp = GPPosterior.from_hyperparameters(
+        gp.features, gp.targets, gp.lengthscales, torch.ones(2), gp.noise_variance, gp.input_dim
+    )
+    control = torch.zeros(1)
+
+    def far(mean):
+        return MomentMatching()(gp, Gaussian(mean, 0.1 * torch.eye(2)), control).covariance
+
+    jacobian = torch.func.jacrev(far)(torch.full((2,), 50.0))
+    assert torch.isfinite(jacobian).all()
+    near = torch.tensor([0.3, -0.4])
+    step = torch.tensor([1e-6, 0.0])
+    numeric = (far(near + step) - far(near - step)) / 2e-6
+    assert torch.allclose(torch.func.jacrev(far)(near)[..., 0], numeric, atol=1e-7)
+
+
 def test_vmap_maps_over_beliefs():
     gp, means = model(), torch.randn(3, 2)
     S, control = belief().covariance, torch.tensor([0.2])
