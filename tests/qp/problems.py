@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gpmpc.qp import QuadraticProgram
+from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
 
 
 def integer_problem(rng: np.random.Generator, feasible: bool | None = None) -> QuadraticProgram:
@@ -54,3 +54,15 @@ def distance(problem: QuadraticProgram, x: np.ndarray, other: np.ndarray) -> flo
     """The P-norm of the difference, relative to that of x (at least 1)."""
     size = np.sqrt(max(1.0, x @ problem.P @ x))
     return float(np.sqrt((x - other) @ problem.P @ (x - other)) / size)
+
+
+def gram(problem, warm_start=None):
+    return DualActiveSet().prepare(problem.P, problem.G).solve(problem.q, problem.lower, problem.upper, warm_start)
+
+
+def lazy(problem, warm_start=None):
+    return DualActiveSet().solve(problem, warm_start)
+
+
+def primal(problem, warm_start=None):
+    return PrimalActiveSet().solve(problem, warm_start)

@@ -2,24 +2,11 @@
 
 import numpy as np
 import pytest
-from problems import feasible_problem, integer_problem, worst_residual
+from problems import feasible_problem, gram, integer_problem, lazy, primal, worst_residual
 
-from gpmpc.qp import DualActiveSet, PrimalActiveSet, QPSolution
+from gpmpc.qp import DualActiveSet, QPSolution
 from gpmpc.qp import record as layout
 from gpmpc.status import Status
-
-
-def gram(problem, warm_start=None):
-    return DualActiveSet().prepare(problem.P, problem.G).solve(problem.q, problem.lower, problem.upper, warm_start)
-
-
-def lazy(problem, warm_start=None):
-    return DualActiveSet().solve(problem, warm_start)
-
-
-def primal(problem, warm_start=None):
-    return PrimalActiveSet().solve(problem, warm_start)
-
 
 ALL = pytest.mark.parametrize("solve", [gram, lazy, primal])
 DUAL = pytest.mark.parametrize("solve", [gram, lazy])
