@@ -21,9 +21,9 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gpmpc.compiled import compile_for
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import record as layout
-from gpmpc.qp.compiled import compile_for
 from gpmpc.qp.dual_kernels import GRAM_SIGNATURE, LAZY_SIGNATURE, solve_gram, solve_lazy
 from gpmpc.qp.dual_rescue import rescue
 from gpmpc.qp.gram_system import gram_system

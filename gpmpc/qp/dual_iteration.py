@@ -10,7 +10,7 @@ or never (d = 0: the constraints contradict each other, and (r, -1) is Farkas' p
 
 import numpy as np
 
-from gpmpc.qp.compiled import compiled
+from gpmpc.compiled import compiled
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, largest, subtract_rows
 from gpmpc.qp.working_set import (
     HIGH_WATCH,

@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
+from gpmpc.compiled import compiled
 from gpmpc.qp import record
-from gpmpc.qp.compiled import compiled
 from gpmpc.qp.dual_iteration import CONTRADICTION, most_violated, step_to
 from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, refine, residuals
 from gpmpc.qp.factor import dot, multiply, multiply_at, pack, unpack

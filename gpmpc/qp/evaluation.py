@@ -5,7 +5,7 @@ the upper left corner of K, and may later move y by the rows of K whose multipli
 solves.
 """
 
-from gpmpc.qp.compiled import compiled
+from gpmpc.compiled import compiled
 from gpmpc.qp.factor import backward_solve, dot, forward_solve, multiply, subtract_rows
 from gpmpc.qp.hessian import solve_lower, solve_transposed
 from gpmpc.qp.working_set import BOUND, LEAST, MOST, NAME, PLACE, SOFTNESS, couple

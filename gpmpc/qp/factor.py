@@ -8,7 +8,7 @@ section 6.5.2). The diagonal holds reciprocals, so that no solve divides.
 
 import math
 
-from gpmpc.qp.compiled import REORDERED, compiled
+from gpmpc.compiled import REORDERED, compiled
 
 
 @compiled

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from gpmpc.qp.compiled import compiled
+from gpmpc.compiled import compiled
 from gpmpc.qp.factor import dot
 
 

@@ -19,7 +19,7 @@ p is K_p, known beforehand; in lazy mode, P = L L', it is w_p = L^-1 c_p, made w
 
 import numpy as np
 
-from gpmpc.qp.compiled import compiled
+from gpmpc.compiled import compiled
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, multiply_at, remove_row
 from gpmpc.qp.hessian import make_row, make_rows
 
