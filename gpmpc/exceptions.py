@@ -51,6 +51,10 @@ class TrainingError(GpmpcError, RuntimeError):
         return self.args[1]
 
 
+class UnsupportedModel(GpmpcError, TypeError):
+    """A method has no formula for this kind of model; the text lists what is possible."""
+
+
 class ProblemError(GpmpcError, ValueError):
     """An optimisation problem is malformed: shapes, symmetry, definiteness, crossed bounds, NaN."""
 

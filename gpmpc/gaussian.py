@@ -60,3 +60,43 @@ def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:
     eigenvalues, vectors = torch.linalg.eigh(torch.where(negative, symmetric, distinct))
     projected = vectors @ (eigenvalues.clamp_min(0)[..., None] * vectors.mT)
     return torch.where(negative, (projected + projected.mT) / 2, symmetric), deficit
+
+
+def square_root(covariance: Tensor) -> Tensor:
+    """The symmetric positive semidefinite root R of a covariance, R R = Sigma, with its derivative.
+
+    The derivative solves the Sylvester equation dR R + R dR = dSigma in the eigenbasis U of R: in it, entry ij of dR is
+    that of dSigma over r_i + r_j (Cao, Lai and Alam, 2017, section 4.1, need it for A). Autograd through the
+    eigendecomposition would divide by differences of eigenvalues instead. Where r_i + r_j = 0 the derivative does not
+    exist and is taken as zero; second derivatives are not provided.
+
+    Args:
+        covariance: (*batch, n, n), symmetric; eigenvalues below zero count as zero.
+
+    Returns:
+        R (*batch, n, n).
+    """
+    constant = covariance.detach()
+    eigenvalues, U = torch.linalg.eigh((constant + constant.mT) / 2)
+    r = eigenvalues.clamp_min(0).sqrt()
+    R = U @ (r[..., :, None] * U.mT)
+    # One step of Newton's method from R, which is the solution already: it changes no value and carries the derivative.
+    return R + square_root_differential(r, U, (covariance - constant)[..., None])[..., 0]
+
+
+def square_root_differential(r: Tensor, U: Tensor, change: Tensor) -> Tensor:
+    """The change dR of the symmetric root R = U diag(r) U' for changes dSigma of R R, from dR R + R dR = dSigma.
+
+    Args:
+        r: Eigenvalues of R (*batch, n).
+        U: Eigenvectors of R (*batch, n, n).
+        change: dSigma, as many as wanted along the last dimension (*batch, n, n, j).
+
+    Returns:
+        dR (*batch, n, n, j); zero where r_i + r_j is.
+    """
+    total = (r[..., :, None] + r[..., None, :])[..., None]
+    positive = total > 0
+    rotated = torch.einsum("...ki,...klj,...lm->...imj", U, change, U)
+    solution = torch.where(positive, rotated / torch.where(positive, total, 1.0), 0.0)
+    return torch.einsum("...ik,...klj,...ml->...imj", U, solution, U)

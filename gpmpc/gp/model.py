@@ -1,4 +1,4 @@
-"""Problem: the exact GPs in GPyTorch, one per output, as one batch; the only door to gpytorch.
+"""Problem: the exact GPs in GPyTorch, one per output, as one batch; and what a trained model of others says.
 
 GPyTorch holds the hyperparameters and evaluates the marginal likelihood of the whole batch by automatic differentiation
 (``GPyTorchEvidence``); ``posterior`` freezes what training found. Parameters are kept as logarithms, everything is
@@ -6,13 +6,17 @@ float64, and the Cholesky factorisation is exact at every size: left alone, GPyT
 solver above 800 points, and keeps the noise above 1e-4.
 """
 
+from collections.abc import Sequence
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
 import gpytorch
 import numpy as np
 import torch
 from gpytorch.constraints import Positive
 from torch import Tensor
+
+from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 
 
 @contextmanager
@@ -109,3 +113,81 @@ class GPyTorchEvidence:
 def _log_parameter() -> Positive:
     """A positive parameter whose raw value is its logarithm."""
     return Positive(transform=torch.exp, inv_transform=torch.log)
+
+
+def members(model: Any, likelihood: Any = None) -> list[tuple[Any, Any]]:
+    """Trained exact GPs with their likelihoods, from one model, an ``IndependentModelList`` or a sequence.
+
+    Raises:
+        UnsupportedModel: One is no single-task ``ExactGP`` with a ``GaussianLikelihood``, or carries transforms.
+        SettingError: One is not in float64.
+    """
+    models = list(model.models) if hasattr(model, "models") else list(model) if isinstance(model, Sequence) else [model]
+    likelihoods = getattr(likelihood, "likelihoods", likelihood)
+    likelihoods = list(likelihoods) if isinstance(likelihoods, Sequence | torch.nn.ModuleList) else [likelihoods]
+    if len(likelihoods) == 1:
+        likelihoods *= len(models)
+    if len(likelihoods) != len(models):
+        raise ShapeError(f"each model needs one likelihood; got {len(models)} models and {len(likelihoods)}")
+    pairs = [(m, m.likelihood if own is None else own) for m, own in zip(models, likelihoods, strict=True)]
+    for one, own in pairs:
+        if not isinstance(one, gpytorch.models.ExactGP) or one.train_inputs is None:
+            raise UnsupportedModel(f"only ExactGP models with training data can be frozen; got {type(one).__name__}")
+        if type(own) is not gpytorch.likelihoods.GaussianLikelihood:
+            raise UnsupportedModel(f"the likelihood must be a GaussianLikelihood; got {type(own).__name__}")
+        for transform in ("input_transform", "outcome_transform"):
+            if getattr(one, transform, None) is not None:
+                raise UnsupportedModel(
+                    f"the model carries an {transform}, which its hyperparameters know nothing of: "
+                    "train without it, and give the units back by GPPosterior.unscaled"
+                )
+        if one.train_targets.dtype != torch.float64 or one.train_inputs[0].dtype != torch.float64:
+            raise SettingError("model", "must be in float64 (model.double(), data too); got float32")
+    return pairs
+
+
+def hyperparameters(model: Any, likelihood: Any = None) -> dict[str, Tensor]:
+    """The arguments of ``GPPosterior.from_hyperparameters`` in trained SE-ARD models: single, batch or a list.
+
+    Raises:
+        UnsupportedModel: The kernel is no (scaled) ``RBFKernel``, the mean neither zero nor constant.
+        ShapeError: The models of a list have other training inputs, or there is more than one batch dimension.
+    """
+    rows: dict[str, list[Tensor]] = {}
+    first = None
+    for one, own in members(model, likelihood):
+        inputs, targets = one.train_inputs[0], one.train_targets
+        inputs = inputs[:, None] if inputs.dim() == 1 else inputs
+        if targets.dim() > 2:
+            raise ShapeError(f"a batch of models has one batch dimension; got targets {tuple(targets.shape)}")
+        outputs, shared = targets[None] if targets.dim() == 1 else targets, inputs.reshape(-1, *inputs.shape[-2:])
+        first = shared[0] if first is None else first
+        if any(each.shape != first.shape or not torch.equal(each, first) for each in shared):
+            raise ShapeError("all outputs must have the same training inputs (N, d); got different ones")
+        scale, kernel = 1.0, one.covar_module
+        if isinstance(kernel, gpytorch.kernels.ScaleKernel):
+            scale, kernel = kernel.outputscale, kernel.base_kernel
+        if type(kernel) is not gpytorch.kernels.RBFKernel or kernel.active_dims is not None:
+            name = type(kernel).__name__ + (" on some dimensions" if kernel.active_dims is not None else "")
+            raise UnsupportedModel(
+                f"GPPosterior has the SE-ARD kernel: RBFKernel, in a ScaleKernel or not; got {name}. "
+                "KernelPosterior.from_gpytorch takes any kernel"
+            )
+        if isinstance(one.mean_module, gpytorch.means.ConstantMean):
+            constant = one.mean_module.constant
+        elif isinstance(one.mean_module, gpytorch.means.ZeroMean):
+            constant = torch.zeros((), dtype=torch.float64)
+        else:
+            raise UnsupportedModel(f"the mean must be zero or constant; got {type(one.mean_module).__name__}")
+        k, d = len(outputs), first.shape[1]
+        found = {
+            "targets": outputs,
+            "lengthscales": kernel.lengthscale.reshape(-1, kernel.lengthscale.shape[-1]).expand(k, d),
+            "signal_variance": torch.as_tensor(scale, dtype=torch.float64).reshape(-1).expand(k),
+            "noise_variance": own.noise.reshape(-1).expand(k),
+            "offset": constant.reshape(-1).expand(k),
+        }
+        for name, value in found.items():
+            rows.setdefault(name, []).append(value.detach().to(first.device))
+    joined = {name: torch.cat(values).clone() for name, values in rows.items()}
+    return {"inputs": first.detach().clone(), **joined, "targets": joined["targets"].T.contiguous()}

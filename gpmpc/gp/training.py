@@ -11,7 +11,7 @@ Cao, Lai and Alam (2017), eq. (9); the penalty is the one of their experiment.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -22,7 +22,8 @@ from scipy.optimize import minimize
 from gpmpc.exceptions import SettingError, TrainingError, check_number
 from gpmpc.gp.evidence import LogEvidence
 from gpmpc.gp.model import BatchExactGP, GPyTorchEvidence
-from gpmpc.gp.posterior import GPPosterior, Predicts
+from gpmpc.gp.posterior import IGNORED, GPPosterior, Predicts
+from gpmpc.gp.scaling import Scaling, identity
 from gpmpc.gp.transitions import Transitions
 
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
@@ -32,7 +33,6 @@ EXPLORATION = 16  # L-BFGS iterations from every start, before ...
 FINALISTS = 2  # ... this many of the best go on to convergence
 LONGER = 1.0  # mean of log l over log std(x~) at the random starts: smooth dynamics prefer long length-scales
 CONSTANT = 1e-8  # a column that moves by less than this part of its magnitude is constant
-IGNORED = 1e8  # length-scale of a constant input, in units of its magnitude
 FAILED = 1e12  # objective where the kernel matrix is not positive definite: finite, so that a line search steps back
 
 
@@ -81,7 +81,7 @@ class Training:
 
     Attributes:
         posterior: The trained GPs, frozen.
-        theta: Rows (log l, log sf, log(sf / sn)), one an output (n, d + 2).
+        theta: Rows (log l, log sf, log(sf / sn)), one an output (n, d + 2), in the units of the data.
         objective: Negative log marginal likelihood plus penalty where the search ended (n,).
         explored: The same where the exploration from every start ended (n, restarts + 1); ``FAILED`` where none could.
         evaluations: Likelihood evaluations, all starts and outputs together.
@@ -97,7 +97,7 @@ class Training:
 
     def gpytorch_model(self) -> BatchExactGP:
         """The same GPs as a GPyTorch model, to go on with there."""
-        model = BatchExactGP(self.posterior.features, self.posterior.targets)
+        model = BatchExactGP(self.posterior.features, self.posterior.targets - self.posterior.offset)
         model.set_hyperparameters(torch.from_numpy(self.theta))
         return model.eval()
 
@@ -108,6 +108,8 @@ class Trainer:
 
     Attributes:
         predicts: What the GPs learn: the next state, or the difference to it.
+        scaling: How features and targets are scaled for training, such as ``standardize``; what comes out is in the
+            units of the data all the same. Without it the prior mean is zero in those units.
         penalty: Added to every output's negative log marginal likelihood; none by default.
         restarts: Random starts besides the first, which has l = std(x~), sf = std(y), sn = std(y) / 10.
         likelihood: How it is evaluated: in closed form, or by GPyTorch's automatic differentiation (slower; the same).
@@ -122,6 +124,7 @@ class Trainer:
     """
 
     predicts: Predicts = "next_state"
+    scaling: Callable[[torch.Tensor, Sequence[str]], Scaling] = identity
     penalty: Penalty | None = None
     restarts: int = 3
     likelihood: Literal["closed_form", "gpytorch"] = "closed_form"
@@ -139,16 +142,30 @@ class Trainer:
             check_number(key, getattr(self, key), above=least)
 
     def __call__(self, transitions: Transitions, seed: int = 0) -> Training:
-        """Trains on transitions, in the units in which the GPs are to work; ``seed`` is that of the random starts.
+        """Trains on transitions; ``seed`` is that of the random starts.
+
+        Raises:
+            TrainingError: Every start failed for an output, which is named.
+        """
+        learned = transitions.next_states
+        if self.predicts == "difference":
+            learned = learned - transitions.states
+        return self.fit(transitions.features, learned, transitions.input_dim, self.predicts, seed)
+
+    def fit(
+        self, features: torch.Tensor, targets: torch.Tensor, input_dim: int, predicts: Predicts, seed: int = 0
+    ) -> Training:
+        """Trains on features x~ = (x, u) (N, n + m) and any targets (N, k).
 
         Raises:
             TrainingError: Every start failed for an output, which is named.
         """
         begin = time.perf_counter()
-        learned = transitions.next_states
-        if self.predicts == "difference":
-            learned = learned - transitions.states
-        inputs, targets = transitions.features.numpy(), learned.numpy()
+        names = [f"x{i + 1}" for i in range(features.shape[1] - input_dim)]
+        names += [f"u{i + 1}" for i in range(input_dim)]
+        feature_scaling = self.scaling(features, names)
+        target_scaling = self.scaling(targets, [f"y{a + 1}" for a in range(targets.shape[1])])
+        inputs, targets = feature_scaling.scale(features).numpy(), target_scaling.scale(targets).numpy()
         outputs, d = targets.shape[1], inputs.shape[1]
         rng = np.random.default_rng(seed)
         fits = [self._fit(inputs, targets[:, a], rng.normal(size=(self.restarts + 1, d + 2))) for a in range(outputs)]
@@ -162,14 +179,16 @@ class Trainer:
         theta = np.array([fit.theta for fit in fits])
         found = torch.from_numpy(theta)
         posterior = GPPosterior.from_hyperparameters(
-            transitions.features,
-            learned,
+            torch.from_numpy(inputs),
+            torch.from_numpy(targets),
             lengthscales=found[:, :-2].exp(),
             signal_variance=(2 * found[:, -2]).exp(),
             noise_variance=(2 * (found[:, -2] - found[:, -1])).exp(),
-            input_dim=transitions.input_dim,
-            predicts=self.predicts,
-        )
+            input_dim=input_dim,
+            predicts=predicts,
+        ).unscaled(feature_scaling, target_scaling)
+        theta[:, :-2] += feature_scaling.factor.log().numpy()
+        theta[:, -2] += target_scaling.factor.log().numpy()
         return Training(
             posterior,
             theta,

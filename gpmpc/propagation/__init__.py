@@ -1,6 +1,26 @@
-"""Gaussian beliefs pushed through learned models."""
+"""Gaussian beliefs pushed through learned models, and the local models that control needs of that."""
 
+from gpmpc.propagation.linearization import Linearization
+from gpmpc.propagation.local_model import LocalModel, linearize, linearize_along, rollout
+from gpmpc.propagation.mean_equivalence import MeanEquivalence
 from gpmpc.propagation.moment_matching import MomentMatching
+from gpmpc.propagation.monte_carlo import MonteCarlo
 from gpmpc.propagation.propagator import Propagation, Propagator
+from gpmpc.propagation.sensitivity import Sensitivity, differentiate
+from gpmpc.propagation.unscented import Unscented
 
-__all__ = ["MomentMatching", "Propagation", "Propagator"]
+__all__ = [
+    "Linearization",
+    "LocalModel",
+    "MeanEquivalence",
+    "MomentMatching",
+    "MonteCarlo",
+    "Propagation",
+    "Propagator",
+    "Sensitivity",
+    "Unscented",
+    "differentiate",
+    "linearize",
+    "linearize_along",
+    "rollout",
+]

@@ -9,7 +9,8 @@ the textbook form of the covariance, beta_a' Q beta_b - M_a M_b, subtracts two n
 is small. Here each product is centred before it is summed, which loses nothing:
 
     mean          M_a = sum_i beta_ai q_ai
-    input-output  Cov[x, f_a] = T_a sum_i beta_ai q_ai z_ai
+    slope         J_a = E[df_a/dx] = dM_a/dmu = (I + Lam_a^-1 S)^-1 sum_i beta_ai q_ai z_ai
+    input-output  Cov[x, f_a] = S J_a' (Stein, 1981)
     covariance    V_ab = sum_ij beta_ai beta_bj q_ai q_bj expm1(delta_ij)
                   V_aa = ... + sf2_a - |L_a^-1 q_a|^2 - sum_ij [(K_a + sn2_a I)^-1]_ij q_ai q_aj expm1(delta_ij)
     delta_ij      = r_ab - 1/2 z_ai' T_ab Lam_b^-1 T_a z_ai - 1/2 z_bj' T_ab Lam_a^-1 T_b z_bj + z_ai' T_ab z_bj
@@ -19,77 +20,91 @@ is small. Here each product is centred before it is summed, which loses nothing:
 (delta follows from T_ab - T_a = -T_ab Lam_b^-1 T_a.) The controls carry no uncertainty: they only weigh the points.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.propagation.propagator import Propagation
+from gpmpc.gp.residual import Affine, ResidualModel
+from gpmpc.propagation.propagator import Propagation, checked_input, unsupported
 
 
 class MomentMatching:
-    """Exact moment matching through a ``GPPosterior``.
+    """Exact moment matching through a ``GPPosterior``, or a ``ResidualModel`` with an affine nominal part.
 
     Args:
+        diagonal: Takes the outputs as independent: only the diagonal of the predicted covariance is computed, at a
+            quarter of the cost for six outputs.
         observation_noise: Adds the noise variance sn2 to the predicted covariance. The paper's tables do not.
     """
 
-    def __init__(self, observation_noise: bool = False):
-        self.observation_noise = observation_noise
+    def __init__(self, diagonal: bool = False, observation_noise: bool = False):
+        self.diagonal, self.observation_noise = diagonal, observation_noise
 
-    def __call__(self, model: GPPosterior, belief: Gaussian, input: Tensor) -> Gaussian:
+    def __call__(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Gaussian:
         """The next state's belief; see ``propagate``."""
         return self.propagate(model, belief, input).belief
 
-    def propagate(self, model: GPPosterior, belief: Gaussian, input: Tensor) -> Propagation:
-        """Moves a belief N(mu, S) one step on.
-
-        Args:
-            model: The GPs.
-            belief: Over the state: mean (*batch, n), covariance (*batch, n, n).
-            input: The certain control (*batch, m).
-
-        Returns:
-            The next belief, Cov[x, x+] (*batch, n, n), and how far the covariance was from positive semidefinite.
+    def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+        """Moves a belief N(mu, S) one step on; see ``Propagator.propagate``.
 
         Raises:
-            ShapeError: Belief or input do not fit the model.
+            UnsupportedModel: There is no closed form for this model.
         """
-        n, m = model.state_dim, model.input_dim
-        if belief.dim != n or input.shape[-1] != m:
-            raise ShapeError(f"the model has {n} states and {m} inputs; got {belief.dim} and {input.shape[-1]}")
-        mean, covariance, cross = moments(model, belief, input)
+        input = checked_input(model, belief, input)
+        if isinstance(model, ResidualModel) and isinstance(model.nominal, Affine):
+            S, chosen = belief.covariance, list(model.states)
+            seen = Gaussian(belief.mean[..., chosen], S[..., chosen, :][..., chosen])
+            M, V, J = moments(model.residual, seen, input[..., list(model.inputs)], self.diagonal)
+            C = S[..., chosen] @ J.mT @ model.B.mT  # Cov[x, B d]
+            A, M, V = model.nominal.A, model.nominal(belief.mean, input) + M @ model.B.mT, model.B @ V @ model.B.mT
+            V, cross = A @ S @ A.mT + A @ C + (A @ C).mT + V, S @ A.mT + C
+        elif isinstance(model, GPPosterior):
+            S = belief.covariance
+            M, V, J = moments(model, belief, input, self.diagonal)
+            cross = S @ J.mT
+            if model.predicts == "difference":
+                M, V, cross = belief.mean + M, S + cross + cross.mT + V, S + cross
+        else:
+            raise unsupported(self, model, "a GPPosterior, or a ResidualModel of an Affine nominal model and one")
         if self.observation_noise:
-            covariance = covariance + torch.diag(model.noise_variance)
-        if model.predicts == "difference":
-            mean = belief.mean + mean
-            covariance = belief.covariance + covariance + cross + cross.mT
-            cross = belief.covariance + cross
-        covariance, deficit = nearest_positive_semidefinite(covariance)
-        return Propagation(Gaussian(mean, covariance), cross, deficit)
+            V = V + model.noise_covariance
+        if self.diagonal:
+            V = torch.diag_embed(V.diagonal(dim1=-2, dim2=-1))
+        V, deficit = nearest_positive_semidefinite(V)
+        return Propagation(Gaussian(M, V), cross, deficit)
 
 
-def moments(model: GPPosterior, belief: Gaussian, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """M (*batch, n), V (*batch, n, n) and Cov[x, f] (*batch, n, n) of the latent functions f; the module's text."""
-    n, S = model.state_dim, belief.covariance[..., None, :, :]  # S: (*batch, 1, n, n), one copy an output or pair
-    inverse_squares = model.lengthscales[:, :n].square().reciprocal()  # the diagonals of Lam_a^-1, (n, n)
+def moments(
+    model: GPPosterior, belief: Gaussian, input: Tensor, diagonal: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
+    """M (*batch, k), V (*batch, k, k) and J = E[df/dx] (*batch, k, n) of the latent functions f; the module's text."""
+    n, k = model.state_dim, model.output_dim
+    S = belief.covariance[..., None, :, :]  # (*batch, 1, n, n), one copy an output or pair
+    inverse_squares = model.lengthscales[:, :n].square().reciprocal()  # the diagonals of Lam_a^-1, (k, n)
     nu = (model.features[:, :n] - belief.mean[..., None, :])[..., None, :, :]  # (*batch, 1, N, n)
     control = (model.features[:, n:] - input[..., None, :])[..., None, :, :] / model.lengthscales[:, None, n:]
-    z = nu * inverse_squares[:, None, :]  # (*batch, n, N, n)
+    z = nu * inverse_squares[:, None, :]  # (*batch, k, N, n)
 
-    half_logdet, T, whitened = _against(S, inverse_squares, nu)
+    half_logdet, factor, T = _against(S, inverse_squares)
+    root = inverse_squares.sqrt()
+    whitened = torch.linalg.solve_triangular(factor, (nu * root[:, None, :]).mT, upper=False)
     log_q = (
         model.signal_variance.log()[:, None]
-        - (control.square().sum(-1) + whitened.square().sum(-1)) / 2
+        - (control.square().sum(-1) + whitened.square().sum(-2)) / 2
         - half_logdet[..., None]
-    )  # (*batch, n, N)
+    )  # (*batch, k, N)
     q = log_q.exp()
-    mean = (model.weights * q).sum(-1)
-    cross = (T @ ((model.weights * q)[..., None, :] @ z).mT)[..., 0].mT  # Cov[x_k, f_a] at [..., k, a]
+    mean = (model.weights * q).sum(-1) + model.offset
+    slope = ((model.weights * q)[..., None, :] @ z)[..., 0, :]
+    slope = root * torch.cholesky_solve((slope / root)[..., None], factor)[..., 0]
 
-    a, b = torch.triu_indices(n, n, device=nu.device)  # the pairs of outputs a <= b
-    half_logdet_ab, T_ab, _ = _against(S, inverse_squares[a] + inverse_squares[b])
+    a, b = torch.triu_indices(k, k, device=nu.device)  # the pairs of outputs a <= b
+    if diagonal:
+        a = b = torch.arange(k, device=nu.device)
+    half_logdet_ab, _, T_ab = _against(S, inverse_squares[a] + inverse_squares[b])
     z_a, z_b = z[..., a, :, :], z[..., b, :, :]
     of_i = _quadratic(z_a, T_ab @ (inverse_squares[b][:, :, None] * T[..., a, :, :])) / 2
     of_j = _quadratic(z_b, T_ab @ (inverse_squares[a][:, :, None] * T[..., b, :, :])) / 2
@@ -106,12 +121,14 @@ def moments(model: GPPosterior, belief: Gaussian, input: Tensor) -> tuple[Tensor
             reduction = (model.precision[i] * centred).sum((-2, -1))
             entry = entry + model.signal_variance[i] - explained[..., i] - reduction
         entries[i, j] = entries[j, i] = entry
-    rows = [torch.stack([entries[i, j] for j in range(n)], dim=-1) for i in range(n)]
-    return mean, torch.stack(rows, dim=-2), cross
+    if diagonal:
+        return mean, torch.diag_embed(torch.stack([entries[i, i] for i in range(k)], dim=-1)), slope
+    rows = [torch.stack([entries[i, j] for j in range(k)], dim=-1) for i in range(k)]
+    return mean, torch.stack(rows, dim=-2), slope
 
 
-def _against(S: Tensor, D: Tensor, nu: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor | None]:
-    """1/2 log|I + S D|, T = (I + S D)^-1 S and vectors w of nu with |w|^2 = nu' (S + D^-1)^-1 nu, for diagonal D.
+def _against(S: Tensor, D: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """1/2 log|I + S D|, the Cholesky factor of I + B, and T = (I + S D)^-1 S, for diagonal D.
 
     Through B = D^1/2 S D^1/2, whose I + B is well conditioned; log1p keeps the digits of a small S.
     """
@@ -119,11 +136,7 @@ def _against(S: Tensor, D: Tensor, nu: Tensor | None = None) -> tuple[Tensor, Te
     B = root[..., :, None] * S * root[..., None, :]
     half_logdet = torch.linalg.eigvalsh(B).log1p().sum(-1) / 2
     factor = torch.linalg.cholesky(B + torch.eye(B.shape[-1], dtype=B.dtype, device=B.device))
-    T = torch.cholesky_solve(B, factor) / (root[..., :, None] * root[..., None, :])
-    if nu is None:
-        return half_logdet, T, None
-    whitened = torch.linalg.solve_triangular(factor, (nu * root[..., None, :]).mT, upper=False).mT
-    return half_logdet, T, whitened
+    return half_logdet, factor, torch.cholesky_solve(B, factor) / (root[..., :, None] * root[..., None, :])
 
 
 def _quadratic(z: Tensor, M: Tensor) -> Tensor:

@@ -3,9 +3,13 @@
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
+from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.gp.posterior import check_query
 
 
 @dataclass(frozen=True)
@@ -14,7 +18,7 @@ class Propagation:
 
     Attributes:
         belief: N(mean, covariance) of the next state; the covariance is symmetric positive semidefinite.
-        cross_covariance: Cov[x, x+] (*batch, n, n).
+        cross_covariance: Cov[x, x+] (*batch, n, k).
         deficit: How far below zero the covariance's smallest eigenvalue was before the projection (*batch,). More
             than round-off of the largest entry says that the model is too nearly noise-free for double precision.
     """
@@ -27,8 +31,64 @@ class Propagation:
 class Propagator(Protocol):
     """One way to push a Gaussian through a model."""
 
-    def __call__(self, model: Any, belief: Gaussian, input: Tensor) -> Gaussian:
+    def __call__(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Gaussian:
         """The next state's belief from the state's belief and a certain control (*batch, m)."""
 
-    def propagate(self, model: Any, belief: Gaussian, input: Tensor) -> Propagation:
-        """The same with the input-output covariance and the size of the projection."""
+    def propagate(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+        """The same with the input-output covariance and the size of the projection.
+
+        Args:
+            model: What was learned.
+            belief: Over the state: mean (*batch, n), covariance (*batch, n, n).
+            input: The certain control (*batch, m); may be left out where m = 0.
+
+        Raises:
+            ShapeError: Belief or input do not fit the model.
+            SettingError: Their dtype or device is another one.
+            DataError: An entry is not finite, or the covariance is not positive semidefinite.
+        """
+
+
+def checked_input(model: DynamicsModel, belief: Gaussian, input: Tensor | None) -> Tensor:
+    """The control (*batch, m), after belief and control were held against the rules of ``Propagator.propagate``.
+
+    Values are looked at where that is free: in host memory, outside torch's transforms.
+    """
+    input = belief.mean[..., :0] if input is None else input
+    check_query(model, belief.mean, input)
+    if belief.covariance.dtype != belief.mean.dtype or belief.covariance.device != belief.mean.device:
+        raise SettingError("belief", "mean and covariance must have the same dtype and device")
+    try:
+        arrays = belief.mean.numpy(), belief.covariance.numpy(), input.numpy()
+    except (RuntimeError, TypeError):  # part of a graph, inside a transform, or on another device
+        return input
+    for name, array in zip(("the belief's mean", "the belief's covariance", "the input"), arrays, strict=True):
+        total = array.sum()
+        if not total - total == 0:
+            raise DataError(f"{name} must be finite; got {array}")
+    _check_semidefinite(belief.covariance)
+    return input
+
+
+def _check_semidefinite(covariance: Tensor) -> None:
+    largest = covariance.abs().amax()
+    if largest == 0 or 0 in covariance.shape:
+        return
+    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype)
+    round_off = torch.finfo(covariance.dtype).eps ** 0.5 * largest
+    if not bool(torch.linalg.cholesky_ex(covariance + round_off * eye).info.any()):
+        return
+    lowest = float(torch.linalg.eigvalsh(covariance).amin())
+    if lowest < -float(round_off):
+        raise DataError(
+            f"the belief's covariance must be positive semidefinite; got an eigenvalue of {lowest:.3g} "
+            f"(largest entry {float(largest):.3g})"
+        )
+
+
+def unsupported(method: Any, model: Any, possible: str) -> UnsupportedModel:
+    """The error of a method that has no formula for a model."""
+    return UnsupportedModel(
+        f"{type(method).__name__} needs {possible}; got {type(model).__name__}. "
+        "Possible with any model: MeanEquivalence, Linearization, Unscented, MonteCarlo"
+    )

@@ -79,7 +79,7 @@ def test_far_from_the_data_the_prior_returns():
         ({"targets": torch.ones(9, 2)}, ShapeError, r"targets must have shape \(10, 2\); got \(9, 2\)"),
         ({"noise_variance": torch.zeros(2)}, SettingError, r"noise_variance: must be positive; got \[0.0, 0.0\]"),
         ({"input_dim": 2}, ShapeError, "2 controls; got 3 columns and 2 outputs"),
-        ({"predicts": "delta"}, SettingError, "'next_state' or 'difference'; got 'delta'"),
+        ({"predicts": "delta"}, SettingError, "'next_state', 'difference', 'value'; got 'delta'"),
         (
             {"inputs": torch.zeros(10, 3), "noise_variance": torch.tensor([1.0, 1e-18])},
             SettingError,

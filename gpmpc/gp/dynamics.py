@@ -1,0 +1,59 @@
+"""Problem: what the rest of the package asks of a learned model of x[k+1] = f(x[k], u[k]), whoever wrote it."""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from gpmpc.gaussian import Gaussian
+
+
+class DynamicsModel(Protocol):
+    """A probabilistic model of the next state; every method takes leading batch dimensions.
+
+    ``gpmpc.testing.check_model`` holds a model against this.
+    """
+
+    state_dim: int
+    input_dim: int
+    output_dim: int
+    dtype: torch.dtype
+    device: torch.device
+    noise_covariance: Tensor  # of the observations, (k, k); no part of ``predict``
+
+    def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
+        """N(mean (*batch, k), covariance (*batch, k, k)) of the latent next state at a certain x and u."""
+
+    def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
+        """The same, and the mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""
+
+
+def batched_jacobian(
+    function: Callable[..., tuple[Tensor, ...]], arguments: Sequence[Tensor]
+) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+    """Values of a function and its first value's Jacobians, by one reverse pass of torch autograd an entry.
+
+    It needs no function transforms, so it works for GPyTorch kernels too, and it can be differentiated again.
+
+    Args:
+        function: Of the arguments, batch element by batch element; the first value is (*batch, k).
+        arguments: Each (*batch, d_i).
+
+    Returns:
+        The values, and d value / d argument (*batch, k, d_i) for each argument.
+    """
+    again = torch.is_grad_enabled() and any(argument.requires_grad for argument in arguments)
+    with torch.enable_grad():
+        leaves = [a if again and a.requires_grad else a.detach().requires_grad_() for a in arguments]
+        values = function(*leaves)
+        rows = [
+            torch.autograd.grad(
+                values[0][..., a].sum(), leaves, create_graph=again, retain_graph=True, materialize_grads=True
+            )
+            for a in range(values[0].shape[-1])
+        ]
+    jacobians = [torch.stack(column, dim=-2) for column in zip(*rows, strict=True)]
+    if not again:
+        values = tuple(value.detach() for value in values)
+    return values, jacobians

@@ -1,0 +1,180 @@
+"""Problem: where part of the dynamics is known, only what it gets wrong has to be learned.
+
+    x[k+1] = f0(x[k], u[k]) + B d(x_s[k], u_s[k])
+
+f0 is the nominal model, d a GP over a selection of the states and inputs, and B says which states it acts on (Hewing,
+Kabzan and Zeilinger, 2020, eq. (3)).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp.dynamics import batched_jacobian
+from gpmpc.gp.posterior import GPPosterior, check_query
+from gpmpc.gp.training import Trainer, Training
+from gpmpc.gp.transitions import Transitions
+
+
+@dataclass(frozen=True)
+class Affine:
+    """A nominal model x+ = A x + B u + c, through which uncertainty goes exactly.
+
+    Attributes:
+        A: (n, n).
+        B: (n, m).
+        c: (n,).
+    """
+
+    A: Tensor
+    B: Tensor
+    c: Tensor
+
+    def __call__(self, state: Tensor, input: Tensor) -> Tensor:
+        """The nominal next state (*batch, n)."""
+        return state @ self.A.mT + input @ self.B.mT + self.c
+
+
+@dataclass(frozen=True)
+class ResidualModel:
+    """A nominal model and a GP on its residual.
+
+    Attributes:
+        nominal: f0, from x (*batch, n) and u (*batch, m) to (*batch, n), in torch; an ``Affine`` one allows exact
+            moment matching.
+        residual: d, with ``predicts="value"``.
+        B: Where it acts (n, k).
+        states: Which states d sees, in its order.
+        inputs: Which inputs d sees, in its order.
+        input_dim: m, all of them.
+
+    Raises:
+        ShapeError: The parts do not belong together.
+        SettingError: The residual predicts something else, or an index is out of range.
+    """
+
+    nominal: Callable[[Tensor, Tensor], Tensor]
+    residual: GPPosterior
+    B: Tensor
+    states: Sequence[int]
+    inputs: Sequence[int]
+    input_dim: int
+
+    def __post_init__(self) -> None:
+        gp = self.residual
+        if gp.predicts != "value":
+            raise SettingError("residual", f"must be a GP with predicts='value'; got {gp.predicts!r}")
+        if (len(self.states), len(self.inputs)) != (gp.state_dim, gp.input_dim):
+            raise ShapeError(
+                f"the residual sees {gp.state_dim} states and {gp.input_dim} inputs; "
+                f"got {len(self.states)} and {len(self.inputs)} selected"
+            )
+        if self.B.dim() != 2 or self.B.shape[1] != gp.output_dim:
+            raise ShapeError(f"B must be (n, {gp.output_dim}); got {tuple(self.B.shape)}")
+        for key, chosen, count in (("states", self.states, self.state_dim), ("inputs", self.inputs, self.input_dim)):
+            if any(not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
+                raise SettingError(key, f"must be different indices from 0 to {count - 1}; got {list(chosen)}")
+
+    @classmethod
+    def train(
+        cls,
+        nominal: Callable[[Tensor, Tensor], Tensor],
+        transitions: Transitions,
+        B: Tensor | None = None,
+        states: Sequence[int] | None = None,
+        inputs: Sequence[int] | None = None,
+        trainer: Trainer | None = None,
+        seed: int = 0,
+    ) -> "ResidualModel":
+        """Learns d from transitions: the part of x[k+1] - f0(x[k], u[k]) that B reaches (least squares).
+
+        Args:
+            nominal: f0.
+            transitions: What was observed.
+            B: Where d acts (n, k); on every state by default.
+            states: Which states d sees; all by default.
+            inputs: Which inputs d sees; all by default.
+            trainer: How the GPs are trained.
+            seed: Of the random starts.
+
+        Raises:
+            TrainingError: An output could not be trained.
+        """
+        n, m = transitions.state_dim, transitions.input_dim
+        states = list(range(n)) if states is None else list(states)
+        inputs = list(range(m)) if inputs is None else list(inputs)
+        B = torch.eye(n, dtype=torch.float64) if B is None else B
+        missed = transitions.next_states - nominal(transitions.states, transitions.inputs)
+        targets = torch.linalg.lstsq(B, missed.mT).solution.mT
+        features = torch.cat([transitions.states[:, states], transitions.inputs[:, inputs]], dim=1)
+        training: Training = (trainer or Trainer()).fit(features, targets, len(inputs), "value", seed)
+        return cls(nominal, training.posterior, B, states, inputs, m)
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states, n."""
+        return len(self.B)
+
+    @property
+    def output_dim(self) -> int:
+        """The same: it predicts the next state."""
+        return len(self.B)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the residual GP."""
+        return self.residual.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Of the residual GP."""
+        return self.residual.device
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """Of the observations (n, n)."""
+        return self.B @ self.residual.noise_covariance @ self.B.mT
+
+    def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
+        """The next state's distribution at a certain state and input: mean (*batch, n), covariance (*batch, n, n)."""
+        input = state[..., :0] if input is None else input
+        check_query(self, state, input)
+        d = self.residual.predict(*self.selected(state, input))
+        return self._combined(self.nominal(state, input), d)
+
+    def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
+        """``predict``, and its mean's derivatives by the state (*batch, n, n) and by the input (*batch, n, m)."""
+        input = state[..., :0] if input is None else input
+        check_query(self, state, input)
+        d, by_state, by_input = self.residual.predict_with_jacobian(*self.selected(state, input))
+        if isinstance(self.nominal, Affine):
+            nominal, A, G = self.nominal(state, input), self.nominal.A, self.nominal.B
+            A, G = A.expand(*state.shape[:-1], *A.shape), G.expand(*state.shape[:-1], *G.shape)
+        else:
+            (nominal,), (A, G) = batched_jacobian(lambda x, u: (self.nominal(x, u),), (state, input))
+        A = A.index_add(-1, self._index(self.states), self.B @ by_state)
+        G = G.index_add(-1, self._index(self.inputs), self.B @ by_input)
+        return self._combined(nominal, d), A, G
+
+    def selected(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
+        """What the residual sees of x (*batch, n) and u (*batch, m)."""
+        return state[..., list(self.states)], input[..., list(self.inputs)]
+
+    def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "ResidualModel":
+        """The same on another device or in another type; a nominal that is no ``Affine`` is taken as it is."""
+        nominal = self.nominal
+        if isinstance(nominal, Affine):
+            nominal = Affine(*(part.to(device=device, dtype=dtype) for part in (nominal.A, nominal.B, nominal.c)))
+        residual, B = self.residual.to(device, dtype), self.B.to(device=device, dtype=dtype)
+        return ResidualModel(nominal, residual, B, self.states, self.inputs, self.input_dim)
+
+    def _combined(self, nominal: Tensor, d: Gaussian) -> Gaussian:
+        return Gaussian(nominal + d.mean @ self.B.mT, self.B @ d.covariance @ self.B.mT)
+
+    def _index(self, chosen: Sequence[int]) -> Tensor:
+        return torch.tensor(list(chosen), dtype=torch.long, device=self.device)

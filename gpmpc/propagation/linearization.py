@@ -1,0 +1,64 @@
+"""Problem: propagate through the model's first-order expansion at the belief's mean, as an extended Kalman filter does.
+
+With A = dm/dx, H_a = d2m_a/dx2 at (mu, u) and the model's own variance there,
+
+    mu+ = m(mu, u) (+ 1/2 tr(H_a S)),   Sigma+ = A S A' + Var[f(mu, u)] (+ 1/2 tr(H_a S H_b S)),   Cov[x, x+] = S A'
+
+The terms in brackets are those of the second-order filter (Jazwinski, 1970, section 9.3; Girard, Rasmussen, Quinonero
+Candela and Murray-Smith, 2003, for GPs). The model's variance is taken at the mean.
+"""
+
+import torch
+from torch import Tensor
+
+from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
+from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.propagation.propagator import Propagation, checked_input
+
+
+class Linearization:
+    """First order, or with the Hessian terms second.
+
+    Args:
+        hessian: Adds the second-order terms.
+        observation_noise: Adds the model's noise covariance.
+    """
+
+    def __init__(self, hessian: bool = False, observation_noise: bool = False):
+        self.hessian, self.observation_noise = hessian, observation_noise
+
+    def __call__(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Gaussian:
+        """The next state's belief; see ``propagate``."""
+        return self.propagate(model, belief, input).belief
+
+    def propagate(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+        """Moves a belief one step on; see ``Propagator.propagate``."""
+        input, S = checked_input(model, belief, input), belief.covariance
+        at_mean, A, _ = model.predict_with_jacobian(belief.mean, input)
+        mean, covariance = at_mean.mean, at_mean.covariance + A @ S @ A.mT
+        if self.hessian:
+            H = mean_hessian(model, belief.mean, input)
+            HS = H @ S[..., None, :, :]
+            mean = mean + HS.diagonal(dim1=-2, dim2=-1).sum(-1) / 2
+            covariance = covariance + (HS[..., :, None, :, :] * HS[..., None, :, :, :].mT).sum((-2, -1)) / 2
+        if self.observation_noise:
+            covariance = covariance + model.noise_covariance
+        covariance, deficit = nearest_positive_semidefinite(covariance)
+        return Propagation(Gaussian(mean, covariance), S @ A.mT, deficit)
+
+
+def mean_hessian(model: DynamicsModel, state: Tensor, input: Tensor) -> Tensor:
+    """d2m/dx2 (*batch, k, n, n): in closed form for SE-ARD GPs, else by torch autograd."""
+    if isinstance(model, GPPosterior):
+        return model.mean_hessian(state, input)
+    again = torch.is_grad_enabled() and (state.requires_grad or input.requires_grad)
+    with torch.enable_grad():
+        x = state if state.requires_grad and again else state.detach().requires_grad_()
+        _, A, _ = model.predict_with_jacobian(x, input)
+        rows = [
+            torch.autograd.grad(A[..., a, d].sum(), x, create_graph=again, retain_graph=True, materialize_grads=True)[0]
+            for a in range(A.shape[-2])
+            for d in range(A.shape[-1])
+        ]
+    return torch.stack(rows, dim=-2).unflatten(-2, A.shape[-2:])

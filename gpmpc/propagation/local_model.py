@@ -1,0 +1,133 @@
+"""Problem: a convex controller needs the belief's dynamics as a linear system in the state and the input.
+
+With the extended state s = [mu; vec(S)], S = Sigma^(1/2) the symmetric root, p = n + n^2 (Cao, Lai and Alam, 2017,
+section 4.1),
+
+    s+ = F(s, u)  ~  A s + B u + c,    A = dF/ds,  B = dF/du,  c = F(s, u) - A s - B u
+
+Sigma = S S', so dSigma = dS S' + S dS'; the root's derivative solves dS S + S dS = dSigma
+(``gaussian.square_root_differential``). Where Sigma = 0 (a measured state) the columns of A for S vanish, because
+Sigma+ depends on S to second order only; where Sigma+ is singular the root has no derivative, and its rows are zero in
+the null space.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gpmpc.exceptions import ShapeError
+from gpmpc.gaussian import Gaussian, square_root_differential
+from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.propagation.propagator import Propagator
+from gpmpc.propagation.sensitivity import differentiate
+
+
+@dataclass(frozen=True)
+class LocalModel:
+    """s+ = A s + B u + c near a belief and an input; batched over leading dimensions.
+
+    Attributes:
+        A: (*batch, p, p), p = n + n^2.
+        B: (*batch, p, m).
+        c: (*batch, p).
+        next: The next belief itself, F(s, u).
+    """
+
+    A: Tensor
+    B: Tensor
+    c: Tensor
+    next: Gaussian
+
+    def __call__(self, s: Tensor, input: Tensor) -> Tensor:
+        """The next extended state (*batch, p)."""
+        return (self.A @ s[..., None] + self.B @ input[..., None])[..., 0] + self.c
+
+
+def extended_state(belief: Gaussian) -> tuple[Tensor, Tensor, Tensor]:
+    """The vector s = [mu; vec(S)] (*batch, p), and the eigenvalues (*batch, n) and eigenvectors (*batch, n, n) of S."""
+    eigenvalues, U = torch.linalg.eigh(belief.covariance)
+    r = eigenvalues.clamp_min(0).sqrt()
+    S = U @ (r[..., :, None] * U.mT)
+    return torch.cat([belief.mean, S.flatten(-2)], dim=-1), r, U
+
+
+def linearize(
+    propagator: Propagator, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None
+) -> LocalModel:
+    """The local model at a belief and an input, or along a plan when both have a leading dimension H.
+
+    Args:
+        propagator: How the belief moves.
+        model: What was learned.
+        belief: Mean (*batch, n), covariance (*batch, n, n).
+        input: (*batch, m); may be left out where m = 0.
+    """
+    input = belief.mean[..., :0] if input is None else input
+    moved, d = differentiate(propagator, model, belief, input)
+    s, _, _ = extended_state(belief)
+    s_next, r_next, U_next = extended_state(moved.belief)
+    n = belief.dim
+    S = s[..., n:].unflatten(-1, (n, n))
+
+    # dSigma = E S' + S E' for a unit change E_kl of S: a derivative D by Sigma becomes 2 D S.
+    mean_by_root = 2 * d.mean_by_covariance @ S[..., None, :, :]
+    covariance_by_root = 2 * d.covariance_by_covariance @ S[..., None, None, :, :]
+    k = moved.belief.dim
+    covariance_rows = torch.cat(
+        [d.covariance_by_mean.flatten(-3, -2), covariance_by_root.flatten(-2).flatten(-3, -2)], dim=-1
+    )
+    by_input = d.covariance_by_input.flatten(-3, -2)
+    roots = square_root_differential(
+        r_next, U_next, torch.cat([covariance_rows, by_input], dim=-1).unflatten(-2, (k, k))
+    )
+    roots = roots.flatten(-3, -2)
+    p = n + n * n
+    A = torch.cat([torch.cat([d.mean_by_mean, mean_by_root.flatten(-2)], dim=-1), roots[..., :p]], dim=-2)
+    B = torch.cat([d.mean_by_input, roots[..., p:]], dim=-2)
+    c = s_next - (A @ s[..., None] + B @ input[..., None])[..., 0]
+    return LocalModel(A, B, c, moved.belief)
+
+
+def rollout(propagator: Propagator, model: DynamicsModel, belief: Gaussian, inputs: Tensor) -> Gaussian:
+    """The beliefs at steps 1 to H: mean (*batch, H, n), covariance (*batch, H, n, n).
+
+    Args:
+        propagator: How the belief moves.
+        model: What was learned.
+        belief: At step 0 (*batch).
+        inputs: (*batch, H, m); an autonomous model takes (*batch, H, 0).
+    """
+    beliefs = []
+    for control in _steps(inputs):
+        belief = propagator(model, belief, control)
+        beliefs.append(belief)
+    return Gaussian(
+        torch.stack([b.mean for b in beliefs], dim=-2), torch.stack([b.covariance for b in beliefs], dim=-3)
+    )
+
+
+def linearize_along(propagator: Propagator, model: DynamicsModel, belief: Gaussian, inputs: Tensor) -> LocalModel:
+    """The local models (*batch, H, ...) along the rollout of inputs (*batch, H, m) from a belief (*batch).
+
+    Stage k is linearised at the belief that stage k - 1 led to; ``next`` is the rollout. Where the beliefs are known
+    before (a plan of the previous step), ``linearize`` takes all stages as one batch.
+    """
+    stages = []
+    for control in _steps(inputs):
+        stages.append(linearize(propagator, model, belief, control))
+        belief = stages[-1].next
+    A, B, c = (
+        torch.stack([getattr(stage, name) for stage in stages], dim=d) for name, d in (("A", -3), ("B", -3), ("c", -2))
+    )
+    beliefs = Gaussian(
+        torch.stack([stage.next.mean for stage in stages], dim=-2),
+        torch.stack([stage.next.covariance for stage in stages], dim=-3),
+    )
+    return LocalModel(A, B, c, beliefs)
+
+
+def _steps(inputs: Tensor) -> tuple[Tensor, ...]:
+    if inputs.dim() < 2 or not inputs.shape[-2]:
+        raise ShapeError(f"inputs must be (*batch, H, m) with H of 1 or more; got {tuple(inputs.shape)}")
+    return inputs.unbind(-2)
