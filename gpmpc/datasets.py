@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from gpmpc.control.nmpc import NMPC
+from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gp.transitions import Transitions
 from gpmpc.plants import ATTITUDES, Plant, attitude_for_thrust_direction
@@ -50,8 +51,8 @@ class Tracking:
     initial_input: Sequence[float]
 
     def fly(self, references: np.ndarray, horizon: int, steps: int) -> Rollout:
-        """Unconstrained NMPC from rest along references (steps + horizon - 1, n)."""
-        controller = NMPC(self.plant, horizon, self.Q, self.R, self.initial_input)
+        """Unconstrained NMPC from rest along references (steps + horizon, n)."""
+        controller = NMPC(self.plant, TrackingProblem(self.Q, self.R), horizon, self.initial_input)
         return closed_loop(self.plant, controller, references, np.zeros(len(self.Q)), steps)
 
 
@@ -63,7 +64,7 @@ class NMPCData:
         translational: How the outer subsystem is flown.
         rotational: How the inner subsystem is flown.
         samples: Transitions of either subsystem.
-        horizon: Of the controller.
+        horizon: Of the controller: predicted states in its cost.
         attitude: How thrust direction becomes attitude: ``"paper"`` or ``"exact"``; see
             ``attitude_for_thrust_direction``.
     """
@@ -71,7 +72,7 @@ class NMPCData:
     translational: Tracking
     rotational: Tracking
     samples: int = 189
-    horizon: int = 3
+    horizon: int = 2
     attitude: str = "paper"
 
     note = (
@@ -95,7 +96,7 @@ class NMPCData:
         """
         if subsystem not in SUBSYSTEMS:
             raise SettingError("subsystem", f"must be one of {', '.join(SUBSYSTEMS)}; got {subsystem!r}")
-        ahead = self.horizon - 1  # the attitude's references reach this far beyond its last step
+        ahead = self.horizon  # the attitude's references reach this far beyond its last step
         outer = self._fly_translational(trajectory, self.samples + ahead)
         if subsystem == "translational":
             return _transitions(outer, self.samples)
@@ -105,7 +106,7 @@ class NMPCData:
         return _transitions(self.rotational.fly(references, self.horizon, self.samples), self.samples)
 
     def _fly_translational(self, trajectory: Trajectory, steps: int) -> Rollout:
-        times = self.translational.plant.time_step * np.arange(steps + self.horizon - 1)
+        times = self.translational.plant.time_step * np.arange(steps + self.horizon)
         references = np.zeros((len(times), 6))
         references[:, ::2] = trajectory(times)  # x, y, z; the velocities are asked to be zero, with little weight
         return self.translational.fly(references, self.horizon, steps)

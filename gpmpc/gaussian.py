@@ -1,6 +1,7 @@
 """Problem: what is known about a state is a Gaussian belief N(mean, covariance), alone or in a batch."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,6 +31,12 @@ class Gaussian:
                 f"mean (*batch, n) needs a covariance (*batch, n, n); "
                 f"got {tuple(self.mean.shape)} and {tuple(self.covariance.shape)}"
             )
+
+    @classmethod
+    def certain(cls, value: Any) -> "Gaussian":
+        """A belief without doubt, such as a measured state (*batch, n), from a tensor, an array or a list."""
+        mean = torch.as_tensor(value)
+        return cls(mean, torch.zeros(*mean.shape, mean.shape[-1], dtype=mean.dtype, device=mean.device))
 
     @property
     def dim(self) -> int:

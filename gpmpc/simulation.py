@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpmpc.control.controller import Controller, Decision
+from gpmpc.control.controller import Controller, Decision, Reference
 from gpmpc.exceptions import ShapeError, SolverFailure
+from gpmpc.gaussian import Gaussian
 from gpmpc.plants import Plant, step
 
 
@@ -34,7 +35,7 @@ def closed_loop(
     Args:
         plant: The system.
         controller: Its feedback law; it sees the next ``controller.horizon`` references.
-        references: Reference states (steps + horizon - 1, n) or more, one a time step.
+        references: Reference states r[0] .. (steps + horizon, n) or more, one a time step.
         initial_state: (n,).
         steps: K.
 
@@ -42,7 +43,7 @@ def closed_loop(
         ShapeError: Too few references for the steps and the horizon.
         SolverFailure: The controller's solver did not succeed at a step; its iterate is not applied.
     """
-    needed = steps + controller.horizon - 1
+    needed = steps + controller.horizon
     if len(references) < needed:
         raise ShapeError(
             f"{steps} steps with horizon {controller.horizon} need {needed} references; got {len(references)}"
@@ -50,10 +51,11 @@ def closed_loop(
     states, inputs, seconds = [np.asarray(initial_state, dtype=float)], [], []
     decision: Decision | None = None
     for k in range(steps):
-        decision = controller.control(states[-1], references[k : k + controller.horizon], decision)
+        ahead = Reference(references[k : k + controller.horizon + 1])
+        decision = controller.control(Gaussian.certain(states[-1]), ahead, decision)
         if not decision.status.solved:
             raise SolverFailure(k, decision.status.advice)
         inputs.append(decision.input)
-        seconds.append(decision.seconds)
+        seconds.append(decision.timing.total)
         states.append(step(plant, states[-1], decision.input))
     return Rollout(np.array(states), np.array(inputs), np.array(references[:steps]), np.array(seconds))

@@ -1,4 +1,4 @@
-"""Problem: everything that turns a state and a reference into an input, behind one call.
+"""Problem: everything that turns what is known of the state, and a reference, into an input, behind one call.
 
 A controller keeps nothing between calls: what it wants to remember (its last plan) is part of the ``Decision`` that it
 returns, and comes back to it as ``previous``.
@@ -9,7 +9,57 @@ from typing import Protocol
 
 import numpy as np
 
+from gpmpc.exceptions import ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.qp import QPSolution, QuadraticProgram
 from gpmpc.status import Status
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a controller is to follow over its horizon H, from the current time on.
+
+    Attributes:
+        states: r_0 .. r_H (H + 1, n); r_0 belongs to the current time.
+        inputs: u*_0 .. u*_{H-1} (H, m), the inputs that belong to it where they are known.
+
+    Raises:
+        ShapeError: The two do not belong together.
+    """
+
+    states: np.ndarray
+    inputs: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.states) != 2 or len(self.states) < 2:
+            raise ShapeError(f"reference states must be (H + 1, n), H of 1 or more; got {np.shape(self.states)}")
+        if self.inputs is not None and (np.ndim(self.inputs) != 2 or len(self.inputs) != len(self.states) - 1):
+            raise ShapeError(f"reference inputs must be ({len(self.states) - 1}, m); got {np.shape(self.inputs)}")
+
+    @property
+    def horizon(self) -> int:
+        """H."""
+        return len(self.states) - 1
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Where the wall time of a decision went [s].
+
+    Attributes:
+        model: Propagation and linearisation.
+        build: From the local model to the optimisation problem.
+        solve: The optimisation problem itself.
+    """
+
+    model: float  # [s]
+    build: float  # [s]
+    solve: float  # [s]
+
+    @property
+    def total(self) -> float:
+        """All of it [s]."""
+        return self.model + self.build + self.solve
 
 
 @dataclass(frozen=True)
@@ -19,18 +69,24 @@ class Decision:
     Attributes:
         input: The input to apply now (m,).
         inputs: The planned inputs (H, m); the first row is ``input``.
-        states: The predicted states (H, n), from the current state on.
+        means: Predicted means of the states (H + 1, n), from the current state on.
+        covariances: Their covariances (H + 1, n, n); zero where the controller does not predict them.
         status: How the solve ended. Inputs of a solve that did not succeed are a failed iterate: do not apply them.
         iterations: Iterations of the solver.
-        seconds: Wall time of the solve [s].
+        timing: Where the time went.
+        problem: The quadratic program that was solved last, where there is one.
+        solution: Its solution: active set, multipliers, residuals; a warm start for the next.
     """
 
     input: np.ndarray
     inputs: np.ndarray
-    states: np.ndarray
+    means: np.ndarray
+    covariances: np.ndarray
     status: Status
     iterations: int
-    seconds: float  # [s]
+    timing: Timing
+    problem: QuadraticProgram | None = None
+    solution: QPSolution | None = None
 
 
 class Controller(Protocol):
@@ -38,13 +94,13 @@ class Controller(Protocol):
 
     @property
     def horizon(self) -> int:
-        """Number of reference samples that ``control`` looks at."""
+        """H, how far it looks ahead."""
 
-    def control(self, state: np.ndarray, reference: np.ndarray, previous: Decision | None = None) -> Decision:
+    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
         """Decides the input for one step.
 
         Args:
-            state: Measured state (n,).
-            reference: Reference states (H, n), from the current time on.
+            belief: What is known of the state; ``Gaussian.certain(x)`` for a measured one.
+            reference: Over the controller's horizon.
             previous: The last decision, to warm-start from; None at the first step.
         """

@@ -1,10 +1,10 @@
 """Problem: the best that a controller can do which knows the true model (nonlinear MPC, the paper's benchmark).
 
-    minimise over u_0 .. u_{H-1}   sum_{i<H} |x_i - r_i|^2_Q + |u_i|^2_R,   x_0 measured,  x_{i+1} = plant(x_i, u_i)
-
-It generated the data of Cao, Lai and Alam (2017), and the sum is theirs: it starts at the measured state (whose cost is
-constant) and ends at x_{H-1}, so the last input only pays for itself. Multiple shooting in CasADi (Andersson et al.,
-2019), solved by IPOPT (Waechter and Biegler, 2006) with exact derivatives.
+A ``TrackingProblem`` under x_{i+1} = plant(x_i, u_i), from the belief's mean; state bounds hold for the states
+themselves, since the model is taken to be true. It generated the data of Cao, Lai and Alam (2017), whose sum over
+N = H + 1 states starts at the measured one (its cost is constant) and has one input more, which only pays for itself.
+Multiple shooting in CasADi (Andersson et al., 2019), solved by IPOPT (Waechter and Biegler, 2006) with exact
+derivatives.
 """
 
 import time
@@ -13,8 +13,10 @@ from collections.abc import Sequence
 import casadi
 import numpy as np
 
-from gpmpc.control.controller import Decision
-from gpmpc.exceptions import ShapeError, check_number, check_numbers
+from gpmpc.control.controller import Decision, Reference, Timing
+from gpmpc.control.tracking import TrackingProblem
+from gpmpc.exceptions import SettingError, ShapeError, check_number, check_numbers
+from gpmpc.gaussian import Gaussian
 from gpmpc.plants import Plant
 from gpmpc.status import Status
 
@@ -32,86 +34,137 @@ class NMPC:
 
     Args:
         plant: The model, and what ``x_{i+1} = plant(x_i, u_i)`` means.
-        horizon: H, the number of states in the cost, the measured one included.
-        Q: State weights, the diagonal (n,).
-        R: Input weights, the diagonal (m,).
+        problem: Weights and bounds. Soft state bounds get one slack variable each, with their weights.
+        horizon: H, the number of predicted states.
         initial_input: First guess of every planned input (m,) where there is no previous decision.
         tolerance: IPOPT's, on the scaled optimality conditions.
 
     Raises:
-        SettingError: A horizon below 1, a negative weight, or a weight or guess of the wrong length.
+        SettingError: A horizon below 1, weights of another dimension than the plant's, or a guess of the wrong length.
     """
 
     def __init__(
         self,
         plant: Plant,
+        problem: TrackingProblem,
         horizon: int,
-        Q: Sequence[float],
-        R: Sequence[float],
         initial_input: Sequence[float],
         tolerance: float = 1e-10,
     ):
         n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
         check_number("horizon", horizon, least=1, whole=True)
-        check_numbers("Q", Q, n, least=0)
-        check_numbers("R", R, m, least=0)
         check_numbers("initial_input", initial_input, m)
         check_number("tolerance", tolerance, above=0)
-        self.plant = plant
-        self.horizon = horizon
+        if (problem.state_dim, problem.input_dim) != (n, m):
+            raise SettingError(
+                "problem", f"must weigh {n} states and {m} inputs; got {problem.state_dim} and {problem.input_dim}"
+            )
+        self.plant, self.problem, self.horizon = plant, problem, horizon
         self.initial_input = np.array(initial_input, dtype=float)
-        self._solver = _build(plant, horizon, np.array(Q, dtype=float), np.array(R, dtype=float), tolerance)
+        self._solver, self._bounds = _build(plant, problem, horizon, tolerance)
 
-    def control(self, state: np.ndarray, reference: np.ndarray, previous: Decision | None = None) -> Decision:
-        """Solves the problem from a measured state (n,) along reference states (H, n)."""
-        n, m, H = len(state), len(self.initial_input), self.horizon
-        if np.shape(reference) != (H, n):
-            raise ShapeError(f"reference must have shape ({H}, {n}); got {np.shape(reference)}")
+    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+        """Solves the problem from the belief's mean along a reference; see ``Controller.control``.
+
+        Raises:
+            ShapeError: The reference does not belong to this controller.
+        """
+        n, m, H = self.problem.state_dim, self.problem.input_dim, self.horizon
+        state = np.asarray(belief.mean, dtype=float)
+        if state.shape != (n,) or np.shape(reference.states) != (H + 1, n):
+            raise ShapeError(
+                f"state and reference must have shapes ({n},) and ({H + 1}, {n}); "
+                f"got {state.shape} and {np.shape(reference.states)}"
+            )
         start = time.perf_counter()
         # The last input is held, not the plan shifted: the end of a plan steers little of this cost, so its inputs
         # lie far from the next solution; from there IPOPT found a worse local minimum on the elliptical flight.
-        guess = np.tile(self.initial_input if previous is None else previous.input, (H, 1))
+        last = self.initial_input if previous is None else previous.input
+        guess = np.tile(last, (H, 1))
+        wanted = np.zeros((H, m)) if reference.inputs is None else reference.inputs
+        lower, upper = self._bounds
         states = _rollout(self.plant, state, guess)
+        unknowns = np.zeros(len(lower["x"]))
+        unknowns[: H * (n + m)] = np.concatenate([states[1:].ravel(), guess.ravel()])
         solution = self._solver(
-            x0=np.concatenate([states.ravel(), guess.ravel()]),
-            p=np.concatenate([state, np.ravel(reference)]),
-            lbg=0.0,
-            ubg=0.0,
+            x0=unknowns,
+            p=np.concatenate([state, last, np.ravel(reference.states[1:]), np.ravel(wanted)]),
+            lbx=lower["x"],
+            ubx=upper["x"],
+            lbg=lower["g"],
+            ubg=upper["g"],
         )
         plan = np.array(solution["x"]).ravel()
         stats = self._solver.stats()
-        states, inputs = plan[: H * n].reshape(H, n), plan[H * n :].reshape(H, m)
+        means = np.vstack([state, plan[: H * n].reshape(H, n)])
+        inputs = plan[H * n : H * (n + m)].reshape(H, m)
         return Decision(
             input=inputs[0],
             inputs=inputs,
-            states=states,
+            means=means,
+            covariances=np.zeros((H + 1, n, n)),
             status=IPOPT_STATUS.get(stats["return_status"], Status.NUMERICAL_TROUBLE),
             iterations=stats["iter_count"],
-            seconds=time.perf_counter() - start,
+            timing=Timing(0.0, 0.0, time.perf_counter() - start),
         )
 
 
-def _build(plant: Plant, horizon: int, Q: np.ndarray, R: np.ndarray, tolerance: float) -> casadi.Function:
-    """The optimisation problem in the unknowns (x_0 .. x_{H-1}, u_0 .. u_{H-1}) as an IPOPT solver."""
-    n, m = len(Q), len(R)
-    x = [casadi.SX.sym(f"x{i}", n) for i in range(horizon)]
-    u = [casadi.SX.sym(f"u{i}", m) for i in range(horizon)]
-    measured, r = casadi.SX.sym("measured", n), [casadi.SX.sym(f"r{i}", n) for i in range(horizon)]
-    cost = sum(casadi.dot(Q, (x[i] - r[i]) ** 2) + casadi.dot(R, u[i] ** 2) for i in range(horizon))
-    gaps = [x[0] - measured]
-    gaps += [x[i + 1] - casadi.vertcat(*plant.successor(x[i], u[i])) for i in range(horizon - 1)]
-    problem = {"x": casadi.vertcat(*x, *u), "p": casadi.vertcat(measured, *r), "f": cost, "g": casadi.vertcat(*gaps)}
+def _build(
+    plant: Plant, problem: TrackingProblem, horizon: int, tolerance: float
+) -> tuple[casadi.Function, tuple[dict, dict]]:
+    """IPOPT on the unknowns (x_1 .. x_H, u_0 .. u_{H-1}, slacks), and the bounds of unknowns and constraints."""
+    n, m, H, limits = problem.state_dim, problem.input_dim, horizon, problem.state_bounds
+    x0, last = casadi.SX.sym("x0", n), casadi.SX.sym("last", m)
+    x = [x0, *(casadi.SX.sym(f"x{i}", n) for i in range(1, H + 1))]
+    u = [casadi.SX.sym(f"u{i}", m) for i in range(H)]
+    r, wanted = [casadi.SX.sym(f"r{i}", n) for i in range(H)], [casadi.SX.sym(f"w{i}", m) for i in range(H)]
+    rates = [u[i] - (u[i - 1] if i else last) for i in range(H)]
+    penalized = {"inputs": u, "deviations": [a - b for a, b in zip(u, wanted, strict=True)], "increments": rates}
+    Q, R = casadi.DM(problem.Q), casadi.DM(problem.R)
+    cost = sum(casadi.bilin(R, v, v) for v in penalized[problem.penalized])
+    for i in range(1, H + 1):
+        error = x[i] - r[i - 1]
+        cost += casadi.bilin(casadi.DM(problem.terminal) if i == H else Q, error, error)
+    constraints = [x[i + 1] - casadi.vertcat(*plant.successor(x[i], u[i])) for i in range(H)]
+    g_lower, g_upper = [np.zeros(n)] * H, [np.zeros(n)] * H
+    if problem.rate_limited:
+        constraints += rates
+        g_lower, g_upper = [*g_lower, *[problem.rate_lower] * H], [*g_upper, *[problem.rate_upper] * H]
+    x_lower, x_upper, slacks = [np.full(H * n, -np.inf)], [np.full(H * n, np.inf)], []
+    if limits is not None and not limits.soft:
+        x_lower, x_upper = [np.tile(limits.lower, H)], [np.tile(limits.upper, H)]
+    x_lower.append(np.tile(problem.input_lower, H))
+    x_upper.append(np.tile(problem.input_upper, H))
+    if limits is not None and limits.soft:
+        for i in range(1, H + 1):
+            for bound, side in ((limits.lower, -1), (limits.upper, 1)):
+                slack = casadi.SX.sym(f"e{i}", n)
+                slacks.append(slack)
+                cost += (limits.l1 or 0.0) * casadi.sum1(slack) + (limits.l2 or 0.0) * casadi.dot(slack, slack)
+                kept = np.isfinite(bound)
+                constraints.append(casadi.DM(side * kept) * (x[i] - np.where(kept, bound, 0.0)) - slack)
+                g_lower, g_upper = [*g_lower, np.full(n, -np.inf)], [*g_upper, np.zeros(n)]
+        x_lower.append(np.zeros(2 * H * n))
+        x_upper.append(np.full(2 * H * n, np.inf))
+    nlp = {
+        "x": casadi.vertcat(*x[1:], *u, *slacks),
+        "p": casadi.vertcat(x0, last, *r, *wanted),
+        "f": cost,
+        "g": casadi.vertcat(*constraints),
+    }
     options = {
         "print_time": False,
         "show_eval_warnings": False,
-        "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 500},
+        "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 500, "bound_relax_factor": 0.0},
     }
-    return casadi.nlpsol("nmpc", "ipopt", problem, options)
+    lower = {"x": np.concatenate(x_lower), "g": np.concatenate(g_lower)}
+    upper = {"x": np.concatenate(x_upper), "g": np.concatenate(g_upper)}
+    return casadi.nlpsol("nmpc", "ipopt", nlp, options), (lower, upper)
 
 
 def _rollout(plant: Plant, state: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-    """States (H, n) that inputs (H, m) lead to, from a state (n,); the last input is not used."""
+    """States (H + 1, n) that inputs (H, m) lead to, from a state (n,)."""
     states = [np.asarray(state, dtype=float)]
-    for u in inputs[:-1]:
+    for u in inputs:
         states.append(np.array(plant.successor(states[-1], u), dtype=float))
     return np.array(states)

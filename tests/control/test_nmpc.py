@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
 
-from gpmpc.control.controller import Decision
+from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.nmpc import NMPC
+from gpmpc.control.tracking import StateBounds, TrackingProblem
 from gpmpc.exceptions import SettingError, ShapeError, SolverFailure
+from gpmpc.gaussian import Gaussian
 from gpmpc.plants import Integrated, Map, Rotational, Translational, step
 from gpmpc.simulation import closed_loop
 from gpmpc.status import Status
@@ -19,20 +21,21 @@ class DoubleIntegrator:
 def test_on_a_linear_plant_it_is_the_least_squares_solution(rng):
     plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
     H, Q, R = 5, np.array([3.0, 0.5]), np.array([0.2])
-    state, reference = rng.normal(size=2), rng.normal(size=(H, 2))
+    state, reference = rng.normal(size=2), rng.normal(size=(H + 1, 2))
     A, B = np.array([[1, 0.5], [0, 1]]), np.array([0.125, 0.5])
-    free = np.array([np.linalg.matrix_power(A, i) @ state for i in range(H)])
+    free = np.array([np.linalg.matrix_power(A, i + 1) @ state for i in range(H)])
     response = np.zeros((H, 2, H))
     for i in range(H):
-        for j in range(i):
-            response[i, :, j] = np.linalg.matrix_power(A, i - 1 - j) @ B
+        for j in range(i + 1):
+            response[i, :, j] = np.linalg.matrix_power(A, i - j) @ B
     rows = (np.sqrt(Q)[None, :, None] * response).reshape(-1, H)
-    right = (np.sqrt(Q) * (reference - free)).ravel()
+    right = (np.sqrt(Q) * (reference[1:] - free)).ravel()
     best = np.linalg.lstsq(np.vstack([rows, np.sqrt(R) * np.eye(H)]), np.append(right, np.zeros(H)), rcond=None)[0]
-    decision = NMPC(plant, H, Q, R, [0.0]).control(state, reference)
+    controller = NMPC(plant, TrackingProblem(Q, R), H, [0.0])
+    decision = controller.control(Gaussian.certain(state), Reference(reference))
     assert decision.status is Status.SOLVED
     assert np.allclose(decision.inputs[:, 0], best, atol=1e-8)
-    assert np.allclose(decision.states, free + response @ best, atol=1e-8)
+    assert np.allclose(decision.means[1:], free + response @ best, atol=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -40,15 +43,16 @@ def test_on_a_linear_plant_it_is_the_least_squares_solution(rng):
 )
 def test_no_small_change_of_the_plan_is_cheaper(plant, rng):
     H, Q, R = 4, np.array([20.0, 1, 20, 1, 20, 1]), np.array([1.0, 1, 1])
-    state, reference = 0.1 * rng.normal(size=6), 0.3 * rng.normal(size=(H, 6))
+    state, reference = 0.1 * rng.normal(size=6), 0.3 * rng.normal(size=(H + 1, 6))
     initial = [7.26, 0, 0] if isinstance(plant, Integrated) else [0, 0, 0]
-    decision = NMPC(plant, H, Q, R, initial).control(state, reference)
+    controller = NMPC(plant, TrackingProblem(Q, R), H, initial)
+    decision = controller.control(Gaussian.certain(state), Reference(reference))
 
     def cost(inputs):
         x, total = state, 0.0
-        for u, r in zip(inputs, reference, strict=True):
-            total += Q @ (x - r) ** 2 + R @ u**2
+        for u, r in zip(inputs, reference[1:], strict=True):
             x = step(plant, x, u)
+            total += Q @ (x - r) ** 2 + R @ u**2
         return total
 
     best = cost(decision.inputs)
@@ -61,22 +65,46 @@ def test_no_small_change_of_the_plan_is_cheaper(plant, rng):
     ("arguments", "error", "message"),
     [
         ({"horizon": 0}, SettingError, "horizon: must be a whole number, 1 or more; got 0"),
-        ({"Q": [1.0] * 5}, SettingError, "Q: must be a list of 6 numbers"),
-        ({"R": [1.0] * 4}, SettingError, "R: must be a list of 3 numbers"),
-        ({"R": [1.0, -1, 1]}, SettingError, "R: must be a number, 0 or more; got -1"),
+        ({"problem": TrackingProblem([1.0] * 5, [1.0] * 3)}, SettingError, "must weigh 6 states and 3 inputs; got 5"),
         ({"initial_input": [0.0]}, SettingError, "initial_input: must be a list of 3 numbers"),
     ],
 )
 def test_misuse_is_refused_at_construction(arguments, error, message):
-    good = {"horizon": 3, "Q": [1.0] * 6, "R": [1.0] * 3, "initial_input": [0.0] * 3}
+    good = {"horizon": 3, "problem": TrackingProblem([1.0] * 6, [1.0] * 3), "initial_input": [0.0] * 3}
     with pytest.raises(error, match=message):
         NMPC(Map(Rotational()), **(good | arguments))
 
 
 def test_a_reference_of_another_shape_is_refused():
-    controller = NMPC(Map(Rotational()), 3, [1.0] * 6, [1.0] * 3, [0.0] * 3)
-    with pytest.raises(ShapeError, match=r"reference must have shape \(3, 6\); got \(2, 6\)"):
-        controller.control(np.zeros(6), np.zeros((2, 6)))
+    controller = NMPC(Map(Rotational()), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3)
+    with pytest.raises(ShapeError, match=r"shapes \(6,\) and \(4, 6\); got \(6,\) and \(2, 6\)"):
+        controller.control(Gaussian.certain(np.zeros(6)), Reference(np.zeros((2, 6))))
+
+
+def test_bounds_on_inputs_rates_and_states_are_kept(rng):
+    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    limits = StateBounds([-np.inf, -0.3], [np.inf, 0.3])
+    bounds = {"input_lower": [-1.0], "input_upper": [0.4], "rate_lower": [-0.3], "rate_upper": [0.3]}
+    problem = TrackingProblem([1.0, 0.0], [1e-3], state_bounds=limits, **bounds)
+    decision = NMPC(plant, problem, 8, [0.0]).control(Gaussian.certain(np.zeros(2)), Reference(np.full((9, 2), 1.0)))
+    assert decision.status is Status.SOLVED
+    rates = np.diff(decision.inputs[:, 0], prepend=0.0)
+    for values, low, high in ((decision.inputs, -1, 0.4), (rates, -0.3, 0.3), (decision.means[:, 1], -0.3, 0.3)):
+        assert low - 1e-8 <= values.min()
+        assert values.max() <= high + 1e-8
+    assert decision.means[:, 1].max() > 0.3 - 1e-6
+    assert rates.max() > 0.3 - 1e-6
+
+
+def test_soft_state_bounds_give_way_where_they_must():
+    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    limits = StateBounds([-np.inf, -0.3], [np.inf, 0.3], l1=100.0)
+    problem = TrackingProblem([1.0, 0.0], [1e-3], input_lower=[-0.2], input_upper=[0.2], state_bounds=limits)
+    fast = Gaussian.certain(np.array([0.0, 0.5]))
+    decision = NMPC(plant, problem, 5, [0.0]).control(fast, Reference(np.zeros((6, 2))))
+    assert decision.status is Status.SOLVED
+    assert np.allclose(decision.means[1:3, 1], [0.4, 0.3], atol=1e-6)
+    assert decision.means[2:, 1].max() < 0.3 + 1e-6
 
 
 class Scripted:
@@ -87,18 +115,21 @@ class Scripted:
     def __init__(self, *statuses):
         self.statuses, self.seen = list(statuses), []
 
-    def control(self, state, reference, previous=None):
-        self.seen.append((state, reference, previous))
-        return Decision(np.ones(1), np.ones((2, 1)), np.zeros((2, 2)), self.statuses.pop(0), 1, 0.0)
+    def control(self, belief, reference, previous=None):
+        self.seen.append((belief.mean, reference.states, previous))
+        timing = Timing(0.0, 0.0, 0.0)
+        return Decision(
+            np.ones(1), np.ones((2, 1)), np.zeros((3, 2)), np.zeros((3, 2, 2)), self.statuses.pop(0), 1, timing
+        )
 
 
 def test_the_loop_hands_on_state_references_and_the_last_decision():
     controller = Scripted(Status.SOLVED, Status.SOLVED, Status.SOLVED)
-    plant, references = Integrated(DoubleIntegrator(), time_step=1.0, substeps=1), np.arange(8.0).reshape(4, 2)
+    plant, references = Integrated(DoubleIntegrator(), time_step=1.0, substeps=1), np.arange(10.0).reshape(5, 2)
     rollout = closed_loop(plant, controller, references, np.zeros(2), 3)
     assert np.allclose(rollout.states, [[0, 0], [0.5, 1], [2, 2], [4.5, 3]])
     assert rollout.inputs.shape == (3, 1)
-    assert [seen[1].tolist() for seen in controller.seen] == [references[k : k + 2].tolist() for k in range(3)]
+    assert [seen[1].tolist() for seen in controller.seen] == [references[k : k + 3].tolist() for k in range(3)]
     assert controller.seen[0][2] is None
     assert controller.seen[2][2].status is Status.SOLVED
 
@@ -113,5 +144,5 @@ def test_a_failed_solve_stops_the_loop_and_is_not_applied():
 
 
 def test_too_few_references_are_refused_before_the_first_step():
-    with pytest.raises(ShapeError, match="3 steps with horizon 2 need 4 references; got 3"):
+    with pytest.raises(ShapeError, match="3 steps with horizon 2 need 5 references; got 3"):
         closed_loop(Map(DoubleIntegrator()), Scripted(), np.zeros((3, 2)), np.zeros(2), 3)
