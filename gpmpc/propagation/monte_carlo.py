@@ -4,6 +4,7 @@ The model's own covariance enters as its mean over the draws (law of total covar
 the function values too. The standard error falls as one over the root of the number of samples.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -39,8 +40,8 @@ class MonteCarlo:
     def propagate(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``."""
         input, n = checked_input(model, belief, input), belief.dim
-        generator = torch.Generator().manual_seed(self.seed)
-        normal = torch.randn(self.samples, n, generator=generator, dtype=torch.float64).to(belief.mean)
+        # NumPy's generator: torch's would stop a vmap around this call.
+        normal = torch.from_numpy(np.random.default_rng(self.seed).standard_normal((self.samples, n))).to(belief.mean)
         steps = normal @ square_root(belief.covariance)  # (*batch, samples, n)
         means, spread = [], 0.0
         for chunk in steps.split(CHUNK, dim=-2):
