@@ -60,6 +60,8 @@ def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:
         symmetrised matrix was positive semidefinite already, which is then returned unchanged.
     """
     symmetric = (covariance + covariance.mT) / 2
+    if _plain(symmetric) and not bool(torch.linalg.cholesky_ex(symmetric).info.any()):  # the usual case, cheaply
+        return symmetric, torch.zeros_like(symmetric[..., 0, 0])
     deficit = (-torch.linalg.eigvalsh(symmetric.detach())[..., 0]).clamp_min(0)
     negative = deficit[..., None, None] > 0
     # The derivative of eigh divides by differences of eigenvalues; where nothing is projected it gets distinct ones.
@@ -107,3 +109,12 @@ def square_root_differential(r: Tensor, U: Tensor, change: Tensor) -> Tensor:
     rotated = torch.einsum("...ki,...klj,...lm->...imj", U, change, U)
     solution = torch.where(positive, rotated / torch.where(positive, total, 1.0), 0.0)
     return torch.einsum("...ik,...klj,...ml->...imj", U, solution, U)
+
+
+def _plain(value: Tensor) -> bool:
+    """Whether a tensor's values may decide what is done next: in host memory, in no graph and in no transform."""
+    try:
+        value.numpy()
+    except (RuntimeError, TypeError):
+        return False
+    return True

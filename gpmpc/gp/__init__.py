@@ -1,6 +1,7 @@
 """Gaussian process dynamics models: data, training (GPyTorch), and the frozen posterior that predicts."""
 
 from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.gp.evaluation import evaluation
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.residual import Affine, ResidualModel
 from gpmpc.gp.scaling import Scaling, identity, min_max, standardize
@@ -17,6 +18,7 @@ __all__ = [
     "Trainer",
     "Training",
     "Transitions",
+    "evaluation",
     "identity",
     "min_max",
     "standardize",

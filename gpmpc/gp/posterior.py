@@ -14,16 +14,20 @@ and gives physical units.
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp.evaluation import host_arrays
 from gpmpc.gp.model import hyperparameters
 from gpmpc.gp.scaling import Scaling
 from gpmpc.gp.transitions import Transitions
+
+if TYPE_CHECKING:
+    from gpmpc.fused import Packed
 
 Predicts = Literal["next_state", "difference", "value"]
 PREDICTS = ("next_state", "difference", "value")
@@ -217,6 +221,14 @@ class GPPosterior:
         """(K + sn2 I)^-1 (k, N, N)."""
         return torch.cholesky_inverse(self.cholesky)
 
+    @cached_property
+    def packed(self) -> "Packed":
+        """The arrays of the compiled loops, for a float64 model in host memory."""
+        from gpmpc.fused import pack  # loads numba
+
+        parts = (self.features, self.lengthscales, self.signal_variance, self.cholesky, self.weights)
+        return pack(*(part.numpy() for part in parts), self.state_dim)
+
     def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "GPPosterior":
         """The same on another device, or in another floating-point type."""
         tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
@@ -241,13 +253,20 @@ class GPPosterior:
 
     def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
         """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""
+        input = state[..., :0] if input is None else input
+        if host_arrays(self.features, state, input) is not None:
+            mean, variance, by_state, by_input = self._compiled("point_with_jacobian", state, input)
+            return Gaussian(mean, torch.diag_embed(variance)), by_state, by_input
         k, difference = self._correlations(state, input)
-        weighted = (k * self.weights)[..., None, :]  # (*batch, k, 1, N)
-        jacobian = (weighted @ (difference / self.lengthscales[:, None, :]))[..., 0, :]
-        by_state, by_input = jacobian[..., : self.state_dim], jacobian[..., self.state_dim :]
-        if self.predicts == "difference":
-            by_state = by_state + torch.eye(self.state_dim, dtype=state.dtype, device=state.device)
-        return self._belief(k, state), by_state, by_input
+        return self._belief(k, state), *self._jacobian(k, difference)
+
+    def mean_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """``predict_with_jacobian`` without the variance, which costs most of it: the mean (*batch, k) comes first."""
+        input = state[..., :0] if input is None else input
+        if host_arrays(self.features, state, input) is not None:
+            return self._compiled("mean_with_jacobian", state, input)
+        k, difference = self._correlations(state, input)
+        return self._mean(k, state), *self._jacobian(k, difference)
 
     def mean_hessian(self, state: Tensor, input: Tensor | None = None) -> Tensor:
         """The mean's second derivatives by the state (*batch, k, n, n)."""
@@ -303,12 +322,36 @@ class GPPosterior:
         difference = (self.features - query[..., None, :])[..., None, :, :] / self.lengthscales[:, None, :]
         return self.signal_variance[:, None] * torch.exp(-difference.square().sum(-1) / 2), difference
 
-    def _belief(self, k: Tensor, state: Tensor) -> Gaussian:
+    def _mean(self, k: Tensor, state: Tensor) -> Tensor:
         mean = (k * self.weights).sum(-1) + self.offset
+        return mean + state if self.predicts == "difference" else mean
+
+    def _belief(self, k: Tensor, state: Tensor) -> Gaussian:
         explained = torch.linalg.solve_triangular(self.cholesky, k[..., None], upper=False)[..., 0].square().sum(-1)
+        return Gaussian(self._mean(k, state), torch.diag_embed((self.signal_variance - explained).clamp_min(0)))
+
+    def _jacobian(self, k: Tensor, difference: Tensor) -> tuple[Tensor, Tensor]:
+        """The mean's derivatives by state and input, from what ``_correlations`` gives."""
+        weighted = (k * self.weights)[..., None, :]  # (*batch, k, 1, N)
+        jacobian = (weighted @ (difference / self.lengthscales[:, None, :]))[..., 0, :]
+        by_state, by_input = jacobian[..., : self.state_dim], jacobian[..., self.state_dim :]
         if self.predicts == "difference":
-            mean = mean + state
-        return Gaussian(mean, torch.diag_embed((self.signal_variance - explained).clamp_min(0)))
+            by_state = by_state + torch.eye(self.state_dim, dtype=self.dtype, device=self.device)
+        return by_state, by_input
+
+    def _compiled(self, function: str, state: Tensor, input: Tensor) -> list[Tensor]:
+        """Mean, (variance,) and derivatives by state and input from ``gpmpc.fused``."""
+        from gpmpc import fused
+
+        check_query(self, state, input)
+        batch = state.shape[:-1]
+        found = getattr(fused, function)(self.packed, *(v.reshape(-1, v.shape[-1]).numpy() for v in (state, input)))
+        parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found[: min(len(found), 4)]]
+        parts[0] += self.offset
+        if self.predicts == "difference":
+            parts[0] += state
+            parts[-2].diagonal(dim1=-2, dim2=-1).add_(1.0)
+        return parts
 
 
 def check_query(model: Any, state: Tensor, input: Tensor) -> None:

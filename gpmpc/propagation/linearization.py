@@ -14,7 +14,9 @@ from torch import Tensor
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
 from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.gp.posterior import GPPosterior
+from gpmpc.propagation.expansion import expand
 from gpmpc.propagation.propagator import Propagation, checked_input
+from gpmpc.propagation.sensitivity import Sensitivity
 
 
 class Linearization:
@@ -34,8 +36,37 @@ class Linearization:
 
     def propagate(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``."""
-        input, S = checked_input(model, belief, input), belief.covariance
+        input = checked_input(model, belief, input)
         at_mean, A, _ = model.predict_with_jacobian(belief.mean, input)
+        return self._propagation(model, belief, input, at_mean, A)
+
+    def differentiate(
+        self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None
+    ) -> tuple[Propagation, Sensitivity] | None:
+        """``propagate`` with all derivatives in closed form; None where there is none (always with ``hessian``)."""
+        input = checked_input(model, belief, input)
+        expansion = None if self.hessian else expand(model, belief.mean, input)
+        if expansion is None:
+            return None
+        A = expansion.A
+        AS = A @ belief.covariance
+        by_mean = torch.einsum("...ip,...jpc->...ijc", AS, expansion.mean_by_state2)
+        by_input = torch.einsum("...ip,...jpc->...ijc", AS, expansion.mean_by_state_input)
+        by_covariance = torch.einsum("...ic,...jd->...ijcd", A, A)
+        sensitivity = Sensitivity(
+            A,
+            torch.zeros_like(expansion.mean_by_state2),
+            expansion.B,
+            by_mean + by_mean.transpose(-3, -2) + torch.diag_embed(expansion.variance_by_state.mT).movedim(-3, -1),
+            (by_covariance + by_covariance.mT) / 2,
+            by_input + by_input.transpose(-3, -2) + torch.diag_embed(expansion.variance_by_input.mT).movedim(-3, -1),
+        )
+        return self._propagation(model, belief, input, expansion.belief, A), sensitivity
+
+    def _propagation(
+        self, model: DynamicsModel, belief: Gaussian, input: Tensor, at_mean: Gaussian, A: Tensor
+    ) -> Propagation:
+        S = belief.covariance
         mean, covariance = at_mean.mean, at_mean.covariance + A @ S @ A.mT
         if self.hessian:
             H = mean_hessian(model, belief.mean, input)

@@ -8,7 +8,9 @@ from torch import Tensor
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.propagation.expansion import expand
 from gpmpc.propagation.propagator import Propagation, checked_input
+from gpmpc.propagation.sensitivity import Sensitivity
 
 
 class MeanEquivalence:
@@ -27,8 +29,26 @@ class MeanEquivalence:
 
     def propagate(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``. State and next state come out uncorrelated."""
-        input = checked_input(model, belief, input)
-        moved = model.predict(belief.mean, input)
+        return self._propagation(model, belief, model.predict(belief.mean, checked_input(model, belief, input)))
+
+    def differentiate(
+        self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None
+    ) -> tuple[Propagation, Sensitivity] | None:
+        """``propagate`` with all derivatives in closed form; None where the model has none."""
+        expansion = expand(model, belief.mean, checked_input(model, belief, input))
+        if expansion is None:
+            return None
+        sensitivity = Sensitivity(
+            expansion.A,
+            torch.zeros_like(expansion.mean_by_state2),
+            expansion.B,
+            torch.diag_embed(expansion.variance_by_state.mT).movedim(-3, -1),
+            torch.zeros_like(expansion.mean_by_state2)[..., None, :, :].repeat_interleave(belief.dim, -3),
+            torch.diag_embed(expansion.variance_by_input.mT).movedim(-3, -1),
+        )
+        return self._propagation(model, belief, expansion.belief), sensitivity
+
+    def _propagation(self, model: DynamicsModel, belief: Gaussian, moved: Gaussian) -> Propagation:
         covariance = moved.covariance + model.noise_covariance if self.observation_noise else moved.covariance
         cross = torch.zeros_like(belief.mean[..., :, None].expand(*belief.mean.shape, moved.dim))
         return Propagation(Gaussian(moved.mean, covariance), cross, torch.zeros_like(moved.mean[..., 0]))

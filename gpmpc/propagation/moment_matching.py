@@ -20,15 +20,18 @@ is small. Here each product is centred before it is summed, which loses nothing:
 (delta follows from T_ab - T_a = -T_ab Lam_b^-1 T_a.) The controls carry no uncertainty: they only weigh the points.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
+from gpmpc.gp.evaluation import host_arrays
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.residual import Affine, ResidualModel
+from gpmpc.propagation.composition import Composition, Latent
 from gpmpc.propagation.propagator import Propagation, checked_input, unsupported
+from gpmpc.propagation.sensitivity import Sensitivity
 
 
 class MomentMatching:
@@ -54,27 +57,61 @@ class MomentMatching:
             UnsupportedModel: There is no closed form for this model.
         """
         input = checked_input(model, belief, input)
-        if isinstance(model, ResidualModel) and isinstance(model.nominal, Affine):
-            S, chosen = belief.covariance, list(model.states)
-            seen = Gaussian(belief.mean[..., chosen], S[..., chosen, :][..., chosen])
-            M, V, J = moments(model.residual, seen, input[..., list(model.inputs)], self.diagonal)
-            C = S[..., chosen] @ J.mT @ model.B.mT  # Cov[x, B d]
-            A, M, V = model.nominal.A, model.nominal(belief.mean, input) + M @ model.B.mT, model.B @ V @ model.B.mT
-            V, cross = A @ S @ A.mT + A @ C + (A @ C).mT + V, S @ A.mT + C
-        elif isinstance(model, GPPosterior):
-            S = belief.covariance
-            M, V, J = moments(model, belief, input, self.diagonal)
-            cross = S @ J.mT
-            if model.predicts == "difference":
-                M, V, cross = belief.mean + M, S + cross + cross.mT + V, S + cross
-        else:
-            raise unsupported(self, model, "a GPPosterior, or a ResidualModel of an Affine nominal model and one")
-        if self.observation_noise:
-            V = V + model.noise_covariance
+        composition = self._composition(model)
+        seen, control = composition.seen(belief, input)
+        return self._propagation(model, *composition.moments(belief, input, self._latent(composition.f, seen, control)))
+
+    def differentiate(
+        self, model: Any, belief: Gaussian, input: Tensor | None = None
+    ) -> tuple[Propagation, Sensitivity] | None:
+        """``propagate`` with all derivatives in closed form; None where only torch can follow."""
+        input = checked_input(model, belief, input)
+        composition = self._composition(model)
+        seen, control = composition.seen(belief, input)
+        arrays = host_arrays(composition.f.features, seen.mean, seen.covariance, control)
+        if arrays is None:
+            return None
+        f = self._compiled(composition.f, seen.mean.shape[:-1], arrays[1:], composition.A is not None)
+        sensitivity = composition.sensitivity(belief.covariance, f)
         if self.diagonal:
-            V = torch.diag_embed(V.diagonal(dim1=-2, dim2=-1))
-        V, deficit = nearest_positive_semidefinite(V)
-        return Propagation(Gaussian(M, V), cross, deficit)
+            sensitivity = sensitivity.of_variances()
+        return self._propagation(model, *composition.moments(belief, input, f)), sensitivity
+
+    def _composition(self, model: Any) -> Composition:
+        composition = Composition.of(model)
+        if composition is None:
+            raise unsupported(self, model, "a GPPosterior, or a ResidualModel of an Affine nominal model and one")
+        return composition
+
+    def _latent(self, f: GPPosterior, belief: Gaussian, input: Tensor) -> Latent:
+        """The moments of f, compiled or by torch."""
+        arrays = host_arrays(f.features, belief.mean, belief.covariance, input)
+        if arrays is None:
+            return Latent(*moments(f, belief, input, self.diagonal))
+        return self._compiled(f, belief.mean.shape[:-1], arrays[1:])
+
+    def _compiled(self, f: GPPosterior, batch: torch.Size, arrays: Sequence[Any], cross: bool | None = None) -> Latent:
+        """The moments of f by ``gpmpc.fused``; ``cross`` asks for derivatives, with those of J or without."""
+        from gpmpc import fused  # loads numba
+
+        mean, S, u = arrays
+        n, m = f.state_dim, f.input_dim
+        flat = mean.reshape(-1, n), S.reshape(-1, n, n), u.reshape(len(mean.reshape(-1, n)), m)
+        if cross is None:
+            found = fused.moments(f.packed, *flat, self.diagonal)
+        else:
+            found = fused.moments_with_jacobian(f.packed, *flat, self.diagonal, cross)
+        parts = [p if p is None else torch.from_numpy(p.reshape(*batch, *p.shape[1:])) for p in found]
+        parts[0] += f.offset
+        return Latent(*parts)
+
+    def _propagation(self, model: Any, mean: Tensor, covariance: Tensor, cross: Tensor) -> Propagation:
+        if self.observation_noise:
+            covariance = covariance + model.noise_covariance
+        if self.diagonal:
+            covariance = torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1))
+        covariance, deficit = nearest_positive_semidefinite(covariance)
+        return Propagation(Gaussian(mean, covariance), cross, deficit)
 
 
 def moments(

@@ -4,7 +4,7 @@
 form for a model says so by a method ``differentiate``; any other is differentiated by torch autograd.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -36,6 +36,17 @@ class Sensitivity:
     covariance_by_mean: Tensor
     covariance_by_covariance: Tensor
     covariance_by_input: Tensor
+
+    def of_variances(self) -> "Sensitivity":
+        """The same where of the next covariance only the diagonal is kept."""
+        n = self.covariance_by_mean.shape[-2]
+        keep = torch.eye(n, dtype=self.mean_by_mean.dtype, device=self.mean_by_mean.device)
+        return replace(
+            self,
+            covariance_by_mean=self.covariance_by_mean * keep[:, :, None],
+            covariance_by_covariance=self.covariance_by_covariance * keep[:, :, None, None],
+            covariance_by_input=self.covariance_by_input * keep[:, :, None],
+        )
 
 
 def differentiate(

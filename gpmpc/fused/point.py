@@ -1,0 +1,128 @@
+"""Problem: the GPs' mean and variance at a certain point, with the derivatives that linearised propagation needs.
+
+    M_a = sum_i beta_ai k_ai,   k_ai = k_a(x~_i, x~),   var_a = sf2_a - |L_a^-1 k_a|^2
+
+With z_i = D_a (x~_i - x~), over states and controls together, dk_i = k_i z_i and every derivative of M is a moment of z
+under the weights beta_ai k_ai (Rasmussen and Williams, 2006, eqs. (2.25)-(2.26), differentiated):
+
+    dM = sum beta k z,   d2M = sum beta k (z z' - D),   d3M = sum beta k (z z z - three times D with z)
+    dvar = -2 sum_i [(K_a + sn2_a I)^-1 k_a]_i k_i z_i
+
+The moments are summed over x~_i - x~, which all outputs share, and scaled by D_a afterwards.
+"""
+
+import numpy as np
+
+from gpmpc.compiled import compiled
+from gpmpc.fused.exponential import exp_all
+from gpmpc.fused.point_rows import aligned_rows, combine, explain, multiply, project
+
+JACOBIAN, HESSIAN = 1, 2  # how much is wanted: up to second derivatives of M, up to third
+
+
+@compiled
+def offsets(points, x, u, difference):
+    """Writes x~_i - x~ as rows."""
+    states = (len(x) + 2) // 3 * 3
+    for c in range(len(points)):
+        at = 0.0
+        if c < len(x):
+            at = x[c]
+        elif states <= c < states + len(u):
+            at = u[c - states]
+        row, source = difference[c], points[c]
+        for j in range(len(row)):
+            row[j] = source[j] - at
+
+
+@compiled
+def means_along(points, inverse_squares, log_signal, beta, x, u, M, dM_dx, dM_du):
+    """M and its gradient at H points: x (H, n), u (H, m), M (H, k), dM_dx (H, k, n), dM_du (H, k, m)."""
+    (rows, padded), n, m = points.shape, x.shape[1], u.shape[1]
+    memory = aligned_rows(2 * rows + 1, padded)
+    difference, squares, k = memory[:rows], memory[rows : 2 * rows], memory[2 * rows]
+    sums = np.empty(rows)
+    for h in range(len(x)):
+        offsets(points, x[h], u[h], difference)
+        for c in range(rows):
+            multiply(difference[c], difference[c], squares[c])
+        for a in range(len(beta)):
+            D = inverse_squares[a]
+            for c in range(rows):
+                sums[c] = D[c] / -2
+            k[:] = log_signal[a]
+            combine(k, sums, squares)
+            exp_all(k)
+            multiply(k, beta[a], k)
+            M[h, a] = k.sum()
+            project(k, difference, sums)
+            for c in range(n):
+                dM_dx[h, a, c] = D[c] * sums[c]
+            for c in range(m):
+                dM_du[h, a, c] = D[rows - padded_inputs(m) + c] * sums[rows - padded_inputs(m) + c]
+
+
+@compiled
+def padded_inputs(m):
+    """Rows of the controls."""
+    return (m + 2) // 3 * 3
+
+
+@compiled
+def points_along(order, points, inverse_squares, log_signal, beta, inverse_cholesky, x, u, out):
+    """Everything at H points, into the ten arrays of ``gpmpc.fused.Expansion`` with H in front."""
+    M, variance, dM_dx, dM_du, dvar_dx, dvar_du, d2M_dx2, d2M_dxdu, d3M_dx3, d3M_dx2du = out
+    (rows, padded), n, m = points.shape, x.shape[1], u.shape[1]
+    U = rows - padded_inputs(m)  # where the controls begin
+    memory = aligned_rows(2 * rows + 5, padded)
+    difference, squares, k, weighted = memory[:rows], memory[rows : 2 * rows], memory[2 * rows], memory[2 * rows + 1]
+    solved, once, twice = memory[2 * rows + 2], memory[2 * rows + 3], memory[2 * rows + 4]
+    sums, moment = np.empty(rows), np.empty(rows)
+    for h in range(len(x)):
+        offsets(points, x[h], u[h], difference)
+        for c in range(rows):
+            multiply(difference[c], difference[c], squares[c])
+        for a in range(len(beta)):
+            D = inverse_squares[a]
+            for c in range(rows):
+                sums[c] = D[c] / -2
+            k[:] = log_signal[a]
+            combine(k, sums, squares)
+            exp_all(k)
+            variance[h, a] = max(np.exp(log_signal[a]) - explain(inverse_cholesky[a], k, solved), 0.0)
+            multiply(solved, k, solved)
+            project(solved, difference, sums)
+            for c in range(n):
+                dvar_dx[h, a, c] = -2 * D[c] * sums[c]
+            for c in range(m):
+                dvar_du[h, a, c] = -2 * D[U + c] * sums[U + c]
+
+            multiply(k, beta[a], weighted)
+            M[h, a] = weighted.sum()
+            project(weighted, difference, sums)
+            J, J_u = dM_dx[h, a], dM_du[h, a]
+            for c in range(n):
+                J[c] = D[c] * sums[c]
+            for c in range(m):
+                J_u[c] = D[U + c] * sums[U + c]
+            for c in range(n):
+                multiply(weighted, difference[c], once)
+                project(once, difference, moment)
+                for d in range(n):
+                    d2M_dx2[h, a, c, d] = D[c] * D[d] * moment[d] - (D[c] * M[h, a] if c == d else 0.0)
+                for d in range(m):
+                    d2M_dxdu[h, a, c, d] = D[c] * D[U + d] * moment[U + d]
+                if order == HESSIAN:
+                    third, third_u = d3M_dx3[h, a], d3M_dx2du[h, a]
+                    for d in range(c + 1):
+                        multiply(once, difference[d], twice)
+                        project(twice, difference, moment)
+                        for e in range(n):
+                            value = D[c] * D[d] * D[e] * moment[e]
+                            value -= D[c] * J[e] if c == d else 0.0
+                            value -= D[c] * J[d] if c == e else 0.0
+                            value -= D[d] * J[c] if d == e else 0.0
+                            third[c, d, e] = third[d, c, e] = value
+                        for e in range(m):
+                            value = D[c] * D[d] * D[U + e] * moment[U + e] - (D[c] * J_u[e] if c == d else 0.0)
+                            third_u[c, d, e] = third_u[d, c, e] = value

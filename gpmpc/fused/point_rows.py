@@ -1,0 +1,116 @@
+"""Problem: sums and products of vectors over the training points, at the speed of the vector registers.
+
+A vector over the points is a row (``gpmpc.fused.packed``); three rows are taken together, so that each pass over
+memory does three multiplications. Lengths are multiples of 8, numbers of rows multiples of 3.
+"""
+
+import numpy as np
+
+from gpmpc.compiled import compiled
+from gpmpc.fused.exponential import widest
+
+LINE = 8  # doubles in a cache line
+
+
+@compiled
+def aligned(size):
+    """Uninitialised doubles that start on a cache line."""
+    memory = np.empty(size + LINE)
+    skip = (-(memory.ctypes.data >> 3)) % LINE
+    return memory[skip : skip + size]
+
+
+@compiled
+def aligned_rows(rows, length):
+    """The same as a matrix."""
+    return aligned(rows * length).reshape(rows, length)
+
+
+@compiled
+def combine(out, factors, rows):
+    """Adds sum_d factors[d] rows[d] to ``out``."""
+    widest()
+    for d in range(0, len(rows), 3):
+        row0, row1, row2 = rows[d], rows[d + 1], rows[d + 2]
+        factor0, factor1, factor2 = factors[d], factors[d + 1], factors[d + 2]
+        for j in range(len(out)):
+            out[j] += factor0 * row0[j] + factor1 * row1[j] + factor2 * row2[j]
+
+
+@compiled
+def project(row, rows, out):
+    """Writes row . rows[d] to out[d]."""
+    widest()
+    for d in range(0, len(rows), 3):
+        row0, row1, row2 = rows[d], rows[d + 1], rows[d + 2]
+        sum0 = sum1 = sum2 = 0.0
+        for j in range(len(row)):
+            sum0 += row[j] * row0[j]
+            sum1 += row[j] * row1[j]
+            sum2 += row[j] * row2[j]
+        out[d], out[d + 1], out[d + 2] = sum0, sum1, sum2
+
+
+@compiled
+def multiply(row, other, out):
+    """Writes the elementwise product to ``out``."""
+    widest()
+    for j in range(len(out)):
+        out[j] = row[j] * other[j]
+
+
+@compiled
+def transform(matrix, rows, out, n):
+    """Writes matrix @ rows, of n rows, to the first rows of ``out``."""
+    widest()
+    for c in range(n):
+        target, factors = out[c], matrix[c]
+        row0, row1, row2 = rows[0], rows[1], rows[2]
+        factor0, factor1, factor2 = factors[0], factors[1], factors[2]
+        for j in range(len(target)):
+            target[j] = factor0 * row0[j] + factor1 * row1[j] + factor2 * row2[j]
+        combine(target, factors[3:], rows[3:])
+
+
+@compiled
+def second_moments(weights, rows, out, n, scratch):
+    """Writes sum_i weights[i] rows[c, i] rows[d, i] to the symmetric out[c, d], c and d < n."""
+    for c in range(n):
+        multiply(weights, rows[c], scratch)
+        project(scratch, rows[: c // 3 * 3 + 3], out[c])
+    for c in range(n):
+        for d in range(c):
+            out[d, c] = out[c, d]
+
+
+@compiled
+def add_products(out, factors, rows, others, n):
+    """Adds sum_d factors[d] rows[d] others[d] over n rows to ``out``."""
+    widest()
+    for d in range(n):
+        factor, row, other = factors[d], rows[d], others[d]
+        for j in range(len(out)):
+            out[j] += factor * row[j] * other[j]
+
+
+@compiled
+def explain(triangle, q, solved):
+    """Returns |L^-1 q|^2 and writes (K + sn2 I)^-1 q to ``solved``, in one pass over the block triangle of L^-1."""
+    widest()
+    solved[:] = 0.0
+    total = 0.0
+    for start in range(0, len(q), 4):
+        length = start // 8 * 8 + 8
+        at = start // 8 * 8 * length // 2 + start % 8 * length
+        row0, row1 = triangle[at : at + length], triangle[at + length : at + 2 * length]
+        row2, row3 = triangle[at + 2 * length : at + 3 * length], triangle[at + 3 * length : at + 4 * length]
+        v0 = v1 = v2 = v3 = 0.0
+        for j in range(length):
+            v0 += row0[j] * q[j]
+            v1 += row1[j] * q[j]
+            v2 += row2[j] * q[j]
+            v3 += row3[j] * q[j]
+        total += v0 * v0 + v1 * v1 + v2 * v2 + v3 * v3
+        for j in range(length):
+            solved[j] += v0 * row0[j] + v1 * row1[j] + v2 * row2[j] + v3 * row3[j]
+    return total

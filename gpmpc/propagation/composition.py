@@ -1,0 +1,152 @@
+"""Problem: from the moments of latent functions f to those of the next state, with all derivatives.
+
+    x+ = A x + G u + c + B f(x_s, u_s)
+
+covers what a model with exact moments can be: next states (A = 0, B = I), differences (A = B = I), and the residual of
+an affine nominal model, whose f sees only some states and inputs. With C = Cov[x, B f] = S J' B' (Stein, 1981),
+
+    mu+ = A mu + G u + c + B M,   Sigma+ = A S A' + A C + C' A' + B V B',   Cov[x, x+] = S A' + C
+
+Derivatives follow by the product rule; those by S are kept symmetric in their last two indices.
+"""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp.residual import Affine, ResidualModel
+from gpmpc.propagation.sensitivity import Sensitivity
+
+
+class Latent(NamedTuple):
+    """Moments of f at x_s ~ N(mu_s, S_s), with derivatives by mu_s, S_s and u_s where they were asked for.
+
+    Attributes:
+        M: E[f] (*batch, k).
+        V: Cov[f] (*batch, k, k).
+        J: E[df/dx_s] (*batch, k, n_s).
+        dM_dS: (*batch, k, n_s, n_s); half of dJ/dmu (Price, 1958).
+        dM_du: (*batch, k, m_s).
+        dV_dmu: (*batch, k, k, n_s).
+        dV_dS: (*batch, k, k, n_s, n_s).
+        dV_du: (*batch, k, k, m_s).
+        dJ_dS: (*batch, k, n_s, n_s, n_s); needed where A is not zero.
+        dJ_du: (*batch, k, n_s, m_s); needed where A is not zero.
+    """
+
+    M: Tensor
+    V: Tensor
+    J: Tensor
+    dM_dS: Tensor | None = None
+    dM_du: Tensor | None = None
+    dV_dmu: Tensor | None = None
+    dV_dS: Tensor | None = None
+    dV_du: Tensor | None = None
+    dJ_dS: Tensor | None = None
+    dJ_du: Tensor | None = None
+
+
+class Composition(NamedTuple):
+    """The affine part around f; None stands for A = 0, no nominal, B = I, or a selection of everything.
+
+    Attributes:
+        f: The latent functions.
+        A: (n, n).
+        nominal: A x + G u + c.
+        B: (n, k).
+        states: Which states f sees.
+        inputs: Which inputs f sees.
+    """
+
+    f: GPPosterior
+    A: Tensor | None = None
+    nominal: Affine | None = None
+    B: Tensor | None = None
+    states: list[int] | None = None
+    inputs: list[int] | None = None
+
+    @classmethod
+    def of(cls, model: Any) -> "Composition | None":
+        """A model taken apart; None where it has no such form."""
+        if isinstance(model, GPPosterior):
+            if model.predicts == "difference":
+                return cls(model, torch.eye(model.state_dim, dtype=model.dtype, device=model.device))
+            return cls(model)
+        if isinstance(model, ResidualModel) and isinstance(model.nominal, Affine):
+            nominal, states, inputs = model.nominal, list(model.states), list(model.inputs)
+            return cls(model.residual, nominal.A, nominal, model.B, states, inputs)
+        return None
+
+    def seen(self, belief: Gaussian, input: Tensor) -> tuple[Gaussian, Tensor]:
+        """What f sees of a belief and an input."""
+        if self.states is None:
+            return belief, input
+        S = belief.covariance[..., self.states, :][..., self.states]
+        return Gaussian(belief.mean[..., self.states], S), input[..., self.inputs]
+
+    def moments(self, belief: Gaussian, input: Tensor, f: Latent) -> tuple[Tensor, Tensor, Tensor]:
+        """mu+ (*batch, n), Sigma+ (*batch, n, n) and Cov[x, x+] (*batch, n, n), by the module's text."""
+        M, V, S, A = f.M, f.V, belief.covariance, self.A
+        cross = (S if self.states is None else S[..., self.states]) @ f.J.mT
+        if self.B is not None:
+            M, V, cross = M @ self.B.mT, self.B @ V @ self.B.mT, cross @ self.B.mT
+        if A is None:
+            return M, V, cross
+        half = A @ cross
+        M = M + (belief.mean if self.nominal is None else self.nominal(belief.mean, input))
+        return M, A @ S @ A.mT + half + half.mT + V, S @ A.mT + cross
+
+    def sensitivity(self, S: Tensor, f: Latent) -> Sensitivity:
+        """The derivatives of mu+ and Sigma+ at a belief with covariance S (*batch, n, n)."""
+        J, dM_dS, dM_du = self._by_state(f.J), self._by_state(f.dM_dS, 2), self._by_input(f.dM_du)
+        dV_dmu, dV_dS, dV_du = self._by_state(f.dV_dmu), self._by_state(f.dV_dS, 2), self._by_input(f.dV_du)
+        if self.B is not None:
+            J, dM_du = self.B @ J, self.B @ dM_du
+            dM_dS = torch.einsum("ia,...acd->...icd", self.B, dM_dS)
+            dV_dmu, dV_du = (torch.einsum("ia,jb,...abc->...ijc", self.B, self.B, d) for d in (dV_dmu, dV_du))
+            dV_dS = torch.einsum("ia,jb,...abcd->...ijcd", self.B, self.B, dV_dS)
+        if self.A is None:
+            return Sensitivity(J, dM_dS, dM_du, dV_dmu, dV_dS, dV_du)
+
+        A, n = self.A, len(self.A)
+        B = torch.eye(n, dtype=A.dtype, device=A.device) if self.B is None else self.B
+        AS = (A @ S) if self.states is None else (A @ S)[..., self.states]  # A C = (A S) J' B'
+        by_mean = torch.einsum("...is,ja,...asc->...ijc", AS, B, self._by_state(2 * f.dM_dS))
+        by_input = torch.einsum("...is,ja,...asc->...ijc", AS, B, self._by_input(f.dJ_du))
+        by_covariance = torch.einsum("...is,ja,...ascd->...ijcd", AS, B, self._by_state(f.dJ_dS, 2))
+        by_covariance = by_covariance + _symmetric(torch.einsum("ic,...jd->...ijcd", A, J))
+        by_covariance = by_covariance + by_covariance.transpose(-4, -3)
+        return Sensitivity(
+            A + J,
+            dM_dS,
+            dM_du if self.nominal is None else self.nominal.B + dM_du,
+            dV_dmu + by_mean + by_mean.transpose(-3, -2),
+            dV_dS + by_covariance + _symmetric(torch.einsum("ic,jd->ijcd", A, A)),
+            dV_du + by_input + by_input.transpose(-3, -2),
+        )
+
+    def _by_state(self, derivative: Tensor, axes: int = 1) -> Tensor:
+        """A derivative by what f sees of the state (its last axes) as one by the whole state."""
+        if self.states is None:
+            return derivative
+        full = derivative.new_zeros(*derivative.shape[:-axes], *[len(self.B)] * axes)
+        if axes == 1:
+            full[..., self.states] = derivative
+        else:
+            rows = torch.tensor(self.states, device=derivative.device)
+            full[..., rows[:, None], rows] = derivative
+        return full
+
+    def _by_input(self, derivative: Tensor) -> Tensor:
+        if self.inputs is None:
+            return derivative
+        full = derivative.new_zeros(*derivative.shape[:-1], self.nominal.B.shape[1])
+        full[..., self.inputs] = derivative
+        return full
+
+
+def _symmetric(derivative: Tensor) -> Tensor:
+    return (derivative + derivative.mT) / 2
