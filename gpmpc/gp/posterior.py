@@ -14,6 +14,7 @@ and gives physical units.
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -221,6 +222,23 @@ class GPPosterior:
         """The same on another device, or in another floating-point type."""
         tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
         return replace(self, **{name: value.to(device=device, dtype=dtype) for name, value in tensors.items()})
+
+    def save(self, path: str | Path) -> None:
+        """Writes one file without pickle, in one piece or not at all; see ``gpmpc.gp.storage``."""
+        from gpmpc.gp.storage import save_posterior  # which knows this class
+
+        save_posterior(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "GPPosterior":
+        """Reads what ``save`` wrote; the predictions are the same, bit by bit.
+
+        Raises:
+            DataError: The file is missing, damaged, of another kind or of a newer format.
+        """
+        from gpmpc.gp.storage import load_posterior
+
+        return load_posterior(path)
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
         """The next state's distribution at a certain state and input (Rasmussen and Williams, 2006, eq. (2.25)).
