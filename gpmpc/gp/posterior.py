@@ -313,6 +313,17 @@ class GPPosterior:
             return transitions.next_states - transitions.states
         return transitions.next_states
 
+    def explained(self, k: Tensor) -> Tensor:
+        """|L_a^-1 k_a|^2 (*batch, k) of k (*batch, k, N): how much of the variance the data explain.
+
+        The batch goes to the right-hand side's columns: broadcast against it, L would be copied for every member.
+        """
+        if k.dim() == 2:
+            return torch.linalg.solve_triangular(self.cholesky, k[..., None], upper=False)[..., 0].square().sum(-1)
+        columns = k.flatten(0, -3).movedim(0, -1)  # (k, N, batch)
+        squares = torch.linalg.solve_triangular(self.cholesky, columns, upper=False).square().sum(-2)
+        return squares.mT.unflatten(0, k.shape[:-2])
+
     def _correlations(self, state: Tensor, input: Tensor | None) -> tuple[Tensor, Tensor]:
         """k(x~_i, x~) (*batch, k, N) and (x~_i - x~) / l (*batch, k, N, d)."""
         input = state[..., :0] if input is None else input
@@ -323,7 +334,7 @@ class GPPosterior:
 
     def _belief(self, k: Tensor, state: Tensor) -> Gaussian:
         mean = (k * self.weights).sum(-1) + self.offset
-        explained = torch.linalg.solve_triangular(self.cholesky, k[..., None], upper=False)[..., 0].square().sum(-1)
+        explained = self.explained(k)
         if self.predicts == "difference":
             mean = mean + state
         return Gaussian(mean, torch.diag_embed((self.signal_variance - explained).clamp_min(0)))
