@@ -19,7 +19,7 @@ from gpmpc.gp.residual import Affine, ResidualModel
 from gpmpc.propagation import Propagation, Propagator, differentiate, linearize
 from gpmpc.testing.promise import require, require_close, require_covariance
 
-DRAWS = 200_000  # of the Monte Carlo oracle
+DRAWS = 100_000  # of the Monte Carlo oracle
 STEP = 1e-5  # of the finite differences, in units of the belief
 
 
