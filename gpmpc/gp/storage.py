@@ -41,10 +41,11 @@ def save_posterior(posterior: GPPosterior, path: str | Path) -> None:
         path: The file; ``.npz`` by convention.
 
     Raises:
+        UnsupportedModel: It is of a derived class, whose own parts this format does not know.
         SettingError: It is in another floating-point type.
-        DataError: The folder does not exist.
+        DataError: The folder does not exist, or the posterior is inconsistent and could not be read again.
     """
-    _write(path, "GPPosterior", _described(posterior), _tensors(posterior))
+    _write(path, "GPPosterior", *_parts(path, posterior))
 
 
 def load_posterior(path: str | Path) -> GPPosterior:
@@ -75,10 +76,10 @@ def save_residual_model(model: ResidualModel, path: str | Path) -> None:
         "input_dim": model.input_dim,
         "states": [int(i) for i in model.states],
         "inputs": [int(i) for i in model.inputs],
-        "residual": _described(model.residual),
     }
+    header["residual"], residual = _parts(path, model.residual)
     tensors = {"B": model.B, **{f"nominal/{name}": getattr(model.nominal, name) for name in ("A", "B", "c")}}
-    tensors |= {f"residual/{name}": value for name, value in _tensors(model.residual).items()}
+    tensors |= {f"residual/{name}": value for name, value in residual.items()}
     _write(path, "ResidualModel", header, tensors)
 
 
@@ -103,18 +104,20 @@ def load_residual_model(path: str | Path) -> ResidualModel:
         raise DataError(f"{path}: not a consistent residual model ({error})") from error
 
 
-def _described(posterior: GPPosterior) -> dict[str, Any]:
-    return {
+def _parts(path: str | Path, posterior: GPPosterior) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """What goes into the header and what into arrays, after a look at whether it could be read again."""
+    if type(posterior) is not GPPosterior:
+        raise UnsupportedModel(f"only a GPPosterior can be saved; got {type(posterior).__name__}")
+    header = {
         "predicts": posterior.predicts,
         "input_dim": posterior.input_dim,
         "states": posterior.state_dim,
         "outputs": posterior.output_dim,
         "points": len(posterior),
     }
-
-
-def _tensors(posterior: GPPosterior) -> dict[str, Tensor]:
-    return {f.name: v for f in fields(posterior) if isinstance(v := getattr(posterior, f.name), Tensor)}
+    tensors = {f.name: v for f in fields(posterior) if isinstance(v := getattr(posterior, f.name), Tensor)}
+    _posterior(Path(path), header, tensors)
+    return header, tensors
 
 
 def _posterior(path: Path, header: dict, tensors: dict[str, Tensor]) -> GPPosterior:
@@ -143,7 +146,7 @@ def _posterior(path: Path, header: dict, tensors: dict[str, Tensor]) -> GPPoster
     if not bool((found["cholesky"].diagonal(dim1=-2, dim2=-1) > 0).all()):
         wrong.append("the diagonal of cholesky")
     if wrong:
-        raise DataError(f"{path}: {wrong[0]} must be positive; the file was altered")
+        raise DataError(f"{path}: {wrong[0]} must be positive")
     return GPPosterior(**found, input_dim=m, predicts=predicts)
 
 
