@@ -2,7 +2,7 @@
 
     mean_a = offset_a + sum_i beta_ai k_ai (+ x_a),   variance_a = sf2_a - |L_a^-1 k_a|^2,   k_ai = k_a(x~_i, x~)
 
-is written with a dozen matrix nodes of CasADi's MX: one for all squared distances, one triangular solve an output. So
+is written with a dozen matrix nodes of CasADi's MX: one for all squared distances, one triangular product an output. So
 the graph stays as small with 189 points as with 10, evaluates at the speed of its loops, and CasADi derives exact
 Jacobians and Hessians from it (Andersson, Gillis, Horn, Rawlings and Diehl, 2019).
 
@@ -61,10 +61,13 @@ def _moments(gp: GPPosterior, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, ca
     if gp.predicts == "difference":
         mean = mean + x
     variance = []
+    lower = casadi.Sparsity.lower(size)
     for a, column in enumerate(casadi.horzsplit(k)):
-        # The sparsity pattern of a triangle is what makes CasADi solve by substitution.
-        factor = casadi.DM(casadi.Sparsity.lower(size), gp.cholesky[a].double().cpu().numpy().T[np.triu_indices(size)])
-        explained = casadi.sumsqr(casadi.solve(casadi.MX(factor), column))
+        # The factor's inverse, since CasADi cannot serialise its triangular solve; both lose the same digits.
+        eye = torch.eye(size, dtype=torch.float64)
+        inverse = torch.linalg.solve_triangular(gp.cholesky[a].detach().double().cpu(), eye, upper=False)
+        entries = casadi.DM(lower, inverse.numpy().T[np.triu_indices(size)])
+        explained = casadi.sumsqr(entries @ column)
         variance.append(casadi.fmax(0, float(gp.signal_variance[a]) - explained))
     return mean, casadi.vertcat(*variance)
 

@@ -74,6 +74,16 @@ def test_the_graph_does_not_grow_with_the_data():
     assert few == many < 60
 
 
+def test_the_function_can_be_stored_expanded_and_compiled(tmp_path, monkeypatch):
+    function = casadi_function(posterior())
+    monkeypatch.chdir(tmp_path)  # CasADi writes C into the present folder only
+    function.generate("gp.c")
+    assert "int gp(" in (tmp_path / "gp.c").read_text()
+    for other in (function.expand(), casadi.Function.deserialize(function.serialize())):
+        for ours, theirs in zip(other([0.1, 0.2], 0.3), function([0.1, 0.2], 0.3), strict=True):
+            assert np.abs(ours.full() - theirs.full()).max() < 1e-13
+
+
 def test_ipopt_steers_through_the_model():
     gp = posterior(size=40, predicts="difference", n=1)
     dynamics, horizon = casadi_function(gp), 4
