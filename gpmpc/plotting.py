@@ -6,8 +6,12 @@ Every function returns a ``Figure`` made without pyplot, so nothing global is to
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from matplotlib import colormaps
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, NullLocator
+from matplotlib.ticker import MaxNLocator, NullFormatter, NullLocator, PercentFormatter
+
+from gpmpc.calibration import Calibration
 
 
 @dataclass(frozen=True)
@@ -68,4 +72,46 @@ def error_over_size(panels: Sequence[Panel], label: str) -> Figure:
         axis.set_visible(False)
     figure.supxlabel("training points N")
     figure.supylabel(label)
+    return figure
+
+
+def calibration_figure(calibration: Calibration) -> Figure:
+    """Coverage against its nominal level (dashed), log density and error over the steps ahead, a column a state."""
+    n, steps = len(calibration.names), range(1, calibration.horizon + 1)
+    order = sorted(range(len(calibration.levels)), key=calibration.levels.__getitem__)
+    colours = colormaps["Blues"](np.linspace(1.0, 0.5, len(order))[::-1])  # the wider the interval, the darker
+    line = {"marker": "o" if calibration.horizon <= 30 else None, "markersize": 3}
+    figure = Figure(figsize=(1.5 + 2.4 * n, 6.0), layout="constrained")
+    axes = figure.subplots(3, n, squeeze=False, sharex=True)
+    for (above, density, error), i in zip(axes.T, range(n), strict=True):
+        above.set_title(calibration.names[i], fontsize="medium")
+        for j, colour in zip(order, colours, strict=True):
+            above.axhline(calibration.levels[j], color=colour, linestyle=(0, (4, 3)), linewidth=1)
+            above.plot(steps, calibration.coverage[:, i, j], color=colour, **line)
+        density.plot(steps, calibration.nlpd[:, i], color=colours[-1], **line)
+        error.plot(steps, calibration.rmse[:, i], color=colours[-1], **line)
+        above.set_ylim(0, 1.04)
+        above.yaxis.set_major_formatter(PercentFormatter(1))
+        above.tick_params(labelleft=i == 0)
+        density.yaxis.set_major_locator(MaxNLocator(nbins=5))
+        error.set_ylim(bottom=0)
+        error.yaxis.set_major_locator(MaxNLocator(nbins=5))
+        error.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6, min_n_ticks=1))
+        for axis in (above, density, error):
+            axis.grid(axis="y", color="0.9")
+            axis.set_axisbelow(True)
+            axis.spines[["top", "right"]].set_visible(False)
+    lowest = 0.0
+    for j, colour in zip(
+        order, colours, strict=True
+    ):  # each level is named at its own line, or just above the last name
+        height = max(calibration.levels[j], lowest)
+        text = f"{100 * calibration.levels[j]:g} %"
+        place = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": "small"}
+        axes[0, -1].annotate(text, (1.03, height), color=colour, **place)
+        lowest = height + 0.085
+    for axis, label in zip(axes[:, 0], ("coverage", "negative log density", "RMSE"), strict=True):
+        axis.set_ylabel(label)
+    figure.supxlabel("steps ahead", fontsize="medium")
+    figure.align_ylabels(axes[:, 0])
     return figure

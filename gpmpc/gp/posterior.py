@@ -14,6 +14,7 @@ and gives physical units.
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -234,6 +235,23 @@ class GPPosterior:
         tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
         return replace(self, **{name: value.to(device=device, dtype=dtype) for name, value in tensors.items()})
 
+    def save(self, path: str | Path) -> None:
+        """Writes one file without pickle, in one piece or not at all; see ``gpmpc.gp.storage``."""
+        from gpmpc.gp.storage import save_posterior  # which knows this class
+
+        save_posterior(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "GPPosterior":
+        """Reads what ``save`` wrote; the predictions are the same, bit by bit.
+
+        Raises:
+            DataError: The file is missing, damaged, of another kind or of a newer format.
+        """
+        from gpmpc.gp.storage import load_posterior
+
+        return load_posterior(path)
+
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
         """The next state's distribution at a certain state and input (Rasmussen and Williams, 2006, eq. (2.25)).
 
@@ -314,6 +332,17 @@ class GPPosterior:
             return transitions.next_states - transitions.states
         return transitions.next_states
 
+    def explained(self, k: Tensor) -> Tensor:
+        """|L_a^-1 k_a|^2 (*batch, k) of k (*batch, k, N): how much of the variance the data explain.
+
+        The batch goes to the right-hand side's columns: broadcast against it, L would be copied for every member.
+        """
+        if k.dim() == 2:
+            return torch.linalg.solve_triangular(self.cholesky, k[..., None], upper=False)[..., 0].square().sum(-1)
+        columns = k.flatten(0, -3).movedim(0, -1)  # (k, N, batch)
+        squares = torch.linalg.solve_triangular(self.cholesky, columns, upper=False).square().sum(-2)
+        return squares.mT.unflatten(0, k.shape[:-2])
+
     def _correlations(self, state: Tensor, input: Tensor | None) -> tuple[Tensor, Tensor]:
         """k(x~_i, x~) (*batch, k, N) and (x~_i - x~) / l (*batch, k, N, d)."""
         input = state[..., :0] if input is None else input
@@ -327,8 +356,8 @@ class GPPosterior:
         return mean + state if self.predicts == "difference" else mean
 
     def _belief(self, k: Tensor, state: Tensor) -> Gaussian:
-        explained = torch.linalg.solve_triangular(self.cholesky, k[..., None], upper=False)[..., 0].square().sum(-1)
-        return Gaussian(self._mean(k, state), torch.diag_embed((self.signal_variance - explained).clamp_min(0)))
+        variance = (self.signal_variance - self.explained(k)).clamp_min(0)
+        return Gaussian(self._mean(k, state), torch.diag_embed(variance))
 
     def _jacobian(self, k: Tensor, difference: Tensor) -> tuple[Tensor, Tensor]:
         """The mean's derivatives by state and input, from what ``_correlations`` gives."""

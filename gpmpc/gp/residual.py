@@ -8,6 +8,7 @@ Kabzan and Zeilinger, 2020, eq. (3)).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -172,6 +173,27 @@ class ResidualModel:
             nominal = Affine(*(part.to(device=device, dtype=dtype) for part in (nominal.A, nominal.B, nominal.c)))
         residual, B = self.residual.to(device, dtype), self.B.to(device=device, dtype=dtype)
         return ResidualModel(nominal, residual, B, self.states, self.inputs, self.input_dim)
+
+    def save(self, path: str | Path) -> None:
+        """Writes one file without pickle, in one piece or not at all; see ``gpmpc.gp.storage``.
+
+        Raises:
+            UnsupportedModel: The nominal model is no ``Affine`` one.
+        """
+        from gpmpc.gp.storage import save_residual_model  # which knows this class
+
+        save_residual_model(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "ResidualModel":
+        """Reads what ``save`` wrote; the predictions are the same, bit by bit.
+
+        Raises:
+            DataError: The file is missing, damaged, of another kind or of a newer format.
+        """
+        from gpmpc.gp.storage import load_residual_model
+
+        return load_residual_model(path)
 
     def _combined(self, nominal: Tensor, d: Gaussian) -> Gaussian:
         return Gaussian(nominal + d.mean @ self.B.mT, self.B @ d.covariance @ self.B.mT)

@@ -147,7 +147,7 @@ def moments(
     of_j = _quadratic(z_b, T_ab @ (inverse_squares[a][:, :, None] * T[..., b, :, :])) / 2
     r = half_logdet[..., a] + half_logdet[..., b] - half_logdet_ab
     of_i, z_a = r[..., None] - of_i, z_a @ T_ab
-    explained = torch.linalg.solve_triangular(model.cholesky, q[..., None], upper=False)[..., 0].square().sum(-1)
+    explained = model.explained(q)
 
     entries = {}
     for pair, (i, j) in enumerate(zip(a.tolist(), b.tolist(), strict=True)):  # one at a time: (N, N) fits the cache

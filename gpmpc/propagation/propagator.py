@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -63,8 +64,7 @@ def checked_input(model: DynamicsModel, belief: Gaussian, input: Tensor | None) 
     except (RuntimeError, TypeError):  # part of a graph, inside a transform, or on another device
         return input
     for name, array in zip(("the belief's mean", "the belief's covariance", "the input"), arrays, strict=True):
-        total = array.sum()
-        if not total - total == 0:
+        if not np.isfinite(array).all():
             raise DataError(f"{name} must be finite; got {array}")
     _check_semidefinite(belief.covariance)
     return input

@@ -1,5 +1,7 @@
 """Checks for those who bring their own part: does it keep the promises that the rest of gpmpc relies on?"""
 
+from gpmpc.testing.model import check_model
+from gpmpc.testing.propagator import check_propagator
 from gpmpc.testing.qp import check_qp_solver
 
-__all__ = ["check_qp_solver"]
+__all__ = ["check_model", "check_propagator", "check_qp_solver"]

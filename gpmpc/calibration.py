@@ -1,0 +1,230 @@
+"""Problem: can the uncertainty that a model and a propagator state be believed, one step ahead and many?
+
+A controller with chance constraints trusts the predicted covariance over its whole horizon, where small faults of
+the model add up and a propagator's approximations with them. So held-out recordings are predicted from every one of
+their states k = 1 to H steps ahead, with the inputs that were applied, and what was predicted is compared with what
+was measured, per step and state: root mean squared error, negative log predictive density (Quinonero-Candela et al.,
+2006), and how often central intervals hold the measurement (Gneiting, Balabdaoui and Raftery, 2007). k = 1 from a
+certain state is the usual check of the model alone.
+
+Predictions from neighbouring states overlap, so their errors are correlated: the effective number of samples is smaller
+than the count, the more so the larger k.
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.gp.transitions import Transitions
+from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
+from gpmpc.propagation import MomentMatching, Propagator
+
+CHUNK = 64  # starts propagated at once: bounds the memory of moment matching at about CHUNK N^2 numbers
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One uninterrupted run at equal time steps.
+
+    Attributes:
+        states: x[0] to x[K] (K + 1, n).
+        inputs: u[0] to u[K - 1] (K, m).
+
+    Raises:
+        ShapeError: There is not one state more than inputs, or no input.
+        DataError: An entry is not finite.
+    """
+
+    states: Tensor
+    inputs: Tensor
+
+    def __post_init__(self) -> None:
+        for name in ("states", "inputs"):
+            object.__setattr__(self, name, torch.as_tensor(getattr(self, name), dtype=torch.float64))
+        if self.states.dim() != 2 or self.inputs.dim() != 2 or not 0 < len(self.inputs) == len(self.states) - 1:
+            raise ShapeError(
+                "a recording has states (K + 1, n) and inputs (K, m), K of 1 or more; "
+                f"got {tuple(self.states.shape)} and {tuple(self.inputs.shape)}"
+            )
+        for name in ("states", "inputs"):
+            if not bool(torch.isfinite(getattr(self, name)).all()):
+                raise DataError(f"{name} of a recording must be finite")
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+    @classmethod
+    def chained(cls, transitions: Transitions) -> list["Recording"]:
+        """The runs in transitions: one goes on for as long as a row's next state is the following row's state."""
+        goes_on = (transitions.next_states[:-1] == transitions.states[1:]).all(dim=1).tolist()
+        ends = [k + 1 for k, same in enumerate(goes_on) if not same] + [len(transitions)]
+        runs = [slice(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True)]
+        return [
+            cls(torch.cat([transitions.states[run], transitions.next_states[run][-1:]]), transitions.inputs[run])
+            for run in runs
+        ]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How predictions of k = 1 to H steps fared.
+
+    Attributes:
+        names: Of the n states.
+        levels: Of the intervals (L).
+        samples: Predictions compared at each step (H,).
+        rmse: Root mean squared error, in the units of each state (H, n).
+        nlpd: Negative log predictive density; lower is better (H, n).
+        coverage: Part of the measurements inside the central interval of each level (H, n, L).
+    """
+
+    names: tuple[str, ...]
+    levels: tuple[float, ...]
+    samples: Tensor
+    rmse: Tensor
+    nlpd: Tensor
+    coverage: Tensor
+
+    @property
+    def horizon(self) -> int:
+        """H, the longest prediction in steps."""
+        return len(self.samples)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row a step and state: step, state, samples, rmse, nlpd, and coverage_<level> for each level."""
+        return [
+            {
+                "step": k + 1,
+                "state": name,
+                "samples": int(self.samples[k]),
+                "rmse": float(self.rmse[k, i]),
+                "nlpd": float(self.nlpd[k, i]),
+                **{f"coverage_{level:g}": float(self.coverage[k, i, j]) for j, level in enumerate(self.levels)},
+            }
+            for k in range(self.horizon)
+            for i, name in enumerate(self.names)
+        ]
+
+    def to_json(self) -> str:
+        """The rows as JSON; a figure that is not finite becomes null."""
+        rows = [
+            {key: None if isinstance(v, float) and not math.isfinite(v) else v for key, v in row.items()}
+            for row in self.rows()
+        ]
+        return json.dumps({"levels": list(self.levels), "states": list(self.names), "rows": rows}, indent=2)
+
+    def markdown(self, steps: Sequence[int] | None = None) -> str:
+        """A table of some steps (from 1), all by default."""
+        steps = range(1, self.horizon + 1) if steps is None else steps
+        titles = ["step", "state", "samples", "RMSE", "NLPD", *(f"{100 * level:g} % coverage" for level in self.levels)]
+        lines = [titles, ["---:", ":---", *["---:"] * (len(titles) - 2)]]
+        for row in self.rows():
+            if row["step"] in steps:
+                step, state, samples, rmse, nlpd, *coverage = row.values()
+                lines.append([str(step), state, str(samples), f"{rmse:.3g}", f"{nlpd:.2f}"])
+                lines[-1] += [f"{value:.3f}" for value in coverage]
+        return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def calibrate(
+    model: DynamicsModel,
+    recordings: Sequence[Recording] | Recording,
+    propagator: Propagator | None = None,
+    horizon: int = 10,
+    levels: Sequence[float] = (0.5, 0.9, 0.95),
+    start_covariance: Tensor | None = None,
+    observation_noise: bool = True,
+    names: Sequence[str] = (),
+) -> Calibration:
+    """Predicts held-out recordings from every state, and compares.
+
+    Args:
+        model: What was learned, from other recordings.
+        recordings: Measured states and applied inputs. A start counts for the steps that its recording still holds.
+        propagator: How the belief moves; exact moment matching by default.
+        horizon: H, the longest prediction in steps.
+        levels: Of the central intervals.
+        start_covariance: How uncertain the measured start is (n, n); certain by default.
+        observation_noise: Adds the model's noise to each predicted variance, because what it is compared with was
+            measured. It does not enter the propagation.
+        names: Of the states; x1, x2, ... by default.
+
+    Raises:
+        ShapeError: Recordings, model, covariance or names do not belong together.
+        SettingError: A level is not between 0 and 1, or no recording is as long as the horizon.
+    """
+    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    propagator = MomentMatching() if propagator is None else propagator
+    names = tuple(names) or tuple(f"x{i + 1}" for i in range(model.state_dim))
+    check_number("horizon", horizon, least=1, whole=True)
+    _check(model, recordings, horizon, levels, names)
+    n, like = model.state_dim, {"dtype": model.dtype, "device": model.device}
+    S = torch.zeros(n, n, **like) if start_covariance is None else start_covariance.to(**like)
+    if S.shape != (n, n):
+        raise ShapeError(f"start_covariance must be ({n}, {n}); got {tuple(S.shape)}")
+    noise = model.noise_covariance.diagonal() if observation_noise else torch.zeros(n, **like)
+
+    # Every start by its recording and its time, those that last longest first: at each step the first few go on.
+    starts = [(r, t) for r, recording in enumerate(recordings) for t in range(len(recording))]
+    starts.sort(key=lambda start: start[1] - len(recordings[start[0]]))
+    found: list[list[tuple[Tensor, ...]]] = [[] for _ in range(horizon)]
+    with torch.no_grad():
+        for first in range(0, len(starts), CHUNK):
+            alive = starts[first : first + CHUNK]
+            mean = torch.stack([recordings[r].states[t] for r, t in alive]).to(**like)
+            belief = Gaussian(mean, S.expand(len(alive), n, n))
+            for k in range(horizon):
+                alive = [(r, t) for r, t in alive if t + k < len(recordings[r])]
+                if not alive:
+                    break
+                count = len(alive)
+                inputs = torch.stack([recordings[r].inputs[t + k] for r, t in alive]).to(**like)
+                belief = propagator(model, Gaussian(belief.mean[:count], belief.covariance[:count]), inputs)
+                observed = torch.stack([recordings[r].states[t + k + 1] for r, t in alive])
+                found[k].append((belief.mean.double().cpu(), (belief.variance + noise).double().cpu(), observed))
+    steps = [tuple(torch.cat(parts) for parts in zip(*step, strict=True)) for step in found]
+    columns = [[tuple(part[:, i : i + 1] for part in step) for i in range(n)] for step in steps]
+    return Calibration(
+        names,
+        tuple(levels),
+        torch.tensor([len(mean) for mean, _, _ in steps]),
+        torch.tensor([[math.sqrt(mean_squared_error(m, y)) for m, _, y in step] for step in columns]).double(),
+        torch.tensor([[negative_log_predictive_density(m, v, y) for m, v, y in step] for step in columns]).double(),
+        torch.tensor(
+            [[[interval_coverage(m, v, y, level) for level in levels] for m, v, y in step] for step in columns]
+        ).double(),
+    )
+
+
+def _check(
+    model: DynamicsModel, recordings: list[Recording], horizon: int, levels: Sequence[float], names: tuple[str, ...]
+) -> None:
+    n, m = model.state_dim, model.input_dim
+    if model.output_dim != n:
+        raise ShapeError(f"the model must predict its {n} states; it has {model.output_dim} outputs")
+    if not recordings:
+        raise ShapeError("at least one recording is needed; got none")
+    for recording in recordings:
+        if (recording.states.shape[1], recording.inputs.shape[1]) != (n, m):
+            raise ShapeError(
+                f"the model has {n} states and {m} inputs; got a recording with {recording.states.shape[1]} and "
+                f"{recording.inputs.shape[1]}"
+            )
+    longest = max(len(recording) for recording in recordings)
+    if horizon > longest:
+        raise SettingError("horizon", f"must be at most {longest} steps, the longest recording; got {horizon}")
+    if len(names) != n:
+        raise ShapeError(f"names must name {n} states; got {len(names)}")
+    if not levels:
+        raise SettingError("levels", "must hold at least one level; got none")
+    for level in levels:
+        if not 0 < level < 1:
+            raise SettingError("levels", f"must lie between 0 and 1; got {level}")

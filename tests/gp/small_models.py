@@ -1,0 +1,29 @@
+"""Untrained models with random data, for tests that do not care what they predict."""
+
+import torch
+
+from gpmpc.gp import Affine, GPPosterior, ResidualModel
+
+
+def posterior(size=12, n=2, m=1, predicts="next_state", seed=0):
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    return GPPosterior.from_hyperparameters(
+        3 * draw(size, n + m) - 1.5,
+        draw(size, n) - 0.5,
+        0.5 + draw(n, n + m),
+        0.5 + draw(n),
+        1e-4 + 1e-2 * draw(n),
+        m,
+        predicts,
+        offset=draw(n),
+    )
+
+
+def residual_model():
+    gp = posterior(n=1, m=1, predicts="value")
+    nominal = Affine(torch.tensor([[1.0, 0.1], [-0.2, 0.9]]), torch.tensor([[0.0, 0.1], [0.1, 0.0]]), torch.ones(2))
+    return ResidualModel(nominal, gp, torch.tensor([[0.0], [1.0]]), [1], [0], 2)

@@ -1,0 +1,42 @@
+"""The module is ``predict``, alone and after torch.export, in operations that other runtimes have."""
+
+import pytest
+import torch
+from small_models import posterior
+
+from gpmpc.gp.module import PosteriorModule
+
+
+@pytest.mark.parametrize("predicts", ["next_state", "difference", "value"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_module_is_predict(predicts, dtype):
+    gp = posterior(n=3, m=2, predicts=predicts).to(dtype=dtype)
+    state, control = torch.randn(4, 5, 3, dtype=dtype), torch.randn(4, 5, 2, dtype=dtype)
+    mean, variance = PosteriorModule(gp)(state, control)
+    at = gp.predict(state, control)
+    close = {"rtol": 0, "atol": 1e-12 if dtype == torch.float64 else 1e-4}
+    assert mean.dtype == dtype
+    assert torch.allclose(mean, at.mean, **close)
+    assert torch.allclose(variance, at.variance, **close)
+
+
+def test_an_exported_program_predicts_any_batch_after_a_round_trip_through_a_file(tmp_path):
+    gp = posterior(m=1, predicts="difference")
+    example, batch = (torch.randn(3, 2), torch.randn(3, 1)), torch.export.Dim("batch")
+    program = torch.export.export(PosteriorModule(gp), example, dynamic_shapes=({0: batch}, {0: batch}))
+    torch.export.save(program, tmp_path / "gp.pt2")
+    exported = torch.export.load(tmp_path / "gp.pt2").module()
+    state, control = torch.randn(7, 2), torch.randn(7, 1)
+    mean, variance = exported(state, control)
+    at = gp.predict(state, control)
+    assert torch.allclose(mean, at.mean, rtol=0, atol=1e-12)
+    assert torch.allclose(variance, at.variance, rtol=0, atol=1e-12)
+    operations = {str(node.target) for node in program.graph.nodes if node.op == "call_function"}
+    assert not [name for name in operations if "linalg" in name or "triangular" in name]
+
+
+def test_an_autonomous_model_takes_an_input_of_no_columns():
+    gp = posterior(m=0)
+    program = torch.export.export(PosteriorModule(gp), (torch.zeros(2), torch.zeros(0)))
+    state = torch.randn(2)
+    assert torch.allclose(program.module()(state, torch.zeros(0))[0], gp.predict(state).mean, atol=1e-12)

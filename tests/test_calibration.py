@@ -1,0 +1,202 @@
+"""Calibration of predictions many steps ahead: right on systems whose uncertainty is known, telling on wrong ones."""
+
+import io
+import json
+import math
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+
+from gpmpc.calibration import CHUNK, Calibration, Recording, calibrate
+from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import GPPosterior, Transitions
+from gpmpc.plotting import calibration_figure
+from gpmpc.propagation import Linearization, MeanEquivalence
+
+A, B, Q = torch.tensor([[0.9, 0.2], [-0.3, 0.8]]), torch.tensor([[0.0], [0.5]]), torch.diag(torch.tensor([0.04, 0.01]))
+NOISE = torch.diag(torch.tensor([0.01, 0.09]))
+
+CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True)
+class LinearGaussian:
+    """x+ = A x + B u + w, w ~ N(0, Q); what its user does not know is nothing."""
+
+    A: torch.Tensor = A
+    Q: torch.Tensor = Q
+    noise_covariance: torch.Tensor = NOISE
+    state_dim: int = 2
+    input_dim: int = 1
+    output_dim: int = 2
+    dtype: torch.dtype = torch.float64
+    device: torch.device = CPU
+
+    def predict(self, state, input=None):
+        mean = state @ self.A.mT + input @ B.mT
+        return Gaussian(mean, self.Q.expand(*mean.shape, 2))
+
+    def predict_with_jacobian(self, state, input=None):
+        at = self.predict(state, input)
+        return at, self.A.expand(*state.shape[:-1], 2, 2), B.expand(*state.shape[:-1], 2, 1)
+
+
+def runs(count, steps, noisy=True):
+    """Runs whose first state is known exactly and whose others are measured: one start each would be exact."""
+    recordings = []
+    for _ in range(count):
+        states, inputs = [torch.randn(2)], torch.randn(steps, 1)
+        for u in inputs:
+            states.append(A @ states[-1] + B @ u + Q.sqrt() @ torch.randn(2))
+        states = torch.stack(states)
+        if noisy:
+            states[1:] += torch.randn(steps, 2) @ NOISE.sqrt()
+        recordings.append(Recording(states, inputs))
+    return recordings
+
+
+def exact_covariances(steps):
+    S, found = torch.zeros(2, 2), []
+    for _ in range(steps):
+        S = A @ S @ A.T + Q
+        found.append(S)
+    return torch.stack(found)
+
+
+def test_the_true_model_is_calibrated_at_every_step_and_level():
+    count, levels = 400, (0.5, 0.9, 0.95)
+    # Without noise every start is exact; the recordings' starts overlap, hence the generous bound.
+    found = calibrate(
+        LinearGaussian(), runs(count, 8, noisy=False), Linearization(), 6, levels, observation_noise=False
+    )
+    assert found.samples.tolist() == [count * (8 - k) for k in range(6)]
+    for j, level in enumerate(levels):
+        error = math.sqrt(level * (1 - level) / count)
+        assert float((found.coverage[:, :, j] - level).abs().max()) < 4 * error
+    variance = exact_covariances(6).diagonal(dim1=-2, dim2=-1)
+    assert torch.allclose(found.rmse, variance.sqrt(), rtol=0.15)
+    assert torch.allclose(found.nlpd, ((2 * math.pi * variance).log() + 1) / 2, atol=0.15)
+
+
+def test_measured_starts_and_observations_are_calibrated_with_their_noise():
+    recordings = [Recording(r.states + 0.0, r.inputs) for r in runs(400, 6)]
+    recordings = [replace(r, states=torch.cat([r.states[:1] + torch.randn(1, 2) @ NOISE.sqrt(), r.states[1:]]))
+                  for r in recordings]  # fmt: skip
+    arguments = {"propagator": Linearization(), "horizon": 3, "levels": (0.9,)}
+    told = calibrate(LinearGaussian(), recordings, start_covariance=NOISE, **arguments)
+    assert float((told.coverage - 0.9).abs().max()) < 0.04
+    untold = calibrate(LinearGaussian(), recordings, **arguments)
+    assert bool((untold.coverage < told.coverage).all())
+    silent = calibrate(LinearGaussian(), recordings, observation_noise=False, **arguments)
+    assert bool((silent.coverage < untold.coverage).all())
+
+
+def test_false_confidence_shows():
+    recordings = runs(100, 8, noisy=False)
+    honest = calibrate(LinearGaussian(), recordings, Linearization(), 5, (0.9,), observation_noise=False)
+    overconfident = calibrate(LinearGaussian(Q=Q / 9), recordings, Linearization(), 5, (0.9,), observation_noise=False)
+    forgetful = calibrate(LinearGaussian(), recordings, MeanEquivalence(), 5, (0.9,), observation_noise=False)
+    biased = calibrate(LinearGaussian(A=0.8 * A), recordings, Linearization(), 5, (0.9,), observation_noise=False)
+    assert float(overconfident.coverage.max()) < 0.6
+    assert bool((overconfident.nlpd > honest.nlpd).all())
+    assert torch.equal(forgetful.coverage[0], honest.coverage[0])  # one step ahead there is nothing to forget
+    assert float(forgetful.coverage[4].max()) < float(honest.coverage[4].min())
+    assert bool((biased.rmse > honest.rmse).all())
+
+
+def test_the_batch_of_all_starts_is_the_loop_over_them():
+    recordings = [*runs(3, 7), *runs(2, 3), *runs(1, CHUNK)]
+    found = calibrate(LinearGaussian(), recordings, Linearization(), 5)
+    k, errors = 4, []
+    for recording in recordings:
+        for t in range(len(recording) - k + 1):
+            belief = Gaussian(recording.states[t], torch.zeros(2, 2))
+            for step in range(k):
+                belief = Linearization()(LinearGaussian(), belief, recording.inputs[t + step])
+            errors.append(recording.states[t + k] - belief.mean)
+    assert int(found.samples[k - 1]) == len(errors)
+    assert torch.allclose(found.rmse[k - 1], torch.stack(errors).square().mean(0).sqrt())
+
+
+def test_a_posterior_in_float32_is_calibrated_by_moment_matching():
+    features = torch.rand(30, 3)
+    gp = GPPosterior.from_hyperparameters(
+        features, features[:, :2].sin(), torch.ones(2, 3), torch.ones(2), torch.full((2,), 1e-2), 1
+    )
+    recordings = runs(2, 5)
+    double, single = (calibrate(each, recordings, horizon=3) for each in (gp, gp.to(dtype=torch.float32)))
+    assert double.rmse.dtype == single.rmse.dtype == torch.float64
+    assert torch.allclose(double.rmse, single.rmse, rtol=1e-3)
+
+
+def example():
+    return Calibration(
+        ("angle", "rate"),
+        (0.5, 0.95),
+        torch.tensor([20, 10]),
+        torch.tensor([[0.1, 0.2], [0.3, 0.4]]),
+        torch.tensor([[1.0, 2.0], [3.0, math.inf]]),
+        torch.tensor([[[0.5, 0.9], [0.6, 1.0]], [[0.4, 0.8], [0.3, 0.7]]]),
+    )
+
+
+def test_the_report_is_rows_json_and_markdown():
+    rows = example().rows()
+    assert len(rows) == 4
+    assert rows[1] == pytest.approx(
+        {"step": 1, "state": "rate", "samples": 20, "rmse": 0.2, "nlpd": 2.0, "coverage_0.5": 0.6, "coverage_0.95": 1.0}
+    )
+    data = json.loads(example().to_json())
+    assert data["levels"] == [0.5, 0.95]
+    assert data["rows"][0] == rows[0]
+    assert data["rows"][3]["nlpd"] is None
+    lines = example().markdown(steps=[2]).splitlines()
+    assert lines[0] == "| step | state | samples | RMSE | NLPD | 50 % coverage | 95 % coverage |"
+    assert lines[2:] == [
+        "| 2 | angle | 10 | 0.3 | 3.00 | 0.400 | 0.800 |",
+        "| 2 | rate | 10 | 0.4 | inf | 0.300 | 0.700 |",
+    ]
+
+
+def test_the_figure_has_a_column_for_each_state_and_a_row_for_each_measure():
+    figure = calibration_figure(example())
+    assert len(figure.axes) == 6
+    assert [axis.get_title() for axis in figure.axes[:2]] == ["angle", "rate"]
+    assert {text.get_text() for text in figure.axes[1].texts} == {"50 %", "95 %"}
+    figure.savefig(io.BytesIO(), format="png")
+
+
+def test_transitions_fall_apart_into_recordings():
+    data = Transitions(
+        torch.tensor([[0.0], [1.0], [5.0], [6.0]]), torch.arange(4.0)[:, None], torch.tensor([[1.0], [2.0], [6.0], [7]])
+    )
+    first, second = Recording.chained(data)
+    assert first.states.ravel().tolist() == [0, 1, 2]
+    assert second.states.ravel().tolist() == [5, 6, 7]
+    assert second.inputs.ravel().tolist() == [2, 3]
+
+
+def test_misuse_is_refused_with_the_rule():
+    model, recording = LinearGaussian(), runs(1, 4)
+    for change, error, message in (
+        ({"horizon": 5}, SettingError, "horizon: must be at most 4 steps, the longest recording; got 5"),
+        ({"horizon": 0}, SettingError, "horizon: must be a whole number, 1 or more; got 0"),
+        ({"horizon": 1, "levels": (95,)}, SettingError, "levels: must lie between 0 and 1; got 95"),
+        ({"horizon": 1, "levels": ()}, SettingError, "at least one level"),
+        ({"horizon": 1, "names": ["a"]}, ShapeError, "names must name 2 states; got 1"),
+        ({"horizon": 1, "start_covariance": torch.eye(3)}, ShapeError, r"must be \(2, 2\); got \(3, 3\)"),
+        ({"horizon": 1, "recordings": []}, ShapeError, "at least one recording"),
+        (
+            {"horizon": 1, "recordings": Recording(torch.zeros(3, 1), torch.zeros(2, 1))},
+            ShapeError,
+            "the model has 2 states and 1 inputs; got a recording with 1 and 1",
+        ),
+    ):
+        with pytest.raises(error, match=message):
+            calibrate(**({"model": model, "recordings": recording, "propagator": Linearization()} | change))
+    with pytest.raises(ShapeError, match=r"inputs \(K, m\), K of 1 or more; got \(3, 2\) and \(3, 1\)"):
+        Recording(torch.zeros(3, 2), torch.zeros(3, 1))
+    with pytest.raises(DataError, match="inputs of a recording must be finite"):
+        Recording(torch.zeros(3, 2), torch.full((2, 1), torch.nan))
