@@ -12,6 +12,7 @@ standard deviations in those of the output, and a constant prior mean. So a post
 and gives physical units.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -19,11 +20,14 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.model import hyperparameters
+from gpmpc.gp.dynamics import check_query
+from gpmpc.gp.kernel import kernel_matrix
+from gpmpc.gp.model import hyperparameters as trained
 from gpmpc.gp.scaling import Scaling
 from gpmpc.gp.transitions import Transitions
+from gpmpc.gp.updating import extended, without
 
 Predicts = Literal["next_state", "difference", "value"]
 PREDICTS = ("next_state", "difference", "value")
@@ -134,18 +138,8 @@ class GPPosterior:
                 f"signal-to-noise ratio {float((signal_variance / noise_variance)[output]):.1e}: raise the noise",
             )
         weights = torch.cholesky_solve((targets - offset).mT[..., None], cholesky)[..., 0]
-        return cls(
-            inputs,
-            targets,
-            lengthscales,
-            signal_variance,
-            noise_variance,
-            offset,
-            cholesky,
-            weights,
-            input_dim,
-            predicts,
-        )
+        hyperparameters = (lengthscales, signal_variance, noise_variance, offset)
+        return cls(inputs, targets, *hyperparameters, cholesky, weights, input_dim, predicts)
 
     @classmethod
     def from_gpytorch(
@@ -163,7 +157,7 @@ class GPPosterior:
         Raises:
             UnsupportedModel: The kernel, mean or likelihood is another one, or transforms are attached.
         """
-        return cls.from_hyperparameters(**hyperparameters(model, likelihood), input_dim=input_dim, predicts=predicts)
+        return cls.from_hyperparameters(**trained(model, likelihood), input_dim=input_dim, predicts=predicts)
 
     def unscaled(self, features: Scaling, targets: Scaling) -> "GPPosterior":
         """The same GPs in physical units, where these were trained on scaled data.
@@ -216,6 +210,13 @@ class GPPosterior:
     def precision(self) -> Tensor:
         """(K + sn2 I)^-1 (k, N, N)."""
         return torch.cholesky_inverse(self.cholesky)
+
+    @property
+    def exact(self) -> bool:
+        """Whether ``targets`` are observations with noise sn2, not a sparse model's pseudo-observations."""
+        diagonal = (self.signal_variance + self.noise_variance)[:, None]
+        error = (self.cholesky.square().sum(-1) - diagonal).abs()
+        return bool((error <= torch.finfo(self.dtype).eps ** 0.75 * diagonal).all())
 
     def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "GPPosterior":
         """The same on another device, or in another floating-point type."""
@@ -280,12 +281,45 @@ class GPPosterior:
         normal = torch.randn(shape, generator=generator, dtype=self.dtype, device=self.device)
         return belief.mean + variance.sqrt() * normal
 
+    def condition_on(self, transitions: Transitions) -> "GPPosterior":
+        """The posterior that has seen more transitions, by an extension of the Cholesky factor: O(N^2) a point.
+
+        The hyperparameters stay; ``Trainer.refit`` fits them anew.
+
+        Raises:
+            ShapeError: The transitions have other dimensions.
+            UnsupportedModel: The GPs learned values, which transitions do not hold: ``condition_on_targets``.
+            SettingError: The larger kernel matrix is not positive definite in this dtype.
+        """
+        return extended(self, transitions.features, self.learned(transitions))
+
+    def condition_on_targets(self, features: Tensor, targets: Tensor) -> "GPPosterior":
+        """The posterior that has seen more points: x~ = (x, u) (p, n + m) and what the GPs learn of them (p, k)."""
+        return extended(self, features, targets)
+
+    def drop(self, indices: Sequence[int] | Tensor) -> "GPPosterior":
+        """The posterior that has not seen some of its points, by a downdate of the Cholesky factor: O(N^2) a point.
+
+        Args:
+            indices: Rows of ``features``; negative ones count from the end.
+
+        Raises:
+            SettingError: An index is out of range or stands there twice.
+            DataError: No point is left.
+        """
+        return without(self, indices)
+
     def learned(self, transitions: Transitions) -> Tensor:
         """What the GPs would be told of transitions: next states, or differences (N, n).
 
         Raises:
             ShapeError: The transitions have other dimensions.
+            UnsupportedModel: The GPs learned values, which transitions do not hold.
         """
+        if self.predicts == "value":
+            raise UnsupportedModel(
+                "transitions hold no targets of a GP with predicts='value': use condition_on_targets"
+            )
         if (transitions.state_dim, transitions.input_dim) != (self.state_dim, self.input_dim):
             raise ShapeError(
                 f"the model has {self.state_dim} states and {self.input_dim} inputs; "
@@ -309,34 +343,3 @@ class GPPosterior:
         if self.predicts == "difference":
             mean = mean + state
         return Gaussian(mean, torch.diag_embed((self.signal_variance - explained).clamp_min(0)))
-
-
-def check_query(model: Any, state: Tensor, input: Tensor) -> None:
-    """Raises unless a state (*batch, n) and an input (*batch, m) fit a model in shape, type and device.
-
-    Raises:
-        ShapeError: Another number of states or inputs.
-        SettingError: Another dtype or device.
-    """
-    if state.shape[-1:] != (model.state_dim,) or input.shape[-1:] != (model.input_dim,):
-        got = [tensor.shape[-1] if tensor.dim() else "a scalar" for tensor in (state, input)]
-        raise ShapeError(
-            f"the model has {model.state_dim} states and {model.input_dim} inputs; got {got[0]} and {got[1]}"
-        )
-    for name, value in (("state", state), ("input", input)):
-        if value.dtype != model.dtype or value.device != model.device:
-            raise SettingError(
-                name, f"must be {model.dtype} on {model.device} like the model; got {value.dtype} on {value.device}"
-            )
-
-
-def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_variance: Tensor) -> Tensor:
-    """k_a(x~_i, x~_j) (k, N, M) of points (N, d) and others (M, d).
-
-    Summed over differences a column at a time: exact for near points, where |x|^2 + |x'|^2 - 2 x'x cancels.
-    """
-    shape = (len(lengthscales), len(points), len(others))
-    total = torch.zeros(shape, dtype=points.dtype, device=points.device)
-    for ours, theirs, scale in zip(points.T, others.T, lengthscales.T, strict=True):
-        total += ((ours[:, None] - theirs) / scale[:, None, None]).square()
-    return signal_variance[:, None, None] * torch.exp(total / -2)
