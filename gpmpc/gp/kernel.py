@@ -11,5 +11,5 @@ def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_v
     shape = (len(lengthscales), len(points), len(others))
     total = zeros(shape, dtype=points.dtype, device=points.device)
     for ours, theirs, scale in zip(points.T, others.T, lengthscales.T, strict=True):
-        total += ((ours[:, None] - theirs) / scale[:, None, None]).square()
+        total.addcmul_((ours[:, None] - theirs).square(), scale[:, None, None] ** -2)
     return signal_variance[:, None, None] * (total / -2).exp()
