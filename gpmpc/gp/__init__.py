@@ -2,10 +2,14 @@
 
 from gpmpc.gp.budget import Budget
 from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.gp.gpytorch_posterior import KernelPosterior
+from gpmpc.gp.gpytorch_training import fit
 from gpmpc.gp.penalties import SoftLimits
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.residual import Affine, ResidualModel
 from gpmpc.gp.scaling import Scaling, identity, min_max, standardize
+from gpmpc.gp.sparse import sparse_posterior
+from gpmpc.gp.sparse_training import SparseTrainer, SparseTraining
 from gpmpc.gp.training import Trainer, Training, train
 from gpmpc.gp.transitions import Transitions
 
@@ -14,14 +18,19 @@ __all__ = [
     "Budget",
     "DynamicsModel",
     "GPPosterior",
+    "KernelPosterior",
     "ResidualModel",
     "Scaling",
     "SoftLimits",
+    "SparseTrainer",
+    "SparseTraining",
     "Trainer",
     "Training",
     "Transitions",
+    "fit",
     "identity",
     "min_max",
+    "sparse_posterior",
     "standardize",
     "train",
 ]

@@ -147,6 +147,8 @@ class GPPosterior:
     ) -> "GPPosterior":
         """Freezes trained SE-ARD ExactGPs of GPyTorch: one, a batch (one batch dimension, an output each), or a list.
 
+        A sparse one (``InducingPointKernel``) comes out as its pseudo-observations; see ``gp.sparse``.
+
         Args:
             model: An ``ExactGP`` with a zero or constant mean and an ``RBFKernel``, scaled by a ``ScaleKernel`` or
                 not; an ``IndependentModelList``; or a sequence of models over the same inputs.
@@ -157,7 +159,12 @@ class GPPosterior:
         Raises:
             UnsupportedModel: The kernel, mean or likelihood is another one, or transforms are attached.
         """
-        return cls.from_hyperparameters(**trained(model, likelihood), input_dim=input_dim, predicts=predicts)
+        found = trained(model, likelihood)
+        if "inducing" in found:
+            from gpmpc.gp.sparse import sparse_posterior  # which builds on this module
+
+            return sparse_posterior(features=found.pop("inputs"), **found, input_dim=input_dim, predicts=predicts)
+        return cls.from_hyperparameters(**found, input_dim=input_dim, predicts=predicts)
 
     def unscaled(self, features: Scaling, targets: Scaling) -> "GPPosterior":
         """The same GPs in physical units, where these were trained on scaled data.
