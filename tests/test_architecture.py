@@ -36,7 +36,7 @@ def test_the_gp_modules_load_neither_optimisation_nor_settings_nor_figures(modul
 @pytest.mark.parametrize(
     ("library", "rooms"),
     [
-        ("gpytorch", ["gp/model.py"]),
+        ("gpytorch", ["gp/model.py", "gp/gpytorch_posterior.py", "gp/gpytorch_training.py"]),
         ("hydra", ["cli"]),
         ("omegaconf", ["cli"]),
         ("matplotlib", ["plotting.py"]),

@@ -7,11 +7,11 @@ total, the row sums p_i, the column sums p_j and g_j = sum_i R_ij z_i, with R = 
 sum has a closed form) and R_ij = E_ij q_i q_j exp(delta_ij) where a = b.
 
 A large delta is harmless. A kernel is at most sf2, so Q_ij = q_ai q_bj exp(delta_ij) is at most sf2_a q_bj and at most
-sf2_b q_ai; the two together give Q_ij <= sf2_a sf2_b exp(-delta_ij). From delta = 300 on it is below 1e-130 sf2_a sf2_b,
-and the exponent may stay there: nothing overflows, and q that underflow belong to nothing that counts.
+sf2_b q_ai; the two together give Q_ij <= sf2_a sf2_b exp(-delta_ij). From delta = 300 on it is below 1e-130 sf2_a
+sf2_b, and the exponent may stay there: nothing overflows, and q that underflow belong to nothing that counts.
 
-Four rows i at a time meet a tile of columns j: the exponents, then their exponentials, then the sums, each in loops over
-slices that stay in the first cache. The four lie in one array, TILE apart: LLVM must see that they do not overlap.
+Four rows i at a time meet a tile of columns j: the exponents, then their exponentials, then the sums, each in loops
+over slices that stay in the first cache. The four lie in one array, TILE apart: LLVM must see that they do not overlap.
 """
 
 from typing import NamedTuple
@@ -19,10 +19,10 @@ from typing import NamedTuple
 from numpy import ndarray
 
 from gpmpc.compiled import compiled
-from gpmpc.fused.exponential import capped_expm1, widest
+from gpmpc.fused.exponential import EXACT, capped_expm1, widest
 from gpmpc.fused.point_rows import aligned
 
-TILE = 264  # columns a tile: not a multiple of 4096 bytes for the four rows, which would collide in the cache
+TILE = 200  # columns a tile: whole cache lines, and the four rows do not fall on each other in the cache
 BLOCK = 4  # rows that meet a tile together
 EXTENDED = BLOCK * TILE  # where R follows P
 
@@ -41,7 +41,7 @@ class Side(NamedTuple):
     weights: ndarray
 
 
-@compiled
+@compiled(fastmath=EXACT)
 def exponents(values, length, left, rise, i, right, fall):
     """Writes delta_ij of four rows from i on."""
     widest()
@@ -62,13 +62,13 @@ def exponents(values, length, left, rise, i, right, fall):
         else:
             for j in range(length):
                 u, v, w = columns[j], columns[TILE + j], columns[2 * TILE + j]
-                values[j] += x0 * u + y0 * v + z0 * w
-                values[TILE + j] += x1 * u + y1 * v + z1 * w
-                values[2 * TILE + j] += x2 * u + y2 * v + z2 * w
-                values[3 * TILE + j] += x3 * u + y3 * v + z3 * w
+                values[j] = values[j] + x0 * u + y0 * v + z0 * w
+                values[TILE + j] = values[TILE + j] + x1 * u + y1 * v + z1 * w
+                values[2 * TILE + j] = values[2 * TILE + j] + x2 * u + y2 * v + z2 * w
+                values[3 * TILE + j] = values[3 * TILE + j] + x3 * u + y3 * v + z3 * w
 
 
-@compiled
+@compiled(fastmath=EXACT)
 def exponentials(values, length):
     """Replaces delta by expm1(delta)."""
     widest()
@@ -79,7 +79,7 @@ def exponentials(values, length):
         values[3 * TILE + j] = capped_expm1(values[3 * TILE + j])
 
 
-@compiled
+@compiled(fastmath=EXACT)
 def weigh(values, length, triangle, at, step, q):
     """For a = b: P_ij = E_ij q_j value, and R_ij = P_ij + E_ij q_j beside it, both without q_i."""
     widest()
@@ -94,24 +94,25 @@ def weigh(values, length, triangle, at, step, q):
         values[EXTENDED + 3 * TILE + j] = e3 * p3 + e3
 
 
-@compiled
+@compiled(fastmath=EXACT)
 def add_weighed(sums, length, values, i, weights, triangle, at, step):
     """For a = b: adds weights_i E_ij values_ij of four rows to the columns' sums."""
     widest()
     row0, row1, row2, row3 = triangle[at:], triangle[at + step :], triangle[at + 2 * step :], triangle[at + 3 * step :]
     w0, w1, w2, w3 = weights[i], weights[i + 1], weights[i + 2], weights[i + 3]
     for j in range(length):
-        upper = w0 * row0[j] * values[j] + w1 * row1[j] * values[TILE + j]
-        sums[j] += upper + (w2 * row2[j] * values[2 * TILE + j] + w3 * row3[j] * values[3 * TILE + j])
+        total = sums[j] + (w0 * row0[j]) * values[j] + (w1 * row1[j]) * values[TILE + j]
+        sums[j] = total + (w2 * row2[j]) * values[2 * TILE + j] + (w3 * row3[j]) * values[3 * TILE + j]
 
 
-@compiled
+@compiled(fastmath=EXACT)
 def add_columns(sums, length, values, i, weights):
     """Adds weights_i values_ij of four rows to the columns' sums."""
     widest()
     w0, w1, w2, w3 = weights[i], weights[i + 1], weights[i + 2], weights[i + 3]
     for j in range(length):
-        sums[j] += w0 * values[j] + w1 * values[TILE + j] + (w2 * values[2 * TILE + j] + w3 * values[3 * TILE + j])
+        total = sums[j] + w0 * values[j] + w1 * values[TILE + j]
+        sums[j] = total + w2 * values[2 * TILE + j] + w3 * values[3 * TILE + j]
 
 
 @compiled
@@ -131,7 +132,7 @@ def add_rows(sums, length, values, i, weights, factors):
     sums[i + 3] += weights[i + 3] * sum3
 
 
-@compiled
+@compiled(fastmath=EXACT)
 def add_vectors(sums, length, values, i, weights, z):
     """Adds weights_i z_i values_ij of four rows to the columns' vectors, a component a TILE."""
     widest()
@@ -144,9 +145,9 @@ def add_vectors(sums, length, values, i, weights, z):
         target = sums[d * TILE :]
         for j in range(length):
             v0, v1, v2, v3 = values[j], values[TILE + j], values[2 * TILE + j], values[3 * TILE + j]
-            target[j] += x0 * v0 + x1 * v1 + (x2 * v2 + x3 * v3)
-            target[TILE + j] += y0 * v0 + y1 * v1 + (y2 * v2 + y3 * v3)
-            target[2 * TILE + j] += t0 * v0 + t1 * v1 + (t2 * v2 + t3 * v3)
+            target[j] = target[j] + x0 * v0 + x1 * v1 + x2 * v2 + x3 * v3
+            target[TILE + j] = target[TILE + j] + y0 * v0 + y1 * v1 + y2 * v2 + y3 * v3
+            target[2 * TILE + j] = target[2 * TILE + j] + t0 * v0 + t1 * v1 + t2 * v2 + t3 * v3
 
 
 @compiled
@@ -169,8 +170,9 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, out):
     memory = aligned((2 * BLOCK + 2 * dims + 2) * TILE)
     values, right = memory[: 2 * EXTENDED], memory[2 * EXTENDED : 2 * EXTENDED + dims * TILE]
     sums, ones = memory[2 * EXTENDED + dims * TILE :], memory[2 * EXTENDED + (2 * dims + 1) * TILE :]
+    extended, vectors, p_i = values[EXTENDED:], sums[TILE:], out[0]
     ones[:] = 1.0
-    out[0, :] = 0.0
+    p_i[:] = 0.0
     total = 0.0
     for start in range(0, padded, TILE):
         stop = min(start + TILE, padded)
@@ -192,8 +194,8 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, out):
                 weigh(values, length, triangle, at, step, weights)
             add_columns(sums, length, values, i, rows.weights)
             if derivatives:
-                add_rows(out[0], length, values, i, rows.weights, factors)
-                add_vectors(sums[TILE:], length, values[EXTENDED:] if same else values, i, rows.weights, rows.z)
+                add_rows(p_i, length, values, i, rows.weights, factors)
+                add_vectors(vectors, length, extended if same else values, i, rows.weights, rows.z)
         for j in range(stop - start):
             sums[j] *= factors[j]
             total += sums[j]

@@ -7,7 +7,7 @@ memory does three multiplications. Lengths are multiples of 8, numbers of rows m
 import numpy as np
 
 from gpmpc.compiled import compiled
-from gpmpc.fused.exponential import widest
+from gpmpc.fused.exponential import EXACT, widest
 
 LINE = 8  # doubles in a cache line
 
@@ -26,7 +26,7 @@ def aligned_rows(rows, length):
     return aligned(rows * length).reshape(rows, length)
 
 
-@compiled
+@compiled(fastmath=EXACT)
 def combine(out, factors, rows):
     """Adds sum_d factors[d] rows[d] to ``out``."""
     widest()
@@ -34,7 +34,7 @@ def combine(out, factors, rows):
         row0, row1, row2 = rows[d], rows[d + 1], rows[d + 2]
         factor0, factor1, factor2 = factors[d], factors[d + 1], factors[d + 2]
         for j in range(len(out)):
-            out[j] += factor0 * row0[j] + factor1 * row1[j] + factor2 * row2[j]
+            out[j] = out[j] + factor0 * row0[j] + factor1 * row1[j] + factor2 * row2[j]
 
 
 @compiled
@@ -59,7 +59,7 @@ def multiply(row, other, out):
         out[j] = row[j] * other[j]
 
 
-@compiled
+@compiled(fastmath=EXACT)
 def transform(matrix, rows, out, n):
     """Writes matrix @ rows, of n rows, to the first rows of ``out``."""
     widest()
@@ -83,14 +83,14 @@ def second_moments(weights, rows, out, n, scratch):
             out[d, c] = out[c, d]
 
 
-@compiled
+@compiled(fastmath=EXACT)
 def add_products(out, factors, rows, others, n):
     """Adds sum_d factors[d] rows[d] others[d] over n rows to ``out``."""
     widest()
     for d in range(n):
         factor, row, other = factors[d], rows[d], others[d]
         for j in range(len(out)):
-            out[j] += factor * row[j] * other[j]
+            out[j] = out[j] + (factor * row[j]) * other[j]
 
 
 @compiled
@@ -112,5 +112,5 @@ def explain(triangle, q, solved):
             v3 += row3[j] * q[j]
         total += v0 * v0 + v1 * v1 + v2 * v2 + v3 * v3
         for j in range(length):
-            solved[j] += v0 * row0[j] + v1 * row1[j] + v2 * row2[j] + v3 * row3[j]
+            solved[j] = solved[j] + v0 * row0[j] + v1 * row1[j] + v2 * row2[j] + v3 * row3[j]
     return total

@@ -1,11 +1,12 @@
 """Problem: what the rest of the package asks of a learned model of x[k+1] = f(x[k], u[k]), whoever wrote it."""
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 
 
@@ -57,3 +58,22 @@ def batched_jacobian(
     if not again:
         values = tuple(value.detach() for value in values)
     return values, jacobians
+
+
+def check_query(model: Any, state: Tensor, input: Tensor) -> None:
+    """Raises unless a state (*batch, n) and an input (*batch, m) fit a model in shape, type and device.
+
+    Raises:
+        ShapeError: Another number of states or inputs.
+        SettingError: Another dtype or device.
+    """
+    if state.shape[-1:] != (model.state_dim,) or input.shape[-1:] != (model.input_dim,):
+        got = [tensor.shape[-1] if tensor.dim() else "a scalar" for tensor in (state, input)]
+        raise ShapeError(
+            f"the model has {model.state_dim} states and {model.input_dim} inputs; got {got[0]} and {got[1]}"
+        )
+    for name, value in (("state", state), ("input", input)):
+        if value.dtype != model.dtype or value.device != model.device:
+            raise SettingError(
+                name, f"must be {model.dtype} on {model.device} like the model; got {value.dtype} on {value.device}"
+            )

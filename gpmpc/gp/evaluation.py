@@ -9,13 +9,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.util import find_spec
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
 from gpmpc.exceptions import SettingError
+from gpmpc.gp.dynamics import check_query
 
 Evaluation = Literal["auto", "compiled", "torch"]
 
@@ -61,3 +63,26 @@ def host_arrays(*tensors: Tensor) -> list[np.ndarray] | None:
     if choice == "compiled":
         raise SettingError("evaluation", f"the compiled loops cannot answer: {reason}")
     return None
+
+
+def compiled_point(model: Any, function: str, state: Tensor, input: Tensor) -> list[Tensor]:
+    """Mean, (variance,) and the mean's derivatives by state and input of a ``GPPosterior``.
+
+    Args:
+        model: The posterior.
+        function: Of ``gpmpc.fused``: ``"mean_with_jacobian"`` or ``"point_with_jacobian"``.
+        state: (*batch, n).
+        input: (*batch, m).
+    """
+    from gpmpc import fused  # loads numba
+
+    check_query(model, state, input)
+    batch = state.shape[:-1]
+    flat = [v.reshape(batch.numel(), v.shape[-1]).numpy() for v in (state, input)]
+    found = getattr(fused, function)(model.packed, *flat)
+    parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found[: min(len(found), 4)]]
+    parts[0] += model.offset
+    if model.predicts == "difference":
+        parts[0] += state
+        parts[-2].diagonal(dim1=-2, dim2=-1).add_(1.0)
+    return parts

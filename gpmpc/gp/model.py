@@ -129,7 +129,9 @@ def members(model: Any, likelihood: Any = None) -> list[tuple[Any, Any]]:
         likelihoods *= len(models)
     if len(likelihoods) != len(models):
         raise ShapeError(f"each model needs one likelihood; got {len(models)} models and {len(likelihoods)}")
-    pairs = [(m, m.likelihood if own is None else own) for m, own in zip(models, likelihoods, strict=True)]
+    pairs = [
+        (m, getattr(m, "likelihood", None) if own is None else own) for m, own in zip(models, likelihoods, strict=True)
+    ]
     for one, own in pairs:
         if not isinstance(one, gpytorch.models.ExactGP) or one.train_inputs is None:
             raise UnsupportedModel(f"only ExactGP models with training data can be frozen; got {type(one).__name__}")
@@ -146,15 +148,20 @@ def members(model: Any, likelihood: Any = None) -> list[tuple[Any, Any]]:
     return pairs
 
 
-def hyperparameters(model: Any, likelihood: Any = None) -> dict[str, Tensor]:
+def hyperparameters(model: Any, likelihood: Any = None) -> dict[str, Any]:
     """The arguments of ``GPPosterior.from_hyperparameters`` in trained SE-ARD models: single, batch or a list.
+
+    Of sparse models (an ``InducingPointKernel`` around the kernel) those of ``sparse_posterior``: also ``inducing``,
+    and the ``method`` by which GPyTorch would predict: FITC, unless its setting ``sgpr_diagonal_correction`` is off.
+    (Then its means are those of SGPR; its variances lack kxx - qxx and vanish far from Z, ours do not.)
 
     Raises:
         UnsupportedModel: The kernel is no (scaled) ``RBFKernel``, the mean neither zero nor constant.
-        ShapeError: The models of a list have other training inputs, or there is more than one batch dimension.
+        ShapeError: The models of a list have other training inputs or inducing points, or there is more than one batch
+            dimension.
     """
     rows: dict[str, list[Tensor]] = {}
-    first = None
+    first, inducing = None, []
     for one, own in members(model, likelihood):
         inputs, targets = one.train_inputs[0], one.train_targets
         inputs = inputs[:, None] if inputs.dim() == 1 else inputs
@@ -165,6 +172,9 @@ def hyperparameters(model: Any, likelihood: Any = None) -> dict[str, Tensor]:
         if any(each.shape != first.shape or not torch.equal(each, first) for each in shared):
             raise ShapeError("all outputs must have the same training inputs (N, d); got different ones")
         scale, kernel = 1.0, one.covar_module
+        if isinstance(kernel, gpytorch.kernels.InducingPointKernel) and kernel.active_dims is None:
+            inducing += kernel.inducing_points.detach().reshape(-1, *kernel.inducing_points.shape[-2:])
+            kernel = kernel.base_kernel
         if isinstance(kernel, gpytorch.kernels.ScaleKernel):
             scale, kernel = kernel.outputscale, kernel.base_kernel
         if type(kernel) is not gpytorch.kernels.RBFKernel or kernel.active_dims is not None:
@@ -190,4 +200,10 @@ def hyperparameters(model: Any, likelihood: Any = None) -> dict[str, Tensor]:
         for name, value in found.items():
             rows.setdefault(name, []).append(value.detach().to(first.device))
     joined = {name: torch.cat(values).clone() for name, values in rows.items()}
-    return {"inputs": first.detach().clone(), **joined, "targets": joined["targets"].T.contiguous()}
+    joined = {"inputs": first.detach().clone(), **joined, "targets": joined["targets"].T.contiguous()}
+    if not inducing:
+        return joined
+    if len(inducing) not in (1, joined["targets"].shape[1]) or any(not torch.equal(Z, inducing[0]) for Z in inducing):
+        raise ShapeError("all outputs must be sparse, with the same inducing points (M, d); got different ones")
+    method = "fitc" if gpytorch.settings.sgpr_diagonal_correction.on() else "sgpr"
+    return {**joined, "inducing": inducing[0].clone(), "method": method}

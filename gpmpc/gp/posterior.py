@@ -12,6 +12,7 @@ standard deviations in those of the output, and a constant prior mean. So a post
 and gives physical units.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,18 +21,20 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.evaluation import host_arrays
-from gpmpc.gp.model import hyperparameters
+from gpmpc.gp.dynamics import check_query
+from gpmpc.gp.evaluation import compiled_point, host_arrays
+from gpmpc.gp.kernel import check_posterior, factorised
+from gpmpc.gp.model import hyperparameters as trained
 from gpmpc.gp.scaling import Scaling
 from gpmpc.gp.transitions import Transitions
+from gpmpc.gp.updating import extended, without
 
 if TYPE_CHECKING:
     from gpmpc.fused import Packed
 
 Predicts = Literal["next_state", "difference", "value"]
-PREDICTS = ("next_state", "difference", "value")
 IGNORED = 1e8  # length-scale of an input that drops out of a kernel, in units of its magnitude
 
 
@@ -94,69 +97,28 @@ class GPPosterior:
                 positive definite.
             DataError: An entry is not finite.
         """
-        if inputs.dim() != 2 or targets.dim() != 2 or not len(inputs):
-            raise ShapeError(
-                "inputs (N, d) and targets (N, k) need two dimensions and a row; "
-                f"got {tuple(inputs.shape)} and {tuple(targets.shape)}"
-            )
-        k, d = targets.shape[1], inputs.shape[1]
-        offset = torch.zeros_like(targets[0]) if offset is None else offset
-        expected = {
-            "inputs": (inputs, (len(inputs), d)),
-            "targets": (targets, (len(inputs), k)),
-            "lengthscales": (lengthscales, (k, d)),
-            "signal_variance": (signal_variance, (k,)),
-            "noise_variance": (noise_variance, (k,)),
-            "offset": (offset, (k,)),
+        offset = torch.zeros_like(targets[:1].flatten()) if offset is None else offset
+        given = {
+            "inputs": inputs,
+            "targets": targets,
+            "lengthscales": lengthscales,
+            "signal_variance": signal_variance,
+            "noise_variance": noise_variance,
+            "offset": offset,
         }
-        for name, (value, shape) in expected.items():
-            if tuple(value.shape) != shape:
-                raise ShapeError(f"{name} must have shape {shape}; got {tuple(value.shape)}")
-            if value.dtype != torch.float64:
-                raise SettingError(name, f"must be float64 (convert after: posterior.to(dtype=...)); got {value.dtype}")
-            if value.device != inputs.device:
-                raise SettingError(name, f"must be on the device of inputs, {inputs.device}; got {value.device}")
-            if not bool(torch.isfinite(value).all()):
-                raise DataError(f"{name} must be finite; got {value[~torch.isfinite(value)][0]}")
-        if predicts not in PREDICTS:
-            raise SettingError("predicts", f"must be one of {', '.join(map(repr, PREDICTS))}; got {predicts!r}")
-        if not 0 <= input_dim < d or (predicts != "value" and d != k + input_dim):
-            raise ShapeError(
-                f"inputs must have n + m columns, one state an output and {input_dim} controls; "
-                f"got {d} columns and {k} outputs"
-            )
-        for name in ("lengthscales", "signal_variance", "noise_variance"):
-            if not bool((expected[name][0] > 0).all()):
-                raise SettingError(name, f"must be positive; got {expected[name][0].tolist()}")
-        kernel = kernel_matrix(inputs, inputs, lengthscales, signal_variance)
-        kernel.diagonal(dim1=-2, dim2=-1).add_(noise_variance[:, None])
-        cholesky, info = torch.linalg.cholesky_ex(kernel)
-        if bool(info.any()):
-            output = int(torch.nonzero(info)[0])
-            raise SettingError(
-                "noise_variance",
-                f"the kernel matrix of output {output} is not positive definite in float64; "
-                f"signal-to-noise ratio {float((signal_variance / noise_variance)[output]):.1e}: raise the noise",
-            )
+        check_posterior(given, input_dim, predicts)
+        cholesky = factorised(inputs, lengthscales, signal_variance, noise_variance)
         weights = torch.cholesky_solve((targets - offset).mT[..., None], cholesky)[..., 0]
-        return cls(
-            inputs,
-            targets,
-            lengthscales,
-            signal_variance,
-            noise_variance,
-            offset,
-            cholesky,
-            weights,
-            input_dim,
-            predicts,
-        )
+        hyperparameters = (lengthscales, signal_variance, noise_variance, offset)
+        return cls(inputs, targets, *hyperparameters, cholesky, weights, input_dim, predicts)
 
     @classmethod
     def from_gpytorch(
         cls, model: Any, likelihood: Any = None, *, input_dim: int, predicts: Predicts = "next_state"
     ) -> "GPPosterior":
         """Freezes trained SE-ARD ExactGPs of GPyTorch: one, a batch (one batch dimension, an output each), or a list.
+
+        A sparse one (``InducingPointKernel``) comes out as its pseudo-observations; see ``gp.sparse``.
 
         Args:
             model: An ``ExactGP`` with a zero or constant mean and an ``RBFKernel``, scaled by a ``ScaleKernel`` or
@@ -168,7 +130,12 @@ class GPPosterior:
         Raises:
             UnsupportedModel: The kernel, mean or likelihood is another one, or transforms are attached.
         """
-        return cls.from_hyperparameters(**hyperparameters(model, likelihood), input_dim=input_dim, predicts=predicts)
+        found = trained(model, likelihood)
+        if "inducing" in found:
+            from gpmpc.gp.sparse import sparse_posterior  # which builds on this module
+
+            return sparse_posterior(features=found.pop("inputs"), **found, input_dim=input_dim, predicts=predicts)
+        return cls.from_hyperparameters(**found, input_dim=input_dim, predicts=predicts)
 
     def unscaled(self, features: Scaling, targets: Scaling) -> "GPPosterior":
         """The same GPs in physical units, where these were trained on scaled data.
@@ -230,6 +197,13 @@ class GPPosterior:
         parts = (self.features, self.lengthscales, self.signal_variance, self.cholesky, self.weights)
         return pack(*(part.numpy() for part in parts), self.state_dim)
 
+    @property
+    def exact(self) -> bool:
+        """Whether ``targets`` are observations with noise sn2, not a sparse model's pseudo-observations."""
+        diagonal = (self.signal_variance + self.noise_variance)[:, None]
+        error = (self.cholesky.square().sum(-1) - diagonal).abs()
+        return bool((error <= torch.finfo(self.dtype).eps ** 0.75 * diagonal).all())
+
     def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "GPPosterior":
         """The same on another device, or in another floating-point type."""
         tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
@@ -273,7 +247,7 @@ class GPPosterior:
         """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""
         input = state[..., :0] if input is None else input
         if host_arrays(self.features, state, input) is not None:
-            mean, variance, by_state, by_input = self._compiled("point_with_jacobian", state, input)
+            mean, variance, by_state, by_input = compiled_point(self, "point_with_jacobian", state, input)
             return Gaussian(mean, torch.diag_embed(variance)), by_state, by_input
         k, difference = self._correlations(state, input)
         return self._belief(k, state), *self._jacobian(k, difference)
@@ -282,7 +256,7 @@ class GPPosterior:
         """``predict_with_jacobian`` without the variance, which costs most of it: the mean (*batch, k) comes first."""
         input = state[..., :0] if input is None else input
         if host_arrays(self.features, state, input) is not None:
-            return self._compiled("mean_with_jacobian", state, input)
+            return compiled_point(self, "mean_with_jacobian", state, input)
         k, difference = self._correlations(state, input)
         return self._mean(k, state), *self._jacobian(k, difference)
 
@@ -317,12 +291,45 @@ class GPPosterior:
         normal = torch.randn(shape, generator=generator, dtype=self.dtype, device=self.device)
         return belief.mean + variance.sqrt() * normal
 
+    def condition_on(self, transitions: Transitions) -> "GPPosterior":
+        """The posterior that has seen more transitions, by an extension of the Cholesky factor: O(N^2) a point.
+
+        The hyperparameters stay; ``Trainer.refit`` fits them anew.
+
+        Raises:
+            ShapeError: The transitions have other dimensions.
+            UnsupportedModel: The GPs learned values, which transitions do not hold: ``condition_on_targets``.
+            SettingError: The larger kernel matrix is not positive definite in this dtype.
+        """
+        return extended(self, transitions.features, self.learned(transitions))
+
+    def condition_on_targets(self, features: Tensor, targets: Tensor) -> "GPPosterior":
+        """The posterior that has seen more points: x~ = (x, u) (p, n + m) and what the GPs learn of them (p, k)."""
+        return extended(self, features, targets)
+
+    def drop(self, indices: Sequence[int] | Tensor) -> "GPPosterior":
+        """The posterior that has not seen some of its points, by a downdate of the Cholesky factor: O(N^2) a point.
+
+        Args:
+            indices: Rows of ``features``; negative ones count from the end.
+
+        Raises:
+            SettingError: An index is out of range or stands there twice.
+            DataError: No point is left.
+        """
+        return without(self, indices)
+
     def learned(self, transitions: Transitions) -> Tensor:
         """What the GPs would be told of transitions: next states, or differences (N, n).
 
         Raises:
             ShapeError: The transitions have other dimensions.
+            UnsupportedModel: The GPs learned values, which transitions do not hold.
         """
+        if self.predicts == "value":
+            raise UnsupportedModel(
+                "transitions hold no targets of a GP with predicts='value': use condition_on_targets"
+            )
         if (transitions.state_dim, transitions.input_dim) != (self.state_dim, self.input_dim):
             raise ShapeError(
                 f"the model has {self.state_dim} states and {self.input_dim} inputs; "
@@ -367,48 +374,3 @@ class GPPosterior:
         if self.predicts == "difference":
             by_state = by_state + torch.eye(self.state_dim, dtype=self.dtype, device=self.device)
         return by_state, by_input
-
-    def _compiled(self, function: str, state: Tensor, input: Tensor) -> list[Tensor]:
-        """Mean, (variance,) and derivatives by state and input from ``gpmpc.fused``."""
-        from gpmpc import fused
-
-        check_query(self, state, input)
-        batch = state.shape[:-1]
-        found = getattr(fused, function)(self.packed, *(v.reshape(-1, v.shape[-1]).numpy() for v in (state, input)))
-        parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found[: min(len(found), 4)]]
-        parts[0] += self.offset
-        if self.predicts == "difference":
-            parts[0] += state
-            parts[-2].diagonal(dim1=-2, dim2=-1).add_(1.0)
-        return parts
-
-
-def check_query(model: Any, state: Tensor, input: Tensor) -> None:
-    """Raises unless a state (*batch, n) and an input (*batch, m) fit a model in shape, type and device.
-
-    Raises:
-        ShapeError: Another number of states or inputs.
-        SettingError: Another dtype or device.
-    """
-    if state.shape[-1:] != (model.state_dim,) or input.shape[-1:] != (model.input_dim,):
-        got = [tensor.shape[-1] if tensor.dim() else "a scalar" for tensor in (state, input)]
-        raise ShapeError(
-            f"the model has {model.state_dim} states and {model.input_dim} inputs; got {got[0]} and {got[1]}"
-        )
-    for name, value in (("state", state), ("input", input)):
-        if value.dtype != model.dtype or value.device != model.device:
-            raise SettingError(
-                name, f"must be {model.dtype} on {model.device} like the model; got {value.dtype} on {value.device}"
-            )
-
-
-def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_variance: Tensor) -> Tensor:
-    """k_a(x~_i, x~_j) (k, N, M) of points (N, d) and others (M, d).
-
-    Summed over differences a column at a time: exact for near points, where |x|^2 + |x'|^2 - 2 x'x cancels.
-    """
-    shape = (len(lengthscales), len(points), len(others))
-    total = torch.zeros(shape, dtype=points.dtype, device=points.device)
-    for ours, theirs, scale in zip(points.T, others.T, lengthscales.T, strict=True):
-        total += ((ours[:, None] - theirs) / scale[:, None, None]).square()
-    return signal_variance[:, None, None] * torch.exp(total / -2)

@@ -7,7 +7,7 @@ Kabzan and Zeilinger, 2020, eq. (3)).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,10 @@ from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import batched_jacobian
-from gpmpc.gp.posterior import GPPosterior, check_query
-from gpmpc.gp.training import Trainer, Training
+from gpmpc.gp.budget import Budget
+from gpmpc.gp.dynamics import batched_jacobian, check_query
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp.training import Trainer
 from gpmpc.gp.transitions import Transitions
 
 
@@ -110,11 +111,24 @@ class ResidualModel:
         states = list(range(n)) if states is None else list(states)
         inputs = list(range(m)) if inputs is None else list(inputs)
         B = torch.eye(n, dtype=torch.float64) if B is None else B
-        missed = transitions.next_states - nominal(transitions.states, transitions.inputs)
-        targets = torch.linalg.lstsq(B, missed.mT).solution.mT
-        features = torch.cat([transitions.states[:, states], transitions.inputs[:, inputs]], dim=1)
-        training: Training = (trainer or Trainer()).fit(features, targets, len(inputs), "value", seed)
+        features, targets = _learned(nominal, B, states, inputs, transitions)
+        training = (trainer or Trainer()).fit(features, targets, len(inputs), "value", seed)
         return cls(nominal, training.posterior, B, states, inputs, m)
+
+    def condition_on(self, transitions: Transitions, budget: Budget | None = None) -> "ResidualModel":
+        """The model whose residual GP has seen more transitions, held to a number of points if a budget is given.
+
+        Raises:
+            ShapeError: The transitions have other dimensions.
+        """
+        if (transitions.state_dim, transitions.input_dim) != (self.state_dim, self.input_dim):
+            raise ShapeError(
+                f"the model has {self.state_dim} states and {self.input_dim} inputs; "
+                f"got transitions with {transitions.state_dim} and {transitions.input_dim}"
+            )
+        seen = _learned(self.nominal, self.B, self.states, self.inputs, transitions)
+        residual = budget.condition(self.residual, *seen) if budget else self.residual.condition_on_targets(*seen)
+        return replace(self, residual=residual)
 
     @property
     def state_dim(self) -> int:
@@ -200,3 +214,17 @@ class ResidualModel:
 
     def _index(self, chosen: Sequence[int]) -> Tensor:
         return torch.tensor(list(chosen), dtype=torch.long, device=self.device)
+
+
+def _learned(
+    nominal: Callable[[Tensor, Tensor], Tensor],
+    B: Tensor,
+    states: Sequence[int],
+    inputs: Sequence[int],
+    transitions: Transitions,
+) -> tuple[Tensor, Tensor]:
+    """What d sees and is to be, of N transitions: the features, and the least-squares part of what f0 missed (N, k)."""
+    to_B = {"device": B.device, "dtype": B.dtype}
+    x, u, after = (t.to(**to_B) for t in (transitions.states, transitions.inputs, transitions.next_states))
+    targets = torch.linalg.lstsq(B, (after - nominal(x, u)).mT).solution.mT
+    return torch.cat([x[:, list(states)], u[:, list(inputs)]], dim=1), targets

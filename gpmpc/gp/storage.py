@@ -23,7 +23,8 @@ from torch import Tensor
 
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, UnsupportedModel
 from gpmpc.files import write_whole
-from gpmpc.gp.posterior import PREDICTS, GPPosterior
+from gpmpc.gp.kernel import PREDICTS
+from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.residual import Affine, ResidualModel
 from gpmpc.provenance import now, versions
 

@@ -13,15 +13,16 @@ Cao, Lai and Alam (2017), eq. (9); the penalty is the one of their experiment.
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from gpmpc.exceptions import SettingError, TrainingError, check_number
+from gpmpc.exceptions import SettingError, ShapeError, TrainingError, UnsupportedModel, check_number
 from gpmpc.gp.evidence import LogEvidence
 from gpmpc.gp.model import BatchExactGP, GPyTorchEvidence
+from gpmpc.gp.penalties import Penalty
 from gpmpc.gp.posterior import IGNORED, GPPosterior, Predicts
 from gpmpc.gp.scaling import Scaling, identity
 from gpmpc.gp.transitions import Transitions
@@ -34,45 +35,6 @@ FINALISTS = 2  # ... this many of the best go on to convergence
 LONGER = 1.0  # mean of log l over log std(x~) at the random starts: smooth dynamics prefer long length-scales
 CONSTANT = 1e-8  # a column that moves by less than this part of its magnitude is constant
 FAILED = 1e12  # objective where the kernel matrix is not positive definite: finite, so that a line search steps back
-
-
-class Penalty(Protocol):
-    """What is added to an output's negative log marginal likelihood."""
-
-    def __call__(self, theta: np.ndarray, log_spread: np.ndarray) -> tuple[float, np.ndarray]:
-        """Value and gradient (d + 2,) at theta, given log std of the inputs (d,)."""
-
-
-@dataclass(frozen=True)
-class SoftLimits:
-    """Length-scales near the data's spread and a signal-to-noise ratio that double precision can bear, as soft walls.
-
-    ((log l_d - log std(x~_d)) / log r)^p summed over d, and (log(sf / sn) / log s)^p; the penalties of PILCO
-    (Deisenroth, 2010) and of the experiment of Cao, Lai and Alam (2017). Nearly flat inside, steep outside.
-
-    Attributes:
-        lengthscale_factor: r, how far a length-scale may be from the spread of its input.
-        signal_to_noise: s, how large sf / sn may be.
-        power: p, even.
-    """
-
-    lengthscale_factor: float = 100.0
-    signal_to_noise: float = 1000.0
-    power: int = 30
-
-    def __post_init__(self) -> None:
-        for key in ("lengthscale_factor", "signal_to_noise"):
-            check_number(key, getattr(self, key), above=1)
-        check_number("power", self.power, least=2, whole=True)
-        if self.power % 2:
-            raise SettingError("power", f"must be even; got {self.power}")
-
-    def __call__(self, theta: np.ndarray, log_spread: np.ndarray) -> tuple[float, np.ndarray]:
-        """Value and gradient (d + 2,) at theta."""
-        width = np.full(len(theta), np.log(self.lengthscale_factor))
-        width[-1] = np.log(self.signal_to_noise)
-        position = np.append(theta[:-2] - log_spread, [0.0, theta[-1]]) / width
-        return (position**self.power).sum(), self.power * position ** (self.power - 1) / width
 
 
 @dataclass(frozen=True)
@@ -141,23 +103,59 @@ class Trainer:
         for key, least in (("tolerance", 0), ("lengthscale_limit", 1), ("signal_to_noise_limit", 1)):
             check_number(key, getattr(self, key), above=least)
 
-    def __call__(self, transitions: Transitions, seed: int = 0) -> Training:
-        """Trains on transitions; ``seed`` is that of the random starts.
-
-        Raises:
-            TrainingError: Every start failed for an output, which is named.
-        """
+    def __call__(self, transitions: Transitions, seed: int = 0, start: GPPosterior | None = None) -> Training:
+        """Trains on transitions; see ``fit``."""
         learned = transitions.next_states
         if self.predicts == "difference":
             learned = learned - transitions.states
-        return self.fit(transitions.features, learned, transitions.input_dim, self.predicts, seed)
+        return self.fit(transitions.features, learned, transitions.input_dim, self.predicts, seed, start)
 
-    def fit(
-        self, features: torch.Tensor, targets: torch.Tensor, input_dim: int, predicts: Predicts, seed: int = 0
-    ) -> Training:
-        """Trains on features x~ = (x, u) (N, n + m) and any targets (N, k).
+    def refit(self, posterior: GPPosterior, transitions: Transitions | None = None, seed: int = 0) -> Training:
+        """Trains on the points a posterior holds, and on new ones, from its hyperparameters on.
+
+        With ``restarts=0`` only from them on. The prior mean is that of this trainer's scaling, as in any training.
+
+        Args:
+            posterior: What was learned so far; what it predicts and its number of inputs stay.
+            transitions: Seen besides, if given.
+            seed: Of the random starts.
 
         Raises:
+            UnsupportedModel: The posterior stands on a sparse model's pseudo-observations.
+            ShapeError: The transitions have other dimensions.
+            TrainingError: Every start failed for an output, which is named.
+        """
+        if not posterior.exact:
+            raise UnsupportedModel(
+                "the posterior holds a sparse model's pseudo-observations, no data: train again with SparseTrainer"
+            )
+        features, targets = (t.to("cpu", torch.float64) for t in (posterior.features, posterior.targets))
+        if transitions is not None:
+            features = torch.cat([features, transitions.features])
+            targets = torch.cat([targets, posterior.learned(transitions)])
+        return self.fit(features, targets, posterior.input_dim, posterior.predicts, seed, start=posterior)
+
+    def fit(
+        self,
+        features: torch.Tensor,
+        targets: torch.Tensor,
+        input_dim: int,
+        predicts: Predicts,
+        seed: int = 0,
+        start: GPPosterior | None = None,
+    ) -> Training:
+        """Trains on features and any targets.
+
+        Args:
+            features: x~ = (x, u) (N, n + m).
+            targets: (N, k).
+            input_dim: m.
+            predicts: What the targets mean.
+            seed: Of the random starts.
+            start: Its hyperparameters are the first start instead; the random ones stay where they are.
+
+        Raises:
+            ShapeError: ``start`` has other dimensions.
             TrainingError: Every start failed for an output, which is named.
         """
         begin = time.perf_counter()
@@ -168,7 +166,11 @@ class Trainer:
         inputs, targets = feature_scaling.scale(features).numpy(), target_scaling.scale(targets).numpy()
         outputs, d = targets.shape[1], inputs.shape[1]
         rng = np.random.default_rng(seed)
-        fits = [self._fit(inputs, targets[:, a], rng.normal(size=(self.restarts + 1, d + 2))) for a in range(outputs)]
+        first: list[np.ndarray | None] = [None] * outputs
+        if start is not None:
+            first = list(log_hyperparameters(start, feature_scaling, target_scaling))
+        perturbations = rng.normal(size=(outputs, self.restarts + 1, d + 2))
+        fits = [self._fit(inputs, targets[:, a], perturbations[a], first[a]) for a in range(outputs)]
         failed = [a for a, fit in enumerate(fits) if fit.objective >= FAILED]
         if failed:
             raise TrainingError(
@@ -198,7 +200,9 @@ class Trainer:
             seconds=time.perf_counter() - begin,
         )
 
-    def _fit(self, inputs: np.ndarray, targets: np.ndarray, perturbations: np.ndarray) -> "_Fit":
+    def _fit(
+        self, inputs: np.ndarray, targets: np.ndarray, perturbations: np.ndarray, given: np.ndarray | None
+    ) -> "_Fit":
         """Fits one output, targets (N,), from the first start and from perturbations (restarts + 1, d + 2) of it."""
         log_inputs, log_output = np.log(spread(inputs)), np.log(spread(targets[:, None])[0])
         centre = np.append(log_inputs, [log_output, 0.0])
@@ -208,7 +212,7 @@ class Trainer:
         search = _Search(_objective(self.likelihood, inputs, targets, self.penalty, log_inputs), centre, reach)
         first = np.append(log_inputs, [log_output, np.log(10.0)])
         longer = np.append(np.full(inputs.shape[1], LONGER), [0.0, 0.0])
-        starts = [first, *(first + longer + shift for shift in perturbations[1:])]
+        starts = [first if given is None else given, *(first + longer + shift for shift in perturbations[1:])]
 
         ends = [search(start, EXPLORATION, self.tolerance) for start in starts]
         finalists = sorted(ends, key=lambda end: end[1])[:FINALISTS]
@@ -253,6 +257,30 @@ class _Search:
         )
         self.evaluations += outcome.nfev
         return outcome.x, float(outcome.fun)
+
+
+def log_hyperparameters(posterior: GPPosterior, features: Scaling, targets: Scaling) -> np.ndarray:
+    """Rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), of a posterior, in scaled units.
+
+    Raises:
+        ShapeError: The scalings belong to other dimensions.
+    """
+    k, d = len(targets.factor), len(features.factor)
+    if posterior.lengthscales.shape != (k, d):
+        got = tuple(posterior.lengthscales.shape[::-1])
+        raise ShapeError(
+            f"the posterior to start from must have {d} features and {k} outputs; got {got[0]} and {got[1]}"
+        )
+    length, sf2, sn2 = (
+        t.to("cpu", torch.float64)
+        for t in (posterior.lengthscales, posterior.signal_variance, posterior.noise_variance)
+    )
+    columns = [
+        (length / features.factor).log(),
+        (sf2.sqrt() / targets.factor).log()[:, None],
+        (sf2 / sn2).log()[:, None] / 2,
+    ]
+    return torch.cat(columns, dim=1).numpy()
 
 
 def spread(columns: np.ndarray) -> np.ndarray:

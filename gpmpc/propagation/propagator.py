@@ -9,8 +9,7 @@ from torch import Tensor
 
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
-from gpmpc.gp.posterior import check_query
+from gpmpc.gp.dynamics import DynamicsModel, check_query
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,91 @@
+"""What it costs to learn one more point while running, and to forget one, beside a factorisation from the start.
+
+    .venv/bin/python benchmarks/online.py [--repeats 31] [--sizes 100 200 500 1000]
+
+One process, one thread, process CPU time; six outputs, nine features. For every size N the posterior of N points is
+conditioned on one more, ten more, drops its oldest point, and is built from the hyperparameters on N + 1 points, in
+turns; ratios are paired. A step under a full budget (one in, one out) is timed under both rules. Writes
+``outputs/benchmarks/online.json``.
+"""
+
+import argparse
+import json
+import os
+import time
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[variable] = "1"
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gpmpc.gp import Budget, GPPosterior
+from gpmpc.provenance import provenance
+
+OUTPUTS, FEATURES, INPUTS = 6, 9, 3
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=31)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[100, 200, 500, 1000])
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    results = []
+    print("six outputs, one thread; medians of process time in ms; ratio: from hyperparameters over + 1 (paired)")
+    columns = ("N", "fresh N+1", "+ 1", "+ 10", "- oldest", "oldest", "least inf.", "ratio")
+    print("".join(f"{column:>12}" for column in columns))
+    for size in arguments.sizes:
+        x, y, settings = problem(size + 10)
+        gp = GPPosterior.from_hyperparameters(x[:size], y[:size], **settings)
+        one, ten = (x[size : size + 1], y[size : size + 1]), (x[size:], y[size:])
+        oldest, least = Budget(size), Budget(size, "least_informative")
+        ways: dict[str, Callable[[], GPPosterior]] = {
+            "fresh": lambda s=size, x=x, y=y, h=settings: GPPosterior.from_hyperparameters(x[: s + 1], y[: s + 1], **h),
+            "add_one": lambda gp=gp, new=one: gp.condition_on_targets(*new),
+            "add_ten": lambda gp=gp, new=ten: gp.condition_on_targets(*new),
+            "drop_oldest": lambda gp=gp: gp.drop(0),
+            "budget_oldest": lambda gp=gp, new=one, b=oldest: b.condition(gp, *new),
+            "budget_least_informative": lambda gp=gp, new=one, b=least: b.condition(gp, *new),
+        }
+        taken = {name: [] for name in ways}
+        for repeat in range(arguments.repeats + 1):
+            for name, way in ways.items():
+                start = time.process_time()
+                way()
+                if repeat:  # the first compiles
+                    taken[name].append(time.process_time() - start)
+        ratios = np.array(taken["fresh"]) / taken["add_one"]
+        medians = {name: float(np.median(seconds)) for name, seconds in taken.items()}
+        results.append({"size": size, "seconds": medians, "ratio": float(np.median(ratios)), "least": ratios.min()})
+        row = "".join(f"{1e3 * median:12.2f}" for median in medians.values())
+        print(f"{size:12}{row}{np.median(ratios):12.1f}", flush=True)
+    path = Path("outputs/benchmarks/online.json")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
+    print(f"written to {path}")
+
+
+def problem(rows: int) -> tuple[torch.Tensor, torch.Tensor, dict]:
+    """Points, targets and hyperparameters of smooth functions of nine features."""
+    generator = torch.Generator().manual_seed(0)
+    x = 4 * torch.rand(rows, FEATURES, generator=generator, dtype=torch.float64) - 2
+    y = torch.stack([torch.sin(x[:, a] + x[:, -1]) + x[:, 0] * x[:, 1] for a in range(OUTPUTS)], dim=1)
+    return (
+        x,
+        y,
+        {
+            "lengthscales": 1.5 + 2 * torch.rand(OUTPUTS, FEATURES, generator=generator, dtype=torch.float64),
+            "signal_variance": torch.ones(OUTPUTS, dtype=torch.float64),
+            "noise_variance": torch.full((OUTPUTS,), 1e-4, dtype=torch.float64),
+            "input_dim": INPUTS,
+        },
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,200 @@
+"""Problem: predict from any exact GP that was trained in GPyTorch, whatever its kernel and mean.
+
+``GPPosterior`` knows the SE-ARD kernel only. Here GPyTorch evaluates the prior (so sums, products, Matern, periodic
+kernels, any mean, and features of the inputs), and the rest is ours: one exact Cholesky factorisation of K + sn2 I, and
+
+    mean = m(x~) + k' (K + sn2 I)^-1 (y - m(X)),   variance = k(x~, x~) - |L^-1 k|^2
+
+(Rasmussen and Williams, 2006, Algorithm 2.1), because GPyTorch's own prediction turns to an iterative solver above 800
+points without a word, takes no leading batch dimensions of queries, and fails under ``torch.func``. Derivatives are
+those of plain torch autograd.
+"""
+
+import copy
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gpytorch
+import torch
+from torch import Tensor
+
+from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp.dynamics import batched_jacobian, check_query
+from gpmpc.gp.kernel import PREDICTS
+from gpmpc.gp.model import exact_inference, members
+from gpmpc.gp.posterior import Predicts
+
+
+@dataclass(frozen=True)
+class KernelPosterior:
+    """Exact GPs with any kernels of GPyTorch, frozen; build it with ``from_gpytorch``.
+
+    It works with every propagation but ``MomentMatching``, which has a closed form for the SE-ARD kernel only.
+
+    Attributes:
+        parts: One a GPyTorch model, each with one output or a batch of them.
+        input_dim: m, how many of the last features are controls.
+        predicts: What the targets mean.
+    """
+
+    parts: tuple["_Part", ...]
+    input_dim: int
+    predicts: Predicts
+
+    @classmethod
+    def from_gpytorch(
+        cls, model: Any, likelihood: Any = None, *, input_dim: int, predicts: Predicts = "next_state"
+    ) -> "KernelPosterior":
+        """Freezes trained ExactGPs: one, a batch (one batch dimension, an output each), or a list of such.
+
+        Args:
+            model: An ``ExactGP`` in float64; an ``IndependentModelList``; or a sequence of models. It is copied.
+            likelihood: Its ``GaussianLikelihood``, or a list of them; the models' own by default.
+            input_dim: m.
+            predicts: What the training targets mean.
+
+        Raises:
+            UnsupportedModel: The model is no such, or approximate.
+            ShapeError: The numbers of features differ, or do not go with the numbers of outputs and controls.
+            SettingError: The model is not in float64, or its kernel matrix is not positive definite.
+        """
+        if predicts not in PREDICTS:
+            raise SettingError("predicts", f"must be one of {', '.join(map(repr, PREDICTS))}; got {predicts!r}")
+        parts = tuple(_Part.of(one, own) for one, own in members(model, likelihood))
+        k, widths = sum(part.outputs for part in parts), sorted({part.features.shape[-1] for part in parts})
+        if len(widths) > 1:
+            raise ShapeError(f"all models must have the same number of features; got {widths}")
+        if not 0 <= input_dim < widths[0] or (predicts != "value" and widths[0] != k + input_dim):
+            raise ShapeError(
+                f"the models must have n + m features, one state an output and {input_dim} controls; "
+                f"got {widths[0]} features and {k} outputs"
+            )
+        return cls(parts, input_dim, predicts)
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states, n."""
+        return self.parts[0].features.shape[-1] - self.input_dim
+
+    @property
+    def output_dim(self) -> int:
+        """Number of outputs, k."""
+        return sum(part.outputs for part in self.parts)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of every tensor."""
+        return self.parts[0].cholesky.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Of every tensor."""
+        return self.parts[0].cholesky.device
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """Of the observations (k, k), diagonal."""
+        return torch.diag(torch.cat([part.noise for part in self.parts]))
+
+    def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "KernelPosterior":
+        """The same on another device, or in another floating-point type."""
+        return replace(self, parts=tuple(part.to(device, dtype) for part in self.parts))
+
+    def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
+        """The next state's distribution at a certain state and input.
+
+        Args:
+            state: x (*batch, n).
+            input: u (*batch, m); may be left out where m = 0.
+
+        Returns:
+            Mean (*batch, k) and diagonal covariance (*batch, k, k) of the latent function.
+
+        Raises:
+            ShapeError: State or input do not fit the model.
+        """
+        input = state[..., :0] if input is None else input
+        check_query(self, state, input)
+        return Gaussian(*self._moments(state, input))
+
+    def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
+        """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""
+        input = state[..., :0] if input is None else input
+        check_query(self, state, input)
+        batch = torch.broadcast_shapes(state.shape[:-1], input.shape[:-1])
+        arguments = (state.expand(*batch, -1), input.expand(*batch, -1))
+        (mean, covariance), (by_state, by_input) = batched_jacobian(self._moments, arguments)
+        return Gaussian(mean, covariance), by_state, by_input
+
+    def _moments(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
+        batch = torch.broadcast_shapes(state.shape[:-1], input.shape[:-1])
+        query = torch.cat([state.expand(*batch, -1), input.expand(*batch, -1)], dim=-1)
+        flat = query.reshape(-1, query.shape[-1])
+        means, variances = zip(*(part.predict(flat) for part in self.parts), strict=True)
+        mean = torch.cat(means, dim=-1).reshape(*batch, -1)
+        variance = torch.cat(variances, dim=-1).reshape(*batch, -1)
+        if self.predicts == "difference":
+            mean = mean + state
+        return mean, torch.diag_embed(variance)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One GPyTorch model with its factorisation: features (k, N, d) or (N, d), without batch for a single one."""
+
+    model: Any
+    features: Tensor
+    cholesky: Tensor
+    weights: Tensor
+    noise: Tensor  # (k,)
+
+    @classmethod
+    def of(cls, model: Any, likelihood: Any) -> "_Part":
+        targets = model.train_targets
+        if targets.dim() > 2:
+            raise ShapeError(f"a batch of models has one batch dimension; got targets {tuple(targets.shape)}")
+        if isinstance(getattr(model, "covar_module", None), gpytorch.kernels.InducingPointKernel):
+            raise UnsupportedModel("the model is sparse (InducingPointKernel): freeze it by GPPosterior.from_gpytorch")
+        copied = copy.deepcopy(model).eval().requires_grad_(False)
+        copied.prediction_strategy = None
+        batch, inputs = targets.shape[:-1], copied.train_inputs[0].detach()
+        features = (inputs[:, None] if inputs.dim() == 1 else inputs).expand(*batch, -1, -1)
+        noise = likelihood.noise.detach().reshape(-1).expand(*batch or (1,)).clone()
+        with exact_inference(), torch.no_grad():
+            prior = copied.forward(features)
+            kernel = prior.lazy_covariance_matrix.to_dense().clone()
+            kernel.diagonal(dim1=-2, dim2=-1).add_(noise.reshape(*batch, 1))
+            cholesky, info = torch.linalg.cholesky_ex(kernel)
+            if bool(info.any()):
+                raise SettingError(
+                    "model",
+                    "its kernel matrix is not positive definite in float64: raise the noise, or drop equal rows",
+                )
+            weights = torch.cholesky_solve((targets - prior.mean)[..., None], cholesky)[..., 0]
+        return cls(copied, features, cholesky, weights, noise)
+
+    @property
+    def outputs(self) -> int:
+        return len(self.noise)
+
+    def predict(self, query: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance (B, k) at (B, d)."""
+        size = self.features.shape[-2]
+        joined = torch.cat([self.features, query.expand(*self.features.shape[:-2], -1, -1)], dim=-2)
+        with exact_inference():
+            prior = self.model.forward(joined)  # lazy: only the two blocks asked for are evaluated
+            covariance = prior.lazy_covariance_matrix
+            k = covariance[..., :size, size:].to_dense()  # (*k, N, B)
+            own = covariance[..., size:, size:].diagonal(dim1=-2, dim2=-1)
+        explained = torch.linalg.solve_triangular(self.cholesky, k, upper=False).square().sum(-2)
+        mean = prior.mean[..., size:] + (self.weights[..., None] * k).sum(-2)
+        variance = (own - explained).clamp_min(0)
+        return mean.reshape(self.outputs, -1).mT, variance.reshape(self.outputs, -1).mT
+
+    def to(self, device: Any, dtype: torch.dtype | None) -> "_Part":
+        tensors = (self.features, self.cholesky, self.weights, self.noise)
+        return _Part(
+            copy.deepcopy(self.model).to(device=device, dtype=dtype),
+            *(tensor.to(device=device, dtype=dtype) for tensor in tensors),
+        )

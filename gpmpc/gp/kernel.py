@@ -1,0 +1,76 @@
+"""Problem: the SE-ARD kernel between two sets of points, its noisy matrix factorised, and what may go into it."""
+
+from torch import Tensor, float64, isfinite, linalg, nonzero, zeros
+
+from gpmpc.exceptions import DataError, SettingError, ShapeError
+
+PREDICTS = ("next_state", "difference", "value")
+
+
+def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_variance: Tensor) -> Tensor:
+    """k_a(x~_i, x~_j) (k, N, M) of points (N, d) and others (M, d).
+
+    Summed over differences a column at a time: exact for near points, where |x|^2 + |x'|^2 - 2 x'x cancels.
+    """
+    shape = (len(lengthscales), len(points), len(others))
+    total = zeros(shape, dtype=points.dtype, device=points.device)
+    for ours, theirs, scale in zip(points.T, others.T, lengthscales.T, strict=True):
+        total.addcmul_((ours[:, None] - theirs).square(), scale[:, None, None] ** -2)
+    return signal_variance[:, None, None] * (total / -2).exp()
+
+
+def factorised(inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor) -> Tensor:
+    """The lower Cholesky factors of K + sn2 I (k, N, N).
+
+    Raises:
+        SettingError: The matrix of an output is not positive definite in double precision.
+    """
+    kernel = kernel_matrix(inputs, inputs, lengthscales, signal_variance)
+    kernel.diagonal(dim1=-2, dim2=-1).add_(noise_variance[:, None])
+    cholesky, info = linalg.cholesky_ex(kernel)
+    if bool(info.any()):
+        output = int(nonzero(info)[0])
+        raise SettingError(
+            "noise_variance",
+            f"the kernel matrix of output {output} is not positive definite in float64; "
+            f"signal-to-noise ratio {float((signal_variance / noise_variance)[output]):.1e}: raise the noise",
+        )
+    return cholesky
+
+
+def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> None:
+    """Raises unless the arguments of ``GPPosterior.from_hyperparameters`` belong together; its docstring has the rules.
+
+    Raises:
+        ShapeError: The shapes do not belong together, or there is no row.
+        SettingError: A hyperparameter is not positive, or a dtype, a device or ``predicts`` is another one.
+        DataError: An entry is not finite.
+    """
+    inputs, targets = given["inputs"], given["targets"]
+    if inputs.dim() != 2 or targets.dim() != 2 or not len(inputs):
+        raise ShapeError(
+            "inputs (N, d) and targets (N, k) need two dimensions and a row; "
+            f"got {tuple(inputs.shape)} and {tuple(targets.shape)}"
+        )
+    (size, d), k = inputs.shape, targets.shape[1]
+    shapes = {"inputs": (size, d), "targets": (size, k), "lengthscales": (k, d)}
+    for name, value in given.items():
+        shape = shapes.get(name, (k,))
+        if tuple(value.shape) != shape:
+            raise ShapeError(f"{name} must have shape {shape}; got {tuple(value.shape)}")
+        if value.dtype != float64:
+            raise SettingError(name, f"must be float64 (convert after: posterior.to(dtype=...)); got {value.dtype}")
+        if value.device != inputs.device:
+            raise SettingError(name, f"must be on the device of inputs, {inputs.device}; got {value.device}")
+        if not bool(isfinite(value).all()):
+            raise DataError(f"{name} must be finite; got {value[~isfinite(value)][0]}")
+    if predicts not in PREDICTS:
+        raise SettingError("predicts", f"must be one of {', '.join(map(repr, PREDICTS))}; got {predicts!r}")
+    if not 0 <= input_dim < d or (predicts != "value" and d != k + input_dim):
+        raise ShapeError(
+            f"inputs must have n + m columns, one state an output and {input_dim} controls; "
+            f"got {d} columns and {k} outputs"
+        )
+    for name in ("lengthscales", "signal_variance", "noise_variance"):
+        if not bool((given[name] > 0).all()):
+            raise SettingError(name, f"must be positive; got {given[name].tolist()}")

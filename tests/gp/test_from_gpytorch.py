@@ -1,0 +1,373 @@
+"""Freezing trained GPyTorch models: SE-ARD ones, sparse ones, and those of any kernel."""
+
+import math
+
+import gpytorch
+import pytest
+import torch
+from gpytorch.kernels import (
+    InducingPointKernel,
+    LinearKernel,
+    MaternKernel,
+    PeriodicKernel,
+    ProductKernel,
+    RBFKernel,
+    ScaleKernel,
+)
+from gpytorch.likelihoods import FixedNoiseGaussianLikelihood, GaussianLikelihood
+from gpytorch.means import ConstantMean, LinearMean, ZeroMean
+
+from gpmpc.exceptions import SettingError, ShapeError, TrainingError, UnsupportedModel
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import GPPosterior, KernelPosterior, fit
+from gpmpc.gp.model import exact_inference
+from gpmpc.gp.sparse import collapsed_bound
+from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, differentiate
+
+
+class Model(gpytorch.models.ExactGP):
+    def __init__(self, x, y, kernel, mean=None, likelihood=None, batch=()):
+        likelihood = likelihood or GaussianLikelihood(batch_shape=torch.Size(batch))
+        super().__init__(x, y, likelihood)
+        self.mean_module, self.covar_module = mean or ZeroMean(batch_shape=torch.Size(batch)), kernel
+
+    def forward(self, x):
+        return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
+
+
+def data(size, outputs=2, d=3, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    x = 3 * torch.rand(size, d, generator=generator) - 1.5
+    y = torch.stack([torch.sin((a + 1) * x[:, 0]) + x[:, 1] * x[:, -1] + a for a in range(outputs)])
+    return x, y + 0.05 * torch.randn(outputs, size, generator=generator)
+
+
+def shaken(model, seed=0):
+    """Trained, as far as these tests care: parameters away from their defaults."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            if parameter.dim() < 2 or "inducing" not in str(parameter.shape):
+                parameter.add_(0.4 * torch.randn(parameter.shape, generator=generator))
+    return model.double().eval()
+
+
+def one_output(size, kernel, y=0, mean=None, **settings):
+    x, targets = data(size)
+    return shaken(Model(x, targets[y], kernel, mean, **settings), seed=y)
+
+
+def batch(size, kernel=None, outputs=2, mean=None):
+    x, y = data(size, outputs)
+    shape = torch.Size([outputs])
+    kernel = kernel or ScaleKernel(RBFKernel(ard_num_dims=3, batch_shape=shape), batch_shape=shape)
+    return shaken(Model(x.expand(outputs, -1, -1), y, kernel, mean, batch=shape))
+
+
+def theirs(model, query):
+    """GPyTorch's own exact mean and variance (B, k)."""
+    models = model if isinstance(model, list) else getattr(model, "models", [model])
+    with exact_inference(), torch.no_grad():
+        beliefs = [m.eval()(query.expand(*m.train_targets.shape[:-1], *query.shape)) for m in models]
+    flat = [(b.mean.reshape(-1, len(query)), b.variance.reshape(-1, len(query))) for b in beliefs]
+    return tuple(torch.cat(parts).mT for parts in zip(*flat, strict=True))
+
+
+def their_jacobian(model, query):
+    models = model if isinstance(model, list) else getattr(model, "models", [model])
+    rows = []
+    for m in models:
+        with exact_inference():
+            leaf = query.clone().requires_grad_()
+            mean = m.eval()(leaf.expand(*m.train_targets.shape[:-1], *query.shape)).mean.reshape(-1, len(query))
+            rows += [torch.autograd.grad(each.sum(), leaf, retain_graph=True)[0] for each in mean]
+    return torch.stack(rows, dim=1)
+
+
+SE_ARD = {
+    "single": lambda size: one_output(size, ScaleKernel(RBFKernel(ard_num_dims=3))),
+    "shared length-scale": lambda size: one_output(size, ScaleKernel(RBFKernel())),
+    "no scale": lambda size: one_output(size, RBFKernel(ard_num_dims=3)),
+    "constant mean": lambda size: one_output(size, ScaleKernel(RBFKernel()), mean=ConstantMean()),
+    "batch": batch,
+    "batch with constant means": lambda size: batch(size, mean=ConstantMean(batch_shape=torch.Size([2]))),
+    "list": lambda size: [one_output(size, ScaleKernel(RBFKernel(ard_num_dims=3)), y) for y in (0, 1)],
+    "IndependentModelList": lambda size: gpytorch.models.IndependentModelList(
+        one_output(size, ScaleKernel(RBFKernel(ard_num_dims=3)), 0), one_output(size, RBFKernel(), 1)
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", SE_ARD)
+@pytest.mark.parametrize("size", [10, 189])
+@pytest.mark.parametrize("frozen", [GPPosterior, KernelPosterior])
+def test_a_frozen_model_predicts_what_gpytorch_does(kind, size, frozen):
+    assert_equal(SE_ARD[kind](size), frozen)
+
+
+@pytest.mark.parametrize("frozen", [GPPosterior, KernelPosterior])
+@pytest.mark.parametrize("size", [900, 2000])
+def test_a_frozen_model_is_exact_where_gpytorch_by_itself_is_not(size, frozen):
+    assert_equal(SE_ARD["single"](size), frozen)
+
+
+def assert_equal(model, frozen):
+    gp = frozen.from_gpytorch(model, input_dim=1, predicts="value")
+    query = data(7, seed=5)[0]
+    belief, by_state, by_input = gp.predict_with_jacobian(query[:, :2], query[:, 2:])
+    mean, variance = theirs(model, query)
+    assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-10)
+    assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-10)
+    jacobian = torch.cat([by_state, by_input], dim=-1)
+    assert torch.allclose(jacobian, their_jacobian(model, query), rtol=0, atol=1e-9)
+
+
+ANY_KERNEL = {
+    "Matern 3/2": lambda: MaternKernel(nu=1.5, ard_num_dims=3),
+    "Matern 5/2": lambda: ScaleKernel(MaternKernel(nu=2.5)),
+    "sum": lambda: ScaleKernel(RBFKernel(ard_num_dims=3)) + LinearKernel(),
+    "product": lambda: ScaleKernel(ProductKernel(RBFKernel(), MaternKernel(nu=2.5))),
+    "periodic on one": lambda: ScaleKernel(PeriodicKernel(active_dims=[0])) + MaternKernel(nu=2.5),
+}
+
+
+@pytest.mark.parametrize("size", [30, 900])
+@pytest.mark.parametrize("kind", ANY_KERNEL)
+def test_any_kernel_predicts_what_gpytorch_does(kind, size):
+    model = one_output(size, ANY_KERNEL[kind](), mean=LinearMean(3))
+    gp = KernelPosterior.from_gpytorch(model, input_dim=1, predicts="value")
+    query = data(6, seed=5)[0]
+    belief, by_state, by_input = gp.predict_with_jacobian(query[:, :2], query[:, 2:])
+    mean, variance = theirs(model, query)
+    assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-10)
+    assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-10)
+    step = 1e-5
+    for d in range(3):
+        shift = step * torch.eye(3)[d]
+        ahead, behind = query + shift, query - shift
+        slope = gp.predict(ahead[:, :2], ahead[:, 2:]).mean - gp.predict(behind[:, :2], behind[:, 2:]).mean
+        jacobian = torch.cat([by_state, by_input], dim=-1)[..., d]
+        assert torch.allclose(jacobian, slope / (2 * step), rtol=1e-6, atol=1e-6)
+
+
+def matern_dynamics(predicts="next_state", size=40):
+    kernel = ScaleKernel(MaternKernel(nu=2.5, ard_num_dims=3, batch_shape=torch.Size([2])), batch_shape=torch.Size([2]))
+    return KernelPosterior.from_gpytorch(batch(size, kernel), input_dim=1, predicts=predicts)
+
+
+def test_leading_batch_dimensions_are_those_of_the_query():
+    gp, x, u = matern_dynamics(), torch.rand(2, 3, 2), torch.rand(2, 3, 1)
+    whole = gp.predict(x, u)
+    assert whole.covariance.shape == (2, 3, 2, 2)
+    single = gp.predict(x[1, 2], u[1, 2])
+    assert torch.allclose(whole.mean[1, 2], single.mean, atol=1e-13)
+    assert torch.allclose(whole.covariance[1, 2], single.covariance, atol=1e-13)
+    _, by_state, by_input = gp.predict_with_jacobian(x, u)
+    assert (by_state.shape, by_input.shape) == ((2, 3, 2, 2), (2, 3, 2, 1))
+
+
+def test_a_difference_model_adds_the_state():
+    x, u = torch.rand(4, 2), torch.rand(4, 1)
+    plain, difference = matern_dynamics(), matern_dynamics("difference")
+    assert torch.allclose(difference.predict(x, u).mean, plain.predict(x, u).mean + x)
+    jacobians = [gp.predict_with_jacobian(x, u)[1] for gp in (plain, difference)]
+    assert torch.allclose(jacobians[1] - jacobians[0], torch.eye(2).expand(4, 2, 2))
+
+
+@pytest.mark.parametrize(
+    "propagator", [MeanEquivalence(), Linearization(), Linearization(hessian=True), Unscented(), MonteCarlo(500)]
+)
+def test_every_sampling_and_expanding_propagation_takes_any_kernel(propagator):
+    gp, at, control = matern_dynamics(), Gaussian(torch.tensor([0.2, -0.4]), 0.01 * torch.eye(2)), torch.rand(1)
+    sampled = MonteCarlo(20_000, seed=3)(gp, at, control)
+    belief = propagator(gp, at, control)
+    assert torch.allclose(belief.mean, sampled.mean, atol=0.05)
+    if not isinstance(propagator, MeanEquivalence):
+        assert torch.allclose(belief.covariance, sampled.covariance, atol=0.01)
+    moved, sensitivity = differentiate(propagator, gp, at, control)
+    step = 1e-5
+    shifted = [propagator(gp, Gaussian(at.mean, at.covariance), control + s * step).mean for s in (1, -1)]
+    assert torch.allclose(moved.belief.mean, belief.mean)
+    assert torch.allclose(sensitivity.mean_by_input[:, 0], (shifted[0] - shifted[1]) / (2 * step), atol=1e-5)
+
+
+def test_moment_matching_says_what_is_possible_with_other_kernels():
+    with pytest.raises(UnsupportedModel, match="got KernelPosterior. Possible with any model: MeanEquivalence, Linear"):
+        MomentMatching()(matern_dynamics(), Gaussian(torch.zeros(2), torch.eye(2)), torch.zeros(1))
+
+
+def test_a_frozen_model_knows_its_sizes_noise_and_type_and_can_be_moved():
+    gp = matern_dynamics()
+    assert (gp.state_dim, gp.input_dim, gp.output_dim, gp.dtype, gp.device.type) == (2, 1, 2, torch.float64, "cpu")
+    assert gp.noise_covariance.shape == (2, 2)
+    single = gp.to(dtype=torch.float32)
+    x, u = torch.rand(5, 2), torch.rand(5, 1)
+    assert single.dtype == torch.float32
+    assert torch.allclose(single.predict(x.float(), u.float()).mean.double(), gp.predict(x, u).mean, atol=1e-3)
+    assert gp.dtype == torch.float64
+    with pytest.raises(ShapeError, match="2 states and 1 inputs; got 2 and 2"):
+        gp.predict(x, torch.zeros(5, 2))
+
+
+def test_what_happens_to_the_model_afterwards_does_not_reach_the_frozen_one():
+    model, query = one_output(20, ScaleKernel(MaternKernel())), torch.rand(4, 3)
+    gp = KernelPosterior.from_gpytorch(model, input_dim=0, predicts="value")
+    before = gp.predict(query).mean
+    shaken(model, seed=7)
+    assert torch.equal(gp.predict(query).mean, before)
+
+
+def with_transform():
+    model = one_output(10, ScaleKernel(RBFKernel()))
+    model.outcome_transform = torch.nn.Identity()
+    return model
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (
+            lambda: one_output(10, ScaleKernel(MaternKernel())),
+            UnsupportedModel,
+            "got MaternKernel. KernelPosterior.from_gpytorch takes any kernel",
+        ),
+        (lambda: one_output(10, RBFKernel(active_dims=[0])), UnsupportedModel, "got RBFKernel on some dimensions"),
+        (lambda: one_output(10, RBFKernel(), mean=LinearMean(3)), UnsupportedModel, "zero or constant; got LinearMean"),
+        (
+            lambda: one_output(10, RBFKernel(), likelihood=FixedNoiseGaussianLikelihood(torch.full((10,), 0.1))),
+            UnsupportedModel,
+            "must be a GaussianLikelihood; got FixedNoiseGaussianLikelihood",
+        ),
+        (with_transform, UnsupportedModel, "carries an outcome_transform"),
+        (lambda: Model(*(t.float() for t in data(9, 1)), RBFKernel()), SettingError, "must be in float64"),
+        (
+            lambda: [one_output(10, RBFKernel()), one_output(11, RBFKernel())],
+            ShapeError,
+            "all outputs must have the same training inputs",
+        ),
+        (lambda: torch.nn.Linear(1, 1), UnsupportedModel, "only ExactGP models .* got Linear"),
+    ],
+)
+def test_models_that_cannot_be_frozen_are_refused_with_the_reason(make, error, message):
+    with pytest.raises(error, match=message):
+        GPPosterior.from_gpytorch(make(), input_dim=0, predicts="value")
+
+
+def test_numbers_that_do_not_go_together_are_refused():
+    with pytest.raises(ShapeError, match="1 controls; got 3 features and 1 outputs"):
+        KernelPosterior.from_gpytorch(one_output(10, MaternKernel()), input_dim=1)
+    with pytest.raises(ShapeError, match="each model needs one likelihood; got 1 models and 2"):
+        KernelPosterior.from_gpytorch(one_output(10, RBFKernel()), [GaussianLikelihood()] * 2, input_dim=1)
+    with pytest.raises(SettingError, match="'next_state', 'difference', 'value'; got 'delta'"):
+        KernelPosterior.from_gpytorch(one_output(10, RBFKernel()), input_dim=1, predicts="delta")
+
+
+# --- sparse ---------------------------------------------------------------------------------------------------------
+
+
+def sgpr(size=120, points=12, outputs=2):
+    x, y = data(size, outputs)
+    likelihood = GaussianLikelihood(batch_shape=torch.Size([outputs]))
+    shape = torch.Size([outputs])
+    kernel = ScaleKernel(RBFKernel(ard_num_dims=3, batch_shape=shape), batch_shape=shape)
+    inducing = InducingPointKernel(kernel, x[:points].clone(), likelihood)
+    return Model(x.expand(outputs, -1, -1), y, inducing, likelihood=likelihood, batch=shape).double().eval()
+
+
+@pytest.mark.parametrize(("corrected", "method"), [(False, "sgpr"), (True, "fitc")])
+def test_a_frozen_sparse_model_predicts_what_gpytorch_does(corrected, method):
+    model, query = sgpr(), data(7, seed=5)[0]
+    with gpytorch.settings.sgpr_diagonal_correction(corrected):
+        mean, variance = theirs(model, query)
+        gp = GPPosterior.from_gpytorch(model, input_dim=1, predicts="value")
+    belief = gp.predict(query[:, :2], query[:, 2:])
+    if method == "sgpr":  # GPyTorch leaves out what the inducing points do not explain: kxx - qxx
+        kernel, Z = model.covar_module.base_kernel, model.covar_module.inducing_points.detach()
+        with torch.no_grad():
+            across = kernel(Z, query).to_dense()
+            variance = variance + gp.signal_variance
+            variance -= (across * torch.linalg.solve(kernel(Z).to_dense(), across)).sum(-2).mT
+    assert len(gp) == 12
+    assert not gp.exact
+    assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-8)
+    assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-8)
+
+
+def test_the_bound_is_gpytorchs():
+    model = sgpr()
+    kernel, (x, *_), y = model.covar_module.base_kernel, model.train_inputs, model.train_targets
+    ours = collapsed_bound(
+        model.covar_module.inducing_points.detach(),
+        x[0],
+        y.mT,
+        kernel.base_kernel.lengthscale.detach()[:, 0],
+        kernel.outputscale.detach(),
+        model.likelihood.noise.detach()[:, 0],
+        jitter=0.0,
+    )
+    likelihood = gpytorch.mlls.ExactMarginalLogLikelihood(model.likelihood.train(), model.train())
+    with exact_inference(), torch.no_grad():
+        bound = likelihood(model(*model.train_inputs), y) * y.shape[-1]
+    assert torch.allclose(ours, bound, rtol=1e-8)
+
+
+def test_sparse_models_over_other_points_are_refused():
+    x, y = data(20)
+    models = []
+    for a in range(2):
+        likelihood = GaussianLikelihood()
+        kernel = InducingPointKernel(RBFKernel(), x[a : a + 5].clone(), likelihood)
+        models.append(Model(x, y[a], kernel, likelihood=likelihood).double().eval())
+    with pytest.raises(ShapeError, match="the same inducing points"):
+        GPPosterior.from_gpytorch(models, input_dim=1)
+    with pytest.raises(UnsupportedModel, match="freeze it by GPPosterior.from_gpytorch"):
+        KernelPosterior.from_gpytorch(models[0], input_dim=1, predicts="value")
+
+
+# --- training -------------------------------------------------------------------------------------------------------
+
+
+def log_density(model):
+    with exact_inference(), torch.no_grad():
+        prior = model.likelihood(model.forward(*model.train_inputs))
+        return float(
+            torch.distributions.MultivariateNormal(prior.mean, prior.covariance_matrix)
+            .log_prob(model.train_targets)
+            .sum()
+        )
+
+
+def test_training_climbs_to_where_the_gradient_vanishes_and_more_starts_never_end_lower():
+    x, y = data(50, 1)
+    single = Model(x, y[0], ScaleKernel(MaternKernel(nu=2.5, ard_num_dims=3)), ConstantMean()).double()
+    before = log_density(single)
+    found = fit(single)
+    assert not single.training
+    assert -found.objective[0] > before + 10
+    assert -found.objective[0] == pytest.approx(log_density(single))
+    again = Model(x, y[0], ScaleKernel(MaternKernel(nu=2.5, ard_num_dims=3)), ConstantMean()).double()
+    several = fit(again, restarts=2)
+    assert several.explored.shape == (1, 3)
+    assert several.objective[0] <= found.objective[0] + 1e-6
+
+
+def test_a_list_is_trained_member_by_member_and_predicts():
+    x, y = data(60)
+    models = [Model(x, each, ScaleKernel(MaternKernel(nu=1.5))).double() for each in y]
+    assert fit(models).objective.shape == (2,)
+    gp, query = KernelPosterior.from_gpytorch(models, input_dim=1), data(50, seed=3)
+    error = gp.predict(query[0][:, :2], query[0][:, 2:]).mean.mT - query[1]
+    assert float(error.square().mean().sqrt()) < 0.3
+
+
+def test_training_that_fails_from_every_start_names_the_outputs_and_restores_the_parameters():
+    x, y = data(10, 2)
+    models = [Model(x, each, ScaleKernel(RBFKernel())).double() for each in y]
+    models[1].set_train_data(targets=torch.full((10,), math.inf), strict=False)
+    before = [p.clone() for p in models[1].parameters()]
+    with pytest.raises(TrainingError, match="no start of 2 .* for output 1:") as caught:
+        fit(models, restarts=1)
+    assert caught.value.outputs == [1]
+    assert all(torch.equal(p, q) for p, q in zip(models[1].parameters(), before, strict=True))
+    with pytest.raises(SettingError, match="restarts: must be a whole number, 0 or more; got -1"):
+        fit(models[0], restarts=-1)
