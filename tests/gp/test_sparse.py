@@ -114,10 +114,10 @@ def test_a_frozen_sparse_model_is_conditioned_and_moment_matched_like_any_other(
     assert torch.allclose(back.predict(query, query[:, :1]).mean, gp.predict(query, query[:, :1]).mean, atol=1e-8)
     assert len(Budget(40, "least_informative")(gp, new)) == 40
     at, control = Gaussian(torch.tensor([0.3, -0.2]), 0.05 * torch.eye(2)), torch.zeros(1)
-    matched, sampled = MomentMatching()(gp, at, control), MonteCarlo(100_000)(gp, at, control)
-    error = (sampled.covariance.diagonal() / 100_000).sqrt()
+    matched, sampled = MomentMatching()(gp, at, control), MonteCarlo(20_000)(gp, at, control)
+    error = (sampled.covariance.diagonal() / 20_000).sqrt()
     assert ((matched.mean - sampled.mean).abs() < 5 * error).all()
-    assert torch.allclose(matched.covariance, sampled.covariance, atol=0.02)
+    assert torch.allclose(matched.covariance, sampled.covariance, atol=0.03)
     with pytest.raises(UnsupportedModel, match="train again with SparseTrainer"):
         Trainer().refit(gp)
 
