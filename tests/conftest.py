@@ -1,6 +1,10 @@
-"""Every test runs in float64 from a fixed seed, on one torch thread; warnings are errors (see pyproject.toml)."""
+"""Every test runs in float64 from a fixed seed, on one thread; warnings are errors (see pyproject.toml)."""
 
 import os
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # read when the libraries load
+    os.environ.setdefault(variable, "1")
+
 from pathlib import Path
 
 import numpy as np

@@ -308,10 +308,7 @@ class GPPosterior:
         return extended(self, features, targets)
 
     def drop(self, indices: Sequence[int] | Tensor) -> "GPPosterior":
-        """The posterior that has not seen some of its points, by a downdate of the Cholesky factor: O(N^2) a point.
-
-        Args:
-            indices: Rows of ``features``; negative ones count from the end.
+        """The posterior that has not seen some of its points (rows of ``features``), in O(N^2) a point.
 
         Raises:
             SettingError: An index is out of range or stands there twice.

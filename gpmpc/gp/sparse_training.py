@@ -53,7 +53,7 @@ class SparseTraining:
 class SparseTrainer:
     """Fits one sparse SE-ARD GP per output, over inducing points that all share.
 
-    Six outputs of nine features, 5000 transitions and 100 inducing points take about half a second an iteration on one
+    Six outputs of nine features, 5000 transitions and 100 inducing points take 0.3 s an iteration on one
     core; the log tells how it goes.
 
     Attributes:

@@ -2,8 +2,8 @@ import gpytorch
 import pytest
 import torch
 
-from gpmpc.exceptions import SettingError, ShapeError
-from gpmpc.gp import GPPosterior
+from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.gp import GPPosterior, Scaling
 from gpmpc.gp.model import BatchExactGP, exact_inference
 
 
@@ -98,3 +98,87 @@ def test_misuse_is_refused_with_the_rule(change, error, message):
     }
     with pytest.raises(error, match=message):
         GPPosterior.from_hyperparameters(**(good | change))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"inputs": torch.zeros(0, 3), "targets": torch.zeros(0, 2)}, ShapeError, r"a row; got \(0, 3\) and \(0, 2\)"),
+        ({"inputs": torch.full((10, 3), torch.nan)}, DataError, "inputs must be finite; got nan"),
+        ({"targets": torch.rand(10, 2).float()}, SettingError, "targets: must be float64"),
+        ({"offset": torch.zeros(3)}, ShapeError, r"offset must have shape \(2,\); got \(3,\)"),
+        ({"input_dim": 3, "predicts": "value"}, ShapeError, "3 controls; got 3 columns and 2 outputs"),
+    ],
+)
+def test_data_that_cannot_be_learned_from_are_refused_with_the_rule(change, error, message):
+    test_misuse_is_refused_with_the_rule(change, error, message)
+
+
+@pytest.mark.parametrize("predicts", ["next_state", "difference"])
+def test_jacobian_and_hessian_of_the_mean_are_those_of_autograd(predicts):
+    gp, state, control = posterior(predicts=predicts), torch.rand(2), torch.rand(1)
+    belief, by_state, by_input = gp.predict_with_jacobian(state, control)
+    reference = torch.func.jacrev(lambda x, u: gp.predict(x, u).mean, argnums=(0, 1))(state, control)
+    hessian = torch.func.jacfwd(torch.func.jacrev(lambda x: gp.predict(x, control).mean))(state)
+    assert torch.equal(belief.mean, gp.predict(state, control).mean)
+    assert torch.allclose(by_state, reference[0], atol=1e-12)
+    assert torch.allclose(by_input, reference[1], atol=1e-12)
+    assert torch.allclose(gp.mean_hessian(state, control), hessian, atol=1e-11)
+    batch = gp.mean_hessian(state.expand(3, 4, 2), control.expand(3, 4, 1))
+    assert torch.allclose(batch[2, 1], hessian, atol=1e-11)
+
+
+def test_a_posterior_of_scaled_data_speaks_physical_units_after_unscaling():
+    gp = posterior()
+    features = Scaling(torch.tensor([1.0, -3.0, 10.0]), torch.tensor([2.0, 0.1, 50.0]))
+    targets = Scaling(torch.tensor([5.0, -7.0]), torch.tensor([100.0, 0.01]))
+    physical, scaled = gp.unscaled(features, targets), torch.rand(6, 3)
+    query = features.restore(scaled)
+    ours, theirs = physical.predict(query[:, :2], query[:, 2:]), gp.predict(scaled[:, :2], scaled[:, 2:])
+    assert torch.allclose(ours.mean, targets.restore(theirs.mean), rtol=1e-12)
+    assert torch.allclose(ours.variance, theirs.variance * targets.factor**2, rtol=1e-10)
+    names = ("lengthscales", "signal_variance", "noise_variance")
+    hyperparameters = {name: getattr(physical, name) for name in names}
+    fresh = GPPosterior.from_hyperparameters(
+        physical.features, physical.targets, **hyperparameters, input_dim=1, offset=physical.offset
+    )
+    assert torch.allclose(physical.cholesky, fresh.cholesky, rtol=1e-9, atol=1e-9)
+    assert torch.allclose(physical.weights, fresh.weights, rtol=1e-8, atol=1e-10)
+    assert physical.exact
+
+
+def test_a_value_model_may_have_any_number_of_outputs():
+    inputs, targets = torch.rand(12, 4), torch.rand(12, 1)
+    settings = (torch.ones(1, 4), torch.ones(1), torch.full((1,), 1e-4))
+    gp = GPPosterior.from_hyperparameters(inputs, targets, *settings, input_dim=1, predicts="value")
+    belief, by_state, by_input = gp.predict_with_jacobian(inputs[:, :3], inputs[:, 3:])
+    assert (gp.state_dim, gp.output_dim, by_state.shape, by_input.shape) == (3, 1, (12, 1, 3), (12, 1, 1))
+    assert torch.allclose(belief.mean, targets, atol=0.05)
+
+
+def test_samples_have_the_predicted_moments_and_follow_their_generator():
+    gp, state, control = posterior(size=5), torch.rand(3, 2), torch.rand(3, 1)
+    draw = gp.sample(state, control, 40_000, torch.Generator().manual_seed(1))
+    noisy = gp.sample(state, control, 40_000, torch.Generator().manual_seed(1), observation_noise=True)
+    belief = gp.predict(state, control)
+    assert draw.shape == (40_000, 3, 2)
+    assert torch.equal(draw, gp.sample(state, control, 40_000, torch.Generator().manual_seed(1)))
+    assert torch.allclose(draw.mean(0), belief.mean, atol=5 * float(belief.variance.max() / 40_000) ** 0.5)
+    assert torch.allclose(draw.var(0), belief.variance, rtol=0.05)
+    assert torch.allclose(noisy.var(0), belief.variance + gp.noise_variance, rtol=0.05)
+
+
+def test_a_posterior_in_single_precision_predicts_nearly_the_same():
+    gp, state, control = posterior(), torch.rand(4, 2), torch.rand(4, 1)
+    single = gp.to(dtype=torch.float32)
+    assert (single.dtype, single.precision.dtype, gp.dtype) == (torch.float32, torch.float32, torch.float64)
+    assert torch.allclose(
+        single.predict(state.float(), control.float()).mean.double(), gp.predict(state, control).mean, atol=1e-3
+    )
+    with pytest.raises(SettingError, match="state: must be torch.float32 on cpu like the model; got torch.float64"):
+        single.predict(state, control)
+
+
+def test_a_query_of_other_dimensions_is_refused():
+    with pytest.raises(ShapeError, match="2 states and 1 inputs; got 2 and 0"):
+        posterior().predict(torch.zeros(2))

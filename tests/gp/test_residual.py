@@ -1,0 +1,153 @@
+"""A known model with a GP on what it misses, against sampling, finite differences, and a known residual."""
+
+import pytest
+import torch
+
+from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import Affine, Budget, GPPosterior, ResidualModel, SparseTrainer, Trainer, Transitions
+from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented
+
+A = torch.tensor([[1.0, 0.1, 0.0], [0.0, 0.9, 0.1], [0.2, 0.0, 0.8]])
+G = torch.tensor([[0.0, 0.1], [0.1, 0.0], [0.5, 0.2]])
+B = torch.tensor([[0.0, 0.3], [1.0, 0.0], [0.5, 1.0]])
+AFFINE = Affine(A, G, torch.tensor([0.1, 0.0, -0.2]))
+
+
+def nonlinear(x, u):
+    return AFFINE(x, u) + 0.3 * torch.sin(2 * x.roll(1, dims=-1))
+
+
+def gp(size=30, seed=0):
+    """Of two outputs over the states 2, 0 and the input 1."""
+    generator = torch.Generator().manual_seed(seed)
+    x = 3 * torch.rand(size, 3, generator=generator) - 1.5
+    return GPPosterior.from_hyperparameters(
+        x,
+        torch.stack([torch.sin(2 * x[:, 0]), x[:, 1] * x[:, 2]], dim=1),
+        lengthscales=torch.tensor([[0.8, 1.2, 1.5], [1.1, 0.9, 2.0]]),
+        signal_variance=torch.tensor([1.0, 0.7]),
+        noise_variance=torch.tensor([1e-3, 2e-3]),
+        input_dim=1,
+        predicts="value",
+    )
+
+
+def model(nominal=AFFINE):
+    return ResidualModel(nominal, gp(), B, states=[2, 0], inputs=[1], input_dim=2)
+
+
+def belief(spread=0.3):
+    root = spread * torch.tensor([[1.0, 0.2, 0.0], [0.0, 0.8, -0.3], [0.4, 0.0, 0.5]])
+    return Gaussian(torch.tensor([0.2, -0.4, 0.5]), root @ root.T)
+
+
+@pytest.mark.parametrize("nominal", [AFFINE, nonlinear])
+def test_the_prediction_is_the_nominal_one_and_the_residual_where_it_acts(nominal):
+    x, u = torch.rand(4, 3), torch.rand(4, 2)
+    found, d = model(nominal).predict(x, u), gp().predict(x[:, [2, 0]], u[:, [1]])
+    assert torch.allclose(found.mean, nominal(x, u) + d.mean @ B.T)
+    assert torch.allclose(found.covariance, B @ d.covariance @ B.T)
+    assert torch.allclose(model().noise_covariance, B @ torch.diag(torch.tensor([1e-3, 2e-3])) @ B.T)
+
+
+@pytest.mark.parametrize("nominal", [AFFINE, nonlinear])
+def test_the_jacobian_is_that_of_finite_differences(nominal):
+    known, x, u, step = model(nominal), torch.rand(2, 4, 3), torch.rand(2, 4, 2), 1e-6
+    _, by_state, by_input = known.predict_with_jacobian(x, u)
+    for d in range(3):
+        shift = step * torch.eye(3)[d]
+        slope = (known.predict(x + shift, u).mean - known.predict(x - shift, u).mean) / (2 * step)
+        assert torch.allclose(by_state[..., d], slope, atol=1e-8)
+    for d in range(2):
+        shift = step * torch.eye(2)[d]
+        slope = (known.predict(x, u + shift).mean - known.predict(x, u - shift).mean) / (2 * step)
+        assert torch.allclose(by_input[..., d], slope, atol=1e-8)
+
+
+def test_moment_matching_with_an_affine_nominal_model_is_what_sampling_finds():
+    known, at, control = model(), belief(), torch.tensor([0.3, -0.5])
+    exact = MomentMatching().propagate(known, at, control)
+    found = [MonteCarlo(20_000, seed=seed).propagate(known, at, control) for seed in range(20)]
+    for exactly, drawn in (
+        (exact.belief.mean, torch.stack([f.belief.mean for f in found])),
+        (exact.belief.covariance, torch.stack([f.belief.covariance for f in found])),
+        (exact.cross_covariance, torch.stack([f.cross_covariance for f in found])),
+    ):
+        z = (drawn.mean(0) - exactly) / (drawn.std(0) / 20**0.5 + 1e-15)
+        assert float(z.abs().max()) < 4.5  # of Student's t with 19 degrees of freedom: 1 in 4000 each
+
+
+def test_a_nonlinear_nominal_model_goes_with_every_other_propagation():
+    known, at, control = model(nonlinear), belief(0.05), torch.tensor([0.3, -0.5])
+    with pytest.raises(UnsupportedModel, match="Possible with any model: MeanEquivalence, Linearization, Unscented"):
+        MomentMatching()(known, at, control)
+    sampled = MonteCarlo(50_000)(known, at, control)
+    for propagator in (Linearization(), Linearization(hessian=True), Unscented()):
+        found = propagator(known, at, control)
+        assert torch.allclose(found.mean, sampled.mean, atol=5e-3)
+        assert torch.allclose(found.covariance, sampled.covariance, atol=1e-3)
+    assert torch.allclose(MeanEquivalence()(known, at, control).mean, known.predict(at.mean, control).mean)
+
+
+def transitions(rows, noise=1e-3, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    x, u = 3 * torch.rand(rows, 3, generator=generator) - 1.5, torch.rand(rows, 2, generator=generator)
+    moved = AFFINE(x, u) + torch.sin(2 * x[:, :1]) * torch.tensor([0.0, 0.5, 1.0])
+    return Transitions(x, u, moved + noise * torch.randn(rows, 3, generator=generator))
+
+
+ACTS = torch.tensor([[0.0], [0.5], [1.0]])
+
+
+@pytest.mark.parametrize("trainer", [Trainer(restarts=0), SparseTrainer(inducing=15, restarts=0, iterations=5)])
+def test_training_finds_a_known_residual(trainer):
+    known = ResidualModel.train(AFFINE, transitions(40), ACTS, states=[0], inputs=[], trainer=trainer)
+    x = torch.linspace(-1.3, 1.3, 30)[:, None].expand(-1, 3)
+    found = known.residual.predict(x[:, :1]).mean[:, 0]
+    assert torch.allclose(found, torch.sin(2 * x[:, 0]), atol=5e-3)
+    held_out = transitions(50, noise=0.0, seed=1)
+    assert torch.allclose(known.predict(held_out.states, held_out.inputs).mean, held_out.next_states, atol=2e-2)
+
+
+def test_by_default_every_state_has_a_residual_of_all_states_and_inputs():
+    known = ResidualModel.train(AFFINE, transitions(15), trainer=Trainer(restarts=0))
+    assert (known.residual.state_dim, known.residual.input_dim, known.residual.output_dim) == (3, 2, 3)
+
+
+def test_a_residual_model_learns_while_it_runs():
+    data = transitions(60)
+    known = ResidualModel.train(AFFINE, data[:20], ACTS, states=[0], inputs=[], trainer=Trainer(restarts=0))
+    grown = known.condition_on(data[20:])
+    assert len(grown.residual) == 60
+    x, u = transitions(20, seed=1).states, transitions(20, seed=1).inputs
+    assert (grown.predict(x, u).covariance[:, 2, 2] < known.predict(x, u).covariance[:, 2, 2]).all()
+    held = known
+    for i in range(20, 60):
+        held = held.condition_on(data[i : i + 1], Budget(25, "least_informative"))
+    assert len(held.residual) == 25
+    with pytest.raises(ShapeError, match="3 states and 2 inputs; got transitions with 3 and 1"):
+        known.condition_on(Transitions(torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1, 3)))
+
+
+def test_a_residual_model_can_be_moved_to_single_precision():
+    x, u = torch.rand(4, 3), torch.rand(4, 2)
+    single = model().to(dtype=torch.float32)
+    assert torch.allclose(single.predict(x.float(), u.float()).mean.double(), model().predict(x, u).mean, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"states": [2]}, ShapeError, "sees 2 states and 1 inputs; got 1 and 1 selected"),
+        ({"states": [2, 3]}, SettingError, r"states: must be different indices from 0 to 2; got \[2, 3\]"),
+        ({"inputs": [2]}, SettingError, r"inputs: must be different indices from 0 to 1; got \[2\]"),
+        ({"states": [1, 1]}, SettingError, r"different indices from 0 to 2; got \[1, 1\]"),
+        ({"B": torch.ones(3, 3)}, ShapeError, r"B must be \(n, 2\); got \(3, 3\)"),
+        ({"residual": GPPosterior(**(vars(gp()) | {"predicts": "difference"}))}, SettingError, "predicts='value'"),
+    ],
+)
+def test_misuse_is_refused_with_the_rule(change, error, message):
+    good = {"nominal": AFFINE, "residual": gp(), "B": B, "states": [2, 0], "inputs": [1], "input_dim": 2}
+    with pytest.raises(error, match=message):
+        ResidualModel(**(good | change))

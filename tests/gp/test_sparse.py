@@ -1,0 +1,193 @@
+"""Sparse GPs frozen to pseudo-observations, against their textbook formulas, the exact GP, and each other."""
+
+import logging
+
+import pytest
+import torch
+
+from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import Budget, GPPosterior, SparseTrainer, Trainer, Transitions, sparse_posterior, standardize
+from gpmpc.gp.kernel import kernel_matrix
+from gpmpc.gp.sparse import collapsed_bound
+from gpmpc.gp.sparse_training import greedy_points
+from gpmpc.propagation import MomentMatching, MonteCarlo
+
+
+def problem(rows=150, noise=1e-2, seed=0, spread=1.0):
+    generator = torch.Generator().manual_seed(seed)
+    x = 4 * torch.rand(rows, 3, generator=generator) - 2
+    y = torch.stack([torch.sin(2 * x[:, 0]) + x[:, 2], x[:, 1] * x[:, 0]], dim=1)
+    settings = {
+        "lengthscales": spread * torch.tensor([[0.8, 2.0, 1.5], [1.0, 1.2, 3.0]]),
+        "signal_variance": torch.tensor([1.0, 2.0]),
+        "noise_variance": torch.full((2,), noise),
+    }
+    return x, y + noise**0.5 * torch.randn(y.shape, generator=generator), settings
+
+
+def textbook(Z, x, y, query, method, lengthscales, signal_variance, noise_variance):
+    """Mean and variance from the formulas with their inverses (Quinonero-Candela and Rasmussen, 2005, section 5)."""
+    means, variances = [], []
+    for a in range(len(lengthscales)):
+
+        def k(p, q, a=a):
+            return kernel_matrix(p, q, lengthscales[a : a + 1], signal_variance[a : a + 1])[0]
+
+        explained = (k(Z, x) * torch.linalg.solve(k(Z, Z), k(Z, x))).sum(0)
+        Lam = noise_variance[a] + (signal_variance[a] - explained if method == "fitc" else torch.zeros(len(x)))
+        S = k(Z, Z) + k(Z, x) / Lam @ k(x, Z)
+        means.append(k(query, Z) @ torch.linalg.solve(S, k(Z, x) / Lam @ y[:, a]))
+        change = torch.linalg.solve(k(Z, Z), k(Z, query)) - torch.linalg.solve(S, k(Z, query))
+        variances.append(signal_variance[a] - (k(Z, query) * change).sum(0))
+    return torch.stack(means, dim=1), torch.stack(variances, dim=1)
+
+
+@pytest.mark.parametrize("method", ["sgpr", "fitc"])
+@pytest.mark.parametrize("noise", [1e-5, 1e-1])
+def test_the_frozen_posterior_has_the_textbooks_mean_and_variance(method, noise):
+    x, y, settings = problem(noise=noise)
+    gp = sparse_posterior(x[:25], x, y, **settings, input_dim=1, predicts="value", method=method)
+    query = problem(40, seed=1)[0]
+    mean, variance = textbook(x[:25], x, y, query, method, **settings)
+    belief = gp.predict(query[:, :2], query[:, 2:])
+    assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-8)
+    assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-8)
+    solved = torch.cholesky_solve((gp.targets - gp.offset).mT[..., None], gp.cholesky)[..., 0]
+    assert torch.allclose(solved, gp.weights, rtol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["sgpr", "fitc"])
+def test_with_every_point_as_inducing_point_it_is_the_exact_gp(method):
+    x, y, settings = problem(60)
+    offset, query = torch.tensor([0.5, -1.0]), problem(40, seed=1)[0]
+    more = settings | {"input_dim": 1, "predicts": "value", "offset": offset}
+    exact = GPPosterior.from_hyperparameters(x, y, **more).predict(query[:, :2], query[:, 2:])
+    sparse = sparse_posterior(x, x, y, **more, method=method).predict(query[:, :2], query[:, 2:])
+    assert torch.allclose(sparse.mean, exact.mean, rtol=0, atol=1e-8)
+    assert torch.allclose(sparse.variance, exact.variance, rtol=0, atol=1e-8)
+
+
+def test_points_that_are_nearly_the_same_get_the_jitter_they_need():
+    x, y, settings = problem(100, spread=20.0)
+    gp = sparse_posterior(x, x, y, **settings, input_dim=1, predicts="value")
+    exact = GPPosterior.from_hyperparameters(x, y, **settings, input_dim=1, predicts="value")
+    query = problem(40, seed=1)[0]
+    ours, theirs = (model.predict(query[:, :2], query[:, 2:]) for model in (gp, exact))
+    assert torch.allclose(ours.mean, theirs.mean, rtol=0, atol=1e-4)
+    assert torch.allclose(ours.variance, theirs.variance, rtol=0, atol=1e-5)
+    with pytest.raises(SettingError, match="inducing: their kernel matrix of output . is not positive definite"):
+        sparse_posterior(x, x, y, **settings, input_dim=1, predicts="value", jitter=0.0)
+
+
+def test_the_bound_is_below_the_evidence_and_reaches_it_with_every_point():
+    x, y, settings = problem(60)
+    gp = GPPosterior.from_hyperparameters(x, y, **settings, input_dim=1, predicts="value")
+    prior = torch.distributions.MultivariateNormal(torch.zeros(60), scale_tril=gp.cholesky)
+    evidence = prior.log_prob(y.mT)
+    few, more = (collapsed_bound(x[:count], x, y, **settings) for count in (10, 40))
+    assert (few < more).all()
+    assert (more < evidence).all()
+    assert torch.allclose(collapsed_bound(x, x, y, **settings, jitter=1e-12), evidence, atol=1e-5)
+    assert torch.allclose(collapsed_bound(x, x, y, **settings, method="fitc", jitter=1e-12), evidence, atol=1e-5)
+
+
+def test_the_bounds_gradient_is_right():
+    x, y, settings = problem(30)
+    leaves = [x[:6].clone(), *settings.values()]
+    for method in ("sgpr", "fitc"):
+
+        def bound(Z, *hyperparameters, method=method):
+            return collapsed_bound(Z, x, y, *hyperparameters, method=method)
+
+        assert torch.autograd.gradcheck(bound, [leaf.clone().requires_grad_() for leaf in leaves], atol=1e-4)
+
+
+@pytest.mark.parametrize("method", ["sgpr", "fitc"])
+def test_a_frozen_sparse_model_is_conditioned_and_moment_matched_like_any_other(method):
+    x, y, settings = problem(200, noise=1e-3)
+    gp = sparse_posterior(x[:40], x, y, **settings, input_dim=1, method=method)
+    new = Transitions(x[:3, :2] + 0.1, x[:3, 2:], y[:3])
+    grown = gp.condition_on(new)
+    assert (grown.predict(new.states, new.inputs).variance < gp.predict(new.states, new.inputs).variance).all()
+    back, query = grown.drop([40, 41, 42]), torch.rand(5, 2)
+    assert torch.allclose(back.predict(query, query[:, :1]).mean, gp.predict(query, query[:, :1]).mean, atol=1e-8)
+    assert len(Budget(40, "least_informative")(gp, new)) == 40
+    at, control = Gaussian(torch.tensor([0.3, -0.2]), 0.05 * torch.eye(2)), torch.zeros(1)
+    matched, sampled = MomentMatching()(gp, at, control), MonteCarlo(20_000)(gp, at, control)
+    error = (sampled.covariance.diagonal() / 20_000).sqrt()
+    assert ((matched.mean - sampled.mean).abs() < 5 * error).all()
+    assert torch.allclose(matched.covariance, sampled.covariance, atol=0.03)
+    with pytest.raises(UnsupportedModel, match="train again with SparseTrainer"):
+        Trainer().refit(gp)
+
+
+def test_greedy_points_differ_and_stop_where_nothing_is_left():
+    x, _, settings = problem(100)
+    chosen = greedy_points(torch.cat([x, x]), *settings.values(), count=30)
+    assert len(torch.unique(chosen, dim=0)) == 30
+    assert len(greedy_points(x[[0, 1, 0, 1, 0]], *settings.values(), count=5)) == 2
+    random = [collapsed_bound(x[i : i + 30], x, problem(100)[1], **settings).sum() for i in range(0, 70, 10)]
+    assert collapsed_bound(chosen, x, problem(100)[1], **settings).sum() > max(random)
+
+
+def transitions(rows, noise=1e-2, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    x, u = 4 * torch.rand(rows, 2, generator=generator) - 2, 2 * torch.rand(rows, 1, generator=generator) - 1
+    moved = torch.stack([x[:, 0] + 0.2 * x[:, 1], x[:, 1] - torch.sin(2 * x[:, 0]) + u[:, 0]], dim=1)
+    return Transitions(x, u, moved + noise * torch.randn(rows, 2, generator=generator))
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"method": "fitc"}, {"learn_locations": False}, {"predicts": "difference", "scaling": standardize}]
+)
+def test_training_sums_up_many_transitions_in_a_few_points(settings, caplog):
+    data, held_out = transitions(600), transitions(200, noise=0.0, seed=1)
+    trainer = SparseTrainer(inducing=40, subset=50, restarts=0, iterations=15, **settings)
+    with caplog.at_level(logging.INFO, "gpmpc"):
+        training = trainer(data, seed=2)
+    gp = training.posterior
+    assert len(gp) == 40
+    assert (training.objective <= training.initial + 1e-9).all() or training.objective.sum() < training.initial.sum()
+    error = gp.predict(held_out.states, held_out.inputs).mean - held_out.next_states
+    assert float(error.square().mean().sqrt()) < 6e-3  # 50 exact points: 3e-2
+    assert torch.allclose(gp.noise_variance.sqrt(), torch.full((2,), 1e-2), rtol=0.3)
+    assert "40 inducing points chosen among 600" in caplog.text
+    assert "iteration 10, minus the bound" in caplog.text
+
+
+def test_fewer_points_than_inducing_points_are_all_taken():
+    data = transitions(20)
+    assert len(SparseTrainer(inducing=50, iterations=3, restarts=0)(data).posterior) == 20
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"inducing": 0}, "inducing: must be a whole number, 1 or more; got 0"),
+        ({"method": "dtc"}, "'sgpr' or 'fitc'; got 'dtc'"),
+        ({"jitter": -1.0}, "jitter: must be a number, 0 or more; got -1.0"),
+        ({"predicts": "value"}, "'next_state' or 'difference'; got 'value'"),
+        ({"iterations": 1.5}, "iterations: must be a whole number, 0 or more; got 1.5"),
+    ],
+)
+def test_misuse_of_the_trainer_is_refused_with_the_rule(setting, message):
+    with pytest.raises(SettingError, match=message):
+        SparseTrainer(**setting)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"inducing": torch.zeros(4, 2)}, ShapeError, r"inducing must be \(M, 3\), M > 0; got \(4, 2\)"),
+        ({"targets": torch.zeros(9, 2)}, ShapeError, "same number of rows; got 10 and 9"),
+        ({"method": "dtc"}, SettingError, "'sgpr' or 'fitc'; got 'dtc'"),
+        ({"features": torch.full((10, 3), torch.nan)}, DataError, "inputs must be finite; got nan"),
+        ({"noise_variance": torch.zeros(2)}, SettingError, "noise_variance: must be positive"),
+    ],
+)
+def test_misuse_is_refused_with_the_rule(change, error, message):
+    x, y, settings = problem(10)
+    good = {"inducing": x[:4], "features": x, "targets": y, **settings, "input_dim": 1, "predicts": "value"}
+    with pytest.raises(error, match=message):
+        sparse_posterior(**(good | change))
