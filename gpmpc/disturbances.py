@@ -115,11 +115,12 @@ class Replaced:
 
 @dataclass(frozen=True)
 class Dropout:
-    """Nothing is measured over a time window: every entry of the state is NaN.
+    """Nothing is measured over a time window: entries of the state are NaN.
 
     Attributes:
         start: When it begins [s].
         stop: When it ends [s].
+        entries: Which ones, from 0; all by default. Without position, for one: 0 to 5 of a ``Coupled`` plant.
 
     Raises:
         SettingError: The window is empty.
@@ -127,6 +128,7 @@ class Dropout:
 
     start: float  # [s]
     stop: float  # [s]
+    entries: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         _check_window(self.start, self.stop)
@@ -137,7 +139,11 @@ class Dropout:
 
     def measured(self, state: np.ndarray, time: float) -> np.ndarray:
         """NaN inside the window."""
-        return np.full_like(state, np.nan) if self.start <= time < self.stop else state
+        if not self.start <= time < self.stop:
+            return state
+        lost = state.copy()
+        lost[slice(None) if self.entries is None else list(self.entries)] = np.nan
+        return lost
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ def closed_loop(
         last = taken[-1].command
         if on_step is not None:
             on_step(taken[-1])
-    return rollout(taken, running, references, system.time_step)
+    return rollout(taken, references, system.time_step, running.covariance)
 
 
 def one_step(
@@ -164,17 +164,21 @@ def one_step(
     return Step(k, time, state, covariance, measured, reference, asked, acted, running.mean)
 
 
-def rollout(steps: Sequence[Step], running: Running, references: Reference, time_step: float) -> Rollout:
-    """The arrays of all steps."""
-    n, nothing = len(running.mean), Timing(0.0, 0.0, 0.0)
+def rollout(
+    steps: Sequence[Step], references: Reference, time_step: float, final_covariance: np.ndarray | None = None
+) -> Rollout:
+    """The arrays of all steps; the last state's covariance (n, n) is zero by default."""
+    last = steps[-1].next_state
+    n, nothing = len(last), Timing(0.0, 0.0, 0.0)
+    final_covariance = np.zeros((n, n)) if final_covariance is None else final_covariance
     decisions: list[Decision | None] = [step.command.decision for step in steps]
     expected = [d if d is not None and d.status.solved else None for d in decisions]
     rows = references.states[: len(steps) + 1]
     if len(rows) == len(steps):
         rows = np.concatenate([rows, rows[-1:]])
     return Rollout(
-        states=np.array([*(step.state for step in steps), running.mean]),
-        covariances=np.array([*(step.covariance for step in steps), running.covariance]),
+        states=np.array([*(step.state for step in steps), last]),
+        covariances=np.array([*(step.covariance for step in steps), final_covariance]),
         measured=np.array([step.measured for step in steps]),
         inputs=np.array([step.input for step in steps]),
         references=np.array(rows, dtype=float),
