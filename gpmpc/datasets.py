@@ -99,11 +99,11 @@ class NMPCData:
         ahead = self.horizon  # the attitude's references reach this far beyond its last step
         outer = self._fly_translational(trajectory, self.samples + ahead)
         if subsystem == "translational":
-            return _transitions(outer, self.samples)
+            return transitions_of(outer, self.samples)
         angles = attitude_for_thrust_direction(outer.inputs[:, 1], outer.inputs[:, 2], self.attitude)
         references = np.zeros((len(angles), 6))
         references[:, [0, 2]] = angles  # phi, theta; psi and the rates are to be zero
-        return _transitions(self.rotational.fly(references, self.horizon, self.samples), self.samples)
+        return transitions_of(self.rotational.fly(references, self.horizon, self.samples), self.samples)
 
     def _fly_translational(self, trajectory: Trajectory, steps: int) -> Rollout:
         times = self.translational.plant.time_step * np.arange(steps + self.horizon)
@@ -148,6 +148,7 @@ class PaperData:
         return data[: self.samples]
 
 
-def _transitions(flight: Rollout, samples: int) -> Transitions:
+def transitions_of(flight: Rollout, samples: int) -> Transitions:
+    """The first transitions of a flight."""
     states, inputs = torch.from_numpy(flight.states), torch.from_numpy(flight.inputs)
     return Transitions(states[:samples], inputs[:samples], states[1 : samples + 1])
