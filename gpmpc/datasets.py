@@ -16,7 +16,7 @@ import torch
 
 from gpmpc.control.nmpc import NMPC
 from gpmpc.control.tracking import TrackingProblem
-from gpmpc.exceptions import DataError, SettingError, check_number
+from gpmpc.exceptions import DataError, SettingError, check_number, check_numbers
 from gpmpc.gp.transitions import Transitions
 from gpmpc.plants import ATTITUDES, Plant, attitude_for_thrust_direction
 from gpmpc.simulation import Rollout, closed_loop
@@ -43,12 +43,18 @@ class Tracking:
         Q: State weights, the diagonal (n,).
         R: Input weights, the diagonal (m,).
         initial_input: First guess of the solver (m,).
+
+    Raises:
+        SettingError: A weight has another length than the plant's states or inputs.
     """
 
     plant: Plant
     Q: Sequence[float]
     R: Sequence[float]
     initial_input: Sequence[float]
+
+    def __post_init__(self) -> None:
+        check_weights(self.plant, self.Q, self.R)
 
     def fly(self, references: np.ndarray, horizon: int, steps: int) -> Rollout:
         """Unconstrained NMPC from rest along references (steps + horizon, n)."""
@@ -146,6 +152,16 @@ class PaperData:
         if len(data) < self.samples:
             raise DataError(f"{path}: the file holds {len(data)} rows; data.samples asks for {self.samples}")
         return data[: self.samples]
+
+
+def check_weights(plant: Plant, Q: Sequence[float], R: Sequence[float]) -> None:
+    """Raises unless diagonal weights fit a plant.
+
+    Raises:
+        SettingError: They do not.
+    """
+    check_numbers("Q", Q, len(plant.dynamics.state_names), least=0)
+    check_numbers("R", R, len(plant.dynamics.input_names), least=0)
 
 
 def transitions_of(flight: Rollout, samples: int) -> Transitions:

@@ -114,11 +114,11 @@ def violation_rate(
         raise ShapeError(
             f"values must be (K, d) with bounds (d,), K of 1 or more; got {values.shape}, {lower.shape}, {upper.shape}"
         )
-    low, high = binomial_interval(
-        violations := int((~_inside(values, lower, upper, tolerance)).sum()), len(values), level
-    )
-    outside = np.maximum(lower - values, values - upper).max(initial=0.0)
-    return ViolationRate(violations, len(values), float(outside), low, high)
+    # A value that is no number keeps no bound.
+    inside = (values >= lower - tolerance) & (values <= upper + tolerance)
+    violations = int((~inside.all(axis=1)).sum())
+    outside = np.fmax.reduce(np.maximum(lower - values, values - upper), axis=None, initial=0.0)
+    return ViolationRate(violations, len(values), float(outside), *binomial_interval(violations, len(values), level))
 
 
 def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
@@ -156,8 +156,3 @@ def time_quantiles(seconds: np.ndarray) -> TimeQuantiles:
     if np.ndim(seconds) != 1 or not len(seconds):
         raise ShapeError(f"seconds must be (K,), K of 1 or more; got {np.shape(seconds)}")
     return TimeQuantiles(*(float(q) for q in np.quantile(seconds, [0.5, 0.95, 0.99, 1.0])))
-
-
-def _inside(values: np.ndarray, lower: np.ndarray, upper: np.ndarray, tolerance: float) -> np.ndarray:
-    """Rows (K,) that keep all bounds; a value that is no number keeps none."""
-    return ((values >= lower - tolerance) & (values <= upper + tolerance)).all(axis=1)

@@ -1,8 +1,8 @@
-"""Problem: one flight is an anecdote; the same experiment has to be flown with many seeds, and none may stop the others.
+"""Problem: one flight is an anecdote; an experiment has to be flown with many seeds, and none may stop the others.
 
 Seeds are independent, so they run in parallel processes. A trial is a callable of its seed that a fresh process can
-import: a function of a module, or a frozen dataclass with ``__call__`` that builds its controller itself. (A script that
-calls ``trials`` does so under ``if __name__ == "__main__":``.)
+import: a function of a module, or a frozen dataclass with ``__call__`` that builds its controller itself. (A script
+that calls ``trials`` does so under ``if __name__ == "__main__":``.)
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -80,7 +80,9 @@ def trials(
                     advance()
         except BrokenProcessPool as error:
             missing = ", ".join(f"seed {seed}" for index, seed in enumerate(seeds) if index not in found)
-            raise GpmpcError(f"a worker process died (out of memory?) with these trials unfinished: {missing}") from error
+            raise GpmpcError(
+                f"a worker process died (out of memory?) with these trials unfinished: {missing}"
+            ) from error
     return [found[index] for index in range(len(seeds))]
 
 

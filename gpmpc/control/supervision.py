@@ -1,4 +1,4 @@
-"""Problem: a controller fails now and then, or there is no state to give to it; something has to be applied all the same.
+"""Problem: a controller fails now and then, or has no state to work from; something has to be applied all the same.
 
 What is applied then is a declared policy. A failed iterate is never applied and never handed on: the next call gets
 the last plan that was solved, moved on in time as if it had been made one step ago, with what was really applied as its

@@ -1,7 +1,7 @@
 """Problem: the whole quadrotor at once, its attitude deciding where its thrust goes.
 
-The translational and the rotational subsystem of Cao, Lai and Alam (2017), joined by their eq. (2): with roll phi, pitch
-theta and yaw psi the thrust U1 points along
+The translational and the rotational subsystem of Cao, Lai and Alam (2017), joined by their eq. (2): with roll phi,
+pitch theta and yaw psi the thrust U1 points along
 
     ux = cos(phi) sin(theta) cos(psi) + sin(phi) sin(psi)
     uy = cos(phi) sin(theta) sin(psi) - sin(phi) cos(psi)
