@@ -29,6 +29,8 @@ class Disturbance(Protocol):
 class Gust:
     """A constant push on single states over a time window, integrated by the plant like any other force.
 
+    (On a ``Map``, whose right-hand side is the next state, it is added to that.)
+
     Attributes:
         rates: What is added to the derivative of a state, by its name: ``{"vx": 2.0}`` is an acceleration of
             2 m/s^2, the force over the mass.
@@ -134,7 +136,15 @@ class Dropout:
         _check_window(self.start, self.stop)
 
     def acting(self, plant: Plant, time: float) -> Plant:
-        """The plant."""
+        """The plant.
+
+        Raises:
+            SettingError: The plant has no such entry.
+        """
+        n = len(plant.dynamics.state_names)
+        for entry in self.entries or ():
+            if not isinstance(entry, int) or not 0 <= entry < n:
+                raise SettingError("entries", f"must be indices of states, 0 to {n - 1}; got {entry!r}")
         return plant
 
     def measured(self, state: np.ndarray, time: float) -> np.ndarray:

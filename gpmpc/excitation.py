@@ -9,6 +9,9 @@ samples, error of the derivatives by the inputs relative to the plant's, median 
                      dither and noise   noise alone   neither
     translational               0.012          0.19       4.1
     rotational                  0.003          0.11       4.0
+
+Steered by the first column's GPs, one step ahead, the plant keeps within 0.03 m of that flight (RMSE); by the last's it
+ends up a kilometre away.
 """
 
 from collections.abc import Sequence

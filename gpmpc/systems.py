@@ -123,6 +123,7 @@ class RunningPlant:
             self.mean = self._sources["initial"].multivariate_normal(self.mean, np.asarray(covariance, dtype=float))
         self.covariance = np.zeros((n, n))
         self._steps = 0
+        self._acting(0.0)  # a disturbance that does not fit is found out before the first step
 
     def measure(self, time: float) -> Gaussian:
         """The state as it is measured, taken for certain: the controllers of this package filter nothing."""
@@ -137,10 +138,7 @@ class RunningPlant:
         Raises:
             Diverged: The next state is not finite.
         """
-        plant = self.plant
-        for disturbance in self.disturbances:
-            plant = disturbance.acting(plant, time)
-        input = self._noisy("input", input)
+        plant, input = self._acting(time), self._noisy("input", input)
         with np.errstate(over="ignore", invalid="ignore"):
             state = step(plant, self.mean, input)
         if not np.isfinite(state).all():
@@ -148,6 +146,12 @@ class RunningPlant:
         self.mean = self._noisy("process", state)
         self._steps += 1
         return input
+
+    def _acting(self, time: float) -> Plant:
+        plant = self.plant
+        for disturbance in self.disturbances:
+            plant = disturbance.acting(plant, time)
+        return plant
 
     def _noisy(self, source: str, value: np.ndarray) -> np.ndarray:
         deviations = getattr(self.noise, source)

@@ -228,6 +228,7 @@ def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
         ({"steps": 0}, SettingError, "steps: must be a whole number, 1 or more; got 0"),
         ({"seed": -1}, SettingError, "seed: must be a whole number, 0 or more; got -1"),
         ({"disturbances": [Gust({"w": 1.0})]}, SettingError, "must name states of the plant, x, v; got 'w'"),
+        ({"disturbances": [Dropout(5, 6, entries=[2])]}, SettingError, "must be indices of states, 0 to 1; got 2"),
         ({"disturbances": [Replaced(Map(Translational()))]}, ShapeError, "replaced by one of the same states"),
     ],
 )
