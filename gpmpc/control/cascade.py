@@ -1,6 +1,6 @@
 """Problem: a quadrotor's position is steered through its attitude, which is a hundred times faster.
 
-Two controllers share the work (Cao, Lai and Alam, 2017, section 2). The outer one, on the translational subsystem,
+Two controllers share the work (Cao, Lai and Alam, 2017). The outer one, on the translational subsystem,
 decides the thrust U1 and its direction (ux, uy), once a second say; the direction, by eq. (2) inverted, is the attitude
 that the inner one, on the rotational subsystem, takes the vehicle to at a rate of its own. (With the plant in the loop
 an inner loop at 1 Hz is unworkable; 20 Hz flies well.)
