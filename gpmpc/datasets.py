@@ -16,7 +16,7 @@ import torch
 
 from gpmpc.control.nmpc import NMPC
 from gpmpc.control.tracking import TrackingProblem
-from gpmpc.exceptions import DataError, SettingError, check_number
+from gpmpc.exceptions import DataError, SettingError, check_number, check_numbers
 from gpmpc.gp.transitions import Transitions
 from gpmpc.plants import ATTITUDES, Plant, attitude_for_thrust_direction
 from gpmpc.simulation import Rollout, closed_loop
@@ -43,12 +43,18 @@ class Tracking:
         Q: State weights, the diagonal (n,).
         R: Input weights, the diagonal (m,).
         initial_input: First guess of the solver (m,).
+
+    Raises:
+        SettingError: A weight has another length than the plant's states or inputs.
     """
 
     plant: Plant
     Q: Sequence[float]
     R: Sequence[float]
     initial_input: Sequence[float]
+
+    def __post_init__(self) -> None:
+        check_weights(self.plant, self.Q, self.R)
 
     def fly(self, references: np.ndarray, horizon: int, steps: int) -> Rollout:
         """Unconstrained NMPC from rest along references (steps + horizon, n)."""
@@ -99,11 +105,11 @@ class NMPCData:
         ahead = self.horizon  # the attitude's references reach this far beyond its last step
         outer = self._fly_translational(trajectory, self.samples + ahead)
         if subsystem == "translational":
-            return _transitions(outer, self.samples)
+            return transitions_of(outer, self.samples)
         angles = attitude_for_thrust_direction(outer.inputs[:, 1], outer.inputs[:, 2], self.attitude)
         references = np.zeros((len(angles), 6))
         references[:, [0, 2]] = angles  # phi, theta; psi and the rates are to be zero
-        return _transitions(self.rotational.fly(references, self.horizon, self.samples), self.samples)
+        return transitions_of(self.rotational.fly(references, self.horizon, self.samples), self.samples)
 
     def _fly_translational(self, trajectory: Trajectory, steps: int) -> Rollout:
         times = self.translational.plant.time_step * np.arange(steps + self.horizon)
@@ -148,6 +154,17 @@ class PaperData:
         return data[: self.samples]
 
 
-def _transitions(flight: Rollout, samples: int) -> Transitions:
+def check_weights(plant: Plant, Q: Sequence[float], R: Sequence[float]) -> None:
+    """Raises unless diagonal weights fit a plant.
+
+    Raises:
+        SettingError: They do not.
+    """
+    check_numbers("Q", Q, len(plant.dynamics.state_names), least=0)
+    check_numbers("R", R, len(plant.dynamics.input_names), least=0)
+
+
+def transitions_of(flight: Rollout, samples: int) -> Transitions:
+    """The first transitions of a flight."""
     states, inputs = torch.from_numpy(flight.states), torch.from_numpy(flight.inputs)
     return Transitions(states[:samples], inputs[:samples], states[1 : samples + 1])

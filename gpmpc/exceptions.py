@@ -74,6 +74,21 @@ class SolverFailure(GpmpcError, RuntimeError):
         return f"the controller's solver failed at step {self.args[0]}: {self.args[1]}"
 
 
+class Diverged(GpmpcError, ArithmeticError):
+    """A simulated system left the finite numbers.
+
+    Attributes:
+        step: The time step (from 0) that it did so in.
+    """
+
+    def __init__(self, step: int, message: str):
+        super().__init__(step, message)
+        self.step = step
+
+    def __str__(self) -> str:
+        return f"step {self.args[0]}: {self.args[1]}"
+
+
 def check_number(
     key: str, value: Any, *, above: float | None = None, least: float | None = None, whole: bool = False, unit: str = ""
 ) -> None:

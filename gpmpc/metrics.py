@@ -1,11 +1,15 @@
-"""Problem: say in numbers how good predictions are, and whether their stated uncertainty can be believed."""
+"""Problem: say in numbers how good predictions and flights are, and how far those numbers can be believed."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.special import betaincinv
 from torch import Tensor
 
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, ShapeError
 
 
 def mean_squared_error(predicted: Tensor, observed: Tensor) -> float:
@@ -27,3 +31,128 @@ def interval_coverage(mean: Tensor, variance: Tensor, observed: Tensor, level: f
         raise SettingError("level", f"must lie between 0 and 1; got {level}")
     half_width = torch.special.ndtri(torch.tensor((1 + level) / 2, dtype=variance.dtype)) * variance.sqrt()
     return float(((observed - mean).abs() <= half_width).double().mean())
+
+
+@dataclass(frozen=True)
+class TrackingError:
+    """Root mean squared distance from the references.
+
+    Attributes:
+        axes: Of every state looked at (j,), in its unit.
+        total: Root of the mean of their summed squares: over x, y, z the distance [m].
+    """
+
+    axes: np.ndarray
+    total: float
+
+
+def tracking_error(states: np.ndarray, references: np.ndarray, axes: Sequence[int] = (0, 2, 4)) -> TrackingError:
+    """How far a flight was from its references, the initial state left out: nobody steered there.
+
+    Args:
+        states: x[0] .. x[K] (K + 1, n), K of 1 or more.
+        references: r[0] .. r[K] (K + 1, n).
+        axes: Which states to look at; x, y, z of the translational ones by default.
+
+    Raises:
+        ShapeError: The two do not belong together.
+    """
+    if np.ndim(states) != 2 or np.shape(states) != np.shape(references) or len(states) < 2:
+        raise ShapeError(
+            f"states and references must both be (K + 1, n), K of 1 or more; got {np.shape(states)} and "
+            f"{np.shape(references)}"
+        )
+    squares = np.square((np.asarray(states) - np.asarray(references))[1:, list(axes)]).mean(axis=0)
+    return TrackingError(np.sqrt(squares), float(np.sqrt(squares.sum())))
+
+
+@dataclass(frozen=True)
+class ViolationRate:
+    """How often bounds were broken.
+
+    Attributes:
+        violations: Steps at which any entry was outside.
+        steps: All steps.
+        worst: Largest distance outside, in the entry's unit; 0 where there was none.
+        low: Lower end of the interval for the probability of a violation.
+        high: Its upper end.
+    """
+
+    violations: int
+    steps: int
+    worst: float
+    low: float
+    high: float
+
+    @property
+    def rate(self) -> float:
+        """Part of the steps."""
+        return self.violations / self.steps
+
+
+def violation_rate(
+    values: np.ndarray, lower: np.ndarray, upper: np.ndarray, level: float = 0.95, tolerance: float = 1e-9
+) -> ViolationRate:
+    """How often states or inputs were outside their bounds, with the interval of Clopper and Pearson (1934).
+
+    The interval takes steps for independent. Those of one flight are not: pool several seeds, and read it as a lower
+    limit of the doubt.
+
+    Args:
+        values: One row a step (K, d).
+        lower: (d,); -inf where there is none.
+        upper: (d,); inf where there is none.
+        level: Of the interval, two-sided.
+        tolerance: What a solver's round-off may be outside.
+
+    Raises:
+        ShapeError: Bounds do not fit the values, or there is no row.
+        SettingError: A level outside (0, 1).
+    """
+    values, lower, upper = (np.asarray(a, dtype=float) for a in (values, lower, upper))
+    if values.ndim != 2 or not len(values) or lower.shape != values.shape[1:] or upper.shape != values.shape[1:]:
+        raise ShapeError(
+            f"values must be (K, d) with bounds (d,), K of 1 or more; got {values.shape}, {lower.shape}, {upper.shape}"
+        )
+    # A value that is no number keeps no bound.
+    inside = (values >= lower - tolerance) & (values <= upper + tolerance)
+    violations = int((~inside.all(axis=1)).sum())
+    outside = np.fmax.reduce(np.maximum(lower - values, values - upper), axis=None, initial=0.0)
+    return ViolationRate(violations, len(values), float(outside), *binomial_interval(violations, len(values), level))
+
+
+def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+    """The exact interval for a probability of which ``successes`` of ``trials`` are known (Clopper and Pearson, 1934).
+
+    Raises:
+        SettingError: More successes than trials, no trials, or a level outside (0, 1).
+    """
+    if not 0 < level < 1:
+        raise SettingError("level", f"must lie between 0 and 1; got {level}")
+    if not 0 <= successes <= trials or trials < 1:
+        raise SettingError("successes", f"must lie between 0 and trials, 1 or more; got {successes} of {trials}")
+    tail = (1 - level) / 2
+    low = betaincinv(successes, trials - successes + 1, tail) if successes else 0.0
+    high = betaincinv(successes + 1, trials - successes, 1 - tail) if successes < trials else 1.0
+    return float(low), float(high)
+
+
+@dataclass(frozen=True)
+class TimeQuantiles:
+    """Of wall times [s]."""
+
+    median: float  # [s]
+    p95: float  # [s]
+    p99: float  # [s]
+    largest: float  # [s]
+
+
+def time_quantiles(seconds: np.ndarray) -> TimeQuantiles:
+    """Median, 95 % and 99 % quantile, and the largest of wall times (K,) [s].
+
+    Raises:
+        ShapeError: There is none.
+    """
+    if np.ndim(seconds) != 1 or not len(seconds):
+        raise ShapeError(f"seconds must be (K,), K of 1 or more; got {np.shape(seconds)}")
+    return TimeQuantiles(*(float(q) for q in np.quantile(seconds, [0.5, 0.95, 0.99, 1.0])))

@@ -1,13 +1,51 @@
-"""Problem: let a controller steer a plant along references, and keep what happened."""
+"""Problem: let a controller steer a system along references, and keep what happened.
 
+    measure -> ask the controller -> fall back by the policy where it failed -> apply -> record
+
+The loop knows neither file formats nor figures: who wants every step as it happens gives ``on_step``, which is called
+after the step and outside of everything that is timed.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from gpmpc.control.controller import Controller, Decision, Reference
-from gpmpc.exceptions import ShapeError, SolverFailure
-from gpmpc.gaussian import Gaussian
-from gpmpc.plants import Plant, step
+from gpmpc.control.controller import Controller, Decision, Reference, Timing
+from gpmpc.control.supervision import Command, OnFailure, check_policy, command
+from gpmpc.disturbances import Disturbance
+from gpmpc.exceptions import ShapeError, check_number
+from gpmpc.plants import Plant
+from gpmpc.status import Status
+from gpmpc.systems import ModelLoop, Noise, Running, RunningModel, RunningPlant
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a loop.
+
+    Attributes:
+        index: k.
+        time: When it began [s].
+        state: x[k], or the mean of the belief (n,).
+        covariance: Of the belief (n, n); zero with a plant in the loop.
+        measured: What the controller was told of it (n,).
+        reference: What it was to follow.
+        command: What it decided, and what came of it.
+        input: What acted (m,).
+        next_state: x[k+1] (n,).
+    """
+
+    index: int
+    time: float  # [s]
+    state: np.ndarray
+    covariance: np.ndarray
+    measured: np.ndarray
+    reference: Reference
+    command: Command
+    input: np.ndarray
+    next_state: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -15,47 +53,158 @@ class Rollout:
     """K steps of a closed loop.
 
     Attributes:
-        states: x[0] .. x[K], (K + 1, n).
-        inputs: u[0] .. u[K-1], (K, m).
-        references: r[0] .. r[K-1], (K, n).
-        seconds: Wall time of every decision (K,) [s].
+        states: x[0] .. x[K], or the means of the beliefs (K + 1, n).
+        covariances: Of the beliefs (K + 1, n, n); zero with a plant in the loop.
+        measured: What the controller was told of x[0] .. x[K-1] (K, n).
+        inputs: What acted, u[0] .. u[K-1] (K, m).
+        references: r[0] .. r[K] (K + 1, n); the last one is r[K-1] once more where no r[K] was given.
+        predicted_means: What the controller expected of x[1] .. x[K] (K, n); NaN where it had not solved.
+        predicted_covariances: The same (K, n, n).
+        statuses: How every solve ended, K.
+        iterations: Of the solver (K,).
+        timings: Where the wall time of every decision went, K.
+        time_step: Of one step [s].
     """
 
     states: np.ndarray
+    covariances: np.ndarray
+    measured: np.ndarray
     inputs: np.ndarray
     references: np.ndarray
-    seconds: np.ndarray
+    predicted_means: np.ndarray
+    predicted_covariances: np.ndarray
+    statuses: tuple[Status, ...]
+    iterations: np.ndarray
+    timings: tuple[Timing, ...]
+    time_step: float  # [s]
+
+    @property
+    def times(self) -> np.ndarray:
+        """When x[0] .. x[K] were (K + 1,) [s]."""
+        return self.time_step * np.arange(len(self.states))
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """Wall time of every decision (K,) [s]."""
+        return np.array([timing.total for timing in self.timings])
+
+    @property
+    def failures(self) -> tuple[tuple[int, Status], ...]:
+        """Every step whose solve failed, with how."""
+        return tuple((k, status) for k, status in enumerate(self.statuses) if not status.solved)
 
 
 def closed_loop(
-    plant: Plant, controller: Controller, references: np.ndarray, initial_state: np.ndarray, steps: int
+    system: Plant | ModelLoop,
+    controller: Controller,
+    references: Reference | np.ndarray,
+    initial: Any,
+    steps: int,
+    *,
+    noise: Noise | None = None,
+    disturbances: Sequence[Disturbance] = (),
+    on_failure: OnFailure = "raise",
+    seed: int = 0,
+    on_step: Callable[[Step], None] | None = None,
 ) -> Rollout:
-    """Runs a controller on a plant.
+    """Runs a controller on a plant, or on a learned model that is rolled on itself.
 
     Args:
-        plant: The system.
+        system: What is steered.
         controller: Its feedback law; it sees the next ``controller.horizon`` references.
-        references: Reference states r[0] .. (steps + horizon, n) or more, one a time step.
-        initial_state: (n,).
+        references: Reference states r[0] .. (steps + horizon, n) or more, one a time step; as a ``Reference`` with the
+            inputs that belong to them.
+        initial: The state (n,). A ``Gaussian`` is the belief that a model loop starts from, and what a plant's state is
+            drawn from.
         steps: K.
+        noise: On a plant's states, measurements and inputs.
+        disturbances: Gusts, other plants, dropouts: what the controller is not told of.
+        on_failure: What is applied where a solve fails: ``"previous_plan"``, ``"hold"`` or ``"raise"``; see
+            ``gpmpc.control.supervision``.
+        seed: Of all random numbers; the same seed gives the same numbers.
+        on_step: Called with every step.
 
     Raises:
-        ShapeError: Too few references for the steps and the horizon.
-        SolverFailure: The controller's solver did not succeed at a step; its iterate is not applied.
+        ShapeError: Too few references for the steps and the horizon, or a state of the wrong length.
+        SettingError: An unknown policy, negative noise, or noise in a model loop.
+        SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
+        Diverged: The system left the finite numbers.
     """
-    needed = steps + controller.horizon
-    if len(references) < needed:
-        raise ShapeError(
-            f"{steps} steps with horizon {controller.horizon} need {needed} references; got {len(references)}"
-        )
-    states, inputs, seconds = [np.asarray(initial_state, dtype=float)], [], []
-    decision: Decision | None = None
+    check_number("steps", steps, least=1, whole=True)
+    check_policy(on_failure)
+    references = checked_references(references, steps, controller.horizon)
+    if isinstance(system, ModelLoop):
+        running: Running = RunningModel(system, initial, disturbances, noise)
+    else:
+        running = RunningPlant(system, initial, disturbances, noise, seed)
+    taken, last = [], None
     for k in range(steps):
-        ahead = Reference(references[k : k + controller.horizon + 1])
-        decision = controller.control(Gaussian.certain(states[-1]), ahead, decision)
-        if not decision.status.solved:
-            raise SolverFailure(k, decision.status.advice)
-        inputs.append(decision.input)
-        seconds.append(decision.timing.total)
-        states.append(step(plant, states[-1], decision.input))
-    return Rollout(np.array(states), np.array(inputs), np.array(references[:steps]), np.array(seconds))
+        ahead = window(references, k, controller.horizon)
+        taken.append(one_step(running, controller, ahead, last, on_failure, k, round(k * system.time_step, 9)))
+        last = taken[-1].command
+        if on_step is not None:
+            on_step(taken[-1])
+    return rollout(taken, references, system.time_step, running.covariance)
+
+
+def one_step(
+    running: Running,
+    controller: Controller,
+    reference: Reference,
+    last: Command | None,
+    on_failure: OnFailure,
+    k: int,
+    time: float,
+) -> Step:
+    """Measures, asks, applies."""
+    state, covariance, belief = running.mean, running.covariance, running.measure(time)
+    asked = command(controller, belief, reference, last, on_failure, k)
+    acted = running.apply(time, asked.input)
+    measured = belief.mean.cpu().numpy().astype(float)
+    return Step(k, time, state, covariance, measured, reference, asked, acted, running.mean)
+
+
+def rollout(
+    steps: Sequence[Step], references: Reference, time_step: float, final_covariance: np.ndarray | None = None
+) -> Rollout:
+    """The arrays of all steps; the last state's covariance (n, n) is zero by default."""
+    last = steps[-1].next_state
+    n, nothing = len(last), Timing(0.0, 0.0, 0.0)
+    final_covariance = np.zeros((n, n)) if final_covariance is None else final_covariance
+    decisions: list[Decision | None] = [step.command.decision for step in steps]
+    expected = [d if d is not None and d.status.solved else None for d in decisions]
+    rows = references.states[: len(steps) + 1]
+    if len(rows) == len(steps):
+        rows = np.concatenate([rows, rows[-1:]])
+    return Rollout(
+        states=np.array([*(step.state for step in steps), last]),
+        covariances=np.array([*(step.covariance for step in steps), final_covariance]),
+        measured=np.array([step.measured for step in steps]),
+        inputs=np.array([step.input for step in steps]),
+        references=np.array(rows, dtype=float),
+        predicted_means=np.array([np.full(n, np.nan) if d is None else d.means[1] for d in expected]),
+        predicted_covariances=np.array([np.full((n, n), np.nan) if d is None else d.covariances[1] for d in expected]),
+        statuses=tuple(step.command.status for step in steps),
+        iterations=np.array([0 if d is None else d.iterations for d in decisions]),
+        timings=tuple(nothing if d is None else d.timing for d in decisions),
+        time_step=time_step,
+    )
+
+
+def window(references: Reference, k: int, horizon: int) -> Reference:
+    """What a controller is to follow over its horizon from step k on."""
+    inputs = None if references.inputs is None else references.inputs[k : k + horizon]
+    return Reference(references.states[k : k + horizon + 1], inputs)
+
+
+def checked_references(references: Reference | np.ndarray, steps: int, horizon: int) -> Reference:
+    """References for all steps.
+
+    Raises:
+        ShapeError: Too few, or no table.
+    """
+    references = references if isinstance(references, Reference) else Reference(np.asarray(references, dtype=float))
+    needed = steps + horizon
+    if len(references.states) < needed:
+        raise ShapeError(f"{steps} steps with horizon {horizon} need {needed} references; got {len(references.states)}")
+    return references

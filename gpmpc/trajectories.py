@@ -244,6 +244,12 @@ class Waypoints:
         return self._path.derivative()(np.clip(t, self.times[0], self.times[-1])) * inside[..., None]
 
 
+def states_along(trajectory: Trajectory, time: np.ndarray) -> np.ndarray:
+    """Translational states x, vx, y, vy, z, vz (..., 6) [m, m/s] of a flight along a trajectory at times (...) [s]."""
+    positions = trajectory(time)
+    return np.stack([positions, trajectory.velocity(time)], axis=-1).reshape(*positions.shape[:-1], 6)
+
+
 def _check_positions(key: str, positions: Sequence[Sequence[float]]) -> None:
     for position in positions:
         try:

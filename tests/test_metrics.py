@@ -1,10 +1,20 @@
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy import stats
 
-from gpmpc.exceptions import SettingError
-from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
+from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.metrics import (
+    binomial_interval,
+    interval_coverage,
+    mean_squared_error,
+    negative_log_predictive_density,
+    time_quantiles,
+    tracking_error,
+    violation_rate,
+)
 
 
 def test_the_mean_squared_error_sums_over_outputs_and_averages_over_samples():
@@ -28,3 +38,55 @@ def test_samples_of_the_prediction_are_covered_at_the_level(level):
 def test_a_level_outside_zero_and_one_is_refused():
     with pytest.raises(SettingError, match="level: must lie between 0 and 1; got 95"):
         interval_coverage(torch.zeros(1, 1), torch.ones(1, 1), torch.zeros(1, 1), 95)
+
+
+def test_the_tracking_error_is_that_of_the_axes_and_of_the_distance_without_the_start():
+    states, references = np.zeros((3, 6)), np.zeros((3, 6))
+    states[0] = 100.0  # where nobody steered
+    states[1, ::2], states[2, ::2] = [3, 0, 0], [0, 4, 0]
+    states[:, 1::2] = 7.0  # velocities are not looked at
+    error = tracking_error(states, references)
+    assert np.allclose(error.axes, [np.sqrt(9 / 2), np.sqrt(16 / 2), 0])
+    assert error.total == pytest.approx(np.sqrt(25 / 2))
+    assert tracking_error(states, references, axes=[1]).total == pytest.approx(7.0)
+
+
+def test_a_violation_is_a_step_with_any_entry_outside():
+    values = np.array([[0.0, 0.0], [1.5, -3.0], [1.0 + 1e-12, 0.0], [np.nan, 0.0], [0.0, 5.0]])
+    rate = violation_rate(values, [-1.0, -2.0], [1.0, np.inf])
+    assert (rate.violations, rate.steps, rate.rate) == (2, 5, 0.4)
+    assert rate.worst == 1.0
+    assert rate.low < 0.4 < rate.high
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(0, 10), (10, 10), (3, 40), (1, 1)])
+def test_the_binomial_interval_is_the_exact_test_turned_round(successes, trials):
+    low, high = binomial_interval(successes, trials, 0.9)
+    if successes:
+        assert stats.binom.sf(successes - 1, trials, low) == pytest.approx(0.05)
+    else:
+        assert low == 0
+    if successes < trials:
+        assert stats.binom.cdf(successes, trials, high) == pytest.approx(0.05)
+    else:
+        assert high == 1
+
+
+def test_the_quantiles_of_times_are_in_order():
+    quantiles = time_quantiles(np.arange(101.0))
+    assert (quantiles.median, quantiles.p95, quantiles.p99, quantiles.largest) == (50, 95, 99, 100)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: tracking_error(np.zeros((3, 6)), np.zeros((2, 6))), ShapeError, r"got \(3, 6\) and \(2, 6\)"),
+        (lambda: violation_rate(np.zeros((3, 2)), [0], [1]), ShapeError, r"bounds \(d,\).*got \(3, 2\), \(1,\)"),
+        (lambda: binomial_interval(3, 2), SettingError, "successes: must lie between 0 and trials"),
+        (lambda: binomial_interval(1, 2, 95), SettingError, "level: must lie between 0 and 1; got 95"),
+        (lambda: time_quantiles(np.zeros(0)), ShapeError, r"seconds must be \(K,\)"),
+    ],
+)
+def test_arrays_that_do_not_belong_together_are_refused(call, error, message):
+    with pytest.raises(error, match=message):
+        call()

@@ -17,14 +17,11 @@ Fits are independent; they run in worker processes of one thread each, and every
 import hashlib
 import json
 import os
-import signal
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +36,10 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Scaling, Training, Transitions
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
+from gpmpc.parallel import in_processes
 from gpmpc.propagation import MomentMatching
 from gpmpc.trajectories import Trajectory
 
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 SOURCES = ("gaussian.py", "metrics.py", "gp/*.py", "propagation/*.py", "experiments/tables.py")
 
 
@@ -176,21 +173,14 @@ class Tables:
                 progress(found[fit.fingerprint])
         missing = [fit for fit in fits if fit.fingerprint not in found]
         if missing:
-            workers = min(self.workers or _cores(), len(missing))
             evaluate = partial(_evaluate, model=self.model, state_std=float(self.state_std))
-            with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), _quiet_on_interrupt) as pool:
-                # The largest first: the last fits to run are then short ones.
-                order = sorted(missing, key=lambda fit: -fit.size)
-                running = {pool.submit(evaluate, fit): fit for fit in order}
-                try:
-                    for done in as_completed(running):
-                        record = done.result()
-                        store.append(running[done].fingerprint, record)
-                        found[running[done].fingerprint] = record
-                        progress(record)
-                except BaseException:
-                    pool.shutdown(wait=False, cancel_futures=True)
-                    raise
+            # The largest first: the last fits to run are then short ones.
+            order = sorted(missing, key=lambda fit: -fit.size)
+            with closing(in_processes(evaluate, order, self.workers)) as finished:
+                for index, record in finished:
+                    store.append(order[index].fingerprint, record)
+                    found[order[index].fingerprint] = record
+                    progress(record)
         return [found[fit.fingerprint] | {"draw": fit.draw} for fit in fits]
 
 
@@ -301,31 +291,6 @@ def _cell(name: str, part: str, raw: Transitions, subsystem: Subsystem) -> Cell:
     states, inputs, next_states = (Scaling(scaling.offset[piece], scaling.factor[piece]) for piece in pieces)
     data = Transitions(states.scale(raw.states), inputs.scale(raw.inputs), next_states.scale(raw.next_states))
     return Cell(name, part, data, next_states, tuple(list(subsystem.columns).index(r) for r in subsystem.reported))
-
-
-def _quiet_on_interrupt() -> None:
-    """Ctrl-C reaches the whole process group; the parent alone answers it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Worker processes started inside use one thread each, whatever library asks."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def _whole_numbers(key: str, values: Any) -> tuple[int, ...]:

@@ -1,16 +1,20 @@
 """The systems that are controlled."""
 
+from gpmpc.plants.coupled import Coupled, attitude_at_yaw, thrust_direction
 from gpmpc.plants.plant import Dynamics, Integrated, Map, Plant, step
 from gpmpc.plants.quadrotor import ATTITUDES, Rotational, Translational, attitude_for_thrust_direction
 
 __all__ = [
     "ATTITUDES",
+    "Coupled",
     "Dynamics",
     "Integrated",
     "Map",
     "Plant",
     "Rotational",
     "Translational",
+    "attitude_at_yaw",
     "attitude_for_thrust_direction",
     "step",
+    "thrust_direction",
 ]

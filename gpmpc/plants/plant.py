@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from gpmpc.exceptions import check_number
+from gpmpc.exceptions import SettingError, check_number
 
 
 class Dynamics(Protocol):
@@ -49,6 +49,9 @@ class Map:
     Attributes:
         dynamics: The right-hand side f.
         time_step: Time that one step stands for [s]; it labels the axis and does not enter the equations.
+
+    Raises:
+        SettingError: The time step is not positive, or the right-hand side means nothing as a map.
     """
 
     dynamics: Dynamics
@@ -56,6 +59,8 @@ class Map:
 
     def __post_init__(self) -> None:
         check_number("time_step", self.time_step, above=0, unit="[s]")
+        if getattr(self.dynamics, "integrated_only", False):
+            raise SettingError("plant", f"{type(self.dynamics).__name__} means nothing as a map; take Integrated")
 
     def successor(self, x: Any, u: Any) -> list[Any]:
         """x[k+1] = f(x[k], u[k])."""

@@ -1,0 +1,103 @@
+"""Problem: a controller fails now and then, or has no state to work from; something has to be applied all the same.
+
+What is applied then is a declared policy. A failed iterate is never applied and never handed on: the next call gets
+the last plan that was solved, moved on in time as if it had been made one step ago, with what was really applied as its
+first input. A plan that is used up holds its last input.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+
+from gpmpc.control.controller import Controller, Decision, Reference
+from gpmpc.exceptions import SettingError, SolverFailure
+from gpmpc.gaussian import Gaussian
+from gpmpc.status import Status
+
+OnFailure = Literal["previous_plan", "hold", "raise"]
+POLICIES = ("previous_plan", "hold", "raise")
+
+
+@dataclass(frozen=True)
+class Command:
+    """What one step applies, and what the next one has to know.
+
+    Attributes:
+        input: What is applied (m,).
+        status: How the step's own solve ended; ``INVALID_MEASUREMENT`` where the controller was not asked.
+        decision: What the controller returned, a failed iterate perhaps; None where it was not asked.
+        plan: The last solved decision, moved on to this step; None before the first.
+    """
+
+    input: np.ndarray
+    status: Status
+    decision: Decision | None
+    plan: Decision | None
+
+
+def command(
+    controller: Controller,
+    belief: Gaussian,
+    reference: Reference,
+    last: Command | None = None,
+    on_failure: OnFailure = "raise",
+    step: int = 0,
+) -> Command:
+    """Asks a controller for one step's input, and falls back by the policy where it has none.
+
+    Args:
+        controller: Whom to ask.
+        belief: What is known of the state (n,); an entry that is not finite is never given to the controller.
+        reference: Over the controller's horizon.
+        last: What came of the step before; None at the first.
+        on_failure: ``"previous_plan"`` goes on along the last solved plan, ``"hold"`` keeps the last input applied,
+            ``"raise"`` stops. Before the first solved plan, the first two take the reference's own input if there is
+            one, and stop otherwise.
+        step: Number of the step, for the message.
+
+    Raises:
+        SettingError: No such policy.
+        SolverFailure: The policy says so, or there is nothing to fall back on.
+    """
+    check_policy(on_failure)
+    plan = None if last is None else last.plan
+    status, decision = Status.INVALID_MEASUREMENT, None
+    if bool(torch.isfinite(belief.mean).all() and torch.isfinite(belief.covariance).all()):
+        decision = controller.control(belief, reference, plan)
+        status = decision.status
+        if status.solved:
+            return Command(decision.input, status, decision, decision)
+    if on_failure == "raise":
+        raise SolverFailure(step, status.advice)
+    if plan is not None:
+        plan = _moved_on(plan)
+        if on_failure == "hold":
+            plan = _with_first_input(plan, last.input)
+        return Command(plan.input, status, decision, plan)
+    if reference.inputs is None:
+        raise SolverFailure(step, f"{status.advice} (no earlier plan and no reference input to fall back on)")
+    return Command(np.array(reference.inputs[0], dtype=float), status, decision, None)
+
+
+def check_policy(on_failure: str) -> None:
+    """Raises unless there is such a policy.
+
+    Raises:
+        SettingError: There is none.
+    """
+    if on_failure not in POLICIES:
+        raise SettingError("on_failure", f"must be one of {', '.join(map(repr, POLICIES))}; got {on_failure!r}")
+
+
+def _moved_on(plan: Decision) -> Decision:
+    """A plan as it would read had it been made one step later: shifted by one row, the last one repeated."""
+    inputs, means, covariances = (
+        np.concatenate([rows[1:], rows[-1:]]) for rows in (plan.inputs, plan.means, plan.covariances)
+    )
+    return replace(plan, input=inputs[0], inputs=inputs, means=means, covariances=covariances)
+
+
+def _with_first_input(plan: Decision, applied: np.ndarray) -> Decision:
+    return replace(plan, input=applied, inputs=np.concatenate([applied[None], plan.inputs[1:]]))

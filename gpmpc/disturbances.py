@@ -1,0 +1,181 @@
+"""Problem: what is there is not always what the controller believes in: wind, another payload, a sensor that drops out.
+
+A ``Disturbance`` is asked, step by step, for the plant that really acts and for what is really measured. Times are
+those at which a step begins: a window that opens within a step acts from the next one on.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, is_dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel, check_number
+from gpmpc.plants import Dynamics, Plant
+
+
+class Disturbance(Protocol):
+    """Something that a controller is not told of."""
+
+    def acting(self, plant: Plant, time: float) -> Plant:
+        """The plant that acts in the step from a time [s] on, in the place of the given one."""
+
+    def measured(self, state: np.ndarray, time: float) -> np.ndarray:
+        """What is measured of a state (n,) at a time [s], in the place of the given one."""
+
+
+@dataclass(frozen=True)
+class Gust:
+    """A constant push on single states over a time window, integrated by the plant like any other force.
+
+    (On a ``Map``, whose right-hand side is the next state, it is added to that.)
+
+    Attributes:
+        rates: What is added to the derivative of a state, by its name: ``{"vx": 2.0}`` is an acceleration of
+            2 m/s^2, the force over the mass.
+        start: When it begins [s].
+        stop: When it ends [s].
+
+    Raises:
+        SettingError: A rate is no number, or the window is empty.
+    """
+
+    rates: Mapping[str, float]  # [unit of the state / s]
+    start: float = 0.0  # [s]
+    stop: float = math.inf  # [s]
+
+    def __post_init__(self) -> None:
+        _check_window(self.start, self.stop)
+        if not isinstance(self.rates, Mapping) or not self.rates:
+            raise SettingError("rates", f"must map names of states to numbers, like {{'vx': 2.0}}; got {self.rates!r}")
+        for name, rate in self.rates.items():
+            check_number(f"rates.{name}", rate)
+
+    def acting(self, plant: Plant, time: float) -> Plant:
+        """The plant with the push, inside the window.
+
+        Raises:
+            SettingError: The plant has no such state.
+            UnsupportedModel: The plant is no dataclass over ``dynamics``, like ``Integrated``.
+        """
+        names = plant.dynamics.state_names
+        for name in self.rates:
+            if name not in names:
+                raise SettingError("rates", f"must name states of the plant, {', '.join(names)}; got {name!r}")
+        if not self.start <= time < self.stop:
+            return plant
+        if not is_dataclass(plant):
+            raise UnsupportedModel(
+                f"a gust needs a plant that is a dataclass over its dynamics; got {type(plant).__name__}. "
+                "Possible with any plant: Replaced"
+            )
+        return replace(plant, dynamics=_Pushed(plant.dynamics, tuple(float(self.rates.get(s, 0.0)) for s in names)))
+
+    def measured(self, state: np.ndarray, time: float) -> np.ndarray:
+        """The state: a gust is felt, not measured."""
+        return state
+
+
+@dataclass(frozen=True)
+class Replaced:
+    """Another plant over a time window: another mass, a broken arm.
+
+    Attributes:
+        plant: What acts then.
+        start: When it begins [s].
+        stop: When it ends [s].
+
+    Raises:
+        SettingError: The window is empty.
+    """
+
+    plant: Plant
+    start: float = 0.0  # [s]
+    stop: float = math.inf  # [s]
+
+    def __post_init__(self) -> None:
+        _check_window(self.start, self.stop)
+
+    def acting(self, plant: Plant, time: float) -> Plant:
+        """The other plant, inside the window.
+
+        Raises:
+            ShapeError: The two have other states, inputs or time steps.
+        """
+        ours, theirs = (
+            (tuple(p.dynamics.state_names), tuple(p.dynamics.input_names), p.time_step) for p in (plant, self.plant)
+        )
+        if ours != theirs:
+            raise ShapeError(f"a plant must be replaced by one of the same states, inputs, step {ours}; got {theirs}")
+        return self.plant if self.start <= time < self.stop else plant
+
+    def measured(self, state: np.ndarray, time: float) -> np.ndarray:
+        """The state."""
+        return state
+
+
+@dataclass(frozen=True)
+class Dropout:
+    """Nothing is measured over a time window: entries of the state are NaN.
+
+    Attributes:
+        start: When it begins [s].
+        stop: When it ends [s].
+        entries: Which ones, from 0; all by default. Without position, for one: 0 to 5 of a ``Coupled`` plant.
+
+    Raises:
+        SettingError: The window is empty.
+    """
+
+    start: float  # [s]
+    stop: float  # [s]
+    entries: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        _check_window(self.start, self.stop)
+
+    def acting(self, plant: Plant, time: float) -> Plant:
+        """The plant.
+
+        Raises:
+            SettingError: The plant has no such entry.
+        """
+        n = len(plant.dynamics.state_names)
+        for entry in self.entries or ():
+            if not isinstance(entry, int) or not 0 <= entry < n:
+                raise SettingError("entries", f"must be indices of states, 0 to {n - 1}; got {entry!r}")
+        return plant
+
+    def measured(self, state: np.ndarray, time: float) -> np.ndarray:
+        """NaN inside the window."""
+        if not self.start <= time < self.stop:
+            return state
+        lost = state.copy()
+        lost[slice(None) if self.entries is None else list(self.entries)] = np.nan
+        return lost
+
+
+@dataclass(frozen=True)
+class _Pushed:
+    """A right-hand side with constants added (n,)."""
+
+    dynamics: Dynamics
+    rates: tuple[float, ...]
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        return self.dynamics.state_names
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        return self.dynamics.input_names
+
+    def derivative(self, x: Any, u: Any) -> Sequence[Any]:
+        return [d + rate for d, rate in zip(self.dynamics.derivative(x, u), self.rates, strict=True)]
+
+
+def _check_window(start: float, stop: float) -> None:
+    check_number("start", start, unit="[s]")
+    if stop != math.inf:
+        check_number("stop", stop, above=start, unit="[s]")

@@ -1,0 +1,138 @@
+"""Problem: a flight that tracks well teaches little, and a model learned from it fails with the plant in the loop.
+
+Where the controller does its work, inputs are a function of states and references, and what each of them does on its
+own cannot be told apart (Ljung, 1999, section 13.4: a closed loop has to be excited). A GP trained on such data
+predicts the very same flight closely and has useless derivatives by the inputs, which are what a controller steers by.
+The remedy is dither: seeded white noise on the inputs, in their own units, well above the process noise. Measured, 189
+samples, error of the derivatives by the inputs relative to the plant's, median along the elliptical flight:
+
+                     dither and noise   noise alone   neither
+    translational               0.012          0.19       4.1
+    rotational                  0.003          0.11       4.0
+
+Steered by the first column's GPs, one step ahead, the plant keeps within 0.03 m of that flight (RMSE); by the last's it
+ends up a kilometre away.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpmpc.control.nmpc import NMPC
+from gpmpc.control.tracking import TrackingProblem
+from gpmpc.datasets import SUBSYSTEMS, check_weights, transitions_of
+from gpmpc.exceptions import SettingError, check_number
+from gpmpc.gp.transitions import Transitions
+from gpmpc.plants import ATTITUDES, Plant, attitude_for_thrust_direction
+from gpmpc.simulation import Rollout, closed_loop
+from gpmpc.systems import Noise
+from gpmpc.trajectories import Trajectory, states_along
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """How one subsystem is flown for data: NMPC on the true plant, which is shaken meanwhile.
+
+    Attributes:
+        plant: The true system.
+        Q: State weights, the diagonal (n,).
+        R: Weights of the inputs' increments, the diagonal (m,).
+        initial_input: First guess of the solver, and the input before the first (m,).
+        dither: Standard deviation of what is added to the inputs (m,), in their units.
+        noise: Standard deviation of what is added to every next state (n,), in their units.
+        horizon: Of the NMPC.
+
+    Raises:
+        SettingError: A weight has another length than the plant's states or inputs.
+    """
+
+    plant: Plant
+    Q: Sequence[float]
+    R: Sequence[float]
+    initial_input: Sequence[float]
+    dither: Sequence[float]
+    noise: Sequence[float]
+    horizon: int = 1
+
+    def __post_init__(self) -> None:
+        check_weights(self.plant, self.Q, self.R)
+
+    def fly(self, references: np.ndarray, steps: int, seed: int) -> Rollout:
+        """From the first of the references (steps + horizon, n) on."""
+        problem = TrackingProblem(self.Q, self.R, penalized="increments")
+        controller = NMPC(self.plant, problem, self.horizon, self.initial_input)
+        noise = Noise(process=self.noise, input=self.dither)
+        return closed_loop(
+            self.plant, controller, references, references[0], steps, noise=noise, seed=seed, on_failure="previous_plan"
+        )
+
+
+@dataclass(frozen=True)
+class ExcitedData:
+    """Transitions of dithered flights, to train models that fly.
+
+    The translational subsystem follows the trajectory from its beginning. The rotational one is asked for attitudes of
+    that flight in random order, each held for a while and approached at first order, as a ``Cascade`` asks for them: so
+    a few seconds at its own rate cover the whole flight's attitudes.
+
+    Attributes:
+        translational: How the outer subsystem is flown.
+        rotational: How the inner subsystem is flown.
+        samples: Transitions of either.
+        hold: Inner steps that an attitude is asked for.
+        response_time: Of the approach to it [s].
+        attitude: How thrust direction becomes attitude: ``"exact"`` or ``"paper"``.
+        seed: Of dither, noise and the order of the attitudes.
+    """
+
+    translational: Excitation
+    rotational: Excitation
+    samples: int = 189
+    hold: int = 10
+    response_time: float = 0.1  # [s]
+    attitude: str = "exact"
+    seed: int = 0
+
+    note = (
+        "Data: our own dithered and noisy flights of integrated plants. They are made for control; the paper's figures "
+        "belong to noise-free data of the map."
+    )
+
+    def __post_init__(self) -> None:
+        for key, least in (("samples", 1), ("hold", 1), ("seed", 0)):
+            check_number(f"data.{key}", getattr(self, key), least=least, whole=True)
+        check_number("data.response_time", self.response_time, above=0, unit="[s]")
+        if self.attitude not in ATTITUDES:
+            raise SettingError("data.attitude", f"must be one of {', '.join(ATTITUDES)}; got {self.attitude!r}")
+
+    def transitions(self, name: str, trajectory: Trajectory, subsystem: str) -> Transitions:
+        """Flies one subsystem; the inputs are those that acted, dither included.
+
+        Raises:
+            SettingError: No such subsystem, negative dither or noise.
+            SolverFailure: The controller's solver failed at the first step.
+        """
+        if subsystem not in SUBSYSTEMS:
+            raise SettingError("subsystem", f"must be one of {', '.join(SUBSYSTEMS)}; got {subsystem!r}")
+        times = self.translational.plant.time_step * np.arange(self.samples + self.translational.horizon)
+        outer = self.translational.fly(states_along(trajectory, times), self.samples, self.seed)
+        if subsystem == "translational":
+            return transitions_of(outer, self.samples)
+        streams = np.random.SeedSequence([self.seed, SUBSYSTEMS.index("rotational")])
+        angles = attitude_for_thrust_direction(outer.inputs[:, 1], outer.inputs[:, 2], self.attitude)
+        references = self._attitudes(angles, np.random.default_rng(streams))
+        seed = int(streams.generate_state(1)[0])
+        return transitions_of(self.rotational.fly(references, self.samples, seed), self.samples)
+
+    def _attitudes(self, angles: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+        """Rotational states (samples + horizon, 6) that approach rows of ``angles`` (K, 2) [rad] one after another."""
+        count = self.samples + self.rotational.horizon
+        chosen = angles[generator.integers(len(angles), size=-(-count // self.hold))]
+        left = np.exp(-self.rotational.plant.time_step / self.response_time)  # of the way, after one step
+        states, at = np.zeros((count, 6)), chosen[0]
+        for j in range(count):
+            wanted = chosen[j // self.hold]
+            states[j, [0, 2]], states[j, [1, 3]] = at, (wanted - at) / self.response_time
+            at = wanted + left * (at - wanted)
+        return states

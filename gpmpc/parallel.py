@@ -1,0 +1,68 @@
+"""Problem: independent jobs should use every core, without one thread pool inside another and without orphans.
+
+Jobs run in freshly started processes (spawn: it is safe with threads and the same on every system), one thread each. On
+Ctrl-C, which reaches the whole process group, the parent alone answers: what is running is ended, nothing hangs.
+"""
+
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from multiprocessing import active_children, get_context
+from typing import TypeVar
+
+J = TypeVar("J")
+R = TypeVar("R")
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def in_processes(function: Callable[[J], R], jobs: Sequence[J], workers: int | None = None) -> Iterator[tuple[int, R]]:
+    """Yields (index of a job, its result), in the order in which they finish.
+
+    Args:
+        function: Of a job; it and its results can be pickled. Its exceptions end the whole run.
+        jobs: Started in this order.
+        workers: Processes; None takes one a core.
+
+    Raises:
+        BrokenProcessPool: A worker process died.
+    """
+    if not jobs:
+        return
+    workers, before = min(workers or cores(), len(jobs)), set(active_children())
+    with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), _quiet_on_interrupt) as pool:
+        running = {pool.submit(function, job): index for index, job in enumerate(jobs)}
+        try:
+            for done in as_completed(running):
+                yield running[done], done.result()
+        except BaseException:  # a failed job, Ctrl-C, or a caller that wants no more
+            pool.shutdown(wait=False, cancel_futures=True)
+            for child in set(active_children()) - before:
+                child.terminate()
+            raise
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _quiet_on_interrupt() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Worker processes started inside use one thread each, whatever library asks."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -1,0 +1,230 @@
+"""Problem: two things can stand at the other end of a loop, and a result has to say which one did.
+
+The plant: a state that is stepped, pushed about and measured with noise. Or the learned model itself, as in the figures
+of Cao, Lai and Alam (2017): every next state is the model's own prediction, mean and covariance carried on, and the
+true plant never enters. The second says how a controller and a model get on with each other, not how a vehicle flies.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from gpmpc.disturbances import Disturbance
+from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number, check_numbers
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.plants import Plant, step
+from gpmpc.propagation.propagator import Propagator
+
+
+@dataclass(frozen=True)
+class ModelLoop:
+    """A learned model rolled on itself.
+
+    Attributes:
+        model: It predicts the next state.
+        propagator: How the belief is carried on.
+        time_step: Time that one step stands for [s].
+        initial_std: Standard deviation of every state at the start where only its mean is given; the paper's 0.1.
+
+    Raises:
+        SettingError: A time step that is not positive, or a negative deviation.
+    """
+
+    model: DynamicsModel
+    propagator: Propagator
+    time_step: float = 1.0  # [s]
+    initial_std: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_number("time_step", self.time_step, above=0, unit="[s]")
+        check_number("initial_std", self.initial_std, least=0)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """White Gaussian noise, as standard deviations; every source draws from a stream of its own.
+
+    Attributes:
+        process: Added to every next state (n,).
+        measurement: Added to what is measured (n,).
+        input: Added to every input that is applied (m,): an actuator's, or the dither that makes data informative.
+
+    Raises:
+        SettingError: An entry is negative or no number.
+    """
+
+    process: Sequence[float] | None = None
+    measurement: Sequence[float] | None = None
+    input: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        for key in ("process", "measurement", "input"):
+            values = getattr(self, key)
+            if values is not None:
+                values = values.tolist() if isinstance(values, np.ndarray) else values
+                check_numbers(f"noise.{key}", values, len(values) if hasattr(values, "__len__") else 1, least=0)
+
+
+class Running(Protocol):
+    """A system under way."""
+
+    mean: np.ndarray  # the state, or what is believed of it (n,)
+    covariance: np.ndarray  # (n, n), zero for a plant's
+
+    def measure(self, time: float) -> Gaussian:
+        """What a controller is told at a time [s]."""
+
+    def apply(self, time: float, input: np.ndarray) -> np.ndarray:
+        """Takes one step from a time [s] on; the input that acted (m,)."""
+
+
+class RunningPlant:
+    """A plant under way, with disturbances and noise.
+
+    Args:
+        plant: What the controller believes in, and what is there where no disturbance says otherwise.
+        initial: The state (n,), or a belief that it is drawn from.
+        disturbances: Each is handed the plant, and the measurement, that the one before left.
+        noise: On states, measurements and inputs.
+        seed: Of all random numbers.
+
+    Raises:
+        ShapeError: State or noise do not fit the plant.
+        SettingError: The seed is no whole number.
+        DataError: The state is not finite.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        initial: Any,
+        disturbances: Sequence[Disturbance] = (),
+        noise: Noise | None = None,
+        seed: int = 0,
+    ):
+        check_number("seed", seed, least=0, whole=True)
+        n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
+        noise = noise or Noise()
+        for key, length in (("process", n), ("measurement", n), ("input", m)):
+            values = getattr(noise, key)
+            if values is not None and len(values) != length:
+                raise ShapeError(f"noise.{key} must have {length} standard deviations; got {len(values)}")
+        # One stream a source: whether states are measured with noise changes nothing about the wind.
+        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
+        self._sources = dict(zip(("initial", "process", "measurement", "input"), streams, strict=True))
+        self.plant, self.disturbances, self.noise = plant, tuple(disturbances), noise
+        mean, covariance = (initial.mean, initial.covariance) if isinstance(initial, Gaussian) else (initial, None)
+        self.mean = checked_state(mean, n)
+        if covariance is not None:
+            self.mean = self._sources["initial"].multivariate_normal(self.mean, np.asarray(covariance, dtype=float))
+        self.covariance = np.zeros((n, n))
+        self._steps = 0
+        self._acting(0.0)  # a disturbance that does not fit is found out before the first step
+
+    def measure(self, time: float) -> Gaussian:
+        """The state as it is measured, taken for certain: the controllers of this package filter nothing."""
+        measured = self._noisy("measurement", self.mean)
+        for disturbance in self.disturbances:
+            measured = disturbance.measured(measured, time)
+        return Gaussian.certain(measured)
+
+    def apply(self, time: float, input: np.ndarray) -> np.ndarray:
+        """Steps the plant that is there at this time.
+
+        Raises:
+            Diverged: The next state is not finite.
+        """
+        plant, input = self._acting(time), self._noisy("input", input)
+        with np.errstate(over="ignore", invalid="ignore"):
+            state = step(plant, self.mean, input)
+        if not np.isfinite(state).all():
+            raise Diverged(self._steps, f"the plant's state is not finite any more; it was {self.mean}, input {input}")
+        self.mean = self._noisy("process", state)
+        self._steps += 1
+        return input
+
+    def _acting(self, time: float) -> Plant:
+        plant = self.plant
+        for disturbance in self.disturbances:
+            plant = disturbance.acting(plant, time)
+        return plant
+
+    def _noisy(self, source: str, value: np.ndarray) -> np.ndarray:
+        deviations = getattr(self.noise, source)
+        if deviations is None:
+            return value
+        return value + np.asarray(deviations, dtype=float) * self._sources[source].standard_normal(len(value))
+
+
+class RunningModel:
+    """A model loop under way.
+
+    Args:
+        loop: Model and propagator.
+        initial: Mean (n,) with covariance ``initial_std``^2 I, or a belief.
+        disturbances: None are possible.
+        noise: None is possible.
+
+    Raises:
+        SettingError: A disturbance or noise is given: nothing of the kind enters a model loop.
+    """
+
+    def __init__(self, loop: ModelLoop, initial: Any, disturbances: Sequence[Disturbance], noise: Noise | None):
+        if disturbances or noise is not None:
+            raise SettingError("disturbances, noise", "need a plant in the loop; got a ModelLoop")
+        self.loop, model = loop, loop.model
+        mean, covariance = (initial.mean, initial.covariance) if isinstance(initial, Gaussian) else (initial, None)
+        mean = torch.as_tensor(checked_state(mean, model.state_dim)).to(model.device, model.dtype)
+        if covariance is None:
+            covariance = loop.initial_std**2 * torch.eye(model.state_dim, dtype=model.dtype, device=model.device)
+        else:
+            covariance = torch.as_tensor(covariance).to(model.device, model.dtype)
+        self._belief = Gaussian(mean, covariance)
+        self._steps = 0
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Of the belief (n,)."""
+        return self._belief.mean.cpu().numpy().astype(float)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of the belief (n, n)."""
+        return self._belief.covariance.cpu().numpy().astype(float)
+
+    def measure(self, time: float) -> Gaussian:
+        """The belief."""
+        return self._belief
+
+    def apply(self, time: float, input: np.ndarray) -> np.ndarray:
+        """Carries the belief one step on.
+
+        Raises:
+            Diverged: The next belief is not finite.
+        """
+        like = self._belief.mean
+        control = torch.as_tensor(np.asarray(input, dtype=float)).to(like.device, like.dtype)
+        self._belief = self.loop.propagator(self.loop.model, self._belief, control)
+        if not bool(torch.isfinite(self._belief.mean).all() and torch.isfinite(self._belief.covariance).all()):
+            raise Diverged(self._steps, f"the model's belief is not finite any more; its mean is {self._belief.mean}")
+        self._steps += 1
+        return input
+
+
+def checked_state(value: Any, n: int) -> np.ndarray:
+    """A finite state (n,) as an array of its own.
+
+    Raises:
+        ShapeError: Another shape.
+        SettingError: An entry is not finite.
+    """
+    state = np.array(value.cpu().numpy() if isinstance(value, torch.Tensor) else value, dtype=float)
+    if state.shape != (n,):
+        raise ShapeError(f"the initial state must have shape ({n},); got {state.shape}")
+    if not np.isfinite(state).all():
+        raise SettingError("initial", f"must be finite; got {state}")
+    return state

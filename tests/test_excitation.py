@@ -1,0 +1,93 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from gpmpc.cli.main import config_folder
+from gpmpc.exceptions import SettingError
+from gpmpc.excitation import Excitation, ExcitedData
+from gpmpc.plants import Integrated, Rotational, Translational, step
+from gpmpc.trajectories import Elliptical
+
+OUTER = Excitation(
+    Integrated(Translational(), 1.0, 1), [1] * 6, [1] * 3, [7.26, 0, 0], dither=[0.3, 0.03, 0.03], noise=[0.01] * 6
+)
+INNER = Excitation(
+    Integrated(Rotational(), 0.05, 1), [1] * 6, [1] * 3, [0, 0, 0], dither=[0.05] * 3, noise=[1e-4, 1e-3] * 3
+)
+DATA = ExcitedData(OUTER, INNER, samples=60)
+
+
+def by_input(plant, x, u):
+    """The true derivatives by the inputs (6, 3)."""
+    return np.array([(step(plant, x, u + e) - step(plant, x, u - e)) / 2e-6 for e in 1e-6 * np.eye(3)]).T
+
+
+@pytest.mark.parametrize(("subsystem", "flown"), [("translational", OUTER), ("rotational", INNER)])
+def test_transitions_are_the_plants_with_the_noise_and_inputs_that_acted(subsystem, flown):
+    data = DATA.transitions("elliptical", Elliptical(), subsystem)
+    stepped = [step(flown.plant, x, u) for x, u in zip(data.states.numpy(), data.inputs.numpy(), strict=True)]
+    left = data.next_states.numpy() - stepped
+    assert np.abs(left.std(axis=0) / flown.noise - 1).max() < 0.5
+    assert (data.inputs.numpy().std(axis=0) > 0.7 * np.array(flown.dither)).all()
+    assert np.array_equal(data.states[1:].numpy(), data.next_states[:-1].numpy())
+
+
+def test_the_seed_decides_the_flight():
+    first, again, other = (
+        replace(DATA, seed=seed).transitions("elliptical", Elliptical(), "rotational").states.numpy()
+        for seed in (0, 0, 1)
+    )
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_a_model_learns_from_dither_what_the_inputs_do_and_cannot_without():
+    def error(dither):
+        source = replace(DATA, translational=replace(OUTER, dither=dither))
+        data = source.transitions("elliptical", Elliptical(), "translational")
+        features = np.hstack([data.features.numpy(), np.ones((60, 1))])
+        learned = np.linalg.lstsq(features, data.next_states.numpy(), rcond=None)[0].T[
+            :, 6:9
+        ]  # near hover it is linear
+        true = by_input(OUTER.plant, np.zeros(6), np.array([0.74 * 9.81, 0, 0]))
+        return np.linalg.norm(learned - true) / np.linalg.norm(true)
+
+    assert error(OUTER.dither) < 0.1
+    assert error([0, 0, 0]) > 0.4
+
+
+def test_a_frozen_attitude_can_be_flown():
+    plant = Integrated(Translational(frozen_attitude=(np.pi / 4, np.pi / 4)), 1.0, 1)
+    source = replace(DATA, samples=20, translational=replace(OUTER, plant=plant, initial_input=[14.5, 0, 0]))
+    data = source.transitions("elliptical", Elliptical(), "translational")
+    assert abs(float(data.inputs[:, 0].mean()) - 2 * 0.74 * 9.81) < 0.5
+
+
+def test_the_settings_that_ship_are_these():
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("tables", ["data=excited", "data.samples=60"])
+    shipped = instantiate(config.data, _convert_="all")
+    assert isinstance(shipped, ExcitedData)
+    ours = replace(shipped, rotational=INNER).transitions("elliptical", Elliptical(), "rotational")
+    assert np.array_equal(ours.states, DATA.transitions("elliptical", Elliptical(), "rotational").states)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"samples": 0}, "data.samples: must be a whole number, 1 or more; got 0"),
+        ({"hold": 1.5}, "data.hold: must be a whole number, 1 or more; got 1.5"),
+        ({"seed": -1}, "data.seed: must be a whole number, 0 or more; got -1"),
+        ({"response_time": 0}, r"data.response_time: must be a number above 0 \[s\]; got 0"),
+        ({"attitude": "level"}, "data.attitude: must be one of paper, exact; got 'level'"),
+        ({"translational": replace(OUTER, dither=[-1, 0, 0])}, "noise.input: must be a number, 0 or more; got -1"),
+    ],
+)
+def test_misuse_is_refused_with_the_rule(change, message):
+    with pytest.raises(SettingError, match=message):
+        replace(DATA, **change).transitions("elliptical", Elliptical(), "translational")
+    with pytest.raises(SettingError, match="must be one of translational, rotational; got 'yaw'"):
+        DATA.transitions("elliptical", Elliptical(), "yaw")
