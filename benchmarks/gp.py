@@ -20,6 +20,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 from collections.abc import Callable
 from pathlib import Path
 
+import gpytorch
 import numpy as np
 import torch
 
@@ -125,11 +126,11 @@ def contenders(size: int, torch_jacobian: bool) -> list[dict[str, Callable]]:
     model = BatchExactGP(gp.features, gp.targets)
     deviation, noise = gp.signal_variance.log() / 2, gp.noise_variance.log() / 2
     model.set_hyperparameters(torch.cat([gp.lengthscales.log(), torch.stack([deviation, deviation - noise], 1)], 1))
-    model.eval()
+    model.eval().requires_grad_(False)
     query = torch.cat([at.mean, control])
 
     def by_gpytorch():
-        with exact_inference():
+        with exact_inference(), gpytorch.settings.skip_posterior_variances():  # the mean alone, from its cache
             return torch.autograd.functional.jacobian(lambda x: model(x[None]).mean[:, 0], query).split(STATES, dim=1)
 
     def gradient_by_torch():

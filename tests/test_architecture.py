@@ -41,7 +41,7 @@ def test_the_gp_modules_load_neither_optimisation_nor_settings_nor_figures(modul
         ("omegaconf", ["cli"]),
         ("matplotlib", ["plotting.py"]),
         ("casadi", ["control", "gp/casadi_.py"]),
-        ("rich", ["cli", "experiments", "trials.py"]),
+        ("rich", ["cli", "experiments", "simulation/trials.py"]),
     ],
 )
 def test_a_heavy_library_has_one_door(library, rooms):

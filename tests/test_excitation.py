@@ -6,8 +6,8 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from gpmpc.cli.main import config_folder
+from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import SettingError
-from gpmpc.excitation import Excitation, ExcitedData
 from gpmpc.plants import Integrated, Rotational, Translational, step
 from gpmpc.trajectories import Elliptical
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import GpmpcError, SettingError
-from gpmpc.trials import trials
+from gpmpc.simulation import trials
 
 
 def draw(seed):
@@ -66,7 +66,7 @@ def test_ctrl_c_ends_everything_at_once(tmp_path):
     program = """
         import multiprocessing, os, signal, threading, time
         from slow_trial import slow
-        from gpmpc.trials import trials
+        from gpmpc.simulation import trials
         if __name__ == "__main__":
             threading.Timer(3.0, os.kill, [os.getpid(), signal.SIGINT]).start()
             try:

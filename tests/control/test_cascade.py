@@ -1,16 +1,14 @@
 import numpy as np
 import pytest
 
-from gpmpc.cascade_loop import cascade_loop
 from gpmpc.control.cascade import Cascade
 from gpmpc.control.nmpc import NMPC
 from gpmpc.control.tracking import TrackingProblem
-from gpmpc.disturbances import Dropout, Gust, Replaced
 from gpmpc.exceptions import SettingError, ShapeError, SolverFailure
 from gpmpc.metrics import tracking_error
 from gpmpc.plants import Coupled, Integrated, Map, Rotational, Translational, step, thrust_direction
+from gpmpc.simulation import Dropout, Gust, Noise, Replaced, cascade_loop
 from gpmpc.status import Status
-from gpmpc.systems import Noise
 from gpmpc.trajectories import Elliptical, Lorenz, states_along
 
 PLANT = Integrated(Coupled(), time_step=0.05, substeps=1)

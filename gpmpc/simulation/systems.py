@@ -12,12 +12,12 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from gpmpc.disturbances import Disturbance
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.plants import Plant, step
 from gpmpc.propagation.propagator import Propagator
+from gpmpc.simulation.disturbances import Disturbance
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,12 @@ import numpy as np
 from gpmpc.control.cascade import Cascade
 from gpmpc.control.controller import Reference
 from gpmpc.control.supervision import Command, OnFailure, check_policy, command
-from gpmpc.disturbances import Disturbance
 from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.plants import Coupled, Plant
-from gpmpc.simulation import Rollout, Step, checked_references, rollout, window
-from gpmpc.systems import Noise, RunningPlant
+from gpmpc.simulation.disturbances import Disturbance
+from gpmpc.simulation.loop import Rollout, Step, checked_references, rollout, window
+from gpmpc.simulation.systems import Noise, RunningPlant
 
 OUTER, INNER = slice(0, 6), slice(6, 12)
 

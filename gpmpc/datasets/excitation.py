@@ -21,12 +21,11 @@ import numpy as np
 
 from gpmpc.control.nmpc import NMPC
 from gpmpc.control.tracking import TrackingProblem
-from gpmpc.datasets import SUBSYSTEMS, check_weights, transitions_of
+from gpmpc.datasets.flights import SUBSYSTEMS, check_weights, transitions_of
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gp.transitions import Transitions
 from gpmpc.plants import ATTITUDES, Plant, attitude_for_thrust_direction
-from gpmpc.simulation import Rollout, closed_loop
-from gpmpc.systems import Noise
+from gpmpc.simulation import Noise, Rollout, closed_loop
 from gpmpc.trajectories import Trajectory, states_along
 
 

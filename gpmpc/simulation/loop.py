@@ -14,11 +14,11 @@ import numpy as np
 
 from gpmpc.control.controller import Controller, Decision, Reference, Timing
 from gpmpc.control.supervision import Command, OnFailure, check_policy, command
-from gpmpc.disturbances import Disturbance
 from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.plants import Plant
+from gpmpc.simulation.disturbances import Disturbance
+from gpmpc.simulation.systems import ModelLoop, Noise, Running, RunningModel, RunningPlant
 from gpmpc.status import Status
-from gpmpc.systems import ModelLoop, Noise, Running, RunningModel, RunningPlant
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,22 @@
+"""Closed loops: a controller on a plant or on a model, with noise, disturbances and many seeds."""
+
+from gpmpc.simulation.cascade_loop import CascadeRollout, cascade_loop
+from gpmpc.simulation.disturbances import Dropout, Gust, Replaced
+from gpmpc.simulation.loop import Rollout, Step, closed_loop
+from gpmpc.simulation.systems import ModelLoop, Noise
+from gpmpc.simulation.trials import Trial, trials
+
+__all__ = [
+    "CascadeRollout",
+    "Dropout",
+    "Gust",
+    "ModelLoop",
+    "Noise",
+    "Replaced",
+    "Rollout",
+    "Step",
+    "Trial",
+    "cascade_loop",
+    "closed_loop",
+    "trials",
+]
