@@ -10,7 +10,7 @@ or never (d = 0: the constraints contradict each other, and (r, -1) is Farkas' p
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import borrowing
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, largest, subtract_rows
 from gpmpc.qp.working_set import (
     HIGH_WATCH,
@@ -37,7 +37,7 @@ DEPENDENT = 1e-12  # d below this share of K_pp: the constraint depends on the w
 DOUBTFUL = 1e-4  # d below this share of K_pp is computed again without cancellation (lazy mode)
 
 
-@compiled
+@borrowing
 def most_violated(y, weights, bounds, excess):
     """The constraint farthest outside its watch after weighting, or ``NO_CONSTRAINT``."""
     lo, hi = bounds[LOW_WATCH], bounds[HIGH_WATCH]
@@ -52,7 +52,7 @@ def most_violated(y, weights, bounds, excess):
     return p
 
 
-@compiled
+@borrowing
 def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch):
     """Changes multipliers until constraint p, whose value is given, is satisfied.
 
@@ -112,7 +112,7 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
         return REACHED, k, changes
 
 
-@compiled
+@borrowing
 def distance_to_span(row, k, n, rows, members, r, rest):
     """|row - sum r_i row_i|^2: what is left of a row outside the span of the working ones (lazy mode)."""
     for j in range(n):
@@ -121,7 +121,7 @@ def distance_to_span(row, k, n, rows, members, r, rest):
     return dot(rest, rest, n)
 
 
-@compiled
+@borrowing
 def first_block(step, sense, k, mu, slots, members, r):
     """The longest step, up to ``step``, that keeps the multipliers in range, and the slot that ends it (or k)."""
     size = 0.0

@@ -14,12 +14,14 @@ import math
 
 import numpy as np
 
-from gpmpc.compiled import compiled
-from gpmpc.qp import record
+from gpmpc.compiled import borrowing
+from gpmpc.qp import record, workspace
 from gpmpc.qp.dual_iteration import CONTRADICTION, most_violated, step_to
 from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, refine, residuals
 from gpmpc.qp.factor import dot, multiply, multiply_at, pack, unpack
+from gpmpc.qp.gram_system import parts
 from gpmpc.qp.hessian import factorise, solve_lower
+from gpmpc.qp.workspace import carve, most_working
 from gpmpc.qp.working_set import (
     CAP,
     HIGH_WATCH,
@@ -46,8 +48,8 @@ WORKING, TAG, AGE, HEADER = record.WORKING, record.TAG, record.AGE, record.HEADE
 SOLVED, INFEASIBLE, ITERATION_LIMIT = record.SOLVED, record.INFEASIBLE, record.ITERATION_LIMIT
 NUMERICAL_TROUBLE, MISUSE, NO_TAG = record.NUMERICAL_TROUBLE, record.MISUSE, record.NO_TAG
 
-GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
-LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
+GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])"
+LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])"
 
 ABSENT = 1e20  # a bound of this size or more is none
 TOLERATED = 1e-10  # a violation below this share of the size of a constraint is none
@@ -60,7 +62,7 @@ FINE = 1e-11  # scaled residual at which refinement stops
 OLD = 1000  # changes after which a factor is computed anew
 
 
-@compiled
+@borrowing
 def read_bounds(lower, upper, norms, bounds):
     """Copies the bounds, with absent ones infinite; True if any are crossed or undefined."""
     bad = 0
@@ -76,7 +78,7 @@ def read_bounds(lower, upper, norms, bounds):
     return bad > 0
 
 
-@compiled
+@borrowing
 def keep_capped(n, warm, traits, bounds, mu):
     """Starts with the guess's multipliers that are at their caps: soft rows that stay violated."""
     for p in range(n, len(mu)):
@@ -86,7 +88,7 @@ def keep_capped(n, warm, traits, bounds, mu):
             watch(p, mu, bounds)
 
 
-@compiled
+@borrowing
 def count_above(values, threshold, size):
     """How many of the first ``size`` values are above the threshold."""
     count = 0
@@ -95,7 +97,7 @@ def count_above(values, threshold, size):
     return count
 
 
-@compiled
+@borrowing
 def all_present(names, bounds, mu):
     """Whether every one of the named bounds is there to be held (it may have become absent since)."""
     for name in names:
@@ -107,7 +109,7 @@ def all_present(names, bounds, mu):
     return True
 
 
-@compiled
+@borrowing
 def write_ray(p, k, y, bounds, members, r, mu):
     """Farkas' proof that constraint p contradicts the working ones, ``C' ray = 0`` and ``ray' bounds < 0``, into mu."""
     sense = 1.0 if y[p] > bounds[UPPER, p] else -1.0
@@ -120,17 +122,19 @@ def write_ray(p, k, y, bounds, members, r, mu):
     mu[p] = sense
 
 
-@compiled
-def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, out):
+@borrowing
+def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out):
     """Both modes after their set-up."""
     M, m = len(lower), len(lower) - n
-    limit, tolerance, soft = int(settings[0]), settings[1], settings[2] != 0.0
-    capacity = M if soft else min(n, M)
-    wide = max(M, capacity + 2)
-    work = np.empty((20 + capacity + 1, wide))
-    bounds, slots, scratch, y = work[:5], work[5:9], work[9:13], work[13, :M]
-    seen, excess, gradient, active, v, slope, R = work[14], work[15], work[16], work[17], work[18], work[19], work[20:]
-    members = np.empty((3, wide), np.int64)
+    limit, tolerance, soft = (
+        int(settings[workspace.LIMIT]),
+        settings[workspace.TOLERANCE],
+        settings[workspace.SOFT] != 0.0,
+    )
+    capacity = most_working(n, M, soft)
+    bounds, slots, scratch, y = vectors[:5], vectors[5:9], vectors[9:13], vectors[13, :M]
+    seen, excess, gradient, active = vectors[14], vectors[15], vectors[16], vectors[17]
+    v, slope, pulled = vectors[18], vectors[19], vectors[20]
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     for p in range(M):
         mu[p] = 0.0
@@ -142,13 +146,13 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
     pull = q
     if guessed and soft:
         keep_capped(n, warm, traits, bounds, mu)
-        pull = np.empty(n)
+        pull = pulled
         add_pull(G, n, q, mu, 0, members, soft, pull)
     if lazy:
         solve_lower(L, n, pull, v)
         for i in range(n):
             v[i] = -v[i]
-    k, age, tag, candidates = 0, 0.0, settings[4], members[2]
+    k, age, tag, candidates = 0, 0.0, settings[workspace.TAG], members[2]
     if guessed:
         names = warm[HEADER + n + M : HEADER + n + M + int(warm[WORKING])]
         fits = len(names) <= capacity and len(names) * (len(names) + 1) // 2 <= len(warm) - (HEADER + n + 2 * M)
@@ -246,41 +250,45 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
     return status
 
 
-@compiled
-def solve_gram(q, lower, upper, warm, system, settings, out):
-    """Gram mode; ``system`` stacks K (M rows), traits (4 rows), P (n rows) and G (m rows), M wide."""
-    n, M = int(settings[3]), system.shape[1]
-    if len(q) != n or len(lower) != M or len(upper) != M:
+@borrowing
+def solve_gram(q, lower, upper, warm, system, work, out):
+    """Gram mode; ``system`` is of ``gpmpc.qp.gram_system``, ``work`` of ``gpmpc.qp.workspace``."""
+    n, M = int(work[workspace.VARIABLES]), int(work[workspace.CONSTRAINTS])
+    if len(q) != n or len(lower) != M or len(upper) != M or not all_finite(q):
         return MISUSE
-    undefined = 0.0
-    for i in range(n):
-        undefined += q[i] * 0.0
-    if undefined != 0.0:
-        return MISUSE
-    P, G = system[M + 4 : M + 4 + n], system[M + 4 + n :]
-    return optimise(False, P, q, G, n, system[:M], P, system[M : M + 4], lower, upper, warm, settings, out)
+    K, P, G = parts(system, n, M)
+    traits, vectors, members, R, _ = carve(work)
+    settings = work[: workspace.SETTINGS]
+    return optimise(False, P, q, G, n, K, P, traits, vectors, members, R, lower, upper, warm, settings, out)
 
 
-@compiled
-def solve_lazy(P, q, G, lower, upper, warm, soft, settings, out):
-    """Lazy mode; ``soft`` stacks softness and caps, M wide."""
+@borrowing
+def solve_lazy(P, q, G, lower, upper, warm, work, out):
+    """Lazy mode; ``work`` is of ``gpmpc.qp.workspace``."""
     n, m = P.shape[0], len(G)
     M = n + m
     shaped = P.shape[1] == n and len(q) == n and (m == 0 or G.shape[1] == n) and len(lower) == M and len(upper) == M
-    if not shaped or soft.shape[1] != M:
+    if not shaped or not all_finite(q):
         return MISUSE
-    L, traits = np.empty((n, n)), np.empty((4, M))
+    traits, vectors, members, R, rest = carve(work)
+    L, rows = rest[: n * n].reshape((n, n)), rest[n * n :].reshape((len(rest) // n - n, n))
     if not factorise(P, L):
         return MISUSE
     undefined = 0.0
-    for i in range(n):
-        undefined += q[i] * 0.0
     for p in range(M):
         norm = math.sqrt(dot(G[p - n], G[p - n], n)) if p >= n else 1.0
         undefined += norm * 0.0
         traits[NORM, p], traits[WEIGHT, p] = norm, 1.0 / norm if norm > 0.0 else 1.0
-        traits[SOFTNESS, p], traits[CAP, p] = soft[0, p], soft[1, p]
     if undefined != 0.0:
         return MISUSE
-    rows = np.empty((min(n, M) + 2 if settings[2] == 0.0 else M + 2, n))
-    return optimise(True, P, q, G, n, rows, L, traits, lower, upper, warm, settings, out)
+    settings = work[: workspace.SETTINGS]
+    return optimise(True, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
+
+
+@borrowing
+def all_finite(vector):
+    """Whether no entry is infinite or NaN."""
+    undefined = 0.0
+    for value in vector:
+        undefined += value * 0.0
+    return undefined == 0.0

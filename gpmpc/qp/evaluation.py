@@ -5,13 +5,13 @@ the upper left corner of K, and may later move y by the rows of K whose multipli
 solves.
 """
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import borrowing
 from gpmpc.qp.factor import backward_solve, dot, forward_solve, multiply, subtract_rows
 from gpmpc.qp.hessian import solve_lower, solve_transposed
 from gpmpc.qp.working_set import BOUND, LEAST, MOST, NAME, PLACE, SOFTNESS, couple
 
 
-@compiled
+@borrowing
 def add_pull(G, n, q, mu, k, members, soft, slope):
     """``slope = q + C' mu``; only where rows are soft can others than the working ones have a multiplier."""
     for i in range(n):
@@ -27,14 +27,14 @@ def add_pull(G, n, q, mu, k, members, soft, slope):
                 add_row(mu[p], G[p - n], n, slope)
 
 
-@compiled
+@borrowing
 def add_row(weight, row, n, target):
     """``target += weight row``."""
     for i in range(n):
         target[i] += weight * row[i]
 
 
-@compiled
+@borrowing
 def evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y):
     """``y = C x`` for the multipliers; leaves ``slope = q + C' mu``."""
     add_pull(G, n, q, mu, k, members, soft, slope)
@@ -48,7 +48,7 @@ def evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y):
     multiply(G, len(G), y, n, y[n:])
 
 
-@compiled
+@borrowing
 def follow_lazily(n, v, rows, L, G, mu, k, members, weights, y):
     """Lazy mode without soft rows: ``y = C x`` from L'x = v - sum mu_i w_i."""
     for i in range(n):
@@ -60,7 +60,7 @@ def follow_lazily(n, v, rows, L, G, mu, k, members, weights, y):
     multiply(G, len(G), y, n, y[n:])
 
 
-@compiled
+@borrowing
 def follow(rows, mu, seen, changed, amounts, y):
     """Gram mode: moves y by the rows of K whose multipliers are not those, ``seen``, that y knows."""
     count = 0
@@ -72,7 +72,7 @@ def follow(rows, mu, seen, changed, amounts, y):
     subtract_rows(y, rows, changed, amounts, count, len(mu))
 
 
-@compiled
+@borrowing
 def residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active):
     """The largest scaled residual of (x, mu), x = y[:n]: stationarity, violation of the working set, duality gap.
 
@@ -92,7 +92,7 @@ def residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active
     return max(max(stationarity / size, infeasibility), abs(gap) / max(1.0, abs(dot(q, y, n))))
 
 
-@compiled
+@borrowing
 def refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, correction, trial):
     """One Newton step on the working set for the residuals ``gradient`` and ``active``; multipliers stay in range."""
     size = n if lazy else len(y)

@@ -8,10 +8,10 @@ section 6.5.2). The diagonal holds reciprocals, so that no solve divides.
 
 import math
 
-from gpmpc.compiled import REORDERED, compiled
+from gpmpc.compiled import REORDERED, borrowing
 
 
-@compiled
+@borrowing
 def dot(a, b, size):
     """Inner product of the first ``size`` entries."""
     total = 0.0
@@ -20,7 +20,7 @@ def dot(a, b, size):
     return total
 
 
-@compiled(fastmath=REORDERED | {"nnan"})
+@borrowing(fastmath=REORDERED | {"nnan"})
 def largest(a, size):
     """The largest of the first ``size`` entries, which vectorises only if none of them is NaN."""
     found = a[0]
@@ -29,7 +29,7 @@ def largest(a, size):
     return found
 
 
-@compiled
+@borrowing
 def subtract_rows(state, rows, places, factors, count, size):
     """``state -= sum_i factors[i] rows[places[i]]``, four rows at a time."""
     i = 0
@@ -46,7 +46,7 @@ def subtract_rows(state, rows, places, factors, count, size):
         i += 1
 
 
-@compiled
+@borrowing
 def multiply(A, count, vector, size, product):
     """``product[i] = A[i] . vector`` for the first ``count`` rows, four at a time."""
     i = 0
@@ -58,7 +58,7 @@ def multiply(A, count, vector, size, product):
         i += 1
 
 
-@compiled
+@borrowing
 def multiply_at(A, places, count, vector, size, product):
     """``product[i] = A[places[i]] . vector``, four at a time."""
     i = 0
@@ -71,7 +71,7 @@ def multiply_at(A, places, count, vector, size, product):
         i += 1
 
 
-@compiled
+@borrowing
 def four_dots(r0, r1, r2, r3, vector, size, product):
     """Four inner products with one vector, which is read once and whose sums hide each other's latency."""
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
@@ -84,7 +84,7 @@ def four_dots(r0, r1, r2, r3, vector, size, product):
     product[0], product[1], product[2], product[3] = s0, s1, s2, s3
 
 
-@compiled
+@borrowing
 def forward_solve(R, k, a):
     """``a <- L^-1 a`` in place."""
     for j in range(k):
@@ -95,14 +95,14 @@ def forward_solve(R, k, a):
             rest[i] -= value * column[i]
 
 
-@compiled
+@borrowing
 def backward_solve(R, k, a):
     """``a <- L^-T a`` in place."""
     for j in range(k - 1, -1, -1):
         a[j] = (a[j] - dot(R[j, j + 1 :], a[j + 1 :], k - j - 1)) * R[j, j]
 
 
-@compiled
+@borrowing
 def append_row(R, k, solved, pivot):
     """Row k of L: ``solved = L^-1 K_Wp`` and ``pivot = K_pp - |solved|^2 > 0``."""
     for j in range(k):
@@ -110,7 +110,7 @@ def append_row(R, k, solved, pivot):
     R[k, k] = 1.0 / math.sqrt(pivot)
 
 
-@compiled
+@borrowing
 def remove_row(R, k, gone, carry):
     """Deletes row ``gone`` of L, which has k rows; ``carry`` is scratch of length k."""
     for j in range(gone):
@@ -134,7 +134,7 @@ def remove_row(R, k, gone, carry):
         rest = rest[: len(old)]
 
 
-@compiled
+@borrowing
 def pack(R, k, packed):
     """Copies the triangle of k rows to a flat array of k (k + 1) / 2 entries."""
     at = 0
@@ -145,7 +145,7 @@ def pack(R, k, packed):
         at += len(column)
 
 
-@compiled
+@borrowing
 def unpack(packed, k, R):
     """The inverse of ``pack``."""
     at = 0

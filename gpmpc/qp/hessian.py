@@ -8,11 +8,11 @@ import math
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import borrowing
 from gpmpc.qp.factor import dot
 
 
-@compiled
+@borrowing
 def factorise(P, L):
     """Fills L; False if P is not symmetric, finite and positive definite."""
     n = len(P)
@@ -41,7 +41,7 @@ def factorise(P, L):
     return True
 
 
-@compiled
+@borrowing
 def is_symmetric(P):
     """Whether P equals its transpose but for rounding; read in blocks that stay in the cache."""
     n = len(P)
@@ -56,7 +56,7 @@ def is_symmetric(P):
     return skew <= 1e-10 * largest
 
 
-@compiled
+@borrowing
 def eliminate(L, first, last, a, b, c, d):
     """Solves ``L w = .`` in place for four right-hand sides whose entries before ``first`` are zero, up to ``last``."""
     a, b, c, d = a[first:], b[first:], c[first:], d[first:]
@@ -74,7 +74,7 @@ def eliminate(L, first, last, a, b, c, d):
         c[j], d[j] = (c[j] - sc) * reciprocal, (d[j] - sd) * reciprocal
 
 
-@compiled
+@borrowing
 def write_constraint(p, n, G, row):
     """``row = c_p``, row p of C = [I; G]; returns its first entry that is not zero for sure."""
     if p >= n:
@@ -88,7 +88,7 @@ def write_constraint(p, n, G, row):
     return p
 
 
-@compiled
+@borrowing
 def make_row(p, n, L, G, row):
     """``row = L^-1 c_p``."""
     first = write_constraint(p, n, G, row)
@@ -96,7 +96,7 @@ def make_row(p, n, L, G, row):
         row[i] = (row[i] - dot(L[i, first:], row[first:], i - first)) * L[i, i]
 
 
-@compiled
+@borrowing
 def make_rows(names, count, n, L, G, rows, places):
     """``rows[places[i]] = L^-1 c_p`` for the constraints p with signed numbers ``names``."""
     i = 0
@@ -113,14 +113,14 @@ def make_rows(names, count, n, L, G, rows, places):
         i += 1
 
 
-@compiled
+@borrowing
 def solve_lower(L, n, a, solution):
     """``solution = L^-1 a``."""
     for i in range(n):
         solution[i] = (a[i] - dot(L[i], solution, i)) * L[i, i]
 
 
-@compiled
+@borrowing
 def solve_transposed(L, n, a):
     """``a <- L^-T a``."""
     for i in range(n - 1, -1, -1):

@@ -19,7 +19,7 @@ p is K_p, known beforehand; in lazy mode, P = L L', it is w_p = L^-1 c_p, made w
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import borrowing
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, multiply_at, remove_row
 from gpmpc.qp.hessian import make_row, make_rows
 
@@ -31,7 +31,7 @@ NORM, WEIGHT, SOFTNESS, CAP = 0, 1, 2, 3  # rows of ``traits``
 GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
 
 
-@compiled
+@borrowing
 def watch(p, mu, bounds):
     """Puts constraint p, outside the working set, under the watch of ``most_violated``.
 
@@ -45,13 +45,13 @@ def watch(p, mu, bounds):
         bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = -np.inf, bounds[LOWER, p] + slack
 
 
-@compiled
+@borrowing
 def ignore(p, bounds):
     """Takes constraint p out of the watch of ``most_violated``."""
     bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = -np.inf, np.inf
 
 
-@compiled
+@borrowing
 def find_row(lazy, p, k, n, rows, L, G, members):
     """Where row p is; in lazy mode it is made in the place that slot k has free."""
     if not lazy:
@@ -61,7 +61,7 @@ def find_row(lazy, p, k, n, rows, L, G, members):
     return place
 
 
-@compiled
+@borrowing
 def couple(lazy, row, k, n, rows, members, product):
     """The products of a row with the rows of the working set, K_Wp if it is row p."""
     if lazy:
@@ -71,7 +71,7 @@ def couple(lazy, row, k, n, rows, members, product):
             product[i] = row[abs(members[NAME, i]) - 1]
 
 
-@compiled
+@borrowing
 def admit(k, p, above, place, traits, free, bounds, slots, members):
     """Writes constraint p into slot k, at its upper bound (``above``) or its lower one."""
     members[NAME, k], members[PLACE, k] = (p + 1 if above else -(p + 1)), place
@@ -82,7 +82,7 @@ def admit(k, p, above, place, traits, free, bounds, slots, members):
     slots[MOST, k] = cap if equality or above else 0.0
 
 
-@compiled
+@borrowing
 def evict(k, slot, slots, members, R, scratch):
     """Deletes a slot of the working set of k members and mends the factor; its place is free for the next row."""
     remove_row(R, k, slot, scratch)
@@ -94,13 +94,13 @@ def evict(k, slot, slots, members, R, scratch):
     members[PLACE, k - 1] = place
 
 
-@compiled
+@borrowing
 def free_value(lazy, row, v, q, n):
     """c_p'x_u, the constraint's value at the unconstrained minimiser: from v = -L^-1 q, or from row p of K and q."""
     return dot(row, v, n) if lazy else -dot(row, q, n)
 
 
-@compiled
+@borrowing
 def choose_guess(names, room, bounds, mu, candidates):
     """Writes the guessed constraints that can be taken, at most ``room``, to ``candidates``; returns how many."""
     count = 0
@@ -115,7 +115,7 @@ def choose_guess(names, room, bounds, mu, candidates):
     return count
 
 
-@compiled
+@borrowing
 def choose_violated(share, room, y, excess, bounds, mu, candidates):
     """The same for the violated constraints whose weighted excess is above ``share``, except those at a cap."""
     count = 0
@@ -127,7 +127,7 @@ def choose_violated(share, room, y, excess, bounds, mu, candidates):
     return count
 
 
-@compiled
+@borrowing
 def take(lazy, candidates, count, k, n, q, v, rows, L, G, traits, bounds, mu, slots, members, R, solved):
     """Takes the candidates into the working set, but for those that depend on the others; returns its size."""
     first = k
@@ -151,7 +151,7 @@ def take(lazy, candidates, count, k, n, q, v, rows, L, G, traits, bounds, mu, sl
     return k
 
 
-@compiled
+@borrowing
 def settle(k, bounds, mu, slots, members, R, scratch):
     """The multipliers of the working set; drops the most wrong one until all are in range. Returns the size.
 
