@@ -13,6 +13,7 @@ import numpy as np
 from gpmpc.compiled import borrowing
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, largest, subtract_rows
 from gpmpc.qp.working_set import (
+    END,
     HIGH_WATCH,
     LEAST,
     LOW_WATCH,
@@ -63,14 +64,14 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
     above = mu[p] > 0.0 or (mu[p] == 0.0 and value > bounds[UPPER, p])
     sense = 1.0 if above == (mu[p] == 0.0) else -1.0  # from a cap the multiplier comes back
     violation = (value - bounds[UPPER if above else LOWER, p]) * sense
-    place = find_row(lazy, p, k, n, rows, L, G, members)
-    row = rows[place]
+    place = find_row(lazy, p, k, n, rows, L, G, traits, members)
+    row, size = rows[place], int(traits[END, p])
     free = free_value(lazy, row, v, q, n)
-    diagonal = (dot(row, row, n) if lazy else row[p]) + traits[SOFTNESS, p]
+    diagonal = (dot(row, row, size) if lazy else row[p]) + traits[SOFTNESS, p]
     solved, r = scratch[1], scratch[2]
     while True:
         admit(k, p, above, place, traits, free, bounds, slots, members)
-        couple(lazy, row, k, n, rows, members, solved)
+        couple(lazy, row, k, size, rows, members, solved)
         forward_solve(R, k, solved)
         for i in range(k):
             r[i] = solved[i]

@@ -17,13 +17,13 @@ import numpy as np
 from gpmpc.compiled import borrowing
 from gpmpc.qp import record, workspace
 from gpmpc.qp.dual_iteration import CONTRADICTION, most_violated, step_to
-from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, refine, residuals
-from gpmpc.qp.factor import dot, multiply, multiply_at, pack, unpack
+from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, refine, residuals, row_values
+from gpmpc.qp.factor import dot, multiply_at, pack, unpack
 from gpmpc.qp.gram_system import parts
-from gpmpc.qp.hessian import factorise, solve_lower
-from gpmpc.qp.workspace import carve, most_working
+from gpmpc.qp.hessian import factorise, solve_transposed
 from gpmpc.qp.working_set import (
     CAP,
+    END,
     HIGH_WATCH,
     LOW_WATCH,
     LOWER,
@@ -31,7 +31,6 @@ from gpmpc.qp.working_set import (
     NORM,
     PLACE,
     SLACK,
-    SOFTNESS,
     UPPER,
     WEIGHT,
     admit,
@@ -42,6 +41,7 @@ from gpmpc.qp.working_set import (
     take,
     watch,
 )
+from gpmpc.qp.workspace import carve, most_working
 
 STATUS, ITERATIONS, VARIABLES, CONSTRAINTS = record.STATUS, record.ITERATIONS, record.VARIABLES, record.CONSTRAINTS
 WORKING, TAG, AGE, HEADER = record.WORKING, record.TAG, record.AGE, record.HEADER
@@ -125,7 +125,7 @@ def write_ray(p, k, y, bounds, members, r, mu):
 @borrowing
 def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out):
     """Both modes after their set-up."""
-    M, m = len(lower), len(lower) - n
+    M = len(lower)
     limit, tolerance, soft = (
         int(settings[workspace.LIMIT]),
         settings[workspace.TOLERANCE],
@@ -147,11 +147,11 @@ def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, uppe
     if guessed and soft:
         keep_capped(n, warm, traits, bounds, mu)
         pull = pulled
-        add_pull(G, n, q, mu, 0, members, soft, pull)
+        add_pull(G, n, q, mu, 0, members, traits, soft, pull)
     if lazy:
-        solve_lower(L, n, pull, v)
         for i in range(n):
-            v[i] = -v[i]
+            v[i] = -pull[i]
+        solve_transposed(L, n, v)
     k, age, tag, candidates = 0, 0.0, settings[workspace.TAG], members[2]
     if guessed:
         names = warm[HEADER + n + M : HEADER + n + M + int(warm[WORKING])]
@@ -173,7 +173,7 @@ def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, uppe
                 lazy, candidates, count, 0, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch[1]
             )
         k = settle(k, bounds, mu, slots, members, R, scratch)
-    evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y)
+    evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y)
     if not lazy:
         for i in range(M):
             seen[i] = mu[i]
@@ -216,22 +216,22 @@ def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, uppe
             if not lazy:
                 follow(rows, mu, seen, candidates, gradient, y)
             elif soft:
-                evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y)
+                evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y)
             else:
-                follow_lazily(n, v, rows, L, G, mu, k, members, gradient, y)
+                follow_lazily(n, v, rows, L, G, mu, k, members, traits, gradient, y)
             continue
         if not current:
             if not lazy:
-                multiply(G, m, y, n, y[n:])
-            add_pull(G, n, q, mu, k, members, soft, slope)
+                row_values(G, n, traits, y)
+            add_pull(G, n, q, mu, k, members, traits, soft, slope)
         best = np.inf
         for attempt in range(REFINEMENTS + 1):
             worst = residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active)
             if worst <= FINE or attempt == REFINEMENTS or not worst < 0.5 * best:
                 break
             best = worst
-            refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, scratch[0], scratch[2])
-            add_pull(G, n, q, mu, k, members, soft, slope)
+            refine(lazy, k, n, rows, L, G, slots, members, traits, R, mu, y, gradient, active, scratch[0], scratch[2])
+            add_pull(G, n, q, mu, k, members, traits, soft, slope)
         status = SOLVED if worst <= tolerance else NUMERICAL_TROUBLE
         rounds += 1
         unchanged = current and attempt == 0
@@ -274,15 +274,28 @@ def solve_lazy(P, q, G, lower, upper, warm, work, out):
     L, rows = rest[: n * n].reshape((n, n)), rest[n * n :].reshape((len(rest) // n - n, n))
     if not factorise(P, L):
         return MISUSE
-    undefined = 0.0
-    for p in range(M):
-        norm = math.sqrt(dot(G[p - n], G[p - n], n)) if p >= n else 1.0
-        undefined += norm * 0.0
-        traits[NORM, p], traits[WEIGHT, p] = norm, 1.0 / norm if norm > 0.0 else 1.0
-    if undefined != 0.0:
+    if not measure(G, n, traits):
         return MISUSE
     settings = work[: workspace.SETTINGS]
     return optimise(True, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
+
+
+@borrowing
+def measure(G, n, traits):
+    """Writes the norms, weights and ends of the constraints; False if G is not finite."""
+    for p in range(n):
+        traits[NORM, p], traits[WEIGHT, p], traits[END, p] = 1.0, 1.0, p + 1
+    undefined, end = 0.0, 0
+    for p in range(len(G)):
+        row = G[p]
+        if dot(row[end:], row[end:], n - end) != 0.0:  # longer than the row before
+            end = n
+            while end > 0 and row[end - 1] == 0.0:
+                end -= 1
+        norm = math.sqrt(dot(row, row, end))
+        undefined += norm * 0.0
+        traits[NORM, n + p], traits[WEIGHT, n + p], traits[END, n + p] = norm, 1.0 / norm if norm > 0.0 else 1.0, end
+    return undefined == 0.0
 
 
 @borrowing

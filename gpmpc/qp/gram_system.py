@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 def gram_system(terms: Terms) -> tuple[Array, Array]:
-    """The array for ``gpmpc.qp.dual_kernels.solve_gram``, and the traits (4, M) of ``gpmpc.qp.working_set``."""
+    """The array for ``gpmpc.qp.dual_kernels.solve_gram``, and the traits (5, M) of ``gpmpc.qp.working_set``."""
     P, G, softness = terms
     C = np.vstack([np.eye(len(P)), G])
     responses = cho_solve(cho_factor(P, lower=True), C.T)  # P^-1 C'
@@ -23,7 +23,9 @@ def gram_system(terms: Terms) -> tuple[Array, Array]:
     K = 0.5 * (K + K.T)
     diagonal = np.diagonal(K)
     weights = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    return np.concatenate([K.ravel(), P.ravel(), G.ravel()]), np.vstack([np.linalg.norm(C, axis=1), weights, softness])
+    ends = ((C != 0) * np.arange(1, len(P) + 1)).max(axis=1)
+    traits = np.vstack([np.linalg.norm(C, axis=1), weights, softness, ends])
+    return np.concatenate([K.ravel(), P.ravel(), G.ravel()]), traits
 
 
 @borrowing

@@ -9,12 +9,13 @@ Everything lives in a few arrays that the kernels hand around, a column per cons
   infinite unless the row is soft with a linear weight; a constraint that leaves at its cap stays violated.
 * ``members`` (3, capacity + 2) integers: the signed number +-(p + 1) of the constraint in each slot, where its row is,
   and scratch for lists of candidates.
-* ``traits`` (4, M): norm, weight in the choice of the most violated, softness 1/rho and cap (``gpmpc.qp.soft_rows``).
+* ``traits`` (5, M): norm, weight in the choice of the most violated, softness 1/rho and cap (``gpmpc.qp.soft_rows``),
+  and the number of leading entries of c_p that may not be zero.
 * ``mu`` (M): multipliers; zero outside the working set except at a cap.
 * ``R``: the Cholesky factor of K_WW + softness (``gpmpc.qp.factor``).
 
 A *row* represents a constraint in the metric of P^-1, K_pq = row_p . row_q or simply entry q of row p: in Gram mode row
-p is K_p, known beforehand; in lazy mode, P = L L', it is w_p = L^-1 c_p, made when p enters.
+p is K_p, known beforehand; in lazy mode, P = L'L, it is w_p = L^-T c_p, made when p enters, and as short as c_p.
 """
 
 import numpy as np
@@ -26,7 +27,7 @@ from gpmpc.qp.hessian import make_row, make_rows
 LOWER, UPPER, SLACK, LOW_WATCH, HIGH_WATCH = 0, 1, 2, 3, 4  # rows of ``bounds``
 BOUND, FREE_VALUE, LEAST, MOST = 0, 1, 2, 3  # rows of ``slots``
 NAME, PLACE = 0, 1  # rows of ``members``
-NORM, WEIGHT, SOFTNESS, CAP = 0, 1, 2, 3  # rows of ``traits``
+NORM, WEIGHT, SOFTNESS, CAP, END = 0, 1, 2, 3, 4  # rows of ``traits``
 
 GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
 
@@ -52,20 +53,20 @@ def ignore(p, bounds):
 
 
 @borrowing
-def find_row(lazy, p, k, n, rows, L, G, members):
+def find_row(lazy, p, k, n, rows, L, G, traits, members):
     """Where row p is; in lazy mode it is made in the place that slot k has free."""
     if not lazy:
         return p
     place = members[PLACE, k]
-    make_row(p, n, L, G, rows[place])
+    make_row(p, n, L, G, traits[END], rows[place])
     return place
 
 
 @borrowing
-def couple(lazy, row, k, n, rows, members, product):
-    """The products of a row with the rows of the working set, K_Wp if it is row p."""
+def couple(lazy, row, k, size, rows, members, product):
+    """The products of a row (``size`` entries in lazy mode) with those of the working set, K_Wp if it is row p."""
     if lazy:
-        multiply_at(rows, members[PLACE], k, row, n, product)
+        multiply_at(rows, members[PLACE], k, row, size, product)
     else:
         for i in range(k):
             product[i] = row[abs(members[NAME, i]) - 1]
@@ -96,7 +97,7 @@ def evict(k, slot, slots, members, R, scratch):
 
 @borrowing
 def free_value(lazy, row, v, q, n):
-    """c_p'x_u, the constraint's value at the unconstrained minimiser: from v = -L^-1 q, or from row p of K and q."""
+    """c_p'x_u, the constraint's value at the unconstrained minimiser: from v = -L^-T q, or from row p of K and q."""
     return dot(row, v, n) if lazy else -dot(row, q, n)
 
 
@@ -132,14 +133,15 @@ def take(lazy, candidates, count, k, n, q, v, rows, L, G, traits, bounds, mu, sl
     """Takes the candidates into the working set, but for those that depend on the others; returns its size."""
     first = k
     if lazy:
-        make_rows(candidates, count, n, L, G, rows, members[PLACE, first:])
+        make_rows(candidates, count, n, L, G, traits[END], rows, members[PLACE, first:])
     for i in range(count):
         p = abs(candidates[i]) - 1
         place = members[PLACE, first + i] if lazy else p
         row = rows[place]
-        couple(lazy, row, k, n, rows, members, solved)
+        size = int(traits[END, p])
+        couple(lazy, row, k, size, rows, members, solved)
         forward_solve(R, k, solved)
-        diagonal = (dot(row, row, n) if lazy else row[p]) + traits[SOFTNESS, p]
+        diagonal = (dot(row, row, size) if lazy else row[p]) + traits[SOFTNESS, p]
         pivot = diagonal - dot(solved, solved, k)
         if pivot > GUESSED_PIVOT * diagonal:
             members[PLACE, first + i] = members[PLACE, k]

@@ -4,9 +4,9 @@ To ask the system for it costs as much as a small solve, so each prepared proble
 before: ``list.pop`` and ``list.append`` are atomic, so two threads never hold the same workspace. A workspace begins
 with what stays the same from solve to solve and is otherwise undefined:
 
-    [iteration limit, tolerance, whether rows are soft, n, M, tag | traits (4, M) | the kernels' arrays]
+    [iteration limit, tolerance, whether rows are soft, n, M, tag | traits (5, M) | the kernels' arrays]
 
-Of the traits (``gpmpc.qp.working_set``) lazy mode fills in norms and weights itself.
+Of the traits (``gpmpc.qp.working_set``) lazy mode fills in norms, weights and ends itself.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ VECTORS = 21  # arrays with an entry per constraint
 
 
 def gram_workspace(settings: Array, traits: Array) -> Array:
-    """Memory for solves in Gram mode with these settings (6,) and traits (4, M)."""
+    """Memory for solves in Gram mode with these settings (6,) and traits (5, M)."""
     work = np.zeros(_size(settings))
     work[:SETTINGS] = settings
     work[SETTINGS : SETTINGS + traits.size] = traits.ravel()
@@ -32,13 +32,15 @@ def lazy_workspace(settings: Array, softness: Array) -> Array:
     """Memory for solves in lazy mode with these settings (6,) and softness (2, M); with room for L and rows."""
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
     rows = most_working(n, M, bool(settings[SOFT])) + 2
-    return np.append(gram_workspace(settings, np.vstack([np.zeros((2, M)), softness])), np.zeros((n + rows) * n))
+    return np.append(
+        gram_workspace(settings, np.vstack([np.zeros((2, M)), softness, np.zeros((1, M))])), np.zeros((n + rows) * n)
+    )
 
 
 def _size(settings: Array) -> int:
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
     capacity = most_working(n, M, bool(settings[SOFT]))
-    return SETTINGS + 4 * M + (VECTORS + 3) * max(M, capacity + 2) + (capacity + 1) ** 2
+    return SETTINGS + 5 * M + (VECTORS + 3) * max(M, capacity + 2) + (capacity + 1) ** 2
 
 
 @borrowing
@@ -53,12 +55,12 @@ def carve(work):
     n, M = int(work[VARIABLES]), int(work[CONSTRAINTS])
     capacity = most_working(n, M, work[SOFT] != 0.0)
     wide = max(M, capacity + 2)
-    a = SETTINGS + 4 * M
+    a = SETTINGS + 5 * M
     b = a + VECTORS * wide
     c = b + 3 * wide
     d = c + (capacity + 1) * (capacity + 1)
     return (
-        work[SETTINGS:a].reshape((4, M)),
+        work[SETTINGS:a].reshape((5, M)),
         work[a:b].reshape((VECTORS, wide)),
         work[b:c].view(np.int64).reshape((3, wide)),
         work[c:d].reshape((capacity + 1, capacity + 1)),
