@@ -11,7 +11,7 @@ or never (d = 0: the constraints contradict each other, and (r, -1) is Farkas' p
 import numpy as np
 
 from gpmpc.compiled import borrowing
-from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, largest, subtract_rows
+from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, subtract_rows
 from gpmpc.qp.working_set import (
     END,
     HIGH_WATCH,
@@ -32,25 +32,49 @@ from gpmpc.qp.working_set import (
     watch,
 )
 
-NO_CONSTRAINT = -1
 REACHED, CONTRADICTION = 0, 1
 DEPENDENT = 1e-12  # d below this share of K_pp: the constraint depends on the working ones
 DOUBTFUL = 1e-4  # d below this share of K_pp is computed again without cancellation (lazy mode)
 
 
 @borrowing
-def most_violated(y, weights, bounds, excess):
-    """The constraint farthest outside its watch after weighting, or ``NO_CONSTRAINT``."""
+def list_violated(y, weights, bounds, excess, listed):
+    """Lists the constraints outside their watch, and by how much after weighting; returns how many there are."""
     lo, hi = bounds[LOW_WATCH], bounds[HIGH_WATCH]
+    violated = 0
     for p in range(len(y)):
         excess[p] = max(y[p] - hi[p], lo[p] - y[p]) * weights[p]
-    worst = largest(excess, len(y))
-    if not worst > 0.0:
-        return NO_CONSTRAINT
-    p = 0
-    while p < len(y) - 1 and excess[p] != worst:
-        p += 1
-    return p
+        violated += excess[p] > 0.0
+    if violated > 0:
+        count = 0
+        for p in range(len(y)):
+            if excess[p] > 0.0:
+                listed[count] = p
+                count += 1
+    return violated
+
+
+@borrowing
+def keep_violated(now, weights, bounds, excess, listed, count):
+    """The same for the listed constraints, which stay listed if they are still outside their watch."""
+    kept = 0
+    for i in range(count):
+        p = listed[i]
+        excess[p] = max(now[p] - bounds[HIGH_WATCH, p], bounds[LOW_WATCH, p] - now[p]) * weights[p]
+        if excess[p] > 0.0:
+            listed[kept] = p
+            kept += 1
+    return kept
+
+
+@borrowing
+def most_violated(excess, listed, count):
+    """The one of the listed constraints with the largest excess."""
+    worst = listed[0]
+    for i in range(1, count):
+        if excess[listed[i]] > excess[worst]:
+            worst = listed[i]
+    return worst
 
 
 @borrowing

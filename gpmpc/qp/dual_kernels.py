@@ -16,8 +16,8 @@ import numpy as np
 
 from gpmpc.compiled import borrowing
 from gpmpc.qp import record, workspace
-from gpmpc.qp.dual_iteration import CONTRADICTION, most_violated, step_to
-from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, refine, residuals, row_values
+from gpmpc.qp.dual_iteration import CONTRADICTION, keep_violated, list_violated, most_violated, step_to
+from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, follow_listed, refine, residuals, row_values
 from gpmpc.qp.factor import dot, multiply_at, pack, unpack
 from gpmpc.qp.gram_system import parts
 from gpmpc.qp.hessian import factorise, solve_transposed
@@ -25,11 +25,13 @@ from gpmpc.qp.working_set import (
     CAP,
     END,
     HIGH_WATCH,
+    LISTED,
     LOW_WATCH,
     LOWER,
     NAME,
     NORM,
     PLACE,
+    SCRATCH,
     SLACK,
     UPPER,
     WEIGHT,
@@ -89,12 +91,12 @@ def keep_capped(n, warm, traits, bounds, mu):
 
 
 @borrowing
-def count_above(values, threshold, size):
-    """How many of the first ``size`` values are above the threshold."""
-    count = 0
-    for i in range(size):
-        count += values[i] > threshold
-    return count
+def count_above(values, threshold, listed, count):
+    """How many of the listed values are above the threshold."""
+    above = 0
+    for i in range(count):
+        above += values[listed[i]] > threshold
+    return above
 
 
 @borrowing
@@ -110,9 +112,9 @@ def all_present(names, bounds, mu):
 
 
 @borrowing
-def write_ray(p, k, y, bounds, members, r, mu):
+def write_ray(p, above, k, bounds, members, r, mu):
     """Farkas' proof that constraint p contradicts the working ones, ``C' ray = 0`` and ``ray' bounds < 0``, into mu."""
-    sense = 1.0 if y[p] > bounds[UPPER, p] else -1.0
+    sense = 1.0 if above else -1.0
     mu[:] = 0.0
     for i in range(k):
         at = abs(members[NAME, i]) - 1
@@ -134,7 +136,7 @@ def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, uppe
     capacity = most_working(n, M, soft)
     bounds, slots, scratch, y = vectors[:5], vectors[5:9], vectors[9:13], vectors[13, :M]
     seen, excess, gradient, active = vectors[14], vectors[15], vectors[16], vectors[17]
-    v, slope, pulled = vectors[18], vectors[19], vectors[20]
+    v, slope, pulled, now = vectors[18], vectors[19], vectors[20], vectors[21]
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     for p in range(M):
         mu[p] = 0.0
@@ -152,7 +154,8 @@ def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, uppe
         for i in range(n):
             v[i] = -pull[i]
         solve_transposed(L, n, v)
-    k, age, tag, candidates = 0, 0.0, settings[workspace.TAG], members[2]
+    k, age, tag, candidates = 0, 0.0, settings[workspace.TAG], members[SCRATCH]
+    listed = members[LISTED]
     if guessed:
         names = warm[HEADER + n + M : HEADER + n + M + int(warm[WORKING])]
         fits = len(names) <= capacity and len(names) * (len(names) + 1) // 2 <= len(warm) - (HEADER + n + 2 * M)
@@ -180,21 +183,23 @@ def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, uppe
     current, iterations, rounds, status, worst = True, 0, 0, NUMERICAL_TROUBLE, np.inf
     interrupted = guessed and warm[STATUS] == ITERATION_LIMIT
     sweeps = SWEEPS if interrupted else 0  # the dual objective climbs with single steps only, and so the end is sure
+    count, fresh = list_violated(y, traits[WEIGHT], bounds, excess, listed), True
     while True:
-        p = most_violated(y, traits[WEIGHT], bounds, excess)
-        if p >= 0:
+        if count > 0:
             if iterations >= limit:
                 status = ITERATION_LIMIT
                 break
             current = False
-            share = SWEPT * excess[p]
-            several = sweeps < SWEEPS and count_above(excess, share, M) > 1
-            if several:
+            p = most_violated(excess, listed, count)
+            value, several = y[p] if fresh else now[p], False
+            if fresh and sweeps < SWEEPS and count_above(excess, SWEPT * excess[p], listed, count) > 1:
                 sweeps += 1
                 before = k
-                count = choose_violated(share, capacity - k, y, excess, bounds, mu, candidates)
+                chosen = choose_violated(
+                    SWEPT * excess[p], capacity - k, y, excess, listed, count, bounds, mu, candidates
+                )
                 k = take(
-                    lazy, candidates, count, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R,
+                    lazy, candidates, chosen, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R,
                     scratch[1],
                 )  # fmt: skip
                 several = k > before
@@ -202,23 +207,33 @@ def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, uppe
                 k = settle(k, bounds, mu, slots, members, R, scratch)
             if not several:
                 outcome, k, changes = step_to(
-                    lazy, p, y[p], k, capacity, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch
+                    lazy, p, value, k, capacity, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch
                 )
                 iterations += changes
                 if outcome == CONTRADICTION:
                     if excess[p] > NOISE * traits[WEIGHT, p] * bounds[SLACK, p] / TOLERATED:
                         status = INFEASIBLE
-                        write_ray(p, k, y, bounds, members, scratch[2], mu)
+                        write_ray(p, value > bounds[UPPER, p], k, bounds, members, scratch[2], mu)
                         break
                     ignore(p, bounds)
                 if soft:
                     sweeps = SWEEPS  # caps may have changed what ``pull`` says
-            if not lazy:
-                follow(rows, mu, seen, candidates, gradient, y)
-            elif soft:
-                evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y)
-            else:
-                follow_lazily(n, v, rows, L, G, mu, k, members, traits, gradient, y)
+            fresh = several or soft or iterations >= limit
+            if not fresh:  # first satisfy those that were seen to be violated, then look at all
+                follow_listed(
+                    lazy, n, v, rows, L, G, mu, k, members, traits, seen, gradient, y, listed, count, now
+                )  # fmt: skip
+                count = keep_violated(now, traits[WEIGHT], bounds, excess, listed, count)
+                fresh = count == 0
+            if fresh:
+                if not lazy:
+                    follow(rows, mu, seen, candidates, gradient, y)
+                elif soft:
+                    evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y)
+                else:
+                    follow_lazily(n, v, rows, L, mu, k, members, gradient, y)
+                    row_values(G, n, traits, y)
+                count = list_violated(y, traits[WEIGHT], bounds, excess, listed)
             continue
         if not current:
             if not lazy:
@@ -235,7 +250,8 @@ def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, uppe
         status = SOLVED if worst <= tolerance else NUMERICAL_TROUBLE
         rounds += 1
         unchanged = current and attempt == 0
-        if unchanged or rounds == ROUNDS or most_violated(y, traits[WEIGHT], bounds, excess) < 0:
+        count = 0 if unchanged or rounds == ROUNDS else list_violated(y, traits[WEIGHT], bounds, excess, listed)
+        if count == 0:
             break
     out[STATUS], out[ITERATIONS], out[WORKING] = status, iterations, k
     out[VARIABLES], out[CONSTRAINTS], out[TAG], out[AGE] = n, M, NO_TAG, age + iterations

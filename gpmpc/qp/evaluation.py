@@ -8,7 +8,7 @@ solves.
 from gpmpc.compiled import borrowing
 from gpmpc.qp.factor import backward_solve, dot, forward_solve, four_dots, multiply, subtract_rows
 from gpmpc.qp.hessian import solve_lower, solve_transposed
-from gpmpc.qp.working_set import BOUND, END, LEAST, MOST, NAME, PLACE, SOFTNESS, couple
+from gpmpc.qp.working_set import BOUND, END, LEAST, MOST, NAME, PLACE, SCRATCH, SOFTNESS, couple
 
 
 @borrowing
@@ -65,27 +65,53 @@ def row_values(G, n, traits, y):
 
 
 @borrowing
-def follow_lazily(n, v, rows, L, G, mu, k, members, traits, weights, y):
-    """Lazy mode without soft rows: ``y = C x`` from L x = v - sum mu_i w_i."""
+def follow_lazily(n, v, rows, L, mu, k, members, weights, y):
+    """Lazy mode without soft rows: x from ``L x = v - sum mu_i w_i``."""
     for i in range(n):
         y[i] = v[i]
     for i in range(k):
         weights[i] = mu[abs(members[NAME, i]) - 1]
     subtract_rows(y, rows, members[PLACE], weights, k, n)
     solve_lower(L, n, y)
-    row_values(G, n, traits, y)
+
+
+@borrowing
+def changes_since(mu, seen, changed, amounts):
+    """Lists the multipliers that are not those, ``seen``, that y knows; returns how many."""
+    count = 0
+    for p in range(len(mu)):
+        if mu[p] != seen[p]:
+            changed[count], amounts[count] = p, mu[p] - seen[p]
+            count += 1
+    return count
 
 
 @borrowing
 def follow(rows, mu, seen, changed, amounts, y):
     """Gram mode: moves y by the rows of K whose multipliers are not those, ``seen``, that y knows."""
-    count = 0
-    for p in range(len(mu)):
-        if mu[p] != seen[p]:
-            changed[count], amounts[count] = p, mu[p] - seen[p]
-            seen[p] = mu[p]
-            count += 1
+    count = changes_since(mu, seen, changed, amounts)
+    for i in range(count):
+        seen[changed[i]] = mu[changed[i]]
     subtract_rows(y, rows, changed, amounts, count, len(mu))
+
+
+@borrowing
+def follow_listed(lazy, n, v, rows, L, G, mu, k, members, traits, seen, weights, y, listed, count, now):
+    """The values ``now`` of a few constraints, without those of all others (in lazy mode y then begins with x)."""
+    if lazy:
+        follow_lazily(n, v, rows, L, mu, k, members, weights, y)
+        for i in range(count):
+            p = listed[i]
+            now[p] = y[p] if p < n else dot(G[p - n], y, int(traits[END, p]))
+    else:
+        changed = members[SCRATCH]
+        changes = changes_since(mu, seen, changed, weights)
+        for i in range(count):
+            p = listed[i]
+            row, value = rows[p], y[p]
+            for c in range(changes):
+                value -= weights[c] * row[changed[c]]
+            now[p] = value
 
 
 @borrowing

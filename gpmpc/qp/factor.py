@@ -8,7 +8,7 @@ section 6.5.2). The diagonal holds reciprocals, so that no solve divides.
 
 import math
 
-from gpmpc.compiled import REORDERED, borrowing
+from gpmpc.compiled import borrowing
 
 
 @borrowing
@@ -18,15 +18,6 @@ def dot(a, b, size):
     for i in range(size):
         total += a[i] * b[i]
     return total
-
-
-@borrowing(fastmath=REORDERED | {"nnan"})
-def largest(a, size):
-    """The largest of the first ``size`` entries, which vectorises only if none of them is NaN."""
-    found = a[0]
-    for i in range(size):
-        found = max(found, a[i])
-    return found
 
 
 @borrowing

@@ -7,8 +7,8 @@ Everything lives in a few arrays that the kernels hand around, a column per cons
 * ``slots`` (4, capacity + 1): the bound b that holds, the constraint's value at the unconstrained minimiser, and the
   range of its multiplier: [0, cap] at an upper bound, [-cap, 0] at a lower one, [-cap, cap] for an equality. The cap is
   infinite unless the row is soft with a linear weight; a constraint that leaves at its cap stays violated.
-* ``members`` (3, capacity + 2) integers: the signed number +-(p + 1) of the constraint in each slot, where its row is,
-  and scratch for lists of candidates.
+* ``members`` (4, capacity + 2) integers: the signed number +-(p + 1) of the constraint in each slot, where its row is,
+  scratch for lists of candidates, and the list of violated constraints.
 * ``traits`` (5, M): norm, weight in the choice of the most violated, softness 1/rho and cap (``gpmpc.qp.soft_rows``),
   and the number of leading entries of c_p that may not be zero.
 * ``mu`` (M): multipliers; zero outside the working set except at a cap.
@@ -26,7 +26,7 @@ from gpmpc.qp.hessian import make_row, make_rows
 
 LOWER, UPPER, SLACK, LOW_WATCH, HIGH_WATCH = 0, 1, 2, 3, 4  # rows of ``bounds``
 BOUND, FREE_VALUE, LEAST, MOST = 0, 1, 2, 3  # rows of ``slots``
-NAME, PLACE = 0, 1  # rows of ``members``
+NAME, PLACE, SCRATCH, LISTED = 0, 1, 2, 3  # rows of ``members``
 NORM, WEIGHT, SOFTNESS, CAP, END = 0, 1, 2, 3, 4  # rows of ``traits``
 
 GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
@@ -117,10 +117,11 @@ def choose_guess(names, room, bounds, mu, candidates):
 
 
 @borrowing
-def choose_violated(share, room, y, excess, bounds, mu, candidates):
-    """The same for the violated constraints whose weighted excess is above ``share``, except those at a cap."""
+def choose_violated(share, room, y, excess, listed, violated, bounds, mu, candidates):
+    """The same for the listed constraints whose weighted excess is above ``share``, except those at a cap."""
     count = 0
-    for p in range(len(y)):
+    for i in range(violated):
+        p = listed[i]
         if excess[p] > share and count < room and mu[p] == 0.0:
             candidates[count] = p + 1 if y[p] > bounds[UPPER, p] else -(p + 1)
             count += 1

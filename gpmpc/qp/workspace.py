@@ -17,7 +17,7 @@ from gpmpc.compiled import borrowing
 Array = NDArray[np.float64]
 
 LIMIT, TOLERANCE, SOFT, VARIABLES, CONSTRAINTS, TAG, SETTINGS = 0, 1, 2, 3, 4, 5, 6
-VECTORS = 21  # arrays with an entry per constraint
+VECTORS = 22  # arrays with an entry per constraint
 
 
 def gram_workspace(settings: Array, traits: Array) -> Array:
@@ -40,7 +40,7 @@ def lazy_workspace(settings: Array, softness: Array) -> Array:
 def _size(settings: Array) -> int:
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
     capacity = most_working(n, M, bool(settings[SOFT]))
-    return SETTINGS + 5 * M + (VECTORS + 3) * max(M, capacity + 2) + (capacity + 1) ** 2
+    return SETTINGS + 5 * M + (VECTORS + 4) * max(M, capacity + 2) + (capacity + 1) ** 2
 
 
 @borrowing
@@ -57,12 +57,12 @@ def carve(work):
     wide = max(M, capacity + 2)
     a = SETTINGS + 5 * M
     b = a + VECTORS * wide
-    c = b + 3 * wide
+    c = b + 4 * wide
     d = c + (capacity + 1) * (capacity + 1)
     return (
         work[SETTINGS:a].reshape((5, M)),
         work[a:b].reshape((VECTORS, wide)),
-        work[b:c].view(np.int64).reshape((3, wide)),
+        work[b:c].view(np.int64).reshape((4, wide)),
         work[c:d].reshape((capacity + 1, capacity + 1)),
         work[d:],
     )
