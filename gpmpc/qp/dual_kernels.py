@@ -19,7 +19,6 @@ from gpmpc.qp import record, workspace
 from gpmpc.qp.dual_iteration import CONTRADICTION, keep_violated, list_violated, most_violated, step_to
 from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, follow_listed, refine, residuals, row_values
 from gpmpc.qp.factor import dot, multiply_at, pack, unpack
-from gpmpc.qp.gram_system import parts
 from gpmpc.qp.hessian import factorise, solve_transposed
 from gpmpc.qp.working_set import (
     CAP,
@@ -50,8 +49,8 @@ WORKING, TAG, AGE, HEADER = record.WORKING, record.TAG, record.AGE, record.HEADE
 SOLVED, INFEASIBLE, ITERATION_LIMIT = record.SOLVED, record.INFEASIBLE, record.ITERATION_LIMIT
 NUMERICAL_TROUBLE, MISUSE, NO_TAG = record.NUMERICAL_TROUBLE, record.MISUSE, record.NO_TAG
 
-GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])"
-LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])"
+GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1])"
+LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 
 ABSENT = 1e20  # a bound of this size or more is none
 TOLERATED = 1e-10  # a violation below this share of the size of a constraint is none
@@ -269,12 +268,11 @@ def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, uppe
 @borrowing
 def solve_gram(q, lower, upper, warm, system, work, out):
     """Gram mode; ``system`` is of ``gpmpc.qp.gram_system``, ``work`` of ``gpmpc.qp.workspace``."""
-    n, M = int(work[workspace.VARIABLES]), int(work[workspace.CONSTRAINTS])
+    settings, traits, vectors, members, R, _ = carve(work)
+    n, M = int(settings[workspace.VARIABLES]), int(settings[workspace.CONSTRAINTS])
     if len(q) != n or len(lower) != M or len(upper) != M or not all_finite(q):
         return MISUSE
-    K, P, G = parts(system, n, M)
-    traits, vectors, members, R, _ = carve(work)
-    settings = work[: workspace.SETTINGS]
+    K, P, G = system[:M], system[M : M + n], system[M + n :]
     return optimise(False, P, q, G, n, K, P, traits, vectors, members, R, lower, upper, warm, settings, out)
 
 
@@ -286,13 +284,12 @@ def solve_lazy(P, q, G, lower, upper, warm, work, out):
     shaped = P.shape[1] == n and len(q) == n and (m == 0 or G.shape[1] == n) and len(lower) == M and len(upper) == M
     if not shaped or not all_finite(q):
         return MISUSE
-    traits, vectors, members, R, rest = carve(work)
-    L, rows = rest[: n * n].reshape((n, n)), rest[n * n :].reshape((len(rest) // n - n, n))
+    settings, traits, vectors, members, R, rest = carve(work)
+    L, rows = rest[:n], rest[n:]
     if not factorise(P, L):
         return MISUSE
     if not measure(G, n, traits):
         return MISUSE
-    settings = work[: workspace.SETTINGS]
     return optimise(True, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
 
 

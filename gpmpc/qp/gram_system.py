@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from gpmpc.compiled import borrowing
 from gpmpc.qp.solution import Terms
 
 Array = NDArray[np.float64]
@@ -25,12 +24,7 @@ def gram_system(terms: Terms) -> tuple[Array, Array]:
     weights = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     ends = ((C != 0) * np.arange(1, len(P) + 1)).max(axis=1)
     traits = np.vstack([np.linalg.norm(C, axis=1), weights, softness, ends])
-    return np.concatenate([K.ravel(), P.ravel(), G.ravel()]), traits
-
-
-@borrowing
-def parts(system, n, M):
-    """K, P and G as views."""
-    a = M * M
-    b = a + n * n
-    return system[:a].reshape((M, M)), system[a:b].reshape((n, n)), system[b:].reshape((M - n, n))
+    system = np.zeros((2 * len(C), len(C)))
+    system[: len(C)] = K
+    system[len(C) :, : len(P)] = np.vstack([P, G])
+    return system, traits

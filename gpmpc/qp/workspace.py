@@ -1,12 +1,13 @@
 """The memory that a solve works in, besides the record that it writes.
 
 To ask the system for it costs as much as a small solve, so each prepared problem or shape keeps what it has used
-before: ``list.pop`` and ``list.append`` are atomic, so two threads never hold the same workspace. A workspace begins
-with what stays the same from solve to solve and is otherwise undefined:
+before: ``list.pop`` and ``list.append`` are atomic, so two threads never hold the same workspace. It is one matrix,
+whose rows have an entry per constraint; to slice it costs nothing. Its first rows stay the same from solve to solve,
+the others are otherwise undefined:
 
-    [iteration limit, tolerance, whether rows are soft, n, M, tag | traits (5, M) | the kernels' arrays]
-
-Of the traits (``gpmpc.qp.working_set``) lazy mode fills in norms, weights and ends itself.
+    iteration limit, tolerance, whether rows are soft, n, M, tag
+    traits (5 rows, see ``gpmpc.qp.working_set``; lazy mode fills in norms, weights and ends itself)
+    vectors, members (integers), R, and in lazy mode L and rows
 """
 
 import numpy as np
@@ -17,30 +18,28 @@ from gpmpc.compiled import borrowing
 Array = NDArray[np.float64]
 
 LIMIT, TOLERANCE, SOFT, VARIABLES, CONSTRAINTS, TAG, SETTINGS = 0, 1, 2, 3, 4, 5, 6
-VECTORS = 22  # arrays with an entry per constraint
+TRAITS, VECTORS, MEMBERS = 5, 22, 4  # rows of each
 
 
 def gram_workspace(settings: Array, traits: Array) -> Array:
     """Memory for solves in Gram mode with these settings (6,) and traits (5, M)."""
-    work = np.zeros(_size(settings))
-    work[:SETTINGS] = settings
-    work[SETTINGS : SETTINGS + traits.size] = traits.ravel()
-    return work
+    return _workspace(settings, traits, 0)
 
 
 def lazy_workspace(settings: Array, softness: Array) -> Array:
-    """Memory for solves in lazy mode with these settings (6,) and softness (2, M); with room for L and rows."""
+    """Memory for solves in lazy mode with these settings (6,) and softness (2, M)."""
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
-    rows = most_working(n, M, bool(settings[SOFT])) + 2
-    return np.append(
-        gram_workspace(settings, np.vstack([np.zeros((2, M)), softness, np.zeros((1, M))])), np.zeros((n + rows) * n)
-    )
+    traits = np.vstack([np.zeros((2, M)), softness, np.zeros((1, M))])
+    return _workspace(settings, traits, n + most_working(n, M, bool(settings[SOFT])) + 2)
 
 
-def _size(settings: Array) -> int:
+def _workspace(settings: Array, traits: Array, more: int) -> Array:
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
     capacity = most_working(n, M, bool(settings[SOFT]))
-    return SETTINGS + 5 * M + (VECTORS + 4) * max(M, capacity + 2) + (capacity + 1) ** 2
+    work = np.zeros((1 + TRAITS + VECTORS + MEMBERS + capacity + 1 + more, max(M, capacity + 2, SETTINGS)))
+    work[0, :SETTINGS] = settings
+    work[1 : 1 + TRAITS, :M] = traits
+    return work
 
 
 @borrowing
@@ -51,18 +50,11 @@ def most_working(n, M, soft):
 
 @borrowing
 def carve(work):
-    """The kernels' arrays: traits, vectors, members, R, and the rest of the memory."""
-    n, M = int(work[VARIABLES]), int(work[CONSTRAINTS])
-    capacity = most_working(n, M, work[SOFT] != 0.0)
-    wide = max(M, capacity + 2)
-    a = SETTINGS + 5 * M
-    b = a + VECTORS * wide
-    c = b + 4 * wide
-    d = c + (capacity + 1) * (capacity + 1)
-    return (
-        work[SETTINGS:a].reshape((5, M)),
-        work[a:b].reshape((VECTORS, wide)),
-        work[b:c].view(np.int64).reshape((4, wide)),
-        work[c:d].reshape((capacity + 1, capacity + 1)),
-        work[d:],
-    )
+    """The kernels' arrays: settings, traits, vectors, members, R, and the rest of the memory."""
+    settings = work[0]
+    capacity = most_working(int(settings[VARIABLES]), int(settings[CONSTRAINTS]), settings[SOFT] != 0.0)
+    a = 1 + TRAITS
+    b = a + VECTORS
+    c = b + MEMBERS
+    d = c + capacity + 1
+    return settings, work[1:a], work[a:b], work[b:c].view(np.int64), work[c:d], work[d:]
