@@ -35,6 +35,7 @@ from gpmpc.qp.workspace import gram_workspace, lazy_workspace
 
 Array = NDArray[np.float64]
 
+empty = np.empty  # a local name saves a look-up
 new = tuple.__new__  # half the time of a named tuple's own constructor
 
 _tags = count(1)  # next() of a count is atomic
@@ -112,7 +113,7 @@ class DualActiveSet:
             n, m = len(P), len(G)
             plan = self._plans.get((n, m)) if soft is None else None
             softness, settings, idle, size, where = plan or self._plan(n, m, soft)
-            record = np.empty(size)
+            record = empty(size)
             try:
                 work = idle.pop()
             except IndexError:
@@ -222,7 +223,7 @@ class Prepared:
             ProblemError: Shapes that do not match, NaN, crossed bounds.
         """
         began = perf_counter()
-        record = np.empty(self._size)
+        record = empty(self._size)
         try:
             work = self._idle.pop()
         except IndexError:

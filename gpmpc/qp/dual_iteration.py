@@ -93,10 +93,10 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
     free = free_value(lazy, row, v, q, n)
     diagonal = (dot(row, row, size) if lazy else row[p]) + traits[SOFTNESS, p]
     solved, r = scratch[1], scratch[2]
+    couple(lazy, row, k, size, rows, members, solved)
+    forward_solve(R, k, solved)
     while True:
         admit(k, p, above, place, traits, free, bounds, slots, members)
-        couple(lazy, row, k, size, rows, members, solved)
-        forward_solve(R, k, solved)
         for i in range(k):
             r[i] = solved[i]
         backward_solve(R, k, r)
@@ -121,7 +121,7 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
         if blocking < k:
             leaving = abs(members[NAME, blocking]) - 1
             mu[leaving] = slots[LEAST if sense * r[blocking] > 0.0 else MOST, blocking]
-            evict(k, blocking, slots, members, R, scratch[0])
+            evict(k, blocking, slots, members, R, solved, scratch[0])
             k -= 1
             members[PLACE, k + 1] = members[PLACE, k]  # the entering row keeps its place in slot k
             watch(leaving, mu, bounds)

@@ -102,8 +102,12 @@ def append_row(R, k, solved, pivot):
 
 
 @borrowing
-def remove_row(R, k, gone, carry):
-    """Deletes row ``gone`` of L, which has k rows; ``carry`` is scratch of length k."""
+def remove_row(R, k, gone, carry, solved):
+    """Deletes row ``gone`` of L, which has k rows, and solves ``solved = L^-1 a`` for a without entry ``gone``.
+
+    ``carry`` is scratch of length k.
+    """
+    left = solved[gone]
     for j in range(gone):
         column = R[j, gone:k]
         for i in range(len(column) - 1):
@@ -117,6 +121,8 @@ def remove_row(R, k, gone, carry):
         reciprocal = 1.0 / math.sqrt(rest[0] * rest[0] + diagonal * diagonal)
         cosine, sine = rest[0] * reciprocal, diagonal * reciprocal
         R[c - 1, c - 1] = reciprocal
+        below = solved[c]
+        solved[c - 1], left = cosine * left + sine * below, cosine * below - sine * left
         old, new = R[c, c + 1 : k], R[c - 1, c : k - 1]
         for i in range(len(old)):
             following, below = rest[i + 1], old[i]

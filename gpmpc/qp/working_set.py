@@ -84,9 +84,12 @@ def admit(k, p, above, place, traits, free, bounds, slots, members):
 
 
 @borrowing
-def evict(k, slot, slots, members, R, scratch):
-    """Deletes a slot of the working set of k members and mends the factor; its place is free for the next row."""
-    remove_row(R, k, slot, scratch)
+def evict(k, slot, slots, members, R, solved, scratch):
+    """Deletes a slot of the working set of k members; its place is free for the next row.
+
+    Mends the factor, and the solution ``solved`` of a forward solve.
+    """
+    remove_row(R, k, slot, scratch, solved)
     place = members[PLACE, slot]
     for i in range(slot, k - 1):
         members[NAME, i], members[PLACE, i] = members[NAME, i + 1], members[PLACE, i + 1]
@@ -160,11 +163,13 @@ def settle(k, bounds, mu, slots, members, R, scratch):
 
     Any working set is a valid start of a dual method once this is done.
     """
-    trial = scratch[2]
+    solved, trial = scratch[1], scratch[2]
+    for i in range(k):
+        solved[i] = slots[FREE_VALUE, i] - slots[BOUND, i]
+    forward_solve(R, k, solved)
     while True:
         for i in range(k):
-            trial[i] = slots[FREE_VALUE, i] - slots[BOUND, i]
-        forward_solve(R, k, trial)
+            trial[i] = solved[i]
         backward_solve(R, k, trial)
         worst, slot = 0.0, -1
         for i in range(k):
@@ -174,7 +179,7 @@ def settle(k, bounds, mu, slots, members, R, scratch):
         if slot < 0:
             break
         p = abs(members[NAME, slot]) - 1
-        evict(k, slot, slots, members, R, scratch[0])
+        evict(k, slot, slots, members, R, solved, scratch[0])
         k -= 1
         mu[p] = 0.0
         watch(p, mu, bounds)
