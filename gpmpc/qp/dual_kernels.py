@@ -286,7 +286,8 @@ def solve_lazy(P, q, G, lower, upper, warm, work, out):
     if not shaped or not all_finite(q):
         return MISUSE
     settings, traits, vectors, members, R, rest = carve(work)
-    L, rows = rest[:n], rest[n:]
+    dense = rest.reshape(rest.size)  # rows without gaps are nearer to each other
+    L, rows = dense[: n * n].reshape((n, n)), dense[n * n : n * (n + len(R) + 1)].reshape((len(R) + 1, n))
     if not factorise(P, L):
         return MISUSE
     if not measure(G, n, traits):

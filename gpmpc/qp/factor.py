@@ -77,20 +77,46 @@ def four_dots(r0, r1, r2, r3, vector, size, product):
 
 @borrowing
 def forward_solve(R, k, a):
-    """``a <- L^-1 a`` in place."""
-    for j in range(k):
+    """``a <- L^-1 a`` in place, four columns at a time."""
+    j = 0
+    while j + 4 <= k:
+        r0, r1, r2, r3 = R[j, j:k], R[j + 1, j:k], R[j + 2, j:k], R[j + 3, j:k]
+        rest = a[j:k]
+        f0 = rest[0] * r0[0]
+        f1 = (rest[1] - f0 * r0[1]) * r1[1]
+        f2 = (rest[2] - f0 * r0[2] - f1 * r1[2]) * r2[2]
+        f3 = (rest[3] - f0 * r0[3] - f1 * r1[3] - f2 * r2[3]) * r3[3]
+        rest[0], rest[1], rest[2], rest[3] = f0, f1, f2, f3
+        rest, r0, r1, r2, r3 = rest[4:], r0[4:], r1[4:], r2[4:], r3[4:]
+        for i in range(len(rest)):
+            rest[i] -= f0 * r0[i] + f1 * r1[i] + f2 * r2[i] + f3 * r3[i]
+        j += 4
+    while j < k:
         value = a[j] * R[j, j]
         a[j] = value
-        column, rest = R[j, j + 1 : k], a[j + 1 : k]
-        for i in range(len(column)):
-            rest[i] -= value * column[i]
+        for i in range(j + 1, k):
+            a[i] -= value * R[j, i]
+        j += 1
 
 
 @borrowing
 def backward_solve(R, k, a):
-    """``a <- L^-T a`` in place."""
-    for j in range(k - 1, -1, -1):
+    """``a <- L^-T a`` in place, four columns at a time."""
+    j = k
+    while j % 4:
+        j -= 1
         a[j] = (a[j] - dot(R[j, j + 1 :], a[j + 1 :], k - j - 1)) * R[j, j]
+    while j > 0:
+        j -= 4
+        r0, r1, r2, r3 = R[j, j:k], R[j + 1, j:k], R[j + 2, j:k], R[j + 3, j:k]
+        rest = a[j:k]
+        s0, s1, s2, s3 = rest[0], rest[1], rest[2], rest[3]
+        four_dots(r0[4:], r1[4:], r2[4:], r3[4:], rest[4:], len(rest) - 4, rest)
+        f3 = (s3 - rest[3]) * r3[3]
+        f2 = (s2 - rest[2] - r2[3] * f3) * r2[2]
+        f1 = (s1 - rest[1] - r1[2] * f2 - r1[3] * f3) * r1[1]
+        f0 = (s0 - rest[0] - r0[1] * f1 - r0[2] * f2 - r0[3] * f3) * r0[0]
+        rest[0], rest[1], rest[2], rest[3] = f0, f1, f2, f3
 
 
 @borrowing

@@ -30,13 +30,14 @@ def lazy_workspace(settings: Array, softness: Array) -> Array:
     """Memory for solves in lazy mode with these settings (6,) and softness (2, M)."""
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
     traits = np.vstack([np.zeros((2, M)), softness, np.zeros((1, M))])
-    return _workspace(settings, traits, n + most_working(n, M, bool(settings[SOFT])) + 2)
+    return _workspace(settings, traits, n * (n + most_working(n, M, bool(settings[SOFT])) + 2))
 
 
-def _workspace(settings: Array, traits: Array, more: int) -> Array:
+def _workspace(settings: Array, traits: Array, own: int) -> Array:
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
     capacity = most_working(n, M, bool(settings[SOFT]))
-    work = np.zeros((1 + TRAITS + VECTORS + MEMBERS + capacity + 1 + more, max(M, capacity + 2, SETTINGS)))
+    wide = max(M, capacity + 2, SETTINGS)
+    work = np.zeros((1 + TRAITS + VECTORS + MEMBERS + capacity + 1 + -(-own // wide), wide))
     work[0, :SETTINGS] = settings
     work[1 : 1 + TRAITS, :M] = traits
     return work
