@@ -3,6 +3,7 @@
     python benchmarks/qp.py                      # every cell of the table, about ten minutes
     python benchmarks/qp.py --quick              # short sequences, horizons 1, 10, 20: about a minute
     python benchmarks/qp.py --horizons 50 --modes changing --slow-solvers 0
+    python benchmarks/qp.py --rows 6,3           # also with bounds on the positions only
 
 Every solver meets the same sequence of QPs (``quadrotor_sequences``) in one process on one thread, warm-started from
 its own last solution. The solvers take turns, sequence by sequence, ``--passes`` times, and the fastest of a QP's
@@ -22,6 +23,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from time import perf_counter
 
@@ -145,18 +147,26 @@ def worst_residual(problem: SequenceProblem, answer) -> float:
     return max(solution.primal_residual(), solution.dual_residual(), solution.duality_gap())
 
 
-def measure_cell(horizon: int, mode: str, settings: argparse.Namespace) -> dict:
+def measure_cell(horizon: int, mode: str, rows: int, settings: argparse.Namespace) -> dict:
     """All solvers on one sequence."""
     changing = mode == "changing"
     closing = DualActiveSet()
-    problems = list(
-        quadrotor_sequence(
-            horizon, changing, settings.length, lambda p: closing.solve_stacked(p.P, p.q, p.G, p.lower, p.upper).x
-        )
-    )
+
+    def close_loop(p: SequenceProblem) -> np.ndarray:
+        return closing.solve_stacked(p.P, p.q, p.G, p.lower, p.upper).x
+
+    problems = list(quadrotor_sequence(horizon, changing, settings.length, close_loop, positions_only=rows == 3))
     fast = {OURS: ours(changing), DAQP_WARM: daqp_warm(changing), DAQP_COLD: daqp_cold}
     slow = {PRIMAL: by_protocol(PrimalActiveSet()), CVXPY: by_protocol(CvxpySolver("CLARABEL", {}))}
-    cell = {"horizon": horizon, "mode": mode, "n": 3 * horizon, "m": 6 * horizon, "QPs": len(problems), "solvers": {}}
+    cell = {
+        "horizon": horizon,
+        "mode": mode,
+        "n": 3 * horizon,
+        "m": rows * horizon,
+        "rows a stage": rows,
+        "QPs": len(problems),
+        "solvers": {},
+    }
     for condition, passes in (("hot", settings.passes), ("flushed", min(settings.passes, 2))):
         flush = condition == "flushed"
         some = problems[: max(20, len(problems) // 4)] if flush else problems
@@ -193,7 +203,7 @@ def quantiles(seconds: np.ndarray) -> dict[str, float]:
 def describe(cell: dict) -> str:
     """One line per cell for the terminal."""
     solvers, ratio = cell["solvers"], cell["ratio hot"]
-    text = f"{cell['mode']:9s} H = {cell['horizon']:3d}: "
+    text = f"{cell['mode']:9s} H = {cell['horizon']:3d}, m = {cell['m']:3d}: "
     text += f"{solvers[OURS]['hot']['median']:8.2f} us, {cell['best DAQP path']} "
     text += f"{solvers[cell['best DAQP path']]['hot']['median']:8.2f} us, ratio {ratio['median']:.3f}"
     if cell["horizon"] in TARGETS[cell["mode"]]:
@@ -232,7 +242,7 @@ def draw(cells: list[dict], path: Path) -> None:
         )
         targets = TARGETS[mode]
         ratios.semilogx(list(targets), list(targets.values()), "k_", ms=14, label="target for the median, hot")
-        ratios.set(xlabel="horizon H (n = 3H, m = 6H)", xticks=x, xticklabels=x)
+        ratios.set(xlabel=f"horizon H (n = 3H, m = {chosen[0]['rows a stage']}H)", xticks=x, xticklabels=x)
         ratios.set_ylim(bottom=0.0)  # open above: where DAQP is faster has to show
         ratios.axhline(1.0, color="0.5", linewidth=0.8)
         ratios.minorticks_off()
@@ -250,6 +260,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--horizons", default="1,5,10,20,50", help="comma-separated")
     parser.add_argument("--modes", default="constant,changing", help="comma-separated")
+    parser.add_argument("--rows", default="6", help="bounded states a stage: 6 (positions, velocities), 3, or 6,3")
     parser.add_argument("--length", type=int, default=440, help="QPs per cell")
     parser.add_argument("--passes", type=int, default=3, help="turns of each solver")
     parser.add_argument("--slow-solvers", type=int, default=30, help="QPs for Algorithm 1 and CVXPY; 0 leaves them out")
@@ -260,14 +271,15 @@ def main() -> None:
         settings.horizons, settings.length, settings.slow_solvers = "1,10,20", 120, 5
     settings.out.mkdir(parents=True, exist_ok=True)
     cells = []
-    for mode in settings.modes.split(","):
-        for horizon in map(int, settings.horizons.split(",")):
-            cells.append(measure_cell(horizon, mode, settings))
-            print(describe(cells[-1]), flush=True)
+    families = map(int, settings.rows.split(","))
+    for rows, mode, horizon in product(families, settings.modes.split(","), map(int, settings.horizons.split(","))):
+        cells.append(measure_cell(horizon, mode, rows, settings))
+        print(describe(cells[-1]), flush=True)
     machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count(), "threads": 1}
     versions = {"python": sys.version.split()[0], "numpy": np.__version__, "unit": "microseconds"}
     (settings.out / "qp.json").write_text(json.dumps({"machine": machine | versions, "cells": cells}, indent=1))
-    draw(cells, settings.out / "qp.png")
+    first = [cell for cell in cells if cell["rows a stage"] == cells[0]["rows a stage"]]
+    draw(first, settings.out / "qp.png")
     print(f"written to {settings.out}")
 
 

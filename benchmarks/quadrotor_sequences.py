@@ -3,7 +3,8 @@
 A solver that is warm-started is judged only by a sequence in which the next problem resembles the last one as it does
 in use. Here the translational subsystem of the quadrotor (thrust and two tilts in, positions and velocities out)
 follows a fast Lissajous curve under process noise. Its MPC is condensed to the inputs of the horizon: input bounds
-become the box of the QP (n = 3H), bounds on the six states of every stage its rows (6H). The bounds narrow and widen
+become the box of the QP (n = 3H), bounds on the six states of every stage its rows (6H); or, as a second family, on
+the three positions (3H). The bounds narrow and widen
 (a corridor that the vehicle passes), so that constraints come and go; they are never narrower than what a known
 feasible plan needs.
 
@@ -82,8 +83,14 @@ def _state_limits(times: Array) -> Array:
     return np.where(inside[:, None], NARROW, WIDE).ravel()
 
 
-def quadrotor_sequence(horizon: int, changing: bool, length: int, solve, seed: int = 0) -> Iterator[SequenceProblem]:
-    """The QPs of ``length`` closed-loop steps; ``solve(problem) -> x`` closes the loop."""
+def quadrotor_sequence(
+    horizon: int, changing: bool, length: int, solve, seed: int = 0, positions_only: bool = False
+) -> Iterator[SequenceProblem]:
+    """The QPs of ``length`` closed-loop steps; ``solve(problem) -> x`` closes the loop.
+
+    With ``positions_only`` the velocities are not bounded: three rows a stage instead of six.
+    """
+    bounded = slice(None, None, 2 if positions_only else 1)
     rng = np.random.default_rng(seed)
     weight = np.kron(np.eye(horizon), STATE_WEIGHT)
     box = np.tile(INPUT_LIMIT, horizon)
@@ -97,14 +104,15 @@ def quadrotor_sequence(horizon: int, changing: bool, length: int, solve, seed: i
             free, forced = _condense(A, B, horizon)
             P = 2.0 * (forced.T @ weight @ forced + np.kron(np.eye(horizon), INPUT_WEIGHT))
             prepared = 0.5 * (P + P.T), forced, 2.0 * forced.T @ weight
-        P, G, gradient = prepared
+        P, forced, gradient = prepared
+        G = np.ascontiguousarray(forced[bounded])
         times = now + TIME_STEP * np.arange(1, horizon + 1)
         drift = free @ state
         q = gradient @ (drift - _reference(times).ravel())
-        limits = _state_limits(times)
+        limits, offset = _state_limits(times)[bounded], drift[bounded]
         feasible = G @ np.clip(np.concatenate([plan[3:], plan[-3:]]), -box, box)
-        lower = np.concatenate([-box, np.minimum(-limits - drift, feasible - 0.01)])
-        upper = np.concatenate([box, np.maximum(limits - drift, feasible + 0.01)])
+        lower = np.concatenate([-box, np.minimum(-limits - offset, feasible - 0.01)])
+        upper = np.concatenate([box, np.maximum(limits - offset, feasible + 0.01)])
         problem = SequenceProblem(P, q, G, lower, upper)
         yield problem
         plan = solve(problem)

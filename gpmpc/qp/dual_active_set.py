@@ -31,9 +31,11 @@ from gpmpc.qp.problem import QuadraticProgram
 from gpmpc.qp.soft_rows import SoftRows, stack_softness
 from gpmpc.qp.solution import QPSolution, Terms
 from gpmpc.qp.solver import WarmStart
+from gpmpc.qp.workspace import gram_workspace, lazy_workspace
 
 Array = NDArray[np.float64]
 
+empty = np.empty  # a local name saves a look-up
 new = tuple.__new__  # half the time of a named tuple's own constructor
 
 _tags = count(1)  # next() of a count is atomic
@@ -110,24 +112,29 @@ class DualActiveSet:
         try:
             n, m = len(P), len(G)
             plan = self._plans.get((n, m)) if soft is None else None
-            softness, settings, size, where = plan or self._plan(n, m, soft)
-            record = np.empty(size)
+            softness, settings, idle, size, where = plan or self._plan(n, m, soft)
+            record = empty(size)
+            try:
+                work = idle.pop()
+            except IndexError:
+                work = lazy_workspace(settings, softness)
             warm = layout.NO_RECORD if warm_start is None else warm_start.record
-            status = solve_lazy(P, q, G, lower, upper, warm, softness, settings, record)
+            status = solve_lazy(P, q, G, lower, upper, warm, work, record)
+            idle.append(work)
         except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
             status = layout.MISUSE
         if status == layout.MISUSE:
             problem = QuadraticProgram.from_stacked(P, q, G, lower, upper)  # raises if it is misuse indeed
             P, q, G, lower, upper = problem.P, problem.q, problem.G, problem.lower, problem.upper
             n, m = len(P), len(G)
-            softness, settings, size, where = self._plan(n, m, soft)
-            record, warm = np.empty(size), _as_record(warm_start, n, n + m)
-            status = solve_lazy(P, q, G, lower, upper, warm, softness, settings, record)
+            softness, settings, _, size, where = self._plan(n, m, soft)
+            record, warm, work = np.empty(size), _as_record(warm_start, n, n + m), lazy_workspace(settings, softness)
+            status = solve_lazy(P, q, G, lower, upper, warm, work, record)
         terms = new(Terms, (P, G, softness))
         if status != layout.SOLVED:
 
             def again(guess: Array, record: Array) -> int:
-                return solve_lazy(P, q, G, lower, upper, guess, softness, settings, record)
+                return solve_lazy(P, q, G, lower, upper, guess, lazy_workspace(settings, softness), record)
 
             record = self._settle(again, terms, q, lower, upper, record, began)
         return new(QPSolution, (record[where], terms, q, lower, upper, record, 0.0, perf_counter() - began))
@@ -146,12 +153,12 @@ class DualActiveSet:
         problem = QuadraticProgram(P, np.zeros(len(np.atleast_1d(P))), G)
         n, m = len(problem.P), len(problem.G)
         terms = Terms(problem.P, problem.G, stack_softness(soft, n, m))
-        return Prepared(self, terms, self._settings(n, n + m, soft is not None))
+        return Prepared(self, terms, self._settings(n, n + m, soft is not None, float(next(_tags))))
 
-    def _plan(self, n: int, m: int, soft: SoftRows | None) -> tuple[Array, Array, int, slice]:
-        """What lazy mode needs to know about a shape: softness, settings, the record's length, and where x is in it."""
+    def _plan(self, n: int, m: int, soft: SoftRows | None) -> tuple[Array, Array, list[Array], int, slice]:
+        """For a shape, softness, settings, idle workspaces, the record's length, and where x is in it."""
         softness, settings = stack_softness(soft, n, m), self._settings(n, n + m, soft is not None)
-        plan = softness, settings, layout.record_size(n, n + m), slice(layout.HEADER, layout.HEADER + n)
+        plan = softness, settings, [], layout.record_size(n, n + m), slice(layout.HEADER, layout.HEADER + n)
         if soft is None:
             self._plans[n, m] = plan
         return plan
@@ -159,9 +166,9 @@ class DualActiveSet:
     def _limit(self, M: int) -> int:
         return self.iteration_limit or 100 + ITERATIONS_PER_CONSTRAINT * M
 
-    def _settings(self, n: int, M: int, soft: bool) -> Array:
-        limit = self._limit(M)
-        return _settings(limit if self.time_limit is None else min(limit, ITERATIONS_PER_LOOK), self.tolerance, soft, n)
+    def _settings(self, n: int, M: int, soft: bool, tag: float = layout.NO_TAG) -> Array:
+        limit = self._limit(M) if self.time_limit is None else min(self._limit(M), ITERATIONS_PER_LOOK)
+        return np.array([limit, self.tolerance, soft, n, M, tag], dtype=float)
 
     def _settle(self, again: Callable, terms: Terms, q: Array, lower: Array, upper: Array, record: Array, began: float):
         """Decides on a solve that did not end as ``SOLVED``: go on, believe it, or try again; returns the record."""
@@ -178,7 +185,8 @@ class DualActiveSet:
         stopped = record[layout.STATUS] == layout.ITERATION_LIMIT and self.iteration_limit is not None
         if stopped or record[layout.STATUS] in (layout.SOLVED, layout.TIME_LIMIT):
             return record
-        return rescue(terms, q, lower, upper, record, _settings(self._limit(len(lower)), self.tolerance, True, len(q)))
+        settings = np.array([self._limit(len(lower)), self.tolerance, True, len(q), len(lower), layout.NO_TAG])
+        return rescue(terms, q, lower, upper, record, settings)
 
 
 class Prepared:
@@ -189,20 +197,17 @@ class Prepared:
         build_seconds: Time that the preparation took [s].
     """
 
-    __slots__ = ("_M", "_settings", "_size", "_solver", "_system", "_x", "build_seconds", "terms")
+    __slots__ = ("_idle", "_settings", "_size", "_solver", "_system", "_traits", "_x", "build_seconds", "terms")
 
     def __init__(self, solver: DualActiveSet, terms: Terms, settings: Array):
         compile_for(solve_gram, GRAM_SIGNATURE)
         began = perf_counter()
-        self.terms, self._solver = terms, solver
-        self._system = gram_system(terms)
-        self._M = self._system.shape[1]
-        n = len(terms.P)
-        self._size = layout.record_size(n, self._M) + layout.factor_size(n, self._M)
+        self.terms, self._solver, self._settings = terms, solver, settings
+        self._system, self._traits = gram_system(terms)
+        self._idle = []
+        n, M = len(terms.P), sum(terms.G.shape)
+        self._size = layout.record_size(n, M) + layout.factor_size(n, M)
         self._x = slice(layout.HEADER, layout.HEADER + n)
-        self._settings = np.append(
-            settings[:-1], next(_tags)
-        )  # a record's factor is good for the problem with its tag only
         self.build_seconds = perf_counter() - began
 
     def solve(self, q: Array, lower: Array, upper: Array, warm_start: WarmStart = None) -> QPSolution:
@@ -218,36 +223,37 @@ class Prepared:
             ProblemError: Shapes that do not match, NaN, crossed bounds.
         """
         began = perf_counter()
-        record = np.empty(self._size)
+        record = empty(self._size)
+        try:
+            work = self._idle.pop()
+        except IndexError:
+            work = gram_workspace(self._settings, self._traits)
         try:
             warm = layout.NO_RECORD if warm_start is None else warm_start.record
-            status = solve_gram(q, lower, upper, warm, self._system, self._settings, record)
+            status = solve_gram(q, lower, upper, warm, self._system, work, record)
         except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
             status = layout.MISUSE
+        self._idle.append(work)
         if status:
             return self._solve_carefully(q, lower, upper, warm_start, record, status, began)
         return new(QPSolution, (record[self._x], self.terms, q, lower, upper, record, 0.0, perf_counter() - began))
 
     def _solve_carefully(self, q, lower, upper, warm_start, record, status, began) -> QPSolution:
         """The rest of ``solve`` for whatever is not plain sailing."""
-        system, settings = self._system, self._settings
+        P, G, _ = self.terms
         if status == layout.MISUSE:
-            P, G, _ = self.terms
             problem = QuadraticProgram.from_stacked(P, q, G, lower, upper)  # raises if it is misuse indeed
             q, lower, upper = problem.q, problem.lower, problem.upper
-            warm = _as_record(warm_start, len(q), self._M)
-            status = solve_gram(q, lower, upper, warm, system, settings, record)
 
         def again(guess: Array, record: Array) -> int:
-            return solve_gram(q, lower, upper, guess, system, settings, record)
+            work = gram_workspace(self._settings, self._traits)
+            return solve_gram(q, lower, upper, guess, self._system, work, record)
 
+        if status == layout.MISUSE:
+            status = again(_as_record(warm_start, len(q), len(lower)), record)
         if status != layout.SOLVED:
             record = self._solver._settle(again, self.terms, q, lower, upper, record, began)
         return QPSolution(record[self._x], self.terms, q, lower, upper, record, 0.0, perf_counter() - began)
-
-
-def _settings(limit: int, tolerance: float, soft: bool, n: int) -> Array:
-    return np.array([float(limit), tolerance, float(soft), float(n), layout.NO_TAG])
 
 
 def _as_record(warm_start: WarmStart, n: int, M: int) -> Array:

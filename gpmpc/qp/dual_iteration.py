@@ -10,9 +10,10 @@ or never (d = 0: the constraints contradict each other, and (r, -1) is Farkas' p
 
 import numpy as np
 
-from gpmpc.compiled import compiled
-from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, largest, subtract_rows
+from gpmpc.compiled import borrowing
+from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, subtract_rows
 from gpmpc.qp.working_set import (
+    END,
     HIGH_WATCH,
     LEAST,
     LOW_WATCH,
@@ -31,28 +32,52 @@ from gpmpc.qp.working_set import (
     watch,
 )
 
-NO_CONSTRAINT = -1
 REACHED, CONTRADICTION = 0, 1
 DEPENDENT = 1e-12  # d below this share of K_pp: the constraint depends on the working ones
 DOUBTFUL = 1e-4  # d below this share of K_pp is computed again without cancellation (lazy mode)
 
 
-@compiled
-def most_violated(y, weights, bounds, excess):
-    """The constraint farthest outside its watch after weighting, or ``NO_CONSTRAINT``."""
+@borrowing
+def list_violated(y, weights, bounds, excess, listed):
+    """Lists the constraints outside their watch, and by how much after weighting; returns how many there are."""
     lo, hi = bounds[LOW_WATCH], bounds[HIGH_WATCH]
+    violated = 0
     for p in range(len(y)):
         excess[p] = max(y[p] - hi[p], lo[p] - y[p]) * weights[p]
-    worst = largest(excess, len(y))
-    if not worst > 0.0:
-        return NO_CONSTRAINT
-    p = 0
-    while p < len(y) - 1 and excess[p] != worst:
-        p += 1
-    return p
+        violated += excess[p] > 0.0
+    if violated > 0:
+        count = 0
+        for p in range(len(y)):
+            if excess[p] > 0.0:
+                listed[count] = p
+                count += 1
+    return violated
 
 
-@compiled
+@borrowing
+def keep_violated(now, weights, bounds, excess, listed, count):
+    """The same for the listed constraints, which stay listed if they are still outside their watch."""
+    kept = 0
+    for i in range(count):
+        p = listed[i]
+        excess[p] = max(now[p] - bounds[HIGH_WATCH, p], bounds[LOW_WATCH, p] - now[p]) * weights[p]
+        if excess[p] > 0.0:
+            listed[kept] = p
+            kept += 1
+    return kept
+
+
+@borrowing
+def most_violated(excess, listed, count):
+    """The one of the listed constraints with the largest excess."""
+    worst = listed[0]
+    for i in range(1, count):
+        if excess[listed[i]] > excess[worst]:
+            worst = listed[i]
+    return worst
+
+
+@borrowing
 def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch):
     """Changes multipliers until constraint p, whose value is given, is satisfied.
 
@@ -63,15 +88,15 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
     above = mu[p] > 0.0 or (mu[p] == 0.0 and value > bounds[UPPER, p])
     sense = 1.0 if above == (mu[p] == 0.0) else -1.0  # from a cap the multiplier comes back
     violation = (value - bounds[UPPER if above else LOWER, p]) * sense
-    place = find_row(lazy, p, k, n, rows, L, G, members)
-    row = rows[place]
+    place = find_row(lazy, p, k, n, rows, L, G, traits, members)
+    row, size = rows[place], int(traits[END, p])
     free = free_value(lazy, row, v, q, n)
-    diagonal = (dot(row, row, n) if lazy else row[p]) + traits[SOFTNESS, p]
+    diagonal = (dot(row, row, size) if lazy else row[p]) + traits[SOFTNESS, p]
     solved, r = scratch[1], scratch[2]
+    couple(lazy, row, k, size, rows, members, solved)
+    forward_solve(R, k, solved)
     while True:
         admit(k, p, above, place, traits, free, bounds, slots, members)
-        couple(lazy, row, k, n, rows, members, solved)
-        forward_solve(R, k, solved)
         for i in range(k):
             r[i] = solved[i]
         backward_solve(R, k, r)
@@ -96,7 +121,7 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
         if blocking < k:
             leaving = abs(members[NAME, blocking]) - 1
             mu[leaving] = slots[LEAST if sense * r[blocking] > 0.0 else MOST, blocking]
-            evict(k, blocking, slots, members, R, scratch[0])
+            evict(k, blocking, slots, members, R, solved, scratch[0])
             k -= 1
             members[PLACE, k + 1] = members[PLACE, k]  # the entering row keeps its place in slot k
             watch(leaving, mu, bounds)
@@ -112,7 +137,7 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
         return REACHED, k, changes
 
 
-@compiled
+@borrowing
 def distance_to_span(row, k, n, rows, members, r, rest):
     """|row - sum r_i row_i|^2: what is left of a row outside the span of the working ones (lazy mode)."""
     for j in range(n):
@@ -121,7 +146,7 @@ def distance_to_span(row, k, n, rows, members, r, rest):
     return dot(rest, rest, n)
 
 
-@compiled
+@borrowing
 def first_block(step, sense, k, mu, slots, members, r):
     """The longest step, up to ``step``, that keeps the multipliers in range, and the slot that ends it (or k)."""
     size = 0.0

@@ -14,22 +14,24 @@ import math
 
 import numpy as np
 
-from gpmpc.compiled import compiled
-from gpmpc.qp import record
-from gpmpc.qp.dual_iteration import CONTRADICTION, most_violated, step_to
-from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, refine, residuals
-from gpmpc.qp.factor import dot, multiply, multiply_at, pack, unpack
-from gpmpc.qp.hessian import factorise, solve_lower
+from gpmpc.compiled import borrowing
+from gpmpc.qp import record, workspace
+from gpmpc.qp.dual_iteration import CONTRADICTION, keep_violated, list_violated, most_violated, step_to
+from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, follow_listed, refine, residuals, row_values
+from gpmpc.qp.factor import dot, multiply_at, pack, unpack
+from gpmpc.qp.hessian import factorise, solve_transposed
 from gpmpc.qp.working_set import (
     CAP,
+    END,
     HIGH_WATCH,
+    LISTED,
     LOW_WATCH,
     LOWER,
     NAME,
     NORM,
     PLACE,
+    SCRATCH,
     SLACK,
-    SOFTNESS,
     UPPER,
     WEIGHT,
     admit,
@@ -40,14 +42,15 @@ from gpmpc.qp.working_set import (
     take,
     watch,
 )
+from gpmpc.qp.workspace import carve, most_working
 
 STATUS, ITERATIONS, VARIABLES, CONSTRAINTS = record.STATUS, record.ITERATIONS, record.VARIABLES, record.CONSTRAINTS
 WORKING, TAG, AGE, HEADER = record.WORKING, record.TAG, record.AGE, record.HEADER
 SOLVED, INFEASIBLE, ITERATION_LIMIT = record.SOLVED, record.INFEASIBLE, record.ITERATION_LIMIT
 NUMERICAL_TROUBLE, MISUSE, NO_TAG = record.NUMERICAL_TROUBLE, record.MISUSE, record.NO_TAG
 
-GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
-LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
+GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1])"
+LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 
 ABSENT = 1e20  # a bound of this size or more is none
 TOLERATED = 1e-10  # a violation below this share of the size of a constraint is none
@@ -57,10 +60,11 @@ SWEPT = 0.5  # those violated by more than this share of the worst
 ROUNDS = 10  # returns from the residuals to the iteration
 REFINEMENTS = 3
 FINE = 1e-11  # scaled residual at which refinement stops
+END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
 OLD = 1000  # changes after which a factor is computed anew
 
 
-@compiled
+@borrowing
 def read_bounds(lower, upper, norms, bounds):
     """Copies the bounds, with absent ones infinite; True if any are crossed or undefined."""
     bad = 0
@@ -76,7 +80,7 @@ def read_bounds(lower, upper, norms, bounds):
     return bad > 0
 
 
-@compiled
+@borrowing
 def keep_capped(n, warm, traits, bounds, mu):
     """Starts with the guess's multipliers that are at their caps: soft rows that stay violated."""
     for p in range(n, len(mu)):
@@ -86,16 +90,16 @@ def keep_capped(n, warm, traits, bounds, mu):
             watch(p, mu, bounds)
 
 
-@compiled
-def count_above(values, threshold, size):
-    """How many of the first ``size`` values are above the threshold."""
-    count = 0
-    for i in range(size):
-        count += values[i] > threshold
-    return count
+@borrowing
+def count_above(values, threshold, listed, count):
+    """How many of the listed values are above the threshold."""
+    above = 0
+    for i in range(count):
+        above += values[listed[i]] > threshold
+    return above
 
 
-@compiled
+@borrowing
 def all_present(names, bounds, mu):
     """Whether every one of the named bounds is there to be held (it may have become absent since)."""
     for name in names:
@@ -107,10 +111,10 @@ def all_present(names, bounds, mu):
     return True
 
 
-@compiled
-def write_ray(p, k, y, bounds, members, r, mu):
+@borrowing
+def write_ray(p, above, k, bounds, members, r, mu):
     """Farkas' proof that constraint p contradicts the working ones, ``C' ray = 0`` and ``ray' bounds < 0``, into mu."""
-    sense = 1.0 if y[p] > bounds[UPPER, p] else -1.0
+    sense = 1.0 if above else -1.0
     mu[:] = 0.0
     for i in range(k):
         at = abs(members[NAME, i]) - 1
@@ -120,17 +124,19 @@ def write_ray(p, k, y, bounds, members, r, mu):
     mu[p] = sense
 
 
-@compiled
-def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, out):
+@borrowing
+def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out):
     """Both modes after their set-up."""
-    M, m = len(lower), len(lower) - n
-    limit, tolerance, soft = int(settings[0]), settings[1], settings[2] != 0.0
-    capacity = M if soft else min(n, M)
-    wide = max(M, capacity + 2)
-    work = np.empty((20 + capacity + 1, wide))
-    bounds, slots, scratch, y = work[:5], work[5:9], work[9:13], work[13, :M]
-    seen, excess, gradient, active, v, slope, R = work[14], work[15], work[16], work[17], work[18], work[19], work[20:]
-    members = np.empty((3, wide), np.int64)
+    M = len(lower)
+    limit, tolerance, soft = (
+        int(settings[workspace.LIMIT]),
+        settings[workspace.TOLERANCE],
+        settings[workspace.SOFT] != 0.0,
+    )
+    capacity = most_working(n, M, soft)
+    bounds, slots, scratch, y = vectors[:5], vectors[5:9], vectors[9:13], vectors[13, :M]
+    seen, excess, gradient, active = vectors[14], vectors[15], vectors[16], vectors[17]
+    v, slope, pulled, now = vectors[18], vectors[19], vectors[20], vectors[21]
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     for p in range(M):
         mu[p] = 0.0
@@ -142,13 +148,14 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
     pull = q
     if guessed and soft:
         keep_capped(n, warm, traits, bounds, mu)
-        pull = np.empty(n)
-        add_pull(G, n, q, mu, 0, members, soft, pull)
+        pull = pulled
+        add_pull(G, n, q, mu, 0, members, traits, soft, pull)
     if lazy:
-        solve_lower(L, n, pull, v)
         for i in range(n):
-            v[i] = -v[i]
-    k, age, tag, candidates = 0, 0.0, settings[4], members[2]
+            v[i] = -pull[i]
+        solve_transposed(L, n, v)
+    k, age, tag, candidates = 0, 0.0, settings[workspace.TAG], members[SCRATCH]
+    listed = members[LISTED]
     if guessed:
         names = warm[HEADER + n + M : HEADER + n + M + int(warm[WORKING])]
         fits = len(names) <= capacity and len(names) * (len(names) + 1) // 2 <= len(warm) - (HEADER + n + 2 * M)
@@ -169,28 +176,30 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
                 lazy, candidates, count, 0, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch[1]
             )
         k = settle(k, bounds, mu, slots, members, R, scratch)
-    evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y)
+    evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y)
     if not lazy:
         for i in range(M):
             seen[i] = mu[i]
     current, iterations, rounds, status, worst = True, 0, 0, NUMERICAL_TROUBLE, np.inf
     interrupted = guessed and warm[STATUS] == ITERATION_LIMIT
     sweeps = SWEEPS if interrupted else 0  # the dual objective climbs with single steps only, and so the end is sure
+    count, fresh = list_violated(y, traits[WEIGHT], bounds, excess, listed), True
     while True:
-        p = most_violated(y, traits[WEIGHT], bounds, excess)
-        if p >= 0:
+        if count > 0:
             if iterations >= limit:
                 status = ITERATION_LIMIT
                 break
             current = False
-            share = SWEPT * excess[p]
-            several = sweeps < SWEEPS and count_above(excess, share, M) > 1
-            if several:
+            p = most_violated(excess, listed, count)
+            value, several = y[p] if fresh else now[p], False
+            if fresh and sweeps < SWEEPS and count_above(excess, SWEPT * excess[p], listed, count) > 1:
                 sweeps += 1
                 before = k
-                count = choose_violated(share, capacity - k, y, excess, bounds, mu, candidates)
+                chosen = choose_violated(
+                    SWEPT * excess[p], capacity - k, y, excess, listed, count, bounds, mu, candidates
+                )
                 k = take(
-                    lazy, candidates, count, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R,
+                    lazy, candidates, chosen, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R,
                     scratch[1],
                 )  # fmt: skip
                 several = k > before
@@ -198,40 +207,51 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
                 k = settle(k, bounds, mu, slots, members, R, scratch)
             if not several:
                 outcome, k, changes = step_to(
-                    lazy, p, y[p], k, capacity, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch
+                    lazy, p, value, k, capacity, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch
                 )
                 iterations += changes
                 if outcome == CONTRADICTION:
                     if excess[p] > NOISE * traits[WEIGHT, p] * bounds[SLACK, p] / TOLERATED:
                         status = INFEASIBLE
-                        write_ray(p, k, y, bounds, members, scratch[2], mu)
+                        write_ray(p, value > bounds[UPPER, p], k, bounds, members, scratch[2], mu)
                         break
                     ignore(p, bounds)
                 if soft:
                     sweeps = SWEEPS  # caps may have changed what ``pull`` says
-            if not lazy:
-                follow(rows, mu, seen, candidates, gradient, y)
-            elif soft:
-                evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y)
-            else:
-                follow_lazily(n, v, rows, L, G, mu, k, members, gradient, y)
+            fresh = several or soft or iterations >= limit
+            if not fresh:  # first satisfy those that were seen to be violated, then look at all
+                follow_listed(
+                    lazy, n, v, rows, L, G, mu, k, members, traits, seen, gradient, y, listed, count, now
+                )  # fmt: skip
+                count = keep_violated(now, traits[WEIGHT], bounds, excess, listed, count)
+                fresh = count == 0
+            if fresh:
+                if not lazy:
+                    follow(rows, mu, seen, candidates, gradient, y)
+                elif soft:
+                    evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y)
+                else:
+                    follow_lazily(n, v, rows, L, mu, k, members, gradient, y)
+                    row_values(G, n, traits, y)
+                count = list_violated(y, traits[WEIGHT], bounds, excess, listed)
             continue
         if not current:
             if not lazy:
-                multiply(G, m, y, n, y[n:])
-            add_pull(G, n, q, mu, k, members, soft, slope)
+                row_values(G, n, traits, y)
+            add_pull(G, n, q, mu, k, members, traits, soft, slope)
         best = np.inf
         for attempt in range(REFINEMENTS + 1):
             worst = residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active)
             if worst <= FINE or attempt == REFINEMENTS or not worst < 0.5 * best:
                 break
             best = worst
-            refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, scratch[0], scratch[2])
-            add_pull(G, n, q, mu, k, members, soft, slope)
+            refine(lazy, k, n, rows, L, G, slots, members, traits, R, mu, y, gradient, active, scratch[0], scratch[2])
+            add_pull(G, n, q, mu, k, members, traits, soft, slope)
         status = SOLVED if worst <= tolerance else NUMERICAL_TROUBLE
         rounds += 1
         unchanged = current and attempt == 0
-        if unchanged or rounds == ROUNDS or most_violated(y, traits[WEIGHT], bounds, excess) < 0:
+        count = 0 if unchanged or rounds == ROUNDS else list_violated(y, traits[WEIGHT], bounds, excess, listed)
+        if count == 0:
             break
     out[STATUS], out[ITERATIONS], out[WORKING] = status, iterations, k
     out[VARIABLES], out[CONSTRAINTS], out[TAG], out[AGE] = n, M, NO_TAG, age + iterations
@@ -246,41 +266,58 @@ def optimise(lazy, P, q, G, n, rows, L, traits, lower, upper, warm, settings, ou
     return status
 
 
-@compiled
-def solve_gram(q, lower, upper, warm, system, settings, out):
-    """Gram mode; ``system`` stacks K (M rows), traits (4 rows), P (n rows) and G (m rows), M wide."""
-    n, M = int(settings[3]), system.shape[1]
-    if len(q) != n or len(lower) != M or len(upper) != M:
+@borrowing
+def solve_gram(q, lower, upper, warm, system, work, out):
+    """Gram mode; ``system`` is of ``gpmpc.qp.gram_system``, ``work`` of ``gpmpc.qp.workspace``."""
+    settings, traits, vectors, members, R, _ = carve(work)
+    n, M = int(settings[workspace.VARIABLES]), int(settings[workspace.CONSTRAINTS])
+    if len(q) != n or len(lower) != M or len(upper) != M or not all_finite(q):
         return MISUSE
-    undefined = 0.0
-    for i in range(n):
-        undefined += q[i] * 0.0
-    if undefined != 0.0:
-        return MISUSE
-    P, G = system[M + 4 : M + 4 + n], system[M + 4 + n :]
-    return optimise(False, P, q, G, n, system[:M], P, system[M : M + 4], lower, upper, warm, settings, out)
+    K, P, G = system[:M], system[M : M + n], system[M + n :]
+    return optimise(False, P, q, G, n, K, P, traits, vectors, members, R, lower, upper, warm, settings, out)
 
 
-@compiled
-def solve_lazy(P, q, G, lower, upper, warm, soft, settings, out):
-    """Lazy mode; ``soft`` stacks softness and caps, M wide."""
+@borrowing
+def solve_lazy(P, q, G, lower, upper, warm, work, out):
+    """Lazy mode; ``work`` is of ``gpmpc.qp.workspace``."""
     n, m = P.shape[0], len(G)
     M = n + m
     shaped = P.shape[1] == n and len(q) == n and (m == 0 or G.shape[1] == n) and len(lower) == M and len(upper) == M
-    if not shaped or soft.shape[1] != M:
+    if not shaped or not all_finite(q):
         return MISUSE
-    L, traits = np.empty((n, n)), np.empty((4, M))
+    settings, traits, vectors, members, R, rest = carve(work)
+    dense = rest.reshape(rest.size)  # rows without gaps are nearer to each other
+    L, rows = dense[: n * n].reshape((n, n)), dense[n * n : n * (n + len(R) + 1)].reshape((len(R) + 1, n))
     if not factorise(P, L):
         return MISUSE
-    undefined = 0.0
-    for i in range(n):
-        undefined += q[i] * 0.0
-    for p in range(M):
-        norm = math.sqrt(dot(G[p - n], G[p - n], n)) if p >= n else 1.0
-        undefined += norm * 0.0
-        traits[NORM, p], traits[WEIGHT, p] = norm, 1.0 / norm if norm > 0.0 else 1.0
-        traits[SOFTNESS, p], traits[CAP, p] = soft[0, p], soft[1, p]
-    if undefined != 0.0:
+    if not measure(G, n, traits):
         return MISUSE
-    rows = np.empty((min(n, M) + 2 if settings[2] == 0.0 else M + 2, n))
-    return optimise(True, P, q, G, n, rows, L, traits, lower, upper, warm, settings, out)
+    return optimise(True, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
+
+
+@borrowing
+def measure(G, n, traits):
+    """Writes the norms, weights and ends of the constraints; False if G is not finite."""
+    for p in range(n):
+        traits[NORM, p], traits[WEIGHT, p], traits[END, p] = 1.0, 1.0, min(n, (p // END_STEP + 1) * END_STEP)
+    undefined, end = 0.0, 0
+    for p in range(len(G)):
+        row = G[p]
+        if dot(row[end:], row[end:], n - end) != 0.0:  # longer than the row before
+            end = n
+            while end > 0 and row[end - 1] == 0.0:
+                end -= 1
+            end = min(n, (end + END_STEP - 1) // END_STEP * END_STEP)
+        norm = math.sqrt(dot(row, row, end))
+        undefined += norm * 0.0
+        traits[NORM, n + p], traits[WEIGHT, n + p], traits[END, n + p] = norm, 1.0 / norm if norm > 0.0 else 1.0, end
+    return undefined == 0.0
+
+
+@borrowing
+def all_finite(vector):
+    """Whether no entry is infinite or NaN."""
+    undefined = 0.0
+    for value in vector:
+        undefined += value * 0.0
+    return undefined == 0.0

@@ -14,6 +14,7 @@ from gpmpc.qp.farkas import proves_infeasibility
 from gpmpc.qp.primal_active_set import PrimalActiveSet
 from gpmpc.qp.problem import ABSENT, QuadraticProgram
 from gpmpc.qp.solution import QPSolution, Terms
+from gpmpc.qp.workspace import TOLERANCE, lazy_workspace
 
 Array = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, se
                 return record
         else:
             residual = max(solution.primal_residual(), solution.dual_residual(), solution.duality_gap())
-            if residual <= settings[1]:
+            if residual <= settings[TOLERANCE]:
                 record[layout.STATUS] = layout.SOLVED
                 return record
             candidates.append((residual if np.isfinite(residual) else np.inf, len(candidates), record))
@@ -48,7 +49,7 @@ def _given(terms, q, lower, upper, record, settings) -> Array:
 
 def _from_nothing(terms, q, lower, upper, record, settings) -> Array:
     result = np.empty_like(record)
-    solve_lazy(terms.P, q, terms.G, lower, upper, layout.NO_RECORD, terms.softness, settings, result)
+    solve_lazy(terms.P, q, terms.G, lower, upper, layout.NO_RECORD, lazy_workspace(settings, terms.softness), result)
     return result
 
 
@@ -61,7 +62,8 @@ def _equilibrated(terms, q, lower, upper, record, settings) -> Array:
     G = np.ascontiguousarray(terms.G * D * scale[n:, None])
     softness = np.vstack([terms.softness[0] * scale**2, terms.softness[1] / scale])
     result = np.empty_like(record)
-    solve_lazy(P, q * D, G, lower * scale, upper * scale, layout.NO_RECORD, softness, settings, result)
+    work = lazy_workspace(settings, softness)
+    solve_lazy(P, q * D, G, lower * scale, upper * scale, layout.NO_RECORD, work, result)
     result[layout.HEADER : layout.HEADER + n] *= D
     result[layout.HEADER + n : layout.HEADER + n + len(lower)] *= scale
     return result
@@ -73,4 +75,4 @@ def _by_algorithm_1(terms, q, lower, upper, record, settings) -> Array:
     if softness.any() or np.isfinite(caps).any():
         return record
     problem = QuadraticProgram.from_stacked(terms.P, q, terms.G, lower, upper)
-    return PrimalActiveSet(tolerance=settings[1]).solve(problem).record
+    return PrimalActiveSet(tolerance=settings[TOLERANCE]).solve(problem).record

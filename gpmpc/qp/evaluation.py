@@ -1,78 +1,120 @@
 """The point that belongs to a set of multipliers, and how well the two solve the QP.
 
 x minimises the Lagrangian, P x = -(q + C'mu), and y = C x are the constraints' values. Gram mode multiplies with P^-1,
-the upper left corner of K, and may later move y by the rows of K whose multipliers changed; lazy mode, P = L L',
+the upper left corner of K, and may later move y by the rows of K whose multipliers changed; lazy mode, P = L'L,
 solves.
 """
 
-from gpmpc.compiled import compiled
-from gpmpc.qp.factor import backward_solve, dot, forward_solve, multiply, subtract_rows
+from gpmpc.compiled import borrowing
+from gpmpc.qp.factor import backward_solve, dot, forward_solve, four_dots, multiply, subtract_rows
 from gpmpc.qp.hessian import solve_lower, solve_transposed
-from gpmpc.qp.working_set import BOUND, LEAST, MOST, NAME, PLACE, SOFTNESS, couple
+from gpmpc.qp.working_set import BOUND, END, LEAST, MOST, NAME, PLACE, SCRATCH, SOFTNESS, couple
 
 
-@compiled
-def add_pull(G, n, q, mu, k, members, soft, slope):
+@borrowing
+def add_pull(G, n, q, mu, k, members, traits, soft, slope):
     """``slope = q + C' mu``; only where rows are soft can others than the working ones have a multiplier."""
     for i in range(n):
         slope[i] = q[i] + mu[i]
     if soft:
         for p in range(n, len(mu)):
             if mu[p] != 0.0:
-                add_row(mu[p], G[p - n], n, slope)
+                add_row(mu[p], G[p - n], int(traits[END, p]), slope)
     else:
         for i in range(k):
             p = abs(members[NAME, i]) - 1
             if p >= n:
-                add_row(mu[p], G[p - n], n, slope)
+                add_row(mu[p], G[p - n], int(traits[END, p]), slope)
 
 
-@compiled
+@borrowing
 def add_row(weight, row, n, target):
     """``target += weight row``."""
     for i in range(n):
         target[i] += weight * row[i]
 
 
-@compiled
-def evaluate(lazy, n, q, rows, L, G, mu, k, members, soft, slope, y):
+@borrowing
+def evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y):
     """``y = C x`` for the multipliers; leaves ``slope = q + C' mu``."""
-    add_pull(G, n, q, mu, k, members, soft, slope)
+    add_pull(G, n, q, mu, k, members, traits, soft, slope)
     if lazy:
-        solve_lower(L, n, slope, y)
+        for i in range(n):
+            y[i] = slope[i]
         solve_transposed(L, n, y)
+        solve_lower(L, n, y)
     else:
         multiply(rows, n, slope, n, y)
     for i in range(n):
         y[i] = -y[i]
-    multiply(G, len(G), y, n, y[n:])
+    row_values(G, n, traits, y)
 
 
-@compiled
-def follow_lazily(n, v, rows, L, G, mu, k, members, weights, y):
-    """Lazy mode without soft rows: ``y = C x`` from L'x = v - sum mu_i w_i."""
+@borrowing
+def row_values(G, n, traits, y):
+    """``y[n:] = G y[:n]``, four rows at a time, as far as they may not be zero."""
+    product, ends, m = y[n:], traits[END, n:], len(G)
+    p = 0
+    while p + 4 <= m:
+        size = int(max(max(ends[p], ends[p + 1]), max(ends[p + 2], ends[p + 3])))
+        four_dots(G[p], G[p + 1], G[p + 2], G[p + 3], y, size, product[p:])
+        p += 4
+    while p < m:
+        product[p] = dot(G[p], y, n)
+        p += 1
+
+
+@borrowing
+def follow_lazily(n, v, rows, L, mu, k, members, weights, y):
+    """Lazy mode without soft rows: x from ``L x = v - sum mu_i w_i``."""
     for i in range(n):
         y[i] = v[i]
     for i in range(k):
         weights[i] = mu[abs(members[NAME, i]) - 1]
     subtract_rows(y, rows, members[PLACE], weights, k, n)
-    solve_transposed(L, n, y)
-    multiply(G, len(G), y, n, y[n:])
+    solve_lower(L, n, y)
 
 
-@compiled
-def follow(rows, mu, seen, changed, amounts, y):
-    """Gram mode: moves y by the rows of K whose multipliers are not those, ``seen``, that y knows."""
+@borrowing
+def changes_since(mu, seen, changed, amounts):
+    """Lists the multipliers that are not those, ``seen``, that y knows; returns how many."""
     count = 0
     for p in range(len(mu)):
         if mu[p] != seen[p]:
             changed[count], amounts[count] = p, mu[p] - seen[p]
-            seen[p] = mu[p]
             count += 1
+    return count
+
+
+@borrowing
+def follow(rows, mu, seen, changed, amounts, y):
+    """Gram mode: moves y by the rows of K whose multipliers are not those, ``seen``, that y knows."""
+    count = changes_since(mu, seen, changed, amounts)
+    for i in range(count):
+        seen[changed[i]] = mu[changed[i]]
     subtract_rows(y, rows, changed, amounts, count, len(mu))
 
 
-@compiled
+@borrowing
+def follow_listed(lazy, n, v, rows, L, G, mu, k, members, traits, seen, weights, y, listed, count, now):
+    """The values ``now`` of a few constraints, without those of all others (in lazy mode y then begins with x)."""
+    if lazy:
+        follow_lazily(n, v, rows, L, mu, k, members, weights, y)
+        for i in range(count):
+            p = listed[i]
+            now[p] = y[p] if p < n else dot(G[p - n], y, int(traits[END, p]))
+    else:
+        changed = members[SCRATCH]
+        changes = changes_since(mu, seen, changed, weights)
+        for i in range(count):
+            p = listed[i]
+            row, value = rows[p], y[p]
+            for c in range(changes):
+                value -= weights[c] * row[changed[c]]
+            now[p] = value
+
+
+@borrowing
 def residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active):
     """The largest scaled residual of (x, mu), x = y[:n]: stationarity, violation of the working set, duality gap.
 
@@ -92,12 +134,14 @@ def residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active
     return max(max(stationarity / size, infeasibility), abs(gap) / max(1.0, abs(dot(q, y, n))))
 
 
-@compiled
-def refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, correction, trial):
+@borrowing
+def refine(lazy, k, n, rows, L, G, slots, members, traits, R, mu, y, gradient, active, correction, trial):
     """One Newton step on the working set for the residuals ``gradient`` and ``active``; multipliers stay in range."""
     size = n if lazy else len(y)
     if lazy:
-        solve_lower(L, n, gradient, correction)
+        for i in range(n):
+            correction[i] = gradient[i]
+        solve_transposed(L, n, correction)
     else:
         multiply(rows, size, gradient, n, correction)
     couple(lazy, correction, k, n, rows, members, trial)
@@ -109,10 +153,10 @@ def refine(lazy, k, n, rows, L, G, slots, members, R, mu, y, gradient, active, c
         correction[j] = -correction[j]
     subtract_rows(correction, rows, members[PLACE], trial, k, size)
     if lazy:
-        solve_transposed(L, n, correction)
+        solve_lower(L, n, correction)
     for i in range(n):
         y[i] += correction[i]
     for i in range(k):
         p = abs(members[NAME, i]) - 1
         mu[p] = min(max(mu[p] + trial[i], slots[LEAST, i]), slots[MOST, i])
-    multiply(G, len(G), y, n, y[n:])
+    row_values(G, n, traits, y)

@@ -8,10 +8,10 @@ section 6.5.2). The diagonal holds reciprocals, so that no solve divides.
 
 import math
 
-from gpmpc.compiled import REORDERED, compiled
+from gpmpc.compiled import borrowing
 
 
-@compiled
+@borrowing
 def dot(a, b, size):
     """Inner product of the first ``size`` entries."""
     total = 0.0
@@ -20,16 +20,7 @@ def dot(a, b, size):
     return total
 
 
-@compiled(fastmath=REORDERED | {"nnan"})
-def largest(a, size):
-    """The largest of the first ``size`` entries, which vectorises only if none of them is NaN."""
-    found = a[0]
-    for i in range(size):
-        found = max(found, a[i])
-    return found
-
-
-@compiled
+@borrowing
 def subtract_rows(state, rows, places, factors, count, size):
     """``state -= sum_i factors[i] rows[places[i]]``, four rows at a time."""
     i = 0
@@ -46,7 +37,7 @@ def subtract_rows(state, rows, places, factors, count, size):
         i += 1
 
 
-@compiled
+@borrowing
 def multiply(A, count, vector, size, product):
     """``product[i] = A[i] . vector`` for the first ``count`` rows, four at a time."""
     i = 0
@@ -58,7 +49,7 @@ def multiply(A, count, vector, size, product):
         i += 1
 
 
-@compiled
+@borrowing
 def multiply_at(A, places, count, vector, size, product):
     """``product[i] = A[places[i]] . vector``, four at a time."""
     i = 0
@@ -71,7 +62,7 @@ def multiply_at(A, places, count, vector, size, product):
         i += 1
 
 
-@compiled
+@borrowing
 def four_dots(r0, r1, r2, r3, vector, size, product):
     """Four inner products with one vector, which is read once and whose sums hide each other's latency."""
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
@@ -84,25 +75,51 @@ def four_dots(r0, r1, r2, r3, vector, size, product):
     product[0], product[1], product[2], product[3] = s0, s1, s2, s3
 
 
-@compiled
+@borrowing
 def forward_solve(R, k, a):
-    """``a <- L^-1 a`` in place."""
-    for j in range(k):
+    """``a <- L^-1 a`` in place, four columns at a time."""
+    j = 0
+    while j + 4 <= k:
+        r0, r1, r2, r3 = R[j, j:k], R[j + 1, j:k], R[j + 2, j:k], R[j + 3, j:k]
+        rest = a[j:k]
+        f0 = rest[0] * r0[0]
+        f1 = (rest[1] - f0 * r0[1]) * r1[1]
+        f2 = (rest[2] - f0 * r0[2] - f1 * r1[2]) * r2[2]
+        f3 = (rest[3] - f0 * r0[3] - f1 * r1[3] - f2 * r2[3]) * r3[3]
+        rest[0], rest[1], rest[2], rest[3] = f0, f1, f2, f3
+        rest, r0, r1, r2, r3 = rest[4:], r0[4:], r1[4:], r2[4:], r3[4:]
+        for i in range(len(rest)):
+            rest[i] -= f0 * r0[i] + f1 * r1[i] + f2 * r2[i] + f3 * r3[i]
+        j += 4
+    while j < k:
         value = a[j] * R[j, j]
         a[j] = value
-        column, rest = R[j, j + 1 : k], a[j + 1 : k]
-        for i in range(len(column)):
-            rest[i] -= value * column[i]
+        for i in range(j + 1, k):
+            a[i] -= value * R[j, i]
+        j += 1
 
 
-@compiled
+@borrowing
 def backward_solve(R, k, a):
-    """``a <- L^-T a`` in place."""
-    for j in range(k - 1, -1, -1):
+    """``a <- L^-T a`` in place, four columns at a time."""
+    j = k
+    while j % 4:
+        j -= 1
         a[j] = (a[j] - dot(R[j, j + 1 :], a[j + 1 :], k - j - 1)) * R[j, j]
+    while j > 0:
+        j -= 4
+        r0, r1, r2, r3 = R[j, j:k], R[j + 1, j:k], R[j + 2, j:k], R[j + 3, j:k]
+        rest = a[j:k]
+        s0, s1, s2, s3 = rest[0], rest[1], rest[2], rest[3]
+        four_dots(r0[4:], r1[4:], r2[4:], r3[4:], rest[4:], len(rest) - 4, rest)
+        f3 = (s3 - rest[3]) * r3[3]
+        f2 = (s2 - rest[2] - r2[3] * f3) * r2[2]
+        f1 = (s1 - rest[1] - r1[2] * f2 - r1[3] * f3) * r1[1]
+        f0 = (s0 - rest[0] - r0[1] * f1 - r0[2] * f2 - r0[3] * f3) * r0[0]
+        rest[0], rest[1], rest[2], rest[3] = f0, f1, f2, f3
 
 
-@compiled
+@borrowing
 def append_row(R, k, solved, pivot):
     """Row k of L: ``solved = L^-1 K_Wp`` and ``pivot = K_pp - |solved|^2 > 0``."""
     for j in range(k):
@@ -110,9 +127,13 @@ def append_row(R, k, solved, pivot):
     R[k, k] = 1.0 / math.sqrt(pivot)
 
 
-@compiled
-def remove_row(R, k, gone, carry):
-    """Deletes row ``gone`` of L, which has k rows; ``carry`` is scratch of length k."""
+@borrowing
+def remove_row(R, k, gone, carry, solved):
+    """Deletes row ``gone`` of L, which has k rows, and solves ``solved = L^-1 a`` for a without entry ``gone``.
+
+    ``carry`` is scratch of length k.
+    """
+    left = solved[gone]
     for j in range(gone):
         column = R[j, gone:k]
         for i in range(len(column) - 1):
@@ -126,6 +147,8 @@ def remove_row(R, k, gone, carry):
         reciprocal = 1.0 / math.sqrt(rest[0] * rest[0] + diagonal * diagonal)
         cosine, sine = rest[0] * reciprocal, diagonal * reciprocal
         R[c - 1, c - 1] = reciprocal
+        below = solved[c]
+        solved[c - 1], left = cosine * left + sine * below, cosine * below - sine * left
         old, new = R[c, c + 1 : k], R[c - 1, c : k - 1]
         for i in range(len(old)):
             following, below = rest[i + 1], old[i]
@@ -134,7 +157,7 @@ def remove_row(R, k, gone, carry):
         rest = rest[: len(old)]
 
 
-@compiled
+@borrowing
 def pack(R, k, packed):
     """Copies the triangle of k rows to a flat array of k (k + 1) / 2 entries."""
     at = 0
@@ -145,7 +168,7 @@ def pack(R, k, packed):
         at += len(column)
 
 
-@compiled
+@borrowing
 def unpack(packed, k, R):
     """The inverse of ``pack``."""
     at = 0

@@ -7,31 +7,32 @@ Everything lives in a few arrays that the kernels hand around, a column per cons
 * ``slots`` (4, capacity + 1): the bound b that holds, the constraint's value at the unconstrained minimiser, and the
   range of its multiplier: [0, cap] at an upper bound, [-cap, 0] at a lower one, [-cap, cap] for an equality. The cap is
   infinite unless the row is soft with a linear weight; a constraint that leaves at its cap stays violated.
-* ``members`` (3, capacity + 2) integers: the signed number +-(p + 1) of the constraint in each slot, where its row is,
-  and scratch for lists of candidates.
-* ``traits`` (4, M): norm, weight in the choice of the most violated, softness 1/rho and cap (``gpmpc.qp.soft_rows``).
+* ``members`` (4, capacity + 2) integers: the signed number +-(p + 1) of the constraint in each slot, where its row is,
+  scratch for lists of candidates, and the list of violated constraints.
+* ``traits`` (5, M): norm, weight in the choice of the most violated, softness 1/rho and cap (``gpmpc.qp.soft_rows``),
+  and the number of leading entries of c_p that may not be zero.
 * ``mu`` (M): multipliers; zero outside the working set except at a cap.
 * ``R``: the Cholesky factor of K_WW + softness (``gpmpc.qp.factor``).
 
 A *row* represents a constraint in the metric of P^-1, K_pq = row_p . row_q or simply entry q of row p: in Gram mode row
-p is K_p, known beforehand; in lazy mode, P = L L', it is w_p = L^-1 c_p, made when p enters.
+p is K_p, known beforehand; in lazy mode, P = L'L, it is w_p = L^-T c_p, made when p enters, and as short as c_p.
 """
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import borrowing
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, multiply_at, remove_row
 from gpmpc.qp.hessian import make_row, make_rows
 
 LOWER, UPPER, SLACK, LOW_WATCH, HIGH_WATCH = 0, 1, 2, 3, 4  # rows of ``bounds``
 BOUND, FREE_VALUE, LEAST, MOST = 0, 1, 2, 3  # rows of ``slots``
-NAME, PLACE = 0, 1  # rows of ``members``
-NORM, WEIGHT, SOFTNESS, CAP = 0, 1, 2, 3  # rows of ``traits``
+NAME, PLACE, SCRATCH, LISTED = 0, 1, 2, 3  # rows of ``members``
+NORM, WEIGHT, SOFTNESS, CAP, END = 0, 1, 2, 3, 4  # rows of ``traits``
 
 GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
 
 
-@compiled
+@borrowing
 def watch(p, mu, bounds):
     """Puts constraint p, outside the working set, under the watch of ``most_violated``.
 
@@ -45,33 +46,33 @@ def watch(p, mu, bounds):
         bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = -np.inf, bounds[LOWER, p] + slack
 
 
-@compiled
+@borrowing
 def ignore(p, bounds):
     """Takes constraint p out of the watch of ``most_violated``."""
     bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = -np.inf, np.inf
 
 
-@compiled
-def find_row(lazy, p, k, n, rows, L, G, members):
+@borrowing
+def find_row(lazy, p, k, n, rows, L, G, traits, members):
     """Where row p is; in lazy mode it is made in the place that slot k has free."""
     if not lazy:
         return p
     place = members[PLACE, k]
-    make_row(p, n, L, G, rows[place])
+    make_row(p, n, L, G, traits[END], rows[place])
     return place
 
 
-@compiled
-def couple(lazy, row, k, n, rows, members, product):
-    """The products of a row with the rows of the working set, K_Wp if it is row p."""
+@borrowing
+def couple(lazy, row, k, size, rows, members, product):
+    """The products of a row (``size`` entries in lazy mode) with those of the working set, K_Wp if it is row p."""
     if lazy:
-        multiply_at(rows, members[PLACE], k, row, n, product)
+        multiply_at(rows, members[PLACE], k, row, size, product)
     else:
         for i in range(k):
             product[i] = row[abs(members[NAME, i]) - 1]
 
 
-@compiled
+@borrowing
 def admit(k, p, above, place, traits, free, bounds, slots, members):
     """Writes constraint p into slot k, at its upper bound (``above``) or its lower one."""
     members[NAME, k], members[PLACE, k] = (p + 1 if above else -(p + 1)), place
@@ -82,10 +83,13 @@ def admit(k, p, above, place, traits, free, bounds, slots, members):
     slots[MOST, k] = cap if equality or above else 0.0
 
 
-@compiled
-def evict(k, slot, slots, members, R, scratch):
-    """Deletes a slot of the working set of k members and mends the factor; its place is free for the next row."""
-    remove_row(R, k, slot, scratch)
+@borrowing
+def evict(k, slot, slots, members, R, solved, scratch):
+    """Deletes a slot of the working set of k members; its place is free for the next row.
+
+    Mends the factor, and the solution ``solved`` of a forward solve.
+    """
+    remove_row(R, k, slot, scratch, solved)
     place = members[PLACE, slot]
     for i in range(slot, k - 1):
         members[NAME, i], members[PLACE, i] = members[NAME, i + 1], members[PLACE, i + 1]
@@ -94,13 +98,13 @@ def evict(k, slot, slots, members, R, scratch):
     members[PLACE, k - 1] = place
 
 
-@compiled
+@borrowing
 def free_value(lazy, row, v, q, n):
-    """c_p'x_u, the constraint's value at the unconstrained minimiser: from v = -L^-1 q, or from row p of K and q."""
+    """c_p'x_u, the constraint's value at the unconstrained minimiser: from v = -L^-T q, or from row p of K and q."""
     return dot(row, v, n) if lazy else -dot(row, q, n)
 
 
-@compiled
+@borrowing
 def choose_guess(names, room, bounds, mu, candidates):
     """Writes the guessed constraints that can be taken, at most ``room``, to ``candidates``; returns how many."""
     count = 0
@@ -115,11 +119,12 @@ def choose_guess(names, room, bounds, mu, candidates):
     return count
 
 
-@compiled
-def choose_violated(share, room, y, excess, bounds, mu, candidates):
-    """The same for the violated constraints whose weighted excess is above ``share``, except those at a cap."""
+@borrowing
+def choose_violated(share, room, y, excess, listed, violated, bounds, mu, candidates):
+    """The same for the listed constraints whose weighted excess is above ``share``, except those at a cap."""
     count = 0
-    for p in range(len(y)):
+    for i in range(violated):
+        p = listed[i]
         if excess[p] > share and count < room and mu[p] == 0.0:
             candidates[count] = p + 1 if y[p] > bounds[UPPER, p] else -(p + 1)
             count += 1
@@ -127,19 +132,20 @@ def choose_violated(share, room, y, excess, bounds, mu, candidates):
     return count
 
 
-@compiled
+@borrowing
 def take(lazy, candidates, count, k, n, q, v, rows, L, G, traits, bounds, mu, slots, members, R, solved):
     """Takes the candidates into the working set, but for those that depend on the others; returns its size."""
     first = k
     if lazy:
-        make_rows(candidates, count, n, L, G, rows, members[PLACE, first:])
+        make_rows(candidates, count, n, L, G, traits[END], rows, members[PLACE, first:])
     for i in range(count):
         p = abs(candidates[i]) - 1
         place = members[PLACE, first + i] if lazy else p
         row = rows[place]
-        couple(lazy, row, k, n, rows, members, solved)
+        size = int(traits[END, p])
+        couple(lazy, row, k, size, rows, members, solved)
         forward_solve(R, k, solved)
-        diagonal = (dot(row, row, n) if lazy else row[p]) + traits[SOFTNESS, p]
+        diagonal = (dot(row, row, size) if lazy else row[p]) + traits[SOFTNESS, p]
         pivot = diagonal - dot(solved, solved, k)
         if pivot > GUESSED_PIVOT * diagonal:
             members[PLACE, first + i] = members[PLACE, k]
@@ -151,17 +157,19 @@ def take(lazy, candidates, count, k, n, q, v, rows, L, G, traits, bounds, mu, sl
     return k
 
 
-@compiled
+@borrowing
 def settle(k, bounds, mu, slots, members, R, scratch):
     """The multipliers of the working set; drops the most wrong one until all are in range. Returns the size.
 
     Any working set is a valid start of a dual method once this is done.
     """
-    trial = scratch[2]
+    solved, trial = scratch[1], scratch[2]
+    for i in range(k):
+        solved[i] = slots[FREE_VALUE, i] - slots[BOUND, i]
+    forward_solve(R, k, solved)
     while True:
         for i in range(k):
-            trial[i] = slots[FREE_VALUE, i] - slots[BOUND, i]
-        forward_solve(R, k, trial)
+            trial[i] = solved[i]
         backward_solve(R, k, trial)
         worst, slot = 0.0, -1
         for i in range(k):
@@ -171,7 +179,7 @@ def settle(k, bounds, mu, slots, members, R, scratch):
         if slot < 0:
             break
         p = abs(members[NAME, slot]) - 1
-        evict(k, slot, slots, members, R, scratch[0])
+        evict(k, slot, slots, members, R, solved, scratch[0])
         k -= 1
         mu[p] = 0.0
         watch(p, mu, bounds)

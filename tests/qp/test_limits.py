@@ -113,7 +113,8 @@ def first_solve(folder, **environment):
 
 
 def copy_of_the_package(folder):
-    for source in [PACKAGE / "__init__.py", PACKAGE / "status.py", PACKAGE / "exceptions.py", *PACKAGE.glob("qp/*.py")]:
+    modules = ("__init__", "status", "exceptions", "compiled")
+    for source in [*(PACKAGE / f"{name}.py" for name in modules), *PACKAGE.glob("qp/*.py")]:
         target = folder / source.relative_to(PACKAGE.parent)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(source.read_text())

@@ -1,0 +1,61 @@
+"""The memory that a solve works in, besides the record that it writes.
+
+To ask the system for it costs as much as a small solve, so each prepared problem or shape keeps what it has used
+before: ``list.pop`` and ``list.append`` are atomic, so two threads never hold the same workspace. It is one matrix,
+whose rows have an entry per constraint; to slice it costs nothing. Its first rows stay the same from solve to solve,
+the others are otherwise undefined:
+
+    iteration limit, tolerance, whether rows are soft, n, M, tag
+    traits (5 rows, see ``gpmpc.qp.working_set``; lazy mode fills in norms, weights and ends itself)
+    vectors, members (integers), R, and in lazy mode L and rows
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpmpc.compiled import borrowing
+
+Array = NDArray[np.float64]
+
+LIMIT, TOLERANCE, SOFT, VARIABLES, CONSTRAINTS, TAG, SETTINGS = 0, 1, 2, 3, 4, 5, 6
+TRAITS, VECTORS, MEMBERS = 5, 22, 4  # rows of each
+
+
+def gram_workspace(settings: Array, traits: Array) -> Array:
+    """Memory for solves in Gram mode with these settings (6,) and traits (5, M)."""
+    return _workspace(settings, traits, 0)
+
+
+def lazy_workspace(settings: Array, softness: Array) -> Array:
+    """Memory for solves in lazy mode with these settings (6,) and softness (2, M)."""
+    n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
+    traits = np.vstack([np.zeros((2, M)), softness, np.zeros((1, M))])
+    return _workspace(settings, traits, n * (n + most_working(n, M, bool(settings[SOFT])) + 2))
+
+
+def _workspace(settings: Array, traits: Array, own: int) -> Array:
+    n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
+    capacity = most_working(n, M, bool(settings[SOFT]))
+    wide = max(M, capacity + 2, SETTINGS)
+    work = np.zeros((1 + TRAITS + VECTORS + MEMBERS + capacity + 1 + -(-own // wide), wide))
+    work[0, :SETTINGS] = settings
+    work[1 : 1 + TRAITS, :M] = traits
+    return work
+
+
+@borrowing
+def most_working(n, M, soft):
+    """How many constraints can work at once."""
+    return M if soft else min(n, M)
+
+
+@borrowing
+def carve(work):
+    """The kernels' arrays: settings, traits, vectors, members, R, and the rest of the memory."""
+    settings = work[0]
+    capacity = most_working(int(settings[VARIABLES]), int(settings[CONSTRAINTS]), settings[SOFT] != 0.0)
+    a = 1 + TRAITS
+    b = a + VECTORS
+    c = b + MEMBERS
+    d = c + capacity + 1
+    return settings, work[1:a], work[a:b], work[b:c].view(np.int64), work[c:d], work[d:]
