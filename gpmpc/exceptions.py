@@ -74,6 +74,10 @@ class SolverFailure(GpmpcError, RuntimeError):
         return f"the controller's solver failed at step {self.args[0]}: {self.args[1]}"
 
 
+class RecordingError(GpmpcError, RuntimeError):
+    """A recording cannot be written or read; the text names the file and the reason."""
+
+
 def check_number(
     key: str, value: Any, *, above: float | None = None, least: float | None = None, whole: bool = False, unit: str = ""
 ) -> None:
