@@ -1,8 +1,9 @@
 """Problem: keep every step of a run in a file that explains itself and survives a crash, without slowing the loop down.
 
-``record(step)`` copies the step's numbers into a pipe, some ten microseconds; another process (``writer``) does the
-rest. What the pipe cannot take at once is held back, up to ``LIMIT``; then ``record`` waits for the writer, so memory is
-bounded and nothing is lost. A writer that fails (a full disk) is reported by the next ``record``, or by ``close``.
+``record(step)`` copies the step's numbers into a pipe, in some ten or twenty microseconds; another process (``writer``)
+does the rest. What the pipe cannot take at once is held back, up to ``LIMIT``; then ``record`` waits for the writer, so
+memory is bounded and nothing is lost. A writer that fails (a full disk) is reported by the next ``record``, or by
+``close``.
 
 Before the first step the file holds where it comes from (commit, versions, host, command, the caller's metadata), the
 resolved configuration, units and frames, flushed to the disk. An unfinished file has no footer; see ``recovery``.
@@ -23,7 +24,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from gpmpc.exceptions import RecordingError, SettingError, ShapeError, check_number
+from gpmpc.exceptions import RecordingError, ShapeError, check_number
 from gpmpc.provenance import provenance
 from gpmpc.recording import schemas, wire
 from gpmpc.step import Step
@@ -105,7 +106,7 @@ class McapRecorder:
         os.set_blocking(self._pipe, False)
         with contextlib.suppress(AttributeError, OSError):  # not Linux, or this user's pipes hold enough already
             fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, PIPE)
-        self._send(wire.frame(wire.SETUP, json.dumps(setup).encode()), None)
+        self._send(wire.frame(wire.SETUP, json.dumps(setup).encode()))
         self._release(0)
         answer = self._answer()
         if answer != "ready":
@@ -120,7 +121,7 @@ class McapRecorder:
         """
         if self._error is not None:
             raise RecordingError(self._error)
-        self._send(*wire.pack(step, self._n, self._m))
+        self._send(wire.pack(step, self._n, self._m))
 
     def close(self, outcome: str = "complete") -> None:
         """Waits until everything is on the disk and the file finished.
@@ -134,7 +135,7 @@ class McapRecorder:
         if self._process.returncode is not None:  # closed before
             return
         if self._error is None:
-            self._send(wire.frame(wire.END, outcome.encode()), None)
+            self._send(wire.frame(wire.END, outcome.encode()))
             self._release(0)
         answer = self._answer()
         if answer != "done":
@@ -180,24 +181,20 @@ class McapRecorder:
         finally:
             os.close(descriptor)
 
-    def _send(self, buffers: list, length: int | None) -> None:
+    def _send(self, frame: bytes) -> None:
         """Writes what the pipe takes and holds back the rest."""
         if self._held:
             self._release(LIMIT)
-        written = 0
-        if not self._held:
-            written = self._write(buffers)
-            if written == length:
-                return
-        rest = memoryview(b"".join(buffers))[written:]
-        self._held.append(rest)
-        self._held_bytes += len(rest)
-        self._release(LIMIT)
+        written = 0 if self._held else self._write(frame)
+        if written < len(frame):
+            self._held.append(memoryview(frame)[written:])
+            self._held_bytes += len(frame) - written
+            self._release(LIMIT)
 
     def _release(self, limit: int) -> None:
         """Writes what is held back: as much as the pipe takes, and until no more than ``limit`` bytes are left."""
         while self._held:
-            written = self._write([self._held[0]])
+            written = self._write(self._held[0])
             self._held_bytes -= written
             self._held[0] = self._held[0][written:]
             if not self._held[0]:
@@ -207,9 +204,9 @@ class McapRecorder:
             else:
                 return
 
-    def _write(self, buffers: list) -> int:
+    def _write(self, data: bytes | memoryview) -> int:
         try:
-            return os.writev(self._pipe, buffers)
+            return os.write(self._pipe, data)
         except BlockingIOError:
             return 0
         except BrokenPipeError:

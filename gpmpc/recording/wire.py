@@ -1,8 +1,8 @@
 """Problem: a step has to leave the control loop in a few microseconds, however long it takes to write it to a file.
 
 The loop and the writer are two processes with a pipe between them. What crosses it is frames: a kind and a length,
-then, for a step, one packed head and the step's arrays as they lie in memory (float64). Packing costs the loop no
-serialisation and no copy of its own; the writer finds every array by the sizes in the head.
+then, for a step, one packed head and the step's arrays as they lie in memory (float64). Packing costs the loop one copy
+and no serialisation; the writer finds every array by the sizes in the head.
 """
 
 import struct
@@ -27,13 +27,13 @@ _NUMBERS = {status: number for number, status in enumerate(STATUSES)}
 _float64 = np.dtype(np.float64)
 
 
-def frame(kind: int, content: bytes) -> list:
+def frame(kind: int, content: bytes) -> bytes:
     """A frame of setup or end."""
-    return [FRAME.pack(kind, len(content)), content]
+    return FRAME.pack(kind, len(content)) + content
 
 
-def pack(step: Step, states: int, inputs: int) -> tuple[list, int]:
-    """The buffers of a step's frame and their length together [bytes]; the arrays are referred to, not copied.
+def pack(step: Step, states: int, inputs: int) -> bytes:
+    """The frame of a step.
 
     Args:
         step: What to pack.
@@ -95,8 +95,7 @@ def pack(step: Step, states: int, inputs: int) -> tuple[list, int]:
         timing.build,
         timing.solve,
     )
-    length += len(head)
-    return [FRAME.pack(STEP, length), head, *arrays], FRAME.size + length
+    return b"".join([FRAME.pack(STEP, _HEAD.size + length), head, *arrays])
 
 
 @dataclass(frozen=True, eq=False)

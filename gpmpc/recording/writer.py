@@ -8,6 +8,7 @@ Only a file that was closed gets a footer. If the loop's process dies, the write
 it still holds and leaves the file without footer; if the disk is full, likewise.
 """
 
+import contextlib
 import json
 import os
 import sys
@@ -208,6 +209,9 @@ def main(descriptor: int) -> None:
     def answer(line: str) -> None:
         os.write(1, f"{line}\n".encode())
 
+    with contextlib.suppress(AttributeError, OSError):  # Linux: be no rival to the loop, which wakes this process up
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    os.nice(5)
     try:
         with os.fdopen(0, "rb", buffering=1 << 20) as source:
             serve(source, os.fdopen(descriptor, "wb"), answer)
