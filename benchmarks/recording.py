@@ -9,10 +9,10 @@ the two taking turns:
 
 *Paced*: every step begins on the millisecond, works for half of it (arithmetic in the interpreter, so anything that
 holds the interpreter's lock or the core shows up), records, and waits for the next. Reported: the time of ``record``
-itself and the processor time in it, which other processes on the machine do not blur, and how the work's time changes.
+itself, the processor time in it, which other processes on the machine blur less, and how the work's time changes.
 
-*Flat out*: steps of a millisecond of work each, without waiting. Reported: how much longer the whole takes, by the clock
-and in the loop's processor time (the writer's process has a core of its own only if one is free).
+*Flat out*: steps of a millisecond of work each, without waiting. Reported: how much longer it takes, by the clock and
+in the loop's processor time (the writer's process has a core of its own only if one is free).
 
 Also: what a step costs the writer's process, which is what a thread in the loop's process would take from the loop.
 """

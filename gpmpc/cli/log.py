@@ -42,6 +42,7 @@ def log(arguments: list[str]) -> None:
 
 def _info(given: argparse.Namespace) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from gpmpc.recording import read_run
@@ -51,17 +52,17 @@ def _info(given: argparse.Namespace) -> None:
     console.print(f"{given.file}: {state}", soft_wrap=True, highlight=False, markup=False)
     channels = Table("topic", "schema", "messages")
     for topic, (count, schema) in run.channels.items():
-        channels.add_row(topic, schema, str(count))
+        channels.add_row(escape(topic), escape(schema), str(count))
     console.print(channels)
     facts = Table(show_header=False)
     for name, value in _facts(run).items():
-        facts.add_row(name, value)
+        facts.add_row(name, escape(value))
     console.print(facts)
     metadata = Table("metadata", "key", "value")
     for name, pairs in run.metadata.items():
         if name != "units":
             for key, value in pairs.items():
-                metadata.add_row(name, key, value)
+                metadata.add_row(*map(escape, (name, key, value)))
     console.print(metadata)
 
 

@@ -6,6 +6,7 @@ own stream reader hands out a record that is cut off as if it were shorter; what
 """
 
 import os
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +20,6 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from gpmpc.exceptions import RecordingError
 from gpmpc.recording.writer import CHUNK_SIZE
-
-END = "end"  # metadata that only a closed recording has
 
 
 class _Whole:
@@ -69,7 +68,12 @@ def _data_records(file: BinaryIO) -> Iterator[McapRecord]:
         if isinstance(record, DataEnd):
             summary = True  # from here on schemas and channels are repeated
         elif isinstance(record, Footer):
-            yield record
+            try:
+                next(records)  # the magic bytes at the end
+            except StopIteration:
+                yield record
+            except (McapError, struct.error):
+                pass
             return
         elif not summary:
             for item in inside:
