@@ -11,9 +11,8 @@ from gpmpc.status import Status
 n, m, H = 6, 3, 10
 rng = np.random.default_rng(0)
 names = ["x", "vx", "y", "vy", "z", "vz"]
-recorder = McapRecorder(
-    sys.argv[1], names, ["U1", "ux", "uy"], time_step=0.01, config="seed: 7\n", metadata={"seed": 7}
-)
+about = {"config": "seed: 7\n", "metadata": {"seed": 7}}
+recorder = McapRecorder(sys.argv[1], names, ["U1", "ux", "uy"], time_step=0.01, **about)
 print(recorder._process.pid, flush=True)
 k = 0
 while True:

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,8 @@ from mcap_protobuf.decoder import DecoderFactory
 from gpmpc.exceptions import RecordingError, SettingError, ShapeError
 from gpmpc.recording import read_run, replay, wire
 from gpmpc.status import Status
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -362,3 +365,18 @@ console.log(JSON.stringify(counts));
     assert counts["Attachment"] == 1
     assert counts["Metadata"] == 4
     assert counts["Footer"] == 1
+
+
+def test_the_foxglove_layout_names_only_what_is_recorded(recorded):
+    path, _ = recorded
+    layout = (ROOT / "docs" / "foxglove-layout.json").read_text()
+    paths = [item["value"] for panel in json.loads(layout)["configById"].values() for item in panel.get("paths", [])]
+    assert len(paths) > 20
+    for value in paths:
+        topic, *fields = value.replace("[-1]", "").split(".")
+        descriptor = decoded(path, topic)[0][1].DESCRIPTOR
+        for field in fields:
+            assert field in descriptor.fields_by_name, value
+            descriptor = descriptor.fields_by_name[field].message_type
+    topics = json.loads(layout)["configById"]["3D!scene"]["topics"]
+    assert set(topics) <= set(read_run(path).channels)

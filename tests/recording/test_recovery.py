@@ -52,10 +52,7 @@ def check_recovered(path, output):
         reader = make_reader(file, validate_crcs=True)
         assert len(list(reader.iter_messages())) == expected
         assert reader.get_summary().statistics.message_count == expected
-        assert (
-            sum(len(index.message_index_offsets) > 0 for index in reader.get_summary().chunk_indexes) > 0
-            or not expected
-        )
+        assert all(index.message_index_offsets for index in reader.get_summary().chunk_indexes)
         [config] = reader.iter_attachments()
         assert config.name == "config.yaml"
         assert config.data == b"seed: 7\n"
@@ -124,7 +121,7 @@ def test_a_file_cut_anywhere_gives_back_its_whole_chunks(finished, tmp_path):
         first = chunks[0].chunk_start_offset
         end = chunks[-1].chunk_start_offset + chunks[-1].chunk_length
     rng = np.random.default_rng(0)
-    cuts = [first, first + 1, first + 9, end - 1, end, len(data) - 1, *rng.integers(first, len(data), 20)]
+    cuts = [first, first + 1, first + 9, end - 1, end, len(data) - 1, *rng.integers(first, len(data), 10)]
     for cut in cuts:
         path = tmp_path / "cut.mcap"
         path.write_bytes(data[:cut])
