@@ -33,6 +33,7 @@ import numpy as np
 from gpmpc.control.controller import Decision, Timing
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.recording import McapRecorder, Step, wire
+from gpmpc.recording.ring import FRAME
 from gpmpc.recording.writer import StepWriter
 from gpmpc.status import Status
 
@@ -132,7 +133,7 @@ def writer_cost(steps: list[Step], settings: dict) -> float:
         "z_down": True,
         "start_time_ns": 0,
     } | settings
-    frames = [wire.pack(step, len(STATES), len(INPUTS))[wire.FRAME.size :] for step in steps]
+    frames = [wire.pack(step, len(STATES), len(INPUTS))[FRAME.size :] for step in steps]
     with tempfile.TemporaryFile() as file:
         writer = StepWriter(file, setup)
         writer.write(frames[0])

@@ -1,8 +1,8 @@
 """Problem: keep every step of a run in a file that explains itself and survives a crash, without slowing the loop down.
 
-``record(step)`` copies the step's numbers into a pipe, in some ten or twenty microseconds; another process (``writer``)
-does the rest. What the pipe cannot take at once is held back, up to ``LIMIT``; then ``record`` waits for the writer, so
-memory is bounded and nothing is lost. A writer that fails (a full disk) is reported by the next ``record``, or by
+``record(step)`` copies the step's numbers into memory that it shares with another process (``writer``), which does the
+rest: some ten or twenty microseconds. If that memory is full, ``record`` waits for the writer, so memory is bounded and
+nothing is lost. A writer that fails (a full disk) is reported by one of the next calls of ``record``, at the latest by
 ``close``.
 
 Before the first step the file holds where it comes from (commit, versions, host, command, the caller's metadata), the
@@ -14,10 +14,9 @@ import fcntl
 import json
 import os
 import platform
-import select
 import subprocess
 import sys
-from collections import deque
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -27,11 +26,11 @@ import numpy as np
 from gpmpc.exceptions import RecordingError, ShapeError, check_number
 from gpmpc.provenance import provenance
 from gpmpc.recording import schemas, wire
+from gpmpc.recording.ring import BATCH, CAPACITY, PAUSE, POSITION, Ring, open_memory
 from gpmpc.step import Step
 
-LIMIT = 64 * 1024 * 1024  # held back at most [bytes]
-PIPE = 1024 * 1024  # what Linux lets a pipe hold without privileges [bytes]
-_WRITER = "import sys; sys.path[:] = {path!r}; from gpmpc.recording.writer import main; main({descriptor})"
+_WRITER = "import sys; sys.path[:] = {path!r}; from gpmpc.recording.writer import main; main({file}, {memory})"
+_WAIT = 0.0005  # between two looks whether there is room [s]
 
 
 class McapRecorder:
@@ -99,15 +98,10 @@ class McapRecorder:
             "record_problems": record_problems,
         }
         self._error: str | None = None
-        self._held: deque[memoryview] = deque()
-        self._held_bytes = 0
-        self._process = self._start(self._open())
-        self._pipe = self._process.stdin.fileno()
-        os.set_blocking(self._pipe, False)
-        with contextlib.suppress(AttributeError, OSError):  # not Linux, or this user's pipes hold enough already
-            fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, PIPE)
-        self._send(wire.frame(wire.SETUP, json.dumps(setup).encode()))
-        self._release(0)
+        self._closed = self._failed = False
+        self._announced, self._rung = 0, 0.0  # position and time [s] of the doorbell
+        self._start()
+        self._send(wire.frame(wire.SETUP, json.dumps(setup).encode()), ring=True)
         answer = self._answer()
         if answer != "ready":
             self._fail(answer)
@@ -117,7 +111,7 @@ class McapRecorder:
 
         Raises:
             ShapeError: An array does not fit the names of states and inputs.
-            RecordingError: The writer has failed, at an earlier step; or the recorder is closed.
+            RecordingError: The writer has failed at an earlier step, the recorder is closed, or a step is too large.
         """
         if self._error is not None:
             raise RecordingError(self._error)
@@ -132,11 +126,11 @@ class McapRecorder:
         Raises:
             RecordingError: It could not be written; the file is left unfinished.
         """
-        if self._process.returncode is not None:  # closed before
+        if self._failed:
+            raise RecordingError(self._error)
+        if self._closed:
             return
-        if self._error is None:
-            self._send(wire.frame(wire.END, outcome.encode()))
-            self._release(0)
+        self._send(wire.frame(wire.END, outcome.encode()), ring=True)
         answer = self._answer()
         if answer != "done":
             self._fail(answer)
@@ -167,48 +161,53 @@ class McapRecorder:
             raise RecordingError(f"{self.path}: another process is recording to this file") from error
         return descriptor
 
-    def _start(self, descriptor: int) -> subprocess.Popen:
-        code = _WRITER.format(path=[entry or os.getcwd() for entry in sys.path], descriptor=descriptor)
+    def _start(self) -> None:
+        file = self._open()
+        memory = None
         try:
-            return subprocess.Popen(
+            memory = open_memory()
+            self._ring = Ring(memory)
+            self._ring.touch()
+            code = _WRITER.format(path=[entry or os.getcwd() for entry in sys.path], file=file, memory=memory)
+            self._process = subprocess.Popen(
                 [sys.executable, "-c", code],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 bufsize=0,
-                pass_fds=[descriptor],
+                pass_fds=[file, memory],
                 start_new_session=True,  # an interrupt from the keyboard ends the loop, which then closes the file
             )
+        except OSError as error:
+            raise RecordingError(f"{self.path}: its writer cannot be started: {error.strerror}") from error
         finally:
-            os.close(descriptor)
+            for descriptor in (file, memory):
+                if descriptor is not None:
+                    os.close(descriptor)
+        self._doorbell = self._process.stdin.fileno()
+        os.set_blocking(self._doorbell, False)
 
-    def _send(self, frame: bytes) -> None:
-        """Writes what the pipe takes and holds back the rest."""
-        if self._held:
-            self._release(LIMIT)
-        written = 0 if self._held else self._write(frame)
-        if written < len(frame):
-            self._held.append(memoryview(frame)[written:])
-            self._held_bytes += len(frame) - written
-            self._release(LIMIT)
+    def _send(self, frame: bytes, ring: bool = False) -> None:
+        """Puts a frame into the shared memory, and rings if enough has come together or enough time has passed."""
+        if 2 * len(frame) > CAPACITY:
+            raise RecordingError(f"{self.path}: a step of {len(frame)} bytes is too large; at most {CAPACITY // 2}")
+        while not self._ring.give(frame):
+            self._announce()
+            if self._process.poll() is not None:
+                self._fail(self._answer())
+            time.sleep(_WAIT)
+        now = time.perf_counter()
+        if ring or self._ring.given - self._announced > BATCH or now - self._rung > PAUSE:
+            self._rung = now
+            self._announce()
 
-    def _release(self, limit: int) -> None:
-        """Writes what is held back: as much as the pipe takes, and until no more than ``limit`` bytes are left."""
-        while self._held:
-            written = self._write(self._held[0])
-            self._held_bytes -= written
-            self._held[0] = self._held[0][written:]
-            if not self._held[0]:
-                self._held.popleft()
-            elif self._held_bytes > limit:
-                select.select([], [self._pipe], [])
-            else:
-                return
-
-    def _write(self, data: bytes | memoryview) -> int:
+    def _announce(self) -> None:
+        self._announced = self._ring.given
         try:
-            return os.write(self._pipe, data)
-        except BlockingIOError:
-            return 0
+            os.write(self._doorbell, POSITION.pack(self._announced))
+        except BlockingIOError:  # thousands of unheard rings: this one has to be heard as well
+            os.set_blocking(self._doorbell, True)
+            os.write(self._doorbell, POSITION.pack(self._announced))
+            os.set_blocking(self._doorbell, False)
         except BrokenPipeError:
             self._fail(self._answer())
 
@@ -218,13 +217,14 @@ class McapRecorder:
 
     def _fail(self, answer: str) -> NoReturn:
         self._end()
+        self._failed = True
         reason = answer or "the process that writes it died"
         self._error = f"{self.path}: the recording stopped and is unfinished: {reason}"
         raise RecordingError(self._error)
 
     def _end(self) -> None:
-        self._held.clear()
-        self._held_bytes = 0
+        self._closed = True
+        del self._ring
         self._process.stdin.close()
         self._process.wait()
         self._process.stdout.close()

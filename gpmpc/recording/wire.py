@@ -1,8 +1,8 @@
 """Problem: a step has to leave the control loop in a few microseconds, however long it takes to write it to a file.
 
-The loop and the writer are two processes with a pipe between them. What crosses it is frames: a kind and a length,
-then, for a step, one packed head and the step's arrays as they lie in memory (float64). Packing costs the loop one copy
-and no serialisation; the writer finds every array by the sizes in the head.
+The loop and the writer are two processes with shared memory between them (``ring``). What crosses it is frames: a kind
+and a length, then, for a step, one packed head and the step's arrays as they lie in memory (float64). Packing costs the
+loop one copy and no serialisation; the writer finds every array by the sizes in the head.
 """
 
 import struct
@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpmpc.exceptions import ShapeError
+from gpmpc.recording.ring import FRAME
 from gpmpc.status import Status
 from gpmpc.step import Step
 
 Array = np.ndarray
 
-FRAME = struct.Struct("<qq")  # kind, length of what follows [bytes]
 SETUP, STEP, END = 0, 1, 2
 STATUSES = tuple(Status)
 
@@ -145,7 +145,7 @@ class PackedStep:
     qp: PackedQP | None
 
 
-def unpack(content: bytes, states: int, inputs: int) -> PackedStep:
+def unpack(content: bytes | memoryview, states: int, inputs: int) -> PackedStep:
     """The step of a frame; its arrays are views of ``content``."""
     time, k, size, version, status, iterations, failed, H, variables, rows, record, *timing = _HEAD.unpack_from(content)
     numbers, start = np.frombuffer(content, np.float64, offset=_HEAD.size), 0

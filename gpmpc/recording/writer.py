@@ -1,8 +1,9 @@
 """Problem: serialising and compressing a step takes longer than a fast control loop can wait.
 
-The writer is a process of its own (a thread would hold the interpreter lock while the loop needs it). It reads frames
-(``wire``) from its standard input and writes an MCAP file, whose descriptor it inherits; its standard output carries
-"ready" once metadata and configuration are on the disk, and at the end "done" or one line that says what went wrong.
+The writer is a process of its own (a thread would hold the interpreter lock while the loop needs it). It takes frames
+(``wire``) from the shared memory (``ring``) and writes an MCAP file, whose descriptor it inherits. Its standard input
+is the doorbell; its standard output carries "ready" once metadata and configuration are on the disk, and at the end
+"done" or one line that says what went wrong.
 
 Only a file that was closed gets a footer. If the loop's process dies, the writer sees the end of its input, writes what
 it still holds and leaves the file without footer; if the disk is full, likewise.
@@ -11,7 +12,6 @@ it still holds and leaves the file without footer; if the disk is full, likewise
 import contextlib
 import json
 import os
-import sys
 from collections.abc import Callable
 from typing import BinaryIO
 
@@ -22,6 +22,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
 from gpmpc.recording import schemas, wire
+from gpmpc.recording.ring import POSITION, Ring
 from gpmpc.recording.scene import CLASSES, LOG, Log, Scene, failure_log
 
 CHUNK_SIZE = 64 * 1024  # [bytes], before compression
@@ -66,7 +67,7 @@ class StepWriter:
         self._step, self._plan, self._qp = twins[schemas.STEP], twins[schemas.PLAN], twins[schemas.QP]
         self._bounds = dict(zip(("input_lower", "input_upper"), setup["input_bounds"] or (), strict=False))
 
-    def write(self, content: bytes) -> None:
+    def write(self, content: bytes | memoryview) -> None:
         """Writes the step of a frame."""
         step = wire.unpack(content, len(self._states), len(self._inputs))
         nanoseconds = self._setup["start_time_ns"] + round(step.time * 1e9)
@@ -177,48 +178,60 @@ def _quality(qp: wire.PackedQP | None) -> tuple[int, dict[str, float]]:
     return int(np.count_nonzero(solution.active_set)), dict(zip(("primal", "dual", "gap"), values, strict=True))
 
 
-def serve(source: BinaryIO, file: BinaryIO, answer: Callable[[str], None]) -> None:
-    """Reads frames until the last one, or the end of the input."""
+def serve(ring: Ring, file: BinaryIO, hear: Callable[[], int | None], answer: Callable[[str], None]) -> None:
+    """Writes what comes until the last frame, or until the loop's process has died.
+
+    Args:
+        ring: Where frames come from.
+        file: Where they go.
+        hear: Waits for the position up to which frames are whole; None once nobody rings any more.
+        answer: Sends a line to the loop's process.
+    """
     writer: StepWriter | None = None
-    while True:
-        head = source.read(wire.FRAME.size)
-        kind, length = wire.FRAME.unpack(head) if len(head) == wire.FRAME.size else (None, 0)
-        content = source.read(length) if length else b""
-        if kind is None or len(content) < length:  # the loop's process has died
-            if writer is not None:
-                writer.interrupt()
-            return
-        if kind == wire.SETUP:
-            writer = StepWriter(file, json.loads(content))
-            answer("ready")
-        elif kind == wire.STEP:
-            writer.write(content)
-        else:
-            writer.finish(content.decode())
-            answer("done")
-            return
+    alive = True
+    while alive:
+        announced = hear()
+        alive = announced is not None
+        while (taken := ring.take(announced if alive else ring.given)) is not None:
+            kind, content = taken
+            if kind == wire.SETUP:
+                writer = StepWriter(file, json.loads(bytes(content)))
+                answer("ready")
+            elif kind == wire.STEP:
+                writer.write(content)
+            else:
+                writer.finish(bytes(content).decode())
+                answer("done")
+                return
+            ring.done(len(content))
+    if writer is not None:
+        writer.interrupt()
 
 
-def main(descriptor: int) -> None:
+def main(file: int, memory: int) -> None:
     """The writer's process.
 
     Args:
-        descriptor: Of the file to write, open and empty.
+        file: Descriptor of the file to write, open and empty.
+        memory: Descriptor of the ring.
     """
 
     def answer(line: str) -> None:
         os.write(1, f"{line}\n".encode())
 
+    def hear() -> int | None:
+        positions = os.read(0, 1 << 16)
+        return POSITION.unpack(positions[-POSITION.size :])[0] if positions else None
+
     with contextlib.suppress(AttributeError, OSError):  # Linux: be no rival to the loop, which wakes this process up
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     os.nice(5)
     try:
-        with os.fdopen(0, "rb", buffering=1 << 20) as source:
-            serve(source, os.fdopen(descriptor, "wb"), answer)
+        serve(Ring(memory), os.fdopen(file, "wb"), hear, answer)
     except Exception as error:
         reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
         try:
             answer(" ".join(str(reason or error).split()))
         finally:
             os._exit(1)  # nothing that is still buffered may reach the file
-    sys.stdout.flush()
+    os._exit(0)  # everything is on the disk; the memory of the ring is still in use, and goes with the process

@@ -8,6 +8,8 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from gpmpc.exceptions import RecordingError, SettingError, ShapeError
+from gpmpc.qp import QuadraticProgram, SoftRows
 from gpmpc.recording import read_run, replay, wire
 from gpmpc.status import Status
 
@@ -81,8 +84,6 @@ def test_a_replayed_step_gives_the_same_answer(recorded):
 
 
 def test_soft_rows_are_replayed_soft(tmp_path):
-    from gpmpc.qp import SoftRows
-
     rng, path = np.random.default_rng(1), tmp_path / "soft.mcap"
     weights = np.where(np.arange(8) % 2, 5.0, np.inf)
     step = runs.make_step(0, rng, soft=SoftRows(quadratic=weights))
@@ -167,8 +168,6 @@ def test_the_tube_is_the_two_sigma_ellipsoid_of_the_predicted_position(recorded)
 
 
 def test_pictures_are_drawn_no_more_than_thirty_times_a_second(tmp_path):
-    from dataclasses import replace
-
     path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
     step = runs.make_step(0, rng)
     with runs.recorder(path, time_step=0.001) as recorder:
@@ -223,8 +222,6 @@ def test_a_recorded_step_is_a_copy(tmp_path):
     ],
 )
 def test_a_step_of_the_wrong_shape_is_refused(tmp_path, change, message):
-    from dataclasses import replace
-
     with runs.recorder(tmp_path / "run.mcap") as recorder:
         step = runs.make_step(0, np.random.default_rng(0))
         with pytest.raises(ShapeError, match=message):
@@ -275,29 +272,86 @@ def test_two_recorders_do_not_share_a_file(tmp_path):
         runs.recorder(tmp_path / "run.mcap")
 
 
-def _limit(size):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-
-
-@pytest.mark.parametrize("room", [100, 20_000, 100_000])
+@pytest.mark.parametrize("room", [20_000, 100_000])
 def test_a_full_disk_is_reported_and_leaves_no_file_that_looks_finished(tmp_path, room):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    steps = [runs.make_step(k, rng, qp=k > 0) for k in range(20)]
+
+    def record_too_much():
+        with runs.recorder(path) as recorder:
+            resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (room, room))
+            for step in 10 * steps:
+                recorder.record(step)
+
+    with pytest.raises(RecordingError) as caught:
+        record_too_much()
+    assert str(caught.value) == f"{path}: the recording stopped and is unfinished: File too large"
+    assert path.stat().st_size <= room
+    run = read_run(path)
+    assert not run.finished
+    assert run.config
+    assert (len(run.times) > 0) == (room > 50_000)
+
+
+def test_a_disk_that_fills_up_with_the_index_leaves_a_file_without_footer(tmp_path):
+    whole = tmp_path / "whole.mcap"
+    runs.record_run(whole, steps=20)
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    recorder = runs.recorder(path)
+    room = whole.stat().st_size - 300  # the last chunk fits, the index does not
+    resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (room, room))
+    for k in range(20):
+        recorder.record(runs.make_step(k, rng))
+    with pytest.raises(RecordingError, match="unfinished: File too large"):
+        recorder.close()
+    with pytest.raises(RecordingError, match="unfinished: File too large"):
+        recorder.close()
+    run = read_run(path)
+    assert not run.finished
+    assert len(run.times) == 20
+
+
+def test_a_disk_that_is_full_from_the_start_is_reported_at_the_start(tmp_path):
     code = (
-        "import sys; sys.path.insert(0, sys.argv[1]); import runs\n"
-        "from gpmpc.exceptions import RecordingError\n"
-        "try:\n    runs.record_run(sys.argv[2], steps=200)\n"
-        "except RecordingError as error:\n    print(error)\n"
+        "import os, resource, sys; sys.path.insert(0, sys.argv[1]); import runs\n"
+        "from gpmpc.recording import ring\n"
+        "memory = ring.open_memory(); ring.open_memory = lambda: memory\n"
+        "from gpmpc.recording import recorder; recorder.open_memory = lambda: memory\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
+        "try:\n    runs.recorder(sys.argv[2])\n"
+        "except Exception as error:\n    print(error)\n"
     )
     path = tmp_path / "run.mcap"
     arguments = [sys.executable, "-c", code, os.path.dirname(runs.__file__), str(path)]
-    limited = {"preexec_fn": lambda: _limit(room)}
-    result = subprocess.run(arguments, capture_output=True, text=True, check=True, **limited)
+    result = subprocess.run(arguments, capture_output=True, text=True, check=True)
     assert result.stdout == f"{path}: the recording stopped and is unfinished: File too large\n", result.stderr
-    assert path.stat().st_size <= room
-    if room > 1000:
-        run = read_run(path)
-        assert not run.finished
-        assert run.config
-        assert (len(run.times) > 0) == (room > 50_000)
+    with pytest.raises(RecordingError):
+        read_run(path)
+
+
+def test_a_writer_that_is_slower_than_the_loop_makes_it_wait_and_loses_nothing(tmp_path):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    step = runs.make_step(0, rng, horizon=2, variables=150)  # 0.4 MB; the shared memory holds forty
+    with runs.recorder(path) as recorder:
+        os.kill(recorder._process.pid, signal.SIGSTOP)
+        threading.Timer(0.5, os.kill, (recorder._process.pid, signal.SIGCONT)).start()
+        for k in range(120):
+            recorder.record(replace(step, k=k, time=0.1 * k))
+    run = read_run(path)
+    assert run.steps.tolist() == list(range(120))
+    assert all(np.array_equal(problem.P, step.decision.problem.P) for problem in run.problems.values())
+
+
+def test_a_step_that_the_shared_memory_cannot_take_is_refused(tmp_path):
+    step = runs.make_step(0, np.random.default_rng(0))
+    program, rows = step.decision.problem, 200_000
+    large = QuadraticProgram(program.P, program.q, np.ones((rows, 6)), np.zeros(rows), np.ones(rows))
+    decision = replace(step.decision, problem=large, solution=None)
+    with runs.recorder(tmp_path / "run.mcap") as recorder:
+        with pytest.raises(RecordingError, match="is too large; at most 8388608"):
+            recorder.record(replace(step, decision=decision))
+        recorder.record(step)
+    assert len(read_run(tmp_path / "run.mcap").times) == 1
 
 
 def test_after_an_error_every_further_step_says_so(tmp_path):
