@@ -89,6 +89,10 @@ class Diverged(GpmpcError, ArithmeticError):
         return f"step {self.args[0]}: {self.args[1]}"
 
 
+class RecordingError(GpmpcError, RuntimeError):
+    """A recording cannot be written or read; the text names the file and the reason."""
+
+
 def check_number(
     key: str, value: Any, *, above: float | None = None, least: float | None = None, whole: bool = False, unit: str = ""
 ) -> None:

@@ -33,6 +33,13 @@ def test_the_gp_modules_load_neither_optimisation_nor_settings_nor_figures(modul
     assert loaded == "[]"
 
 
+def test_the_writer_of_recordings_starts_without_torch_and_without_compilers():
+    forbidden = ["torch", "numba", "scipy", "hydra", "matplotlib"]
+    code = f"import sys, gpmpc.recording.writer; print([m for m in {forbidden} if m in sys.modules])"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+    assert loaded == "[]"
+
+
 @pytest.mark.parametrize(
     ("library", "rooms"),
     [
@@ -42,6 +49,11 @@ def test_the_gp_modules_load_neither_optimisation_nor_settings_nor_figures(modul
         ("matplotlib", ["plotting.py"]),
         ("casadi", ["control", "gp/casadi_.py"]),
         ("rich", ["cli", "experiments", "simulation/trials.py"]),
+        ("mcap", ["recording"]),
+        ("mcap_protobuf", ["recording"]),
+        ("google.protobuf", ["recording"]),
+        ("foxglove_schemas_protobuf", ["recording"]),
+        ("pandas", ["recording", "cli"]),
     ],
 )
 def test_a_heavy_library_has_one_door(library, rooms):

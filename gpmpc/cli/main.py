@@ -19,15 +19,18 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 import gpmpc
+from gpmpc.cli.log import log
 from gpmpc.cli.tables import tables
 from gpmpc.exceptions import GpmpcError
 
 USAGE = f"""gpmpc {gpmpc.__version__}: Gaussian process model predictive control
 
 usage: gpmpc COMMAND [SETTING=VALUE ...]
+       gpmpc log info|recover|export FILE [OUTPUT]
 
 commands:
   tables    Tables 1 and 2 of Cao, Lai and Alam (2017), computed beside the printed figures
+  log       What is in a recording (info), rescue an unfinished one (recover), a table of its steps (export)
 
 gpmpc COMMAND --help lists a command's settings, --cfg job prints them resolved.
 """
@@ -43,8 +46,12 @@ def main() -> None:
         print(gpmpc.__version__)
         return
     command = arguments[0]
+    if command in PLAIN:
+        _run_plain(PLAIN[command], arguments[1:])
+        return
     if command not in COMMANDS:
-        _fail(f"unknown command {command!r}{_nearest(command, COMMANDS)}; gpmpc --help lists the commands")
+        known = [*COMMANDS, *PLAIN]
+        _fail(f"unknown command {command!r}{_nearest(command, known)}; gpmpc --help lists the commands")
     task, config_name = COMMANDS[command]
     sys.argv = [f"gpmpc {command}", *arguments[1:]]
     _run(task, config_name)
@@ -78,12 +85,29 @@ def _run(task: Callable[[DictConfig], None], config_name: str) -> None:
     entry = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)
     try:
         guarded(entry(partial(guarded, task)))
-    except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
+    except BrokenPipeError:
+        _end_of_pipe()
     except KeyboardInterrupt:
         print("\ninterrupted; the same command goes on where it stopped", file=sys.stderr)
         sys.exit(130)
+
+
+def _run_plain(task: Callable[[list[str]], None], arguments: list[str]) -> None:
+    """Runs a command that works on files and has no settings to compose."""
+    try:
+        task(arguments)
+    except GpmpcError as error:
+        if os.environ.get("HYDRA_FULL_ERROR"):
+            raise
+        _fail(" ".join(str(error).split()))
+    except BrokenPipeError:
+        _end_of_pipe()
+
+
+def _end_of_pipe() -> None:
+    """The reader of a pipe, such as head, has seen enough."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(1)
 
 
 def _fail(message: str) -> None:
@@ -140,3 +164,4 @@ def _nearest(name: str, known: Iterable[str]) -> str:
 
 
 COMMANDS: dict[str, tuple[Callable[[DictConfig], None], str]] = {"tables": (tables, "tables")}
+PLAIN: dict[str, Callable[[list[str]], None]] = {"log": log}

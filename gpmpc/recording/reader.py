@@ -1,0 +1,274 @@
+"""Problem: a recorded run has to come back as arrays, and any of its decisions has to be repeatable.
+
+``read_run`` reads finished files and unfinished ones alike (all that is whole, see ``recovery``). ``replay`` solves a
+step's quadratic program again: its minimiser is unique, so any exact solver finds the recorded plan.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mcap.records import Attachment, Channel, Footer, Message, Metadata, Schema
+
+from gpmpc.exceptions import RecordingError
+from gpmpc.recording import schemas
+from gpmpc.recording.recovery import whole_records
+from gpmpc.recording.writer import CONFIG, PLAN, QP, STEP
+from gpmpc.status import Status
+
+if TYPE_CHECKING:
+    import pandas
+
+    from gpmpc.qp import QPSolution, QPSolver
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """K recorded steps; n states, m inputs, horizon H (the longest; NaN beyond a shorter one).
+
+    Attributes:
+        path: The file.
+        finished: It was closed; otherwise these are the steps that were saved.
+        state_names: n names.
+        input_names: m names.
+        steps: Numbers k of the steps (K,).
+        times: [s] (K,).
+        references: (K, n).
+        states: True states (K, n).
+        measured: Measured states (K, n).
+        inputs: Applied inputs (K, m).
+        innovations: (K, n).
+        belief_covariances: (K, n, n).
+        plan_inputs: (K, H, m).
+        plan_means: (K, H + 1, n).
+        plan_stds: (K, H + 1, n).
+        plan_covariances: (K, H + 1, n, n).
+        statuses: K of them.
+        iterations: (K,).
+        active_set_sizes: (K,).
+        residuals: Primal and dual residual and duality gap of the quadratic program (K, 3); NaN without one.
+        timings: Model, build, solve, total [s] (K, 4).
+        gp_sizes: (K,).
+        gp_versions: (K,).
+        failed: Whether the decision was not applied (K,).
+        channels: Number of messages and schema by topic.
+        metadata: Metadata records by name.
+        config: Text of the resolved configuration.
+        problems: Messages ``gpmpc.QuadraticProgram`` by k; see ``replay``.
+    """
+
+    path: Path
+    finished: bool
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    steps: Array
+    times: Array
+    references: Array
+    states: Array
+    measured: Array
+    inputs: Array
+    innovations: Array
+    belief_covariances: Array
+    plan_inputs: Array
+    plan_means: Array
+    plan_stds: Array
+    plan_covariances: Array
+    statuses: tuple[Status, ...]
+    iterations: Array
+    active_set_sizes: Array
+    residuals: Array
+    timings: Array
+    gp_sizes: Array
+    gp_versions: Array
+    failed: Array
+    channels: dict[str, tuple[int, str]]
+    metadata: dict[str, dict[str, str]]
+    config: str
+    problems: dict[int, "RecordedProblem"]
+
+    @cached_property
+    def columns(self) -> dict[str, Array]:
+        """The run as a table: a column (K,) per scalar field of ``gpmpc.Step``, in its order."""
+        table: dict[str, Array] = {"time": self.times, "k": self.steps}
+        std = np.sqrt(np.diagonal(self.belief_covariances, axis1=1, axis2=2))
+        groups = {"reference": self.references, "state": self.states, "measured": self.measured, "input": self.inputs}
+        groups |= {"innovation": self.innovations, "belief_std": std}
+        for group, values in groups.items():
+            names = self.input_names if group == "input" else self.state_names
+            table |= {f"{group}.{name}": values[:, i] for i, name in enumerate(names)}
+        table |= {"status": np.array([status.name for status in self.statuses], dtype=object)}
+        table |= {"iterations": self.iterations, "active_set_size": self.active_set_sizes}
+        table |= {f"timing.{name}": self.timings[:, i] for i, name in enumerate(schemas.TIMING)}
+        table |= {f"residuals.{name}": self.residuals[:, i] for i, name in enumerate(schemas.RESIDUALS)}
+        return table | {"gp_size": self.gp_sizes, "gp_version": self.gp_versions, "failed": self.failed}
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """``columns`` as a data frame, units in its ``attrs``.
+
+        Raises:
+            RecordingError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise RecordingError("data frames need pandas: pip install 'gpmpc[report]'") from error
+        frame = pandas.DataFrame(self.columns)
+        frame.attrs["units"] = self.metadata.get("units", {})
+        return frame
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedProblem:
+    """A quadratic program as it was solved; letters as in ``gpmpc.qp``.
+
+    Attributes:
+        P: (n, n).
+        q: (n,).
+        G: (m, n).
+        lower: Bounds of the stacked constraints ``[x; Gx]`` (M,).
+        upper: (M,).
+        softness: 1/rho and the cap of the multiplier of every stacked constraint (2, M).
+        x: The solution found then (n,); empty where there was none.
+        multipliers: Its multipliers (M,); empty where there was none.
+    """
+
+    P: Array
+    q: Array
+    G: Array
+    lower: Array
+    upper: Array
+    softness: Array
+    x: Array
+    multipliers: Array
+
+
+def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
+    """Solves the quadratic program of step k again.
+
+    Args:
+        run: A run recorded with its problems.
+        k: Number of the step.
+        solver: ``DualActiveSet()`` if omitted, which also takes soft rows.
+
+    Raises:
+        RecordingError: The step or its problem is not in the recording.
+    """
+    from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
+
+    recorded = run.problems.get(k)
+    if recorded is None:
+        raise RecordingError(f"{run.path}: holds no quadratic program of step {k}; it holds {len(run.problems)} others")
+    problem = QuadraticProgram.from_stacked(recorded.P, recorded.q, recorded.G, recorded.lower, recorded.upper)
+    solver = solver if solver is not None else DualActiveSet()
+    inverse, caps = recorded.softness[:, len(recorded.q) :]
+    if not inverse.any() and np.isinf(caps).all():
+        return solver.solve(problem)
+    with np.errstate(divide="ignore"):
+        return solver.solve(problem, soft=SoftRows(quadratic=1 / inverse, linear=caps))
+
+
+def read_run(path: str | Path) -> Run:
+    """Reads a recording.
+
+    Args:
+        path: A file that ``McapRecorder`` wrote, finished or not.
+
+    Raises:
+        RecordingError: There is no such file, or it is no recording of a run.
+    """
+    path = Path(path)
+    metadata: dict[str, dict[str, str]] = {}
+    names: dict[int, str] = {}
+    channels: dict[int, Channel] = {}
+    counts: dict[int, int] = {}
+    data: dict[str, list[bytes]] = {STEP: [], PLAN: [], QP: []}
+    config, finished = "", False
+    for record in whole_records(path):
+        if isinstance(record, Message):
+            counts[record.channel_id] += 1
+            topic = channels[record.channel_id].topic
+            if topic in data:
+                data[topic].append(record.data)
+        elif isinstance(record, Schema):
+            names[record.id] = record.name
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+            counts.setdefault(record.id, 0)
+        elif isinstance(record, Metadata):
+            metadata[record.name] = record.metadata
+        elif isinstance(record, Attachment) and record.name == CONFIG:
+            config = record.data.decode()
+        finished = finished or isinstance(record, Footer)
+    about = metadata.get("run", {})
+    if "state_names" not in about:
+        raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
+    states, inputs = tuple(about["state_names"].split()), tuple(about["input_names"].split())
+    classes = schemas.message_classes(states, inputs, packed=False)
+    steps = [classes[schemas.STEP].FromString(content) for content in data[STEP]]
+    plans = [classes[schemas.PLAN].FromString(content) for content in data[PLAN][: len(steps)]]
+    problems = [classes[schemas.QP].FromString(content) for content in data[QP]]
+    return Run(
+        path=path,
+        finished=finished,
+        state_names=states,
+        input_names=inputs,
+        **_steps(steps, states, inputs),
+        **_plans(plans, len(steps), states, inputs),
+        channels={channel.topic: (counts[i], names.get(channel.schema_id, "")) for i, channel in channels.items()},
+        metadata=metadata,
+        config=config,
+        problems={message.k: _problem(message) for message in problems},
+    )
+
+
+def _table(messages: list, fields: tuple[str, ...]) -> Array:
+    rows = [[getattr(message, field) for field in fields] for message in messages]
+    return np.array(rows, dtype=float).reshape(len(messages), len(fields))
+
+
+def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Any]:
+    n, statuses = len(states), tuple(Status)
+    groups = {"references": "reference", "states": "state", "measured": "measured", "innovations": "innovation"}
+    arrays = {name: _table([getattr(step, group) for step in steps], states) for name, group in groups.items()}
+    integers = {"steps": "k", "iterations": "iterations", "active_set_sizes": "active_set_size"}
+    integers |= {"gp_sizes": "gp_size", "gp_versions": "gp_version"}
+    arrays |= {name: np.array([getattr(step, field) for step in steps], int) for name, field in integers.items()}
+    covariances = b"".join(step.belief_covariance for step in steps)
+    return arrays | {
+        "times": np.array([step.time for step in steps], dtype=float),
+        "inputs": _table([step.input for step in steps], inputs),
+        "belief_covariances": np.frombuffer(covariances).reshape(len(steps), n, n),
+        "statuses": tuple(statuses[step.status] for step in steps),
+        "residuals": _table([step.residuals for step in steps], schemas.RESIDUALS),
+        "timings": _table([step.timing for step in steps], schemas.TIMING),
+        "failed": np.array([step.failed for step in steps], dtype=bool),
+    }
+
+
+def _plans(plans: list, steps: int, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Array]:
+    H, n = max((len(plan.stages) - 1 for plan in plans), default=0), len(states)
+    arrays = {
+        "plan_inputs": np.full((steps, H, len(inputs)), np.nan),
+        "plan_means": np.full((steps, H + 1, n), np.nan),
+        "plan_stds": np.full((steps, H + 1, n), np.nan),
+        "plan_covariances": np.full((steps, H + 1, n, n), np.nan),
+    }
+    for k, plan in enumerate(plans):
+        stages = list(plan.stages)
+        length = len(stages)
+        arrays["plan_means"][k, :length] = _table([stage.mean for stage in stages], states)
+        arrays["plan_stds"][k, :length] = _table([stage.std for stage in stages], states)
+        arrays["plan_inputs"][k, : length - 1] = _table([stage.input for stage in stages[:-1]], inputs)
+        arrays["plan_covariances"][k, :length] = np.frombuffer(plan.covariances).reshape(length, n, n)
+    return arrays
+
+
+def _problem(message: Any) -> RecordedProblem:
+    n, rows = message.variables, message.rows
+    shapes = {"P": (n, n), "q": (n,), "G": (rows, n), "lower": (n + rows,), "upper": (n + rows,)}
+    shapes |= {"softness": (2, n + rows), "x": (-1,), "multipliers": (-1,)}
+    return RecordedProblem(**{name: np.frombuffer(getattr(message, name)).reshape(s) for name, s in shapes.items()})

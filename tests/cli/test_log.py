@@ -1,0 +1,101 @@
+"""``gpmpc log`` as a user meets it."""
+
+import csv
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "recording"))
+import runs
+
+from gpmpc.recording import read_run
+
+
+def gpmpc_log(*arguments, cwd):
+    command = [sys.executable, "-c", "from gpmpc.cli import main; main()", "log", *arguments]
+    environment = os.environ | {"COLUMNS": "160"}
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, env=environment, timeout=100, check=False)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A finished run, the same cut off, and a file that is none."""
+    folder = tmp_path_factory.mktemp("runs")
+    runs.record_run(folder / "run.mcap", steps=10)
+    data = (folder / "run.mcap").read_bytes()
+    (folder / "cut.mcap").write_bytes(data[:-100])
+    (folder / "notes.mcap").write_text("these are notes")
+    return folder
+
+
+def test_info_shows_channels_counts_metadata_and_statuses(folder):
+    result = gpmpc_log("info", "run.mcap", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    for text in (
+        "run.mcap: finished",
+        "/step",
+        "gpmpc.Step",
+        "vx [m/s]",
+        "SOLVED 10",
+        "10 kept for replay",
+        "0 to 0.9 s",
+    ):
+        assert text in result.stdout
+    assert "unfinished" in gpmpc_log("info", "cut.mcap", cwd=folder).stdout
+
+
+def test_recover_writes_a_finished_file_beside_the_broken_one(folder):
+    result = gpmpc_log("recover", "cut.mcap", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith("written to cut.recovered.mcap: ")
+    assert read_run(folder / "cut.recovered.mcap").finished
+
+
+def test_export_writes_a_row_per_step_with_exact_numbers(folder):
+    result = gpmpc_log("export", "run.mcap", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    run = read_run(folder / "run.mcap")
+    with (folder / "run.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["state.vx"]) for row in rows] == run.states[:, 1].tolist()
+    assert rows[0]["status"] == "SOLVED"
+    assert rows[0]["innovation.x"] == "nan"
+    assert list(rows[0]) == list(run.columns)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pyarrow") is None, reason="the extra 'report' is not installed")
+def test_export_writes_parquet(folder):
+    import pandas
+
+    assert gpmpc_log("export", "run.mcap", "run.parquet", cwd=folder).returncode == 0
+    frame = pandas.read_parquet(folder / "run.parquet")
+    np.testing.assert_array_equal(frame["state.vx"], read_run(folder / "run.mcap").states[:, 1])
+
+
+MISTAKES = [
+    (["info", "missing.mcap"], "missing.mcap: cannot be read: No such file or directory"),
+    (["info", "notes.mcap"], "notes.mcap: is not an MCAP file"),
+    (["recover", "notes.mcap"], "notes.mcap: is not an MCAP file"),
+    (["recover", "run.mcap", "run.mcap"], "run.mcap: a file cannot be recovered into itself"),
+    (["export", "run.mcap", "run.xlsx"], "output: must end in .csv or .parquet; got 'run.xlsx'"),
+    (["export", "run.mcap", "nowhere/run.csv"], "output: cannot write to nowhere/run.csv: No such file"),
+    (["show", "run.mcap"], "invalid choice: 'show'"),
+    (["info"], "the following arguments are required: file"),
+    ([], "the following arguments are required: info|recover|export"),
+]
+if importlib.util.find_spec("pandas") is None:
+    MISTAKES.append((["export", "run.mcap", "run.parquet"], "pandas: pip install 'gpmpc[report]'"))
+
+
+@pytest.mark.parametrize(("arguments", "message"), MISTAKES, ids=lambda v: " ".join(v) if isinstance(v, list) else "")
+def test_a_mistake_is_one_clear_line(folder, arguments, message):
+    result = gpmpc_log(*arguments, cwd=folder)
+    assert result.returncode == 2
+    assert result.stderr.startswith("gpmpc: ")
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1

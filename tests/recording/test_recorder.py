@@ -1,0 +1,436 @@
+"""A recording holds what happened, can be read by others, and says clearly when it could not be written."""
+
+import json
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import runs
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from gpmpc.exceptions import RecordingError, SettingError, ShapeError
+from gpmpc.qp import QuadraticProgram, SoftRows
+from gpmpc.recording import read_run, replay, wire
+from gpmpc.status import Status
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    return path, runs.record_run(path, steps=30)
+
+
+def decoded(path, topic):
+    with path.open("rb") as file:
+        messages = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(topics=[topic])
+        return [(message, proto) for _, _, message, proto in messages]
+
+
+def test_every_number_comes_back_as_it_was(recorded):
+    path, steps = recorded
+    run = read_run(path)
+    assert run.finished
+    for name, group in {
+        "states": "state",
+        "references": "reference",
+        "measured": "measured",
+        "inputs": "input",
+    }.items():
+        np.testing.assert_array_equal(getattr(run, name), [getattr(step, group) for step in steps])
+    np.testing.assert_array_equal(run.innovations, [step.innovation for step in steps])
+    np.testing.assert_array_equal(run.belief_covariances, [step.belief_covariance for step in steps])
+    np.testing.assert_array_equal(run.plan_means, [step.decision.means for step in steps])
+    np.testing.assert_array_equal(run.plan_covariances, [step.decision.covariances for step in steps])
+    np.testing.assert_array_equal(run.plan_inputs, [step.decision.inputs for step in steps])
+    np.testing.assert_allclose(run.plan_stds**2, np.diagonal(run.plan_covariances, axis1=2, axis2=3), rtol=1e-14)
+    assert run.times.tolist() == [step.time for step in steps]
+    assert run.steps.tolist() == list(range(30))
+    assert run.iterations.tolist() == [step.decision.iterations for step in steps]
+    assert run.gp_sizes.tolist() == [step.gp_size for step in steps]
+    assert run.gp_versions.tolist() == [step.gp_version for step in steps]
+    np.testing.assert_allclose(run.timings[:, -1], 0.006)
+
+
+def test_the_quality_of_every_solution_is_recorded(recorded):
+    path, steps = recorded
+    run = read_run(path)
+    for k, step in enumerate(steps):
+        solution = step.decision.solution
+        residuals = solution.primal_residual(), solution.dual_residual(), solution.duality_gap()
+        np.testing.assert_allclose(run.residuals[k], residuals, atol=1e-15)
+        assert run.active_set_sizes[k] == np.count_nonzero(solution.active_set)
+
+
+def test_a_replayed_step_gives_the_same_answer(recorded):
+    path, steps = recorded
+    run = read_run(path)
+    for k, step in enumerate(steps):
+        again = replay(run, k)
+        assert again.status.solved
+        np.testing.assert_allclose(again.x, step.decision.solution.x, rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(run.problems[k].x, step.decision.solution.x)
+
+
+def test_soft_rows_are_replayed_soft(tmp_path):
+    rng, path = np.random.default_rng(1), tmp_path / "soft.mcap"
+    weights = np.where(np.arange(8) % 2, 5.0, np.inf)
+    step = runs.make_step(0, rng, soft=SoftRows(quadratic=weights))
+    with runs.recorder(path) as recorder:
+        recorder.record(step)
+    np.testing.assert_allclose(replay(read_run(path), 0).x, step.decision.solution.x, rtol=0, atol=1e-9)
+
+
+def test_a_run_without_problems_has_none_to_replay(tmp_path):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    with runs.recorder(path, record_problems=False) as recorder:
+        recorder.record(runs.make_step(0, rng))
+        recorder.record(runs.make_step(1, rng, qp=False))
+    run = read_run(path)
+    assert np.isfinite(run.residuals[0]).all()  # the solution was judged all the same
+    assert np.isnan(run.residuals[1]).all()
+    with pytest.raises(RecordingError, match="holds no quadratic program of step 0"):
+        replay(run, 0)
+
+
+def test_the_file_says_where_it_comes_from_before_the_first_message(recorded):
+    path, _ = recorded
+    run = read_run(path)
+    about = run.metadata["run"]
+    for key in ("seed", "command", "host", "python", "versions.numpy", "created", "machine.system"):
+        assert about[key]
+    assert run.metadata["units"]["state.vx"] == "m/s"
+    assert run.metadata["units"]["stages.input.U1"] == "N"
+    assert run.metadata["frames"]["positions"] == "world"
+    assert run.metadata["end"] == {"steps": "30", "outcome": "complete"}
+    assert json.loads(run.config) == {"seed": 7}
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        first_chunk = min(index.chunk_start_offset for index in reader.get_summary().chunk_indexes)
+        early = [index for index in reader.get_summary().metadata_indexes if index.offset < first_chunk]
+        assert [index.name for index in early] == ["run", "units", "frames"]
+        assert all(index.offset < first_chunk for index in reader.get_summary().attachment_indexes)
+
+
+def test_chunks_are_small_compressed_and_indexed(recorded):
+    path, _ = recorded
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        chunks = reader.get_summary().chunk_indexes
+        assert len(chunks) > 1
+        assert {chunk.compression for chunk in chunks} == {"zstd"}
+        assert max(chunk.uncompressed_size for chunk in chunks) < 2 * 64 * 1024
+        assert reader.get_summary().statistics.message_count == len(list(reader.iter_messages()))
+
+
+def test_any_reader_finds_a_field_by_the_plants_names(recorded):
+    path, steps = recorded
+    for (message, proto), step in zip(decoded(path, "/step"), steps, strict=True):
+        assert message.log_time == round(step.time * 1e9)
+        assert message.sequence == step.k
+        assert proto.DESCRIPTOR.full_name == "gpmpc.Step"
+        assert proto.state.vx == step.state[1]
+        assert step.input[0] == proto.input.U1
+        assert proto.input_upper.U1 == 10.0
+        assert list(proto.belief_covariance) == step.belief_covariance.ravel().tolist()
+    for (_, proto), step in zip(decoded(path, "/plan"), steps, strict=True):
+        assert proto.stages[2].mean.z == step.decision.means[2, 4]
+        assert proto.stages[2].time == pytest.approx(step.time + 0.2)
+    for (_, proto), step in zip(decoded(path, "/qp"), steps, strict=True):
+        assert list(proto.P) == step.decision.problem.P.ravel().tolist()
+
+
+def test_the_tube_is_the_two_sigma_ellipsoid_of_the_predicted_position(recorded):
+    path, steps = recorded
+    updates = decoded(path, "/plan/tube")
+    assert len(updates) == len(steps)
+    for (_, update), step in zip(updates, steps, strict=True):
+        for i, sphere in enumerate(update.entities[0].spheres):
+            q = sphere.pose.orientation
+            v = np.array([q.x, q.y, q.z])
+            cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+            R = np.eye(3) + 2 * q.w * cross + 2 * cross @ cross
+            radii = np.array([sphere.size.x, sphere.size.y, sphere.size.z]) / 2
+            covariance = step.decision.covariances[i][np.ix_([0, 2, 4], [0, 2, 4])]
+            np.testing.assert_allclose(R @ np.diag((radii / 2) ** 2) @ R.T, covariance, atol=1e-12)
+            assert sphere.pose.position.z == step.decision.means[i, 4]
+
+
+def test_pictures_are_drawn_no_more_than_thirty_times_a_second(tmp_path):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    step = runs.make_step(0, rng)
+    with runs.recorder(path, time_step=0.001) as recorder:
+        for k in range(1000):
+            recorder.record(replace(step, k=k, time=k * 0.001))
+    assert read_run(path).channels["/step"][0] == 1000
+    assert 29 <= read_run(path).channels["/pose"][0] <= 31
+
+
+def test_failures_are_logged_with_advice(tmp_path):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    with runs.recorder(path) as recorder:
+        recorder.record(runs.make_step(0, rng))
+        recorder.record(runs.make_step(1, rng, status=Status.INFEASIBLE, failed=True))
+    [(_, entry)] = decoded(path, "/log")
+    assert entry.message.startswith("step 1: INFEASIBLE: no point satisfies the constraints")
+    assert entry.message.endswith("the policy for failures chose the input")
+    run = read_run(path)
+    assert run.statuses == (Status.SOLVED, Status.INFEASIBLE)
+    assert run.failed.tolist() == [False, True]
+
+
+def test_a_run_that_ends_in_an_error_is_recorded_up_to_there(tmp_path):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+
+    def run_into_trouble():
+        with runs.recorder(path) as recorder:
+            recorder.record(runs.make_step(0, rng))
+            raise ZeroDivisionError("too bad")
+
+    with pytest.raises(ZeroDivisionError):
+        run_into_trouble()
+    run = read_run(path)
+    assert len(run.times) == 1
+    assert run.metadata["end"]["outcome"] == "ZeroDivisionError: too bad"
+
+
+def test_a_recorded_step_is_a_copy(tmp_path):
+    path, step = tmp_path / "run.mcap", runs.make_step(0, np.random.default_rng(0))
+    expected = step.state.copy()
+    with runs.recorder(path) as recorder:
+        recorder.record(step)
+        step.state[:] = 7
+    np.testing.assert_array_equal(read_run(path).states[0], expected)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"state": np.zeros(5)}, r"step 0: state must be \(6,\); got \(5,\)"),
+        ({"belief_covariance": np.zeros(6)}, r"belief_covariance must be \(6, 6\); got \(6,\)"),
+    ],
+)
+def test_a_step_of_the_wrong_shape_is_refused(tmp_path, change, message):
+    with runs.recorder(tmp_path / "run.mcap") as recorder:
+        step = runs.make_step(0, np.random.default_rng(0))
+        with pytest.raises(ShapeError, match=message):
+            recorder.record(replace(step, **change))
+        recorder.record(step)
+    assert len(read_run(tmp_path / "run.mcap").times) == 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"units": {"w": "m"}}, SettingError, "units: must be of x, vx"),
+        ({"time_step": 0}, SettingError, "time_step: must be a number above 0"),
+        ({"input_bounds": [1, 2, 3]}, ShapeError, r"input bounds must be \(2, 3\); got \(3,\)"),
+    ],
+)
+def test_misuse_is_refused_before_a_file_is_made(tmp_path, settings, error, message):
+    with pytest.raises(error, match=message):
+        runs.recorder(tmp_path / "run.mcap", **settings)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_name_that_cannot_be_a_field_is_refused(tmp_path):
+    from gpmpc.recording import McapRecorder
+
+    with pytest.raises(SettingError, match="letters, digits and _, a letter first; got 'vertical speed'"):
+        McapRecorder(tmp_path / "run.mcap", ["vertical speed"], ["u"], time_step=1.0)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
+def test_a_read_only_folder_is_named(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(RecordingError, match="cannot be written: Permission denied"):
+        runs.recorder(tmp_path / "run.mcap")
+
+
+def test_a_path_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "taken").write_text("a file, not a folder")
+    with pytest.raises(RecordingError, match=r"taken/run\.mcap: cannot be written: "):
+        runs.recorder(tmp_path / "taken" / "run.mcap")
+    with pytest.raises(RecordingError, match="cannot be written: Is a directory"):
+        runs.recorder(tmp_path)
+
+
+def test_two_recorders_do_not_share_a_file(tmp_path):
+    message = "another process is recording to this file"
+    with runs.recorder(tmp_path / "run.mcap"), pytest.raises(RecordingError, match=message):
+        runs.recorder(tmp_path / "run.mcap")
+
+
+@pytest.mark.parametrize("room", [20_000, 100_000])
+def test_a_full_disk_is_reported_and_leaves_no_file_that_looks_finished(tmp_path, room):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    steps = [runs.make_step(k, rng, qp=k > 0) for k in range(20)]
+
+    def record_too_much():
+        with runs.recorder(path) as recorder:
+            resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (room, room))
+            for step in 10 * steps:
+                recorder.record(step)
+
+    with pytest.raises(RecordingError) as caught:
+        record_too_much()
+    assert str(caught.value) == f"{path}: the recording stopped and is unfinished: File too large"
+    assert path.stat().st_size <= room
+    run = read_run(path)
+    assert not run.finished
+    assert run.config
+    assert (len(run.times) > 0) == (room > 50_000)
+
+
+def test_a_disk_that_fills_up_with_the_index_leaves_a_file_without_footer(tmp_path):
+    whole = tmp_path / "whole.mcap"
+    runs.record_run(whole, steps=20)
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    recorder = runs.recorder(path)
+    room = whole.stat().st_size - 300  # the last chunk fits, the index does not
+    resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (room, room))
+    for k in range(20):
+        recorder.record(runs.make_step(k, rng))
+    with pytest.raises(RecordingError, match="unfinished: File too large"):
+        recorder.close()
+    with pytest.raises(RecordingError, match="unfinished: File too large"):
+        recorder.close()
+    run = read_run(path)
+    assert not run.finished
+    assert len(run.times) == 20
+
+
+def test_a_disk_that_is_full_from_the_start_is_reported_at_the_start(tmp_path):
+    code = (
+        "import os, resource, sys; sys.path.insert(0, sys.argv[1]); import runs\n"
+        "from gpmpc.recording import ring\n"
+        "memory = ring.open_memory(); ring.open_memory = lambda: memory\n"
+        "from gpmpc.recording import recorder; recorder.open_memory = lambda: memory\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
+        "try:\n    runs.recorder(sys.argv[2])\n"
+        "except Exception as error:\n    print(error)\n"
+    )
+    path = tmp_path / "run.mcap"
+    arguments = [sys.executable, "-c", code, os.path.dirname(runs.__file__), str(path)]
+    result = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    assert result.stdout == f"{path}: the recording stopped and is unfinished: File too large\n", result.stderr
+    with pytest.raises(RecordingError):
+        read_run(path)
+
+
+def test_a_writer_that_is_slower_than_the_loop_makes_it_wait_and_loses_nothing(tmp_path):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    step = runs.make_step(0, rng, horizon=2, variables=150)  # 0.4 MB; the shared memory holds forty
+    with runs.recorder(path) as recorder:
+        os.kill(recorder._process.pid, signal.SIGSTOP)
+        threading.Timer(0.5, os.kill, (recorder._process.pid, signal.SIGCONT)).start()
+        for k in range(120):
+            recorder.record(replace(step, k=k, time=0.1 * k))
+    run = read_run(path)
+    assert run.steps.tolist() == list(range(120))
+    assert all(np.array_equal(problem.P, step.decision.problem.P) for problem in run.problems.values())
+
+
+def test_a_step_that_the_shared_memory_cannot_take_is_refused(tmp_path):
+    step = runs.make_step(0, np.random.default_rng(0))
+    program, rows = step.decision.problem, 200_000
+    large = QuadraticProgram(program.P, program.q, np.ones((rows, 6)), np.zeros(rows), np.ones(rows))
+    decision = replace(step.decision, problem=large, solution=None)
+    with runs.recorder(tmp_path / "run.mcap") as recorder:
+        with pytest.raises(RecordingError, match="is too large; at most 8388608"):
+            recorder.record(replace(step, decision=decision))
+        recorder.record(step)
+    assert len(read_run(tmp_path / "run.mcap").times) == 1
+
+
+def test_after_an_error_every_further_step_says_so(tmp_path):
+    recorder, step = runs.recorder(tmp_path / "run.mcap"), runs.make_step(0, np.random.default_rng(0))
+    os.kill(recorder._process.pid, signal.SIGKILL)
+    os.waitid(os.P_PID, recorder._process.pid, os.WEXITED | os.WNOWAIT)
+    with pytest.raises(RecordingError, match="unfinished: the process that writes it died"):
+        recorder.record(step)
+    with pytest.raises(RecordingError, match="unfinished"):
+        recorder.record(step)
+    assert not read_run(tmp_path / "run.mcap").finished
+
+
+def test_a_closed_recorder_takes_no_more(tmp_path):
+    recorder = runs.recorder(tmp_path / "run.mcap")
+    recorder.close()
+    recorder.close()
+    with pytest.raises(RecordingError, match="the recording is closed"):
+        recorder.record(runs.make_step(0, np.random.default_rng(0)))
+
+
+def _record_many(folder, name):
+    for i in range(3):
+        runs.record_run(folder / "tree" / str(i) / f"{name}.mcap", steps=20)
+
+
+def test_two_processes_recording_into_one_tree_lose_nothing(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    processes = [context.Process(target=_record_many, args=(tmp_path, name)) for name in ("a", "b")]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    files = sorted(tmp_path.rglob("*.mcap"))
+    assert len(files) == 6
+    assert all(read_run(file).finished and len(read_run(file).times) == 20 for file in files)
+
+
+def test_the_wire_knows_the_layout_of_a_solvers_record():
+    from gpmpc.qp import record
+
+    assert record.HEADER == wire.RECORD_HEADER
+
+
+def _node_reads_mcap():
+    node = shutil.which("node")
+    found = node and subprocess.run([node, "-e", "require.resolve('@mcap/core')"], capture_output=True, check=False)
+    return bool(found) and found.returncode == 0
+
+
+@pytest.mark.skipif(not _node_reads_mcap(), reason="node's @mcap/core is not installed")
+def test_the_reader_of_another_language_agrees(recorded):
+    path, _ = recorded
+    script = """
+const {McapStreamReader} = require('@mcap/core');
+const reader = new McapStreamReader({decompressHandlers: {zstd: (data, size) => Buffer.alloc(Number(size))},
+                                     includeChunks: true, validateCrcs: false});
+reader.append(require('fs').readFileSync(process.argv[1]));
+const counts = {};
+for (let r; (r = reader.nextRecord());) counts[r.type] = (counts[r.type] || 0) + 1;
+console.log(JSON.stringify(counts));
+"""
+    output = subprocess.run(["node", "-e", script, str(path)], capture_output=True, text=True, check=True).stdout
+    counts = json.loads(output)
+    assert counts["Attachment"] == 1
+    assert counts["Metadata"] == 4
+    assert counts["Footer"] == 1
+
+
+def test_the_foxglove_layout_names_only_what_is_recorded(recorded):
+    path, _ = recorded
+    layout = (ROOT / "docs" / "foxglove-layout.json").read_text()
+    paths = [item["value"] for panel in json.loads(layout)["configById"].values() for item in panel.get("paths", [])]
+    assert len(paths) > 20
+    for value in paths:
+        topic, *fields = value.replace("[-1]", "").split(".")
+        descriptor = decoded(path, topic)[0][1].DESCRIPTOR
+        for field in fields:
+            assert field in descriptor.fields_by_name, value
+            descriptor = descriptor.fields_by_name[field].message_type
+    topics = json.loads(layout)["configById"]["3D!scene"]["topics"]
+    assert set(topics) <= set(read_run(path).channels)

@@ -1,0 +1,187 @@
+"""A run that was killed keeps everything that had been written whole, and becomes a file that any reader opens."""
+
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import runs
+import zstandard
+from mcap.reader import make_reader
+
+from gpmpc.exceptions import RecordingError
+from gpmpc.recording import read_run, recover
+
+ENDLESS = Path(__file__).with_name("endless.py")
+MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = 0x05, 0x06, 0x09, 0x0C, 0x0F  # opcodes of MCAP
+MAGIC = 8  # [bytes]
+
+
+def walk(data):
+    """Opcodes and contents of the records, one after the other, as the format defines them."""
+    start = 0
+    while len(data) - start >= 9:
+        opcode, length = struct.unpack_from("<BQ", data, start)
+        if len(data) - start - 9 < length or opcode == DATA_END:
+            return
+        yield opcode, data[start + 9 : start + 9 + length]
+        start += 9 + length
+
+
+def whole_messages(data):
+    """Number of the messages in all whole chunks, counted without MCAP's library."""
+    count = 0
+    for opcode, content in walk(data[MAGIC:]):
+        if opcode == CHUNK:
+            size, _, name = struct.unpack_from("<QII", content, 16)
+            inside = zstandard.decompress(content[32 + name + 8 :], size)
+            count += sum(kind == MESSAGE for kind, _ in walk(inside))
+    return count
+
+
+def check_recovered(path, output):
+    expected = whole_messages(path.read_bytes())
+    found = recover(path, output)
+    assert found.messages == expected
+    with output.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert len(list(reader.iter_messages())) == expected
+        assert reader.get_summary().statistics.message_count == expected
+        assert all(index.message_index_offsets for index in reader.get_summary().chunk_indexes)
+        [config] = reader.iter_attachments()
+        assert config.name == "config.yaml"
+        assert config.data == b"seed: 7\n"
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+    assert metadata["run"]["seed"] == "7"
+    assert metadata["units"]["time"] == "s"
+    run = read_run(output)
+    assert run.finished
+    np.testing.assert_array_equal(run.times, read_run(path).times)
+    return run
+
+
+def endless(path, *arguments):
+    command = [sys.executable, str(ENDLESS), str(path), *arguments]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    return process, int(process.stdout.readline())
+
+
+def finish(process):
+    process.wait()
+    process.stdin.close()
+    process.stdout.close()
+
+
+def test_a_run_killed_at_twenty_random_moments_is_recovered_every_time(tmp_path):
+    rng, steps = np.random.default_rng(), []
+    for batch in range(5):
+        paths = [tmp_path / f"{batch}-{i}.mcap" for i in range(4)]
+        started = [endless(path) for path in paths]
+        for process, writer in started:
+            time.sleep(rng.uniform(0, 0.3))
+            os.kill(writer, signal.SIGKILL)
+            process.kill()
+            finish(process)
+        for path in paths:
+            assert not read_run(path).finished
+            steps.append(len(check_recovered(path, path.with_suffix(".recovered.mcap")).times))
+    assert max(steps) > 0
+
+
+def test_when_only_the_loop_dies_not_a_step_is_lost(tmp_path):
+    path = tmp_path / "run.mcap"
+    process, writer = endless(path, "100")
+    assert process.stdout.readline() == b"recorded\n"
+    process.kill()
+    finish(process)
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{writer}").exists() and time.monotonic() < deadline:  # it writes what it still holds
+        time.sleep(0.01)
+    run = read_run(path)
+    assert not run.finished
+    assert run.steps.tolist() == list(range(100))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    runs.record_run(path, steps=20, config="seed: 7\n", start_time_ns=10**18)
+    return path
+
+
+def test_a_file_cut_anywhere_gives_back_its_whole_chunks(finished, tmp_path):
+    data = finished.read_bytes()
+    with finished.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+        first = chunks[0].chunk_start_offset
+        end = chunks[-1].chunk_start_offset + chunks[-1].chunk_length
+    rng = np.random.default_rng(0)
+    cuts = [first, first + 1, first + 9, end - 1, end, len(data) - 1, *rng.integers(first, len(data), 10)]
+    for cut in cuts:
+        path = tmp_path / "cut.mcap"
+        path.write_bytes(data[:cut])
+        assert not read_run(path).finished
+        check_recovered(path, tmp_path / "recovered.mcap")
+
+
+def test_a_file_cut_before_its_configuration_is_whole_does_not_pretend_to_have_one(finished, tmp_path):
+    data = finished.read_bytes()
+    path, output = tmp_path / "cut.mcap", tmp_path / "recovered.mcap"
+    path.write_bytes(data[: data.index(b"seed: 7\n") + 4])
+    recover(path, output)
+    with output.open("rb") as file:
+        assert not list(make_reader(file).iter_attachments())
+
+
+def test_a_damaged_chunk_ends_what_is_recovered(finished, tmp_path):
+    data = bytearray(finished.read_bytes())
+    with finished.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    data[chunks[-1].chunk_start_offset + 100] ^= 0xFF
+    path, output = tmp_path / "damaged.mcap", tmp_path / "recovered.mcap"
+    path.write_bytes(data)
+    assert 0 < recover(path, output).messages < recover(finished, tmp_path / "copy.mcap").messages
+    assert not read_run(path).finished
+
+
+def test_a_finished_file_is_copied_with_nothing_lost(finished, tmp_path):
+    output = tmp_path / "copy.mcap"
+    assert recover(finished, output).finished
+    before, after = read_run(finished), read_run(output)
+    np.testing.assert_array_equal(before.plan_means, after.plan_means)
+    assert before.metadata == after.metadata
+    assert before.channels == after.channels
+
+
+def test_what_cannot_be_recovered_is_named(finished, tmp_path):
+    (tmp_path / "notes.mcap").write_text("these are notes, no recording")
+    (tmp_path / "empty.mcap").touch()
+    output = tmp_path / "out.mcap"
+    with pytest.raises(RecordingError, match=r"missing\.mcap: cannot be read: No such file"):
+        recover(tmp_path / "missing.mcap", output)
+    with pytest.raises(RecordingError, match=r"notes\.mcap: is not an MCAP file"):
+        recover(tmp_path / "notes.mcap", output)
+    with pytest.raises(RecordingError, match=r"empty\.mcap: is empty"):
+        recover(tmp_path / "empty.mcap", output)
+    with pytest.raises(RecordingError, match="cannot be recovered into itself"):
+        recover(finished, finished)
+    with pytest.raises(RecordingError, match="cannot be written"):
+        recover(finished, tmp_path / "nowhere" / "out.mcap")
+    assert not output.exists()
+
+
+def test_a_file_of_others_is_no_run(tmp_path):
+    from mcap.writer import Writer
+
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()
+    with pytest.raises(RecordingError, match="is not the recording of a run"):
+        read_run(path)
