@@ -60,7 +60,7 @@ class NonlinearGPMPC:
         horizon: int,
         initial_input: Sequence[float],
         optimizer: Literal["sqp", "slsqp"] = "sqp",
-        tolerance: float = 1e-6,
+        tolerance: float = 1e-5,
         max_iterations: int = 100,
     ):
         self.initial_input = check_controller(problem, model.output_dim, model.input_dim, horizon, initial_input)
