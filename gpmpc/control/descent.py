@@ -43,7 +43,8 @@ class Step:
     Attributes:
         change: d (H m,).
         size: |d|_M / sqrt(f + |U|^2_M).
-        decrease: Of the objective, by its linearisation along d.
+        decrease: Of the objective, by its linearisation at U + d; negative where bounds have to be met first.
+        violation: Of rates and hard margins that is left, by their linearisation at U + d.
         multiplier: The largest of those of the rates and hard margins, in size.
         consistent: Whether the linearised constraints can be met together.
         solution: The quadratic program's; None where it has none.
@@ -52,6 +53,7 @@ class Step:
     change: np.ndarray
     size: float
     decrease: float
+    violation: float
     multiplier: float
     consistent: bool
     solution: QPSolution | None
@@ -110,9 +112,11 @@ class Program:
 
     def violation(self, shot: Shot) -> float:
         """Sum of the violations of rates and hard margins, each in its own unit."""
-        rates = self.rates @ shot.plan
-        over = np.maximum(rates - self.rate_upper, self.rate_lower - rates).clip(0).sum()
-        return float(over + (0.0 if self.soft else shot.margins.clip(0).sum()))
+        return self._beyond_rates(shot.plan) + (0.0 if self.soft else float(shot.margins.clip(0).sum()))
+
+    def _beyond_rates(self, plan: np.ndarray) -> float:
+        rates = self.rates @ plan
+        return float(np.maximum(rates - self.rate_upper, self.rate_lower - rates).clip(0).sum())
 
     def metric(self, shot: Shot) -> tuple[np.ndarray, float]:
         """M and the scale f + |U|^2_M that steps are measured against."""
@@ -140,15 +144,16 @@ class Program:
             solution = solver.solve_stacked(P, q, G, lower, upper, None, self._softened([(ELASTIC * scale, np.inf)]))
         if not solution.status.solved:
             consistent = consistent and solution.status is not Status.INFEASIBLE
-            return Step(np.zeros_like(unit), math.inf, 0.0, 0.0, consistent, None)
+            return Step(np.zeros_like(unit), math.inf, 0.0, 0.0, 0.0, consistent, None)
         d = solution.x * unit
         hard = solution.z[: len(self.rates)] if self.soft else solution.z
-        over = (shot.margins + shot.margin_jacobian @ d).clip(0) if self.soft else np.zeros(0)
-        linearised = shot.cost + shot.gradient @ d + self.l1 * over.sum() + self.l2 * over @ over
+        beyond = (shot.margins + shot.margin_jacobian @ d).clip(0)
+        linearised = shot.cost + shot.gradient @ d + self.l1 * beyond.sum() + self.l2 * beyond @ beyond
         return Step(
             change=d,
             size=math.sqrt(max(d @ M @ d, 0.0) / scale),
-            decrease=max(self.objective(shot) - float(linearised), 0.0),
+            decrease=self.objective(shot) - float(linearised),
+            violation=self._beyond_rates(shot.plan + d) + (0.0 if self.soft else float(beyond.sum())),
             multiplier=float(np.abs(hard).max(initial=0.0)),
             consistent=consistent,
             solution=solution,
@@ -175,7 +180,7 @@ def sqp(program: Program, shot: Shot, tolerance: float, limit: int) -> Outcome:
     for iteration in range(limit + 1):
         step = program.step(shot, last)
         if step.solution is None:
-            return shot, Status.NUMERICAL_TROUBLE if step.consistent else Status.INFEASIBLE, iteration
+            return shot, _trouble(step), iteration
         if step.size <= tolerance:
             return shot, Status.SOLVED if step.consistent else Status.INFEASIBLE, iteration
         if iteration == limit:
@@ -183,9 +188,14 @@ def sqp(program: Program, shot: Shot, tolerance: float, limit: int) -> Outcome:
         last, penalty = step.solution, max(penalty, 1.5 * step.multiplier)
         found = _line_search(program, shot, step, penalty)
         if found is None:
-            return shot, Status.NUMERICAL_TROUBLE, iteration
+            return shot, _trouble(step), iteration
         shot = found
     return shot, Status.ITERATION_LIMIT, limit
+
+
+def _trouble(step: Step) -> Status:
+    """What a method says that cannot go on from a plan."""
+    return Status.NUMERICAL_TROUBLE if step.consistent else Status.INFEASIBLE
 
 
 def _line_search(program: Program, shot: Shot, step: Step, penalty: float) -> Shot | None:
@@ -195,7 +205,7 @@ def _line_search(program: Program, shot: Shot, step: Step, penalty: float) -> Sh
         return program.objective(at) + penalty * program.violation(at)
 
     before, (_, scale) = merit(shot), program.metric(shot)
-    expected = step.decrease + penalty * program.violation(shot)
+    expected = max(step.decrease + penalty * (program.violation(shot) - step.violation), 0.0)
     length = 1.0
     for _ in range(HALVINGS):
         plan = (shot.plan + length * step.change).clip(program.lower, program.upper)
@@ -215,7 +225,7 @@ def slsqp(program: Program, shot: Shot, tolerance: float, limit: int) -> Outcome
     for _ in range(ROUNDS):
         step = program.step(shot)
         if step.solution is None:
-            return shot, Status.NUMERICAL_TROUBLE if step.consistent else Status.INFEASIBLE, iterations
+            return shot, _trouble(step), iterations
         if step.size <= tolerance:
             return shot, Status.SOLVED if step.consistent else Status.INFEASIBLE, iterations
         if iterations >= limit:
@@ -228,7 +238,7 @@ def slsqp(program: Program, shot: Shot, tolerance: float, limit: int) -> Outcome
             break
         shot = found
         iterations += used
-    return shot, Status.NUMERICAL_TROUBLE, iterations
+    return shot, _trouble(step), iterations
 
 
 def _round(program: Program, shot: Shot, tolerance: float, limit: int) -> tuple[Shot, int]:
@@ -266,7 +276,7 @@ def _round(program: Program, shot: Shot, tolerance: float, limit: int) -> tuple[
 
     def kept_jacobian(w: np.ndarray) -> np.ndarray:
         margins = -(at(w).margin_jacobian @ T) / margin_norm[:, None]
-        return np.vstack([C_wide, np.hstack([margins, np.eye(c)])])
+        return np.vstack([C_wide, np.hstack([margins, np.eye(len(margins), c)])])
 
     first = np.concatenate([np.zeros(size), shot.margins.clip(0) / margin_norm if c else np.zeros(0)])
     constraints: list[dict[str, str | Callable]] = []
