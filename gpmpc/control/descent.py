@@ -10,13 +10,16 @@ Gauss-Newton Hessian M,
 d = 0 exactly at the KKT points (Nocedal and Wright, 2006, section 18.1), and |d|_M, relative to sqrt(f + |U|^2_M), is
 the accuracy reached, whatever the units. A method's own flag decides nothing.
 
-``sqp`` takes these steps, with a line search on the exact penalty function (Han, 1977; Gauss-Newton: Bock, 1983).
+``sqp`` takes such steps, with a line search on the exact penalty function (Han, 1977; Gauss-Newton: Bock, 1983). M
+knows nothing of how covariances bend; where they weigh, Gauss-Newton alone took up to eight times the iterations. So the
+steps' metric is M with the last pairs of steps and gradient changes put in by damped BFGS updates (Powell, 1978).
 ``slsqp`` hands the problem to SciPy's SLSQP (Kraft, 1988), in the variables w = L'(U - U_0), M = L L', in which the
 curvature is nearly the identity that its BFGS update starts from; it starts again from a fresh M until d is small.
 """
 
 import math
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -32,8 +35,12 @@ from gpmpc.status import Status
 HALVINGS = 20  # of a step, before the line search gives up
 NOISE = 1e-10  # round-off of the objective, as a share of its scale: posteriors with sf2 >> y^2 lose that much
 ELASTIC = 1e4  # weight of hard margins whose linearisations contradict each other, in units of the scale of f
+MEMORY = 10  # pairs of a BFGS-corrected metric
 ROUNDS = 8  # fresh starts of SLSQP
 FAILURES = (DataError, np.linalg.LinAlgError, RuntimeError)  # of a model led out of its numbers by a trial plan
+
+
+Pair = tuple[np.ndarray, np.ndarray]  # a change of U, and that of the Lagrangian's gradient (H m,)
 
 
 @dataclass(frozen=True)
@@ -46,6 +53,7 @@ class Step:
         decrease: Of the objective, by its linearisation at U + d; negative where bounds have to be met first.
         violation: Of rates and hard margins that is left, by their linearisation at U + d.
         multiplier: The largest of those of the rates and hard margins, in size.
+        margin_prices: Multipliers of the margins (c,), over their copies.
         consistent: Whether the linearised constraints can be met together.
         solution: The quadratic program's; None where it has none.
     """
@@ -55,6 +63,7 @@ class Step:
     decrease: float
     violation: float
     multiplier: float
+    margin_prices: np.ndarray
     consistent: bool
     solution: QPSolution | None
 
@@ -123,9 +132,17 @@ class Program:
         M = self.shooting.curvature(shot)
         return M, max(abs(self.objective(shot)) + shot.plan @ M @ shot.plan, np.finfo(float).tiny)
 
-    def step(self, shot: Shot, last: QPSolution | None = None) -> Step:
-        """The projected Newton step at a plan; ``last`` is a warm start."""
+    def step(self, shot: Shot, last: QPSolution | None = None, pairs: Sequence[Pair] = ()) -> Step:
+        """The projected Newton step at a plan.
+
+        Args:
+            shot: The plan.
+            last: A warm start.
+            pairs: Steps and gradient changes that M is to be corrected by, the oldest first.
+        """
         M, scale = self.metric(shot)
+        for pair in pairs:
+            M = _updated(M, *pair)
         unit = 1 / np.sqrt(M.diagonal())  # the QP in inputs of unit curvature
         P, q = M * unit * unit[:, None], shot.gradient * unit
         copies = len(self._prices) if self.soft else 1  # a row that pays both prices is written twice
@@ -144,7 +161,7 @@ class Program:
             solution = solver.solve_stacked(P, q, G, lower, upper, None, self._softened([(ELASTIC * scale, np.inf)]))
         if not solution.status.solved:
             consistent = consistent and solution.status is not Status.INFEASIBLE
-            return Step(np.zeros_like(unit), math.inf, 0.0, 0.0, 0.0, consistent, None)
+            return Step(np.zeros_like(unit), math.inf, 0.0, 0.0, 0.0, np.zeros(len(shot.margins)), consistent, None)
         d = solution.x * unit
         hard = solution.z[: len(self.rates)] if self.soft else solution.z
         beyond = (shot.margins + shot.margin_jacobian @ d).clip(0)
@@ -155,6 +172,7 @@ class Program:
             decrease=self.objective(shot) - float(linearised),
             violation=self._beyond_rates(shot.plan + d) + (0.0 if self.soft else float(beyond.sum())),
             multiplier=float(np.abs(hard).max(initial=0.0)),
+            margin_prices=solution.z[len(self.rates) :].reshape(copies, len(shot.margins)).sum(axis=0),
             consistent=consistent,
             solution=solution,
         )
@@ -175,22 +193,39 @@ Outcome = tuple[Shot, Status, int]  # the last plan, how it ended, iterations
 
 
 def sqp(program: Program, shot: Shot, tolerance: float, limit: int) -> Outcome:
-    """Gauss-Newton steps from a plan, until the next would be smaller than the tolerance."""
-    penalty, last = 0.0, None
+    """BFGS-corrected Gauss-Newton steps from a plan, until the next Gauss-Newton step would be small."""
+    penalty, last, pairs = 0.0, None, deque(maxlen=MEMORY)
     for iteration in range(limit + 1):
-        step = program.step(shot, last)
-        if step.solution is None:
-            return shot, _trouble(step), iteration
-        if step.size <= tolerance:
-            return shot, Status.SOLVED if step.consistent else Status.INFEASIBLE, iteration
+        judged = program.step(shot, last)
+        if judged.solution is None:
+            return shot, _trouble(judged), iteration
+        if judged.size <= tolerance:
+            return shot, Status.SOLVED if judged.consistent else Status.INFEASIBLE, iteration
         if iteration == limit:
             break
+        step = program.step(shot, judged.solution, pairs) if pairs else judged
+        step = judged if step.solution is None else step
         last, penalty = step.solution, max(penalty, 1.5 * step.multiplier)
         found = _line_search(program, shot, step, penalty)
         if found is None:
             return shot, _trouble(step), iteration
+        prices = step.margin_prices
+        bend = (found.margin_jacobian - shot.margin_jacobian).T @ prices
+        pairs.append((found.plan - shot.plan, found.gradient - shot.gradient + bend))
         shot = found
     return shot, Status.ITERATION_LIMIT, limit
+
+
+def _updated(B: np.ndarray, change: np.ndarray, gradient_change: np.ndarray) -> np.ndarray:
+    """B after a BFGS update, damped so that it stays positive definite (Powell, 1978)."""
+    Bs, y = B @ change, gradient_change
+    curvature, sy = change @ Bs, change @ y
+    if not curvature > 0:
+        return B
+    if sy < 0.2 * curvature:
+        share = 0.8 * curvature / (curvature - sy)
+        y = share * y + (1 - share) * Bs
+    return B - np.outer(Bs, Bs) / curvature + np.outer(y, y) / (change @ y)
 
 
 def _trouble(step: Step) -> Status:
