@@ -11,8 +11,9 @@ d = 0 exactly at the KKT points (Nocedal and Wright, 2006, section 18.1), and |d
 the accuracy reached, whatever the units. A method's own flag decides nothing.
 
 ``sqp`` takes such steps, with a line search on the exact penalty function (Han, 1977; Gauss-Newton: Bock, 1983). M
-knows nothing of how covariances bend; where they weigh, Gauss-Newton alone took up to eight times the iterations. So the
-steps' metric is M with the last pairs of steps and gradient changes put in by damped BFGS updates (Powell, 1978).
+knows nothing of how covariances bend; where they weigh, Gauss-Newton alone took up to eight times the iterations.
+So the steps' metric is M with the last pairs of steps and gradient changes put in by damped BFGS updates (Powell,
+1978).
 ``slsqp`` hands the problem to SciPy's SLSQP (Kraft, 1988), in the variables w = L'(U - U_0), M = L L', in which the
 curvature is nearly the identity that its BFGS update starts from; it starts again from a fresh M until d is small.
 """
