@@ -37,6 +37,8 @@ HALVINGS = 20  # of a step, before the line search gives up
 NOISE = 1e-10  # round-off of the objective, as a share of its scale: posteriors with sf2 >> y^2 lose that much
 ELASTIC = 1e4  # weight of hard margins whose linearisations contradict each other, in units of the scale of f
 MEMORY = 10  # pairs of a BFGS-corrected metric
+NEAR = 0.1  # size of a step from which pairs are kept
+CREEP = 0.25  # ratio of two Gauss-Newton steps' sizes above which the metric is corrected
 ROUNDS = 8  # fresh starts of SLSQP
 FAILURES = (DataError, np.linalg.LinAlgError, RuntimeError)  # of a model led out of its numbers by a trial plan
 
@@ -195,7 +197,7 @@ Outcome = tuple[Shot, Status, int]  # the last plan, how it ended, iterations
 
 def sqp(program: Program, shot: Shot, tolerance: float, limit: int) -> Outcome:
     """BFGS-corrected Gauss-Newton steps from a plan, until the next Gauss-Newton step would be small."""
-    penalty, last, pairs = 0.0, None, deque(maxlen=MEMORY)
+    penalty, last, size, pairs = 0.0, None, math.inf, deque(maxlen=MEMORY)
     for iteration in range(limit + 1):
         judged = program.step(shot, last)
         if judged.solution is None:
@@ -204,15 +206,18 @@ def sqp(program: Program, shot: Shot, tolerance: float, limit: int) -> Outcome:
             return shot, Status.SOLVED if judged.consistent else Status.INFEASIBLE, iteration
         if iteration == limit:
             break
-        step = program.step(shot, judged.solution, pairs) if pairs else judged
+        # Pairs from far away mislead (six times the evaluations were seen); near by they help where Gauss-Newton creeps.
+        creeps = judged.size > CREEP * size
+        size = judged.size
+        step = program.step(shot, judged.solution, pairs) if pairs and creeps else judged
         step = judged if step.solution is None else step
         last, penalty = step.solution, max(penalty, 1.5 * step.multiplier)
         found = _line_search(program, shot, step, penalty)
         if found is None:
             return shot, _trouble(step), iteration
-        prices = step.margin_prices
-        bend = (found.margin_jacobian - shot.margin_jacobian).T @ prices
-        pairs.append((found.plan - shot.plan, found.gradient - shot.gradient + bend))
+        if judged.size < NEAR:
+            bend = (found.margin_jacobian - shot.margin_jacobian).T @ step.margin_prices
+            pairs.append((found.plan - shot.plan, found.gradient - shot.gradient + bend))
         shot = found
     return shot, Status.ITERATION_LIMIT, limit
 
