@@ -37,7 +37,7 @@ HALVINGS = 20  # of a step, before the line search gives up
 NOISE = 1e-10  # round-off of the objective, as a share of its scale: posteriors with sf2 >> y^2 lose that much
 ELASTIC = 1e4  # weight of hard margins whose linearisations contradict each other, in units of the scale of f
 MEMORY = 10  # pairs of a BFGS-corrected metric
-NEAR = 0.1  # size of a step from which pairs are kept
+NEAR = 0.03  # size of a step from which pairs are kept
 CREEP = 0.25  # ratio of two Gauss-Newton steps' sizes above which the metric is corrected
 ROUNDS = 8  # fresh starts of SLSQP
 FAILURES = (DataError, np.linalg.LinAlgError, RuntimeError)  # of a model led out of its numbers by a trial plan
@@ -206,7 +206,7 @@ def sqp(program: Program, shot: Shot, tolerance: float, limit: int) -> Outcome:
             return shot, Status.SOLVED if judged.consistent else Status.INFEASIBLE, iteration
         if iteration == limit:
             break
-        # Pairs from far away mislead (six times the evaluations were seen); near by they help where Gauss-Newton creeps.
+        # Pairs from far away mislead (eleven times the evaluations were seen); near by they help a creeping method.
         creeps = judged.size > CREEP * size
         size = judged.size
         step = program.step(shot, judged.solution, pairs) if pairs and creeps else judged
