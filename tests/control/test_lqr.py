@@ -1,0 +1,107 @@
+"""Linear-quadratic tracking against least squares, the Riccati equation, and its own bounds."""
+
+import numpy as np
+import pytest
+from small_models import LinearGaussian, double_integrator, pendulum_posterior
+
+from gpmpc.control.controller import Reference
+from gpmpc.control.lqr import LQR, lqr_gain
+from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.control.tracking import TrackingProblem
+from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.propagation import MeanEquivalence
+from gpmpc.status import Status
+
+A, B = np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([[0.125], [0.5]])
+Q, R = np.array([[3.0, 0.4], [0.4, 0.5]]), np.array([[0.2]])
+
+
+@pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
+def test_without_bounds_it_is_the_optimum_of_a_linear_model(penalized, rng):
+    H, model = 6, double_integrator(c=[0.1, -0.2])
+    problem = TrackingProblem(Q, R, penalized, terminal=3 * Q)
+    reference = Reference(rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1)))
+    state = Gaussian.certain(rng.normal(size=2))
+    ours = LQR(model, problem, H, [0.3]).control(state, reference)
+    best = NonlinearGPMPC(model, MeanEquivalence(), problem, H, [0.3], tolerance=1e-9).control(state, reference)
+    assert ours.status is Status.SOLVED
+    assert np.allclose(ours.inputs, best.inputs, atol=1e-8)
+    assert np.allclose(ours.means, best.means, atol=1e-8)
+    assert ours.covariances.shape == (H + 1, 2, 2)
+
+
+def test_the_stationary_gain_solves_the_riccati_equation():
+    K = lqr_gain(A, B, Q, R)
+    moved = A - B @ K
+    P = sum(
+        np.linalg.matrix_power(moved.T, i) @ (Q + K.T @ R @ K) @ np.linalg.matrix_power(moved, i) for i in range(400)
+    )
+    assert np.abs(np.linalg.eigvals(moved)).max() < 1
+    assert np.allclose(P, Q + A.T @ P @ A - A.T @ P @ B @ np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A), rtol=1e-10)
+
+
+def test_a_long_horizon_gives_the_stationary_gain(rng):
+    controller, state = LQR(double_integrator(), TrackingProblem(Q, R), 60, [0.0]), rng.normal(size=2)
+    decision = controller.control(Gaussian.certain(state), Reference(np.zeros((61, 2))))
+    assert np.allclose(decision.input, -lqr_gain(A, B, Q, R) @ state, atol=1e-9)
+
+
+def test_an_unweighted_mode_on_the_unit_circle_falls_back_to_the_recursion():
+    K = lqr_gain(np.diag([1.0, 0.5]), np.array([[0.0], [1.0]]), np.diag([0.0, 1.0]), np.eye(1))
+    assert K[0, 0] == pytest.approx(0, abs=1e-12)
+    assert K[0, 1] == pytest.approx(lqr_gain([[0.5]], [[1.0]], [[1.0]], [[1.0]])[0, 0])
+
+
+def test_a_growing_mode_out_of_reach_has_no_gain():
+    with pytest.raises(SettingError, match="do not reach a growing mode"):
+        lqr_gain(np.diag([1.2, 0.5]), np.array([[0.0], [1.0]]), np.eye(2), np.eye(1))
+
+
+def test_reference_inputs_feed_forward():
+    H, model = 5, double_integrator()
+    states, wanted = [np.array([0.2, -0.1])], np.array([[0.3], [0.1], [-0.4], [0.2], [0.0]])
+    for u in wanted:
+        states.append(A @ states[-1] + B @ u)
+    controller = LQR(model, TrackingProblem(Q, R, "deviations"), H, [0.0])
+    decision = controller.control(Gaussian.certain(states[0]), Reference(np.array(states), wanted))
+    assert np.allclose(decision.inputs, wanted, atol=1e-10)
+
+
+def test_inputs_are_clipped_to_the_box_and_the_rates():
+    bounds = {"input_lower": [-0.5], "input_upper": [0.4], "rate_lower": [-0.3], "rate_upper": [0.3]}
+    controller = LQR(double_integrator(), TrackingProblem(Q, R, **bounds), 6, [0.0])
+    decision = controller.control(Gaussian.certain(np.array([-3.0, 0.0])), Reference(np.zeros((7, 2))))
+    rates = np.diff(decision.inputs[:, 0], prepend=0.0)
+    assert rates[0] == pytest.approx(0.3)
+    assert decision.inputs.max() == pytest.approx(0.4)
+    assert np.abs(rates).max() <= 0.3 + 1e-12
+    assert np.allclose(decision.means[1], A @ [-3.0, 0.0] + B @ decision.input)
+
+
+def test_an_input_without_weight_or_effect_stays_at_rest():
+    model = LinearGaussian(A.tolist(), [[0.125, 0.0], [0.5, 0.0]])
+    controller = LQR(model, TrackingProblem(Q, [0.0, 0.0]), 3, [0.0, 0.0])
+    decision = controller.control(Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros((4, 2))))
+    assert np.allclose(decision.inputs[:, 1], 0)
+
+
+def test_it_brings_a_learned_pendulum_to_rest():
+    model, state, decision = pendulum_posterior(), np.array([0.8, 0.0]), None
+    controller = LQR(model, TrackingProblem([5.0, 0.5], [0.05], input_lower=[-4.0], input_upper=[4.0]), 15, [0.0])
+    for _ in range(40):
+        decision = controller.control(Gaussian.certain(state), Reference(np.zeros((16, 2))), decision)
+        acceleration = -4 * np.sin(state[0]) - 0.3 * state[1] + decision.input[0]
+        state = state + np.array([0.2 * state[1] + 0.02 * acceleration, 0.2 * acceleration])
+    assert np.abs(state).max() < 0.02
+
+
+def test_a_bad_measurement_is_said_so_and_misuse_is_refused():
+    controller = LQR(double_integrator(), TrackingProblem(Q, R), 3, [0.2])
+    decision = controller.control(Gaussian.certain(np.array([np.nan, 0.0])), Reference(np.zeros((4, 2))))
+    assert decision.status is Status.INVALID_MEASUREMENT
+    assert np.array_equal(decision.inputs, np.full((3, 1), 0.2))
+    with pytest.raises(ShapeError, match=r"shapes \(2,\) and \(4, 2\)"):
+        controller.control(Gaussian.certain(np.zeros(2)), Reference(np.zeros((3, 2))))
+    with pytest.raises(SettingError, match="must weigh 2 states and 1 inputs; got 2 and 2"):
+        LQR(double_integrator(), TrackingProblem(Q, [1.0, 1.0]), 3, [0.2])
