@@ -15,6 +15,7 @@ class Status(Enum):
     ITERATION_LIMIT = "stopped at the iteration limit: raise the limit, or check the scaling of the problem"
     TIME_LIMIT = "stopped at the time limit: raise the limit, shorten the horizon, or warm-start"
     NUMERICAL_TROUBLE = "the residuals could not be brought to the tolerance: check the scaling of the problem"
+    INVALID_MEASUREMENT = "the state is not finite: check the estimator; the last plan can bridge a gap"
 
     @property
     def solved(self) -> bool:

@@ -1,0 +1,129 @@
+"""Problem: a controller is asked with what its caller has; what it is asked is checked once, in one place, for all.
+
+A question that does not fit the controller is misuse and raises. A state that is not finite is a bad measurement, which
+happens in flight: it is answered by a ``Status`` (``unanswered``).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpmpc.control.controller import Decision, Reference, Timing
+from gpmpc.control.tracking import TrackingProblem
+from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
+from gpmpc.gaussian import Gaussian
+from gpmpc.status import Status
+
+
+@dataclass(frozen=True)
+class Request:
+    """One step's question, in float64.
+
+    Attributes:
+        state: Mean of the belief (n,).
+        covariance: Of the belief (n, n).
+        targets: r_1 .. r_H (H, n).
+        wanted: Reference inputs u*_0 .. u*_{H-1} (H, m); zero where there are none.
+        last: The input before this step, u_{-1} (m,).
+        shifted: The last plan, one step on, its last input repeated (H, m); the last input held where there is no
+            plan of a solve that succeeded.
+    """
+
+    state: np.ndarray
+    covariance: np.ndarray
+    targets: np.ndarray
+    wanted: np.ndarray
+    last: np.ndarray
+    shifted: np.ndarray
+
+    @classmethod
+    def read(
+        cls,
+        problem: TrackingProblem,
+        horizon: int,
+        initial_input: np.ndarray,
+        belief: Gaussian,
+        reference: Reference,
+        previous: Decision | None,
+    ) -> "Request":
+        """From the arguments of ``Controller.control``.
+
+        Args:
+            problem: Says n and m.
+            horizon: H.
+            initial_input: Taken as the last input where there is no previous decision (m,).
+            belief: Of the state.
+            reference: Over the horizon.
+            previous: The last decision.
+
+        Raises:
+            ShapeError: Belief or reference have other dimensions than the problem and the horizon.
+            DataError: The reference is not finite.
+        """
+        n, m = problem.state_dim, problem.input_dim
+        state, covariance = _array(belief.mean), _array(belief.covariance)
+        targets = np.asarray(reference.states, dtype=float)
+        if state.shape != (n,) or targets.shape != (horizon + 1, n):
+            raise ShapeError(
+                f"state and reference must have shapes ({n},) and ({horizon + 1}, {n}); "
+                f"got {state.shape} and {targets.shape}"
+            )
+        wanted = np.zeros((horizon, m)) if reference.inputs is None else np.asarray(reference.inputs, dtype=float)
+        if wanted.shape != (horizon, m):
+            raise ShapeError(f"reference inputs must have shape ({horizon}, {m}); got {wanted.shape}")
+        for name, values in (("states", targets), ("inputs", wanted)):
+            if not np.isfinite(values).all():
+                raise DataError(f"reference {name} must be finite; got {values[~np.isfinite(values)][0]}")
+        last = np.asarray(initial_input if previous is None else previous.input, dtype=float)
+        shifted = np.tile(last, (horizon, 1))
+        if previous is not None and previous.status.solved and np.shape(previous.inputs) == (horizon, m):
+            shifted = np.vstack([previous.inputs[1:], previous.inputs[-1:]])
+        return cls(state, covariance, targets[1:], wanted, last, shifted)
+
+    @property
+    def finite(self) -> bool:
+        """Whether the belief can be worked with."""
+        return bool(np.isfinite(self.state).all() and np.isfinite(self.covariance).all())
+
+    @property
+    def held(self) -> np.ndarray:
+        """The last input over the whole horizon (H, m)."""
+        return np.tile(self.last, (len(self.targets), 1))
+
+    def unanswered(self, status: Status, iterations: int = 0, timing: Timing | None = None) -> Decision:
+        """The decision of a step without a usable solve: the shifted plan, and no prediction."""
+        H, n = self.targets.shape
+        return Decision(
+            input=self.shifted[0],
+            inputs=self.shifted,
+            means=np.full((H + 1, n), np.nan),
+            covariances=np.full((H + 1, n, n), np.nan),
+            status=status,
+            iterations=iterations,
+            timing=timing or Timing(0.0, 0.0, 0.0),
+        )
+
+
+def check_controller(
+    problem: TrackingProblem, states: int, inputs: int, horizon: int, initial_input: np.ndarray
+) -> np.ndarray:
+    """The settings that every controller has, held against its model; gives the initial input as an array (m,).
+
+    Raises:
+        SettingError: A horizon below 1, weights of another dimension than the model's, or an initial input of the
+            wrong length.
+    """
+    check_number("horizon", horizon, least=1, whole=True)
+    check_numbers("initial_input", initial_input, inputs)
+    if (problem.state_dim, problem.input_dim) != (states, inputs):
+        raise SettingError(
+            "problem",
+            f"must weigh {states} states and {inputs} inputs; got {problem.state_dim} and {problem.input_dim}",
+        )
+    return np.array(initial_input, dtype=float)
+
+
+def _array(value: object) -> np.ndarray:
+    """A tensor or array as float64 in host memory."""
+    value = value.detach().cpu() if hasattr(value, "detach") else value
+    return np.asarray(value, dtype=float)
