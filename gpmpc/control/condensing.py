@@ -77,7 +77,7 @@ class Condenser:
     def slope(
         self, A: Array, B: Array, c: Array, start: Array, rows: Array, targets: Array, wanted: Array, last: Array
     ) -> tuple[Array, Array]:
-        """q (H m,), and E_k s_{k+1} without input (H, r).
+        """The linear term q (H m,), and E_k s_{k+1} without input (H, r).
 
         Args:
             A: As for ``curvature``.
@@ -152,7 +152,7 @@ def respond(A, B, c, start, inputs, states):
 
 @compiled
 def _weigh(W, x, y):
-    """y = W x for a block-diagonal W."""
+    """Writes W x for a block-diagonal W to ``y``."""
     n = W.shape[1]
     for b in range(len(W)):
         for i in range(n):
@@ -240,9 +240,8 @@ def _held_curvature(A, B, W, T, same, rows, H, P, G):
             if not same:
                 _weigh(T, X[k, a], TX[k, a])
     total = np.empty((m, m))
-    for d in range(
-        H
-    ):  # blocks (j, j - d): sum over l <= H - j of X_l' W X_{l + d}, the last l with the terminal weight
+    for d in range(H):
+        # Block (j, j - d) is the sum over l <= H - j of X_l' W X_{l + d}, with the terminal weight at the last l.
         total[:] = 0.0
         for k in range(H - d):
             j = H - 1 - k
@@ -271,7 +270,7 @@ def _mirror(P, m):
 
 @compiled
 def _slope(A, B, c, start, rows, targets, W, T, q, values):
-    """q = 2 Gamma' W (s^0 - r) by the adjoint recursion, and E s^0."""
+    """Adds 2 Gamma' W (s^0 - r) to q by the adjoint recursion, and writes E s^0 to ``values``."""
     held, held_rows = len(A) - 1, len(rows) - 1
     H, n = targets.shape
     p, m, r = B.shape[1], B.shape[2], rows.shape[1]

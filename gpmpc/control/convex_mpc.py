@@ -9,9 +9,10 @@ step is the real-time iteration (Diehl, Bock and Schloeder, 2005). More of them 
 sequential quadratic programming. The step length is then found by backtracking on the true cost along the true rollout,
 with an exact penalty for the state bounds (Nocedal and Wright, 2006, section 18.3). What is stationary there:
 
-* ``full``, ``diagonal``: the expected cost of the propagated belief, tr(Q Sigma) included, under the chance constraints.
-* ``zero_order``: the cost of the means under bounds tightened by the covariances that the solution itself leads to, whose
-  dependence on the inputs is left out of the derivatives; ``none``: the cost of the means.
+* ``full``, ``diagonal``: the expected cost of the propagated belief, tr(Q Sigma) included, under chance constraints.
+* ``zero_order``: the cost of the means under bounds tightened by the covariances that the solution itself leads to;
+  that these depend on the inputs is left out of the derivatives.
+* ``none``: the cost of the means.
 """
 
 from collections.abc import Sequence

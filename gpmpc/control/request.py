@@ -117,7 +117,8 @@ def check_controller(
     check_numbers("initial_input", initial_input, inputs)
     if (problem.state_dim, problem.input_dim) != (states, inputs):
         raise SettingError(
-            "problem", f"must weigh {states} states and {inputs} inputs; got {problem.state_dim} and {problem.input_dim}"
+            "problem",
+            f"must weigh {states} states and {inputs} inputs; got {problem.state_dim} and {problem.input_dim}",
         )
     return np.array(initial_input, dtype=float)
 

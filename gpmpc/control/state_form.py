@@ -1,11 +1,11 @@
-"""Problem: the convex program of ``gpmpc.control.convex_mpc`` with the states left in it, open to any convex constraint.
+"""Problem: the program of ``gpmpc.control.convex_mpc`` with the states left in it, open to any convex constraint.
 
     minimise    sum_{k=1..H} |s_k - r_k|^2_{W_k} + sum_{k=0..H-1} |v_k|^2_R + price of violated bounds
     subject to  s_{k+1} = A_k s_k + B_k u_k + c_k,   bounds of inputs, increments and states
 
-Written in CVXPY (Diamond and Boyd, 2016) with Parameters where disciplined parametrised programming allows them (Agrawal
-et al., 2019), so that it is compiled once. It is slower than the condensed program and gives the same inputs, by another
-road: an independent check, and the place to try a constraint of one's own, which takes one line:
+Written in CVXPY (Diamond and Boyd, 2016) with Parameters where disciplined parametrised programming allows them
+(Agrawal et al., 2019), so that it is compiled once. It is slower than the condensed program and gives the same inputs,
+by another road: an independent check, and the place to try a constraint of one's own, which takes one line:
 
     StateFormMPC(..., constraints=lambda states, inputs: [states[1:, 0] + states[1:, 2] <= 5.0])
 """
@@ -44,8 +44,8 @@ class StateFormMPC:
         form: As for ``ConvexMPC``.
         covariance: As for ``ConvexMPC``.
         feedback: As for ``ConvexMPC``.
-        constraints: Of the states s_0 .. s_H (H + 1, p), whose first n columns are the means, and the inputs (H, m), two
-            CVXPY variables: a list of constraints. Called once.
+        constraints: Of the states s_0 .. s_H (H + 1, p), whose first n columns are the means, and the inputs (H, m),
+            two CVXPY variables: a list of constraints. Called once.
         solver: A CVXPY solver.
         options: The solver's own; tight tolerances for Clarabel by default.
 
