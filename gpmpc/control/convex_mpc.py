@@ -162,7 +162,7 @@ class ConvexMPC:
         warm = previous.solution if solved else None
         try:
             if self.iterations > 1:
-                return self._iterate(request, warm)
+                return self._iterate(request, previous, warm)
             prediction = self.predictor.predict(request, previous)
             modelled = perf_counter()
             stacked = self._stack(prediction, request)
@@ -216,10 +216,11 @@ class ConvexMPC:
         means, covariances = self.predictor.beliefs(prediction, inputs)
         return Decision(inputs[0], inputs, means, covariances, status, iterations, timing, program, solution)
 
-    def _iterate(self, request: Request, warm: QPSolution | None) -> Decision:
-        """Sequential quadratic programming from the shifted plan."""
-        spent, inputs, price, status = np.zeros(3), request.shifted, 0.0, Status.ITERATION_LIMIT
+    def _iterate(self, request: Request, previous: Decision | None, warm: QPSolution | None) -> Decision:
+        """Sequential quadratic programming from the last plan."""
+        spent, price, status = np.zeros(3), 0.0, Status.ITERATION_LIMIT
         clock = _Clock(spent)
+        inputs = self.predictor.plan(request, previous)
         prediction = self.predictor.along(request, inputs)
         clock.charge(0)
         for count in range(1, self.iterations + 1):

@@ -133,10 +133,10 @@ class Predictor:
     def predict(self, request: Request, previous: Decision | None) -> Prediction:
         """The stage models of a step: about its request, and for ``increment`` about the step before."""
         if self.form == "trajectory":
-            return self.along(request, request.shifted)
+            return self.along(request, self.plan(request, previous))
         if self.form == "deviation":
-            return self._held(request, request.wanted[0])
-        prediction = self._held(request, request.last)
+            return self.held(request, request.wanted[0])
+        prediction = self.held(request, request.last)
         if previous is None or not previous.status.solved:
             return prediction  # no step before: the increment that the local model itself predicts
         before = self.state(previous.means[0], previous.covariances[0])
@@ -145,6 +145,24 @@ class Predictor:
             n = self.problem.state_dim
             c[n:] = prediction.c[0, n:]
         return Prediction(prediction.A, prediction.B, c[None], prediction.start, prediction.covariances)
+
+    def plan(self, request: Request, previous: Decision | None) -> Array:
+        """The inputs (H, m) to linearise along: the last plan shifted; without one, a guess that follows the reference.
+
+        A constant input would do for short horizons. On long ones its rollout leaves the data, the bounds, or the
+        finite numbers; so the guess is the model's own flight under the LQR gain of its first local model.
+        """
+        if previous is not None and previous.status.solved:
+            return request.shifted
+        problem, n = self.problem, self.problem.state_dim
+        belief, centre = self._belief(request.state, request.covariance), request.shifted[0]
+        A, B, *_ = self._linearise(belief, self._tensor(centre))
+        gain = self._gain(np.ascontiguousarray(A[:n, :n]), np.ascontiguousarray(B[:n]))
+        mean, inputs = request.state, np.empty_like(request.shifted)
+        for k, target in enumerate(request.targets):
+            inputs[k] = np.clip(centre + gain @ (mean - target), problem.input_lower, problem.input_upper)
+            mean = _array(self.model.predict(self._tensor(mean), self._tensor(inputs[k])).mean)
+        return inputs
 
     def along(self, request: Request, inputs: Array) -> Prediction:
         """The stage models along the rollout of a plan (H, m)."""
@@ -161,7 +179,8 @@ class Predictor:
         A, B, c = (np.array(part) for part in zip(*stages, strict=True))
         return Prediction(A, B, c, self.state(request.state, covariances[0]), np.array(covariances))
 
-    def _held(self, request: Request, input: Array) -> Prediction:
+    def held(self, request: Request, input: Array) -> Prediction:
+        """The local model about the belief and an input (m,), for all stages."""
         belief, H = self._belief(request.state, request.covariance), self.horizon
         A, B, c, after, cross = self._linearise(belief, self._tensor(input))
         now, after = _array(belief.covariance), _array(after.covariance)
