@@ -46,19 +46,17 @@ def spread(A, V, start, horizon):
     return covariances
 
 
-def with_feedback(gain: Array, B: Array, covariance: Array, cross: Array, open_loop: Array) -> Array:
-    """Sigma+ (n, n) under feedback, from what a propagator says without it.
+def own_spread(A: Array, cross: Array, open_loop: Array) -> Array:
+    """V (n, n): what a step adds to the spread of the state, from what a propagator says of the step.
 
-    With Cov[x, x+] = C the feedback adds B K (x - mu) to x+; where C = Sigma A' this is the formula above.
+    Sigma+ less the part that passes through linearly, A Cov[x, x+] = A Sigma A'; a propagator that lets nothing pass
+    (mean equivalence) has no such part. Projected onto the positive semidefinite matrices.
 
     Args:
-        gain: K (m, n).
-        B: (n, m).
-        covariance: Sigma (n, n).
-        cross: C (n, n).
-        open_loop: Sigma+ without feedback (n, n).
+        A: d mu+ / d mu (n, n).
+        cross: Cov[x, x+] (n, n).
+        open_loop: Sigma+ (n, n).
     """
-    added = B @ gain
-    coupled = added @ cross
-    total = open_loop + coupled + coupled.T + added @ covariance @ added.T
-    return (total + total.T) / 2
+    passed = A @ cross
+    eigenvalues, vectors = np.linalg.eigh(open_loop - (passed + passed.T) / 2)
+    return (vectors * np.clip(eigenvalues, 0, None)) @ vectors.T

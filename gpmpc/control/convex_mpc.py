@@ -78,8 +78,9 @@ class ConvexMPC:
         solver: Of the quadratic program; ``DualActiveSet()`` by default, which state bounds with a price need.
         iterations: Quadratic programs a step at most; more than one for ``"trajectory"`` only.
         tolerance: Of more iterations: largest change of an input, over max(1, largest input), that counts as none.
-        feedback: Predicts the covariances of ``"zero_order"`` under an ancillary feedback, without which no long
-            horizon with state bounds is feasible; the other modes predict them without feedback.
+        feedback: Rolls plans out, and predicts the covariances of ``"zero_order"``, under an ancillary feedback,
+            without which no long horizon with state bounds is feasible. ``"full"`` and ``"diagonal"`` predict their
+            covariances without feedback.
 
     Attributes:
         soft: Prices of the rows of the program's G, None where all are hard.
@@ -220,8 +221,8 @@ class ConvexMPC:
         """Sequential quadratic programming from the last plan."""
         spent, price, status = np.zeros(3), 0.0, Status.ITERATION_LIMIT
         clock = _Clock(spent)
-        inputs = self.predictor.plan(request, previous)
-        prediction = self.predictor.along(request, inputs)
+        prediction = self.predictor.predict(request, previous)
+        inputs = prediction.inputs
         clock.charge(0)
         for count in range(1, self.iterations + 1):
             stacked = self._stack(prediction, request)

@@ -6,7 +6,8 @@
   Alam, 2017, section 4). Summed up that is an affine model again, c = s_0 - A s_{-1} - B u_{-1}. Between two measured
   states S does not change, which says nothing of how it will grow: there the rows of S take the local model's c.
 * ``deviation``: the local model about the current belief and the reference input u*_0, held.
-* ``trajectory``: the belief is rolled out along a plan and linearised at every stage (linear time-varying).
+* ``trajectory``: the belief is rolled out along the last plan, shifted, and linearised at every stage (linear
+  time-varying). The rollout follows what the plan predicted by an ancillary feedback; the first one, the reference.
 
 What s holds of the belief is its *covariance* mode. ``full``: s = [mu; vec S], S = Sigma^(1/2), as in the paper.
 ``diagonal``: s = [mu; standard deviations], correlations are dropped at every stage. ``zero_order``: s = mu, and the
@@ -16,13 +17,13 @@ covariances are predicted beside the optimisation as if the inputs did not chang
 Torch ends here: what comes out is NumPy float64.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
 
-from gpmpc.control.ancillary_feedback import lqr_gain, spread, with_feedback
+from gpmpc.control.ancillary_feedback import lqr_gain, own_spread, spread
 from gpmpc.control.condensing import respond
 from gpmpc.control.controller import Decision
 from gpmpc.control.request import Request
@@ -52,6 +53,7 @@ class Prediction:
         start: s_0 (p,).
         covariances: Sigma_0 .. Sigma_H that the models were made at (H + 1, n, n); a held model has one of its own for
             the stages 1 to H.
+        inputs: The inputs that they were made at (H, m).
     """
 
     A: Array
@@ -59,6 +61,7 @@ class Prediction:
     c: Array
     start: Array
     covariances: Array
+    inputs: Array
 
     def states(self, inputs: Array) -> Array:
         """s_0 .. s_H (H + 1, p) under inputs (H, m), as the stage models have it."""
@@ -77,7 +80,7 @@ class Predictor:
         horizon: H.
         form: See the module's text.
         covariance: See the module's text.
-        feedback: Predicts the covariances of ``zero_order`` under an ancillary feedback; see
+        feedback: Rolls out, and predicts the covariances of ``zero_order``, under an ancillary feedback; see
             ``gpmpc.control.ancillary_feedback``.
 
     Raises:
@@ -133,7 +136,7 @@ class Predictor:
     def predict(self, request: Request, previous: Decision | None) -> Prediction:
         """The stage models of a step: about its request, and for ``increment`` about the step before."""
         if self.form == "trajectory":
-            return self.along(request, self.plan(request, previous))
+            return self.along(request, request.shifted, self._followed(request, previous))
         if self.form == "deviation":
             return self.held(request, request.wanted[0])
         prediction = self.held(request, request.last)
@@ -144,40 +147,33 @@ class Predictor:
         if not request.covariance.any():
             n = self.problem.state_dim
             c[n:] = prediction.c[0, n:]
-        return Prediction(prediction.A, prediction.B, c[None], prediction.start, prediction.covariances)
+        return replace(prediction, c=c[None])
 
-    def plan(self, request: Request, previous: Decision | None) -> Array:
-        """The inputs (H, m) to linearise along: the last plan shifted; without one, a guess that follows the reference.
+    def along(self, request: Request, inputs: Array, follow: Array | None = None) -> Prediction:
+        """The stage models along the rollout of a plan.
 
-        A constant input would do for short horizons. On long ones its rollout leaves the data, the bounds, or the
-        finite numbers; so the guess is the model's own flight under the LQR gain of its first local model.
+        Args:
+            request: Where it starts.
+            inputs: The plan (H, m).
+            follow: Means (H, n) that the rollout is to follow by the ancillary feedback, which changes the plan within
+                its bounds: u_k + K (mu_k - follow_k) for k = 1 .. H-1.
         """
-        if previous is not None and previous.status.solved:
-            return request.shifted
-        problem, n = self.problem, self.problem.state_dim
-        belief, centre = self._belief(request.state, request.covariance), request.shifted[0]
-        A, B, *_ = self._linearise(belief, self._tensor(centre))
-        gain = self._gain(np.ascontiguousarray(A[:n, :n]), np.ascontiguousarray(B[:n]))
-        mean, inputs = request.state, np.empty_like(request.shifted)
-        for k, target in enumerate(request.targets):
-            inputs[k] = np.clip(centre + gain @ (mean - target), problem.input_lower, problem.input_upper)
-            mean = _array(self.model.predict(self._tensor(mean), self._tensor(inputs[k])).mean)
-        return inputs
-
-    def along(self, request: Request, inputs: Array) -> Prediction:
-        """The stage models along the rollout of a plan (H, m)."""
-        belief, gain, stages = self._belief(request.state, request.covariance), None, []
-        covariances = [_array(belief.covariance)]
-        for input in inputs:
+        belief, gain, stages, plan = self._belief(request.state, request.covariance), None, [], np.array(inputs)
+        covariances, n = [_array(belief.covariance)], self.problem.state_dim
+        for k, input in enumerate(plan):
+            if follow is not None and k:
+                moved = input + gain @ (_array(belief.mean) - follow[k])
+                input[:] = np.clip(moved, self.problem.input_lower, self.problem.input_upper)
             A, B, c, belief, cross = self._linearise(belief, self._tensor(input))
-            if cross is not None and self.feedback:
-                gain = self._gain(A, B) if gain is None else gain
-                after = with_feedback(gain, B, covariances[-1], cross, _array(belief.covariance))
-                belief = Gaussian(belief.mean, self._tensor(after))
+            if self.feedback and gain is None and (follow is not None or cross is not None):
+                gain = self._gain(np.ascontiguousarray(A[:n, :n]), np.ascontiguousarray(B[:n]))
+            if self.feedback and cross is not None:
+                V, closed = own_spread(A, cross, _array(belief.covariance)), A + B @ gain
+                belief = Gaussian(belief.mean, self._tensor(spread(closed, V, covariances[-1], 1)[1]))
             covariances.append(_array(belief.covariance))
             stages.append((A, B, c))
         A, B, c = (np.array(part) for part in zip(*stages, strict=True))
-        return Prediction(A, B, c, self.state(request.state, covariances[0]), np.array(covariances))
+        return Prediction(A, B, c, self.state(request.state, covariances[0]), np.array(covariances), plan)
 
     def held(self, request: Request, input: Array) -> Prediction:
         """The local model about the belief and an input (m,), for all stages."""
@@ -186,14 +182,22 @@ class Predictor:
         now, after = _array(belief.covariance), _array(after.covariance)
         if cross is None:
             covariances = np.concatenate([now[None], np.tile(after, (H, 1, 1))])
-        else:  # what the step adds to the spread of the state, then that at every stage
-            own = after - A @ now @ A.T if now.any() else after
-            eigenvalues, vectors = np.linalg.eigh((own + own.T) / 2)
-            V = (vectors * np.clip(eigenvalues, 0, None)) @ vectors.T
+        else:
             closed = A + B @ self._gain(A, B) if self.feedback else A
-            covariances = spread(np.ascontiguousarray(closed), np.ascontiguousarray(V), now, H)
+            covariances = spread(closed, own_spread(A, cross, after), now, H)
         start = self.state(request.state, now)
-        return Prediction(A[None], B[None], c[None], start, covariances)
+        return Prediction(A[None], B[None], c[None], start, covariances, np.tile(input, (H, 1)))
+
+    def _followed(self, request: Request, previous: Decision | None) -> Array | None:
+        """What the rollout of a shifted plan has to follow: its own means, or without one the reference.
+
+        Open-loop, over a long horizon, the smallest error leads the rollout out of the data and the bounds.
+        """
+        if not self.feedback:
+            return None
+        if previous is not None and previous.status.solved and len(previous.means) == self.horizon + 1:
+            return previous.means[1:]
+        return np.concatenate([request.state[None], request.targets[:-1]])
 
     # One stage, by covariance mode: A, B, c, the next belief, and Cov[x, x+] where feedback can act on it.
 

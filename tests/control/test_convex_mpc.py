@@ -62,7 +62,7 @@ def test_on_a_linear_model_all_forms_are_the_nonlinear_benchmark(penalized, rng)
     model, H = linear_gaussian(3, 2), 6
     bounds = StateBounds([-0.6, -np.inf, -0.6], [np.inf, 0.5, np.inf], kappa=0.0)
     problem = TrackingProblem(
-        [2.0, 1.0, 0.5], [0.3, 0.2], penalized, [5.0, 5.0, 1.0], [-0.7, -0.5], [0.7, 0.4], [-0.5, -0.5], [0.5, 0.5], bounds
+        [2.0, 1.0, 0.5], [0.3, 0.2], penalized, [5.0, 5.0, 1.0], [-0.7, -0.5], [0.7, 0.4], [-0.5] * 2, [0.5] * 2, bounds
     )  # fmt: skip
     controllers = [
         ConvexMPC(model, propagator(c), problem, H, [0.0, 0.0], f, c)
@@ -132,23 +132,19 @@ def test_a_model_that_stays_is_prepared_once_and_gives_the_same_inputs(rng):
 
 @pytest.mark.parametrize(("form", "covariance"), PAIRS)
 def test_bounds_and_rates_are_kept_for_thirty_steps(form, covariance):
-    problem, H, start = (
-        quadrotor_problem(rate_lower=[-2, -0.2, -0.2], rate_upper=[2, 0.2, 0.2]),
-        4,
-        [0.8, 0.0, -0.6, 0.0, 0.5, 0.0],
-    )
+    problem, H = quadrotor_problem(rate_lower=[-2, -0.1, -0.1], rate_upper=[2, 0.1, 0.1]), 4
     controller = ConvexMPC(gp(), propagator(covariance), problem, H, HOVER, form, covariance)
     steps = 30
     if covariance in ("full", "diagonal") and form == "trajectory":
         controller.predictor.propagator = MeanEquivalence()  # half the time; the bounds do not care
-    states, inputs, decisions = fly(controller, start, at_origin(H), steps)
+    states, inputs, decisions = fly(controller, [0.8, 0.0, -0.6, 0.0, 0.5, 0.0], at_origin(H), steps)
     rates = np.diff(inputs, axis=0, prepend=HOVER[None])
     plans = np.concatenate([d.inputs for d in decisions])
     assert (plans >= problem.input_lower - 1e-8).all()
     assert (plans <= problem.input_upper + 1e-8).all()
     assert (rates >= problem.rate_lower - 1e-8).all()
     assert (rates <= problem.rate_upper + 1e-8).all()
-    assert np.abs(rates[:, 1:]).max() > 0.2 - 1e-6  # they were needed
+    assert np.abs(rates[:, 1:]).max() > 0.1 - 1e-6  # they were needed
     assert np.abs(states[-5:, ::2]).max() < 0.1
     assert decisions[-1].means.shape == (H + 1, 6)
     assert decisions[-1].covariances.shape == (H + 1, 6, 6)
@@ -184,12 +180,13 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
     limits = StateBounds([-np.inf, -0.35] * 3, [np.inf, 0.9] * 3, confidence=0.9)
     problem, reference = quadrotor_problem(state_bounds=limits), at_origin(H)
     state = np.array([0.8, -0.1, -0.4, 0.1, 0.3, 0.0])
-    controller = ConvexMPC(gp(), moves, problem, H, HOVER, "trajectory", covariance, iterations=30)
+    model = gp(20 if isinstance(moves, MomentMatching) else 60)
+    controller = ConvexMPC(model, moves, problem, H, HOVER, "trajectory", covariance, iterations=30)
     kappa = 0.0 if covariance == "none" else limits.kappa
     merits, search = [], controller._search
 
     def exact(inputs):
-        cost, means, variances, u = expected_cost(problem, gp(), moves, state, inputs, reference, covariance)
+        cost, means, variances, u = expected_cost(problem, model, moves, state, inputs, reference, covariance)
         sd = variances.sqrt() if kappa else torch.zeros_like(means)
         rows = torch.cat([(means + kappa * sd)[:, 1::2], (means - kappa * sd)[:, 1::2]], dim=1)  # the order of G
         outside = (rows[:, :3] - 0.9).clamp_min(0).sum() + (-0.35 - rows[:, 3:]).clamp_min(0).sum()
@@ -197,14 +194,14 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
 
     def watched(request, prediction, inputs, proposed, price):
         found = search(request, prediction, inputs, proposed, price)
-        merits.append([float(cost + price * out) for cost, _, out, _, _ in (exact(inputs), exact(found[0]))])
+        merits.append([(cost + price * out).item() for cost, _, out, _, _ in (exact(inputs), exact(found[0]))])
         return found
 
     controller._search = watched
     decision = controller.control(Gaussian.certain(state), reference)
     assert decision.status is Status.SOLVED
     assert 2 < decision.iterations < 30
-    assert all(later <= earlier + 1e-10 for earlier, later in merits)
+    assert all(later <= earlier + 1e-10 for earlier, later in merits[1:])  # the first guess breaks the rates
     cost, rows, outside, u, means = exact(decision.inputs)
     assert outside < 1e-6
     assert np.allclose(decision.means[1:], means.detach(), atol=1e-7)
@@ -244,7 +241,10 @@ def test_a_higher_confidence_keeps_further_from_the_bound(form, covariance):
     for confidence in (0.6, 0.9, 0.99):
         limits = StateBounds([-np.inf] * 6, [0.9, np.inf, np.inf, np.inf, np.inf, np.inf], confidence)
         problem = quadrotor_problem(Q=[10.0, 10.0, 1, 1, 1, 1], state_bounds=limits)
-        controller = ConvexMPC(gp(), propagator(covariance), problem, H, HOVER, form, covariance)
+        count = 60 if form == "trajectory" else 1
+        controller = ConvexMPC(
+            gp(), propagator(covariance), problem, H, HOVER, form, covariance, iterations=count, tolerance=1e-5
+        )
         last = controller.control(Gaussian.certain(state), reference)
         assert last.status is Status.SOLVED
         highest.append(last.means[1:, 0].max())
@@ -370,7 +370,7 @@ def test_bounds_that_cannot_be_kept_are_reported(iterations):
         ({"tolerance": 0.0}, "tolerance: must be a number above 0"),
         ({"feedback": "yes"}, "feedback: must be true or false; got 'yes'"),
         (
-            {"problem": quadrotor_problem(state_bounds=StateBounds([0.0] * 6, [1.0] * 6, l1=1.0)), "solver": CvxpySolver()},
+            {"problem": quadrotor_problem(state_bounds=StateBounds([0] * 6, [1] * 6, l1=1.0)), "solver": CvxpySolver()},
             "solver: state bounds with a price .* need DualActiveSet; got CvxpySolver",
         ),
     ],
