@@ -48,6 +48,8 @@ class ChanceConstraints:
     def rows(self, prediction: Prediction) -> Array:
         """E_k (H, r, p), or (1, r, p) where it is the same for all k."""
         n, r, p = self._n, self.per_stage, len(prediction.start)
+        if not r:
+            return np.zeros((1, 0, p))
         if self._covariance == "full" and len(prediction.A) > 1:
             normals = _row_directions(prediction.covariances[1:])
         elif self._covariance == "full":

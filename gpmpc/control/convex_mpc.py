@@ -7,7 +7,8 @@ Alam (2017, section 4), and its time-varying relatives.
 With ``form="trajectory"`` the program is that of a Gauss-Newton step from the last plan, shifted: one of them a control
 step is the real-time iteration (Diehl, Bock and Schloeder, 2005). More of them solve the nonlinear problem itself by
 sequential quadratic programming. The step length is then found by backtracking on the true cost along the true rollout,
-with an exact penalty for the state bounds (Nocedal and Wright, 2006, section 18.3). What is stationary there:
+with an exact penalty for the state bounds, and the Gauss-Newton Hessian is corrected by damped BFGS updates for the
+curvature of the Lagrangian that it misses (Nocedal and Wright, 2006, section 18.3). What is stationary there:
 
 * ``full``, ``diagonal``: the expected cost of the propagated belief, tr(Q Sigma) included, under chance constraints.
 * ``zero_order``: the cost of the means under bounds tightened by the covariances that the solution itself leads to;
@@ -220,12 +221,20 @@ class ConvexMPC:
     def _iterate(self, request: Request, previous: Decision | None, warm: QPSolution | None) -> Decision:
         """Sequential quadratic programming from the last plan."""
         spent, price, status = np.zeros(3), 0.0, Status.ITERATION_LIMIT
-        clock = _Clock(spent)
+        clock, taken, corrections = _Clock(spent), None, []
         prediction = self.predictor.predict(request, previous)
         inputs = prediction.inputs
         clock.charge(0)
         for count in range(1, self.iterations + 1):
             stacked = self._stack(prediction, request)
+            slope = stacked.P @ inputs.ravel() + stacked.q
+            if taken is not None:  # how the Lagrangian's slope changed over the last step, at its multipliers
+                step, multipliers, before = taken
+                corrections.append((step, slope + stacked.G.T @ multipliers - before))
+                P = stacked.P
+                for pair in corrections:
+                    P = _damped_update(P, *pair)
+                stacked = stacked._replace(P=P, q=slope - P @ inputs.ravel(), prepared=None)
             clock.charge(1)
             solution = self._solve(stacked, warm)
             clock.charge(2)
@@ -241,32 +250,35 @@ class ConvexMPC:
                 break
             row_multipliers = np.abs(solution.z[self._condenser.rate_rows :])
             price = max(price, 2.0 * float(row_multipliers.max(initial=0.0)))
-            found = self._search(request, prediction, inputs, proposed, price)
+            found = self._search(request, prediction, inputs, proposed, slope, price)
             clock.charge(0)
             if found is None:
                 status = Status.NUMERICAL_TROUBLE
                 break
+            taken = (found[0] - inputs).ravel(), solution.z, slope + stacked.G.T @ solution.z
             inputs, prediction = found
         return self._decide(request, prediction, stacked, solution, status, count, Timing(*spent))
 
     def _search(
-        self, request: Request, prediction: Prediction, inputs: Array, proposed: Array, price: float
+        self, request: Request, prediction: Prediction, inputs: Array, proposed: Array, slope: Array, price: float
     ) -> tuple[Array, Prediction] | None:
         """The next plan between ``inputs`` and ``proposed``, with the stage models along it; None if none is better.
 
-        The stage models are exact along the plan that they were made at, so one function of a prediction and a plan is
-        both: the true merit there, and what the quadratic program promises elsewhere.
+        The stage models are exact along the plan that they were made at: there their cost and violations are the true
+        ones.
         """
         limits = self._chance.limits(prediction)  # tightening of zero_order stays during the search
-        here = self._merit(request, prediction, inputs, limits, price)
-        promised = self._merit(request, prediction, proposed, limits, price) - here
+        violated = self._violation_price(prediction, inputs, limits, price)
+        here = self._cost(request, prediction, inputs) + violated
+        promised = float(slope @ (proposed - inputs).ravel())
+        promised += self._violation_price(prediction, proposed, limits, price) - violated
         whole = not self._keeps_input_bounds(inputs, request.last)  # a first guess outside is left in one step
         step = 1.0
         while step >= SHORTEST_STEP:
             trial = proposed if step == 1.0 else inputs + step * (proposed - inputs)
             try:
                 moved = self.predictor.along(request, trial)
-                merit = self._merit(request, moved, trial, limits, price)
+                merit = self._cost(request, moved, trial) + self._violation_price(moved, trial, limits, price)
             except DataError:  # the rollout left the finite numbers
                 if whole:
                     return None
@@ -276,15 +288,18 @@ class ConvexMPC:
             step /= 2
         return None
 
-    def _merit(
-        self, request: Request, prediction: Prediction, inputs: Array, limits: tuple[Array, Array], price: float
+    def _cost(self, request: Request, prediction: Prediction, inputs: Array) -> float:
+        states = prediction.states(inputs)
+        return self._condenser.cost(states, inputs, request.targets, request.wanted, request.last)
+
+    def _violation_price(
+        self, prediction: Prediction, inputs: Array, limits: tuple[Array, Array], price: float
     ) -> float:
-        states, (lower, upper) = prediction.states(inputs), limits
-        total = self._condenser.cost(states, inputs, request.targets, request.wanted, request.last)
-        if self._chance.per_stage:
-            values = (self._chance.rows(prediction) @ states[1:, :, None])[..., 0]
-            total += self._chance.price(np.maximum(0.0, np.maximum(values - upper, lower - values)), price)
-        return total
+        if not self._chance.per_stage:
+            return 0.0
+        values = (self._chance.rows(prediction) @ prediction.states(inputs)[1:, :, None])[..., 0]
+        lower, upper = limits
+        return self._chance.price(np.maximum(0.0, np.maximum(values - upper, lower - values)), price)
 
     def _keeps_input_bounds(self, inputs: Array, last: Array) -> bool:
         problem, rates = self.problem, np.diff(inputs, axis=0, prepend=last[None])
@@ -309,6 +324,16 @@ def read_request(
     previous = previous if previous is not None and previous.status.solved else None
     request = Request.read(problem, H, initial_input, belief, reference, previous)
     return replace(request, shifted=np.clip(request.shifted, problem.input_lower, problem.input_upper))
+
+
+def _damped_update(P: Array, step: Array, change: Array) -> Array:
+    """BFGS with Powell's damping, which keeps P positive definite (Nocedal and Wright, 2006, procedure 18.2)."""
+    moved = P @ step
+    curvature, found = step @ moved, step @ change
+    if found < 0.2 * curvature:
+        share = 0.8 * curvature / (curvature - found)
+        change, found = share * change + (1 - share) * moved, 0.2 * curvature
+    return P - np.outer(moved, moved) / curvature + np.outer(change, change) / found
 
 
 class _Clock:
