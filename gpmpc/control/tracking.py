@@ -97,6 +97,9 @@ class TrackingProblem:
     def __post_init__(self) -> None:
         object.__setattr__(self, "Q", _weight("Q", self.Q))
         object.__setattr__(self, "R", _weight("R", self.R))
+        lowest = np.linalg.eigvalsh(self.R)[0]
+        if lowest <= 0:
+            raise SettingError("R", f"must be positive definite; its smallest eigenvalue is {lowest:.3g}")
         terminal = self.Q if self.terminal is None else _weight("terminal", self.terminal)
         object.__setattr__(self, "terminal", terminal)
         if terminal.shape != self.Q.shape:

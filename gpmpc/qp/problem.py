@@ -142,6 +142,14 @@ class QuadraticProgram:
         lower, upper = as_float_array("lower", lower, (n + m,)), as_float_array("upper", upper, (n + m,))
         return cls(P, q, G, lower[n:], upper[n:], lower[:n], upper[:n])
 
+    @classmethod
+    def unchecked(cls, P: Array, q: Array, G: Array, lower: Array, upper: Array) -> "QuadraticProgram":
+        """``from_stacked`` without a look at the arrays, for a builder whose formulas keep the rules by themselves."""
+        program, n = object.__new__(cls), len(q)
+        parts = {"P": P, "q": q, "G": G, "h_lower": lower[n:], "h_upper": upper[n:], "lb": lower[:n], "ub": upper[:n]}
+        program.__dict__.update(parts)
+        return program
+
     @property
     def lower(self) -> Array:
         """(M,) lower bounds of the stacked constraints ``[x; Gx]``."""

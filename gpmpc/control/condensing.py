@@ -1,0 +1,297 @@
+"""Problem: minimise over the inputs alone what the affine stage models say of the states.
+
+    s_{k+1} = A_k s_k + B_k u_k + c_k,   k = 0 .. H-1,   s_0 given
+    minimise  sum_{k=1..H} |s_k - r_k|^2_{W_k} + sum_{k=0..H-1} |v_k|^2_R,    rows l_k <= E_k s_k <= h_k
+
+With Gamma_{k,i} = ds_k / du_i the stacked problem is min 1/2 U'P U + q'U with P = 2 (Gamma' W Gamma + R~), q = 2 Gamma'
+W (s^0 - r) + ..., s^0 the response to no input at all: (38)-(39) of Cao, Lai and Alam (2017), whose P lacks the 2. The
+paper's unknowns are the increments dU = D U; in U the same problem has the input bounds as a box. Bounds on the
+increments are rows.
+
+Multiplying the stacked matrices out costs O(H^3). Here it is O(H^2): Gamma is made a stage at a time, and with the cost
+to go M_H = W_H, M_k = W_k + A_k' M_{k+1} A_k of a system without input, block (k, i <= k) of P is 2 B_k' M_{k+1}
+Gamma_{k+1,i} (Andersson, 2013; Axehill, 2015, show that this order is reached). Where A
+and B are held, Gamma_{k,i} depends on k - i only, and each block of P is its lower right neighbour plus one product.
+
+Weights are block diagonal, (p / n, n, n): Q alone for the mean, and one Q a row of S for s = [mu; vec S], where
+diag(Q, I_n kron Q) is never written out.
+"""
+
+import numpy as np
+
+from gpmpc.compiled import compiled
+from gpmpc.control.tracking import TrackingProblem
+
+Array = np.ndarray
+
+
+class Condenser:
+    """Condenses the stages of one tracking problem, input weights and bounds included.
+
+    Args:
+        problem: Weights and bounds of the inputs.
+        horizon: H.
+        weight: W of the extended state (p / n, n, n).
+        terminal: W_H (p / n, n, n).
+    """
+
+    def __init__(self, problem: TrackingProblem, horizon: int, weight: Array, terminal: Array):
+        m = problem.input_dim
+        self.problem, self.horizon = problem, horizon
+        self._weight, self._terminal = np.ascontiguousarray(weight), np.ascontiguousarray(terminal)
+        self._same_terminal = bool(np.array_equal(weight, terminal))
+        difference = np.eye(horizon * m) - np.eye(horizon * m, k=-m)  # D: dU = D U - [u_{-1}; 0; ...]
+        stacked = np.kron(np.eye(horizon), problem.R)
+        self._input_hessian = 2 * (
+            difference.T @ stacked @ difference if problem.penalized == "increments" else stacked
+        )
+        self._rate_rows = difference if problem.rate_limited else difference[:0]
+        self._box = np.tile(problem.input_lower, horizon), np.tile(problem.input_upper, horizon)
+        self._rates = np.tile(problem.rate_lower, horizon), np.tile(problem.rate_upper, horizon)
+
+    @property
+    def rate_rows(self) -> int:
+        """How many rows of G bound increments; they come before those of the states."""
+        return len(self._rate_rows)
+
+    def curvature(self, A: Array, B: Array, rows: Array) -> tuple[Array, Array]:
+        """P (H m, H m) and G (rate rows + H r, H m), which do not depend on where the state is.
+
+        Args:
+            A: (H, p, p), or (1, p, p) where it is held; all arrays contiguous.
+            B: (H, p, m), or (1, p, m).
+            rows: E_k of s_{k+1}, (H, r, p), or (1, r, p) where they are held.
+        """
+        first, size = self.rate_rows, len(self._input_hessian)
+        P = self._input_hessian.copy()
+        G = np.zeros((first + self.horizon * rows.shape[1], size))
+        G[:first] = self._rate_rows
+        if len(A) == 1 and len(rows) == 1:
+            _held_curvature(
+                A[0], B[0], self._weight, self._terminal, self._same_terminal, rows[0], self.horizon, P, G[first:]
+            )
+        else:
+            _varying_curvature(A, B, self._weight, self._terminal, rows, self.horizon, P, G[first:])
+        return P, G
+
+    def slope(
+        self, A: Array, B: Array, c: Array, start: Array, rows: Array, targets: Array, wanted: Array, last: Array
+    ) -> tuple[Array, Array]:
+        """The linear term q (H m,), and E_k s_{k+1} without input (H, r).
+
+        Args:
+            A: As for ``curvature``.
+            B: As for ``curvature``.
+            c: (H, p) or (1, p).
+            start: s_0 (p,).
+            rows: As for ``curvature``.
+            targets: r_1 .. r_H of the mean (H, n); the rest of s is to be zero.
+            wanted: Reference inputs (H, m), used where R weighs deviations.
+            last: u_{-1} (m,), used where R weighs increments.
+        """
+        H, m = self.horizon, len(last)
+        q, values = np.zeros((H, m)), np.zeros((H, rows.shape[1]))
+        _slope(A, B, c, start, rows, targets, self._weight, self._terminal, q, values)
+        if self.problem.penalized == "deviations":
+            q -= 2 * wanted @ self.problem.R
+        elif self.problem.penalized == "increments":
+            q[0] -= 2 * last @ self.problem.R
+        return q.ravel(), values
+
+    def bounds(self, last: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """The bounds of the stacked constraints [U; rates; rows], from those of the rows (H, r) each."""
+        parts = [[side] for side in self._box]
+        if self.rate_rows:
+            for part, side in zip(parts, self._rates, strict=True):
+                shifted = side.copy()
+                shifted[: len(last)] += last
+                part.append(shifted)
+        return np.concatenate([*parts[0], lower.ravel()]), np.concatenate([*parts[1], upper.ravel()])
+
+    def cost(self, states: Array, inputs: Array, targets: Array, wanted: Array, last: Array) -> float:
+        """The objective itself, constants included [the unit of the cost].
+
+        Args:
+            states: s_0 .. s_H (H + 1, p).
+            inputs: (H, m).
+            targets: r_1 .. r_H (H, n).
+            wanted: (H, m).
+            last: u_{-1} (m,).
+        """
+        error = states[1:].copy()
+        error[:, : targets.shape[1]] -= targets
+        blocks = error.reshape(len(error), *self._weight.shape[:2])
+        penalized = inputs
+        if self.problem.penalized == "deviations":
+            penalized = inputs - wanted
+        elif self.problem.penalized == "increments":
+            penalized = np.diff(inputs, axis=0, prepend=last[None])
+        total = np.einsum("kbi,bij,kbj->", blocks[:-1], self._weight, blocks[:-1])
+        total += np.einsum("bi,bij,bj->", blocks[-1], self._terminal, blocks[-1])
+        return float(total + np.einsum("ki,ij,kj->", penalized, self.problem.R, penalized))
+
+
+@compiled
+def respond(A, B, c, start, inputs, states):
+    """Writes s_0 .. s_H (H + 1, p) under inputs (H, m) to ``states``."""
+    held = len(A) - 1
+    p, m = B.shape[1], B.shape[2]
+    states[0, :] = start
+    for k in range(len(inputs)):
+        at = min(k, held)
+        s, u = states[k], inputs[k]
+        for r in range(p):
+            total = c[at, r]
+            row = A[at, r]
+            for j in range(p):
+                total += row[j] * s[j]
+            for j in range(m):
+                total += B[at, r, j] * u[j]
+            states[k + 1, r] = total
+
+
+@compiled
+def _weigh(W, x, y):
+    """Writes W x for a block-diagonal W to ``y``."""
+    n = W.shape[1]
+    for b in range(len(W)):
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += W[b, i, j] * x[b * n + j]
+            y[b * n + i] = total
+
+
+@compiled
+def _add_product(A, X, width, Y):
+    """Y += A X on the first ``width`` columns; entries of A that are zero cost nothing."""
+    for r in range(len(A)):
+        out = Y[r]
+        for c in range(A.shape[1]):
+            a = A[r, c]
+            if a != 0.0:
+                row = X[c]
+                for i in range(width):
+                    out[i] += a * row[i]
+
+
+@compiled
+def _dot(x, y):
+    total = 0.0
+    for i in range(len(x)):
+        total += x[i] * y[i]
+    return total
+
+
+@compiled
+def _varying_curvature(A, B, W, T, rows, H, P, G):
+    """Adds 2 Gamma' W Gamma to P, and writes E Gamma to G."""
+    held, held_rows = len(A) - 1, len(rows) - 1
+    p, m, r = B.shape[1], B.shape[2], rows.shape[1]
+    n = W.shape[1]
+    M, MA = np.zeros((p, p)), np.zeros((p, p))
+    MB = np.zeros((H, p, m))
+    for k in range(H - 1, -1, -1):  # backward: B_k' M_{k+1}
+        at = min(k, held)
+        weight = T if k == H - 1 else W
+        for b in range(len(W)):  # M_{k+1} = W_{k+1} + A' M A, the second part is there already
+            for i in range(n):
+                for j in range(n):
+                    M[b * n + i, b * n + j] += weight[b, i, j]
+        _add_product(M, B[at], m, MB[k])
+        MA[:] = 0.0
+        _add_product(M, A[at], p, MA)
+        M[:] = 0.0
+        _add_product(A[at].T, MA, p, M)
+    gamma, moved = np.zeros((p, H * m)), np.zeros((p, H * m))
+    for k in range(H):  # forward: Gamma_{k+1}
+        at, row_at = min(k, held), min(k, held_rows)
+        moved[:] = 0.0
+        _add_product(A[at], gamma, k * m, moved)
+        gamma, moved = moved, gamma
+        for i in range(p):
+            for j in range(m):
+                gamma[i, k * m + j] = B[at, i, j]
+        width = (k + 1) * m
+        for a in range(m):
+            out = P[k * m + a]
+            for i in range(p):
+                weight_i = 2.0 * MB[k, i, a]
+                row = gamma[i]
+                for j in range(width):
+                    out[j] += weight_i * row[j]
+        _add_product(rows[row_at], gamma, width, G[k * r : (k + 1) * r])
+    _mirror(P, m)
+
+
+@compiled
+def _held_curvature(A, B, W, T, same, rows, H, P, G):
+    """The same with one A, B and E for all stages."""
+    p, m, r = B.shape[0], B.shape[1], rows.shape[0]
+    X, WX, TX = np.empty((H, m, p)), np.empty((H, m, p)), np.empty((H, m, p))  # X_l = A^(l-1) B, transposed
+    for a in range(m):
+        for i in range(p):
+            X[0, a, i] = B[i, a]
+        for k in range(1, H):
+            for i in range(p):
+                X[k, a, i] = _dot(A[i], X[k - 1, a])
+        for k in range(H):
+            _weigh(W, X[k, a], WX[k, a])
+            if not same:
+                _weigh(T, X[k, a], TX[k, a])
+    total = np.empty((m, m))
+    for d in range(H):
+        # Block (j, j - d) is the sum over l <= H - j of X_l' W X_{l + d}, with the terminal weight at the last l.
+        total[:] = 0.0
+        for k in range(H - d):
+            j = H - 1 - k
+            for a in range(m):
+                for b in range(m):
+                    usual = _dot(WX[k, a], X[k + d, b])
+                    last = usual if same else _dot(TX[k, a], X[k + d, b])
+                    P[j * m + a, (j - d) * m + b] += 2.0 * (total[a, b] + last)
+                    total[a, b] += usual
+    for e in range(r):
+        for d in range(H):
+            for b in range(m):
+                value = _dot(rows[e], X[d, b])
+                for k in range(d, H):
+                    G[k * r + e, (k - d) * m + b] = value
+    _mirror(P, m)
+
+
+@compiled
+def _mirror(P, m):
+    """Takes the upper triangle from the lower one."""
+    for i in range(len(P)):
+        for j in range(i):
+            P[j, i] = P[i, j]
+
+
+@compiled
+def _slope(A, B, c, start, rows, targets, W, T, q, values):
+    """Adds 2 Gamma' W (s^0 - r) to q by the adjoint recursion, and writes E s^0 to ``values``."""
+    held, held_rows = len(A) - 1, len(rows) - 1
+    H, n = targets.shape
+    p, m, r = B.shape[1], B.shape[2], rows.shape[1]
+    free, nothing = np.empty((H + 1, p)), np.zeros((H, m))
+    respond(A, B, c, start, nothing, free)
+    error, slope, pulled = np.empty(p), np.zeros(p), np.zeros(p)
+    for k in range(H - 1, -1, -1):
+        at, row_at = min(k, held), min(k, held_rows)
+        for e in range(r):
+            values[k, e] = _dot(rows[row_at, e], free[k + 1])
+        error[:] = free[k + 1]
+        for i in range(n):
+            error[i] -= targets[k, i]
+        _weigh(T if k == H - 1 else W, error, slope)
+        for i in range(p):
+            slope[i] = 2.0 * slope[i] + pulled[i]
+        pulled[:] = 0.0
+        for i in range(p):
+            weight = slope[i]
+            row = A[at, i]
+            for j in range(p):
+                pulled[j] += weight * row[j]
+            for j in range(m):
+                q[k, j] += weight * B[at, i, j]

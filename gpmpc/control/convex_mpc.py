@@ -1,0 +1,348 @@
+"""Problem: steer an uncertain system by one convex program a step, although its model is a Gaussian process.
+
+The belief's future is taken as affine in the inputs (``gpmpc.control.prediction`` says how), the states are eliminated
+(``gpmpc.control.condensing``), and what is left is a quadratic program in the inputs: the convex GP-MPC of Cao, Lai and
+Alam (2017, section 4), and its time-varying relatives.
+
+With ``form="trajectory"`` the program is that of a Gauss-Newton step from the last plan, shifted: one of them a control
+step is the real-time iteration (Diehl, Bock and Schloeder, 2005). More of them solve the nonlinear problem itself by
+sequential quadratic programming. The step length is then found by backtracking on the true cost along the true rollout,
+with an exact penalty for the state bounds, and the Gauss-Newton Hessian is corrected by damped BFGS updates for the
+curvature of the Lagrangian that it misses (Nocedal and Wright, 2006, section 18.3). What is stationary there:
+
+* ``full``, ``diagonal``: the expected cost of the propagated belief, tr(Q Sigma) included, under chance constraints.
+* ``zero_order``: the cost of the means under bounds tightened by the covariances that the solution itself leads to;
+  that these depend on the inputs is left out of the derivatives.
+* ``none``: the cost of the means.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+
+from gpmpc.control.chance_constraints import ChanceConstraints
+from gpmpc.control.condensing import Condenser
+from gpmpc.control.controller import Decision, Reference, Timing
+from gpmpc.control.prediction import Covariance, Form, Prediction, Predictor
+from gpmpc.control.request import Request, check_controller
+from gpmpc.control.tracking import TrackingProblem
+from gpmpc.exceptions import DataError, ProblemError, SettingError, ShapeError, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.propagation import Propagator
+from gpmpc.qp import DualActiveSet, Prepared, QPSolution, QPSolver, QuadraticProgram
+from gpmpc.status import Status
+
+Array = np.ndarray
+
+SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
+SHORTEST_STEP = 2.0**-12
+ROUND_OFF = 1e-13  # share of the merit below which a difference says nothing
+
+
+class _Stacked(NamedTuple):
+    """A quadratic program as its solver takes it, bounds on [U; G U]."""
+
+    P: Array
+    q: Array
+    G: Array
+    lower: Array
+    upper: Array
+    prepared: Prepared | None
+
+
+class _Held(NamedTuple):
+    """What was made of the last A, B and E that were held."""
+
+    A: Array
+    B: Array
+    rows: Array
+    P: Array
+    G: Array
+    prepared: Prepared | None
+
+
+class ConvexMPC:
+    """Convex GP-MPC.
+
+    Args:
+        model: What was learned.
+        propagator: How the belief moves; ``covariance="none"`` needs the model's mean only.
+        problem: Weights and bounds.
+        horizon: H, the number of predicted states.
+        initial_input: The input before the first step, and the first guess of every planned one (m,).
+        form: ``"increment"``, ``"deviation"`` or ``"trajectory"``; see ``gpmpc.control.prediction``.
+        covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see there.
+        solver: Of the quadratic program; ``DualActiveSet()`` by default, which state bounds with a price need.
+        iterations: Quadratic programs a step at most; more than one for ``"trajectory"`` only.
+        tolerance: Of more iterations: largest change of an input, over max(1, largest input), that counts as none.
+        feedback: Rolls plans out, and predicts the covariances of ``"zero_order"``, under an ancillary feedback,
+            without which no long horizon with state bounds is feasible. ``"full"`` and ``"diagonal"`` predict their
+            covariances without feedback.
+
+    Attributes:
+        soft: Prices of the rows of the program's G, None where all are hard.
+
+    Raises:
+        SettingError: A setting is unknown or out of its range, or model and problem have other dimensions.
+    """
+
+    def __init__(
+        self,
+        model: DynamicsModel,
+        propagator: Propagator,
+        problem: TrackingProblem,
+        horizon: int,
+        initial_input: Sequence[float],
+        form: Form = "trajectory",
+        covariance: Covariance = "zero_order",
+        solver: QPSolver | None = None,
+        iterations: int = 1,
+        tolerance: float = 1e-8,
+        feedback: bool = True,
+    ):
+        self.initial_input = check_controller(problem, model.state_dim, model.input_dim, horizon, initial_input)
+        check_number("iterations", iterations, least=1, whole=True)
+        check_number("tolerance", tolerance, above=0)
+        if iterations > 1 and form != "trajectory":
+            raise SettingError("iterations", f"form {form!r} is one quadratic program, so 1; got {iterations}")
+        self.problem, self.horizon, self.iterations, self.tolerance = problem, horizon, iterations, tolerance
+        self.solver = DualActiveSet() if solver is None else solver
+        self.predictor = Predictor(model, propagator, problem, horizon, form, covariance, feedback)
+        weights = self.predictor.extended(problem.Q), self.predictor.extended(problem.terminal)
+        self._condenser = Condenser(problem, horizon, *weights)
+        self._chance = ChanceConstraints(problem.state_bounds, problem.state_dim, horizon, covariance)
+        self.soft = self._chance.softness(self._condenser.rate_rows)
+        if self.soft is not None and not isinstance(self.solver, DualActiveSet):
+            raise SettingError(
+                "solver", f"state bounds with a price (l1, l2) need DualActiveSet; got {type(self.solver).__name__}"
+            )
+        self._held: _Held | None = None  # remembered for speed; no answer depends on it
+
+    def build(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> QuadraticProgram:
+        """The (first) quadratic program of a step, checked.
+
+        Its unknowns are the inputs u_0 .. u_{H-1}, one after the other. Rows of G: increments u_k - u_{k-1} where they
+        are bounded, then the bounded states of the stages 1 to H, upper bounds first; ``soft`` has their prices.
+
+        Args:
+            belief: As for ``control``.
+            reference: As for ``control``.
+            previous: As for ``control``.
+
+        Raises:
+            ShapeError: As for ``control``.
+            DataError: The belief is not finite, or it does not stay so.
+            ProblemError: The program is malformed, numerically.
+        """
+        request = read_request(self.predictor, self.initial_input, belief, reference, previous)
+        prediction = self.predictor.predict(request, previous)
+        return QuadraticProgram.from_stacked(*self._stack(prediction, request)[:5])
+
+    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+        """Decides the input for one step; see ``Controller.control``.
+
+        A belief that is not finite is answered with ``INVALID_MEASUREMENT``. ``iterations`` of the decision counts
+        quadratic programs; with more than one allowed, ``ITERATION_LIMIT`` says that the tolerance was not reached.
+
+        Args:
+            belief: What is known of the state.
+            reference: Over the horizon, with inputs where the form or the weights ask for them.
+            previous: The last decision; one that was not solved is ignored.
+
+        Raises:
+            ShapeError: Belief or reference have other dimensions, or reference inputs are missing.
+        """
+        request = read_request(self.predictor, self.initial_input, belief, reference, previous)
+        if not request.finite:
+            return request.unanswered(Status.INVALID_MEASUREMENT)
+        began = perf_counter()
+        solved = previous is not None and previous.status.solved
+        warm = previous.solution if solved else None
+        try:
+            if self.iterations > 1:
+                return self._iterate(request, previous, warm)
+            prediction = self.predictor.predict(request, previous)
+            modelled = perf_counter()
+            stacked = self._stack(prediction, request)
+            built = perf_counter()
+            solution = self._solve(stacked, warm)
+        except (DataError, ProblemError, np.linalg.LinAlgError):  # a rollout or a program without finite numbers
+            return request.unanswered(Status.NUMERICAL_TROUBLE, timing=Timing(perf_counter() - began, 0.0, 0.0))
+        timing = Timing(modelled - began, built - modelled, perf_counter() - built)
+        return self._decide(request, prediction, stacked, solution, solution.status, 1, timing)
+
+    def _stack(self, prediction: Prediction, request: Request) -> _Stacked:
+        A, B, rows = prediction.A, prediction.B, self._chance.rows(prediction)
+        held = self._held if len(A) == 1 else None
+        if held is not None and all(map(np.array_equal, (A, B, rows), held[:3])):
+            if held.prepared is None and isinstance(self.solver, DualActiveSet):  # seen twice: it may well stay
+                held = self._held = held._replace(prepared=self.solver.prepare(held.P, held.G, self.soft))
+            P, G, prepared = held.P, held.G, held.prepared
+        else:
+            (P, G), prepared = self._condenser.curvature(A, B, rows), None
+            self._held = _Held(A, B, rows, P, G, None) if len(A) == 1 else None
+        q, values = self._condenser.slope(
+            A, B, prediction.c, prediction.start, rows, request.targets, request.wanted, request.last
+        )
+        low, high = self._chance.limits(prediction)
+        lower, upper = self._condenser.bounds(request.last, low - values, high - values)
+        return _Stacked(P, q, G, lower, upper, prepared)
+
+    def _solve(self, stacked: _Stacked, warm: QPSolution | None) -> QPSolution:
+        P, q, G, lower, upper, prepared = stacked
+        if prepared is not None:
+            return prepared.solve(q, lower, upper, warm)
+        if isinstance(self.solver, DualActiveSet):
+            return self.solver.solve_stacked(P, q, G, lower, upper, warm, self.soft)
+        warm = warm if warm is not None and len(warm.q) == len(q) and len(warm.lower) == len(lower) else None
+        return self.solver.solve(QuadraticProgram.from_stacked(P, q, G, lower, upper), warm)
+
+    def _decide(
+        self,
+        request: Request,
+        prediction: Prediction,
+        stacked: _Stacked,
+        solution: QPSolution,
+        status: Status,
+        iterations: int,
+        timing: Timing,
+    ) -> Decision:
+        program = QuadraticProgram.unchecked(*stacked[:5])
+        if not status.solved:
+            return replace(request.unanswered(status, iterations, timing), problem=program, solution=solution)
+        inputs = np.array(solution.x).reshape(request.shifted.shape)
+        means, covariances = self.predictor.beliefs(prediction, inputs)
+        return Decision(inputs[0], inputs, means, covariances, status, iterations, timing, program, solution)
+
+    def _iterate(self, request: Request, previous: Decision | None, warm: QPSolution | None) -> Decision:
+        """Sequential quadratic programming from the last plan."""
+        spent, price, status = np.zeros(3), 0.0, Status.ITERATION_LIMIT
+        clock, taken, corrections = _Clock(spent), None, []
+        prediction = self.predictor.predict(request, previous)
+        inputs = prediction.inputs
+        clock.charge(0)
+        for count in range(1, self.iterations + 1):
+            stacked = self._stack(prediction, request)
+            slope = stacked.P @ inputs.ravel() + stacked.q
+            if taken is not None:  # how the Lagrangian's slope changed over the last step, at its multipliers
+                step, multipliers, before = taken
+                corrections.append((step, slope + stacked.G.T @ multipliers - before))
+                P = stacked.P
+                for pair in corrections:
+                    P = _damped_update(P, *pair)
+                stacked = stacked._replace(P=P, q=slope - P @ inputs.ravel(), prepared=None)
+            clock.charge(1)
+            solution = self._solve(stacked, warm)
+            clock.charge(2)
+            if not solution.status.solved:
+                status = solution.status
+                break
+            warm, proposed = solution, solution.x.reshape(inputs.shape)
+            size = max(1.0, float(np.abs(proposed).max()))
+            if np.abs(proposed - inputs).max() <= self.tolerance * size:
+                status = Status.SOLVED
+                break
+            if count == self.iterations:
+                break
+            row_multipliers = np.abs(solution.z[self._condenser.rate_rows :])
+            price = max(price, 2.0 * float(row_multipliers.max(initial=0.0)))
+            found = self._search(request, prediction, inputs, proposed, slope, price)
+            clock.charge(0)
+            if found is None:
+                status = Status.NUMERICAL_TROUBLE
+                break
+            taken = (found[0] - inputs).ravel(), solution.z, slope + stacked.G.T @ solution.z
+            inputs, prediction = found
+        return self._decide(request, prediction, stacked, solution, status, count, Timing(*spent))
+
+    def _search(
+        self, request: Request, prediction: Prediction, inputs: Array, proposed: Array, slope: Array, price: float
+    ) -> tuple[Array, Prediction] | None:
+        """The next plan between ``inputs`` and ``proposed``, with the stage models along it; None if none is better.
+
+        The stage models are exact along the plan that they were made at: there their cost and violations are the true
+        ones.
+        """
+        limits = self._chance.limits(prediction)  # tightening of zero_order stays during the search
+        violated = self._violation_price(prediction, inputs, limits, price)
+        here = self._cost(request, prediction, inputs) + violated
+        promised = float(slope @ (proposed - inputs).ravel())
+        promised += self._violation_price(prediction, proposed, limits, price) - violated
+        whole = not self._keeps_input_bounds(inputs, request.last)  # a first guess outside is left in one step
+        step = 1.0
+        while step >= SHORTEST_STEP:
+            trial = proposed if step == 1.0 else inputs + step * (proposed - inputs)
+            try:
+                moved = self.predictor.along(request, trial)
+                merit = self._cost(request, moved, trial) + self._violation_price(moved, trial, limits, price)
+            except DataError:  # the rollout left the finite numbers
+                if whole:
+                    return None
+                merit = np.inf
+            if whole or merit <= here + SUFFICIENT_DECREASE * step * promised + ROUND_OFF * abs(here):
+                return trial, moved
+            step /= 2
+        return None
+
+    def _cost(self, request: Request, prediction: Prediction, inputs: Array) -> float:
+        states = prediction.states(inputs)
+        return self._condenser.cost(states, inputs, request.targets, request.wanted, request.last)
+
+    def _violation_price(
+        self, prediction: Prediction, inputs: Array, limits: tuple[Array, Array], price: float
+    ) -> float:
+        if not self._chance.per_stage:
+            return 0.0
+        values = (self._chance.rows(prediction) @ prediction.states(inputs)[1:, :, None])[..., 0]
+        lower, upper = limits
+        return self._chance.price(np.maximum(0.0, np.maximum(values - upper, lower - values)), price)
+
+    def _keeps_input_bounds(self, inputs: Array, last: Array) -> bool:
+        problem, rates = self.problem, np.diff(inputs, axis=0, prepend=last[None])
+        return bool(
+            ((inputs >= problem.input_lower) & (inputs <= problem.input_upper)).all()
+            and ((rates >= problem.rate_lower - 1e-9) & (rates <= problem.rate_upper + 1e-9)).all()
+        )
+
+
+def read_request(
+    predictor: Predictor, initial_input: Array, belief: Gaussian, reference: Reference, previous: Decision | None
+) -> Request:
+    """The checked question of a step; a previous decision that was not solved counts as none.
+
+    Raises:
+        ShapeError: Belief or reference have other dimensions, or reference inputs are missing.
+    """
+    problem, H = predictor.problem, predictor.horizon
+    if reference.inputs is None and (predictor.form == "deviation" or problem.penalized == "deviations"):
+        what = "form 'deviation'" if predictor.form == "deviation" else "penalized 'deviations'"
+        raise ShapeError(f"{what} needs reference inputs ({H}, {problem.input_dim}); got none")
+    previous = previous if previous is not None and previous.status.solved else None
+    request = Request.read(problem, H, initial_input, belief, reference, previous)
+    return replace(request, shifted=np.clip(request.shifted, problem.input_lower, problem.input_upper))
+
+
+def _damped_update(P: Array, step: Array, change: Array) -> Array:
+    """BFGS with Powell's damping, which keeps P positive definite (Nocedal and Wright, 2006, procedure 18.2)."""
+    moved = P @ step
+    curvature, found = step @ moved, step @ change
+    if found < 0.2 * curvature:
+        share = 0.8 * curvature / (curvature - found)
+        change, found = share * change + (1 - share) * moved, 0.2 * curvature
+    return P - np.outer(moved, moved) / curvature + np.outer(change, change) / found
+
+
+class _Clock:
+    """Charges the time since it was last asked to one of several accounts."""
+
+    def __init__(self, accounts: Array):
+        self._accounts, self._last = accounts, perf_counter()
+
+    def charge(self, account: int) -> None:
+        now = perf_counter()
+        self._accounts[account] += now - self._last
+        self._last = now
