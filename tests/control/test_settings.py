@@ -11,13 +11,23 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.plants import Integrated, Translational
 
-FOLDER = Path(__file__).resolve().parents[2] / "conf" / "controller"
+FOLDER = Path(__file__).resolve().parents[2] / "conf"
 
 
-@pytest.mark.parametrize(("name", "subject"), [("nmpc", "plant"), ("nonlinear", "model"), ("lqr", "model")])
+@pytest.mark.parametrize(
+    ("name", "subject"),
+    [
+        ("nmpc", "plant"),
+        ("nonlinear", "model"),
+        ("lqr", "model"),
+        ("convex", "model"),
+        ("paper", "model"),
+        ("state_form", "model"),
+    ],
+)
 def test_the_settings_of_a_controller_build_one_that_decides(name, subject):
+    from hydra import compose, initialize_config_dir
     from hydra.utils import instantiate
-    from omegaconf import OmegaConf
 
     generator = torch.Generator().manual_seed(0)
     features = torch.randn(15, 9, generator=generator)
@@ -25,8 +35,8 @@ def test_the_settings_of_a_controller_build_one_that_decides(name, subject):
         features, 0.1 * features[:, :6], 3 * torch.ones(6, 9), torch.ones(6), 1e-2 * torch.ones(6), 3, "difference"
     )
     parts = {"plant": Integrated(Translational(), time_step=0.5), "model": posterior}
-    settings = OmegaConf.load(FOLDER / f"{name}.yaml")
-    settings.horizon = 2
+    with initialize_config_dir(str(FOLDER), version_base=None):
+        settings = compose(overrides=[f"+controller={name}", "controller.horizon=2"]).controller
     controller = instantiate(settings, _convert_="all")(parts[subject])
     decision = controller.control(Gaussian.certain(np.zeros(6)), Reference(np.full((3, 6), 0.1)))
     assert decision.status.solved
