@@ -31,6 +31,7 @@ from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation import Propagator, differentiate, linearize
 from gpmpc.propagation.local_model import extended_state
 
@@ -235,10 +236,14 @@ class Predictor:
         return A, B, c, moved.belief, _array(moved.cross_covariance)
 
     def _none(self, belief: Gaussian, input: torch.Tensor) -> tuple[Array, Array, Array, Gaussian, None]:
-        moved, A, B = self.model.predict_with_jacobian(belief.mean, input)
+        if isinstance(self.model, GPPosterior):
+            mean, A, B = self.model.mean_with_jacobian(belief.mean, input)
+        else:
+            moved, A, B = self.model.predict_with_jacobian(belief.mean, input)
+            mean = moved.mean
         A, B = _array(A), _array(B)
-        c = _array(moved.mean) - A @ _array(belief.mean) - B @ _array(input)
-        return A, B, c, Gaussian(moved.mean, torch.zeros_like(moved.covariance)), None
+        c = _array(mean) - A @ _array(belief.mean) - B @ _array(input)
+        return A, B, c, Gaussian(mean, torch.zeros_like(belief.covariance)), None
 
     def _gain(self, A: Array, B: Array) -> Array:
         problem = self.problem

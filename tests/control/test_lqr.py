@@ -79,9 +79,9 @@ def test_inputs_are_clipped_to_the_box_and_the_rates():
     assert np.allclose(decision.means[1], A @ [-3.0, 0.0] + B @ decision.input)
 
 
-def test_an_input_without_weight_or_effect_stays_at_rest():
+def test_an_input_without_effect_stays_at_rest():
     model = LinearGaussian(A.tolist(), [[0.125, 0.0], [0.5, 0.0]])
-    controller = LQR(model, TrackingProblem(Q, [0.0, 0.0]), 3, [0.0, 0.0])
+    controller = LQR(model, TrackingProblem(Q, [1e-3, 1e-3]), 3, [0.0, 0.0])
     decision = controller.control(Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros((4, 2))))
     assert np.allclose(decision.inputs[:, 1], 0)
 
