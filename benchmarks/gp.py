@@ -133,6 +133,13 @@ def contenders(size: int, torch_jacobian: bool) -> list[dict[str, Callable]]:
         with exact_inference(), gpytorch.settings.skip_posterior_variances():  # the mean alone, from its cache
             return torch.autograd.functional.jacobian(lambda x: model(x[None]).mean[:, 0], query).split(STATES, dim=1)
 
+    trained = BatchExactGP(gp.features, gp.targets)  # as it comes from training
+    trained.load_state_dict(model.state_dict())
+    trained.eval()
+
+    def by_gpytorch_as_usual():
+        return torch.autograd.functional.jacobian(lambda x: trained(x[None]).mean[:, 0], query).split(STATES, dim=1)
+
     def gradient_by_torch():
         mean = torch.func.jacrev(lambda x: gp.predict(x[:STATES], x[STATES:]).mean)
         return mean(query).split(STATES, dim=1)
@@ -146,7 +153,8 @@ def contenders(size: int, torch_jacobian: bool) -> list[dict[str, Callable]]:
         {
             "mean with Jacobian": lambda: fused.mean_with_jacobian(gps, mu, u)[1:],
             "mean with Jacobian, torch jacrev": gradient_by_torch,
-            "mean with Jacobian, GPyTorch": by_gpytorch,
+            "mean with Jacobian, GPyTorch, frozen": by_gpytorch,
+            "mean with Jacobian, GPyTorch": by_gpytorch_as_usual,
         },
     ]
     at_all = (at.mean, at.covariance, control)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from gpmpc.exceptions import ShapeError
 from gpmpc.fused.moments import CROSS, JACOBIAN, VALUE, moments_along
 from gpmpc.fused.packed import Array, Packed, pack
-from gpmpc.fused.point import HESSIAN, means_along, points_along
+from gpmpc.fused.point import HESSIAN, means_along, means_memory, points_along
 
 __all__ = [
     "Expansion",
@@ -106,11 +106,18 @@ def mean_with_jacobian(packed: Packed, x: ArrayLike, u: ArrayLike) -> tuple[Arra
     Raises:
         ShapeError: x or u do not fit the model.
     """
-    x, u, single = _points(packed, x, u)
-    H, k = len(x), packed.output_dim
-    M, J, dM_du = np.empty((H, k)), np.empty((H, k, packed.state_dim)), np.empty((H, k, packed.input_dim))
-    means_along(packed.points, packed.inverse_squares, packed.log_signal, packed.weights, x, u, M, J, dM_du)
-    return (M[0], J[0], dM_du[0]) if single else (M, J, dM_du)
+    n, m = packed.state_dim, packed.input_dim
+    if type(x) is np.ndarray and type(u) is np.ndarray and x.shape == (n,) and u.shape == (m,):
+        queries, single = np.concatenate((x, u), dtype=np.float64)[None], True  # the usual case, quickly
+    else:
+        x, u, single = _points(packed, x, u)
+        queries = np.concatenate((x, u), axis=1)
+    points, out = packed.points, np.empty((len(queries), packed.output_dim, 1 + n + m))
+    memory = np.empty(means_memory(*points.shape))
+    means_along(points, packed.inverse_squares, packed.log_signal, packed.weights, queries, n, memory, out)
+    if single:
+        return out[0, :, 0], out[0, :, 1 : 1 + n], out[0, :, 1 + n :]
+    return out[..., 0], out[..., 1 : 1 + n], out[..., 1 + n :]
 
 
 def point_with_jacobian(packed: Packed, x: ArrayLike, u: ArrayLike, hessian: bool = False) -> Expansion:

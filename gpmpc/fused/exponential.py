@@ -12,7 +12,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import borrowing
 
 EXACT = frozenset({"contract", "nsz"})  # "reassoc" would cancel the constant that rounds
 
@@ -71,7 +71,7 @@ def float_of(typing_context, bits):
     return types.float64(types.int64), generate
 
 
-@compiled(fastmath=EXACT)
+@borrowing(fastmath=EXACT)
 def reduced_expm1(r):
     """expm1(r) for |r| <= ln(2)/2."""
     g = G9 * r + G8
@@ -86,7 +86,7 @@ def reduced_expm1(r):
     return g * (r * r) + r
 
 
-@compiled(fastmath=EXACT)
+@borrowing(fastmath=EXACT)
 def capped_expm1(x):
     """exp(x) - 1 for x <= 300 and exp(300) above; the low part of ln 2 is left out, worth a third of x's last digit."""
     x = SATURATED if x < SATURATED else x  # written so that NaN stays NaN
@@ -97,7 +97,7 @@ def capped_expm1(x):
     return reduced_expm1(x - k * LN2_HIGH) * scale + (scale - 1.0)
 
 
-@compiled(fastmath=EXACT)
+@borrowing(fastmath=EXACT)
 def exp(x):
     """The exponential of any x; 2^k is applied in two halves, so that results reach down to the subnormal numbers."""
     x = -750.0 if x < -750.0 else x
@@ -110,7 +110,7 @@ def exp(x):
     return (reduced_expm1(r) + 1.0) * float_of((half + 1023) << 52) * float_of((power - half + 1023) << 52)
 
 
-@compiled
+@borrowing
 def exp_all(x):
     """Replaces x by exp(x)."""
     widest()

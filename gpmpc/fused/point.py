@@ -13,14 +13,14 @@ The moments are summed over x~_i - x~, which all outputs share, and scaled by D_
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import borrowing, compiled
 from gpmpc.fused.exponential import exp_all
-from gpmpc.fused.point_rows import aligned_rows, combine, explain, multiply, project
+from gpmpc.fused.point_rows import LINE, aligned_rows, combine, explain, multiply, project
 
 JACOBIAN, HESSIAN = 1, 2  # how much is wanted: up to second derivatives of M, up to third
 
 
-@compiled
+@borrowing
 def offsets(points, x, u, difference):
     """Writes x~_i - x~ as rows."""
     states = (len(x) + 2) // 3 * 3
@@ -35,34 +35,42 @@ def offsets(points, x, u, difference):
             row[j] = source[j] - at
 
 
-@compiled
-def means_along(points, inverse_squares, log_signal, beta, x, u, M, dM_dx, dM_du):
-    """M and its gradient at H points: x (H, n), u (H, m), M (H, k), dM_dx (H, k, n), dM_du (H, k, m)."""
-    (rows, padded), n, m = points.shape, x.shape[1], u.shape[1]
-    memory = aligned_rows(2 * rows + 1, padded)
-    difference, squares, k = memory[:rows], memory[rows : 2 * rows], memory[2 * rows]
-    sums = np.empty(rows)
-    for h in range(len(x)):
-        offsets(points, x[h], u[h], difference)
+def means_memory(rows, padded):
+    """Numbers that ``means_along`` works in, for ``points`` of this shape."""
+    return (2 * rows + 1) * padded + rows + LINE
+
+
+@borrowing
+def means_along(points, inverse_squares, log_signal, beta, queries, n, memory, out):
+    """M and its gradient at H points x~ = (x, u), queries (H, n + m), into out (H, k, 1 + n + m).
+
+    What it works in is lent by the caller, ``means_memory`` numbers: counting references costs a third of a call.
+    """
+    rows, padded = points.shape
+    skipped = (n + 2) // 3 * 3 - n  # padded rows between the states' and the controls'
+    skip = (-(memory.ctypes.data >> 3)) % LINE  # rows start on cache lines
+    table = memory[skip : skip + (2 * rows + 1) * padded].reshape(2 * rows + 1, padded)
+    difference, squares, k, sums = table[:rows], table[rows : 2 * rows], table[2 * rows], memory[-rows:]
+    for h in range(len(queries)):
+        offsets(points, queries[h, :n], queries[h, n:], difference)
         for c in range(rows):
             multiply(difference[c], difference[c], squares[c])
         for a in range(len(beta)):
-            D = inverse_squares[a]
+            D, answer = inverse_squares[a], out[h, a]
             for c in range(rows):
                 sums[c] = D[c] / -2
             k[:] = log_signal[a]
             combine(k, sums, squares)
             exp_all(k)
             multiply(k, beta[a], k)
-            M[h, a] = k.sum()
+            answer[0] = k.sum()
             project(k, difference, sums)
-            for c in range(n):
-                dM_dx[h, a, c] = D[c] * sums[c]
-            for c in range(m):
-                dM_du[h, a, c] = D[rows - padded_inputs(m) + c] * sums[rows - padded_inputs(m) + c]
+            for c in range(len(answer) - 1):
+                row = c if c < n else c + skipped
+                answer[1 + c] = D[row] * sums[row]
 
 
-@compiled
+@borrowing
 def padded_inputs(m):
     """Rows of the controls."""
     return (m + 2) // 3 * 3

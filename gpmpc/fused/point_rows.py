@@ -6,7 +6,7 @@ memory does three multiplications. Lengths are multiples of 8, numbers of rows m
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import borrowing, compiled
 from gpmpc.fused.exponential import EXACT, widest
 
 LINE = 8  # doubles in a cache line
@@ -26,7 +26,7 @@ def aligned_rows(rows, length):
     return aligned(rows * length).reshape(rows, length)
 
 
-@compiled(fastmath=EXACT)
+@borrowing(fastmath=EXACT)
 def combine(out, factors, rows):
     """Adds sum_d factors[d] rows[d] to ``out``."""
     widest()
@@ -37,7 +37,7 @@ def combine(out, factors, rows):
             out[j] = out[j] + factor0 * row0[j] + factor1 * row1[j] + factor2 * row2[j]
 
 
-@compiled
+@borrowing
 def project(row, rows, out):
     """Writes row . rows[d] to out[d]."""
     widest()
@@ -51,7 +51,7 @@ def project(row, rows, out):
         out[d], out[d + 1], out[d + 2] = sum0, sum1, sum2
 
 
-@compiled
+@borrowing
 def multiply(row, other, out):
     """Writes the elementwise product to ``out``."""
     widest()
@@ -59,7 +59,7 @@ def multiply(row, other, out):
         out[j] = row[j] * other[j]
 
 
-@compiled(fastmath=EXACT)
+@borrowing(fastmath=EXACT)
 def transform(matrix, rows, out, n):
     """Writes matrix @ rows, of n rows, to the first rows of ``out``."""
     widest()
@@ -72,7 +72,7 @@ def transform(matrix, rows, out, n):
         combine(target, factors[3:], rows[3:])
 
 
-@compiled
+@borrowing
 def second_moments(weights, rows, out, n, scratch):
     """Writes sum_i weights[i] rows[c, i] rows[d, i] to the symmetric out[c, d], c and d < n."""
     for c in range(n):
@@ -83,7 +83,7 @@ def second_moments(weights, rows, out, n, scratch):
             out[d, c] = out[c, d]
 
 
-@compiled(fastmath=EXACT)
+@borrowing(fastmath=EXACT)
 def add_products(out, factors, rows, others, n):
     """Adds sum_d factors[d] rows[d] others[d] over n rows to ``out``."""
     widest()
@@ -93,7 +93,7 @@ def add_products(out, factors, rows, others, n):
             out[j] = out[j] + (factor * row[j]) * other[j]
 
 
-@compiled
+@borrowing
 def explain(triangle, q, solved):
     """Returns |L^-1 q|^2 and writes (K + sn2 I)^-1 q to ``solved``, in one pass over the block triangle of L^-1."""
     widest()

@@ -77,12 +77,15 @@ def compiled_point(model: Any, function: str, state: Tensor, input: Tensor) -> l
     from gpmpc import fused  # loads numba
 
     check_query(model, state, input)
-    batch = state.shape[:-1]
-    flat = [v.reshape(batch.numel(), v.shape[-1]).numpy() for v in (state, input)]
-    found = getattr(fused, function)(model.packed, *flat)
-    parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found[: min(len(found), 4)]]
-    parts[0] += model.offset
+    x, u, batch = state.numpy(), input.numpy(), state.shape[:-1]
+    if len(batch) > 1:
+        x, u = x.reshape(batch.numel(), x.shape[-1]), u.reshape(batch.numel(), u.shape[-1])
+    found = getattr(fused, function)(model.packed, x, u)
+    mean, *others = found[:3] if len(found) == 3 else found[:4]
+    mean += model.offset.numpy()
     if model.predicts == "difference":
-        parts[0] += state
-        parts[-2].diagonal(dim1=-2, dim2=-1).add_(1.0)
-    return parts
+        mean += x
+        diagonal = range(x.shape[-1])
+        others[-2][..., diagonal, diagonal] += 1.0
+    parts = [torch.from_numpy(part) for part in (mean, *others)]
+    return [part.unflatten(0, batch) for part in parts] if len(batch) > 1 else parts
