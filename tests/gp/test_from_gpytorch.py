@@ -119,7 +119,7 @@ def assert_equal(model, frozen):
     assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-10)
     assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-10)
     jacobian = torch.cat([by_state, by_input], dim=-1)
-    assert torch.allclose(jacobian, their_jacobian(model, query), rtol=0, atol=1e-9)
+    assert torch.allclose(jacobian, their_jacobian(model, query), rtol=0, atol=1e-10)
 
 
 ANY_KERNEL = {
