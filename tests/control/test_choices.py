@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from systems import HOVER, QUADROTOR, quadrotor_gp
 
 from gpmpc.control.controller import Reference
 from gpmpc.gaussian import Gaussian
 from gpmpc.status import Status
+from tests.control.systems import HOVER, QUADROTOR, quadrotor_gp
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 

@@ -5,7 +5,6 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
-from systems import HOVER, QUADROTOR, LinearPlant, linear_gaussian, quadrotor_gp
 
 from gpmpc.control.controller import Reference
 from gpmpc.control.convex_mpc import ConvexMPC
@@ -18,6 +17,7 @@ from gpmpc.plants import step
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, rollout
 from gpmpc.qp import CvxpySolver, DualActiveSet
 from gpmpc.status import Status
+from tests.control.systems import HOVER, QUADROTOR, LinearPlant, linear_gaussian, quadrotor_gp
 
 PAIRS = list(product(FORMS, COVARIANCES))
 gp = lru_cache(quadrotor_gp)

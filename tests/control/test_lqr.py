@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from small_models import LinearGaussian, double_integrator, pendulum_posterior
 
 from gpmpc.control.controller import Reference
 from gpmpc.control.lqr import LQR, lqr_gain
@@ -12,6 +11,7 @@ from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import MeanEquivalence
 from gpmpc.status import Status
+from tests.control.small_models import LinearGaussian, double_integrator, pendulum_posterior
 
 A, B = np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([[0.125], [0.5]])
 Q, R = np.array([[3.0, 0.4], [0.4, 0.5]]), np.array([[0.2]])

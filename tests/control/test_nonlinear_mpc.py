@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from small_models import double_integrator, pendulum_posterior
 
 from gpmpc.control.controller import Reference
 from gpmpc.control.descent import Program
@@ -18,6 +17,7 @@ from gpmpc.plants import Integrated
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, rollout
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
+from tests.control.small_models import double_integrator, pendulum_posterior
 
 PROPAGATORS = {
     "mean equivalence": MeanEquivalence(),

@@ -4,7 +4,6 @@ from itertools import product
 
 import numpy as np
 import pytest
-from systems import HOVER, QUADROTOR, quadrotor_gp
 
 from gpmpc.control.controller import Reference
 from gpmpc.control.convex_mpc import ConvexMPC
@@ -17,6 +16,7 @@ from gpmpc.plants import step
 from gpmpc.propagation import Linearization, MeanEquivalence
 from gpmpc.qp import CvxpySolver
 from gpmpc.status import Status
+from tests.control.systems import HOVER, QUADROTOR, quadrotor_gp
 
 H = 3
 PENALIZED = {"increment": "increments", "deviation": "deviations", "trajectory": "inputs"}

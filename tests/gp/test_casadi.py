@@ -4,11 +4,11 @@ import casadi
 import numpy as np
 import pytest
 import torch
-from small_models import posterior, residual_model
 
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gp import GPPosterior, ResidualModel
 from gpmpc.gp.casadi_ import casadi_function
+from tests.gp.small_models import posterior, residual_model
 
 CASES = {
     "next_state": lambda: posterior(),

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from small_models import posterior
 
 from gpmpc.gp.module import PosteriorModule
+from tests.gp.small_models import posterior
 
 
 @pytest.mark.parametrize("predicts", ["next_state", "difference", "value"])

@@ -10,10 +10,10 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
-from small_models import posterior, residual_model
 
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
 from gpmpc.gp import GPPosterior, ResidualModel, Trainer, Transitions
+from tests.gp.small_models import posterior, residual_model
 
 
 def trained():

@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from test_propagators import ALL, DETERMINISTIC, belief, gp, linear
 
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.propagation import MomentMatching, linearize, linearize_along, rollout
 from gpmpc.propagation.local_model import extended_state
+from tests.propagation.test_propagators import ALL, DETERMINISTIC, belief, gp, linear
 
 MODELS = {
     "next_state": lambda: gp(),

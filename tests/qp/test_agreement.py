@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from problems import distance, feasible_problem, integer_problem, worst_residual
 
 from gpmpc.qp import CvxpySolver, DualActiveSet, PrimalActiveSet, QuadraticProgram
 from gpmpc.status import Status
+from tests.qp.problems import distance, feasible_problem, integer_problem, worst_residual
 
 DAQP_SOLVED, DAQP_INFEASIBLE = (1, 2), (-1, -6)  # -6: infeasible by its presolve of equal or crossed bounds
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from problems import feasible_problem, gram, lazy, primal, stacked_rows, worst_residual
 from scipy.linalg import hilbert
 
 from gpmpc.qp import QuadraticProgram
 from gpmpc.status import Status
+from tests.qp.problems import feasible_problem, gram, lazy, primal, stacked_rows, worst_residual
 
 ALL = pytest.mark.parametrize("solve", [gram, lazy, primal])
 DUAL = pytest.mark.parametrize("solve", [gram, lazy])

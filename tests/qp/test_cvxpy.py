@@ -3,11 +3,11 @@ import sys
 
 import numpy as np
 import pytest
-from problems import distance, feasible_problem
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import CvxpySolver, DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
+from tests.qp.problems import distance, feasible_problem
 
 
 def test_an_unknown_solver_is_refused_with_the_list_of_those_installed():

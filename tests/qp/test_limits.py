@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from problems import feasible_problem, integer_problem
 
 from gpmpc.qp import DualActiveSet, PrimalActiveSet
 from gpmpc.status import Status
+from tests.qp.problems import feasible_problem, integer_problem
 
 PACKAGE = Path(__file__).resolve().parents[2] / "gpmpc"
 

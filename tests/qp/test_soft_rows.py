@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from problems import feasible_problem, worst_residual
 
 from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram, SoftRows
 from gpmpc.status import Status
+from tests.qp.problems import feasible_problem, worst_residual
 
 
 def gram(problem, soft, warm_start=None):

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from problems import feasible_problem, worst_residual
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import DualActiveSet, QuadraticProgram, make_solution
 from gpmpc.status import Status
+from tests.qp.problems import feasible_problem, worst_residual
 
 
 @pytest.fixture

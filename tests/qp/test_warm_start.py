@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from problems import feasible_problem, gram, integer_problem, lazy, primal, worst_residual
 
 from gpmpc.qp import DualActiveSet, QPSolution
 from gpmpc.qp import record as layout
 from gpmpc.status import Status
+from tests.qp.problems import feasible_problem, gram, integer_problem, lazy, primal, worst_residual
 
 ALL = pytest.mark.parametrize("solve", [gram, lazy, primal])
 DUAL = pytest.mark.parametrize("solve", [gram, lazy])

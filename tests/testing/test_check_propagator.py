@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_check_model import Honest, posterior, residual
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Propagation, Unscented
 from gpmpc.testing import check_propagator
+from tests.testing.test_check_model import Honest, posterior, residual
 
 OWN = {
     "mean equivalence": (MeanEquivalence, {}, {"linear": False}),
