@@ -31,8 +31,9 @@ from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.gp.evaluation import host_arrays, point_arrays
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.propagation import Propagator, differentiate, linearize
+from gpmpc.propagation import Linearization, Propagator, differentiate, linearize
 from gpmpc.propagation.local_model import extended_state
 
 Array = np.ndarray
@@ -106,6 +107,9 @@ class Predictor:
         self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
         self.form, self.covariance, self.feedback = form, covariance, feedback
         self._linearise = getattr(self, f"_{covariance}")
+        self._first_order = (
+            isinstance(model, GPPosterior) and type(propagator) is Linearization and not propagator.hessian
+        )
 
     def extended(self, weight: Array) -> Array:
         """The weight of s that belongs to a weight of x (n, n): the blocks on its diagonal (p / n, n, n)."""
@@ -165,12 +169,11 @@ class Predictor:
             if follow is not None and k:
                 moved = input + gain @ (_array(belief.mean) - follow[k])
                 input[:] = np.clip(moved, self.problem.input_lower, self.problem.input_upper)
-            A, B, c, belief, cross = self._linearise(belief, self._tensor(input))
-            if self.feedback and gain is None and (follow is not None or cross is not None):
+            A, B, c, belief, V = self._linearise(belief, self._tensor(input))
+            if self.feedback and gain is None and (follow is not None or V is not None):
                 gain = self._gain(np.ascontiguousarray(A[:n, :n]), np.ascontiguousarray(B[:n]))
-            if self.feedback and cross is not None:
-                V, closed = own_spread(A, cross, _array(belief.covariance)), A + B @ gain
-                belief = Gaussian(belief.mean, self._tensor(spread(closed, V, covariances[-1], 1)[1]))
+            if self.feedback and V is not None:
+                belief = Gaussian(belief.mean, self._tensor(spread(A + B @ gain, V, covariances[-1], 1)[1]))
             covariances.append(_array(belief.covariance))
             stages.append((A, B, c))
         A, B, c = (np.array(part) for part in zip(*stages, strict=True))
@@ -179,13 +182,12 @@ class Predictor:
     def held(self, request: Request, input: Array) -> Prediction:
         """The local model about the belief and an input (m,), for all stages."""
         belief, H = self._belief(request.state, request.covariance), self.horizon
-        A, B, c, after, cross = self._linearise(belief, self._tensor(input))
+        A, B, c, after, V = self._linearise(belief, self._tensor(input))
         now, after = _array(belief.covariance), _array(after.covariance)
-        if cross is None:
+        if V is None:
             covariances = np.concatenate([now[None], np.tile(after, (H, 1, 1))])
         else:
-            closed = A + B @ self._gain(A, B) if self.feedback else A
-            covariances = spread(closed, own_spread(A, cross, after), now, H)
+            covariances = spread(A + B @ self._gain(A, B) if self.feedback else A, V, now, H)
         start = self.state(request.state, now)
         return Prediction(A[None], B[None], c[None], start, covariances, np.tile(input, (H, 1)))
 
@@ -200,7 +202,8 @@ class Predictor:
             return previous.means[1:]
         return np.concatenate([request.state[None], request.targets[:-1]])
 
-    # One stage, by covariance mode: A, B, c, the next belief, and Cov[x, x+] where feedback can act on it.
+    # One stage, by covariance mode: A, B, c, the next belief, and, where feedback can act on it, what the covariance
+    # gains in the stage, V = Sigma+ - A Sigma A'.
 
     def _full(self, belief: Gaussian, input: torch.Tensor) -> tuple[Array, Array, Array, Gaussian, None]:
         local = linearize(self.propagator, self.model, belief, input)
@@ -230,20 +233,35 @@ class Predictor:
         return A, B, c, Gaussian(moved.belief.mean, torch.diag_embed(moved.belief.variance)), None
 
     def _zero_order(self, belief: Gaussian, input: torch.Tensor) -> tuple[Array, Array, Array, Gaussian, Array]:
+        x, u, S = _array(belief.mean), _array(input), _array(belief.covariance)
+        if self._first_order and host_arrays(self.model.features) is not None:
+            mean, variance, A, B = point_arrays(self.model, "point_with_jacobian", x, u)
+            V = np.diag(variance)
+            if self.propagator.observation_noise:
+                V += _array(self.model.noise_covariance)
+            after = Gaussian(torch.from_numpy(mean), torch.from_numpy(A @ S @ A.T + V))
+            return A, np.ascontiguousarray(B), mean - A @ x - B @ u, after, V
         moved, d = differentiate(self.propagator, self.model, belief, input)
         A, B = _array(d.mean_by_mean), _array(d.mean_by_input)
-        c = _array(moved.belief.mean) - A @ _array(belief.mean) - B @ _array(input)
-        return A, B, c, moved.belief, _array(moved.cross_covariance)
+        c = _array(moved.belief.mean) - A @ x - B @ u
+        V = own_spread(A, _array(moved.cross_covariance), _array(moved.belief.covariance))
+        return A, B, c, moved.belief, V
 
     def _none(self, belief: Gaussian, input: torch.Tensor) -> tuple[Array, Array, Array, Gaussian, None]:
-        if isinstance(self.model, GPPosterior):
-            mean, A, B = self.model.mean_with_jacobian(belief.mean, input)
+        x, u = _array(belief.mean), _array(input)
+        if isinstance(self.model, GPPosterior) and host_arrays(self.model.features) is not None:
+            mean, A, B = point_arrays(self.model, "mean_with_jacobian", x, u)
         else:
             moved, A, B = self.model.predict_with_jacobian(belief.mean, input)
-            mean = moved.mean
-        A, B = _array(A), _array(B)
-        c = _array(mean) - A @ _array(belief.mean) - B @ _array(input)
-        return A, B, c, Gaussian(mean, torch.zeros_like(belief.covariance)), None
+            mean, A, B = _array(moved.mean), _array(A), _array(B)
+        c = mean - A @ x - B @ u
+        return (
+            np.ascontiguousarray(A),
+            np.ascontiguousarray(B),
+            c,
+            Gaussian(self._tensor(mean), belief.covariance),
+            None,
+        )
 
     def _gain(self, A: Array, B: Array) -> Array:
         problem = self.problem

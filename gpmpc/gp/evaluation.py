@@ -66,20 +66,26 @@ def host_arrays(*tensors: Tensor) -> list[np.ndarray] | None:
 
 
 def compiled_point(model: Any, function: str, state: Tensor, input: Tensor) -> list[Tensor]:
-    """Mean, (variance,) and the mean's derivatives by state and input of a ``GPPosterior``.
-
-    Args:
-        model: The posterior.
-        function: Of ``gpmpc.fused``: ``"mean_with_jacobian"`` or ``"point_with_jacobian"``.
-        state: (*batch, n).
-        input: (*batch, m).
-    """
-    from gpmpc import fused  # loads numba
-
+    """``point_arrays`` of tensors: state (*batch, n), input (*batch, m)."""
     check_query(model, state, input)
     x, u, batch = state.numpy(), input.numpy(), state.shape[:-1]
     if len(batch) > 1:
         x, u = x.reshape(batch.numel(), x.shape[-1]), u.reshape(batch.numel(), u.shape[-1])
+    parts = [torch.from_numpy(part) for part in point_arrays(model, function, x, u)]
+    return [part.unflatten(0, batch) for part in parts] if len(batch) > 1 else parts
+
+
+def point_arrays(model: Any, function: str, x: np.ndarray, u: np.ndarray) -> list[np.ndarray]:
+    """Mean, (variance,) and the mean's derivatives by state and input of a ``GPPosterior``, in NumPy.
+
+    Args:
+        model: The posterior; float64, in host memory.
+        function: Of ``gpmpc.fused``: ``"mean_with_jacobian"`` or ``"point_with_jacobian"``.
+        x: State (n,) or (H, n).
+        u: Input (m,) or (H, m).
+    """
+    from gpmpc import fused  # loads numba
+
     found = getattr(fused, function)(model.packed, x, u)
     mean, *others = found[:3] if len(found) == 3 else found[:4]
     mean += model.offset.numpy()
@@ -87,5 +93,4 @@ def compiled_point(model: Any, function: str, state: Tensor, input: Tensor) -> l
         mean += x
         diagonal = range(x.shape[-1])
         others[-2][..., diagonal, diagonal] += 1.0
-    parts = [torch.from_numpy(part) for part in (mean, *others)]
-    return [part.unflatten(0, batch) for part in parts] if len(batch) > 1 else parts
+    return [mean, *others]
