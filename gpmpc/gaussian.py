@@ -9,7 +9,7 @@ from torch import Tensor
 from gpmpc.exceptions import ShapeError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Gaussian:
     """N(mean, covariance), batched over leading dimensions.
 
@@ -25,7 +25,7 @@ class Gaussian:
     covariance: Tensor
 
     def __post_init__(self) -> None:
-        expected = (*self.mean.shape, self.mean.shape[-1]) if self.mean.dim() else ()
+        expected = (*self.mean.shape, self.mean.shape[-1]) if self.mean.dim() else None
         if self.covariance.shape != expected:
             raise ShapeError(
                 f"mean (*batch, n) needs a covariance (*batch, n, n); "
@@ -36,6 +36,7 @@ class Gaussian:
     def certain(cls, value: Any) -> "Gaussian":
         """A belief without doubt, such as a measured state (*batch, n), from a tensor, an array or a list."""
         mean = torch.as_tensor(value)
+        mean = mean if mean.is_floating_point() else mean.to(torch.float64)
         return cls(mean, torch.zeros(*mean.shape, mean.shape[-1], dtype=mean.dtype, device=mean.device))
 
     @property

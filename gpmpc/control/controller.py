@@ -88,6 +88,9 @@ class Decision:
     problem: QuadraticProgram | None = None
     solution: QPSolution | None = None
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "input", np.array(self.input, dtype=float))  # no view of the plan
+
 
 class Controller(Protocol):
     """A feedback law with a look-ahead."""

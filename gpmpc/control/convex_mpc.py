@@ -27,7 +27,7 @@ from gpmpc.control.chance_constraints import ChanceConstraints
 from gpmpc.control.condensing import Condenser
 from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.prediction import Covariance, Form, Prediction, Predictor
-from gpmpc.control.request import Request, check_controller
+from gpmpc.control.request import Request, check_controller, check_dynamics
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import DataError, ProblemError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
@@ -104,7 +104,7 @@ class ConvexMPC:
         tolerance: float = 1e-8,
         feedback: bool = True,
     ):
-        self.initial_input = check_controller(problem, model.state_dim, model.input_dim, horizon, initial_input)
+        self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
         check_number("iterations", iterations, least=1, whole=True)
         check_number("tolerance", tolerance, above=0)
         if iterations > 1 and form != "trajectory":
@@ -312,7 +312,7 @@ class ConvexMPC:
 def read_request(
     predictor: Predictor, initial_input: Array, belief: Gaussian, reference: Reference, previous: Decision | None
 ) -> Request:
-    """The checked question of a step; a previous decision that was not solved counts as none.
+    """The checked question of a step.
 
     Raises:
         ShapeError: Belief or reference have other dimensions, or reference inputs are missing.
@@ -321,7 +321,6 @@ def read_request(
     if reference.inputs is None and (predictor.form == "deviation" or problem.penalized == "deviations"):
         what = "form 'deviation'" if predictor.form == "deviation" else "penalized 'deviations'"
         raise ShapeError(f"{what} needs reference inputs ({H}, {problem.input_dim}); got none")
-    previous = previous if previous is not None and previous.status.solved else None
     request = Request.read(problem, H, initial_input, belief, reference, previous)
     return replace(request, shifted=np.clip(request.shifted, problem.input_lower, problem.input_upper))
 

@@ -21,7 +21,7 @@ import torch
 from scipy.linalg import solve_discrete_are
 
 from gpmpc.control.controller import Decision, Reference, Timing
-from gpmpc.control.request import Request, check_controller
+from gpmpc.control.request import Request, check_controller, check_dynamics
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
@@ -51,7 +51,7 @@ class LQR:
     """
 
     def __init__(self, model: DynamicsModel, problem: TrackingProblem, horizon: int, initial_input: Sequence[float]):
-        self.initial_input = check_controller(problem, model.output_dim, model.input_dim, horizon, initial_input)
+        self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
         self.model, self.problem, self.horizon = model, problem, horizon
 
     def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:

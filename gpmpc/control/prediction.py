@@ -234,7 +234,7 @@ class Predictor:
 
     def _zero_order(self, belief: Gaussian, input: torch.Tensor) -> tuple[Array, Array, Array, Gaussian, Array]:
         x, u, S = _array(belief.mean), _array(input), _array(belief.covariance)
-        if self._first_order and host_arrays(self.model.features) is not None:
+        if self._first_order and host_arrays(self.model.weights) is not None:
             mean, variance, A, B = point_arrays(self.model, "point_with_jacobian", x, u)
             V = np.diag(variance)
             if self.propagator.observation_noise:
@@ -249,7 +249,7 @@ class Predictor:
 
     def _none(self, belief: Gaussian, input: torch.Tensor) -> tuple[Array, Array, Array, Gaussian, None]:
         x, u = _array(belief.mean), _array(input)
-        if isinstance(self.model, GPPosterior) and host_arrays(self.model.features) is not None:
+        if isinstance(self.model, GPPosterior) and host_arrays(self.model.weights) is not None:
             mean, A, B = point_arrays(self.model, "mean_with_jacobian", x, u)
         else:
             moved, A, B = self.model.predict_with_jacobian(belief.mean, input)

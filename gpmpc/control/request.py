@@ -12,6 +12,7 @@ from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.status import Status
 
 
@@ -54,7 +55,7 @@ class Request:
             initial_input: Taken as the last input where there is no previous decision (m,).
             belief: Of the state.
             reference: Over the horizon.
-            previous: The last decision.
+            previous: The last decision. Of one that was not solved only ``input`` counts: what was applied.
 
         Raises:
             ShapeError: Belief or reference have other dimensions than the problem and the horizon.
@@ -75,6 +76,8 @@ class Request:
             if not np.isfinite(values).all():
                 raise DataError(f"reference {name} must be finite; got {values[~np.isfinite(values)][0]}")
         last = np.asarray(initial_input if previous is None else previous.input, dtype=float)
+        if not np.isfinite(last).all():
+            last = np.asarray(initial_input, dtype=float)
         shifted = np.tile(last, (horizon, 1))
         if previous is not None and previous.status.solved and np.shape(previous.inputs) == (horizon, m):
             shifted = np.vstack([previous.inputs[1:], previous.inputs[-1:]])
@@ -102,6 +105,19 @@ class Request:
             iterations=iterations,
             timing=timing or Timing(0.0, 0.0, 0.0),
         )
+
+
+def check_dynamics(model: DynamicsModel) -> tuple[int, int]:
+    """The numbers of states and inputs of a model that predicts the next state.
+
+    Raises:
+        SettingError: It predicts something else.
+    """
+    if model.output_dim != model.state_dim:
+        raise SettingError(
+            "model", f"must predict the next state; got {model.state_dim} states and {model.output_dim} outputs"
+        )
+    return model.state_dim, model.input_dim
 
 
 def check_controller(

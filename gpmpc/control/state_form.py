@@ -20,7 +20,7 @@ from gpmpc.control.chance_constraints import ChanceConstraints
 from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.convex_mpc import read_request
 from gpmpc.control.prediction import Covariance, Form, Prediction, Predictor
-from gpmpc.control.request import Request, check_controller
+from gpmpc.control.request import Request, check_controller, check_dynamics
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
@@ -67,7 +67,7 @@ class StateFormMPC:
         solver: str = "CLARABEL",
         options: dict | None = None,
     ):
-        self.initial_input = check_controller(problem, model.state_dim, model.input_dim, horizon, initial_input)
+        self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
         self.problem, self.horizon, self.solver = problem, horizon, solver
         self.options = TIGHT.get(solver, {}) if options is None else options
         self.predictor = Predictor(model, propagator, problem, horizon, form, covariance, feedback)

@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 import torch
 
-from gpmpc.control.controller import Controller, Decision, Reference
+from gpmpc.control.controller import Controller, Decision, Reference, Timing
+from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.status import Status
@@ -28,7 +29,8 @@ class Command:
         input: What is applied (m,).
         status: How the step's own solve ended; ``INVALID_MEASUREMENT`` where the controller was not asked.
         decision: What the controller returned, a failed iterate perhaps; None where it was not asked.
-        plan: The last solved decision, moved on to this step; None before the first.
+        plan: The last solved decision, moved on to this step. Before the first a decision that was not solved, with
+            what was applied as its ``input``; None where nothing was.
     """
 
     input: np.ndarray
@@ -54,7 +56,7 @@ def command(
         last: What came of the step before; None at the first.
         on_failure: ``"previous_plan"`` goes on along the last solved plan, ``"hold"`` keeps the last input applied,
             ``"raise"`` stops. Before the first solved plan, the first two take the reference's own input if there is
-            one, and stop otherwise.
+            one, within the controller's input bounds, and stop otherwise.
         step: Number of the step, for the message.
 
     Raises:
@@ -71,14 +73,21 @@ def command(
             return Command(decision.input, status, decision, decision)
     if on_failure == "raise":
         raise SolverFailure(step, status.advice)
-    if plan is not None:
+    if plan is not None and plan.status.solved:
         plan = _moved_on(plan)
         if on_failure == "hold":
             plan = _with_first_input(plan, last.input)
         return Command(plan.input, status, decision, plan)
     if reference.inputs is None:
         raise SolverFailure(step, f"{status.advice} (no earlier plan and no reference input to fall back on)")
-    return Command(np.array(reference.inputs[0], dtype=float), status, decision, None)
+    input = np.array(reference.inputs[0], dtype=float)
+    problem = getattr(controller, "problem", None)
+    if isinstance(problem, TrackingProblem):
+        input = np.clip(input, problem.input_lower, problem.input_upper)
+    H, n = reference.horizon, reference.states.shape[1]
+    nothing = np.full((H + 1, n), np.nan), np.full((H + 1, n, n), np.nan)
+    applied = Decision(input, np.tile(input, (H, 1)), *nothing, status, 0, Timing(0.0, 0.0, 0.0))
+    return Command(input, status, decision, applied)
 
 
 def check_policy(on_failure: str) -> None:

@@ -45,8 +45,8 @@ def batched_jacobian(
         The values, and d value / d argument (*batch, k, d_i) for each argument.
     """
     again = torch.is_grad_enabled() and any(argument.requires_grad for argument in arguments)
-    with torch.enable_grad():
-        leaves = [a if again and a.requires_grad else a.detach().requires_grad_() for a in arguments]
+    with torch.inference_mode(False), torch.enable_grad():
+        leaves = [a if again and a.requires_grad else a.detach().clone().requires_grad_() for a in arguments]
         values = function(*leaves)
         rows = [
             torch.autograd.grad(
@@ -71,6 +71,11 @@ def check_query(model: Any, state: Tensor, input: Tensor) -> None:
         got = [tensor.shape[-1] if tensor.dim() else "a scalar" for tensor in (state, input)]
         raise ShapeError(
             f"the model has {model.state_dim} states and {model.input_dim} inputs; got {got[0]} and {got[1]}"
+        )
+    if state.shape[:-1] != input.shape[:-1]:
+        raise ShapeError(
+            "state (*batch, n) and input (*batch, m) must have the same batch; "
+            f"got {tuple(state.shape[:-1])} and {tuple(input.shape[:-1])}"
         )
     for name, value in (("state", state), ("input", input)):
         if value.dtype != model.dtype or value.device != model.device:

@@ -38,7 +38,7 @@ Predicts = Literal["next_state", "difference", "value"]
 IGNORED = 1e8  # length-scale of an input that drops out of a kernel, in units of its magnitude
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GPPosterior:
     """Exact GPs, one per output, over the same N points; build it with one of the ``from_`` methods.
 
@@ -107,6 +107,7 @@ class GPPosterior:
             "offset": offset,
         }
         check_posterior(given, input_dim, predicts)
+        inputs, targets, lengthscales, signal_variance, noise_variance, offset = (v.clone() for v in given.values())
         cholesky = factorised(inputs, lengthscales, signal_variance, noise_variance)
         weights = torch.cholesky_solve((targets - offset).mT[..., None], cholesky)[..., 0]
         hyperparameters = (lengthscales, signal_variance, noise_variance, offset)
@@ -246,7 +247,7 @@ class GPPosterior:
     def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
         """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""
         input = state[..., :0] if input is None else input
-        if host_arrays(self.features, state, input) is not None:
+        if host_arrays(self.weights, state, input) is not None:
             mean, variance, by_state, by_input = compiled_point(self, "point_with_jacobian", state, input)
             return Gaussian(mean, torch.diag_embed(variance)), by_state, by_input
         k, difference = self._correlations(state, input)
@@ -255,7 +256,7 @@ class GPPosterior:
     def mean_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """``predict_with_jacobian`` without the variance, which costs most of it: the mean (*batch, k) comes first."""
         input = state[..., :0] if input is None else input
-        if host_arrays(self.features, state, input) is not None:
+        if host_arrays(self.weights, state, input) is not None:
             return compiled_point(self, "mean_with_jacobian", state, input)
         k, difference = self._correlations(state, input)
         return self._mean(k, state), *self._jacobian(k, difference)

@@ -78,6 +78,20 @@ class ResidualModel:
             )
         if self.B.dim() != 2 or self.B.shape[1] != gp.output_dim:
             raise ShapeError(f"B must be (n, {gp.output_dim}); got {tuple(self.B.shape)}")
+        parts = {"B": (self.B, tuple(self.B.shape))}
+        if isinstance(self.nominal, Affine):
+            n, m = self.state_dim, self.input_dim
+            nominal = self.nominal
+            parts |= {
+                "nominal.A": (nominal.A, (n, n)),
+                "nominal.B": (nominal.B, (n, m)),
+                "nominal.c": (nominal.c, (n,)),
+            }
+        for name, (value, shape) in parts.items():
+            if tuple(value.shape) != shape:
+                raise ShapeError(f"{name} must have shape {shape}; got {tuple(value.shape)}")
+            if value.dtype != gp.dtype or value.device != gp.device:
+                raise SettingError(name, f"must be {gp.dtype} on {gp.device}; got {value.dtype} on {value.device}")
         for key, chosen, count in (("states", self.states, self.state_dim), ("inputs", self.inputs, self.input_dim)):
             if any(not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
                 raise SettingError(key, f"must be different indices from 0 to {count - 1}; got {list(chosen)}")

@@ -78,7 +78,7 @@ def without(posterior: "GPPosterior", indices: Sequence[int] | Tensor) -> "GPPos
     kept = torch.tensor([i for i in range(size) if i not in chosen], device=posterior.device)
     if not len(kept):
         raise DataError(f"a posterior needs at least one point; dropping {len(dropped)} of {size} leaves none")
-    if posterior.device.type != "cpu" or len(dropped) > MANY * size:
+    if posterior.device.type != "cpu" or posterior.cholesky.requires_grad or len(dropped) > MANY * size:
         rows = posterior.cholesky[:, kept]
         first = dropped[0]  # nothing changes above it
         cholesky = rows[:, :, kept]

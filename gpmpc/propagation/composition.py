@@ -128,6 +128,11 @@ class Composition(NamedTuple):
             dV_du + by_input + by_input.transpose(-3, -2),
         )
 
+    def outer(self, hessian: Tensor) -> Tensor:
+        """Second derivatives of B f by the whole state (*batch, n, n, n), from those of f (*batch, k, n_s, n_s)."""
+        hessian = self._by_state(hessian, 2)
+        return hessian if self.B is None else torch.einsum("ia,...acd->...icd", self.B, hessian)
+
     def _by_state(self, derivative: Tensor, axes: int = 1) -> Tensor:
         """A derivative by what f sees of the state (its last axes) as one by the whole state."""
         if self.states is None:

@@ -35,7 +35,7 @@ class Expansion(NamedTuple):
 
 def expand(model: DynamicsModel, state: Tensor, input: Tensor) -> Expansion | None:
     """The expansion of a ``GPPosterior``; None for other models, and where torch has to follow."""
-    if not isinstance(model, GPPosterior) or (arrays := host_arrays(model.features, state, input)) is None:
+    if not isinstance(model, GPPosterior) or (arrays := host_arrays(model.weights, state, input)) is None:
         return None
     from gpmpc import fused  # loads numba
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
 from gpmpc.gp.dynamics import DynamicsModel
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.propagation.composition import Composition
 from gpmpc.propagation.expansion import expand
 from gpmpc.propagation.propagator import Propagation, checked_input
 from gpmpc.propagation.sensitivity import Sensitivity
@@ -81,11 +81,13 @@ class Linearization:
 
 def mean_hessian(model: DynamicsModel, state: Tensor, input: Tensor) -> Tensor:
     """d2m/dx2 (*batch, k, n, n): in closed form for SE-ARD GPs, else by torch autograd."""
-    if isinstance(model, GPPosterior):
-        return model.mean_hessian(state, input)
+    composition = Composition.of(model)
+    if composition is not None:  # an affine part has no second derivative
+        seen, control = composition.seen(Gaussian.certain(state), input)
+        return composition.outer(composition.f.mean_hessian(seen.mean, control))
     again = torch.is_grad_enabled() and (state.requires_grad or input.requires_grad)
-    with torch.enable_grad():
-        x = state if state.requires_grad and again else state.detach().requires_grad_()
+    with torch.inference_mode(False), torch.enable_grad():
+        x = state if state.requires_grad and again else state.detach().clone().requires_grad_()
         _, A, _ = model.predict_with_jacobian(x, input)
         rows = [
             torch.autograd.grad(A[..., a, d].sum(), x, create_graph=again, retain_graph=True, materialize_grads=True)[0]

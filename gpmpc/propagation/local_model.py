@@ -57,13 +57,18 @@ def linearize(
 ) -> LocalModel:
     """The local model at a belief and an input, or along a plan when both have a leading dimension H.
 
+    A local model is a constant: no gradient flows through it, and torch's function transforms do not apply.
+
     Args:
         propagator: How the belief moves.
         model: What was learned.
         belief: Mean (*batch, n), covariance (*batch, n, n).
         input: (*batch, m); may be left out where m = 0.
     """
-    input = belief.mean[..., :0] if input is None else input
+    belief = Gaussian(belief.mean.detach(), belief.covariance.detach())
+    input = belief.mean[..., :0] if input is None else input.detach()
+    if model.output_dim != belief.dim:
+        raise ShapeError(f"a local model needs an output a state; got {belief.dim} states, {model.output_dim} outputs")
     moved, d = differentiate(propagator, model, belief, input)
     s, _, _ = extended_state(belief)
     s_next, r_next, U_next = extended_state(moved.belief)

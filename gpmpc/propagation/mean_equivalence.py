@@ -43,7 +43,7 @@ class MeanEquivalence:
             torch.zeros_like(expansion.mean_by_state2),
             expansion.B,
             torch.diag_embed(expansion.variance_by_state.mT).movedim(-3, -1),
-            torch.zeros_like(expansion.mean_by_state2)[..., None, :, :].repeat_interleave(belief.dim, -3),
+            torch.zeros_like(expansion.mean_by_state2)[..., None, :, :].repeat_interleave(expansion.belief.dim, -3),
             torch.diag_embed(expansion.variance_by_input.mT).movedim(-3, -1),
         )
         return self._propagation(model, belief, expansion.belief), sensitivity

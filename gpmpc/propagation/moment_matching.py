@@ -68,7 +68,7 @@ class MomentMatching:
         input = checked_input(model, belief, input)
         composition = self._composition(model)
         seen, control = composition.seen(belief, input)
-        arrays = host_arrays(composition.f.features, seen.mean, seen.covariance, control)
+        arrays = host_arrays(composition.f.weights, seen.mean, seen.covariance, control)
         if arrays is None:
             return None
         f = self._compiled(composition.f, seen.mean.shape[:-1], arrays[1:], composition.A is not None)
@@ -85,7 +85,7 @@ class MomentMatching:
 
     def _latent(self, f: GPPosterior, belief: Gaussian, input: Tensor) -> Latent:
         """The moments of f, compiled or by torch."""
-        arrays = host_arrays(f.features, belief.mean, belief.covariance, input)
+        arrays = host_arrays(f.weights, belief.mean, belief.covariance, input)
         if arrays is None:
             return Latent(*moments(f, belief, input, self.diagonal))
         return self._compiled(f, belief.mean.shape[:-1], arrays[1:])

@@ -55,6 +55,8 @@ def checked_input(model: DynamicsModel, belief: Gaussian, input: Tensor | None) 
     Values are looked at where that is free: in host memory, outside torch's transforms.
     """
     input = belief.mean[..., :0] if input is None else input
+    if input.dim() == 1 and input.shape[-1] == model.input_dim:
+        input = input.expand(*belief.mean.shape[:-1], model.input_dim)  # one control for all
     check_query(model, belief.mean, input)
     if belief.covariance.dtype != belief.mean.dtype or belief.covariance.device != belief.mean.device:
         raise SettingError("belief", "mean and covariance must have the same dtype and device")
@@ -70,11 +72,12 @@ def checked_input(model: DynamicsModel, belief: Gaussian, input: Tensor | None) 
 
 
 def _check_semidefinite(covariance: Tensor) -> None:
-    largest = covariance.abs().amax()
-    if largest == 0 or 0 in covariance.shape:
+    if not covariance.numel() or not (largest := covariance.abs().amax()):
         return
     eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype)
     round_off = torch.finfo(covariance.dtype).eps ** 0.5 * largest
+    if bool((gap := (covariance - covariance.mT).abs().amax()) > round_off):
+        raise DataError(f"the belief's covariance must be symmetric; got entries that differ by {float(gap):.3g}")
     if not bool(torch.linalg.cholesky_ex(covariance + round_off * eye).info.any()):
         return
     lowest = float(torch.linalg.eigvalsh(covariance).amin())

@@ -16,18 +16,18 @@ from gpmpc.propagation.propagator import Propagation, Propagator, checked_input
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Derivatives of the next belief N(mu+, Sigma+) at a belief N(mu, Sigma) and an input u.
+    """Derivatives of the next belief N(mu+, Sigma+) at a belief N(mu, Sigma) and an input u; k outputs, mostly k = n.
 
     Those by Sigma are symmetric in their last two indices: d mu+_a = sum_cd mean_by_covariance[a, c, d] dSigma[c, d]
     for symmetric dSigma.
 
     Attributes:
-        mean_by_mean: (*batch, n, n).
-        mean_by_covariance: (*batch, n, n, n).
-        mean_by_input: (*batch, n, m).
-        covariance_by_mean: (*batch, n, n, n).
-        covariance_by_covariance: (*batch, n, n, n, n).
-        covariance_by_input: (*batch, n, n, m).
+        mean_by_mean: (*batch, k, n).
+        mean_by_covariance: (*batch, k, n, n).
+        mean_by_input: (*batch, k, m).
+        covariance_by_mean: (*batch, k, k, n).
+        covariance_by_covariance: (*batch, k, k, n, n).
+        covariance_by_input: (*batch, k, k, m).
     """
 
     mean_by_mean: Tensor
@@ -39,8 +39,8 @@ class Sensitivity:
 
     def of_variances(self) -> "Sensitivity":
         """The same where of the next covariance only the diagonal is kept."""
-        n = self.covariance_by_mean.shape[-2]
-        keep = torch.eye(n, dtype=self.mean_by_mean.dtype, device=self.mean_by_mean.device)
+        k = self.covariance_by_mean.shape[-2]
+        keep = torch.eye(k, dtype=self.mean_by_mean.dtype, device=self.mean_by_mean.device)
         return replace(
             self,
             covariance_by_mean=self.covariance_by_mean * keep[:, :, None],
@@ -74,8 +74,15 @@ def by_autograd(
     propagator: Propagator, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None
 ) -> tuple[Propagation, Sensitivity]:
     """``differentiate`` by torch autograd, for any propagator and model that torch can follow."""
-    input, n = checked_input(model, belief, input), belief.dim
-    rows, columns = torch.tril_indices(n, n, device=belief.mean.device)
+    input, n, k = checked_input(model, belief, input), belief.dim, model.output_dim
+    with torch.inference_mode(False):  # inference tensors, constants too, could not be saved for backward
+        return _by_autograd(propagator, model, belief, input, n, k)
+
+
+def _by_autograd(
+    propagator: Propagator, model: DynamicsModel, belief: Gaussian, input: Tensor, n: int, k: int
+) -> tuple[Propagation, Sensitivity]:
+    rows, columns = torch.tril_indices(k, k, device=belief.mean.device)
     batch = belief.mean.shape[:-1]
 
     def step(mean: Tensor, covariance: Tensor, control: Tensor) -> tuple[Tensor, ...]:
@@ -89,7 +96,6 @@ def by_autograd(
     )
     by_covariance = by_covariance.unflatten(-1, (n, n))
     by_covariance = (by_covariance + by_covariance.mT) / 2
-    k = values[1].shape[-1]
     whole = torch.zeros(k, k, dtype=torch.long, device=rows.device)
     whole[rows, columns] = whole[columns, rows] = torch.arange(len(rows), device=rows.device) + k
     mean_parts = [part[..., :k, :] for part in (by_mean, by_input)]

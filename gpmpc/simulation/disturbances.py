@@ -125,7 +125,7 @@ class Dropout:
         entries: Which ones, from 0; all by default. Without position, for one: 0 to 5 of a ``Coupled`` plant.
 
     Raises:
-        SettingError: The window is empty.
+        SettingError: The window is empty, or an entry is no whole number, 0 or more.
     """
 
     start: float  # [s]
@@ -134,6 +134,11 @@ class Dropout:
 
     def __post_init__(self) -> None:
         _check_window(self.start, self.stop)
+        if self.entries is not None:
+            entries = [int(e) if isinstance(e, np.integer) else e for e in self.entries]
+            for entry in entries:
+                check_number("entries", entry, least=0, whole=True)
+            object.__setattr__(self, "entries", tuple(entries))
 
     def acting(self, plant: Plant, time: float) -> Plant:
         """The plant.
@@ -143,7 +148,7 @@ class Dropout:
         """
         n = len(plant.dynamics.state_names)
         for entry in self.entries or ():
-            if not isinstance(entry, int) or not 0 <= entry < n:
+            if entry >= n:
                 raise SettingError("entries", f"must be indices of states, 0 to {n - 1}; got {entry!r}")
         return plant
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
@@ -59,10 +60,10 @@ def trials(
         SettingError: No seeds, a seed twice, or a worker count below 1.
         GpmpcError: A worker process died.
     """
-    if isinstance(seeds, int):
-        check_number("seeds", seeds, least=1, whole=True)
-        seeds = range(seeds)
-    seeds = list(seeds)
+    if isinstance(seeds, int | np.integer):
+        check_number("seeds", int(seeds), least=1, whole=True)
+        seeds = range(int(seeds))
+    seeds = [int(seed) if isinstance(seed, np.integer) else seed for seed in seeds]
     for seed in seeds:
         check_number("seeds", seed, least=0, whole=True)
     if not seeds or len(set(seeds)) < len(seeds):

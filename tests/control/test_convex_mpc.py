@@ -334,8 +334,22 @@ def test_a_decision_that_was_not_solved_is_no_warm_start():
     controller = ConvexMPC(gp(), MeanEquivalence(), quadrotor_problem(), 3, HOVER, "trajectory", "none")
     belief = Gaussian.certain(np.full(6, 0.3))
     fresh = controller.control(belief, at_origin(3))
-    failed = replace(fresh, inputs=np.full((3, 3), np.nan), status=Status.NUMERICAL_TROUBLE, solution=None)
+    nothing = {"inputs": np.full((3, 3), np.nan), "status": Status.NUMERICAL_TROUBLE, "solution": None}
+    failed = replace(fresh, input=np.array(HOVER), **nothing)
     assert np.array_equal(controller.control(belief, at_origin(3), failed).inputs, fresh.inputs)
+
+
+def test_what_was_applied_at_a_failed_step_is_where_the_next_increment_starts():
+    problem = quadrotor_problem(rate_lower=[-0.05] * 3, rate_upper=[0.05] * 3)
+    controller = ConvexMPC(gp(), MeanEquivalence(), problem, 3, HOVER, "trajectory", "none")
+    decision = controller.control(Gaussian.certain(np.full(6, 0.3)), at_origin(3))
+    for _ in range(3):
+        decision = controller.control(Gaussian.certain(np.full(6, 0.3)), at_origin(3), decision)
+    blind = controller.control(Gaussian.certain(np.full(6, np.nan)), at_origin(3), decision)
+    assert blind.status is Status.INVALID_MEASUREMENT
+    following = controller.control(Gaussian.certain(np.full(6, 0.3)), at_origin(3), blind)
+    assert np.abs(following.input - blind.input).max() <= 0.05 + 1e-8
+    assert np.abs(blind.input - np.array(HOVER)).max() > 0.1
 
 
 @pytest.mark.parametrize("iterations", [1, 10])

@@ -3,6 +3,7 @@ import pytest
 
 from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.supervision import command
+from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.status import Status
@@ -100,3 +101,14 @@ def test_raise_stops_at_the_step():
 def test_a_misspelt_policy_is_refused():
     with pytest.raises(SettingError, match="on_failure: must be one of 'previous_plan', 'hold', 'raise'; got 'held'"):
         run(Planner(), 1, "held")
+
+
+def test_before_the_first_plan_the_reference_input_is_applied_within_the_bounds_and_told_to_the_controller():
+    planner = Planner()
+    planner.problem = TrackingProblem([1.0], [1.0], input_lower=[-2.0], input_upper=[2.0])
+    reference = Reference(np.zeros((5, 1)), np.full((4, 1), 5.0))
+    commands = run(planner, 3, "previous_plan", [LOST, LOST, STATE], reference)
+    assert [c.input[0] for c in commands] == [2, 2, 0]
+    told = planner.previous[0]
+    assert told.input[0] == 2
+    assert not told.status.solved

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Affine, GPPosterior, ResidualModel, evaluation
-from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, differentiate
+from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented, differentiate, linearize
 from gpmpc.propagation.sensitivity import by_autograd
 from tests.propagation.test_moment_matching import belief, model
 
@@ -95,3 +95,107 @@ def test_a_float32_model_is_answered_by_torch_in_float32():
     gp = MODELS["next state"].to(dtype=torch.float32)
     mean, A, _ = gp.mean_with_jacobian(torch.zeros(3, dtype=torch.float32), torch.zeros(2, dtype=torch.float32))
     assert mean.dtype == A.dtype == torch.float32
+
+
+def value_model(n, m, k):
+    features, targets = draw(20, n + m), draw(20, k)
+    scales = 0.7 + draw(k, n + m).abs()
+    return GPPosterior.from_hyperparameters(
+        features, targets, scales, torch.ones(k), torch.full((k,), 1e-2), m, predicts="value"
+    )
+
+
+@pytest.mark.parametrize(("n", "k"), [(2, 3), (3, 2)])
+@pytest.mark.parametrize("propagator", [MeanEquivalence(), Linearization(), MomentMatching(), Unscented()], ids=str)
+def test_functions_with_more_or_fewer_outputs_than_states_have_derivatives_too(propagator, n, k):
+    gp, at, control = value_model(n, 1, k), belief(n), draw(1)
+    found, d = differentiate(propagator, gp, at, control)
+    step = 1e-6
+    for c in range(n):
+        shift = step * torch.eye(n)[c]
+        up, down = (propagator(gp, Gaussian(at.mean + sign * shift, at.covariance), control) for sign in (1, -1))
+        assert torch.allclose(d.mean_by_mean[:, c], (up.mean - down.mean) / (2 * step), atol=1e-7)
+        assert torch.allclose(d.covariance_by_mean[..., c], (up.covariance - down.covariance) / (2 * step), atol=1e-7)
+    assert d.covariance_by_covariance.shape == (k, k, n, n)
+    assert found.cross_covariance.shape == (n, k)
+    with pytest.raises(ShapeError, match=f"got {n} states, {k} outputs"):
+        linearize(propagator, gp, at, control)
+
+
+def test_no_gradient_flows_through_a_local_model():
+    gp, control = MODELS["difference"], torch.zeros(2, requires_grad=True)
+    local = linearize(MomentMatching(), gp, Gaussian.certain([0.1, 0.2, 0.3]), control)
+    assert not local.A.requires_grad
+    assert not local.c.requires_grad
+
+
+@pytest.mark.parametrize("choice", ["auto", "torch"])
+@pytest.mark.parametrize("propagator", [*PROPAGATORS[:4], Unscented()], ids=str)
+def test_beliefs_and_inputs_belong_together_or_are_refused(propagator, choice):
+    gp, at = MODELS["next state"], belief(3)
+    batch = Gaussian(at.mean + draw(2, 3, 3), at.covariance.expand(2, 3, 3, 3))
+    control = draw(2)
+    with evaluation(choice):
+        one_for_all = propagator(gp, batch, control)
+        assert torch.allclose(one_for_all.mean, propagator(gp, batch, control.expand(2, 3, 2)).mean, atol=1e-13)
+        for wrong in (draw(3, 2, 2), draw(6, 2), draw(1, 2)):
+            with pytest.raises(ShapeError, match="the same batch"):
+                propagator(gp, batch, wrong)
+        with pytest.raises(ShapeError, match="the same batch"):
+            gp.predict_with_jacobian(batch.mean, draw(3, 2, 2))
+        nobody = propagator(gp, Gaussian(draw(0, 3), draw(0, 3, 3)), draw(0, 2))
+        assert nobody.mean.shape == (0, 3)
+
+
+def test_a_covariance_that_is_not_symmetric_is_refused():
+    lopsided = Gaussian(torch.zeros(3), torch.eye(3) + torch.diag(torch.full((2,), 0.3), 1))
+    with pytest.raises(DataError, match="must be symmetric; got entries that differ by 0.3"):
+        MomentMatching()(MODELS["next state"], lopsided, torch.zeros(2))
+
+
+def test_models_whose_hyperparameters_carry_gradients_are_answered_by_torch():
+    log_scale = torch.zeros(2, 3, requires_grad=True)
+    features, targets = draw(12, 3), draw(12, 2)
+
+    def mean(scale):
+        gp = GPPosterior.from_hyperparameters(features, targets, scale.exp(), torch.ones(2), 0.1 * torch.ones(2), 1)
+        dropped = gp.drop([1])
+        at = Gaussian(torch.zeros(2), 0.1 * torch.eye(2))
+        answers = gp.predict_with_jacobian(at.mean, torch.zeros(1))[1].sum()
+        return (
+            answers
+            + MomentMatching()(gp, at, torch.zeros(1)).mean.sum()
+            + dropped.predict(at.mean, torch.zeros(1)).mean.sum()
+        )
+
+    (gradient,) = torch.autograd.grad(mean(log_scale), log_scale)
+    shift = torch.zeros(2, 3)
+    shift[0, 1] = 1e-6
+    numeric = (mean(log_scale.detach() + shift) - mean(log_scale.detach() - shift)) / 2e-6
+    assert torch.allclose(gradient[0, 1], numeric, rtol=1e-6, atol=1e-8)
+
+
+def test_inference_mode_stops_no_derivative():
+    gp, at = MODELS["next state"], belief(3)
+    outside = linearize(Unscented(), gp, at, torch.zeros(2))
+    with torch.inference_mode():
+        inside = linearize(Unscented(), gp, belief(3), torch.zeros(2))
+    assert torch.allclose(inside.A, outside.A, atol=1e-12)
+
+
+def test_second_order_propagation_of_a_residual_model_is_mapped_by_vmap():
+    gp, at, means = MODELS["residual"], belief(3), draw(4, 3)
+    second = Linearization(hessian=True)
+    mapped = torch.func.vmap(lambda m: second(gp, Gaussian(m, at.covariance), torch.zeros(2)).covariance)(means)
+    alone = second(gp, Gaussian(means[2], at.covariance), torch.zeros(2)).covariance
+    assert torch.allclose(mapped[2], alone, atol=1e-11)
+
+
+def test_a_posterior_does_not_follow_what_becomes_of_the_tensors_it_was_made_of():
+    features = draw(10, 3)
+    gp = GPPosterior.from_hyperparameters(
+        features, draw(10, 2), torch.ones(2, 3), torch.ones(2), 0.1 * torch.ones(2), 1
+    )
+    before = gp.predict(torch.zeros(2), torch.zeros(1)).mean
+    features.add_(1.0)
+    assert torch.equal(gp.predict(torch.zeros(2), torch.zeros(1)).mean, before)
