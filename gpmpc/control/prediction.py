@@ -24,6 +24,7 @@ import numpy as np
 import torch
 
 from gpmpc.control.ancillary_feedback import lqr_gain, own_spread, spread
+from gpmpc.control.compiled_rollout import roll_out
 from gpmpc.control.condensing import respond
 from gpmpc.control.controller import Decision
 from gpmpc.control.request import Request
@@ -107,9 +108,9 @@ class Predictor:
         self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
         self.form, self.covariance, self.feedback = form, covariance, feedback
         self._linearise = getattr(self, f"_{covariance}")
-        self._first_order = (
-            isinstance(model, GPPosterior) and type(propagator) is Linearization and not propagator.hessian
-        )
+        exact = isinstance(model, GPPosterior) and model.predicts in ("next_state", "difference")
+        self._first_order = exact and type(propagator) is Linearization and not propagator.hessian
+        self._compiles = exact and (covariance == "none" or (covariance == "zero_order" and self._first_order))
 
     def extended(self, weight: Array) -> Array:
         """The weight of s that belongs to a weight of x (n, n): the blocks on its diagonal (p / n, n, n)."""
@@ -163,6 +164,14 @@ class Predictor:
             follow: Means (H, n) that the rollout is to follow by the ancillary feedback, which changes the plan within
                 its bounds: u_k + K (mu_k - follow_k) for k = 1 .. H-1.
         """
+        if self._compiles and host_arrays(self.model.weights) is not None:
+            noisy = self.covariance == "zero_order" and self.propagator.observation_noise
+            noise = _array(self.model.noise_covariance) if noisy else np.zeros_like(request.covariance)
+            known = self._belief(request.state, request.covariance).covariance.numpy()
+            uncertain = self.covariance == "zero_order"
+            start, problem = request.state, self.problem
+            found = roll_out(self.model, problem, start, known, inputs, follow, self.feedback, uncertain, noise)
+            return Prediction(found.A, found.B, found.c, start, found.covariances, found.inputs)
         belief, gain, stages, plan = self._belief(request.state, request.covariance), None, [], np.array(inputs)
         covariances, n = [_array(belief.covariance)], self.problem.state_dim
         for k, input in enumerate(plan):

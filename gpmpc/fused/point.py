@@ -77,6 +77,36 @@ def padded_inputs(m):
 
 
 @compiled
+def expand_at(
+    uncertain, points, inverse_squares, log_signal, beta, inverse_cholesky, x, u, memory, M, variance, J, J_u
+):
+    """M, its gradient J (k, n), J_u (k, m), and the variance where ``uncertain``, at one point, for other loops."""
+    (rows, padded), n, m = points.shape, len(x), len(u)
+    U = rows - padded_inputs(m)
+    difference, squares, k, solved = memory[:rows], memory[rows : 2 * rows], memory[2 * rows], memory[2 * rows + 1]
+    sums = np.empty(rows)
+    offsets(points, x, u, difference)
+    for c in range(rows):
+        multiply(difference[c], difference[c], squares[c])
+    for a in range(len(beta)):
+        D = inverse_squares[a]
+        for c in range(rows):
+            sums[c] = D[c] / -2
+        k[:] = log_signal[a]
+        combine(k, sums, squares)
+        exp_all(k)
+        if uncertain:
+            variance[a] = max(np.exp(log_signal[a]) - explain(inverse_cholesky[a], k, solved), 0.0)
+        multiply(k, beta[a], k)
+        M[a] = k.sum()
+        project(k, difference, sums)
+        for c in range(n):
+            J[a, c] = D[c] * sums[c]
+        for c in range(m):
+            J_u[a, c] = D[U + c] * sums[U + c]
+
+
+@compiled
 def points_along(order, points, inverse_squares, log_signal, beta, inverse_cholesky, x, u, out):
     """Everything at H points, into the ten arrays of ``gpmpc.fused.Expansion`` with H in front."""
     M, variance, dM_dx, dM_du, dvar_dx, dvar_du, d2M_dx2, d2M_dxdu, d3M_dx3, d3M_dx2du = out

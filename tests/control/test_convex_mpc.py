@@ -13,6 +13,7 @@ from gpmpc.control.prediction import COVARIANCES, FORMS
 from gpmpc.control.tracking import StateBounds, TrackingProblem
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp import evaluation
 from gpmpc.plants import step
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, rollout
 from gpmpc.qp import CvxpySolver, DualActiveSet
@@ -407,3 +408,20 @@ def test_a_reference_that_does_not_belong_is_refused():
         controller.control(belief, at_origin(2))
     with pytest.raises(ShapeError, match=r"got \(5,\) and \(4, 6\)"):
         controller.control(Gaussian.certain(np.zeros(5)), at_origin(3))
+
+
+@pytest.mark.parametrize("observation_noise", [False, True])
+@pytest.mark.parametrize("feedback", [False, True])
+@pytest.mark.parametrize("covariance", ["zero_order", "none"])
+def test_the_compiled_rollout_is_the_one_stage_by_stage(covariance, feedback, observation_noise):
+    H, propagator = 6, Linearization(observation_noise=observation_noise)
+    arguments = (gp(), propagator, quadrotor_problem(), H, HOVER, "trajectory", covariance)
+    compiled, by_torch = ConvexMPC(*arguments, feedback=feedback), ConvexMPC(*arguments, feedback=feedback)
+    belief = Gaussian(torch.full((6,), 0.2), 1e-3 * torch.eye(6))
+    first = compiled.control(belief, at_origin(H))
+    with evaluation("torch"):
+        expected = by_torch.control(belief, at_origin(H), first)
+    found = compiled.control(belief, at_origin(H), first)
+    assert np.allclose(found.inputs, expected.inputs, atol=1e-9)
+    assert np.allclose(found.means, expected.means, atol=1e-10)
+    assert np.allclose(found.covariances, expected.covariances, atol=1e-12)
