@@ -1,7 +1,7 @@
 """Problem: along a plan every stage is linearised where the one before has led; in Python the loop costs most of it.
 
-The rollout of ``gpmpc.control.prediction`` for SE-ARD posteriors whose stages need the mean and, for ``zero_order``, the
-variance at the mean (``Linearization``): one compiled loop, with the feedback of ``ancillary_feedback``.
+The rollout of ``gpmpc.control.prediction`` for SE-ARD posteriors whose stages need the mean and, for ``zero_order``,
+the variance at the mean (``Linearization``): one compiled loop, with the feedback of ``ancillary_feedback``.
 """
 
 from typing import NamedTuple

@@ -77,11 +77,13 @@ def padded_inputs(m):
 
 
 @compiled
-def expand_at(
-    uncertain, points, inverse_squares, log_signal, beta, inverse_cholesky, x, u, memory, M, variance, J, J_u
-):
-    """M, its gradient J (k, n), J_u (k, m), and the variance where ``uncertain``, at one point, for other loops."""
-    (rows, padded), n, m = points.shape, len(x), len(u)
+def expand_at(uncertain, gp, inverse_cholesky, x, u, memory, M, variance, J, J_u):
+    """M, its gradient J (k, n), J_u (k, m), and the variance where ``uncertain``, at one point, for other loops.
+
+    ``gp`` holds the first four arrays of ``means_along``; ``memory`` has 2 R + 2 aligned rows.
+    """
+    points, inverse_squares, log_signal, beta = gp
+    rows, n, m = len(points), len(x), len(u)
     U = rows - padded_inputs(m)
     difference, squares, k, solved = memory[:rows], memory[rows : 2 * rows], memory[2 * rows], memory[2 * rows + 1]
     sums = np.empty(rows)
