@@ -5,6 +5,7 @@ neither can be written it refuses to cache; the kernels are then compiled anew i
 (that is what makes them vectorise); infinities and NaN keep their meaning.
 """
 
+import contextlib
 from collections.abc import Callable
 from functools import partial
 from threading import Lock
@@ -30,7 +31,14 @@ def compiled(
     """
     if function is None:
         return partial(compiled, fastmath=fastmath, allocates=allocates)
-    options = {"nogil": True, "fastmath": set(fastmath)} | ({} if allocates else {"_nrt": False})
+    options = {"nogil": True, "fastmath": set(fastmath)}
+    if not allocates:
+        with contextlib.suppress(KeyError):  # numba's own option, not promised: without it kernels are slower
+            return _jit(function, options | {"_nrt": False})
+    return _jit(function, options)
+
+
+def _jit(function: Callable, options: dict) -> Callable:
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # "cannot cache function ...: no locator available"
@@ -50,3 +58,15 @@ def compile_for(kernel: Callable, signature: str) -> None:
         if not kernel.signatures:
             kernel.compile(signature)
             kernel.disable_compile()
+
+
+def direct(kernel: Callable) -> Callable:
+    """The machine code of a kernel that ``compile_for`` has compiled, called without numba's look at the arguments.
+
+    That look takes a quarter of a microsecond. The caller has to see to it that each argument is a NumPy array of the
+    right dtype; other objects and other numbers of axes raise ``TypeError``, strides are the kernel's business.
+    """
+    try:
+        return next(iter(kernel.overloads.values())).entry_point
+    except (AttributeError, StopIteration):  # another numba
+        return kernel

@@ -19,7 +19,8 @@ from gpmpc.qp import record, workspace
 from gpmpc.qp.dual_iteration import CONTRADICTION, keep_violated, list_violated, most_violated, step_to
 from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, follow_listed, refine, residuals, row_values
 from gpmpc.qp.factor import dot, multiply_at, pack, unpack
-from gpmpc.qp.hessian import factorise, solve_transposed
+from gpmpc.qp.cholesky import factorise
+from gpmpc.qp.hessian import solve_transposed
 from gpmpc.qp.working_set import (
     CAP,
     END,
@@ -42,7 +43,7 @@ from gpmpc.qp.working_set import (
     take,
     watch,
 )
-from gpmpc.qp.workspace import carve, most_working
+from gpmpc.qp.workspace import carve, most_working, padded
 
 STATUS, ITERATIONS, VARIABLES, CONSTRAINTS = record.STATUS, record.ITERATIONS, record.VARIABLES, record.CONSTRAINTS
 WORKING, TAG, AGE, HEADER = record.WORKING, record.TAG, record.AGE, record.HEADER
@@ -271,7 +272,8 @@ def solve_gram(q, lower, upper, warm, system, work, out):
     """Gram mode; ``system`` is of ``gpmpc.qp.gram_system``, ``work`` of ``gpmpc.qp.workspace``."""
     settings, traits, vectors, members, R, _ = carve(work)
     n, M = int(settings[workspace.VARIABLES]), int(settings[workspace.CONSTRAINTS])
-    if len(q) != n or len(lower) != M or len(upper) != M or not all_finite(q):
+    dense = is_dense(q) and is_dense(lower) and is_dense(upper) and is_dense(warm)
+    if not dense or len(q) != n or len(lower) != M or len(upper) != M or not all_finite(q):
         return MISUSE
     K, P, G = system[:M], system[M : M + n], system[M + n :]
     return optimise(False, P, q, G, n, K, P, traits, vectors, members, R, lower, upper, warm, settings, out)
@@ -283,11 +285,13 @@ def solve_lazy(P, q, G, lower, upper, warm, work, out):
     n, m = P.shape[0], len(G)
     M = n + m
     shaped = P.shape[1] == n and len(q) == n and (m == 0 or G.shape[1] == n) and len(lower) == M and len(upper) == M
-    if not shaped or not all_finite(q):
+    dense = is_dense(q) and is_dense(lower) and is_dense(upper) and is_dense(warm) and is_dense(P) and is_dense(G)
+    if not shaped or not dense or not all_finite(q):
         return MISUSE
     settings, traits, vectors, members, R, rest = carve(work)
     dense = rest.reshape(rest.size)  # rows without gaps are nearer to each other
-    L, rows = dense[: n * n].reshape((n, n)), dense[n * n : n * (n + len(R) + 1)].reshape((len(R) + 1, n))
+    size = n * padded(n)
+    L, rows = dense[:size].reshape((n, padded(n))), dense[size : size + n * (len(R) + 1)].reshape((len(R) + 1, n))
     if not factorise(P, L):
         return MISUSE
     if not measure(G, n, traits):
@@ -312,6 +316,16 @@ def measure(G, n, traits):
         undefined += norm * 0.0
         traits[NORM, n + p], traits[WEIGHT, n + p], traits[END, n + p] = norm, 1.0 / norm if norm > 0.0 else 1.0, end
     return undefined == 0.0
+
+
+@borrowing
+def is_dense(array):
+    """Whether the array is as contiguous as its type claims: ``gpmpc.compiled.direct`` does not ask."""
+    step, dense = array.itemsize, True
+    for axis in range(array.ndim - 1, -1, -1):
+        dense &= array.strides[axis] == step or array.shape[axis] <= 1
+        step *= array.shape[axis]
+    return dense or array.size == 0
 
 
 @borrowing

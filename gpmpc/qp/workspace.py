@@ -30,7 +30,7 @@ def lazy_workspace(settings: Array, softness: Array) -> Array:
     """Memory for solves in lazy mode with these settings (6,) and softness (2, M)."""
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
     traits = np.vstack([np.zeros((2, M)), softness, np.zeros((1, M))])
-    return _workspace(settings, traits, n * (n + most_working(n, M, bool(settings[SOFT])) + 2))
+    return _workspace(settings, traits, n * (padded(n) + most_working(n, M, bool(settings[SOFT])) + 2))
 
 
 def _workspace(settings: Array, traits: Array, own: int) -> Array:
@@ -47,6 +47,12 @@ def _workspace(settings: Array, traits: Array, own: int) -> Array:
 def most_working(n, M, soft):
     """How many constraints can work at once."""
     return M if soft else min(n, M)
+
+
+@borrowing
+def padded(size):
+    """The next multiple of eight."""
+    return (size + 7) // 8 * 8
 
 
 @borrowing
