@@ -27,10 +27,11 @@ def factorise(P, L):
     whole = n // BLOCK * BLOCK
     if whole < n and not finish_last_rows(P, L, whole):
         return False
-    for top in range(whole - BLOCK, -1, -BLOCK):
-        if not finish_four_rows(P, L, top):
-            return False
-    return True
+    good, top = True, whole - BLOCK
+    while good and top >= 0:
+        good = finish_four_rows(P, L, top)
+        top -= BLOCK
+    return good
 
 
 @borrowing

@@ -18,7 +18,7 @@ from gpmpc.compiled import borrowing
 Array = NDArray[np.float64]
 
 LIMIT, TOLERANCE, SOFT, VARIABLES, CONSTRAINTS, TAG, SETTINGS = 0, 1, 2, 3, 4, 5, 6
-TRAITS, VECTORS, MEMBERS = 5, 22, 4  # rows of each
+TRAITS, VECTORS, MEMBERS = 5, 23, 4  # rows of each
 
 
 def gram_workspace(settings: Array, traits: Array) -> Array:
@@ -36,11 +36,18 @@ def lazy_workspace(settings: Array, softness: Array) -> Array:
 def _workspace(settings: Array, traits: Array, own: int) -> Array:
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
     capacity = most_working(n, M, bool(settings[SOFT]))
-    wide = max(M, capacity + 2, SETTINGS)
-    work = np.zeros((1 + TRAITS + VECTORS + MEMBERS + capacity + 1 + -(-own // wide), wide))
+    wide = padded(max(M, capacity + 2, SETTINGS)) + 8  # kernels write whole lanes
+    work = aligned(1 + TRAITS + VECTORS + MEMBERS + capacity + 1 + -(-own // wide), wide)
     work[0, :SETTINGS] = settings
     work[1 : 1 + TRAITS, :M] = traits
     return work
+
+
+def aligned(rows: int, columns: int) -> Array:
+    """Zeros that begin where a cache line does: a load of eight numbers that spans two lines takes twice the time."""
+    memory = np.zeros(rows * columns + 8)
+    start = -memory.ctypes.data // 8 % 8
+    return memory[start : start + rows * columns].reshape(rows, columns)
 
 
 @borrowing
