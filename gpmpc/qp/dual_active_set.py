@@ -123,7 +123,7 @@ class DualActiveSet:
             except IndexError:
                 work = lazy_workspace(settings, softness)
             warm = layout.NO_RECORD if warm_start is None else warm_start.record
-            if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is warm.dtype is FLOAT:
+            if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is FLOAT:
                 status = run_lazy(P, q, G, lower, upper, warm, work, record)
             else:  # may still be float64: a dtype that was pickled is another object
                 status = solve_lazy(P, q, G, lower, upper, warm, work, record)
@@ -239,7 +239,7 @@ class Prepared:
             work = gram_workspace(self._settings, self._traits)
         try:
             warm = layout.NO_RECORD if warm_start is None else warm_start.record
-            if q.dtype is lower.dtype is upper.dtype is warm.dtype is FLOAT:
+            if q.dtype is lower.dtype is upper.dtype is FLOAT:
                 status = run_gram(q, lower, upper, warm, self._system, work, record)
             else:  # may still be float64: a dtype that was pickled is another object
                 status = solve_gram(q, lower, upper, warm, self._system, work, record)

@@ -130,10 +130,10 @@ def residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, 
     """
     if lazy:
         multiply(P, n, y, n, gradient)
+        for i in range(n, padded(n)):
+            gradient[i] = 0.0
     else:
         combine(P, n, y, 0, n, gradient)
-    for i in range(n, padded(n)):
-        gradient[i] = 0.0
     sizes, rest, undefined = no_lanes(), no_lanes(), no_lanes()
     for i in range(0, n, 8):
         pull, slopes = lanes(gradient, i), lanes(slope, i)
