@@ -273,7 +273,7 @@ def _as_record(warm_start: WarmStart, n: int, M: int) -> Array:
     if warm_start is None:
         return layout.NO_RECORD
     if isinstance(warm_start, QPSolution):
-        return warm_start.record
+        return np.ascontiguousarray(warm_start.record, dtype=np.float64)
     active = np.asarray(warm_start)
     if active.shape != (M,) or active.dtype.kind not in "biuf":
         raise ProblemError(

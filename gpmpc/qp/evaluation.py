@@ -12,6 +12,8 @@ from gpmpc.qp.lanes import combine, lanes, larger, largest, no_lanes, plus, put
 from gpmpc.qp.working_set import BOUND, END, LEAST, MOST, NAME, PLACE, SCRATCH, SOFTNESS, couple
 from gpmpc.qp.workspace import padded
 
+FEW = 16  # variables below which four inner products at a time are faster than rows in whole registers
+
 
 @borrowing
 def add_pull(G, n, q, mu, k, members, traits, soft, slope):
@@ -45,6 +47,8 @@ def evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y):
             y[i] = slope[i]
         solve_transposed(L, n, y)
         solve_lower(L, n, y)
+    elif n < FEW:
+        multiply(rows, n, slope, n, y)
     else:
         combine(rows, n, slope, 0, n, y)  # K is symmetric
     for i in range(n):
@@ -57,7 +61,7 @@ def row_values(lazy, L, G, n, traits, y):
     """``y[n:] = G y[:n]``, several rows at a time, as far as they may not be zero."""
     product, ends, m = y[n:], traits[END, n:], len(G)
     p = 0
-    if not lazy:
+    if not lazy and n >= FEW:
         while p < m:
             size = min(32, m - p)
             combine(L, int(ends[p + size - 1]), y, p, size, product)
@@ -128,7 +132,7 @@ def residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, 
     Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where y = C x and slope = q + C' mu. The
     vectors gradient, slope and q are padded, the latter two with zeros.
     """
-    if lazy:
+    if lazy or n < FEW:
         multiply(P, n, y, n, gradient)
         for i in range(n, padded(n)):
             gradient[i] = 0.0
