@@ -5,7 +5,6 @@ neither can be written it refuses to cache; the kernels are then compiled anew i
 (that is what makes them vectorise); infinities and NaN keep their meaning.
 """
 
-import contextlib
 from collections.abc import Callable
 from functools import partial
 from threading import Lock
@@ -32,10 +31,18 @@ def compiled(
     if function is None:
         return partial(compiled, fastmath=fastmath, allocates=allocates)
     options = {"nogil": True, "fastmath": set(fastmath)}
-    if not allocates:
-        with contextlib.suppress(KeyError):  # numba's own option, not promised: without it kernels are slower
-            return _jit(function, options | {"_nrt": False})
+    if not allocates and _counting_is_optional():
+        options["_nrt"] = False
     return _jit(function, options)
+
+
+def _counting_is_optional() -> bool:
+    """Whether this numba knows its own option ``_nrt``, which it does not promise; without it kernels are slower."""
+    try:
+        from numba.core.cpu import CPUTargetOptions
+    except ImportError:
+        return False
+    return hasattr(CPUTargetOptions, "_nrt")
 
 
 def _jit(function: Callable, options: dict) -> Callable:
