@@ -30,7 +30,22 @@ def compiled(
     """
     if function is None:
         return partial(compiled, fastmath=fastmath, allocates=allocates)
-    options = {"nogil": True, "fastmath": set(fastmath)} | ({} if allocates else {"_nrt": False})
+    options = {"nogil": True, "fastmath": set(fastmath)}
+    if not allocates and _counting_is_optional():
+        options["_nrt"] = False
+    return _jit(function, options)
+
+
+def _counting_is_optional() -> bool:
+    """Whether this numba knows its own option ``_nrt``, which it does not promise; without it kernels are slower."""
+    try:
+        from numba.core.cpu import CPUTargetOptions
+    except ImportError:
+        return False
+    return hasattr(CPUTargetOptions, "_nrt")
+
+
+def _jit(function: Callable, options: dict) -> Callable:
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # "cannot cache function ...: no locator available"
@@ -50,3 +65,15 @@ def compile_for(kernel: Callable, signature: str) -> None:
         if not kernel.signatures:
             kernel.compile(signature)
             kernel.disable_compile()
+
+
+def direct(kernel: Callable) -> Callable:
+    """The machine code of a kernel that ``compile_for`` has compiled, called without numba's look at the arguments.
+
+    That look takes a quarter of a microsecond. The caller has to see to it that each argument is a NumPy array of the
+    right dtype; other objects and other numbers of axes raise ``TypeError``, strides are the kernel's business.
+    """
+    try:
+        return next(iter(kernel.overloads.values())).entry_point
+    except (AttributeError, StopIteration):  # another numba
+        return kernel

@@ -21,7 +21,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpmpc.compiled import compile_for
+from gpmpc.compiled import compile_for, direct
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import record as layout
 from gpmpc.qp.dual_kernels import GRAM_SIGNATURE, LAZY_SIGNATURE, solve_gram, solve_lazy
@@ -35,9 +35,11 @@ from gpmpc.qp.workspace import gram_workspace, lazy_workspace
 
 Array = NDArray[np.float64]
 
+FLOAT = np.dtype(np.float64)
 empty = np.empty  # a local name saves a look-up
 new = tuple.__new__  # half the time of a named tuple's own constructor
 
+run_gram, run_lazy = solve_gram, solve_lazy  # until they are compiled
 _tags = count(1)  # next() of a count is atomic
 ITERATIONS_PER_CONSTRAINT = 10  # default limit, beyond which the iteration is taken to cycle
 ITERATIONS_PER_LOOK = 25  # iterations between two looks at the clock
@@ -66,7 +68,9 @@ class DualActiveSet:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ProblemError(f"{name} must be positive; got {value}")
+        global run_lazy
         compile_for(solve_lazy, LAZY_SIGNATURE)
+        run_lazy = direct(solve_lazy)
 
     def solve(
         self, problem: QuadraticProgram, warm_start: WarmStart = None, soft: SoftRows | None = None
@@ -119,7 +123,10 @@ class DualActiveSet:
             except IndexError:
                 work = lazy_workspace(settings, softness)
             warm = layout.NO_RECORD if warm_start is None else warm_start.record
-            status = solve_lazy(P, q, G, lower, upper, warm, work, record)
+            if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is FLOAT:
+                status = run_lazy(P, q, G, lower, upper, warm, work, record)
+            else:  # may still be float64: a dtype that was pickled is another object
+                status = solve_lazy(P, q, G, lower, upper, warm, work, record)
             idle.append(work)
         except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
             status = layout.MISUSE
@@ -200,7 +207,9 @@ class Prepared:
     __slots__ = ("_idle", "_settings", "_size", "_solver", "_system", "_traits", "_x", "build_seconds", "terms")
 
     def __init__(self, solver: DualActiveSet, terms: Terms, settings: Array):
+        global run_gram
         compile_for(solve_gram, GRAM_SIGNATURE)
+        run_gram = direct(solve_gram)
         began = perf_counter()
         self.terms, self._solver, self._settings = terms, solver, settings
         self._system, self._traits = gram_system(terms)
@@ -230,7 +239,10 @@ class Prepared:
             work = gram_workspace(self._settings, self._traits)
         try:
             warm = layout.NO_RECORD if warm_start is None else warm_start.record
-            status = solve_gram(q, lower, upper, warm, self._system, work, record)
+            if q.dtype is lower.dtype is upper.dtype is FLOAT:
+                status = run_gram(q, lower, upper, warm, self._system, work, record)
+            else:  # may still be float64: a dtype that was pickled is another object
+                status = solve_gram(q, lower, upper, warm, self._system, work, record)
         except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
             status = layout.MISUSE
         self._idle.append(work)
@@ -261,7 +273,7 @@ def _as_record(warm_start: WarmStart, n: int, M: int) -> Array:
     if warm_start is None:
         return layout.NO_RECORD
     if isinstance(warm_start, QPSolution):
-        return warm_start.record
+        return np.ascontiguousarray(warm_start.record, dtype=np.float64)
     active = np.asarray(warm_start)
     if active.shape != (M,) or active.dtype.kind not in "biuf":
         raise ProblemError(

@@ -16,10 +16,11 @@ import numpy as np
 
 from gpmpc.compiled import borrowing
 from gpmpc.qp import record, workspace
+from gpmpc.qp.cholesky import factorise
 from gpmpc.qp.dual_iteration import CONTRADICTION, keep_violated, list_violated, most_violated, step_to
 from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, follow_listed, refine, residuals, row_values
 from gpmpc.qp.factor import dot, multiply_at, pack, unpack
-from gpmpc.qp.hessian import factorise, solve_transposed
+from gpmpc.qp.hessian import solve_transposed
 from gpmpc.qp.working_set import (
     CAP,
     END,
@@ -42,7 +43,7 @@ from gpmpc.qp.working_set import (
     take,
     watch,
 )
-from gpmpc.qp.workspace import carve, most_working
+from gpmpc.qp.workspace import carve, most_working, padded
 
 STATUS, ITERATIONS, VARIABLES, CONSTRAINTS = record.STATUS, record.ITERATIONS, record.VARIABLES, record.CONSTRAINTS
 WORKING, TAG, AGE, HEADER = record.WORKING, record.TAG, record.AGE, record.HEADER
@@ -125,8 +126,8 @@ def write_ray(p, above, k, bounds, members, r, mu):
 
 
 @borrowing
-def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out):
-    """Both modes after their set-up."""
+def optimise(lazy, P, linear, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out):
+    """Both modes after their set-up; ``rows`` is K and L is G' in Gram mode."""
     M = len(lower)
     limit, tolerance, soft = (
         int(settings[workspace.LIMIT]),
@@ -136,8 +137,10 @@ def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, uppe
     capacity = most_working(n, M, soft)
     bounds, slots, scratch, y = vectors[:5], vectors[5:9], vectors[9:13], vectors[13, :M]
     seen, excess, gradient, active = vectors[14], vectors[15], vectors[16], vectors[17]
-    v, slope, pulled, now = vectors[18], vectors[19], vectors[20], vectors[21]
+    v, slope, pulled, now, q = vectors[18], vectors[19], vectors[20], vectors[21], vectors[22]
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
+    for i in range(n):
+        q[i] = linear[i]
     for p in range(M):
         mu[p] = 0.0
     for i in range(capacity + 2):
@@ -232,16 +235,16 @@ def optimise(lazy, P, q, G, n, rows, L, traits, vectors, members, R, lower, uppe
                     evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y)
                 else:
                     follow_lazily(n, v, rows, L, mu, k, members, gradient, y)
-                    row_values(G, n, traits, y)
+                    row_values(lazy, L, G, n, traits, y)
                 count = list_violated(y, traits[WEIGHT], bounds, excess, listed)
             continue
         if not current:
             if not lazy:
-                row_values(G, n, traits, y)
+                row_values(lazy, L, G, n, traits, y)
             add_pull(G, n, q, mu, k, members, traits, soft, slope)
         best = np.inf
         for attempt in range(REFINEMENTS + 1):
-            worst = residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active)
+            worst = residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, active)
             if worst <= FINE or attempt == REFINEMENTS or not worst < 0.5 * best:
                 break
             best = worst
@@ -271,10 +274,11 @@ def solve_gram(q, lower, upper, warm, system, work, out):
     """Gram mode; ``system`` is of ``gpmpc.qp.gram_system``, ``work`` of ``gpmpc.qp.workspace``."""
     settings, traits, vectors, members, R, _ = carve(work)
     n, M = int(settings[workspace.VARIABLES]), int(settings[workspace.CONSTRAINTS])
-    if len(q) != n or len(lower) != M or len(upper) != M or not all_finite(q):
+    dense = is_dense(q) and is_dense(lower) and is_dense(upper) and is_dense(warm)
+    if not dense or len(q) != n or len(lower) != M or len(upper) != M or not all_finite(q):
         return MISUSE
-    K, P, G = system[:M], system[M : M + n], system[M + n :]
-    return optimise(False, P, q, G, n, K, P, traits, vectors, members, R, lower, upper, warm, settings, out)
+    K, P, transposed, G = system[:M], system[M : M + n], system[M + n : M + 2 * n], system[M + 2 * n :]
+    return optimise(False, P, q, G, n, K, transposed, traits, vectors, members, R, lower, upper, warm, settings, out)
 
 
 @borrowing
@@ -283,11 +287,14 @@ def solve_lazy(P, q, G, lower, upper, warm, work, out):
     n, m = P.shape[0], len(G)
     M = n + m
     shaped = P.shape[1] == n and len(q) == n and (m == 0 or G.shape[1] == n) and len(lower) == M and len(upper) == M
-    if not shaped or not all_finite(q):
+    dense = is_dense(q) and is_dense(lower) and is_dense(upper) and is_dense(warm)
+    dense &= is_dense_matrix(P) and is_dense_matrix(G)
+    if not shaped or not dense or not all_finite(q):
         return MISUSE
     settings, traits, vectors, members, R, rest = carve(work)
     dense = rest.reshape(rest.size)  # rows without gaps are nearer to each other
-    L, rows = dense[: n * n].reshape((n, n)), dense[n * n : n * (n + len(R) + 1)].reshape((len(R) + 1, n))
+    size = n * padded(n)
+    L, rows = dense[:size].reshape((n, padded(n))), dense[size : size + n * (len(R) + 1)].reshape((len(R) + 1, n))
     if not factorise(P, L):
         return MISUSE
     if not measure(G, n, traits):
@@ -312,6 +319,19 @@ def measure(G, n, traits):
         undefined += norm * 0.0
         traits[NORM, n + p], traits[WEIGHT, n + p], traits[END, n + p] = norm, 1.0 / norm if norm > 0.0 else 1.0, end
     return undefined == 0.0
+
+
+@borrowing
+def is_dense(vector):
+    """Whether a vector is as contiguous as its type claims: ``gpmpc.compiled.direct`` does not ask."""
+    return vector.strides[0] == vector.itemsize or len(vector) <= 1
+
+
+@borrowing
+def is_dense_matrix(A):
+    """The same for a matrix."""
+    rows, columns = A.shape
+    return (A.strides[0] == columns * A.itemsize and A.strides[1] == A.itemsize) or rows * columns == 0
 
 
 @borrowing

@@ -2,13 +2,17 @@
 
 x minimises the Lagrangian, P x = -(q + C'mu), and y = C x are the constraints' values. Gram mode multiplies with P^-1,
 the upper left corner of K, and may later move y by the rows of K whose multipliers changed; lazy mode, P = L'L,
-solves.
+solves. What is called L is the transposed G in Gram mode, which adds its rows faster than it multiplies those of G.
 """
 
 from gpmpc.compiled import borrowing
 from gpmpc.qp.factor import backward_solve, dot, forward_solve, four_dots, multiply, subtract_rows
 from gpmpc.qp.hessian import solve_lower, solve_transposed
+from gpmpc.qp.lanes import combine, lanes, larger, largest, no_lanes, plus, put
 from gpmpc.qp.working_set import BOUND, END, LEAST, MOST, NAME, PLACE, SCRATCH, SOFTNESS, couple
+from gpmpc.qp.workspace import padded
+
+FEW = 16  # variables below which four inner products at a time are faster than rows in whole registers
 
 
 @borrowing
@@ -43,18 +47,25 @@ def evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y):
             y[i] = slope[i]
         solve_transposed(L, n, y)
         solve_lower(L, n, y)
-    else:
+    elif n < FEW:
         multiply(rows, n, slope, n, y)
+    else:
+        combine(rows, n, slope, 0, n, y)  # K is symmetric
     for i in range(n):
         y[i] = -y[i]
-    row_values(G, n, traits, y)
+    row_values(lazy, L, G, n, traits, y)
 
 
 @borrowing
-def row_values(G, n, traits, y):
-    """``y[n:] = G y[:n]``, four rows at a time, as far as they may not be zero."""
+def row_values(lazy, L, G, n, traits, y):
+    """``y[n:] = G y[:n]``, several rows at a time, as far as they may not be zero."""
     product, ends, m = y[n:], traits[END, n:], len(G)
     p = 0
+    if not lazy and n >= FEW:
+        while p < m:
+            size = min(32, m - p)
+            combine(L, int(ends[p + size - 1]), y, p, size, product)
+            p += size
     while p + 4 <= m:
         size = int(max(max(ends[p], ends[p + 1]), max(ends[p + 2], ends[p + 3])))
         four_dots(G[p], G[p + 1], G[p + 2], G[p + 3], y, size, product[p:])
@@ -115,17 +126,26 @@ def follow_listed(lazy, n, v, rows, L, G, mu, k, members, traits, seen, weights,
 
 
 @borrowing
-def residuals(P, q, n, traits, mu, k, slots, members, y, slope, gradient, active):
+def residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, active):
     """The largest scaled residual of (x, mu), x = y[:n]: stationarity, violation of the working set, duality gap.
 
-    Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where y = C x and slope = q + C' mu.
+    Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where y = C x and slope = q + C' mu. The
+    vectors gradient, slope and q are padded, the latter two with zeros.
     """
-    multiply(P, n, y, n, gradient)
-    size, stationarity, infeasibility, gap = 1.0, 0.0, 0.0, 0.0
-    for i in range(n):
-        size = max(size, max(abs(gradient[i]), abs(q[i])))
-        gradient[i] += slope[i]
-        stationarity = max(stationarity, abs(gradient[i]))
+    if lazy or n < FEW:
+        multiply(P, n, y, n, gradient)
+        for i in range(n, padded(n)):
+            gradient[i] = 0.0
+    else:
+        combine(P, n, y, 0, n, gradient)
+    sizes, rest, undefined = no_lanes(), no_lanes(), no_lanes()
+    for i in range(0, n, 8):
+        pull, slopes = lanes(gradient, i), lanes(slope, i)
+        sizes = larger(larger(sizes, pull), lanes(q, i))
+        pull = plus(pull, 1.0, slopes)
+        put(gradient, i, pull)
+        rest, undefined = larger(rest, pull), plus(undefined, 0.0, pull)
+    size, stationarity, infeasibility, gap = max(1.0, largest(sizes)), largest(rest), 0.0, largest(undefined)
     for i in range(k):
         p, b = abs(members[NAME, i]) - 1, slots[BOUND, i]
         active[i] = y[p] - traits[SOFTNESS, p] * mu[p] - b
@@ -159,4 +179,4 @@ def refine(lazy, k, n, rows, L, G, slots, members, traits, R, mu, y, gradient, a
     for i in range(k):
         p = abs(members[NAME, i]) - 1
         mu[p] = min(max(mu[p] + trial[i], slots[LEAST, i]), slots[MOST, i])
-    row_values(G, n, traits, y)
+    row_values(lazy, L, G, n, traits, y)

@@ -1,7 +1,8 @@
 """What Gram mode needs to know about P and G, laid out in one array for the kernel.
 
 K = C P^-1 C' with C = [I; G] says how each constraint's value answers to each multiplier. The kernel reads one flat
-array: K (M, M), P (n, n), G (m, n).
+array: K (M, M), P (n, n), G' (n, m), G (m, n),
+rows padded with zeros to whole lanes.
 """
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from gpmpc.qp.solution import Terms
+from gpmpc.qp.workspace import aligned, padded
 
 Array = NDArray[np.float64]
 
@@ -23,8 +25,12 @@ def gram_system(terms: Terms) -> tuple[Array, Array]:
     diagonal = np.diagonal(K)
     weights = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     ends = ((C != 0) * np.arange(1, len(P) + 1)).max(axis=1)
+    ends[len(P) :] = np.maximum.accumulate(ends[len(P) :])  # so that the last of several rows has the largest
     traits = np.vstack([np.linalg.norm(C, axis=1), weights, softness, ends])
-    system = np.zeros((2 * len(C), len(C)))
-    system[: len(C)] = K
-    system[len(C) :, : len(P)] = np.vstack([P, G])
+    n, m = len(P), len(G)
+    system = aligned(2 * len(C) + n, padded(len(C)))
+    system[: n + m, : n + m] = K
+    system[n + m : 2 * n + m, :n] = P
+    system[2 * n + m : 3 * n + m, :m] = G.T
+    system[3 * n + m :, :n] = G
     return system, traits

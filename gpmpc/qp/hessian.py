@@ -1,79 +1,7 @@
-"""Lazy mode's work with P: its Cholesky factor, and the rows w_p = L^-T c_p of the constraints that enter.
-
-``P = L'L`` with L lower triangular, so that variables are eliminated from the last to the first: a constraint on the
-first few variables only, as all are in predictive control where no state depends on later inputs, then has as short a
-row. The diagonal of the array L holds reciprocals, its upper triangle is undefined.
-
-Rows are subtracted from rows, up to eight at a time, so that the one that changes is read and written seldom.
-"""
-
-import math
+"""Lazy mode's work with the factor of P (``gpmpc.qp.cholesky``): the rows w_p = L^-T c_p of constraints that enter."""
 
 from gpmpc.compiled import borrowing
 from gpmpc.qp.factor import dot, four_dots
-
-
-@borrowing
-def factorise(P, L):
-    """Fills L; False if P is not symmetric, finite and positive definite."""
-    n = len(P)
-    if not is_symmetric(P):
-        return False
-    for top in range((n - 1) // 4 * 4, -1, -4):
-        end = min(top + 4, n)
-        for i in range(top, end):
-            source, target = P[i], L[i]
-            for j in range(end):
-                target[j] = source[j]
-        s = top + 4
-        while s + 8 <= n:
-            for i in range(top, end):
-                subtract_eight(L[i], L, s, i, end)
-            s += 8
-        while s + 4 <= n:
-            a, b, c, d = L[s], L[s + 1], L[s + 2], L[s + 3]
-            for i in range(top, end):
-                subtract_four(L[i], a, b, c, d, a[i], b[i], c[i], d[i], end)
-            s += 4
-        while s < n:
-            for i in range(top, end):
-                subtract(L[i], L[s, i], L[s], end)
-            s += 1
-        for i in range(end - 1, top - 1, -1):
-            row = L[i]
-            pivot = row[i]
-            if not (pivot > n * 2.3e-16 * P[i, i] and pivot < math.inf):
-                return False
-            reciprocal = 1.0 / math.sqrt(pivot)
-            for j in range(i):
-                row[j] *= reciprocal
-            row[i] = reciprocal
-            for j in range(top, i):
-                subtract(L[j], row[j], row, j + 1)
-    return True
-
-
-@borrowing
-def is_symmetric(P):
-    """Whether P equals its transpose but for rounding; read in blocks that stay in the cache."""
-    n = len(P)
-    largest, squares, skewed = 0.0, 0.0, 0
-    for i in range(n):
-        largest = max(largest, abs(P[i, i]))
-    allowed = 1e-10 * largest
-    for left in range(0, n, 8):
-        for i in range(left, min(left + 8, n)):
-            for j in range(left, i):
-                squares += (P[i, j] - P[j, i]) * (P[i, j] - P[j, i])
-        for i in range(left + 8, n):
-            for j in range(left, left + 8):
-                squares += (P[i, j] - P[j, i]) * (P[i, j] - P[j, i])
-    if squares <= allowed * allowed:  # enough, and quickly summed
-        return True
-    for i in range(n):
-        for j in range(i):
-            skewed += not abs(P[i, j] - P[j, i]) <= allowed
-    return skewed == 0
 
 
 @borrowing
@@ -88,16 +16,6 @@ def subtract_four(target, a, b, c, d, fa, fb, fc, fd, size):
     """``target -= fa a + fb b + fc c + fd d``."""
     for j in range(size):
         target[j] -= fa * a[j] + fb * b[j] + fc * c[j] + fd * d[j]
-
-
-@borrowing
-def subtract_eight(target, L, s, i, size):
-    """``target -= sum_r L[r, i] L[r]`` for the eight rows from s on."""
-    a, b, c, d, e, f, g, h = L[s], L[s + 1], L[s + 2], L[s + 3], L[s + 4], L[s + 5], L[s + 6], L[s + 7]
-    fa, fb, fc, fd, fe, ff, fg, fh = a[i], b[i], c[i], d[i], e[i], f[i], g[i], h[i]
-    for j in range(size):
-        low = fa * a[j] + fb * b[j] + fc * c[j] + fd * d[j]
-        target[j] -= low + (fe * e[j] + ff * f[j] + fg * g[j] + fh * h[j])
 
 
 @borrowing

@@ -18,7 +18,7 @@ from gpmpc.compiled import borrowing
 Array = NDArray[np.float64]
 
 LIMIT, TOLERANCE, SOFT, VARIABLES, CONSTRAINTS, TAG, SETTINGS = 0, 1, 2, 3, 4, 5, 6
-TRAITS, VECTORS, MEMBERS = 5, 22, 4  # rows of each
+TRAITS, VECTORS, MEMBERS = 5, 23, 4  # rows of each
 
 
 def gram_workspace(settings: Array, traits: Array) -> Array:
@@ -30,23 +30,36 @@ def lazy_workspace(settings: Array, softness: Array) -> Array:
     """Memory for solves in lazy mode with these settings (6,) and softness (2, M)."""
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
     traits = np.vstack([np.zeros((2, M)), softness, np.zeros((1, M))])
-    return _workspace(settings, traits, n * (n + most_working(n, M, bool(settings[SOFT])) + 2))
+    return _workspace(settings, traits, n * (padded(n) + most_working(n, M, bool(settings[SOFT])) + 2))
 
 
 def _workspace(settings: Array, traits: Array, own: int) -> Array:
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
     capacity = most_working(n, M, bool(settings[SOFT]))
-    wide = max(M, capacity + 2, SETTINGS)
-    work = np.zeros((1 + TRAITS + VECTORS + MEMBERS + capacity + 1 + -(-own // wide), wide))
+    wide = padded(max(M, capacity + 2, SETTINGS)) + 8  # kernels write whole lanes
+    work = aligned(1 + TRAITS + VECTORS + MEMBERS + capacity + 1 + -(-own // wide), wide)
     work[0, :SETTINGS] = settings
     work[1 : 1 + TRAITS, :M] = traits
     return work
+
+
+def aligned(rows: int, columns: int) -> Array:
+    """Zeros that begin where a cache line does: a load of eight numbers that spans two lines takes twice the time."""
+    memory = np.zeros(rows * columns + 8)
+    start = -memory.ctypes.data // 8 % 8
+    return memory[start : start + rows * columns].reshape(rows, columns)
 
 
 @borrowing
 def most_working(n, M, soft):
     """How many constraints can work at once."""
     return M if soft else min(n, M)
+
+
+@borrowing
+def padded(size):
+    """The next multiple of eight."""
+    return (size + 7) // 8 * 8
 
 
 @borrowing

@@ -1,0 +1,76 @@
+"""The kernels are called without numba's look at the arguments: whatever is given, no memory is misread."""
+
+import pickle
+
+import numba
+import numpy as np
+import pytest
+from problems import feasible_problem, worst_residual
+
+import gpmpc.compiled
+from gpmpc.qp import DualActiveSet
+
+ODD = {
+    "every other entry": lambda a: np.repeat(a, 2, axis=-1)[..., ::2],
+    "backwards": lambda a: np.ascontiguousarray(a[..., ::-1])[..., ::-1],
+    "by columns": np.asfortranarray,
+    "a list": lambda a: a.tolist(),
+    "another byte order": lambda a: a.astype(a.dtype.newbyteorder()),
+    "a dtype that was pickled": lambda a: pickle.loads(pickle.dumps(a)),
+    "unaligned": lambda a: np.frombuffer(b"x" + a.tobytes(), dtype=float, offset=1).reshape(a.shape),
+    "read-only": lambda a: np.frombuffer(a.tobytes()).reshape(a.shape),
+    "integers": lambda a: np.rint(a).astype(np.int64),
+}
+
+
+@pytest.mark.parametrize("odd", ODD.values(), ids=ODD)
+@pytest.mark.parametrize("position", range(5))
+def test_an_odd_array_is_read_as_what_it_is(odd, position, rng):
+    problem = feasible_problem(rng, 6, 9)
+    arrays = [problem.P, problem.q, problem.G, problem.lower, problem.upper]
+    if odd is ODD["integers"]:
+        arrays = [np.rint(10 * a) if np.isfinite(a).all() else a for a in arrays]
+        if not np.isfinite(arrays[position]).all() or position == 0:
+            pytest.skip("has no integer form")
+        if position >= 3:
+            arrays[3], arrays[4] = np.full(15, -3.0), np.full(15, 4.0)
+    given = list(arrays)
+    given[position] = odd(arrays[position])
+    expected = DualActiveSet().solve_stacked(*arrays)
+    solutions = [DualActiveSet().solve_stacked(*given), DualActiveSet().solve_stacked(*given, expected)]
+    prepared = DualActiveSet().prepare(given[0], given[2])
+    solutions += [prepared.solve(given[1], *given[3:]), prepared.solve(given[1], *given[3:], expected)]
+    for solution in solutions:
+        assert solution.status is expected.status
+        if expected.status.solved:
+            assert worst_residual(solution) < 1e-9
+            np.testing.assert_allclose(solution.x, expected.x, atol=1e-9 * max(1.0, np.abs(expected.x).max()))
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int64, np.uint64, "datetime64[s]"])
+def test_eight_bytes_of_another_kind_are_not_taken_for_a_float(kind, rng):
+    problem = feasible_problem(rng, 3, 4)
+    rest = problem.lower, problem.upper
+    q = np.arange(3).astype(kind)
+    expected = DualActiveSet().solve_stacked(problem.P, np.arange(3.0), problem.G, *rest)
+    prepared = DualActiveSet().prepare(problem.P, problem.G)
+    for solution in (prepared.solve(q, *rest, expected), DualActiveSet().solve_stacked(problem.P, q, problem.G, *rest)):
+        np.testing.assert_allclose(solution.x, expected.x, atol=1e-9)
+
+
+def test_a_record_with_gaps_is_a_warm_start_too(rng):
+    problem = feasible_problem(rng, 6, 9)
+    cold = DualActiveSet().solve(problem)
+    gappy = cold._replace(record=np.repeat(cold.record, 2)[::2])
+    prepared, vectors = DualActiveSet().prepare(problem.P, problem.G), (problem.q, problem.lower, problem.upper)
+    for solution in (DualActiveSet().solve(problem, gappy), prepared.solve(*vectors, gappy)):
+        assert solution.status.solved
+        np.testing.assert_allclose(solution.x, cold.x, atol=1e-9)
+
+
+def test_without_numbas_private_parts_kernels_are_slower_and_no_worse(monkeypatch):
+    monkeypatch.setattr(gpmpc.compiled, "_counting_is_optional", lambda: False)
+    monkeypatch.setattr(numba, "njit", lambda **options: lambda function: (function, options))
+    _, options = gpmpc.compiled.borrowing(len)
+    assert "_nrt" not in options
+    assert gpmpc.compiled.direct(print) is print
