@@ -20,6 +20,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 import gpmpc
 from gpmpc.cli.log import log
+from gpmpc.cli.run import run
 from gpmpc.cli.tables import tables
 from gpmpc.exceptions import GpmpcError
 
@@ -29,6 +30,7 @@ usage: gpmpc COMMAND [SETTING=VALUE ...]
        gpmpc log info|recover|export FILE [OUTPUT]
 
 commands:
+  run       One flight: trains a model, flies with it, records; with -m a sweep of many, resumed where it stopped
   tables    Tables 1 and 2 of Cao, Lai and Alam (2017), computed beside the printed figures
   log       What is in a recording (info), rescue an unfinished one (recover), a table of its steps (export)
 
@@ -163,5 +165,5 @@ def _nearest(name: str, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-COMMANDS: dict[str, tuple[Callable[[DictConfig], None], str]] = {"tables": (tables, "tables")}
+COMMANDS: dict[str, tuple[Callable[[DictConfig], None], str]] = {"run": (run, "run"), "tables": (tables, "tables")}
 PLAIN: dict[str, Callable[[list[str]], None]] = {"log": log}
