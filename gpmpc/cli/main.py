@@ -21,6 +21,8 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 import gpmpc
 from gpmpc.cli.log import log
+from gpmpc.cli.plot import plot
+from gpmpc.cli.report import report
 from gpmpc.cli.run import run
 from gpmpc.cli.tables import tables
 from gpmpc.exceptions import GpmpcError
@@ -30,11 +32,15 @@ SHOW_TRACEBACK = bool(os.environ.get("HYDRA_FULL_ERROR"))
 USAGE = f"""gpmpc {gpmpc.__version__}: Gaussian process model predictive control
 
 usage: gpmpc COMMAND [SETTING=VALUE ...]
+       gpmpc report OUTPUTS [--compare A B] [--to DIR]
+       gpmpc plot RUN [--to DIR] [--format png|pdf|svg] [--no-animation]
        gpmpc log info|recover|export FILE [OUTPUT]
 
 commands:
   run       One flight: trains a model, flies with it, records; with -m a sweep of many, resumed where it stopped
   tables    Tables 1 and 2 of Cao, Lai and Alam (2017), computed beside the printed figures
+  report    A tree of runs as one table, with figures; whether two groups of runs differ
+  plot      A recorded flight as figures and an animation
   log       What is in a recording (info), rescue an unfinished one (recover), a table of its steps (export)
 
 gpmpc COMMAND --help lists a command's settings, --cfg job prints them resolved.
@@ -66,7 +72,9 @@ def main() -> None:
         return
     # Guarded inside as well, where Hydra would add a line of its own to a task's error.
     guarded = partial(_guarded, config_name, task)
-    _run(hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)(guarded), config_name)
+    _run(
+        hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)(guarded), config_name
+    )
 
 
 def config_folder() -> Path:
@@ -184,4 +192,4 @@ def _nearest(name: str, known: Iterable[str]) -> str:
 
 
 COMMANDS: dict[str, tuple[Callable[[DictConfig], None], str]] = {"run": (run, "run"), "tables": (tables, "tables")}
-PLAIN: dict[str, Callable[[list[str]], None]] = {"log": log}
+PLAIN: dict[str, Callable[[list[str]], None]] = {"log": log, "plot": plot, "report": report}

@@ -117,7 +117,9 @@ def _recorder(experiment: "Experiment", folder: "RunFolder", config: DictConfig,
                 dynamics.state_names,
                 dynamics.input_names,
                 time_step=experiment.plant.time_step,
-                units={name: unit for name, unit in UNITS.items() if name in dynamics.state_names + dynamics.input_names},
+                units={
+                    name: unit for name, unit in UNITS.items() if name in dynamics.state_names + dynamics.input_names
+                },
                 config=OmegaConf.to_yaml(config, resolve=True),
                 metadata={"seed": experiment.seed, "command": about["provenance"]["command"]},
                 input_bounds=[problem.input_lower, problem.input_upper],

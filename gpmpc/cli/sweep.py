@@ -6,6 +6,8 @@ and unfinished ones are. The parent only looks at the folders to show how far it
 run that another process works on is left to it, and looked at again at the end.
 """
 
+import hashlib
+import json
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -28,8 +30,9 @@ from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig
 
 from gpmpc.cli.run import checked_folder, choices, fly_one
-from gpmpc.exceptions import GpmpcError
-from gpmpc.experiments.run_folder import Busy, RunFolder, folder_name
+from gpmpc.exceptions import GpmpcError, SettingError
+from gpmpc.experiments.run_folder import PLAN, Busy, RunFolder, folder_name
+from gpmpc.files import write_whole
 from gpmpc.parallel import THREADS
 
 LOOK = 0.5  # between two looks at the folders [s]
@@ -70,6 +73,7 @@ def sweep(overrides: Sequence[str], conf: Path) -> None:
         context, config = _composed(overrides, conf)
         jobs = _jobs(overrides, config)
         _check(jobs, context, config)
+        _keep_plan(jobs, Path(config.folder))
         waiting = [job for job in jobs if not job.folder.finished]
         skipped = len(jobs) - len(waiting)
         with _progress(jobs, console):
@@ -135,6 +139,17 @@ def _check(jobs: Sequence[Job], context: HydraContext, config: DictConfig) -> No
             seen.update(job.overrides)
 
 
+def _keep_plan(jobs: Sequence[Job], tree: Path) -> None:
+    """Writes what was asked for, so that a report knows what is missing; equal sweeps write the same file."""
+    plan = [choices(job.overrides) for job in jobs]
+    text = json.dumps({"runs": plan}, indent=1) + "\n"
+    try:
+        tree.mkdir(parents=True, exist_ok=True)
+        write_whole(tree / f"{PLAN}{hashlib.sha256(text.encode()).hexdigest()[:10]}.json", text)
+    except OSError as error:
+        raise SettingError("folder", f"cannot write to {tree}: {error.strerror or error}") from error
+
+
 def _launch(jobs: Sequence[Job], wait: bool, context: HydraContext, config: DictConfig) -> list[dict[str, Any]]:
     """What came of every job."""
     if not jobs:
@@ -153,7 +168,14 @@ def _launch(jobs: Sequence[Job], wait: bool, context: HydraContext, config: Dict
 @contextmanager
 def _progress(jobs: Sequence[Job], console: Any) -> Iterator[None]:
     """One bar for the whole sweep, drawn by a thread that looks at the folders."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
     columns += [TextColumn("left"), TimeRemainingColumn()]

@@ -26,6 +26,7 @@ from gpmpc.files import write_whole
 from gpmpc.provenance import provenance
 
 METRICS, ERROR, CONFIG, RECORDING = "metrics.json", "error.json", "config.yaml", "run.mcap"
+PLAN = "sweep-"  # begins the name of the files that say which runs a sweep asked for
 LONGEST_NAME = 150  # of a folder, in characters; file systems take 255 bytes
 
 
