@@ -161,7 +161,8 @@ def _one_line(error: Exception, config_name: str) -> str:
         return f"{error.full_key}: this setting has no default; give it as {error.full_key}=VALUE"
     ambiguous = re.match(r"Ambiguous value for argument '([^=]+)=([^']+)'", text)
     if ambiguous:
-        return f"{ambiguous[1]}: a list is written in brackets, {ambiguous[1]}=[{ambiguous[2]}]"
+        listed = f"{ambiguous[1]}: a list is written in brackets, {ambiguous[1]}=[{ambiguous[2]}]"
+        return f"{listed}; a sweep takes -m" if config_name == "run" else listed
     lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc" not in line]
     return "; ".join(line.rstrip(":;") for line in lines) or type(error).__name__
 

@@ -91,8 +91,6 @@ def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, abou
     from gpmpc.experiments.run import fly, metrics
     from gpmpc.simulation import tell
 
-    if config.recorder not in ("mcap", "none", None):
-        raise SettingError("recorder", f"must be 'mcap' or 'none'; got {config.recorder!r}")
     if config.recorder != "mcap":
         return metrics(experiment, fly(experiment))
     with ExitStack() as stack:
@@ -143,6 +141,9 @@ def experiment_of(config: DictConfig) -> "Experiment":
     from gpmpc.simulation import Noise
 
     config = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    checked_folder(config)
+    if config.recorder not in ("mcap", "none", None):
+        raise SettingError("recorder", f"must be 'mcap' or 'none'; got {config.recorder!r}")
     for group in ("data", "trajectory", "plant", "model", "controller"):
         if not config.get(group):
             raise SettingError(group, "choose one")

@@ -4,11 +4,13 @@ Cao, Lai and Alam (2017), figures 2 to 4, show positions and inputs over time. T
 expected one step before, with two standard deviations.
 """
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
@@ -42,11 +44,10 @@ def tracking_figure(run: "Run") -> Figure:
     axes = figure.subplots(2, len(states), squeeze=False, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
     for column, i in enumerate(states):
         above, below = axes[:, column]
-        name, unit = run.state_names[i], units.get(f"state.{run.state_names[i]}", "")
         reference = run.references[:, i]
         above.plot(run.times, run.states[:, i], color=FLOWN, linewidth=1.6, label="flown")
         above.plot(run.times, reference, color=REFERENCE, linewidth=1.2, linestyle=(0, (4, 3)), label="reference")
-        above.set_title(f"{name} [{unit}]" if unit else name)
+        above.set_title(f"{run.state_names[i]}{_unit(units, run, i)}")
         error, band = mean[:, column] - reference, 2 * std[:, column]
         below.axhline(0, color=REFERENCE, linewidth=1, linestyle=(0, (4, 3)))
         below.fill_between(
@@ -61,9 +62,8 @@ def tracking_figure(run: "Run") -> Figure:
         below.plot(run.times, run.states[:, i] - reference, color=FLOWN, linewidth=1.2)
         _failures(run, (above, below))
         below.set_xlabel("time [s]")
-    axes[1, 0].set_ylabel("distance from\nthe reference")
-    handles = [h for axis in axes[:, 0] for h in axis.get_legend_handles_labels()[0]]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    axes[1, 0].set_ylabel(f"from the reference{_unit(units, run, states[0])}")
+    _legend(figure, axes.ravel())
     for axis in axes.ravel():
         _plain(axis)
     figure.align_ylabels(axes[:, 0])
@@ -78,17 +78,12 @@ def inputs_figure(run: "Run") -> Figure:
     for i, axis in enumerate(axes):
         unit = units.get(f"input.{run.input_names[i]}", "")
         axis.step(run.times, run.inputs[:, i], where="post", color=FLOWN, linewidth=1.4, label="applied")
-        for limit in run.input_bounds[:, i]:
-            if np.isfinite(limit):
-                axis.axhline(limit, color=BOUND, linestyle=(0, (4, 3)), linewidth=1, label="bound")
+        _bounds(axis, run.inputs[:, i], run.input_bounds[:, i])
         axis.set_ylabel(f"{run.input_names[i]} [{unit}]" if unit not in ("", "1") else run.input_names[i])
-        axis.margins(y=0.1)
         _failures(run, (axis,))
         _plain(axis)
     axes[-1].set_xlabel("time [s]")
-    handles, labels = axes[0].get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=len(unique), frameon=False)
+    _legend(figure, axes)
     figure.align_ylabels(axes)
     return figure
 
@@ -106,6 +101,7 @@ def timing_figure(run: "Run") -> Figure:
         over_time.stairs(top, edges, baseline=bottom, fill=True, color=colour, label=name)
         bottom = top
     total = np.sort(milliseconds[:, -1])
+    total = total[total > 0] if total.any() else total  # a controller that was not asked took no time
     # A first step that loads and compiles would leave nothing to be seen of the others.
     ceiling = 1.15 * total[max(0, int(np.ceil(0.98 * len(total))) - 1)] or 1.0
     over_time.set_ylim(0, ceiling)
@@ -116,21 +112,51 @@ def timing_figure(run: "Run") -> Figure:
     over_time.set_xlabel("time [s]")
     over_time.set_ylabel("decision [ms]")
     distribution.step(total, np.arange(1, len(total) + 1) / len(total), where="post", color=FLOWN)
-    if total[0] > 0 and total[-1] > 20 * total[0]:
+    if total[0] > 0 and total[-1] > 5 * total[0]:
         distribution.set_xscale("log")
-    for share, name in ((0.5, "median"), (0.99, "99 %")):
-        value = float(np.quantile(total, share))
+        distribution.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        distribution.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        distribution.xaxis.set_minor_formatter(NullFormatter())
+    median, most = (float(np.quantile(total, share)) for share in (0.5, 0.99))
+    for value in (median, most):
         distribution.axvline(value, color=BOUND, linewidth=1, linestyle=(0, (4, 3)))
-        place = {"xytext": (4, 0), "textcoords": "offset points", "va": "bottom", "fontsize": "small"}
-        distribution.annotate(f"{name}\n{value:.3g} ms", (value, 0.04 if share < 0.9 else 0.55), **place)
+    distribution.set_title(f"median {median:.3g} ms, 99 % below {most:.3g} ms", fontsize="small")
     distribution.set_ylim(0, 1.02)
     distribution.set_xlabel("decision [ms]")
     distribution.set_ylabel("share of the steps")
     for axis in (over_time, distribution):
         _plain(axis)
-    handles, labels = over_time.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    _legend(figure, [over_time])
     return figure
+
+
+def _unit(units: dict[str, str], run: "Run", state: int) -> str:
+    """The unit of a state, in brackets."""
+    unit = units.get(f"state.{run.state_names[state]}", "")
+    return f" [{unit}]" if unit else ""
+
+
+def _legend(figure: Figure, axes: Iterable[Axes]) -> None:
+    """One for the whole figure, below it; nothing twice."""
+    found = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=len(found), frameon=False)
+
+
+def _bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
+    """Lines where they are near; where they are so far that the input would be flat beside them, in words."""
+    low, high = float(inputs.min()), float(inputs.max())
+    span = max(high - low, 1e-3 * max(abs(low), abs(high), 1e-3))
+    limits = [limit for limit in bounds if np.isfinite(limit)]
+    near = [limit for limit in limits if low - 2 * span <= limit <= high + 2 * span]
+    for limit in near:
+        axis.axhline(limit, color=BOUND, linestyle=(0, (4, 3)), linewidth=1, label="bound")
+    low, high = min([low, *near]), max([high, *near])
+    axis.set_ylim(low - 0.12 * max(high - low, span), high + 0.25 * max(high - low, span))
+    if len(near) < len(limits):
+        text = "bounds " + " and ".join(f"{limit:g}" for limit in limits)
+        axis.annotate(
+            text, (0.995, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize="small", color=BOUND
+        )
 
 
 def _failures(run: "Run", axes: tuple[Axes, ...]) -> None:
