@@ -121,8 +121,9 @@ def record(choices: Sequence[str], settings: Mapping[str, Any], command: str) ->
 def folder_name(choices: Sequence[str]) -> str:
     """A name for a run of these choices, ``key=value`` each; runs of other choices have other names."""
     text = ",".join(sorted(choices)) or "default"
-    # Equal up to upper and lower case is equal on some file systems.
     name = re.sub(r"[^\w=.,+\-\[\]@]", "_", text, flags=re.ASCII)[:LONGEST_NAME]
-    if name == text == text.lower():
+    # Equal up to upper and lower case is equal on some file systems; a comma in a choice could be one between two.
+    if name == text == text.lower() and not any("," in choice for choice in choices):
         return name
+    text = json.dumps(sorted(choices))
     return f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
