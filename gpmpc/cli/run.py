@@ -195,7 +195,7 @@ def choices(overrides: Sequence[str]) -> list[str]:
     found = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
-        if key not in ASIDE:
+        if key not in ASIDE and not key.lstrip("+~").startswith(("hydra.", "hydra/")):
             found[key] = key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"
     return sorted(found.values())
 

@@ -16,6 +16,7 @@ from gpmpc.experiments.tables_report import number
 from gpmpc.plotting import Series, over_variable
 
 DRAWN = ("rmse", "failed", "decision")  # the panels of a figure
+SHOWN = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
 MOST_LINES = 8  # in a figure; what is varied besides is pooled
 LATEX = str.maketrans({c: f"\\{c}" for c in "&%$#_{}"} | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"})
 STYLE = """
@@ -66,15 +67,17 @@ def title(report: Report) -> str:
 
 def render(report: Report) -> Table:
     """The table for a terminal: mean, and the quartiles below it; what is zero everywhere is left out."""
-    shown = [name for name in report.measures() if any(any(cell.numbers(name)) for cell in report.cells)]
+    known = [name for name in SHOWN if name in report.measures()]
+    shown = [name for name in known if any(any(cell.numbers(name)) for cell in report.cells)]
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title(report), title_justify="left")
     for name in (*(report.variables or ("runs",)), "seeds"):
-        table.add_column(name, justify="right", overflow="fold")
+        table.add_column(name.replace(".", ".\n"), justify="right", no_wrap=True)
     for name in shown:
-        table.add_column(MEASURES[name].label.replace(" [", "\n\\[").replace(", ", "\n"), justify="right", no_wrap=True)
+        unit = MEASURES[name].label.rpartition(" [")[2]
+        table.add_column(f"{SHOWN[name]}\n\\[{unit}", justify="right", no_wrap=True)
     for cell in report.cells:
         texts = [_text(cell, name, "\n").replace("[", "\\[") for name in shown]
-        table.add_row(*_named(report, cell), _seeds(cell), *texts)
+        table.add_row(*_named(report, cell), _seeds(cell, "\n"), *texts)
     return table
 
 
@@ -196,9 +199,10 @@ def _counts(cell: Cell) -> tuple:
     return cell.runs, cell.failed, cell.missing
 
 
-def _seeds(cell: Cell) -> str:
+def _seeds(cell: Cell, separator: str = ", ") -> str:
+    """How many finished, and where not all did, how many did not."""
     notes = [f"{len(group)} {word}" for group, word in ((cell.failed, "failed"), (cell.missing, "missing")) if group]
-    return str(len(cell.runs)) + (f" ({', '.join(notes)})" if notes else "")
+    return separator.join([str(len(cell.runs)), *notes])
 
 
 def _text(cell: Cell, measure: str, separator: str = " ") -> str:

@@ -85,7 +85,7 @@ def test_every_document_holds_the_same_numbers_and_the_page_stands_alone(tree):
     assert float(rows[0]["rmse_q25"]) == np.quantile(found.cells[0].numbers("rmse"), 0.25)
     assert (rows[1]["failed"], rows[1]["missing"]) == ("1", "1")
     for name in ("report.md", "report.html"):
-        for text in (f"{expected.mean:.3g}", "no start led anywhere", "1 failed, 1 missing", "gpmpc run -m"):
+        for text in (f"{expected.mean:.3g}", "no start led anywhere", "6, 1 failed, 1 missing", "gpmpc run -m"):
             assert text in written[name]
     assert f"{expected.mean:.3g}" in written["report.tex"]
     assert written["over-controller.png"].startswith(b"\x89PNG")
