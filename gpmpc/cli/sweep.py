@@ -55,14 +55,14 @@ class Job:
 def sweep(overrides: Sequence[str], conf: Path) -> None:
     """Runs every combination of the choices that is not finished; the command line after ``gpmpc run -m``.
 
-    Exits with 1 where runs failed, and names them.
+    Exits with 1 where runs failed, and names them, and where the launcher broke down.
 
     Args:
         overrides: The settings, some with several values.
         conf: Folder of the configuration.
 
     Raises:
-        GpmpcError: A mistake in the settings, before anything is launched, or a launcher that broke down.
+        GpmpcError: A mistake in the settings, before anything is launched.
     """
     from rich.console import Console
 
@@ -162,7 +162,8 @@ def _launch(jobs: Sequence[Job], wait: bool, context: HydraContext, config: Dict
         return [each.return_value for each in returns]
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise GpmpcError(f"the launcher broke down: {reason}; the same command goes on where it stopped") from error
+        print(f"gpmpc: the launcher broke down: {reason}; the same command goes on where it stopped", file=sys.stderr)
+        sys.exit(1)
 
 
 @contextmanager
