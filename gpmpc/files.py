@@ -5,7 +5,10 @@ from pathlib import Path
 
 
 def write_whole(path: str | Path, content: bytes | str) -> None:
-    """Writes a file in one piece or not at all: to a neighbour first, flushed to the disk, then renamed over it."""
+    """Writes a file in one piece or not at all: to a neighbour first, flushed to the disk, then renamed over it.
+
+    When it returns, both the content and the name are on the disk.
+    """
     path = Path(path)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -16,3 +19,9 @@ def write_whole(path: str | Path, content: bytes | str) -> None:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+    if os.name == "posix":  # elsewhere a folder cannot be opened, and needs not be flushed
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)

@@ -46,7 +46,7 @@ def test_the_writer_of_recordings_starts_without_torch_and_without_compilers():
         ("gpytorch", ["gp/model.py", "gp/gpytorch_posterior.py", "gp/gpytorch_training.py"]),
         ("hydra", ["cli"]),
         ("omegaconf", ["cli"]),
-        ("matplotlib", ["plotting.py"]),
+        ("matplotlib", ["plotting"]),
         ("casadi", ["control", "gp/casadi_.py"]),
         ("rich", ["cli", "experiments", "simulation/trials.py"]),
         ("mcap", ["recording"]),

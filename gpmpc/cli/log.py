@@ -4,8 +4,9 @@ import argparse
 import csv
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
+from gpmpc.cli.arguments import Parser
 from gpmpc.exceptions import GpmpcError, SettingError
 
 if TYPE_CHECKING:
@@ -14,20 +15,13 @@ if TYPE_CHECKING:
 FORMATS = (".csv", ".parquet")
 
 
-class _Parser(argparse.ArgumentParser):
-    """A parser whose mistakes are errors of this package, so that they are answered as all others are."""
-
-    def error(self, message: str) -> NoReturn:
-        raise GpmpcError(f"{message}; {self.prog} --help shows how")
-
-
 def log(arguments: list[str]) -> None:
     """The command line after ``gpmpc log``.
 
     Raises:
         GpmpcError: A mistake in the arguments, or a file that cannot be read or written.
     """
-    parser = _Parser(prog="gpmpc log", description=__doc__)
+    parser = Parser(prog="gpmpc log", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="info|recover|export")
     info_parser = commands.add_parser("info", help="channels, duration, metadata and how the solves ended")
     recover_parser = commands.add_parser("recover", help="write what is whole in an unfinished file to a new one")

@@ -14,22 +14,33 @@ from functools import partial
 from pathlib import Path
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 import gpmpc
 from gpmpc.cli.log import log
+from gpmpc.cli.plot import plot
+from gpmpc.cli.report import report
+from gpmpc.cli.run import run
 from gpmpc.cli.tables import tables
 from gpmpc.exceptions import GpmpcError
 
+EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher
+SHOW_TRACEBACK = bool(os.environ.get("HYDRA_FULL_ERROR"))
 USAGE = f"""gpmpc {gpmpc.__version__}: Gaussian process model predictive control
 
 usage: gpmpc COMMAND [SETTING=VALUE ...]
+       gpmpc report OUTPUTS [--compare A B] [--to DIR]
+       gpmpc plot RUN [--to DIR] [--format png|pdf|svg] [--no-animation]
        gpmpc log info|recover|export FILE [OUTPUT]
 
 commands:
+  run       One flight: trains a model, flies with it, records; with -m a sweep of many, resumed where it stopped
   tables    Tables 1 and 2 of Cao, Lai and Alam (2017), computed beside the printed figures
+  report    A tree of runs as one table, with figures; whether two groups of runs differ
+  plot      A recorded flight as figures and an animation
   log       What is in a recording (info), rescue an unfinished one (recover), a table of its steps (export)
 
 gpmpc COMMAND --help lists a command's settings, --cfg job prints them resolved.
@@ -54,7 +65,16 @@ def main() -> None:
         _fail(f"unknown command {command!r}{_nearest(command, known)}; gpmpc --help lists the commands")
     task, config_name = COMMANDS[command]
     sys.argv = [f"gpmpc {command}", *arguments[1:]]
-    _run(task, config_name)
+    if command == "run" and (overrides := _swept(arguments[1:])) is not None:
+        from gpmpc.cli.sweep import sweep
+
+        _run(lambda: sweep(overrides, config_folder()), config_name)
+        return
+    # Guarded inside as well, where Hydra would add a line of its own to a task's error.
+    guarded = partial(_guarded, config_name, task)
+    _run(
+        hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)(guarded), config_name
+    )
 
 
 def config_folder() -> Path:
@@ -64,27 +84,17 @@ def config_folder() -> Path:
     return installed if installed.is_dir() else package.parent / "conf"
 
 
-def _run(task: Callable[[DictConfig], None], config_name: str) -> None:
-    show_traceback = bool(os.environ.get("HYDRA_FULL_ERROR"))
+def _swept(arguments: list[str]) -> list[str] | None:
+    """The settings of a sweep; None where another thing is asked for."""
+    given, unknown = get_args_parser().parse_known_args(arguments)
+    asked = given.multirun and not (given.help or given.hydra_help or given.cfg or given.info)
+    return given.overrides if asked and not unknown else None
+
+
+def _run(entry: Callable[[], None], config_name: str) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # let Hydra raise, so that the message can be ours
-
-    def guarded(function: Callable, *arguments: DictConfig) -> None:
-        try:
-            function(*arguments)
-        except (GpmpcError, HydraException, OmegaConfBaseException) as error:
-            if show_traceback:
-                raise
-            _fail(_one_line(error, config_name))
-        except (TypeError, ValueError, ArithmeticError) as error:  # a value that no check foresaw
-            if show_traceback:
-                raise
-            reason = " ".join(str(error).split()) or type(error).__name__
-            _fail(f"{reason}; is a setting of the wrong kind? HYDRA_FULL_ERROR=1 shows where")
-
-    # Twice: around composing the settings, and inside, where Hydra would add a line of its own to a task's error.
-    entry = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)
     try:
-        guarded(entry(partial(guarded, task)))
+        _guarded(config_name, entry)
     except BrokenPipeError:
         _end_of_pipe()
     except KeyboardInterrupt:
@@ -92,12 +102,27 @@ def _run(task: Callable[[DictConfig], None], config_name: str) -> None:
         sys.exit(130)
 
 
+def _guarded(config_name: str, function: Callable, *arguments: DictConfig) -> None:
+    """Calls a function; a user's mistake ends with one line, or with its traceback for who asks."""
+    try:
+        function(*arguments)
+    except (GpmpcError, HydraException, OmegaConfBaseException) as error:
+        if SHOW_TRACEBACK:
+            raise
+        _fail(_one_line(error, config_name))
+    except (TypeError, ValueError, ArithmeticError) as error:  # a value that no check foresaw
+        if SHOW_TRACEBACK:
+            raise
+        reason = " ".join(str(error).split()) or type(error).__name__
+        _fail(f"{reason}; is a setting of the wrong kind? HYDRA_FULL_ERROR=1 shows where")
+
+
 def _run_plain(task: Callable[[list[str]], None], arguments: list[str]) -> None:
     """Runs a command that works on files and has no settings to compose."""
     try:
         task(arguments)
     except GpmpcError as error:
-        if os.environ.get("HYDRA_FULL_ERROR"):
+        if SHOW_TRACEBACK:
             raise
         _fail(" ".join(str(error).split()))
     except BrokenPipeError:
@@ -127,13 +152,17 @@ def _one_line(error: Exception, config_name: str) -> str:
     if unknown:
         return f"unknown setting {unknown[1]!r}{_nearest(unknown[1], _settings(config_name))}"
     option = re.search(r"Could not find '([^'/]+)/([^']+)'\s+Available options in '[^']+':\n((?:\t.*\n)+)", text)
+    if option and option[2].removeprefix("launcher/") in EXTRAS:
+        extra = EXTRAS[option[2].removeprefix("launcher/")]
+        return f"launcher: this one is not installed: pip install 'gpmpc[{extra}]'"
     if option:
         return f"{option[1]}: no such option {option[2]!r}; available are {', '.join(option[3].split())}"
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key}: this setting has no default; give it as {error.full_key}=VALUE"
     ambiguous = re.match(r"Ambiguous value for argument '([^=]+)=([^']+)'", text)
     if ambiguous:
-        return f"{ambiguous[1]}: a list is written in brackets, {ambiguous[1]}=[{ambiguous[2]}]"
+        listed = f"{ambiguous[1]}: a list is written in brackets, {ambiguous[1]}=[{ambiguous[2]}]"
+        return f"{listed}; a sweep takes -m" if config_name == "run" else listed
     lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc" not in line]
     return "; ".join(line.rstrip(":;") for line in lines) or type(error).__name__
 
@@ -163,5 +192,5 @@ def _nearest(name: str, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-COMMANDS: dict[str, tuple[Callable[[DictConfig], None], str]] = {"tables": (tables, "tables")}
-PLAIN: dict[str, Callable[[list[str]], None]] = {"log": log}
+COMMANDS: dict[str, tuple[Callable[[DictConfig], None], str]] = {"run": (run, "run"), "tables": (tables, "tables")}
+PLAIN: dict[str, Callable[[list[str]], None]] = {"log": log, "plot": plot, "report": report}

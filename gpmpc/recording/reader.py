@@ -41,6 +41,7 @@ class Run:
         states: True states (K, n).
         measured: Measured states (K, n).
         inputs: Applied inputs (K, m).
+        input_bounds: Lower and upper bounds (2, m); infinite where none were given.
         innovations: (K, n).
         belief_covariances: (K, n, n).
         plan_inputs: (K, H, m).
@@ -71,6 +72,7 @@ class Run:
     states: Array
     measured: Array
     inputs: Array
+    input_bounds: Array
     innovations: Array
     belief_covariances: Array
     plan_inputs: Array
@@ -241,12 +243,20 @@ def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dic
     return arrays | {
         "times": np.array([step.time for step in steps], dtype=float),
         "inputs": _table([step.input for step in steps], inputs),
+        "input_bounds": _bounds(steps[:1], inputs),
         "belief_covariances": np.frombuffer(covariances).reshape(len(steps), n, n),
         "statuses": tuple(statuses[step.status] for step in steps),
         "residuals": _table([step.residuals for step in steps], schemas.RESIDUALS),
         "timings": _table([step.timing for step in steps], schemas.TIMING),
         "failed": np.array([step.failed for step in steps], dtype=bool),
     }
+
+
+def _bounds(steps: list, inputs: tuple[str, ...]) -> Array:
+    """Of the first step: they are the same in all."""
+    if not steps or not steps[0].HasField("input_lower"):
+        return np.tile([[-np.inf], [np.inf]], len(inputs))
+    return np.concatenate([_table([steps[0].input_lower], inputs), _table([steps[0].input_upper], inputs)])
 
 
 def _plans(plans: list, steps: int, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Array]:

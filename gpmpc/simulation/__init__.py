@@ -1,13 +1,15 @@
 """Closed loops: a controller on a plant or on a model, with noise, disturbances and many seeds."""
 
 from gpmpc.simulation.cascade_loop import CascadeRollout, cascade_loop
-from gpmpc.simulation.disturbances import Dropout, Gust, Replaced
+from gpmpc.simulation.disturbances import Disturbance, Dropout, Gust, Replaced
 from gpmpc.simulation.loop import Rollout, Step, closed_loop
 from gpmpc.simulation.systems import ModelLoop, Noise
+from gpmpc.simulation.telling import tell
 from gpmpc.simulation.trials import Trial, trials
 
 __all__ = [
     "CascadeRollout",
+    "Disturbance",
     "Dropout",
     "Gust",
     "ModelLoop",
@@ -18,5 +20,6 @@ __all__ = [
     "Trial",
     "cascade_loop",
     "closed_loop",
+    "tell",
     "trials",
 ]

@@ -1,23 +1,14 @@
 """The command line as a user meets it: help, results, and one clear line for every mistake."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from command import gpmpc
 
 ROW = " ".join(str(i / 7) for i in range(15))
 RESULTS = Path("outputs/tables/nmpc-seed0/data.samples=12,model.restarts=0,sizes=[5],trajectory=elliptical")
 FILES = [f"ds_nmpc_{t}_{s}.txt" for t in ("Elliptical", "Lorenz") for s in ("trans", "rotate")]
-
-
-def gpmpc(*arguments, cwd, **environment):
-    command = [str(Path(sys.executable).with_name("gpmpc")), *arguments]
-    return subprocess.run(
-        command, cwd=cwd, capture_output=True, text=True, env=os.environ | environment, timeout=300, check=False
-    )
 
 
 def authors_folder(folder, text=f"{ROW}\n" * 20, broken=None):

@@ -1,17 +1,16 @@
-"""Problem: figures of the results; the only importer of matplotlib.
-
-Every function returns a ``Figure`` made without pyplot, so nothing global is touched and no window opens.
-"""
+"""Figures of the paper's results and of how far predictions can be believed."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter, NullLocator, PercentFormatter
 
-from gpmpc.calibration import Calibration
+if TYPE_CHECKING:
+    from gpmpc.calibration import Calibration
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ def error_over_size(panels: Sequence[Panel], label: str) -> Figure:
     return figure
 
 
-def calibration_figure(calibration: Calibration) -> Figure:
+def calibration_figure(calibration: "Calibration") -> Figure:
     """Coverage against its nominal level (dashed), log density and error over the steps ahead, a column a state."""
     n, steps = len(calibration.names), range(1, calibration.horizon + 1)
     order = sorted(range(len(calibration.levels)), key=calibration.levels.__getitem__)

@@ -1,0 +1,234 @@
+"""``gpmpc run``: one flight, from its settings to its folder; ``gpmpc run -m`` (``sweep``) flies many of them so."""
+
+import shlex
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import InstantiationException
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+
+from gpmpc.exceptions import DataError, GpmpcError, RecordingError, SettingError, ShapeError
+
+if TYPE_CHECKING:
+    from gpmpc.experiments.run import Experiment
+    from gpmpc.experiments.run_folder import RunFolder
+
+ASIDE = ("launcher", "folder")  # settings that a result does not depend on
+GROUPS = ("data", "trajectory", "plant", "model", "controller", "propagation", "solver")
+UNITS = dict.fromkeys("xyz", "m") | {"vx": "m/s", "vy": "m/s", "vz": "m/s", "U1": "N", "ux": "1", "uy": "1"}
+MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
+PATIENCE = 10.0  # with the writer of a recording whose run was killed a moment ago [s]
+
+
+def run(config: DictConfig) -> None:
+    """The task behind ``conf/run.yaml``: flies, prints what came of it, and says where it is kept."""
+    from rich.console import Console
+
+    from gpmpc.experiments.run_summary import summary
+
+    console = Console()
+    with console.status("flying"):
+        experiment_of(config)  # what a user can get wrong is found out before anything is written
+        outcome = fly_one(config)
+    if "error" in outcome:
+        where = f" (traceback: {outcome['folder']}/error.json)" if outcome["kept"] else ""
+        print(f"gpmpc: {outcome['error']}{where}", file=sys.stderr)
+        sys.exit(2 if outcome["mistake"] else 1)
+    console.print(summary(outcome["result"]))
+    state = "finished before" if outcome["skipped"] else "written to"
+    console.print(f"{state}: {outcome['folder']}", soft_wrap=True, highlight=False, markup=False)
+
+
+def fly_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
+    """One run; what goes wrong in it is kept in its folder and returned as ``error``.
+
+    Args:
+        config: The composed settings.
+        wait: For another process that works on the same run.
+
+    Raises:
+        Busy: Another process works on it, and ``wait`` is false.
+        SettingError: The folder cannot be written.
+    """
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    from gpmpc.experiments.run_folder import RunFolder, folder_name, record
+
+    overrides = HydraConfig.get().overrides.task
+    options = {group: HydraConfig.get().runtime.choices.get(group) for group in GROUPS}
+    folder = RunFolder(Path(checked_folder(config)) / folder_name(choices(overrides)))
+    outcome = {"folder": str(folder.path), "skipped": False}
+    try:
+        with folder.claimed(wait):
+            settings = plain_settings(config, options)
+            if folder.finished:
+                return outcome | {"skipped": True} | _found(folder, settings)
+            about = record(choices(overrides), settings, command_of(overrides))
+            torch.set_num_threads(1)  # the same sums in the same order, whatever the launcher
+            try:
+                folder.begin(OmegaConf.to_yaml(config, resolve=True))
+                with threadpool_limits(1):
+                    result = about | _fly(experiment_of(config), folder, config, about)
+                folder.finish(result)
+            except Exception as error:
+                folder.fail(error, about)
+                return outcome | {"error": reason_of(error), "mistake": isinstance(error, MISTAKES), "kept": True}
+    except OSError as error:
+        raise SettingError("folder", f"cannot write to {folder.path}: {error.strerror or error}") from error
+    return outcome | {"result": result}
+
+
+def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
+    """Trains, flies and records; the metrics."""
+    from gpmpc.experiments.run import fly, metrics
+    from gpmpc.simulation import tell
+
+    if config.recorder != "mcap":
+        return metrics(experiment, fly(experiment))
+    with ExitStack() as stack:
+
+        def prepared(controller: Any, training: Any) -> Callable:
+            recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller.problem))
+            return tell(recorder, 0 if training is None else len(training.posterior))
+
+        flight = fly(experiment, prepared)
+    return metrics(experiment, flight)
+
+
+def _recorder(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict, problem: Any) -> Any:
+    from gpmpc.experiments.run_folder import RECORDING
+    from gpmpc.recording import McapRecorder
+
+    dynamics, deadline = experiment.plant.dynamics, time.monotonic() + PATIENCE
+    while True:
+        try:
+            return McapRecorder(
+                folder.path / RECORDING,
+                dynamics.state_names,
+                dynamics.input_names,
+                time_step=experiment.plant.time_step,
+                units={
+                    name: unit for name, unit in UNITS.items() if name in dynamics.state_names + dynamics.input_names
+                },
+                config=OmegaConf.to_yaml(config, resolve=True),
+                metadata={"seed": experiment.seed, "command": about["provenance"]["command"]},
+                input_bounds=[problem.input_lower, problem.input_upper],
+            )
+        except RecordingError as error:
+            # The folder is ours, so only the orphaned writer of a killed run can still hold the file.
+            if "another process" not in str(error) or time.monotonic() > deadline:
+                raise
+            time.sleep(0.1)
+
+
+def experiment_of(config: DictConfig) -> "Experiment":
+    """The settings as objects.
+
+    Raises:
+        GpmpcError: A setting is wrong.
+    """
+    from hydra.utils import instantiate
+
+    from gpmpc.experiments.run import Experiment
+    from gpmpc.simulation import Noise
+
+    config = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    checked_folder(config)
+    if config.recorder not in ("mcap", "none", None):
+        raise SettingError("recorder", f"must be 'mcap' or 'none'; got {config.recorder!r}")
+    for group in ("data", "trajectory", "plant", "model", "controller"):
+        if not config.get(group):
+            raise SettingError(group, "choose one")
+    if len(config.trajectory) != 1:
+        raise SettingError("trajectory", f"choose one; got {', '.join(config.trajectory)}")
+    for group, part in (("propagation", "propagator"), ("solver", "solver")):
+        if config.get(group):
+            if part not in config.controller:
+                raise SettingError(group, "this controller has none to choose; leave it out")
+            config.controller[part] = config[group]
+    with open_dict(config):
+        size = config.data.pop("size")
+    ((name, trajectory),) = config.trajectory.items()
+    controller = instantiate(config.controller, _convert_="all")
+    return Experiment(
+        data=instantiate(config.data, _convert_="all"),
+        trajectory=instantiate(trajectory, _convert_="all"),
+        plant=instantiate(config.plant, _convert_="all"),
+        train=instantiate(config.model, _convert_="all"),
+        controller=controller,
+        name=name,
+        size=size,
+        propagator=getattr(controller, "keywords", {}).get("propagator"),
+        noise=Noise(**config.noise) if any(config.noise.values()) else None,
+        disturbances=instantiate(config.disturbances, _convert_="all"),
+        **{key: config[key] for key in ("steps", "seed", "loop", "on_failure")},
+    )
+
+
+def plain_settings(config: DictConfig, options: dict[str, Any]) -> dict[str, Any]:
+    """All that a result depends on, as plain data: the settings, and the chosen option by group."""
+    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    return {key: value for key, value in settings.items() if key not in ASIDE} | {"options": options}
+
+
+def checked_folder(config: DictConfig) -> str:
+    """The tree of the runs.
+
+    Raises:
+        SettingError: It is no path.
+    """
+    if not isinstance(config.folder, str):
+        raise SettingError("folder", f"must be the path of a folder; got {config.folder!r}")
+    return config.folder
+
+
+def choices(overrides: Sequence[str]) -> list[str]:
+    """What distinguishes a run, ``key=value`` each in Hydra's own spelling; of a key given twice, the last counts."""
+    found = {}
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key = override.get_key_element()
+        if key not in ASIDE and not key.lstrip("+~").startswith(("hydra.", "hydra/")):
+            found[key] = key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"
+    return sorted(found.values())
+
+
+def command_of(overrides: Sequence[str]) -> str:
+    """What makes one run again."""
+    return shlex.join(["gpmpc", "run", *choices(overrides)])
+
+
+def reason_of(error: BaseException) -> str:
+    """One line."""
+    ours: BaseException | None = error
+    while ours is not None and not isinstance(ours, GpmpcError):
+        ours = ours.__cause__
+    if ours is not None:
+        return " ".join(str(ours).split())
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _found(folder: "RunFolder", settings: dict[str, Any]) -> dict[str, Any]:
+    """The result of a run that was finished before, or that it was another one."""
+    result = folder.result()
+    differing = differences(result["settings"], settings)
+    if not differing:
+        return {"result": result}
+    first = ", ".join(f"{key}: {then!r} then, {now!r} now" for key, then, now in differing[:3])
+    message = f"folder: {folder.path} holds a finished run of other settings ({first}); choose another folder"
+    return {"error": message, "mistake": True, "kept": False}
+
+
+def differences(then: Any, now: Any, key: str = "") -> list[tuple[str, Any, Any]]:
+    """Every leaf in which two settings differ."""
+    if isinstance(then, dict) and isinstance(now, dict):
+        keys = dict.fromkeys([*then, *now])
+        return [d for k in keys for d in differences(then.get(k), now.get(k), f"{key}.{k}" if key else k)]
+    return [] if then == now else [(key, then, now)]

@@ -1,0 +1,146 @@
+"""Problem: two groups of runs differ in their means, and it has to be said whether that is more than luck.
+
+Runs of one seed share their training rows and their noise, so they are compared in pairs: what else was varied is
+averaged within a seed first, and a seed counts once. Two paired tests are stated. The signed-rank test (Wilcoxon, 1945)
+decides: it asks only that the differences are spread symmetrically. Student's t-test beside it asks for normal ones.
+With fewer than six pairs nothing can make the first one significant at 5 %.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.experiments.report import MEASURES, SEED, Report
+
+LEVEL = 0.05
+FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Whether group A differs from group B in one measure.
+
+    Attributes:
+        measure: Name of the measure.
+        means: Of A and of B.
+        difference: Mean of A - B over the pairs.
+        interval: Of that mean, 95 %, by Student's t.
+        wilcoxon: Two-sided p-value of the signed-rank test.
+        t_test: Two-sided p-value of the paired t-test.
+        rank_biserial: Share of the signed ranks that are positive minus that of the negative (Kerby, 2014): +-1 where
+            every pair differs in the same direction.
+        standardised: Mean over standard deviation of the differences (Cohen's d_z).
+        pairs: Their number, n.
+    """
+
+    measure: str
+    means: tuple[float, float]
+    difference: float
+    interval: tuple[float, float]
+    wilcoxon: float
+    t_test: float
+    rank_biserial: float
+    standardised: float
+    pairs: int
+
+    @property
+    def verdict(self) -> str:
+        """In words."""
+        if self.pairs < FEWEST:
+            return f"undecided: {self.pairs} pairs cannot show anything at 5 %; fly {FEWEST} seeds or more"
+        if self.wilcoxon < LEVEL:
+            return f"A is {'larger' if self.rank_biserial > 0 else 'smaller'} than B"
+        return "no difference shown"
+
+
+def compare(report: Report, a: str, b: str) -> list[Comparison]:
+    """Holds two groups of a report's runs against each other, seed by seed, in every measure.
+
+    Args:
+        report: All runs.
+        a: Choices that say what belongs to group A, such as ``controller=lqr`` or ``data.size=50,horizon=1``.
+        b: The same of group B.
+
+    Raises:
+        SettingError: A choice that was not varied, or a value that does not occur.
+        DataError: The groups have no two seeds in common.
+    """
+    groups = [_group(report, key, text) for key, text in (("A", a), ("B", b))]
+    comparisons = []
+    for measure in report.measures():
+        first, second = (_by_pair(report, group, measure) for group in groups)
+        common: dict[str, list[tuple[float, float]]] = {}
+        for (rest, seed), value in first.items():
+            if (rest, seed) in second:
+                common.setdefault(seed, []).append((value, second[rest, seed]))
+        if len(common) >= 2:
+            pairs = np.array([np.mean(values, axis=0) for values in common.values()])
+            comparisons.append(_tested(measure, pairs))
+    if not comparisons:
+        raise DataError(f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common")
+    return comparisons
+
+
+def _group(report: Report, key: str, text: str) -> dict[str, str]:
+    group = {}
+    for choice in text.split(","):
+        name, _, value = choice.partition("=")
+        if name not in report.variables:
+            varied = ", ".join(report.variables) or "nothing"
+            raise SettingError(f"compare {key}", f"must choose among what was varied, {varied}; got {choice!r}")
+        values = dict.fromkeys(cell.values[report.variables.index(name)] for cell in report.cells)
+        if value not in values:
+            raise SettingError(f"compare {key}", f"{name} was varied over {', '.join(values)}; got {value!r}")
+        group[name] = value
+    return group
+
+
+def _by_pair(report: Report, group: Mapping[str, str], measure: str) -> dict[tuple[tuple, str], float]:
+    """Values by what a partner has to share: the other settings and the seed."""
+    found = {}
+    for cell in report.cells:
+        values = dict(zip(report.variables, cell.values, strict=True))
+        if all(values[name] == value for name, value in group.items()):
+            rest = tuple(values[name] for name in report.variables if name not in group)
+            for seed, run in cell.runs.items():
+                value = MEASURES[measure].of(run.result)
+                if value is not None:
+                    found[rest, seed] = float(value)
+    return found
+
+
+def _tested(measure: str, pairs: np.ndarray) -> Comparison:
+    """Of pairs (n, 2)."""
+    differences = pairs[:, 0] - pairs[:, 1]
+    n, mean, spread = len(differences), float(differences.mean()), float(differences.std(ddof=1))
+    nothing = not differences.any()
+    half = float(stats.t.ppf(0.975, n - 1)) * spread / np.sqrt(n)
+    ranks = stats.rankdata(np.abs(differences[differences != 0]))
+    signed = float((ranks * np.sign(differences[differences != 0])).sum())
+    return Comparison(
+        measure=measure,
+        means=(float(pairs[:, 0].mean()), float(pairs[:, 1].mean())),
+        difference=mean,
+        interval=(mean - half, mean + half),
+        wilcoxon=1.0 if nothing else float(stats.wilcoxon(differences).pvalue),
+        t_test=1.0 if nothing else 0.0 if spread == 0 else float(stats.ttest_rel(pairs[:, 0], pairs[:, 1]).pvalue),
+        rank_biserial=signed / float(ranks.sum()) if len(ranks) else 0.0,
+        standardised=mean / spread if spread > 0 else 0.0 if mean == 0 else float(np.copysign(np.inf, mean)),
+        pairs=n,
+    )
+
+
+def sentences(comparisons: Sequence[Comparison], a: str, b: str) -> list[str]:
+    """A line a measure, with everything that a reader needs to doubt it."""
+    lines = [f"A: {a}; B: {b}; pairs are seeds ({SEED}), what else was varied is averaged within a seed."]
+    for c in comparisons:
+        low, high = c.interval
+        lines.append(
+            f"{MEASURES[c.measure].label}: {c.verdict}. Mean {c.means[0]:.4g} against {c.means[1]:.4g}, difference "
+            f"{c.difference:.3g} (95 %: {low:.3g} to {high:.3g}); Wilcoxon signed-rank p = {c.wilcoxon:.3g}, paired "
+            f"t-test p = {c.t_test:.3g}; rank-biserial {c.rank_biserial:.2f}, d_z {c.standardised:.2f}; n = {c.pairs}"
+        )
+    return lines

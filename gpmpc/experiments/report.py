@@ -1,0 +1,244 @@
+"""Problem: a tree of runs has to become one table: what was varied, what came of it, what failed and what is missing.
+
+A *cell* is one combination of the varied settings; its runs differ in their seed. What a sweep asked for is in the
+plans that it leaves in the tree; without any, every combination of the values that occur is expected. Runs are read
+from their ``metrics.json`` and ``error.json`` alone.
+"""
+
+import json
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpmpc.exceptions import DataError
+from gpmpc.experiments.run_folder import ERROR, METRICS, PLAN
+
+SEED = "seed"
+LARGEST_PRODUCT = 100_000  # combinations that are looked through for missing ones where there is no plan
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One number of a run.
+
+    Attributes:
+        label: With its unit.
+        of: From a run's result to the number; None where the run has none.
+        logarithmic: How it is drawn.
+    """
+
+    label: str
+    of: Callable[[Mapping[str, Any]], float | None]
+    logarithmic: bool = True
+
+
+MEASURES = {
+    "rmse": Measure("RMSE [m]", lambda r: r["rmse"]["total"]),
+    "outside": Measure("steps outside bounds [%]", lambda r: _outside(r), logarithmic=False),
+    "failed": Measure("failed solves [%]", lambda r: 100 * sum(r["failures"].values()) / r["steps"], logarithmic=False),
+    "decision": Measure("decision, median [ms]", lambda r: 1e3 * r["times"]["total"]["median"]),
+    "training": Measure("training [s]", lambda r: r["times"]["training"]),
+}
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """One run of a tree.
+
+    Attributes:
+        folder: Where it is.
+        choices: What was asked for, by key.
+        settings: All of them.
+        result: What came of it; None where it failed.
+        error: Why it failed; None where it did not.
+    """
+
+    folder: Path
+    choices: Mapping[str, str]
+    settings: Mapping[str, Any]
+    result: Mapping[str, Any] | None
+    error: str | None = None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """All runs of one combination.
+
+    Attributes:
+        values: Of the varied settings, in the order of ``Report.variables``.
+        runs: Those that finished, by seed.
+        failed: Those that failed, by seed.
+        missing: Seeds asked for of which there is nothing.
+    """
+
+    values: tuple[str, ...]
+    runs: Mapping[str, RunRecord]
+    failed: Mapping[str, RunRecord]
+    missing: tuple[str, ...]
+
+    def numbers(self, measure: str) -> list[float]:
+        """One measure of all runs that have it, by seed."""
+        found = [MEASURES[measure].of(run.result) for run in self.runs.values()]
+        return [float(value) for value in found if value is not None]
+
+
+@dataclass(frozen=True)
+class Report:
+    """A tree of runs.
+
+    Attributes:
+        tree: Where it is.
+        variables: Settings that were varied, without the seed.
+        constants: What was asked for of all runs alike.
+        cells: In the order of their values.
+    """
+
+    tree: Path
+    variables: tuple[str, ...]
+    constants: Mapping[str, str]
+    cells: tuple[Cell, ...]
+
+    def measures(self) -> list[str]:
+        """Those of which any run has a number."""
+        return [name for name in MEASURES if any(cell.numbers(name) for cell in self.cells)]
+
+    def commands(self) -> list[str]:
+        """What would fill the cells in which runs are missing or failed, one a cell."""
+        commands = []
+        for cell in self.cells:
+            seeds = sorted([*cell.missing, *cell.failed], key=in_order)
+            if seeds:
+                chosen = [*self.constants.items(), *zip(self.variables, cell.values, strict=True)]
+                settings = [f"{key}={value}" if value else key for key, value in chosen if value != "default"]
+                sweep = [f"{SEED}={','.join(seeds)}", f"folder={self.tree}"]
+                commands.append(shlex.join(["gpmpc", "run", "-m", *settings, *sweep]))
+        return commands
+
+
+def read_runs(tree: str | Path) -> list[RunRecord]:
+    """Every run below a folder, finished or failed.
+
+    Raises:
+        DataError: There is no such folder, no run in it, or a file that is no run's.
+    """
+    tree = Path(tree)
+    if not tree.is_dir():
+        raise DataError(f"{tree}: no such folder")
+    found = []
+    for path in sorted(tree.rglob(METRICS)):
+        found.append(_read(path, METRICS))
+    finished = {run.folder for run in found}
+    for path in sorted(tree.rglob(ERROR)):
+        if path.parent not in finished:
+            found.append(_read(path, ERROR))
+    if not found:
+        raise DataError(f"{tree}: holds no run, finished or failed")
+    return found
+
+
+def report(tree: str | Path) -> Report:
+    """Puts a tree together.
+
+    Raises:
+        DataError: As ``read_runs``.
+    """
+    tree, runs = Path(tree), read_runs(tree)
+    asked = _planned(tree)
+    chosen = [*(run.choices for run in runs), *asked]
+    keys = list(dict.fromkeys([*(key for choices in chosen for key in choices), SEED]))
+    filled = [_filled(run.choices, keys, run.settings) for run in runs]
+    planned = [_filled(choices, keys, runs[0].settings) for choices in asked]
+    values: dict[str, dict[str, None]] = {}
+    for choices in [*filled, *planned]:
+        for key, value in choices.items():
+            values.setdefault(key, {})[value] = None
+    varied = tuple(sorted(key for key, seen in values.items() if len(seen) > 1 and key != SEED))
+    constants = {key: next(iter(seen)) for key, seen in values.items() if len(seen) == 1 and key != SEED}
+    cells: dict[tuple[str, ...], tuple[dict, dict]] = {}
+    for run, choices in zip(runs, filled, strict=True):
+        kept = cells.setdefault(tuple(choices[key] for key in varied), ({}, {}))
+        kept[run.result is None][choices[SEED]] = run
+    expected = {(tuple(choices[key] for key in varied), choices[SEED]) for choices in planned}
+    if not asked:
+        axes = [values[key] for key in (*varied, SEED)]
+        if np.prod([len(axis) for axis in axes], dtype=float) <= LARGEST_PRODUCT:
+            expected = {(tuple(combination[:-1]), combination[-1]) for combination in product(*axes)}
+    missing: dict[tuple[str, ...], list[str]] = {}
+    for key, seed in expected:
+        done, failed = cells.setdefault(key, ({}, {}))
+        if seed not in done and seed not in failed:
+            missing.setdefault(key, []).append(seed)
+    in_rows = sorted(cells, key=lambda values: [in_order(value) for value in values])
+    return Report(
+        tree,
+        varied,
+        {key: value for key, value in constants.items() if value != "default"},
+        tuple(
+            Cell(key, *map(_by_seed, cells[key]), tuple(sorted(missing.get(key, []), key=in_order))) for key in in_rows
+        ),
+    )
+
+
+def in_order(value: str) -> tuple[int, float, str]:
+    """Numbers by their size, then words."""
+    try:
+        return 0, float(value), value
+    except ValueError:
+        return 1, 0.0, value
+
+
+def _by_seed(runs: Mapping[str, RunRecord]) -> dict[str, RunRecord]:
+    return {seed: runs[seed] for seed in sorted(runs, key=in_order)}
+
+
+def _read(path: Path, name: str) -> RunRecord:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        choices = {key: value for key, _, value in (choice.partition("=") for choice in content["choices"])}
+        settings, result = content["settings"], None
+        if name == METRICS:  # what the measures need
+            result = {key: content[key] for key in ("steps", "rmse", "violations", "failures", "times")}
+        error = None if result else content["error"]
+    except (OSError, ValueError, KeyError, TypeError) as reason:
+        raise DataError(f"{path}: is not what a run writes: {type(reason).__name__}: {reason}") from reason
+    return RunRecord(path.parent, choices, settings, result, error)
+
+
+def _planned(tree: Path) -> list[dict[str, str]]:
+    """What sweeps asked for."""
+    planned: dict[tuple[str, ...], None] = {}
+    for path in sorted(tree.rglob(f"{PLAN}*.json")):
+        try:
+            planned |= {tuple(choices): None for choices in json.loads(path.read_text(encoding="utf-8"))["runs"]}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{path}: is not what a sweep writes: {type(error).__name__}: {error}") from error
+    return [{key: value for key, _, value in (choice.partition("=") for choice in plan)} for plan in planned]
+
+
+def _filled(choices: Mapping[str, str], keys: Sequence[str], settings: Mapping[str, Any]) -> dict[str, str]:
+    """Choices, and for what only others chose the settings that held all the same."""
+    return {key: choices.get(key) or _setting(settings, key) for key in keys}
+
+
+def _setting(settings: Mapping[str, Any], key: str) -> str:
+    """The value that a run had which did not choose; "default" where the settings do not tell."""
+    option = settings.get("options", {}).get(key)
+    if option is not None:
+        return str(option)
+    value: Any = settings
+    for part in key.split("."):
+        if not isinstance(value, Mapping) or part not in value:
+            return "default"
+        value = value[part]
+    if isinstance(value, bool) or value is None:
+        return {True: "true", False: "false", None: "null"}[value]
+    return str(value) if isinstance(value, int | float | str) else "default"
+
+
+def _outside(result: Mapping[str, Any]) -> float:
+    return 100 * max(rate["rate"] for rate in result["violations"].values())

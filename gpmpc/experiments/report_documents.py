@@ -1,0 +1,223 @@
+"""How a tree of runs is shown: one table as text, Markdown, CSV and LaTeX, figures, and a page that holds them all."""
+
+import base64
+import csv
+import io
+from collections.abc import Sequence
+from html import escape
+from statistics import mean, quantiles
+from typing import NamedTuple
+
+from rich import box
+from rich.table import Table
+
+from gpmpc.experiments.report import MEASURES, Cell, Report, in_order
+from gpmpc.experiments.tables_report import number
+from gpmpc.plotting import Series, over_variable
+
+DRAWN = ("rmse", "failed", "decision")  # the panels of a figure
+SHOWN = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
+MOST_LINES = 8  # in a figure; what is varied besides is pooled
+LATEX = str.maketrans({c: f"\\{c}" for c in "&%$#_{}"} | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"})
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: .25rem .8rem; text-align: right; border-bottom: 1px solid #e4e4e4; white-space: nowrap; }
+th { border-bottom: 2px solid #1f4e79; } td:first-child, th:first-child { text-align: left; }
+img { max-width: 100%; } code, pre { background: #f5f5f5; padding: .1rem .3rem; overflow-x: auto; }
+pre { padding: .6rem; } .wide { overflow-x: auto; } .bad { color: #b03a2e; }
+"""
+
+
+class Spread(NamedTuple):
+    """Of one measure over the runs of a cell."""
+
+    mean: float
+    low: float
+    median: float
+    high: float
+
+
+def spread(values: Sequence[float]) -> Spread | None:
+    """Mean and quartiles; None where there is nothing."""
+    if not values:
+        return None
+    if len(values) == 1:
+        return Spread(*[values[0]] * 4)
+    return Spread(mean(values), *quantiles(values, n=4, method="inclusive"))
+
+
+def documents(report: Report, comparison: Sequence[str] = ()) -> dict[str, str | bytes]:
+    """Everything that is written of a report, by file name."""
+    drawn = figures(report)
+    return {
+        "report.md": markdown(report, list(drawn), comparison),
+        "report.csv": comma_separated(report),
+        "report.tex": latex(report),
+        "report.html": page(report, drawn, comparison),
+        **drawn,
+    }
+
+
+def title(report: Report) -> str:
+    """What was varied, and how much there is of it."""
+    finished, failed, missing = (sum(map(len, group)) for group in zip(*map(_counts, report.cells), strict=True))
+    return f"{finished} finished in {len(report.cells)} cells, {failed} failed, {missing} missing"
+
+
+def render(report: Report) -> Table:
+    """The table for a terminal: mean, and the quartiles below it; what is zero everywhere is left out."""
+    known = [name for name in SHOWN if name in report.measures()]
+    shown = [name for name in known if any(any(cell.numbers(name)) for cell in report.cells)]
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title(report), title_justify="left")
+    for name in (*(report.variables or ("runs",)), "seeds"):
+        table.add_column(name.replace(".", ".\n"), justify="right", no_wrap=True)
+    for name in shown:
+        unit = MEASURES[name].label.rpartition(" [")[2]
+        table.add_column(f"{SHOWN[name]}\n\\[{unit}", justify="right", no_wrap=True)
+    for cell in report.cells:
+        texts = [_text(cell, name, "\n").replace("[", "\\[") for name in shown]
+        table.add_row(*_named(report, cell), _seeds(cell, "\n"), *texts)
+    return table
+
+
+def markdown(report: Report, drawn: Sequence[str] = (), comparison: Sequence[str] = ()) -> str:
+    """The table as Markdown, with what failed, what is missing and how to get it."""
+    rows = [_header(report), ["---"] * len(_header(report)), *_rows(report)]
+    out = [f"# {report.tree.name}", "", f"{title(report)}.{_constants(report)}", ""]
+    out += ["| " + " | ".join(row) + " |" for row in rows]
+    out += ["", "Mean [first to third quartile] over the seeds.", ""]
+    out += [line for name in drawn for line in (f"![{name}]({name})", "")]
+    if comparison:
+        out += ["## Comparison", "", *(f"- {line}" for line in comparison), ""]
+    if any(cell.failed for cell in report.cells):
+        out += ["## Failed", "", *(f"- `{folder}`: {error}" for folder, error in _failures(report)), ""]
+    if report.commands():
+        out += ["## To fill the gaps", "", "```", *report.commands(), "```", ""]
+    return "\n".join(out)
+
+
+def comma_separated(report: Report) -> str:
+    """One line a cell."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    measured = [f"{name}_{part}" for name in report.measures() for part in ("mean", "q25", "median", "q75")]
+    writer.writerow([*report.variables, "finished", "failed", "missing", *measured])
+    for cell in report.cells:
+        numbers = [value for name in report.measures() for value in spread(cell.numbers(name)) or [""] * 4]
+        writer.writerow([*cell.values, *(len(group) for group in _counts(cell)), *numbers])
+    return buffer.getvalue()
+
+
+def latex(report: Report) -> str:
+    """The table as LaTeX with the rules of the booktabs package."""
+    header = [text.translate(LATEX) for text in _header(report)]
+    out = ["% needs \\usepackage{booktabs}", f"\\begin{{tabular}}{{{'r' * len(header)}}}", "\\toprule"]
+    out += [" & ".join(header) + " \\\\", "\\midrule"]
+    out += [" & ".join(text.translate(LATEX).replace("—", "--") for text in row) + " \\\\" for row in _rows(report)]
+    return "\n".join([*out, "\\bottomrule", "\\end{tabular}", "% mean [first to third quartile] over the seeds", ""])
+
+
+def figures(report: Report) -> dict[str, bytes]:
+    """One figure (PNG) a varied setting, by file name."""
+    drawn = {}
+    measures = [name for name in DRAWN if name in report.measures()]
+    if not measures or not report.variables:
+        return drawn
+    for variable in report.variables:
+        index = report.variables.index(variable)
+        positions = sorted({cell.values[index] for cell in report.cells}, key=in_order)
+        lines = _lines(report, index)
+        panels = []
+        for name in measures:
+            series = []
+            for label, cells in lines.items():
+                values: dict[str, list[float]] = {position: [] for position in positions}
+                for cell in cells:
+                    values[cell.values[index]] += cell.numbers(name)
+                series.append(Series(label, list(values.values())))
+            panels.append((MEASURES[name].label, MEASURES[name].logarithmic, series))
+        buffer = io.BytesIO()
+        over_variable(variable, positions, panels).savefig(buffer, format="png", dpi=130)
+        drawn[f"over-{variable.replace('/', '-')}.png"] = buffer.getvalue()
+    return drawn
+
+
+def page(report: Report, drawn: dict[str, bytes], comparison: Sequence[str] = ()) -> str:
+    """One HTML file with its figures inside, which opens without a server."""
+    row = "".join(f"<th>{escape(name)}</th>" for name in _header(report))
+    body = "\n".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in _rows(report))
+    parts = [f"<h1>{escape(report.tree.name)}</h1>", f"<p>{escape(title(report))}.{escape(_constants(report))}</p>"]
+    parts += [
+        f'<p><img alt="{escape(name)}" src="data:image/png;base64,{base64.b64encode(png).decode()}"></p>'
+        for name, png in drawn.items()
+    ]
+    parts.append(f'<div class="wide"><table><thead><tr>{row}</tr></thead><tbody>\n{body}\n</tbody></table></div>')
+    parts.append("<p>Mean [first to third quartile] over the seeds. Figures: medians, quartiles, all runs.</p>")
+    if comparison:
+        parts += ["<h2>Comparison</h2>", *(f"<p>{escape(line)}</p>" for line in comparison)]
+    if failures := _failures(report):
+        items = "".join(f"<li><code>{escape(f)}</code> <span class=bad>{escape(e)}</span></li>" for f, e in failures)
+        parts += ["<h2>Failed</h2>", f"<ul>{items}</ul>"]
+    if report.commands():
+        commands = escape("\n".join(report.commands()))
+        parts += ["<h2>To fill the gaps</h2>", f"<pre>{commands}</pre>"]
+    head = f'<meta charset="utf-8"><title>{escape(report.tree.name)}</title><style>{STYLE}</style>'
+    return f"<!doctype html>\n<html lang=en><head>{head}</head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
+
+
+def _lines(report: Report, index: int) -> dict[str, list[Cell]]:
+    """Cells by what else was varied; by one setting only where all together were too many lines."""
+    others = [i for i in range(len(report.variables)) if i != index]
+    distinct = {i: {cell.values[i] for cell in report.cells} for i in others}
+    while len({tuple(cell.values[i] for i in others) for cell in report.cells}) > MOST_LINES:
+        others.remove(max(others, key=lambda i: len(distinct[i])))
+    lines: dict[tuple[str, ...], list[Cell]] = {}
+    for cell in report.cells:
+        lines.setdefault(tuple(cell.values[i] for i in others), []).append(cell)
+    names = [report.variables[i] for i in others]
+    return {
+        ", ".join(f"{name}={value}" for name, value in zip(names, key, strict=True)) or "all": cells
+        for key, cells in lines.items()
+    }
+
+
+def _header(report: Report) -> list[str]:
+    return [*(report.variables or ("runs",)), "seeds", *(MEASURES[name].label for name in report.measures())]
+
+
+def _rows(report: Report) -> list[list[str]]:
+    measures = report.measures()
+    return [[*_named(report, cell), _seeds(cell), *(_text(cell, name) for name in measures)] for cell in report.cells]
+
+
+def _named(report: Report, cell: Cell) -> Sequence[str]:
+    return cell.values if report.variables else ("all",)
+
+
+def _counts(cell: Cell) -> tuple:
+    return cell.runs, cell.failed, cell.missing
+
+
+def _seeds(cell: Cell, separator: str = ", ") -> str:
+    """How many finished, and where not all did, how many did not."""
+    notes = [f"{len(group)} {word}" for group, word in ((cell.failed, "failed"), (cell.missing, "missing")) if group]
+    return separator.join([str(len(cell.runs)), *notes])
+
+
+def _text(cell: Cell, measure: str, separator: str = " ") -> str:
+    found = spread(cell.numbers(measure))
+    if found is None:
+        return "—"
+    if found.low == found.high:
+        return number(found.mean)
+    return f"{number(found.mean)}{separator}[{number(found.low)}, {number(found.high)}]"
+
+
+def _constants(report: Report) -> str:
+    text = ", ".join(f"{key}={value}" for key, value in report.constants.items())
+    return f" All of them: {text}." if text else ""
+
+
+def _failures(report: Report) -> list[tuple[str, str]]:
+    return [(run.folder.name, run.error or "") for cell in report.cells for run in cell.failed.values()]

@@ -1,0 +1,198 @@
+"""Problem: one flight with a learned model has a dozen ingredients, and a result has to follow from them alone.
+
+    data -> a random subset -> training -> controller -> closed loop -> metrics
+
+``Experiment`` holds the ingredients as objects, ``fly`` does the work, ``metrics`` says in plain data what came of it.
+Neither knows files or settings. The seed is that of the subset, of the training's random starts and of the noise: the
+same seed gives the same numbers, and the subsets of one seed are nested, so that sizes can be compared in pairs.
+"""
+
+import inspect
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from gpmpc.control.controller import Controller, Reference
+from gpmpc.control.supervision import OnFailure, check_policy
+from gpmpc.datasets import DataSource
+from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.gp import Training, Transitions
+from gpmpc.metrics import ViolationRate, time_quantiles, tracking_error, violation_rate
+from gpmpc.plants import Plant
+from gpmpc.propagation import MomentMatching, Propagator
+from gpmpc.simulation import Disturbance, ModelLoop, Noise, Rollout, Step, closed_loop
+from gpmpc.trajectories import Trajectory, states_along
+
+STAGES = ("model", "build", "solve", "total")  # of a decision's time
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One flight of the translational subsystem, with everything that it depends on.
+
+    Attributes:
+        data: Where transitions come from.
+        trajectory: What is followed, from its beginning.
+        plant: What flies, and what a controller on the true model believes in.
+        train: From transitions and a ``seed`` to a ``Training``.
+        controller: From a model, or from a ``plant`` where its first argument is called so, to a ``Controller``.
+        name: Of the trajectory, which data from files are filed under.
+        size: Rows drawn for the training; None takes all.
+        steps: Of the flight.
+        seed: Of all random numbers.
+        loop: What stands at the other end: the plant, or the learned model rolled on itself.
+        propagator: How a model loop carries its belief on; the controller's own, or moment matching, by default.
+        noise: On the plant.
+        disturbances: Of the plant.
+        on_failure: What is applied where a solve fails.
+
+    Raises:
+        SettingError: A number out of range, an unknown policy or loop.
+    """
+
+    data: DataSource
+    trajectory: Trajectory
+    plant: Plant
+    train: Callable[..., Training]
+    controller: Callable[..., Controller]
+    name: str = "elliptical"
+    size: int | None = None
+    steps: int = 100
+    seed: int = 0
+    loop: Literal["plant", "model"] = "plant"
+    propagator: Propagator | None = None
+    noise: Noise | None = None
+    disturbances: Sequence[Disturbance] = ()
+    on_failure: OnFailure = "previous_plan"
+
+    def __post_init__(self) -> None:
+        if self.size is not None:
+            check_number("data.size", self.size, least=1, whole=True)
+        check_number("steps", self.steps, least=1, whole=True)
+        check_number("seed", self.seed, least=0, whole=True)
+        check_policy(self.on_failure)
+        if self.loop not in ("plant", "model"):
+            raise SettingError("loop", f"must be 'plant' or 'model'; got {self.loop!r}")
+        if len(self.plant.dynamics.state_names) != 6 or "vx" not in self.plant.dynamics.state_names:
+            raise SettingError("plant", "must be translational: x, vx, y, vy, z, vz")
+        if self.loop == "model" and not self.learns:
+            raise SettingError("loop", "a model loop needs a controller that learns a model; this one knows the plant")
+
+    @property
+    def learns(self) -> bool:
+        """Whether the controller works on a learned model."""
+        return next(iter(inspect.signature(self.controller).parameters)) != "plant"
+
+
+@dataclass(frozen=True)
+class Flight:
+    """What came of an experiment.
+
+    Attributes:
+        rollout: Every step, as arrays.
+        controller: What steered.
+        training: What was learned; None where the controller knows the plant.
+    """
+
+    rollout: Rollout
+    controller: Controller
+    training: Training | None
+
+
+def fly(
+    experiment: Experiment, prepared: Callable[[Controller, Training | None], Callable[[Step], None]] | None = None
+) -> Flight:
+    """Trains and flies.
+
+    Args:
+        experiment: All of it.
+        prepared: Called before the first step with the controller and the training; what it returns is called with
+            every step.
+
+    Raises:
+        SettingError: More rows asked for than there are, or settings that do not fit each other.
+        DataError: The data cannot be read.
+        TrainingError: An output could not be trained.
+        SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
+        Diverged: The system left the finite numbers.
+    """
+    plant, training = experiment.plant, None
+    if experiment.learns:
+        training = experiment.train(training_rows(experiment), seed=experiment.seed)
+        controller = experiment.controller(training.posterior)
+    else:
+        controller = experiment.controller(plant)
+    system: Plant | ModelLoop = plant
+    if experiment.loop == "model":
+        propagator = experiment.propagator or MomentMatching()
+        system = ModelLoop(training.posterior, propagator, time_step=plant.time_step)
+    times = plant.time_step * np.arange(experiment.steps + controller.horizon + 1)
+    states = states_along(experiment.trajectory, times)
+    resting = np.asarray(controller.initial_input)  # falls back on it where the very first solve fails
+    on_step = None if prepared is None else prepared(controller, training)
+    rollout = closed_loop(
+        system,
+        controller,
+        Reference(states, np.tile(resting, (len(states) - 1, 1))),
+        states[0],
+        experiment.steps,
+        noise=experiment.noise,
+        disturbances=experiment.disturbances,
+        on_failure=experiment.on_failure,
+        seed=experiment.seed,
+        on_step=on_step,
+    )
+    return Flight(rollout, controller, training)
+
+
+def training_rows(experiment: Experiment) -> Transitions:
+    """The rows drawn, in the order of the flight that they come from.
+
+    Raises:
+        SettingError: More rows asked for than there are.
+        ShapeError: The data have other dimensions than the plant.
+    """
+    data = experiment.data.transitions(experiment.name, experiment.trajectory, "translational")
+    expected = len(experiment.plant.dynamics.state_names), len(experiment.plant.dynamics.input_names)
+    if (data.state_dim, data.input_dim) != expected:
+        raise ShapeError(f"data and plant must have the same dimensions; got {data.state_dim, data.input_dim}")
+    size = len(data) if experiment.size is None else experiment.size
+    if size > len(data):
+        raise SettingError("data.size", f"must be at most {len(data)}, the rows of the data; got {size}")
+    drawn = np.random.default_rng(experiment.seed).permutation(len(data))[:size]
+    return data[np.sort(drawn).tolist()]
+
+
+def metrics(experiment: Experiment, flight: Flight) -> dict[str, Any]:
+    """What came of a flight, as plain data; everything that differs between equal runs is under ``times``."""
+    rollout, problem = flight.rollout, flight.controller.problem
+    names = experiment.plant.dynamics.state_names[::2]
+    error = tracking_error(rollout.states, rollout.references)
+    violations = {"inputs": violation_rate(rollout.inputs, problem.input_lower, problem.input_upper)}
+    if problem.state_bounds is not None:
+        bounds = problem.state_bounds
+        violations["states"] = violation_rate(rollout.states[1:], bounds.lower, bounds.upper)
+    training = flight.training
+    return {
+        "steps": experiment.steps,
+        "rmse": {name: float(value) for name, value in zip(names, error.axes, strict=True)} | {"total": error.total},
+        "violations": {name: _violations(rate) for name, rate in violations.items()},
+        "failures": dict(Counter(status.name for _, status in rollout.failures)),
+        "iterations": {"mean": float(rollout.iterations.mean()), "largest": int(rollout.iterations.max())},
+        "training": None
+        if training is None
+        else {
+            "size": len(training.posterior),
+            "evaluations": training.evaluations,
+            "objective": [float(value) for value in training.objective],
+        },
+        "times": {"training": None if training is None else training.seconds}
+        | {stage: asdict(time_quantiles(np.array([getattr(t, stage) for t in rollout.timings]))) for stage in STAGES},
+    }
+
+
+def _violations(rate: ViolationRate) -> dict[str, Any]:
+    return asdict(rate) | {"rate": rate.rate}

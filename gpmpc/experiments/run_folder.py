@@ -1,0 +1,129 @@
+"""Problem: a run's folder has to say by itself whether the run is finished, what came of it and what made it.
+
+    config.yaml    the resolved settings
+    run.mcap       every step
+    metrics.json   what came of it; written last and in one piece: where it is, the run is finished
+    error.json     why it failed, where it did
+
+Runs of a sweep share nothing but the tree of such folders, so any number of processes can work on one tree: who works
+on a folder holds a lock on it, which the system takes back from a process that dies.
+"""
+
+import fcntl
+import hashlib
+import json
+import os
+import re
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gpmpc.exceptions import GpmpcError
+from gpmpc.files import write_whole
+from gpmpc.provenance import provenance
+
+METRICS, ERROR, CONFIG, RECORDING = "metrics.json", "error.json", "config.yaml", "run.mcap"
+PLAN = "sweep-"  # begins the name of the files that say which runs a sweep asked for
+LONGEST_NAME = 150  # of a folder, in characters; file systems take 255 bytes
+
+
+class Busy(GpmpcError):
+    """Another process works on this run."""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """One run's folder.
+
+    Attributes:
+        path: Where it is.
+    """
+
+    path: Path
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is a result."""
+        return (self.path / METRICS).exists()
+
+    @property
+    def failed_at(self) -> int | None:
+        """When the run failed [ns]; None where it did not."""
+        try:
+            return (self.path / ERROR).stat().st_mtime_ns
+        except FileNotFoundError:
+            return None
+
+    @contextmanager
+    def claimed(self, wait: bool = True) -> Iterator[None]:
+        """Keeps other processes from working on this run meanwhile; makes the folder.
+
+        Args:
+            wait: Until another process is done with it.
+
+        Raises:
+            Busy: Another process works on it, and ``wait`` is false.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        folder = os.open(self.path, os.O_RDONLY)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            yield
+        except BlockingIOError as error:
+            raise Busy(f"{self.path}: another process works on this run") from error
+        finally:
+            os.close(folder)
+
+    def begin(self, config: str) -> None:
+        """Forgets an earlier failure and keeps the resolved settings."""
+        (self.path / ERROR).unlink(missing_ok=True)
+        write_whole(self.path / CONFIG, config)
+
+    def finish(self, result: Mapping[str, Any]) -> None:
+        """Makes the run a finished one."""
+        write_whole(self.path / METRICS, json.dumps(result, indent=1) + "\n")
+
+    def fail(self, error: BaseException, about: Mapping[str, Any]) -> None:
+        """Keeps why the run failed, with the traceback."""
+        content = {
+            **about,
+            "error": " ".join(str(error).split()) or type(error).__name__,
+            "kind": type(error).__name__,
+            "traceback": "".join(traceback.format_exception(error)),
+        }
+        write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")
+
+    def result(self) -> dict[str, Any]:
+        """What came of the finished run."""
+        return json.loads((self.path / METRICS).read_text(encoding="utf-8"))
+
+
+def record(choices: Sequence[str], settings: Mapping[str, Any], command: str) -> dict[str, Any]:
+    """What metrics.json and error.json begin with: what was asked for and what made it.
+
+    Args:
+        choices: What the user chose, ``key=value`` each.
+        settings: The resolved configuration, with the chosen options by group under ``choices``.
+        command: What makes this run again.
+    """
+    return {
+        "schema": 1,
+        "choices": list(choices),
+        "settings": dict(settings),
+        "seed": settings.get("seed"),
+        "provenance": provenance() | {"command": command},
+    }
+
+
+def folder_name(choices: Sequence[str]) -> str:
+    """A name for a run of these choices, ``key=value`` each; runs of other choices have other names."""
+    text = ",".join(sorted(choices)) or "default"
+    name = re.sub(r"[^\w=.,+\-\[\]@]", "_", text, flags=re.ASCII)[:LONGEST_NAME]
+    # Equal up to upper and lower case is equal on some file systems; a comma in a choice could be one between two.
+    if name == text == text.lower() and not any("," in choice for choice in choices):
+        return name
+    text = json.dumps(sorted(choices))
+    return f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"

@@ -1,0 +1,22 @@
+"""Problem: figures of the results; the only importer of matplotlib.
+
+Every function returns a ``Figure`` made without pyplot, so nothing global is touched and no window opens.
+"""
+
+from gpmpc.plotting.animation import animate, ffmpeg_exists
+from gpmpc.plotting.recorded import inputs_figure, timing_figure, tracking_figure
+from gpmpc.plotting.results import Panel, calibration_figure, error_over_size
+from gpmpc.plotting.sweeps import Series, over_variable
+
+__all__ = [
+    "Panel",
+    "Series",
+    "animate",
+    "calibration_figure",
+    "error_over_size",
+    "ffmpeg_exists",
+    "inputs_figure",
+    "over_variable",
+    "timing_figure",
+    "tracking_figure",
+]

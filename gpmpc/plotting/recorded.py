@@ -1,0 +1,173 @@
+"""Figures of one recorded flight, in the manner of the paper's: tracking, inputs, computation time.
+
+Cao, Lai and Alam (2017), figures 2 to 4, show positions and inputs over time. The tube here is what the controller
+expected one step before, with two standard deviations.
+"""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+if TYPE_CHECKING:
+    from gpmpc.recording import Run
+
+FLOWN, REFERENCE, TUBE, BOUND, FAILED = "#1f4e79", "#c0392b", "#9dc3e6", "0.45", "#e08e0b"
+POSITIONS = ("x", "y", "z")
+STAGES = ("model", "build", "solve")
+STAGE_COLOURS = ("#1f4e79", "#7fb2e5", "#c0392b")
+
+
+def positions_of(run: "Run") -> list[int]:
+    """Indices of the states x, y, z; of all states where there is none of these."""
+    found = [run.state_names.index(name) for name in POSITIONS if name in run.state_names]
+    return found or list(range(len(run.state_names)))
+
+
+def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Means and standard deviations (K, j) that were predicted one step before; NaN where nothing was."""
+    mean, std = np.full((2, len(run.times), len(states)), np.nan)
+    if run.plan_means.shape[1] > 1:
+        mean[1:], std[1:] = run.plan_means[:-1, 1, states], run.plan_stds[:-1, 1, states]
+    return mean, std
+
+
+def tracking_figure(run: "Run") -> Figure:
+    """Every axis over time against its reference, and below it the distance from the reference with the tube."""
+    states = positions_of(run)
+    units = run.metadata.get("units", {})
+    mean, std = expected(run, states)
+    figure = Figure(figsize=(3.6 * len(states), 4.6), layout="constrained")
+    axes = figure.subplots(2, len(states), squeeze=False, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
+    for column, i in enumerate(states):
+        above, below = axes[:, column]
+        reference = run.references[:, i]
+        above.plot(run.times, run.states[:, i], color=FLOWN, linewidth=1.6, label="flown")
+        above.plot(run.times, reference, color=REFERENCE, linewidth=1.2, linestyle=(0, (4, 3)), label="reference")
+        above.set_title(f"{run.state_names[i]}{_unit(units, run, i)}")
+        error, band = mean[:, column] - reference, 2 * std[:, column]
+        below.axhline(0, color=REFERENCE, linewidth=1, linestyle=(0, (4, 3)))
+        below.fill_between(
+            run.times,
+            error - band,
+            error + band,
+            color=TUBE,
+            alpha=0.7,
+            linewidth=0,
+            label="expected one step before, $\\pm 2\\sigma$",
+        )
+        below.plot(run.times, run.states[:, i] - reference, color=FLOWN, linewidth=1.2)
+        _failures(run, (above, below))
+        below.set_xlabel("time [s]")
+    axes[1, 0].set_ylabel(f"from the reference{_unit(units, run, states[0])}")
+    _legend(figure, axes.ravel())
+    for axis in axes.ravel():
+        _plain(axis)
+    figure.align_ylabels(axes[:, 0])
+    return figure
+
+
+def inputs_figure(run: "Run") -> Figure:
+    """What acted, over time, with its bounds."""
+    m, units = len(run.input_names), run.metadata.get("units", {})
+    figure = Figure(figsize=(7.2, 1.6 * m + 0.6), layout="constrained")
+    axes = figure.subplots(m, 1, squeeze=False, sharex=True)[:, 0]
+    for i, axis in enumerate(axes):
+        unit = units.get(f"input.{run.input_names[i]}", "")
+        axis.step(run.times, run.inputs[:, i], where="post", color=FLOWN, linewidth=1.4, label="applied")
+        _bounds(axis, run.inputs[:, i], run.input_bounds[:, i])
+        axis.set_ylabel(f"{run.input_names[i]} [{unit}]" if unit not in ("", "1") else run.input_names[i])
+        _failures(run, (axis,))
+        _plain(axis)
+    axes[-1].set_xlabel("time [s]")
+    _legend(figure, axes)
+    figure.align_ylabels(axes)
+    return figure
+
+
+def timing_figure(run: "Run") -> Figure:
+    """Where the time of every decision went, and how the totals are distributed."""
+    milliseconds = 1e3 * run.timings
+    figure = Figure(figsize=(8.4, 3.2), layout="constrained")
+    over_time, distribution = figure.subplots(1, 2, gridspec_kw={"width_ratios": [3, 2]})
+    width = run.times[1] - run.times[0] if len(run.times) > 1 else 1.0
+    edges = np.append(run.times, run.times[-1] + width)
+    bottom = np.zeros(len(run.times))
+    for j, (name, colour) in enumerate(zip(STAGES, STAGE_COLOURS, strict=True)):
+        top = bottom + milliseconds[:, j]
+        over_time.stairs(top, edges, baseline=bottom, fill=True, color=colour, label=name)
+        bottom = top
+    total = np.sort(milliseconds[:, -1])
+    total = total[total > 0] if total.any() else total  # a controller that was not asked took no time
+    # A first step that loads and compiles would leave nothing to be seen of the others.
+    ceiling = 1.15 * total[max(0, int(np.ceil(0.98 * len(total))) - 1)] or 1.0
+    over_time.set_ylim(0, ceiling)
+    beyond = int((total > ceiling).sum())
+    if beyond:
+        text = f"{beyond} above, up to {total[-1]:.3g} ms"
+        over_time.annotate(text, (0.99, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize="small")
+    over_time.set_xlabel("time [s]")
+    over_time.set_ylabel("decision [ms]")
+    distribution.step(total, np.arange(1, len(total) + 1) / len(total), where="post", color=FLOWN)
+    if total[0] > 0 and total[-1] > 5 * total[0]:
+        distribution.set_xscale("log")
+        distribution.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        distribution.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        distribution.xaxis.set_minor_formatter(NullFormatter())
+    median, most = (float(np.quantile(total, share)) for share in (0.5, 0.99))
+    for value in (median, most):
+        distribution.axvline(value, color=BOUND, linewidth=1, linestyle=(0, (4, 3)))
+    distribution.set_title(f"median {median:.3g} ms, 99 % below {most:.3g} ms", fontsize="small")
+    distribution.set_ylim(0, 1.02)
+    distribution.set_xlabel("decision [ms]")
+    distribution.set_ylabel("share of the steps")
+    for axis in (over_time, distribution):
+        _plain(axis)
+    _legend(figure, [over_time])
+    return figure
+
+
+def _unit(units: dict[str, str], run: "Run", state: int) -> str:
+    """The unit of a state, in brackets."""
+    unit = units.get(f"state.{run.state_names[state]}", "")
+    return f" [{unit}]" if unit else ""
+
+
+def _legend(figure: Figure, axes: Iterable[Axes]) -> None:
+    """One for the whole figure, below it; nothing twice."""
+    found = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=len(found), frameon=False)
+
+
+def _bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
+    """Lines where they are near; where they are so far that the input would be flat beside them, in words."""
+    low, high = float(inputs.min()), float(inputs.max())
+    span = max(high - low, 1e-3 * max(abs(low), abs(high), 1e-3))
+    limits = [limit for limit in bounds if np.isfinite(limit)]
+    near = [limit for limit in limits if low - 2 * span <= limit <= high + 2 * span]
+    for limit in near:
+        axis.axhline(limit, color=BOUND, linestyle=(0, (4, 3)), linewidth=1, label="bound")
+    low, high = min([low, *near]), max([high, *near])
+    axis.set_ylim(low - 0.12 * max(high - low, span), high + 0.25 * max(high - low, span))
+    if len(near) < len(limits):
+        text = "bounds " + " and ".join(f"{limit:g}" for limit in limits)
+        axis.annotate(
+            text, (0.995, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize="small", color=BOUND
+        )
+
+
+def _failures(run: "Run", axes: tuple[Axes, ...]) -> None:
+    """A mark at every step whose decision was not applied."""
+    times = run.times[run.failed]
+    for axis in axes:
+        for j, time in enumerate(times):
+            axis.axvline(time, color=FAILED, linewidth=1, alpha=0.6, label="failed solve" if j == 0 else None, zorder=0)
+
+
+def _plain(axis: Axes) -> None:
+    axis.grid(axis="y", color="0.9")
+    axis.set_axisbelow(True)
+    axis.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,62 @@
+"""Problem: a loop's step and a recorder's step are told from different sides: what happened, and what was decided.
+
+The loop keeps what it needs to go on (``Command``, with the last plan moved on); a recorder wants one flat ``Step`` of
+everything a reader may ask for. This is the bridge, so that neither has to know the other.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from gpmpc import step as recorded
+from gpmpc.control.controller import Decision, Timing
+from gpmpc.simulation.loop import Step
+from gpmpc.status import Status
+
+
+def tell(recorder: Any, gp_size: int = 0) -> Callable[[Step], None]:
+    """What ``closed_loop`` takes as ``on_step`` to have every step recorded.
+
+    Args:
+        recorder: Any object with ``record(step)`` of a ``gpmpc.step.Step``.
+        gp_size: Transitions that the model holds.
+    """
+    expected: np.ndarray | None = None  # of the next measurement
+
+    def on_step(step: Step) -> None:
+        nonlocal expected
+        n, decision = len(step.state), step.command.decision
+        nothing = np.full(n, np.nan)
+        recorder.record(
+            recorded.Step(
+                time=step.time,
+                k=step.index,
+                reference=np.asarray(step.reference.states[0], dtype=float),
+                state=step.state,
+                measured=step.measured,
+                input=np.asarray(step.input, dtype=float),
+                decision=_unasked(step) if decision is None else decision,
+                innovation=nothing if expected is None else step.measured - expected,
+                belief_covariance=step.covariance,
+                gp_size=gp_size,
+                failed=not step.command.status.solved,
+            )
+        )
+        expected = decision.means[1] if decision is not None and decision.status.solved else None
+
+    return on_step
+
+
+def _unasked(step: Step) -> Decision:
+    """A decision that says nothing: the controller was not asked, since nothing was measured."""
+    H, n, m = step.reference.horizon, len(step.state), len(step.input)
+    return Decision(
+        input=step.input,
+        inputs=np.full((H, m), np.nan),
+        means=np.full((H + 1, n), np.nan),
+        covariances=np.full((H + 1, n, n), np.nan),
+        status=Status.INVALID_MEASUREMENT,
+        iterations=0,
+        timing=Timing(0.0, 0.0, 0.0),
+    )

@@ -1,0 +1,206 @@
+"""One flight and many of them, as a user meets them: results, resumption, and one clear line for every mistake."""
+
+import importlib.util
+import json
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+from command import gpmpc, start
+
+from gpmpc.recording import read_run, replay
+
+TINY = ["data.samples=25", "model.restarts=0", "steps=3", "horizon=1"]
+SWEPT = ["run", "-m", *TINY, "data.size=10,20", "seed=range(2)"]
+
+
+def results(tree):
+    """Every finished run's metrics by folder, without times and what made them."""
+    found = {}
+    for path in tree.glob("*/metrics.json"):
+        found[path.parent.name] = content = json.loads(path.read_text())
+        assert content.pop("times")
+        assert content.pop("provenance")
+    return found
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory):
+    cwd = tmp_path_factory.mktemp("single")
+    disturbances = "disturbances=[{_target_: gpmpc.simulation.Dropout, start: 2, stop: 3}]"
+    return cwd, gpmpc("run", *TINY, "steps=4", "seed=7", disturbances, "folder=tree", cwd=cwd)
+
+
+def test_a_run_leaves_a_folder_that_says_everything(single):
+    cwd, done = single
+    assert done.returncode == 0, done.stderr
+    for text in ("4 steps of elliptical with convex", "RMSE [m]", "INVALID_MEASUREMENT 1", "25 rows"):
+        assert text in done.stdout
+    (folder,) = (cwd / "tree").iterdir()
+    assert sorted(path.name for path in folder.iterdir()) == ["config.yaml", "metrics.json", "run.mcap"]
+    found = json.loads((folder / "metrics.json").read_text())
+    assert set(found["rmse"]) == {"x", "y", "z", "total"}
+    assert found["rmse"]["total"] < 1
+    assert found["failures"] == {"INVALID_MEASUREMENT": 1}
+    assert found["violations"]["inputs"]["steps"] == 4
+    assert found["settings"]["options"]["controller"] == "convex"
+    assert found["seed"] == 7
+    assert set(found["times"]) == {"training", "model", "build", "solve", "total"}
+    assert found["provenance"]["command"].startswith("gpmpc run data.samples=25")
+    assert found["provenance"]["versions"]["torch"]
+
+
+def test_the_recording_holds_the_flight_and_its_decisions(single):
+    cwd, _ = single
+    (path,) = (cwd / "tree").glob("*/run.mcap")
+    run, found = read_run(path), json.loads((path.parent / "metrics.json").read_text())
+    assert run.finished
+    assert run.failed.tolist() == [False, False, True, False]
+    assert np.isnan(run.measured[2]).all()
+    assert np.isnan(run.innovations[0]).all()
+    assert np.allclose(run.innovations[1], run.measured[1] - run.plan_means[0, 1], atol=1e-14)
+    assert run.input_bounds.tolist() == [[0.0, -0.7, -0.7], [20.0, 0.7, 0.7]]
+    assert np.allclose(replay(run, 1).x, run.problems[1].x, atol=1e-9)
+    assert run.metadata["run"]["seed"] == "7"
+    errors = np.square((run.states - run.references)[1:, ::2])  # x[K] is in the metrics, not in the recording
+    assert found["rmse"]["total"] ** 2 * 4 >= errors.sum()
+
+
+def test_a_recorded_flight_is_drawn(single):
+    cwd, _ = single
+    (folder,) = (cwd / "tree").iterdir()
+    done = gpmpc("plot", str(folder), "--to", "figures", cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    assert {"tracking.png", "inputs.png", "timing.png", "flight.gif"} <= {p.name for p in (cwd / "figures").iterdir()}
+    assert (cwd / "figures" / "flight.gif").read_bytes().startswith(b"GIF89a")
+    assert "Ignoring" not in done.stderr
+
+
+def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_them(single):
+    cwd, _ = single
+    (folder,) = (cwd / "tree").iterdir()
+    found = json.loads((folder / "metrics.json").read_text())
+    arguments = ["run", *found["choices"], "folder=tree"]
+    again = gpmpc(*arguments, cwd=cwd)
+    assert again.returncode == 0, again.stderr
+    assert "finished before" in again.stdout
+    found["settings"]["controller"]["tolerance"] = 1
+    (folder / "metrics.json").write_text(json.dumps(found))
+    other = gpmpc(*arguments, cwd=cwd)
+    assert other.returncode == 2
+    assert "holds a finished run of other settings (controller.tolerance: 1 then, 1e-08 now)" in other.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["horizn=5"], "unknown setting 'horizn' (did you mean 'horizon'?)"),
+        (["-m", "horizn=5,6"], "unknown setting 'horizn' (did you mean 'horizon'?)"),
+        (["controller=convx"], "controller: no such option 'convx'; available are convex, lqr, nmpc"),
+        (["-m", "controller=lqr,convx"], "controller: no such option 'convx'; available are convex, lqr, nmpc"),
+        (["data=paper"], "data.folder: this setting has no default"),
+        (["data=paper", "data.folder=nowhere"], "nowhere: no such folder"),
+        (["controller=lqr", "propagation=unscented"], "propagation: this controller has none to choose"),
+        (["recorder=mpac"], "recorder: must be 'mcap' or 'none'; got 'mpac'"),
+        (["horizon=1,2"], "horizon: a list is written in brackets, horizon=[1,2]; a sweep takes -m"),
+        (["folder=null"], "folder: must be the path of a folder; got None"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_mistake_is_one_clear_line_and_leaves_nothing_behind(arguments, message, tmp_path):
+    done = gpmpc("run", *arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_mistake_that_the_flight_finds_is_kept_with_its_traceback(tmp_path):
+    done = gpmpc("run", *TINY, "data.size=26", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "data.size: must be at most 25, the rows of the data; got 26" in done.stderr
+    assert done.stderr.count("\n") == 1
+    (path,) = tmp_path.glob("outputs/run/*/error.json")
+    assert "Traceback" in json.loads(path.read_text())["traceback"]
+    assert not (path.parent / "metrics.json").exists()
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory):
+    """Four runs, one after another."""
+    cwd = tmp_path_factory.mktemp("sweep")
+    done = gpmpc(*SWEPT, "folder=tree", cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    assert "4 runs: 4 flown, 0 finished before, 0 failed" in done.stdout
+    assert "4/4" in done.stdout
+    return cwd / "tree", results(cwd / "tree")
+
+
+def test_a_sweep_flies_every_combination(sweep):
+    tree, found = sweep
+    assert len(found) == 4
+    assert len({tuple(content["choices"]) for content in found.values()}) == 4
+    assert len({content["rmse"]["total"] for content in found.values()}) == 4
+    assert "data.size=10,data.samples=25" not in found
+    (plan,) = tree.glob("sweep-*.json")
+    assert sorted(json.loads(plan.read_text())["runs"]) == sorted(c["choices"] for c in found.values())
+
+
+def needs(module):
+    """A launcher that an extra brings; tried out by hand."""
+    missing = pytest.mark.skipif(importlib.util.find_spec(module) is None, reason=f"{module} is not installed")
+    return [pytest.mark.slow, missing]
+
+
+@pytest.mark.parametrize(
+    "launcher",
+    ["joblib", pytest.param("submitit", marks=needs("submitit")), pytest.param("ray", marks=needs("ray"))],
+)
+def test_every_launcher_gives_the_same_numbers(launcher, sweep, tmp_path):
+    capped = ["hydra.launcher.n_jobs=2"] if launcher == "joblib" else []
+    done = gpmpc(*SWEPT, "folder=tree", f"launcher={launcher}", *capped, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "4/4" in done.stdout
+    assert results(tmp_path / "tree") == sweep[1]
+
+
+def test_a_killed_sweep_goes_on_and_ends_as_if_nothing_had_happened(sweep, tmp_path):
+    tree = tmp_path / "tree"
+    killed = start(*SWEPT, "folder=tree", cwd=tmp_path)
+    deadline = time.monotonic() + 120
+    while not list(tree.glob("*/metrics.json")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    time.sleep(np.random.default_rng().uniform(0, 0.4))
+    os.killpg(killed.pid, signal.SIGKILL)
+    killed.wait()
+    assert 0 < len(results(tree)) < 4
+    done = gpmpc(*SWEPT, "folder=tree", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert results(tree) == sweep[1]
+
+
+def test_two_sweeps_share_a_tree(sweep, tmp_path):
+    both = [start(*SWEPT, "folder=tree", cwd=tmp_path) for _ in range(2)]
+    assert [process.wait(timeout=240) for process in both] == [0, 0]
+    assert results(tmp_path / "tree") == sweep[1]
+
+
+def test_failed_runs_are_named_and_stop_nothing(tmp_path):
+    sizes = ",".join(str(size) for size in [*range(8, 19), 99])
+    done = gpmpc(
+        "run", "-m", *TINY, "steps=1", "recorder=none", f"data.size={sizes}", "seed=0,1", "folder=t", cwd=tmp_path
+    )
+    assert done.returncode == 1
+    assert "24 runs: 22 flown, 0 finished before, 2 failed" in done.stdout
+    lines = done.stderr.splitlines()
+    assert len(lines) == 2
+    assert all("data.size=99" in line and "must be at most 25" in line for line in lines)
+    assert len(results(tmp_path / "t")) == 22
+    told = gpmpc("report", "t", cwd=tmp_path)
+    assert told.returncode == 0, told.stderr
+    assert "22 finished in 12 cells, 2 failed, 0 missing" in told.stdout
+    assert told.stdout.count("failed: ") == 2
+    assert "to fill: gpmpc run -m" in told.stdout
+    assert "data.size=99 seed=0,1 folder=t" in told.stdout

@@ -1,0 +1,52 @@
+"""Runs that were never flown, in the folders and with the content that real ones have."""
+
+import json
+
+import numpy as np
+
+from gpmpc.control.controller import Timing
+from gpmpc.experiments.run import Experiment, Flight, metrics
+from gpmpc.experiments.run_folder import PLAN, RunFolder, folder_name, record
+from gpmpc.plants import Integrated, Translational
+from gpmpc.simulation import Rollout
+from gpmpc.status import Status
+
+PLANT = Integrated(Translational(), time_step=1.0, substeps=1)
+
+
+class Bounds:
+    input_lower, input_upper, state_bounds = np.zeros(3), np.full(3, 10.0), None
+
+
+class Steering:
+    problem, horizon = Bounds, 1
+
+
+def metrics_of(error, steps=20, failing=0):
+    """The metrics of a flight that is everywhere ``error`` [m] from its reference in x."""
+    references = np.zeros((steps + 1, 6))
+    states = references.copy()
+    states[:, 0] = error
+    statuses = (Status.INFEASIBLE,) * failing + (Status.SOLVED,) * (steps - failing)
+    nothing, timing = np.full((steps, 6), np.nan), Timing(1e-3, 1e-4, 2e-3)
+    rollout = Rollout(
+        states, np.zeros((steps + 1, 6, 6)), states[:-1], np.ones((steps, 3)), references, nothing,
+        np.full((steps, 6, 6), np.nan), statuses, np.ones(steps, int), (timing,) * steps, 1.0,
+    )  # fmt: skip
+    experiment = Experiment(None, None, PLANT, None, lambda plant: None, steps=steps)
+    return metrics(experiment, Flight(rollout, Steering, None))
+
+
+def made_up_run(tree, choices, settings, result=None, error=None):
+    folder = RunFolder(tree / folder_name(choices))
+    folder.path.mkdir(parents=True)
+    about = record(choices, settings, "gpmpc run")
+    if error is None:
+        folder.finish(about | result)
+    else:
+        folder.fail(ValueError(error), about)
+
+
+def plan(tree, runs):
+    tree.mkdir(parents=True, exist_ok=True)
+    (tree / f"{PLAN}0.json").write_text(json.dumps({"runs": runs}))

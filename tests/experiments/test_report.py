@@ -1,0 +1,167 @@
+"""A tree of runs becomes one table; what failed and what is missing is named."""
+
+import csv
+import io
+import json
+import time
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from made_up import made_up_run, metrics_of, plan
+from omegaconf import OmegaConf
+
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.experiments.comparison import compare, sentences
+from gpmpc.experiments.report import report
+from gpmpc.experiments.report_documents import documents, page, render, spread
+from gpmpc.experiments.run_folder import METRICS, folder_name, record
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
+
+
+def chosen(controller, seed, **more):
+    settings = SETTINGS | {"seed": seed, "options": {"controller": controller}}
+    return sorted([f"controller={controller}", f"seed={seed}", *(f"{k}={v}" for k, v in more.items())]), settings
+
+
+def add(tree, controller, seed, error, **how):
+    made_up_run(tree, *chosen(controller, seed), result=metrics_of(error, **how))
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """Two controllers, eight seeds, of which one failed and one is missing."""
+    rng = np.random.default_rng(3)
+    for seed in range(8):
+        luck = rng.uniform(0.5, 2.0)  # shared by both: that is what pairs are for
+        add(tmp_path, "convex", seed, 0.010 * luck, failing=seed % 2)
+        if seed < 6:
+            add(tmp_path, "lqr", seed, 0.012 * luck)
+    made_up_run(tmp_path, *chosen("lqr", 6), error="no start led\nanywhere")
+    plan(tmp_path, [chosen(c, seed)[0] for c in ("convex", "lqr") for seed in range(8)])
+    return tmp_path
+
+
+def test_cells_are_made_of_what_was_varied_and_seeds_fill_them(tree):
+    found = report(tree)
+    assert found.variables == ("controller",)
+    convex, lqr = found.cells
+    assert (convex.values, lqr.values) == (("convex",), ("lqr",))
+    assert list(convex.runs) == [str(seed) for seed in range(8)]
+    assert (list(lqr.failed), lqr.missing) == (["6"], ("7",))
+    assert np.mean(convex.numbers("failed")) == pytest.approx(2.5)
+    assert np.allclose(np.array(lqr.numbers("rmse")) / convex.numbers("rmse")[:6], 1.2)
+
+
+def test_the_gaps_come_with_the_command_that_fills_them(tree):
+    assert report(tree).commands() == [f"gpmpc run -m controller=lqr seed=6,7 folder={tree}"]
+
+
+def test_without_a_plan_every_combination_is_expected(tmp_path):
+    for controller, seed in (("lqr", 0), ("lqr", 1), ("convex", 1)):
+        add(tmp_path, controller, seed, 0.1)
+    convex, lqr = report(tmp_path).cells
+    assert (convex.missing, lqr.missing) == (("0",), ())
+
+
+def test_a_run_that_did_not_choose_counts_with_the_setting_that_it_had(tmp_path):
+    made_up_run(tmp_path, ["seed=1"], SETTINGS | {"seed": 1}, result=metrics_of(0.1))
+    made_up_run(tmp_path, ["horizon=5", "seed=1"], SETTINGS | {"seed": 1, "horizon": 5}, result=metrics_of(0.1))
+    found = report(tmp_path)
+    assert found.variables == ("horizon",)
+    assert [cell.values for cell in found.cells] == [("5",), ("10",)]  # numbers by their size
+
+
+def test_every_document_holds_the_same_numbers_and_the_page_stands_alone(tree):
+    found = report(tree)
+    written = documents(found)
+    rows = list(csv.DictReader(io.StringIO(written["report.csv"])))
+    expected = spread(found.cells[0].numbers("rmse"))
+    assert float(rows[0]["rmse_mean"]) == expected.mean
+    assert float(rows[0]["rmse_q25"]) == np.quantile(found.cells[0].numbers("rmse"), 0.25)
+    assert (rows[1]["failed"], rows[1]["missing"]) == ("1", "1")
+    for name in ("report.md", "report.html"):
+        for text in (f"{expected.mean:.3g}", "no start led anywhere", "6, 1 failed, 1 missing", "gpmpc run -m"):
+            assert text in written[name]
+    assert f"{expected.mean:.3g}" in written["report.tex"]
+    assert written["over-controller.png"].startswith(b"\x89PNG")
+    html = written["report.html"]
+    assert "data:image/png;base64," in html
+    assert not [mark for mark in ("http:", "https:", "<script", "<link") if mark in html]
+    assert render(found).row_count == 2
+
+
+def test_what_a_run_says_is_text_in_the_page(tree):
+    made_up_run(tree, *chosen("nmpc", 0), error="<script>alert(1)</script>")
+    assert "<script>" not in page(report(tree), {})
+
+
+def test_pairs_show_what_means_alone_do_not(tree):
+    by_measure = {c.measure: c for c in compare(report(tree), "controller=lqr", "controller=convex")}
+    rmse = by_measure["rmse"]
+    assert rmse.pairs == 6
+    assert rmse.wilcoxon == pytest.approx(2 ** (1 - 6))  # every pair in one direction: the smallest p there is
+    assert rmse.verdict == "A is larger than B"
+    assert rmse.rank_biserial == 1
+    assert rmse.interval[0] < rmse.difference < rmse.interval[1]
+    text = sentences([rmse], "controller=lqr", "controller=convex")[1]
+    for word in ("Wilcoxon signed-rank p = 0.0312", "t-test", "rank-biserial", "n = 6"):
+        assert word in text
+
+
+def test_equal_groups_and_few_pairs_show_nothing(tmp_path):
+    for seed in range(7):
+        for controller in ("lqr", "convex"):
+            add(tmp_path, controller, seed, 0.1 + 0.01 * seed)
+    assert compare(report(tmp_path), "controller=lqr", "controller=convex")[0].verdict == "no difference shown"
+    few = tmp_path / "few"
+    for seed in range(5):
+        add(few, "lqr", seed, 0.2)
+        add(few, "convex", seed, 0.1)
+    assert "5 pairs" in compare(report(few), "controller=lqr", "controller=convex")[0].verdict
+
+
+@pytest.mark.parametrize(
+    ("group", "message"),
+    [("controler=lqr", "must choose among what was varied, controller"), ("controller=x", "varied over convex, lqr")],
+)
+def test_a_group_that_is_none_is_refused(tree, group, message):
+    with pytest.raises(SettingError, match=message):
+        compare(report(tree), group, "controller=lqr")
+
+
+def test_what_is_no_tree_of_runs_is_refused(tmp_path):
+    with pytest.raises(DataError, match="no such folder"):
+        report(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="holds no run"):
+        report(tmp_path)
+    (tmp_path / "metrics.json").write_text('{"choices": []')
+    with pytest.raises(DataError, match=r"metrics.json: is not what a run writes"):
+        report(tmp_path)
+
+
+def test_a_thousand_runs_are_put_together_quickly_and_in_little_memory(tmp_path):
+    with initialize_config_dir(str(CONF), version_base="1.3"):  # as large as real ones
+        settings = OmegaConf.to_container(compose("run"), resolve=True)
+    content = record([], settings | {"options": {}}, "gpmpc run") | metrics_of(0.1)
+    for seed in range(50):
+        for size in (10, 20, 50, 100, 189):
+            for horizon in (1, 3, 5, 10):
+                content["choices"] = [f"data.size={size}", f"horizon={horizon}", f"seed={seed}"]
+                folder = tmp_path / folder_name(content["choices"])
+                folder.mkdir()
+                (folder / METRICS).write_text(json.dumps(content, indent=1))
+    tracemalloc.start()
+    start = time.perf_counter()
+    found = report(tmp_path)
+    documents(found)
+    seconds, (_, peak) = time.perf_counter() - start, tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert sum(len(cell.runs) for cell in found.cells) == 1000
+    assert len(found.cells) == 20
+    assert seconds < 20
+    assert peak < 1e9
