@@ -36,7 +36,7 @@ def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tracking_figure(run: "Run") -> Figure:
-    """Every axis over time against its reference, and below it the distance from the reference with the tube."""
+    """Every axis over time against its reference, and below it the error with the tube."""
     states = positions_of(run)
     units = run.metadata.get("units", {})
     mean, std = expected(run, states)
@@ -62,7 +62,7 @@ def tracking_figure(run: "Run") -> Figure:
         below.plot(run.times, run.states[:, i] - reference, color=FLOWN, linewidth=1.2)
         _failures(run, (above, below))
         below.set_xlabel("time [s]")
-    axes[1, 0].set_ylabel(f"from the reference{_unit(units, run, states[0])}")
+    axes[1, 0].set_ylabel(f"error{_unit(units, run, states[0])}")
     _legend(figure, axes.ravel())
     for axis in axes.ravel():
         _plain(axis)
