@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 import gpmpc
+from gpmpc.cli.figures import figures
 from gpmpc.cli.log import log
 from gpmpc.cli.tables import tables
 from gpmpc.exceptions import GpmpcError
@@ -30,6 +31,7 @@ usage: gpmpc COMMAND [SETTING=VALUE ...]
 
 commands:
   tables    Tables 1 and 2 of Cao, Lai and Alam (2017), computed beside the printed figures
+  figures   Figures 2 to 4 and section 5.2: the flights, in the paper's reading and with the plant in the loop
   log       What is in a recording (info), rescue an unfinished one (recover), a table of its steps (export)
 
 gpmpc COMMAND --help lists a command's settings, --cfg job prints them resolved.
@@ -163,5 +165,8 @@ def _nearest(name: str, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-COMMANDS: dict[str, tuple[Callable[[DictConfig], None], str]] = {"tables": (tables, "tables")}
+COMMANDS: dict[str, tuple[Callable[[DictConfig], None], str]] = {
+    "tables": (tables, "tables"),
+    "figures": (figures, "figures"),
+}
 PLAIN: dict[str, Callable[[list[str]], None]] = {"log": log}

@@ -54,7 +54,7 @@ def command(
         last: What came of the step before; None at the first.
         on_failure: ``"previous_plan"`` goes on along the last solved plan, ``"hold"`` keeps the last input applied,
             ``"raise"`` stops. Before the first solved plan, the first two take the reference's own input if there is
-            one, and stop otherwise.
+            one, within the bounds of the controller's problem, and stop otherwise.
         step: Number of the step, for the message.
 
     Raises:
@@ -78,7 +78,7 @@ def command(
         return Command(plan.input, status, decision, plan)
     if reference.inputs is None:
         raise SolverFailure(step, f"{status.advice} (no earlier plan and no reference input to fall back on)")
-    return Command(np.array(reference.inputs[0], dtype=float), status, decision, None)
+    return Command(_within_bounds(controller, np.array(reference.inputs[0], dtype=float)), status, decision, None)
 
 
 def check_policy(on_failure: str) -> None:
@@ -89,6 +89,12 @@ def check_policy(on_failure: str) -> None:
     """
     if on_failure not in POLICIES:
         raise SettingError("on_failure", f"must be one of {', '.join(map(repr, POLICIES))}; got {on_failure!r}")
+
+
+def _within_bounds(controller: Controller, input: np.ndarray) -> np.ndarray:
+    """An input clipped to the box of the controller's problem, where it has one: a reference may lie outside."""
+    problem = getattr(controller, "problem", None)
+    return input if problem is None else np.clip(input, problem.input_lower, problem.input_upper)
 
 
 def _moved_on(plan: Decision) -> Decision:
