@@ -78,28 +78,31 @@ def _experiment(config: DictConfig, settings: dict) -> Any:
     """The experiment that the settings describe; everything that a user can get wrong is found out here."""
     from hydra.utils import instantiate
 
-    from gpmpc.experiments.flights import Flights, Row
+    from gpmpc.experiments.flight import LOOPS, Row
+    from gpmpc.experiments.flights import Flights
 
-    groups = ("data", "excited", "undithered", "trajectory", "subsystem", "model", "plant")
+    groups = ("data", "excited", "undithered", "trajectory", "subsystem", "model", "flying", "plant")
     for key in groups:
         if not config.get(key):
             raise SettingError(key, "choose at least one" if key in ("trajectory", "subsystem") else "choose one")
     parts = {key: instantiate(config[key], _convert_="all") for key in groups}
-    rows = {}
+    rows, loops = {}, settings["loop"] if isinstance(settings["loop"], list) else [settings["loop"]]
+    for loop in loops:
+        if loop not in LOOPS:
+            raise SettingError("loop", f"must be among {', '.join(LOOPS)}; got {loop!r}")
     for name, row in settings["rows"].items():
-        if row is None:  # taken out on the command line
-            continue
         try:
             rows[name] = Row(**row)
         except TypeError as error:
             raise SettingError(f"rows.{name}", str(error).removeprefix("Row.__init__() ")) from error
+    rows = {name: row for name, row in rows.items() if row.loop in loops}
     return Flights(
         rows=rows,
         data={key: parts[key] for key in ("data", "excited", "undithered")},
         trajectories=parts["trajectory"],
         subsystems=parts["subsystem"],
-        model=parts["model"],
-        model_settings=settings["model"],
+        models={"model": parts["model"], "plant": parts["flying"]},
+        model_settings={"model": settings["model"], "plant": settings["flying"]},
         plant=parts["plant"],
         **{key: settings[key] for key in NUMBERS},
     )

@@ -26,9 +26,9 @@ LOOPS = {
     "plant": "The plant in the loop",
 }
 LEGEND = (
-    "RMSE: of the positions [m] (rotational: roll, pitch, yaw [rad]), over all steps and trials; total: root of the summed "
-    "squares. outside: the farthest that an input left its bounds. failed: steps without a solve, bridged by the last plan. "
-    "lost: trials that left the finite numbers or had nothing to fall back on. Times: wall time of a decision."
+    "RMSE: of the positions [m] (attitude: roll, pitch, yaw [rad]) over all steps and trials; total: root of summed "
+    "squares. outside: the farthest that an input left its bounds. failed: steps without a solve, bridged by the last "
+    "plan. lost: trials that left the finite numbers or had nothing to fall back on. Times: wall time of a decision."
 )
 
 
@@ -236,7 +236,7 @@ def comma_separated(rows: Sequence[Summary]) -> str:
 
 
 def pictures(rows: Sequence[Summary], records: Sequence[dict]) -> dict[str, bytes]:
-    """Figures 2 (elliptical), 3 (Lorenz) and 4 (inputs), and of the plant in the loop; with several settings, curves."""
+    """Figures 2 (elliptical), 3 (Lorenz), 4 (inputs), the same of the plant in the loop; curves over settings."""
     found: dict[str, bytes] = {}
     drawn = [record for record in records if "drawn" in record]
     for loop, suffix in (("model", ""), ("plant", "-plant")):
@@ -245,15 +245,11 @@ def pictures(rows: Sequence[Summary], records: Sequence[dict]) -> dict[str, byte
         chosen = [r for r in chosen if r["horizon"] == shortest[r["name"]] and not r["size"]]
         chosen = [r for r in chosen if "without" not in r["name"]]
         for figure, trajectory in (("figure2", "elliptical"), ("figure3", "lorenz")):
-            panels = {"translational": POSITIONS, "rotational": ANGLES}
-            shown = [
-                (
-                    labels,
-                    [_curve(r, "states", range(0, 6, 2)) for r in chosen if (r["trajectory"], r["subsystem"]) == at],
-                )
-                for subsystem, labels in panels.items()
-                if (at := (trajectory, subsystem)) and any((r["trajectory"], r["subsystem"]) == at for r in chosen)
-            ]
+            shown = []
+            for subsystem, labels in (("translational", POSITIONS), ("rotational", ANGLES)):
+                there = [r for r in chosen if (r["trajectory"], r["subsystem"]) == (trajectory, subsystem)]
+                if there:
+                    shown.append((labels, [_curve(r, "states", range(0, 6, 2)) for r in there]))
             if shown:
                 found[f"{figure}{suffix}.png"] = _png(tracking(shown))
         inputs = [
