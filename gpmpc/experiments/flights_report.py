@@ -261,12 +261,11 @@ def pictures(rows: Sequence[Summary], records: Sequence[dict]) -> dict[str, byte
         ]
         if inputs:
             found[f"figure4{suffix}.png"] = _png(tracking(inputs))
-    several = {key: {getattr(row, key) for row in rows if row.trials} for key in ("horizon", "size", "confidence")}
-    if len(several["horizon"]) > 1:
-        found["horizon.png"] = _png(over_settings(_over_horizon(rows), "horizon H", logarithmic=True))
-    if len(several["confidence"] - {None}) > 1:
-        found["confidence.png"] = _png(over_settings(_over_confidence(rows), "allowed rate 1 - eta", diagonal=True))
-    return found
+    curves = (
+        ("horizon.png", _over_horizon(rows), "horizon H", {"logarithmic": True}),
+        ("confidence.png", _over_confidence(rows), "allowed rate 1 - eta", {"diagonal": True}),
+    )
+    return found | {name: _png(over_settings(panels, at, **how)) for name, panels, at, how in curves if panels}
 
 
 def _flies(record: dict) -> bool:
