@@ -1,4 +1,4 @@
-"""The whole quadrotor on learned models: a cascade of two GPs at 1 and 20 Hz beside the same cascade on the true models.
+"""The whole quadrotor on learned models: two GPs at 1 and 20 Hz beside the same cascade on the true models.
 
     .venv/bin/python benchmarks/cascade.py [--steps 189] [--seeds 3]
 

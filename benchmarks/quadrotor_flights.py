@@ -8,7 +8,7 @@ import torch
 
 from gpmpc.control.controller import Controller, Decision, Reference
 from gpmpc.control.tracking import StateBounds, TrackingProblem
-from gpmpc.datasets import ExcitedData, Excitation
+from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, standardize
 from gpmpc.plants import Integrated, Rotational, Translational

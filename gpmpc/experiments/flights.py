@@ -36,8 +36,8 @@ from gpmpc.parallel import in_processes
 from gpmpc.plants import Plant
 from gpmpc.trajectories import Trajectory, states_along
 
-SOURCES = ("*.py", "control/*.py", "gp/*.py", "propagation/*.py", "fused/*.py", "qp/*.py", "simulation/*.py")
-SOURCES += ("datasets/*.py", "plants/*.py", "experiments/flight.py", "experiments/flights.py")
+SOURCES = ("gaussian.py", "metrics.py", "control/*.py", "gp/*.py", "propagation/*.py", "fused/*.py", "qp/*.py")
+SOURCES += ("simulation/*.py", "datasets/*.py", "plants/*.py", "experiments/flight.py", "experiments/flights.py")
 
 
 @dataclass(frozen=True)
