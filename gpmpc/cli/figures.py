@@ -91,6 +91,8 @@ def _experiment(config: DictConfig, settings: dict) -> Any:
         if loop not in LOOPS:
             raise SettingError("loop", f"must be among {', '.join(LOOPS)}; got {loop!r}")
     for name, row in settings["rows"].items():
+        if row is None:  # left out on the command line
+            continue
         try:
             rows[name] = Row(**row)
         except TypeError as error:

@@ -32,8 +32,8 @@ METHODS = {"sqp": sqp, "slsqp": slsqp}
 class NonlinearGPMPC:
     """Nonlinear MPC on a learned model.
 
-    Each step starts from the last plan, shifted, from the last input held, or from the reference's own inputs where it
-    has some, whichever is best; the Gauss-Newton
+    Each step starts from the last plan, shifted, from the last input held, or from the reference's own inputs where R
+    weighs deviations from them, whichever is best; the Gauss-Newton
     ``"sqp"`` needs the fewest evaluations of the model, ``"slsqp"`` is SciPy's, for comparison.
 
     Args:
@@ -136,11 +136,12 @@ class NonlinearGPMPC:
     def _start(program: Program, request: Request) -> Shot:
         """The best of the plans at hand: the one that breaks fewer bounds, then the cheapest.
 
-        They are the last input held, the last plan shifted, and the reference's own inputs where it has some: from
-        elsewhere a model that is nearly flat in some direction can take hundreds of iterations to get there.
+        They are the last input held, the last plan shifted, and the reference's own inputs where R weighs deviations
+        from them: from elsewhere a model that is nearly flat in some direction takes hundreds of iterations to get
+        there.
         """
         plans = []
-        known = [request.wanted] if request.wanted.any() else []  # all zero: there are none
+        known = [request.wanted] if program.shooting.problem.penalized == "deviations" else []
         for candidate in (request.held, request.shifted, *known):
             plan = candidate.ravel().clip(program.lower, program.upper)
             if not any(np.array_equal(plan, other) for other in plans):

@@ -49,12 +49,15 @@ class Row:
         bounded: Whether the inputs are bounded.
         horizon: H, or several.
         propagation: ``"moment_matching"`` or ``"linearization"``: how the controller's belief moves.
+        observation_noise: Whether the learned noise counts as part of the predicted state; chance constraints with a
+            noisy plant in the loop need it.
         data: What the GP learned from: a name in ``Flights.data``.
         size: Training transitions, or several; 0 for all.
         confidence: eta of the state bounds of the trajectory, or several; None without state bounds.
         subsystems: Which are flown; the plant in the loop is translational.
         trials: Seeds, for plants; None takes the experiment's.
         settings: Further arguments of the controller.
+        title: What it is called in tables and figures; its name by default.
 
     Raises:
         SettingError: An unknown loop, controller or propagation, or a model loop with the true plant's controller.
@@ -68,12 +71,14 @@ class Row:
     bounded: bool = True
     horizon: Any = 1
     propagation: str = "moment_matching"
+    observation_noise: bool = False
     data: str = "data"
     size: Any = ALL
     confidence: Any = None
     subsystems: Sequence[str] = ("translational",)
     trials: int | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    title: str = ""
 
     def __post_init__(self) -> None:
         known = (("loop", LOOPS), ("controller", CONTROLLERS), ("propagation", PROPAGATIONS))
@@ -151,7 +156,7 @@ def controller_of(row: Row, task: Task) -> Controller:
     at_first = np.clip(at_first, problem.input_lower, problem.input_upper)
     if row.controller == "nmpc":
         return NMPC(task.plant, problem, row.horizon, at_first, **settings)
-    model, propagator = _loaded(task.posterior), PROPAGATIONS[row.propagation]()
+    model, propagator = _loaded(task.posterior), PROPAGATIONS[row.propagation](observation_noise=row.observation_noise)
     return CONTROLLERS[row.controller](model, propagator, problem, row.horizon, at_first, **settings)
 
 
@@ -160,6 +165,7 @@ def fly(flight: Flight) -> dict:
     torch.set_num_threads(1)
     row, task = flight.row, flight.task
     record = {key: getattr(flight, key) for key in ("name", "trajectory", "subsystem", "trial", "seed")}
+    record["name"] = row.title or flight.name
     record |= {key: getattr(row, key) for key in ("loop", "controller", "horizon", "size", "confidence", "bounded")}
     try:
         controller = controller_of(row, task)
@@ -208,7 +214,7 @@ def _measured(rollout: Rollout, flight: Flight) -> dict:
             shown["deviations"] = np.sqrt(rollout.covariances.diagonal(axis1=1, axis2=2)) * scale.factor.numpy()
         if task.reference.inputs is not None:
             shown["reference_inputs"] = task.reference.inputs[: task.steps]
-        measured["drawn"] = {key: np.round(value, 6).tolist() for key, value in shown.items()}
+        measured["drawn"] = {key: np.round(value, 9).tolist() for key, value in shown.items()}
         measured["bounds"] = [list(task.lower), list(task.upper)]
     return measured
 

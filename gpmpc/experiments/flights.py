@@ -114,7 +114,7 @@ class Flights:
     def _flight(self, name: str, row: Row, trajectory: str, subsystem: str, trial: int, task: Task) -> Flight:
         # All rows meet the same seeds: their differences are paired.
         seed = int(np.random.SeedSequence([self.seed, trial]).generate_state(1)[0])
-        described = [asdict(row), trajectory, subsystem, seed, repr(task.plant), task.noise, task.steps]
+        described = [name, asdict(row), trajectory, subsystem, seed, repr(task.plant), task.noise, task.steps]
         described += [str(task.posterior and task.posterior.name), list(task.lower), list(task.upper)]
         described += [_plain(task.state_lower), _plain(task.state_upper)]
         arrays = [task.reference.states, task.reference.inputs, task.scaling.factor.numpy()]

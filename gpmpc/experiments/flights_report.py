@@ -309,7 +309,7 @@ def _over_confidence(rows: Sequence[Summary]) -> dict[str, list[Curve]]:
                 ends = np.array([binomial_interval(*count) for count in counts])
                 rates = np.array([violated / steps for violated, steps in counts])
                 at = np.array([1 - r.confidence for r in group])
-                curve = Curve(f"H = {H}, {label}", at, rates[:, None], interval=ends)
+                curve = Curve(f"{name}, H = {H}, {label}", at, rates[:, None], interval=ends)
                 panels.setdefault(f"{trajectory}: rate of violations", []).append(curve)
     return panels
 
