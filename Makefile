@@ -1,4 +1,4 @@
-# Two commands on a fresh machine (git, make and Python 3.10+ with venv): `make tables` and `make test`.
+# Three commands on a fresh machine (git, make and Python 3.10+ with venv): `make tables`, `make figures`, `make test`.
 # Each builds .venv first when it is missing or when the dependencies have changed.
 PYTHON ?= python3
 ENV := .venv/.installed
