@@ -198,7 +198,11 @@ def over_settings(
             handles.setdefault(curve.label, line)
         if logarithmic:
             axis.set_xscale("log")
-            axis.set_yscale("log")
+            reach = np.concatenate([curve.values[:, 0] for curve in curves])
+            if reach.max() > 10 * reach.min() > 0:
+                axis.set_yscale("log")
+            else:
+                axis.set_ylim(0, 1.08 * reach.max())
             ticks = sorted({int(a) for curve in curves for a in curve.at})
             axis.set_xticks(ticks, [str(t) for t in ticks])
             axis.xaxis.set_minor_locator(NullLocator())

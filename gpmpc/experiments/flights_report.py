@@ -19,6 +19,7 @@ from gpmpc.metrics import binomial_interval, time_quantiles
 from gpmpc.plotting import Curve, over_settings, tracking
 
 STYLE = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0), "title_justify": "left", "title_style": "bold"}
+ERRORS = ("x - reference [m]", "y - reference [m]", "z - reference [m]")
 POSITIONS, ANGLES = ("x [m]", "y [m]", "z [m]"), ("roll [rad]", "pitch [rad]", "yaw [rad]")
 INPUTS = ("U1 [N]", "ux [-]", "uy [-]")
 LOOPS = {
@@ -248,7 +249,9 @@ def pictures(rows: Sequence[Summary], records: Sequence[dict]) -> dict[str, byte
             shown = []
             for subsystem, labels in (("translational", POSITIONS), ("rotational", ANGLES)):
                 there = [r for r in chosen if (r["trajectory"], r["subsystem"]) == (trajectory, subsystem)]
-                if there:
+                if there and loop == "plant":  # all are so close to the reference that only the difference shows
+                    shown.append((ERRORS, [_curve(r, "errors", range(0, 6, 2)) for r in there]))
+                elif there:
                     shown.append((labels, [_curve(r, "states", range(0, 6, 2)) for r in there]))
             if shown:
                 found[f"{figure}{suffix}.png"] = _png(tracking(shown))
@@ -274,8 +277,11 @@ def _flies(record: dict) -> bool:
 
 def _curve(record: dict, key: str, columns: Sequence[int]) -> Curve:
     drawn, at = record["drawn"], list(columns)
-    values = np.array(drawn[key])[:, at]
-    wanted = drawn.get("references" if key == "states" else "reference_inputs")
+    if key == "errors":
+        values = (np.array(drawn["states"]) - np.array(drawn["references"]))[:, at]
+    else:
+        values = np.array(drawn[key])[:, at]
+    wanted = drawn.get({"states": "references", "inputs": "reference_inputs"}.get(key))
     bounds = record["bounds"] if key == "inputs" and record["bounded"] else None
     label = record["name"] + (f" (H = {record['horizon']})" if record["loop"] == "plant" else "")
     return Curve(label, np.arange(len(values)), values, None if wanted is None else np.array(wanted)[:, at], bounds)
