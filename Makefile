@@ -1,12 +1,15 @@
-# Two commands on a fresh machine (git, make and Python 3.10+ with venv): `make tables` and `make test`.
+# Three commands on a fresh machine (git, make and Python 3.10+ with venv): `make tables`, `make figures`, `make test`.
 # Each builds .venv first when it is missing or when the dependencies have changed.
 PYTHON ?= python3
 ENV := .venv/.installed
 
-.PHONY: tables test lint clean
+.PHONY: tables figures test lint clean
 
 tables: $(ENV)  ## The paper's Tables 1 and 2 beside ours; settings: make tables SET="draws=50 data=paper data.folder=DIR"
 	.venv/bin/gpmpc tables $(SET)
+
+figures: $(ENV)  ## Figures 2 to 4 and section 5.2; settings: make figures SET="trials=10 data=paper data.folder=DIR"
+	.venv/bin/gpmpc figures $(SET)
 
 test: $(ENV)  ## The whole test suite; options: make test ARGS="-k gaussian"
 	.venv/bin/python -m pytest $(ARGS)

@@ -25,6 +25,7 @@ def test_the_wheel_carries_the_settings_and_the_printed_figures(wheel):
     settings = {str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml")}
     assert {f"gpmpc/{name}" for name in settings} <= set(names)
     assert "gpmpc/experiments/paper_tables.csv" in names
+    assert "gpmpc/experiments/paper_timings.csv" in names
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/"))]
 
 

@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 import gpmpc
+from gpmpc.cli.figures import figures
 from gpmpc.cli.log import log
 from gpmpc.cli.plot import plot
 from gpmpc.cli.report import report
@@ -41,6 +42,7 @@ commands:
   tables    Tables 1 and 2 of Cao, Lai and Alam (2017), computed beside the printed figures
   report    A tree of runs as one table, with figures; whether two groups of runs differ
   plot      A recorded flight as figures and an animation
+  figures   Figures 2 to 4 and section 5.2: the flights, in the paper's reading and with the plant in the loop
   log       What is in a recording (info), rescue an unfinished one (recover), a table of its steps (export)
 
 gpmpc COMMAND --help lists a command's settings, --cfg job prints them resolved.
@@ -192,5 +194,9 @@ def _nearest(name: str, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-COMMANDS: dict[str, tuple[Callable[[DictConfig], None], str]] = {"run": (run, "run"), "tables": (tables, "tables")}
+COMMANDS: dict[str, tuple[Callable[[DictConfig], None], str]] = {
+    "run": (run, "run"),
+    "tables": (tables, "tables"),
+    "figures": (figures, "figures"),
+}
 PLAIN: dict[str, Callable[[list[str]], None]] = {"log": log, "plot": plot, "report": report}

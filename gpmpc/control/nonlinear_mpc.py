@@ -32,7 +32,8 @@ METHODS = {"sqp": sqp, "slsqp": slsqp}
 class NonlinearGPMPC:
     """Nonlinear MPC on a learned model.
 
-    Each step starts from the last plan, shifted, or from the last input held, whichever is better; the Gauss-Newton
+    Each step starts from the last plan, shifted, from the last input held, or from the reference's own inputs where R
+    weighs deviations from them, whichever is best; the Gauss-Newton
     ``"sqp"`` needs the fewest evaluations of the model, ``"slsqp"`` is SciPy's, for comparison.
 
     Args:
@@ -133,9 +134,19 @@ class NonlinearGPMPC:
 
     @staticmethod
     def _start(program: Program, request: Request) -> Shot:
-        """The better of the two plans at hand: the one that breaks fewer bounds, then the cheaper."""
-        plans = [plan.ravel().clip(program.lower, program.upper) for plan in (request.held, request.shifted)]
-        if np.array_equal(*plans):
+        """The best of the plans at hand: the one that breaks fewer bounds, then the cheapest.
+
+        They are the last input held, the last plan shifted, and the reference's own inputs where R weighs deviations
+        from them: from elsewhere a model that is nearly flat in some direction takes hundreds of iterations to get
+        there.
+        """
+        plans = []
+        known = [request.wanted] if program.shooting.problem.penalized == "deviations" else []
+        for candidate in (request.held, request.shifted, *known):
+            plan = candidate.ravel().clip(program.lower, program.upper)
+            if not any(np.array_equal(plan, other) for other in plans):
+                plans.append(plan)
+        if len(plans) == 1:
             return program(plans[0])
         shots = [program(plan) for plan in plans]
         # Violations that one step mends anyway are not worth a far worse plan.

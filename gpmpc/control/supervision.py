@@ -80,10 +80,7 @@ def command(
         return Command(plan.input, status, decision, plan)
     if reference.inputs is None:
         raise SolverFailure(step, f"{status.advice} (no earlier plan and no reference input to fall back on)")
-    input = np.array(reference.inputs[0], dtype=float)
-    problem = getattr(controller, "problem", None)
-    if isinstance(problem, TrackingProblem):
-        input = np.clip(input, problem.input_lower, problem.input_upper)
+    input = _within_bounds(controller, np.array(reference.inputs[0], dtype=float))
     H, n = reference.horizon, reference.states.shape[1]
     nothing = np.full((H + 1, n), np.nan), np.full((H + 1, n, n), np.nan)
     applied = Decision(input, np.tile(input, (H, 1)), *nothing, status, 0, Timing(0.0, 0.0, 0.0))
@@ -98,6 +95,14 @@ def check_policy(on_failure: str) -> None:
     """
     if on_failure not in POLICIES:
         raise SettingError("on_failure", f"must be one of {', '.join(map(repr, POLICIES))}; got {on_failure!r}")
+
+
+def _within_bounds(controller: Controller, input: np.ndarray) -> np.ndarray:
+    """An input clipped to the box of the controller's problem, where it has one: a reference may lie outside."""
+    problem = getattr(controller, "problem", None)
+    if not isinstance(problem, TrackingProblem):
+        return input
+    return np.clip(input, problem.input_lower, problem.input_upper)
 
 
 def _moved_on(plan: Decision) -> Decision:

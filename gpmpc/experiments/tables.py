@@ -150,7 +150,7 @@ class Tables:
         seed = int(np.random.SeedSequence([self.seed, *names, size, draw]).generate_state(1)[0])
         settings = [self.model_settings, self.state_std, cell.reported, size, seed]
         arrays = (cell.data.features, cell.data.next_states, cell.scaling.factor)
-        fingerprint = _digest(
+        fingerprint = digest(
             _source(), json.dumps(settings, sort_keys=True).encode(), *(array.numpy().tobytes() for array in arrays)
         )
         return Fit(cell, size, draw, seed, fingerprint)
@@ -309,7 +309,8 @@ def _source() -> bytes:
     return b"".join(path.read_bytes() for pattern in SOURCES for path in sorted(package.glob(pattern)))
 
 
-def _digest(*parts: bytes) -> str:
+def digest(*parts: bytes) -> str:
+    """A fingerprint of bytes."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(part)

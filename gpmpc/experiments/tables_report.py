@@ -178,7 +178,7 @@ def markdown(rows: Sequence[Row], meta: dict, note: str) -> str:
         for row in (row for row in rows if row.trajectory == trajectory):
             cells = [cell for name in MEASURES for cell in _with_paper(row.statistics.get(name), " ")]
             lines.append([row.subsystem, str(row.size), *cells, _seconds(row)])
-        out += [f"## {title(trajectory)}", "", *_markdown_table(header, lines), ""]
+        out += [f"## {title(trajectory)}", "", *markdown_table(header, lines), ""]
     out += ["Ours: median [min, max] over the draws. " + LEGEND, "", PAPER_SECONDS, "", note, ""]
     out += ["## Plain predictions and calibration", ""]
     lines = [
@@ -186,7 +186,7 @@ def markdown(rows: Sequence[Row], meta: dict, note: str) -> str:
         + [_range(row.statistics.get(name), " ") for name in CALIBRATION]
         for row in rows
     ]
-    out += [*_markdown_table(["", "N", *CALIBRATION.values()], lines), ""]
+    out += [*markdown_table(["", "N", *CALIBRATION.values()], lines), ""]
     outside = differences(rows)
     out += ["## Outside our range", "", *([f"- {line}" for line in outside] or ["Nothing."]), ""]
     out += ["## Made by", "", "```json", json.dumps(meta, indent=2), "```", ""]
@@ -336,6 +336,7 @@ def _latex(value: float | Decimal) -> str:
     return f"${mantissa} \\cdot 10^{{{exponent}}}$"
 
 
-def _markdown_table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
+def markdown_table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
+    """Header and lines as a Markdown table."""
     rows = [header, ["---"] * len(header), *lines]
     return ["| " + " | ".join(row) + " |" for row in rows]

@@ -114,3 +114,107 @@ def calibration_figure(calibration: "Calibration") -> Figure:
     figure.supxlabel("steps ahead", fontsize="medium")
     figure.align_ylabels(axes[:, 0])
     return figure
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line in each panel of a group.
+
+    Attributes:
+        label: In the legend.
+        at: Where the values lie on the horizontal axis (K,).
+        values: A column a panel (K, p).
+        wanted: What they were to be (K or more, p); None where there is nothing.
+        bounds: Lower and upper, an entry a panel; None without.
+        interval: Lower and upper end of what is doubtful of the first column (K, 2).
+    """
+
+    label: str
+    at: np.ndarray
+    values: np.ndarray
+    wanted: np.ndarray | None = None
+    bounds: Sequence[Sequence[float]] | None = None
+    interval: np.ndarray | None = None
+
+
+COLOURS = ("#c0392b", "#1f4e79", "#2e8b57", "#b8860b", "#6a3d9a", "#555555")
+DASHES = ("-", (0, (5, 2)), (0, (1.2, 1.6)), (0, (6, 2, 1.2, 2)), (0, (3, 3)), "-")
+
+
+def tracking(groups: Sequence[tuple[Sequence[str], Sequence[Curve]]]) -> Figure:
+    """Values over the time steps, a row of panels a group and a panel a column; references grey, bounds dotted."""
+    columns = max(len(labels) for labels, _ in groups)
+    figure = Figure(figsize=(4.0 * columns, 2.7 * len(groups) + 0.7), layout="constrained")
+    axes = figure.subplots(len(groups), columns, squeeze=False, sharex=True)
+    handles: dict[str, object] = {}
+    for row, (labels, curves) in zip(axes, groups, strict=True):
+        for j, (axis, label) in enumerate(zip(row, labels, strict=False)):
+            wanted = next((c.wanted for c in curves if c.wanted is not None), None)
+            if wanted is not None:
+                (line,) = axis.plot(wanted[: len(curves[0].at), j], color="0.75", linewidth=3.5)
+                handles.setdefault("reference", line)
+            bounded = next((c.bounds for c in curves if c.bounds is not None), None)
+            reach = [c.values[:, j] for c in curves] + ([] if wanted is None else [wanted[:, j]])
+            low, high = min(v.min() for v in reach), max(v.max() for v in reach)
+            room = 0.08 * max(high - low, 1e-6)
+            for bound in () if bounded is None else (bounded[0][j], bounded[1][j]):
+                if low - 5 * room <= bound <= high + 5 * room:  # one that is far away would only flatten the curves
+                    line = axis.axhline(bound, color="0.25", linestyle=":", linewidth=1.2)
+                    handles.setdefault("bound", line)
+            for curve, colour, dash in zip(curves, COLOURS, DASHES, strict=False):
+                (line,) = axis.plot(curve.at, curve.values[:, j], color=colour, linestyle=dash, linewidth=1.3)
+                handles.setdefault(curve.label, line)
+            axis.set_ylabel(label)
+            axis.grid(color="0.92")
+            axis.set_axisbelow(True)
+            axis.spines[["top", "right"]].set_visible(False)
+    for axis in axes[-1]:
+        axis.set_xlabel("time step k")
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside upper center", ncols=min(4, len(handles)), frameon=False
+    )
+    return figure
+
+
+def over_settings(
+    panels: Mapping[str, Sequence[Curve]], label: str, logarithmic: bool = False, diagonal: bool = False
+) -> Figure:
+    """One measure over a setting, a panel a title, with intervals; logarithmic, or with the diagonal drawn in."""
+    columns = min(2, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.8 * columns, 3.3 * rows + 0.8), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    handles: dict[str, object] = {}
+    for axis, (title, curves) in zip(axes, panels.items(), strict=False):
+        axis.set_title(title, fontsize="medium")
+        for i, curve in enumerate(curves):
+            colour, value = COLOURS[i % len(COLOURS)], curve.values[:, 0]
+            if curve.interval is None:
+                (line,) = axis.plot(curve.at, value, "o-", color=colour, markersize=4, linewidth=1.3)
+            else:
+                ends = np.abs(curve.interval.T - value)
+                line = axis.errorbar(curve.at, value, ends, fmt="o-", color=colour, markersize=4, capsize=3)
+            handles.setdefault(curve.label, line)
+        if logarithmic:
+            axis.set_xscale("log")
+            reach = np.concatenate([curve.values[:, 0] for curve in curves])
+            if reach.max() > 10 * reach.min() > 0:
+                axis.set_yscale("log")
+            else:
+                axis.set_ylim(0, 1.08 * reach.max())
+            ticks = sorted({int(a) for curve in curves for a in curve.at})
+            axis.set_xticks(ticks, [str(t) for t in ticks])
+            axis.xaxis.set_minor_locator(NullLocator())
+        if diagonal:
+            end = max(float(curve.at.max()) for curve in curves)
+            (line,) = axis.plot([0, end], [0, end], color="0.4", linestyle=(0, (4, 3)), linewidth=1)
+            handles.setdefault("what is allowed", line)
+            axis.set_ylim(bottom=0)
+        axis.grid(color="0.92")
+        axis.set_axisbelow(True)
+        axis.spines[["top", "right"]].set_visible(False)
+    for axis in axes[len(panels) :]:
+        axis.set_visible(False)
+    figure.supxlabel(label, fontsize="medium")
+    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=2, frameon=False)
+    return figure

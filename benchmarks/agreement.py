@@ -1,0 +1,154 @@
+"""Do two roads to one answer meet? Sequential quadratic programs, solvers and forms, and a long horizon with bounds.
+
+    .venv/bin/python benchmarks/agreement.py [--steps 200] [--recorded 500]
+
+1. ``trajectory`` iterated to tolerance against ``NonlinearGPMPC`` on sampled steps of flights, full covariances: the
+   nonlinear objective at the one's plan over that at the other's.
+2. The condensed program by our dual active set, the paper's primal one and Clarabel, and the state form in CVXPY, on
+   recorded steps with active bounds: the largest difference of an input, in its own unit.
+3. A horizon of 50 with state bounds: how many programs had no solution.
+
+One process, one thread. Writes ``outputs/benchmarks/agreement.json``.
+"""
+
+import argparse
+import json
+import os
+import time
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[variable] = "1"
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from quadrotor_flights import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
+
+from gpmpc.control.convex_mpc import ConvexMPC
+from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.control.state_form import StateFormMPC
+from gpmpc.control.tracking import StateBounds
+from gpmpc.propagation import Linearization, MomentMatching
+from gpmpc.provenance import provenance
+from gpmpc.qp import CvxpySolver, PrimalActiveSet
+
+PROPAGATIONS = {"linearization": Linearization(), "moment_matching": MomentMatching()}
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=200, help="sampled steps a propagation")
+    parser.add_argument("--recorded", type=int, default=500, help="steps for solvers and forms")
+    parser.add_argument("--horizon", type=int, default=5, help="of the first comparison")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    posteriors = {name: trained(name) for name in TRAJECTORIES}
+    results = {
+        "optimality": [optimality(posteriors, name, arguments) for name in PROPAGATIONS],
+        "solvers": solvers(posteriors, arguments.recorded),
+        "long_horizon": [long_horizon(posteriors[name], name, l1) for name in TRAJECTORIES for l1 in (None, 1e4)],
+    }
+    path = Path("outputs/benchmarks/agreement.json")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
+    print(f"written to {path}")
+
+
+def optimality(posteriors: dict, propagation: str, arguments: argparse.Namespace) -> dict:
+    """The nonlinear objective at the plan of iterated quadratic programs, relative to that of the nonlinear method."""
+    propagator, gaps, times, failed = PROPAGATIONS[propagation], [], [[], []], {"convex": 0, "nonlinear": 0}
+    for trajectory, gp in posteriors.items():
+        asked = (problem(), arguments.horizon, HOVER)
+        convex = ConvexMPC(gp, propagator, *asked, form="trajectory", covariance="full", iterations=100, tolerance=1e-7)
+        nonlinear = NonlinearGPMPC(gp, propagator, *asked, tolerance=1e-6, max_iterations=300)
+        count = arguments.steps // len(posteriors)
+        flown = recorded(ConvexMPC(gp, Linearization(), *asked), trajectory, count, std=0.01)
+        for step in flown:
+            plans = []
+            for controller, spent in zip((convex, nonlinear), times, strict=True):
+                began = time.process_time()
+                plans.append(controller.control(step.belief, step.reference, step.previous))
+                spent.append(time.process_time() - began)
+            failed["convex"] += not plans[0].status.solved
+            failed["nonlinear"] += not plans[1].status.solved
+            last = HOVER if step.previous is None else step.previous.input
+            values = [nonlinear.objective(plan.inputs, step.belief, step.reference, last)[0] for plan in plans]
+            gaps.append(values[0] / values[1] - 1)
+    gaps = np.array(gaps)
+    result = {
+        "propagation": propagation,
+        "steps": len(gaps),
+        "within_1e-4": float((gaps <= 1e-4).mean()),
+        "gap_median": float(np.median(gaps)),
+        "gap_95": float(np.quantile(gaps, 0.95)),
+        "gap_largest": float(gaps.max()),
+        "gap_smallest": float(gaps.min()),
+        "failed": failed,
+        "seconds_median": [float(np.median(spent)) for spent in times],
+    }
+    print(f"optimality: {result}", flush=True)
+    return result
+
+
+def solvers(posteriors: dict, count: int) -> dict:
+    """Inputs by several solvers and forms on one program."""
+    found = {name: [] for name in ("primal_active_set", "clarabel", "state_form")}
+    active, unsolved = 0, dict.fromkeys(found, 0)
+    for trajectory, gp in posteriors.items():
+        # Bounds that bite: of the inputs, and of positions, with a margin that noise does not leave.
+        bounds = StateBounds(*(0.95 * np.asarray(side) for side in STATE_BOUNDS[trajectory]), l1=1e3)
+        hard = (problem(tilt=0.1), 10, HOVER)
+        soft = (problem(bounds), 10, HOVER)
+        for asked, kinds in ((hard, ("primal_active_set", "clarabel", "state_form")), (soft, ("state_form",))):
+            ours = ConvexMPC(gp, Linearization(), *asked)
+            others = {
+                "primal_active_set": lambda a=asked, g=gp: ConvexMPC(g, Linearization(), *a, solver=PrimalActiveSet()),
+                "clarabel": lambda a=asked, g=gp: ConvexMPC(g, Linearization(), *a, solver=CvxpySolver()),
+                "state_form": lambda a=asked, g=gp: StateFormMPC(g, Linearization(), *a),
+            }
+            others = {kind: others[kind]() for kind in kinds}
+            for step in recorded(ours, trajectory, count // 4):
+                if not step.decision.status.solved:
+                    continue
+                active += bool(len(step.decision.solution.active_set))
+                for kind, controller in others.items():
+                    again = controller.control(step.belief, step.reference, step.previous)
+                    if again.status.solved:
+                        found[kind].append(float(np.abs(again.inputs - step.decision.inputs).max()))
+                    else:
+                        unsolved[kind] += 1
+    result = {
+        kind: {
+            "steps": len(gaps),
+            "unsolved": unsolved[kind],
+            "within_1e-6": float((np.array(gaps) <= 1e-6).mean()),
+            "median": float(np.median(gaps)),
+            "largest": max(gaps),
+        }
+        for kind, gaps in found.items()
+    } | {"steps_with_active_bounds": active}
+    print(f"solvers: {result}", flush=True)
+    return result
+
+
+def long_horizon(gp, trajectory: str, l1: float | None) -> dict:
+    """H = 50 with state bounds that the reference breaks, hard or at a price."""
+    limits = StateBounds(*STATE_BOUNDS[trajectory], l1=l1)
+    flown = recorded(ConvexMPC(gp, Linearization(), problem(limits), 50, HOVER), trajectory, 189)
+    statuses = [step.decision.status.name for step in flown]
+    times = [step.decision.timing.total for step in flown]
+    result = {
+        "trajectory": trajectory,
+        "l1": l1,
+        "steps": len(flown),
+        "statuses": {name: statuses.count(name) for name in dict.fromkeys(statuses)},
+        "ms_median": 1e3 * float(np.median(times)),
+    }
+    print(f"H = 50: {result}", flush=True)
+    return result
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""The whole quadrotor on learned models: two GPs at 1 and 20 Hz beside the same cascade on the true models.
+
+    .venv/bin/python benchmarks/cascade.py [--steps 189] [--seeds 3]
+
+Twelve states; outer and inner controller are convex GP-MPC, and NMPC on the true subsystems for comparison. Flown
+along both trajectories as they are, with a gust, and with a mass that is 20 % larger than the models know. RMSE of the
+position, total over x, y, z, after every outer step. Writes ``outputs/benchmarks/cascade.json``.
+"""
+
+import argparse
+import json
+import os
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[variable] = "1"
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from quadrotor_flights import HOVER, INNER, OUTER, TRAJECTORIES, problem, trained
+
+from gpmpc.control.cascade import Cascade
+from gpmpc.control.convex_mpc import ConvexMPC
+from gpmpc.control.nmpc import NMPC
+from gpmpc.control.tracking import TrackingProblem
+from gpmpc.exceptions import GpmpcError
+from gpmpc.metrics import tracking_error
+from gpmpc.plants import Coupled, Integrated
+from gpmpc.propagation import Linearization
+from gpmpc.provenance import provenance
+from gpmpc.simulation import Gust, Noise, Replaced, cascade_loop
+from gpmpc.trajectories import states_along
+
+PLANT = Integrated(Coupled(), time_step=0.05, substeps=2)
+HEAVY = Integrated(Coupled(mass=1.2 * 0.74), time_step=0.05, substeps=2)
+NOISE = Noise(measurement=[0.01] * 6 + [0.002, 0.01] * 3)  # [m, m/s, rad, rad/s]
+INNER_PROBLEM = TrackingProblem([1] * 6, [1] * 3, penalized="increments")
+CASES = {
+    "as it is": (),
+    "gust": (Gust({"vx": 0.5, "vy": -0.3}, start=40.0, stop=50.0),),
+    "mass + 20 %": (Replaced(HEAVY),),
+}
+
+
+def main() -> None:
+    """Flies and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=189, help="outer steps")
+    parser.add_argument("--seeds", type=int, default=3)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    results = []
+    for trajectory in TRAJECTORIES:
+        outer, inner = trained(trajectory), trained(trajectory, "rotational")
+        cascades = {
+            "true model": Cascade(
+                NMPC(OUTER, problem(), 1, HOVER), NMPC(INNER, INNER_PROBLEM, 1, [0.0] * 3, tolerance=1e-8)
+            ),
+            "GP": Cascade(
+                ConvexMPC(outer, Linearization(), problem(), 1, HOVER),
+                ConvexMPC(inner, Linearization(), INNER_PROBLEM, 1, [0.0] * 3, covariance="none"),
+            ),
+        }
+        for case in CASES:
+            flown = {name: flights(cascade, trajectory, case, arguments) for name, cascade in cascades.items()}
+            ratio = flown["GP"]["rmse"] / flown["true model"]["rmse"]
+            results.append({"trajectory": trajectory, "case": case, "ratio": ratio} | flown)
+            print(json.dumps(results[-1]), flush=True)
+    path = Path("outputs/benchmarks/cascade.json")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
+    print(f"written to {path}")
+
+
+def flights(cascade: Cascade, trajectory: str, case: str, arguments: argparse.Namespace) -> dict:
+    """Pooled tracking error over the seeds, lost flights, failed solves, and times of a step."""
+    references = states_along(TRAJECTORIES[trajectory], np.arange(arguments.steps + 2.0))
+    start = np.concatenate([references[0], np.zeros(6)])
+    squares, lost, failures, outer, inner, worst = [], 0, 0, [], [], 0.0
+    for seed in range(arguments.seeds):
+        try:
+            flight = cascade_loop(
+                PLANT, cascade, references, start, arguments.steps,
+                noise=NOISE, disturbances=CASES[case], on_failure="previous_plan", seed=seed,
+            )  # fmt: skip
+        except GpmpcError as error:
+            print(f"lost: {error}")
+            lost += 1
+            continue
+        squares.append(tracking_error(flight.outer.states, flight.outer.references).total ** 2)
+        away = (flight.outer.states - flight.outer.references)[:, ::2]
+        worst = max(worst, float(np.linalg.norm(away, axis=1).max()))
+        failures += len(flight.outer.failures) + len(flight.inner.failures)
+        outer.append(flight.outer.seconds)
+        inner.append(flight.inner.seconds)
+    if not squares:
+        return {"rmse": float("nan"), "lost": lost}
+    return {
+        "rmse": float(np.sqrt(np.mean(squares))),
+        "worst": worst,
+        "lost": lost,
+        "failures": failures,
+        "outer_ms": 1e3 * float(np.median(np.concatenate(outer))),
+        "inner_ms": 1e3 * float(np.median(np.concatenate(inner))),
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,109 @@
+"""What a control step costs beside one moment-matched Jacobian, and beside nonlinear GP-MPC on the same questions.
+
+    .venv/bin/python benchmarks/controllers.py [--steps 60] [--horizons 1 10]
+
+One process, one thread, process CPU time, GPs on 189 transitions. Questions are recorded on a flight with the plant in
+the loop, with the plans that the one controller made, and then put to each controller in turns, warm-started from its
+own last answer. ``jacobian`` is one call of ``differentiate`` with moment matching. Ratios are paired. Writes
+``outputs/benchmarks/controllers.json``.
+"""
+
+import argparse
+import json
+import os
+import time
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[variable] = "1"
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from quadrotor_flights import HOVER, TRAJECTORIES, Asked, problem, recorded, trained
+
+from gpmpc.control.convex_mpc import ConvexMPC
+from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.gp import GPPosterior
+from gpmpc.propagation import Linearization, MomentMatching, differentiate
+from gpmpc.provenance import provenance
+
+STD = 0.01  # [m, m/s] of the belief: the full covariance is differentiated, as in a loop with an estimator
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--horizons", type=int, nargs="+", default=[1, 10])
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    results = []
+    for trajectory in TRAJECTORIES:
+        gp = trained(trajectory)
+        for horizon in arguments.horizons:
+            results.append(measured(gp, trajectory, horizon, arguments.steps))
+    path = Path("outputs/benchmarks/controllers.json")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
+    print(f"written to {path}")
+
+
+def ways(gp: GPPosterior, horizon: int) -> dict:
+    """The controllers that are compared, by name."""
+    exact, asked = MomentMatching(), (problem(), horizon, HOVER)
+    return {
+        "paper's form": ConvexMPC(gp, exact, *asked, form="increment", covariance="full"),
+        "trajectory, linearised": ConvexMPC(gp, Linearization(), *asked),
+        "trajectory, mean": ConvexMPC(gp, Linearization(), *asked, covariance="none"),
+        "nonlinear, sqp": NonlinearGPMPC(gp, exact, *asked, optimizer="sqp"),
+        "nonlinear, slsqp": NonlinearGPMPC(gp, exact, *asked, optimizer="slsqp"),
+    }
+
+
+def measured(gp: GPPosterior, trajectory: str, horizon: int, steps: int) -> dict:
+    """Median times [ms] and ratios at one horizon."""
+    flown: list[Asked] = recorded(ConvexMPC(gp, Linearization(), problem(), horizon, HOVER), trajectory, steps, STD)
+    controllers, exact = ways(gp, horizon), MomentMatching()
+    taken = {name: [] for name in ["jacobian", *controllers]}
+    unsolved, last = dict.fromkeys(controllers, 0), dict.fromkeys(controllers)
+    for count, step in enumerate(flown):
+        input = torch.tensor(step.decision.input)
+        spent = {"jacobian": _time(lambda s=step, u=input: differentiate(exact, gp, s.belief, u))[0]}
+        for name, controller in controllers.items():
+            spent[name], decision = _time(
+                lambda c=controller, s=step, p=last[name]: c.control(s.belief, s.reference, p)
+            )
+            unsolved[name] += not decision.status.solved
+            last[name] = decision
+        if count >= 2:  # what is compiled or loaded at a first call is left out
+            for name, seconds in spent.items():
+                taken[name].append(seconds)
+    times = {name: np.array(seconds) for name, seconds in taken.items()}
+    ours = times["paper's form"]
+    result = {
+        "trajectory": trajectory,
+        "horizon": horizon,
+        "steps": len(ours),
+        "ms_median": {name: 1e3 * float(np.median(t)) for name, t in times.items()},
+        "ms_p95": {name: 1e3 * float(np.quantile(t, 0.95)) for name, t in times.items()},
+        "over_jacobian": {name: float(np.median(t / times["jacobian"])) for name, t in times.items()},
+        "over_papers_form": {name: float(np.median(t / ours)) for name, t in times.items()},
+        "over_trajectory": {name: float(np.median(t / times["trajectory, linearised"])) for name, t in times.items()},
+        "unsolved": unsolved,
+    }
+    print(f"{trajectory}, H = {horizon} ({len(ours)} steps)")
+    for name in times:
+        row = [result[key][name] for key in ("ms_median", "ms_p95", "over_jacobian", "over_papers_form")]
+        print(f"  {name:24}" + "".join(f"{value:10.3f}" for value in row), unsolved.get(name, ""), flush=True)
+    return result
+
+
+def _time(call) -> tuple[float, object]:
+    began = time.process_time()
+    answer = call()
+    return time.process_time() - began, answer
+
+
+if __name__ == "__main__":
+    main()
