@@ -5,10 +5,11 @@ Every function returns a ``Figure`` made without pyplot, so nothing global is to
 
 from gpmpc.plotting.animation import animate, ffmpeg_exists
 from gpmpc.plotting.recorded import inputs_figure, timing_figure, tracking_figure
-from gpmpc.plotting.results import Panel, calibration_figure, error_over_size
+from gpmpc.plotting.results import Curve, Panel, calibration_figure, error_over_size, over_settings, tracking
 from gpmpc.plotting.sweeps import Series, over_variable
 
 __all__ = [
+    "Curve",
     "Panel",
     "Series",
     "animate",
@@ -16,7 +17,9 @@ __all__ = [
     "error_over_size",
     "ffmpeg_exists",
     "inputs_figure",
+    "over_settings",
     "over_variable",
     "timing_figure",
+    "tracking",
     "tracking_figure",
 ]
