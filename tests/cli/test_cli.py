@@ -4,7 +4,8 @@ import json
 from pathlib import Path
 
 import pytest
-from command import gpmpc
+
+from tests.cli.command import gpmpc
 
 ROW = " ".join(str(i / 7) for i in range(15))
 RESULTS = Path("outputs/tables/nmpc-seed0/data.samples=12,model.restarts=0,sizes=[5],trajectory=elliptical")

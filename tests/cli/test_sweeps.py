@@ -8,9 +8,9 @@ import time
 
 import numpy as np
 import pytest
-from command import gpmpc, start
 
 from gpmpc.recording import read_run, replay
+from tests.cli.command import gpmpc, start
 
 TINY = ["data.samples=25", "model.restarts=0", "steps=3", "horizon=1"]
 SWEPT = ["run", "-m", *TINY, "data.size=10,20", "seed=range(2)"]

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from systems import HOVER, quadrotor_gp
 
 from gpmpc.control.controller import Reference
 from gpmpc.control.convex_mpc import ConvexMPC
@@ -13,6 +12,7 @@ from gpmpc.control.tracking import TrackingProblem
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import PrimalActiveSet
+from tests.control.systems import HOVER, quadrotor_gp
 
 H = 4
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
-from made_up import made_up_run, metrics_of, plan
 from omegaconf import OmegaConf
 
 from gpmpc.exceptions import DataError, SettingError
@@ -18,6 +17,7 @@ from gpmpc.experiments.comparison import compare, sentences
 from gpmpc.experiments.report import report
 from gpmpc.experiments.report_documents import documents, page, render, spread
 from gpmpc.experiments.run_folder import METRICS, folder_name, record
+from tests.experiments.made_up import made_up_run, metrics_of, plan
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}

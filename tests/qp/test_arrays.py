@@ -5,10 +5,10 @@ import pickle
 import numba
 import numpy as np
 import pytest
-from problems import feasible_problem, worst_residual
 
 import gpmpc.compiled
 from gpmpc.qp import DualActiveSet
+from tests.qp.problems import feasible_problem, worst_residual
 
 ODD = {
     "every other entry": lambda a: np.repeat(a, 2, axis=-1)[..., ::2],

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import runs
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -22,6 +21,7 @@ from gpmpc.exceptions import RecordingError, SettingError, ShapeError
 from gpmpc.qp import QuadraticProgram, SoftRows
 from gpmpc.recording import read_run, replay, wire
 from gpmpc.status import Status
+from tests.recording import runs
 
 ROOT = Path(__file__).resolve().parents[2]
 

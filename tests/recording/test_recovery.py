@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import runs
 import zstandard
 from mcap.reader import make_reader
 
 from gpmpc.exceptions import RecordingError
 from gpmpc.recording import read_run, recover
+from tests.recording import runs
 
 ENDLESS = Path(__file__).with_name("endless.py")
 MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = 0x05, 0x06, 0x09, 0x0C, 0x0F  # opcodes of MCAP
