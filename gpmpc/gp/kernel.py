@@ -5,13 +5,18 @@ from torch import Tensor, float64, isfinite, linalg, nonzero, zeros
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 
 PREDICTS = ("next_state", "difference", "value")
+FEW = 16  # columns of a kernel matrix whose differences, all at once, fit the cache
 
 
 def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_variance: Tensor) -> Tensor:
     """k_a(x~_i, x~_j) (k, N, M) of points (N, d) and others (M, d).
 
-    Summed over differences a column at a time: exact for near points, where |x|^2 + |x'|^2 - 2 x'x cancels.
+    Summed over differences, a column at a time where there are many: exact for near points, where
+    |x|^2 + |x'|^2 - 2 x'x cancels.
     """
+    if len(others) <= FEW:
+        squares = (points[:, None] - others).square() @ lengthscales.mT**-2  # (N, M, k)
+        return signal_variance[:, None, None] * (squares.movedim(-1, 0) / -2).exp()
     shape = (len(lengthscales), len(points), len(others))
     total = zeros(shape, dtype=points.dtype, device=points.device)
     for ours, theirs, scale in zip(points.T, others.T, lengthscales.T, strict=True):
