@@ -35,6 +35,16 @@ def offsets(points, x, u, difference):
             row[j] = source[j] - at
 
 
+@borrowing
+def correlate(log_signal, D, squares, factors, k):
+    """Writes k_i = sf2 exp(-1/2 sum_d D_d (x~_i - x~)_d^2) to ``k``, from squared offsets; ``factors`` is scratch."""
+    for c in range(len(squares)):
+        factors[c] = D[c] / -2
+    k[:] = log_signal
+    combine(k, factors, squares)
+    exp_all(k)
+
+
 def means_memory(rows, padded):
     """Numbers that ``means_along`` works in, for ``points`` of this shape."""
     return (2 * rows + 1) * padded + rows + LINE
@@ -57,11 +67,7 @@ def means_along(points, inverse_squares, log_signal, beta, queries, n, memory, o
             multiply(difference[c], difference[c], squares[c])
         for a in range(len(beta)):
             D, answer = inverse_squares[a], out[h, a]
-            for c in range(rows):
-                sums[c] = D[c] / -2
-            k[:] = log_signal[a]
-            combine(k, sums, squares)
-            exp_all(k)
+            correlate(log_signal[a], D, squares, sums, k)
             multiply(k, beta[a], k)
             answer[0] = k.sum()
             project(k, difference, sums)
@@ -92,11 +98,7 @@ def expand_at(uncertain, gp, inverse_cholesky, x, u, memory, M, variance, J, J_u
         multiply(difference[c], difference[c], squares[c])
     for a in range(len(beta)):
         D = inverse_squares[a]
-        for c in range(rows):
-            sums[c] = D[c] / -2
-        k[:] = log_signal[a]
-        combine(k, sums, squares)
-        exp_all(k)
+        correlate(log_signal[a], D, squares, sums, k)
         if uncertain:
             variance[a] = max(np.exp(log_signal[a]) - explain(inverse_cholesky[a], k, solved), 0.0)
         multiply(k, beta[a], k)
@@ -124,11 +126,7 @@ def points_along(order, points, inverse_squares, log_signal, beta, inverse_chole
             multiply(difference[c], difference[c], squares[c])
         for a in range(len(beta)):
             D = inverse_squares[a]
-            for c in range(rows):
-                sums[c] = D[c] / -2
-            k[:] = log_signal[a]
-            combine(k, sums, squares)
-            exp_all(k)
+            correlate(log_signal[a], D, squares, sums, k)
             variance[h, a] = max(np.exp(log_signal[a]) - explain(inverse_cholesky[a], k, solved), 0.0)
             multiply(solved, k, solved)
             project(solved, difference, sums)
