@@ -1,6 +1,5 @@
 """``gpmpc figures``: flies the figures of the paper and writes tables, figures and data."""
 
-import logging
 import sys
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from gpmpc.cli.screen import progress_bar, told_console
 from gpmpc.exceptions import GpmpcError, SettingError
 
 NUMBERS = ("bounds", "state_bounds", "steps", "samples", "trials", "noise", "seed", "workers")
@@ -15,30 +15,13 @@ NUMBERS = ("bounds", "state_bounds", "steps", "samples", "trials", "noise", "see
 
 def figures(config: DictConfig) -> None:
     """The task behind ``conf/figures.yaml``."""
-    from rich.console import Console
-    from rich.logging import RichHandler
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
     from gpmpc.experiments.flights_report import documents, render, summarise
     from gpmpc.experiments.tables import FitStore
     from gpmpc.files import write_whole
     from gpmpc.provenance import provenance
 
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    console = Console()
-    log = logging.getLogger("gpmpc")
-    log.setLevel(logging.INFO)
-    log.handlers = [RichHandler(console=console, show_path=False, show_time=False, show_level=False)]
-    log.propagate, told = False, set()
-    # Rows share their data: what was said of it once needs no second time.
-    log.handlers[0].addFilter(lambda r: not (r.getMessage() in told or told.add(r.getMessage())))
+    console = told_console()
 
     experiment = _experiment(config, settings)
     if not isinstance(settings["folder"], str):
@@ -46,9 +29,7 @@ def figures(config: DictConfig) -> None:
     folder, meta = Path(settings["folder"]), provenance() | {"settings": settings}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
-        columns += [TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()]
-        with Progress(*columns, console=console) as progress:
+        with progress_bar(console) as progress:
             task = progress.add_task("training GPs", total=None)
             flights = experiment.flights(folder)
             store = FitStore(folder / "flights.jsonl")

@@ -1,28 +1,18 @@
 """``gpmpc tables``: computes Tables 1 and 2 and writes them as Markdown, CSV, LaTeX, JSON and a figure."""
 
-import logging
 import sys
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from gpmpc.cli.screen import progress_bar, told_console
 from gpmpc.exceptions import GpmpcError, SettingError
 
 
 def tables(config: DictConfig) -> None:
     """The task behind ``conf/tables.yaml``."""
     from hydra.utils import instantiate
-    from rich.console import Console
-    from rich.logging import RichHandler
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     from gpmpc.experiments.tables import FitStore, Tables
     from gpmpc.experiments.tables_report import documents, render, summarise
@@ -30,11 +20,7 @@ def tables(config: DictConfig) -> None:
     from gpmpc.provenance import provenance
 
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    console = Console()
-    log = logging.getLogger("gpmpc")
-    log.setLevel(logging.INFO)
-    log.handlers = [RichHandler(console=console, show_path=False, show_time=False, show_level=False)]
-    log.propagate = False
+    console = told_console()
 
     # Everything that a user can get wrong is found out before anything is written.
     groups = ("data", "trajectory", "subsystem", "model")
@@ -59,9 +45,7 @@ def tables(config: DictConfig) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         store = FitStore(folder / "fits.jsonl")
-        columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
-        columns += [TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()]
-        with Progress(*columns, console=console) as progress:
+        with progress_bar(console) as progress:
             task = progress.add_task("training GPs", total=len(fits))
             draws = experiment.run(store, fits, progress=lambda _: progress.advance(task))
         rows = summarise(draws)
