@@ -40,7 +40,7 @@ Array = np.ndarray
 
 SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 SHORTEST_STEP = 2.0**-12
-ROUND_OFF = 1e-13  # share of the merit below which a difference says nothing
+ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
 
 
 class _Stacked(NamedTuple):
@@ -78,7 +78,8 @@ class ConvexMPC:
         covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see there.
         solver: Of the quadratic program; ``DualActiveSet()`` by default, which state bounds with a price need.
         iterations: Quadratic programs a step at most; more than one for ``"trajectory"`` only.
-        tolerance: Of more iterations: largest change of an input, over max(1, largest input), that counts as none.
+        tolerance: Of more iterations: how far a plan may be from a KKT point, in cosines between the weighted residuals
+            and their change with an input (More, 1978, eq. (8.2)); what is decided is one program better than that.
         feedback: Rolls plans out, and predicts the covariances of ``"zero_order"``, under an ancillary feedback,
             without which no long horizon with state bounds is feasible. ``"full"`` and ``"diagonal"`` predict their
             covariances without feedback.
@@ -101,7 +102,7 @@ class ConvexMPC:
         covariance: Covariance = "zero_order",
         solver: QPSolver | None = None,
         iterations: int = 1,
-        tolerance: float = 1e-8,
+        tolerance: float = 1e-6,
         feedback: bool = True,
     ):
         self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
@@ -224,13 +225,15 @@ class ConvexMPC:
         clock, taken, corrections = _Clock(spent), None, []
         prediction = self.predictor.predict(request, previous)
         inputs = prediction.inputs
+        cost = self._cost(request, prediction, inputs)
         clock.charge(0)
         for count in range(1, self.iterations + 1):
             stacked = self._stack(prediction, request)
-            slope = stacked.P @ inputs.ravel() + stacked.q
+            slope, diagonal = stacked.P @ inputs.ravel() + stacked.q, stacked.P.diagonal()
             if taken is not None:  # how the Lagrangian's slope changed over the last step, at its multipliers
                 step, multipliers, before = taken
-                corrections.append((step, slope + stacked.G.T @ multipliers - before))
+                if step @ stacked.P @ step > ROUND_OFF * cost:
+                    corrections.append((step, slope + stacked.G.T @ multipliers - before))
                 P = stacked.P
                 for pair in corrections:
                     P = _damped_update(P, *pair)
@@ -242,34 +245,41 @@ class ConvexMPC:
                 status = solution.status
                 break
             warm, proposed = solution, solution.x.reshape(inputs.shape)
-            size = max(1.0, float(np.abs(proposed).max()))
-            if np.abs(proposed - inputs).max() <= self.tolerance * size:
+            if self._residual(stacked, diagonal, slope, solution, inputs, cost) <= self.tolerance:
                 status = Status.SOLVED
                 break
             if count == self.iterations:
                 break
             row_multipliers = np.abs(solution.z[self._condenser.rate_rows :])
             price = max(price, 2.0 * float(row_multipliers.max(initial=0.0)))
-            found = self._search(request, prediction, inputs, proposed, slope, price)
+            found = self._search(request, prediction, inputs, cost, proposed, slope, price)
             clock.charge(0)
             if found is None:
                 status = Status.NUMERICAL_TROUBLE
                 break
             taken = (found[0] - inputs).ravel(), solution.z, slope + stacked.G.T @ solution.z
-            inputs, prediction = found
+            inputs, prediction, cost = found
         return self._decide(request, prediction, stacked, solution, status, count, Timing(*spent))
 
     def _search(
-        self, request: Request, prediction: Prediction, inputs: Array, proposed: Array, slope: Array, price: float
-    ) -> tuple[Array, Prediction] | None:
-        """The next plan between ``inputs`` and ``proposed``, with the stage models along it; None if none is better.
+        self,
+        request: Request,
+        prediction: Prediction,
+        inputs: Array,
+        cost: float,
+        proposed: Array,
+        slope: Array,
+        price: float,
+    ) -> tuple[Array, Prediction, float] | None:
+        """The next plan between ``inputs`` and ``proposed``, with the stage models along it and its cost; None if none
+        is better.
 
         The stage models are exact along the plan that they were made at: there their cost and violations are the true
         ones.
         """
         limits = self._chance.limits(prediction)  # tightening of zero_order stays during the search
         violated = self._violation_price(prediction, inputs, limits, price)
-        here = self._cost(request, prediction, inputs) + violated
+        here = cost + violated
         promised = float(slope @ (proposed - inputs).ravel())
         promised += self._violation_price(prediction, proposed, limits, price) - violated
         whole = not self._keeps_input_bounds(inputs, request.last)  # a first guess outside is left in one step
@@ -278,15 +288,37 @@ class ConvexMPC:
             trial = proposed if step == 1.0 else inputs + step * (proposed - inputs)
             try:
                 moved = self.predictor.along(request, trial)
-                merit = self._cost(request, moved, trial) + self._violation_price(moved, trial, limits, price)
+                cost = self._cost(request, moved, trial)
+                merit = cost + self._violation_price(moved, trial, limits, price)
             except DataError:  # the rollout left the finite numbers
                 if whole:
                     return None
                 merit = np.inf
             if whole or merit <= here + SUFFICIENT_DECREASE * step * promised + ROUND_OFF * abs(here):
-                return trial, moved
+                return trial, moved, cost
             step /= 2
         return None
+
+    @staticmethod
+    def _residual(
+        stacked: _Stacked, h: Array, slope: Array, solution: QPSolution, inputs: Array, cost: float
+    ) -> float:
+        """How far ``inputs`` are from a KKT point, with the rows' multipliers of the program made there.
+
+        The Lagrangian's gradient g, projected onto the box (the middle one of g, h (u - lower) and h (u - upper), h the
+        diagonal of the Gauss-Newton Hessian), as a share of the largest that a cost's gradient can be, sqrt(2 h cost);
+        and how far the rows are from where the program wants them.
+        """
+        plan, size = inputs.ravel(), inputs.size
+        gradient = slope + stacked.G.T @ solution.z
+        above, below = h * (plan - stacked.lower[:size]), h * (plan - stacked.upper[:size])
+        left = np.abs(np.maximum(below, np.minimum(gradient, above)))
+        share = float((left / np.sqrt(2 * h * cost + np.finfo(float).tiny)).max())
+        if not len(stacked.G):
+            return share
+        values = stacked.G @ plan
+        moved = np.abs(stacked.G @ solution.x - values).max() / max(1.0, np.abs(values).max())
+        return max(share, float(moved))
 
     def _cost(self, request: Request, prediction: Prediction, inputs: Array) -> float:
         states = prediction.states(inputs)
