@@ -6,11 +6,11 @@ unknowns, the states those of the GPs' mean rolled out by torch,
     f(U) = sum_i |x_i - r_i|^2_Q + sum_i |v_i|^2_R,   x_{i+1} = m(x_i, u_i),   lower <= U <= upper
     g = df/dU by the discrete adjoint (Bryson and Ho, 1975, section 2.2)
 
-A plan is a KKT point exactly where the middle one of g_j, h_j (u_j - lower_j) and h_j (u_j - upper_j) is zero for every
-j, whatever positive h_j: the multipliers of the box are those of the projection (Facchinei and Pang, 2003, section 1.5.1).
-With h the diagonal of the Gauss-Newton Hessian all three are gradients. f is a sum of squares, so |g_j| is at most
-sqrt(2 h_j f), and the share of it that is left is the cosine between the residuals and their change with u_j (More, 1978,
-eq. (8.2)): a number from 0 to 1 whatever the units of inputs and cost. The largest of them is the residual of a plan.
+A plan is a KKT point exactly where the middle one of g_j, h_j (u_j - lower_j) and h_j (u_j - upper_j) is zero for
+every j, whatever positive h_j: multipliers of the box are those of the projection (Facchinei and Pang, 2003, section
+1.5.1). With h the diagonal of the Gauss-Newton Hessian all three are gradients. f is a sum of squares, so |g_j| is at
+most sqrt(2 h_j f), and the share of it that is left is the cosine between the residuals and their change with u_j
+(More, 1978, eq. (8.2)), from 0 to 1 whatever the units of inputs and cost. The largest is the residual of a plan.
 """
 
 from dataclasses import dataclass

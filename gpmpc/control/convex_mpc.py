@@ -271,8 +271,7 @@ class ConvexMPC:
         slope: Array,
         price: float,
     ) -> tuple[Array, Prediction, float] | None:
-        """The next plan between ``inputs`` and ``proposed``, with the stage models along it and its cost; None if none
-        is better.
+        """The next plan between ``inputs`` and ``proposed``, its stage models and its cost; None if none is better.
 
         The stage models are exact along the plan that they were made at: there their cost and violations are the true
         ones.
@@ -300,9 +299,7 @@ class ConvexMPC:
         return None
 
     @staticmethod
-    def _residual(
-        stacked: _Stacked, h: Array, slope: Array, solution: QPSolution, inputs: Array, cost: float
-    ) -> float:
+    def _residual(stacked: _Stacked, h: Array, slope: Array, solution: QPSolution, inputs: Array, cost: float) -> float:
         """How far ``inputs`` are from a KKT point, with the rows' multipliers of the program made there.
 
         The Lagrangian's gradient g, projected onto the box (the middle one of g, h (u - lower) and h (u - upper), h the
