@@ -32,7 +32,7 @@ class MeanAlone:
         batch, (k, n), m = A.shape[:-2], A.shape[-2:], B.shape[-1]
 
         def zero(*shape: int) -> Tensor:
-            return torch.zeros(*batch, *shape, dtype=A.dtype, device=A.device)
+            return torch.zeros((*batch, *shape), dtype=A.dtype, device=A.device)
 
         sensitivity = Sensitivity(A, zero(k, n, n), B, zero(k, k, n), zero(k, k, n, n), zero(k, k, m))
         return Propagation(Gaussian(moved.mean, zero(k, k)), zero(n, k), zero()), sensitivity

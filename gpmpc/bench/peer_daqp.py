@@ -47,7 +47,8 @@ class Daqp:
             model = self._models[G.shape] = daqp.Model()
             model.setup(P, q, G, upper, lower, np.zeros(len(lower), dtype=np.int32))
         else:
-            model.update(H=P, f=q, A=G, bupper=upper, blower=lower)
+            rows = {"A": G} if len(G) else {}  # which it does not take empty here
+            model.update(H=P, f=q, bupper=upper, blower=lower, **rows)
         x, _, flag, found = model.solve()
         status = STATUSES.get(int(flag), Status.NUMERICAL_TROUBLE)
         if not status.solved:

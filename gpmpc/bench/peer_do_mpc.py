@@ -9,6 +9,7 @@ import importlib.util
 import warnings
 from typing import Any, NamedTuple
 
+import casadi
 import numpy as np
 
 from gpmpc.bench.optimality import Question
@@ -52,14 +53,21 @@ class DoMpc:
         if np.count_nonzero(problem.R - np.diag(problem.R.diagonal())):
             raise SettingError("R", "must be diagonal: do-mpc's penalty of the increments is")
         self._horizon = horizon
-        model = _model(gp)
-        self._mpc = mpc = _do_mpc().controller.MPC(model)
-        mpc.settings.n_horizon, mpc.settings.t_step, mpc.settings.store_full_solution = horizon, 1.0, False
+        with warnings.catch_warnings():  # about what else could be installed, and about CasADi's next version
+            warnings.simplefilter("ignore")
+            self._set_up(gp, problem, tolerance)
+
+    def _set_up(self, gp: GPPosterior, problem: TrackingProblem, tolerance: float) -> None:
+        toolbox = importlib.import_module("do_mpc")
+        model = _model(toolbox, gp)
+        self._mpc = mpc = toolbox.controller.MPC(model)
+        mpc.settings.n_horizon, mpc.settings.t_step, mpc.settings.store_full_solution = self._horizon, 1.0, False
         settings = {"tol": tolerance, "max_iter": 200} | WARM  # it hands on the last multipliers, but no such option
         mpc.settings.nlpsol_opts = {f"ipopt.{name}": value for name, value in settings.items()}
         mpc.settings.supress_ipopt_output()
         x, r = model.x["x"], model.tvp["r"]
-        mpc.set_objective(mterm=(x - r).T @ problem.terminal @ (x - r), lterm=(x - r).T @ problem.Q @ (x - r))
+        Q, terminal = casadi.DM(problem.Q), casadi.DM(problem.terminal)
+        mpc.set_objective(mterm=casadi.bilin(terminal, x - r, x - r), lterm=casadi.bilin(Q, x - r, x - r))
         mpc.set_rterm(u=problem.R.diagonal())
         mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = problem.input_lower, problem.input_upper
         self._references = mpc.get_tvp_template()
@@ -81,18 +89,11 @@ class DoMpc:
         return Planned(np.array(inputs))
 
 
-def _model(gp: GPPosterior) -> Any:
-    model = _do_mpc().model.Model("discrete", "SX")
+def _model(toolbox: Any, gp: GPPosterior) -> Any:
+    model = toolbox.model.Model("discrete", "SX")
     x = model.set_variable("_x", "x", shape=(gp.state_dim, 1))
     u = model.set_variable("_u", "u", shape=(gp.input_dim, 1))
     model.set_variable("_tvp", "r", shape=(gp.state_dim, 1))
     model.set_rhs("x", mean_function(gp)(x, u))
     model.setup()
     return model
-
-
-def _do_mpc() -> Any:
-    """The toolbox, without its warnings about what else could be installed."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return importlib.import_module("do_mpc")

@@ -65,7 +65,7 @@ class GPyTorchSlsqp:
             inputs = torch.tensor(plan.reshape(start.shape), requires_grad=True)
             total = self._cost(question.belief.mean, before, inputs, targets)
             total.backward()
-            return float(total), inputs.grad.numpy().ravel()
+            return float(total.detach()), inputs.grad.numpy().ravel()
 
         options = {"maxiter": 200, "ftol": self._tolerance}
         with exact_inference(), gpytorch.settings.skip_posterior_variances():

@@ -28,6 +28,7 @@ from gpmpc.control.condensing import Condenser
 from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.prediction import Covariance, Form, Prediction, Predictor
 from gpmpc.control.request import Request, check_controller, check_dynamics
+from gpmpc.control.sequential import MEMORY, corrected, kkt_share
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import DataError, ProblemError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
@@ -78,8 +79,7 @@ class ConvexMPC:
         covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see there.
         solver: Of the quadratic program; ``DualActiveSet()`` by default, which state bounds with a price need.
         iterations: Quadratic programs a step at most; more than one for ``"trajectory"`` only.
-        tolerance: Of more iterations: how far a plan may be from a KKT point, in cosines between the weighted residuals
-            and their change with an input (More, 1978, eq. (8.2)); what is decided is one program better than that.
+        tolerance: Of more iterations: how far the plan may be from a KKT point, as a cosine (``sequential.kkt_share``).
         feedback: Rolls plans out, and predicts the covariances of ``"zero_order"``, under an ancillary feedback,
             without which no long horizon with state bounds is feasible. ``"full"`` and ``"diagonal"`` predict their
             covariances without feedback.
@@ -221,8 +221,9 @@ class ConvexMPC:
 
     def _iterate(self, request: Request, previous: Decision | None, warm: QPSolution | None) -> Decision:
         """Sequential quadratic programming from the last plan."""
-        spent, price, status = np.zeros(3), 0.0, Status.ITERATION_LIMIT
-        clock, taken, corrections = _Clock(spent), None, []
+        spent, price, status, share = np.zeros(3), 0.0, Status.ITERATION_LIMIT, np.inf
+        clock, taken = _Clock(spent), None
+        pairs = np.empty((2, 0, request.shifted.size))
         prediction = self.predictor.predict(request, previous)
         inputs = prediction.inputs
         cost = self._cost(request, prediction, inputs)
@@ -233,10 +234,9 @@ class ConvexMPC:
             if taken is not None:  # how the Lagrangian's slope changed over the last step, at its multipliers
                 step, multipliers, before = taken
                 if step @ stacked.P @ step > ROUND_OFF * cost:
-                    corrections.append((step, slope + stacked.G.T @ multipliers - before))
-                P = stacked.P
-                for pair in corrections:
-                    P = _damped_update(P, *pair)
+                    pair = np.stack([step, slope + stacked.G.T @ multipliers - before])
+                    pairs = np.concatenate([pairs[:, -MEMORY + 1 :], pair[:, None]], axis=1)
+                P = corrected(stacked.P, *pairs)
                 stacked = stacked._replace(P=P, q=slope - P @ inputs.ravel(), prepared=None)
             clock.charge(1)
             solution = self._solve(stacked, warm)
@@ -245,7 +245,13 @@ class ConvexMPC:
                 status = solution.status
                 break
             warm, proposed = solution, solution.x.reshape(inputs.shape)
-            if self._residual(stacked, diagonal, slope, solution, inputs, cost) <= self.tolerance:
+            bounds, last_share = (stacked.lower, stacked.upper), share
+            share = kkt_share(
+                diagonal, slope, stacked.G, np.array(solution.z), inputs.ravel(), np.array(solution.x), *bounds, cost
+            )
+            # The program's plan is better by about the rate of the last one (Hairer and Wanner, 1996, eq. (IV.8.10)).
+            rate = share / last_share if taken is not None else 1.0
+            if share * min(1.0, rate / max(1.0 - rate, 1e-9)) <= self.tolerance:
                 status = Status.SOLVED
                 break
             if count == self.iterations:
@@ -281,7 +287,7 @@ class ConvexMPC:
         here = cost + violated
         promised = float(slope @ (proposed - inputs).ravel())
         promised += self._violation_price(prediction, proposed, limits, price) - violated
-        whole = not self._keeps_input_bounds(inputs, request.last)  # a first guess outside is left in one step
+        whole = not self._keeps_rates(inputs, request.last)  # a first guess outside is left in one step
         step = 1.0
         while step >= SHORTEST_STEP:
             trial = proposed if step == 1.0 else inputs + step * (proposed - inputs)
@@ -298,25 +304,6 @@ class ConvexMPC:
             step /= 2
         return None
 
-    @staticmethod
-    def _residual(stacked: _Stacked, h: Array, slope: Array, solution: QPSolution, inputs: Array, cost: float) -> float:
-        """How far ``inputs`` are from a KKT point, with the rows' multipliers of the program made there.
-
-        The Lagrangian's gradient g, projected onto the box (the middle one of g, h (u - lower) and h (u - upper), h the
-        diagonal of the Gauss-Newton Hessian), as a share of the largest that a cost's gradient can be, sqrt(2 h cost);
-        and how far the rows are from where the program wants them.
-        """
-        plan, size = inputs.ravel(), inputs.size
-        gradient = slope + stacked.G.T @ solution.z
-        above, below = h * (plan - stacked.lower[:size]), h * (plan - stacked.upper[:size])
-        left = np.abs(np.maximum(below, np.minimum(gradient, above)))
-        share = float((left / np.sqrt(2 * h * cost + np.finfo(float).tiny)).max())
-        if not len(stacked.G):
-            return share
-        values = stacked.G @ plan
-        moved = np.abs(stacked.G @ solution.x - values).max() / max(1.0, np.abs(values).max())
-        return max(share, float(moved))
-
     def _cost(self, request: Request, prediction: Prediction, inputs: Array) -> float:
         states = prediction.states(inputs)
         return self._condenser.cost(states, inputs, request.targets, request.wanted, request.last)
@@ -330,12 +317,11 @@ class ConvexMPC:
         lower, upper = limits
         return self._chance.price(np.maximum(0.0, np.maximum(values - upper, lower - values)), price)
 
-    def _keeps_input_bounds(self, inputs: Array, last: Array) -> bool:
+    def _keeps_rates(self, inputs: Array, last: Array) -> bool:
+        if not self._condenser.rate_rows:
+            return True
         problem, rates = self.problem, np.diff(inputs, axis=0, prepend=last[None])
-        return bool(
-            ((inputs >= problem.input_lower) & (inputs <= problem.input_upper)).all()
-            and ((rates >= problem.rate_lower - 1e-9) & (rates <= problem.rate_upper + 1e-9)).all()
-        )
+        return bool(((rates >= problem.rate_lower - 1e-9) & (rates <= problem.rate_upper + 1e-9)).all())
 
 
 def read_request(
@@ -352,16 +338,6 @@ def read_request(
         raise ShapeError(f"{what} needs reference inputs ({H}, {problem.input_dim}); got none")
     request = Request.read(problem, H, initial_input, belief, reference, previous)
     return replace(request, shifted=np.clip(request.shifted, problem.input_lower, problem.input_upper))
-
-
-def _damped_update(P: Array, step: Array, change: Array) -> Array:
-    """BFGS with Powell's damping, which keeps P positive definite (Nocedal and Wright, 2006, procedure 18.2)."""
-    moved = P @ step
-    curvature, found = step @ moved, step @ change
-    if found < 0.2 * curvature:
-        share = 0.8 * curvature / (curvature - found)
-        change, found = share * change + (1 - share) * moved, 0.2 * curvature
-    return P - np.outer(moved, moved) / curvature + np.outer(change, change) / found
 
 
 class _Clock:
