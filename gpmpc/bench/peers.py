@@ -28,13 +28,14 @@ from gpmpc.bench.peer_casadi import CasadiIpopt
 from gpmpc.bench.peer_gpytorch import GPyTorchSlsqp
 from gpmpc.bench.quadrotor import HOVER, problem, recorded, trained
 from gpmpc.bench.timing import WARM_UP, take_turns
-from gpmpc.control.controller import Controller, Decision
+from gpmpc.control.controller import Controller, Decision, Timing
 from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.propagation import Linearization
+from gpmpc.status import Status
 
 TRAJECTORY, STEPS = "lorenz", 150
 TOLERANCE = 1e-5  # of the common KKT residual
@@ -71,10 +72,17 @@ def by_controller(controller: Controller) -> Solve:
     """A controller of this package as a contender."""
 
     def solve(question: Question, last: Decision | None) -> Decision:
-        previous = None if last is None else replace(last, input=question.last)
+        previous = _begun(question) if last is None else replace(last, input=question.last)
         return controller.control(question.belief, question.reference, previous)
 
     return solve
+
+
+def _begun(question: Question) -> Decision:
+    """No plan yet, but an input before."""
+    H, n = question.targets.shape
+    inputs, nothing = np.tile(question.last, (H, 1)), np.full((H + 1, n, n), np.nan)
+    return Decision(inputs[0], inputs, nothing[:, 0], nothing, Status.ITERATION_LIMIT, 0, Timing(0.0, 0.0, 0.0))
 
 
 def peers_problem() -> TrackingProblem:
@@ -137,9 +145,9 @@ def one_program(gp: GPPosterior, problem: TrackingProblem, horizon: int) -> list
 def measure_peers(horizons: Sequence[int], seconds: float, tell: Tell = print) -> list[dict]:
     """Times of ours and theirs, as plain rows.
 
-    A row has ``part``, ``kind``, ``what``, ``horizon`` (None for ``linearisation``), the summary of its ``Times``
-    [ms], and ``ratio``, the median over that of ours in the same turns. Plans have the common residual, ``kkt`` (median)
-    and ``kkt_worst``; converged ones ``tolerance`` and ``within``, the share of them that is. What is not installed has
+    A row has ``part``, ``kind``, ``what``, ``horizon`` (None for ``linearisation``), the summary of its ``Times`` [ms],
+    and ``ratio``, the median over ours of the same turns. Plans have the common residual, ``kkt`` (median) and
+    ``kkt_worst``; converged ones ``tolerance``, and ``within``, the share of them that is. What is not installed has a
     ``note`` instead of all that.
 
     Args:

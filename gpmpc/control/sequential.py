@@ -15,7 +15,7 @@ MEMORY = 10  # pairs of a corrected Hessian
 def kkt_share(h, slope, G, z, plan, proposed, lower, upper, cost):
     """How far a plan is from a KKT point, with multipliers z of the rows: 0 there, a share of 1 elsewhere.
 
-    The Lagrangian's gradient g = slope + G'z, projected onto the box (the middle one of g, h (u - lower), h (u - upper))
+    The Lagrangian's gradient g = slope + G'z is projected onto the box (the middle of g, h (u - lower), h (u - upper))
     and divided by the largest that the gradient of such a cost can be, sqrt(2 h cost) (Cauchy and Schwarz): the cosine
     between the residuals and their change with an input (More, 1978, eq. (8.2)). Where there are rows, also how far
     they are from where the program wants them, relative to the largest of them or 1.
