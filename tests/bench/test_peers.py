@@ -123,7 +123,7 @@ def test_all_contenders_that_are_here_agree(gp, questions, optimum):
         solve = make()
         first = solve(questions[0], None)
         assert (np.abs(first.inputs - optimum) <= accuracy).all(), name
-        warm, cold = solve(questions[1], first), make()(questions[1], None)
+        warm, cold = solve(questions[1], first), solve(questions[1], None)
         for answer in (warm, cold):
             assert kkt_residual(gp, PROBLEM, questions[1], answer.inputs) < 1e-3, name
         assert (np.abs(warm.inputs - cold.inputs) <= accuracy).all(), name
