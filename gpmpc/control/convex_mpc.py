@@ -246,9 +246,7 @@ class ConvexMPC:
                 break
             warm, proposed = solution, solution.x.reshape(inputs.shape)
             bounds, last_share = (stacked.lower, stacked.upper), share
-            share = kkt_share(
-                diagonal, slope, stacked.G, np.array(solution.z), inputs.ravel(), np.array(solution.x), *bounds, cost
-            )
+            share = kkt_share(diagonal, slope, stacked.G, solution.z, inputs.ravel(), solution.x, *bounds, cost)
             # The program's plan is better by about the rate of the last one (Hairer and Wanner, 1996, eq. (IV.8.10)).
             rate = share / last_share if taken is not None else 1.0
             if share * min(1.0, rate / max(1.0 - rate, 1e-9)) <= self.tolerance:
