@@ -114,7 +114,7 @@ def test_the_residual_knows_no_units_of_the_cost(gp, questions):
 def test_all_contenders_that_are_here_agree(gp, questions, optimum):
     """Each stops by a measure of its own; what that leaves is less than a hundredth of the inputs' range."""
     makers = {name: make for group in converged(gp, PROBLEM, H) for name, make in group.items()}
-    assert len(makers) == 7
+    assert len(makers) == 8
     assert (makers["do-mpc + IPOPT"] is None) == (not peer_do_mpc.installed())
     accuracy = 1e-2 * (PROBLEM.input_upper - PROBLEM.input_lower)
     for name, make in makers.items():
