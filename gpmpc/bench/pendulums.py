@@ -1,6 +1,6 @@
 """Problem: speed over the size of the GPs, the horizon and the state's dimension needs one system of every size.
 
-A row of c pendulums, each with a torque of its own and a spring to its neighbours: n = 2 c states, m = c inputs, smooth,
+A row of c pendulums, each with a torque of its own and a spring to its neighbours: 2 c states, c inputs; smooth,
 nonlinear, coupled and stable to fly with any model of it. Its GPs are not trained, since hyperparameters do not change
 what a prediction costs: they come from the ranges of the data.
 """
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from casadi import sin as symbolic_sin
 
 from gpmpc.exceptions import check_number
 from gpmpc.gp import GPPosterior
@@ -52,8 +51,7 @@ class Pendulums:
         rates = []
         for i in range(self.count):
             angle, rate = x[2 * i], x[2 * i + 1]
-            swung = np.sin(angle) if isinstance(angle, float | np.ndarray) else symbolic_sin(angle)
-            pull = -STIFFNESS * swung - DAMPING * rate + u[i]
+            pull = -STIFFNESS * np.sin(angle) - DAMPING * rate + u[i]
             if i > 0:
                 pull = pull + SPRING * (x[2 * i - 2] - angle)
             if i + 1 < self.count:
@@ -75,9 +73,9 @@ def pendulum_gp(state_dim: int, size: int, seed: int = 0) -> GPPosterior:
     inputs = random.uniform(-6.0, 6.0, (size, m))  # [1/s^2]
     changes = np.array([step(plant, x, u) for x, u in zip(states, inputs, strict=True)]) - states
     features = np.concatenate([states, inputs], axis=1)
-    # As wide as a few ranges of the data: the system is smooth, and every feature counts in every output.
-    scales = np.tile(3.0 * (features.std(0) + 1e-3), (n, 1))
-    signal = 10.0 * (changes.var(0) + 1e-6)
+    # Wider than the data, as for a smooth system, and every feature counts in every output.
+    scales = np.tile(6.0 * (features.std(0) + 1e-3), (n, 1))
+    signal = 100.0 * (changes.var(0) + 1e-6)
     parts = (features, changes, scales, signal, NOISE_SHARE * signal)
     return GPPosterior.from_hyperparameters(*map(torch.from_numpy, parts), m, predicts="difference")
 
