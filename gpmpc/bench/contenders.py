@@ -43,13 +43,11 @@ class Family(NamedTuple):
     Attributes:
         name: Kind of controller, for the reader.
         words: What chooses it.
-        once: The horizon from which on it is so slow that one seed has to do.
         longest: The longest horizon that is worth the time.
     """
 
     name: str
     words: str
-    once: float = math.inf
     longest: float = math.inf
 
 
@@ -73,21 +71,21 @@ FAMILIES = (
     Family(MEAN, f"{CONVEX} {NONE}"),
     Family(ZERO_ORDER, CONVEX),
     Family(ZERO_ORDER, f"{CONVEX} propagation=mean_equivalence"),
-    Family(ZERO_ORDER, f"{CONVEX} {EXACT}", once=10),
-    Family(ZERO_ORDER, f"{CONVEX} {POINTS}", once=1, longest=5),
-    Family(SPREAD, f"{CONVEX} {DIAGONAL}", once=10),
-    Family(SPREAD, f"{CONVEX} {DIAGONAL} {EXACT}", once=10),
-    Family(SPREAD, f"{CONVEX} {FULL}", once=10),
-    Family(SPREAD, f"{CONVEX} {FULL} {EXACT}", once=5),
-    Family(SPREAD, f"{CONVEX} {FULL} {POINTS}", once=1, longest=5),
+    Family(ZERO_ORDER, f"{CONVEX} {EXACT}"),
+    Family(ZERO_ORDER, f"{CONVEX} {POINTS}", longest=5),
+    Family(SPREAD, f"{CONVEX} {DIAGONAL}"),
+    Family(SPREAD, f"{CONVEX} {DIAGONAL} {EXACT}"),
+    Family(SPREAD, f"{CONVEX} {FULL}"),
+    Family(SPREAD, f"{CONVEX} {FULL} {EXACT}"),
+    Family(SPREAD, f"{CONVEX} {FULL} {POINTS}", longest=1),
     Family(CONVERGED, f"{CONVEX} {NONE} {MORE}"),
     Family(CONVERGED, f"{CONVEX} {MORE}"),
-    Family(CONVERGED, f"{CONVEX} {FULL} {EXACT} {MORE}", once=1, longest=10),
+    Family(CONVERGED, f"{CONVEX} {FULL} {EXACT} {MORE}", longest=10),
     Family(STATES, "controller=state_form"),
-    Family(NONLINEAR, f"controller=nonlinear {FIRST_ORDER}", once=10),
-    Family(NONLINEAR, "controller=nonlinear", once=5),
-    Family(NONLINEAR, f"controller=nonlinear {FIRST_ORDER} {SLSQP}", once=10),
-    Family(NONLINEAR, f"controller=nonlinear {SLSQP}", once=5),
+    Family(NONLINEAR, f"controller=nonlinear {FIRST_ORDER}"),
+    Family(NONLINEAR, "controller=nonlinear"),
+    Family(NONLINEAR, f"controller=nonlinear {FIRST_ORDER} {SLSQP}", longest=10),
+    Family(NONLINEAR, f"controller=nonlinear {SLSQP}", longest=10),
 )
 
 
@@ -99,13 +97,11 @@ class Contender:
         family: Kind of controller, for the reader.
         words: What is typed after ``gpmpc run`` to choose it, the horizon apart.
         horizon: H.
-        once: Whether it flies with the first seed only.
     """
 
     family: str
     words: str
     horizon: int
-    once: bool = False
 
     def controller(self, model: GPPosterior) -> Controller:
         """The controller that the words mean, on a learned model, or for ``nmpc`` on the plant itself.
@@ -137,7 +133,7 @@ def contenders(horizons: Sequence[int] = HORIZONS) -> list[Contender]:
     for horizon in horizons:
         check_number("horizons", horizon, least=1, whole=True)
     return [
-        Contender(family.name, family.words, horizon, horizon >= family.once)
+        Contender(family.name, family.words, horizon)
         for family in FAMILIES
         for horizon in sorted(set(horizons))
         if horizon <= family.longest
