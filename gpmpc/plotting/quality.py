@@ -63,6 +63,7 @@ def _scales(axis: Axes, rows: Sequence[Mapping]) -> None:
     reach = [tick for tick in TICKS if low * 1.5 - 1 <= tick <= high * 1.5 + 1]
     axis.set_yticks(reach, [f"{tick:+d} %" if tick else "0" for tick in reach])
     axis.yaxis.set_minor_locator(NullLocator())
+    axis.set_ylim(min(1.5 * low, 0) - 0.4, 1.7 * max(high, LINEAR))
     times = [row["median"] for row in rows] or [1.0]
     axis.set_xlim(min(times) / 1.7, max(times) * 1.6)
     axis.grid(color="0.92")

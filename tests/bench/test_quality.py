@@ -49,6 +49,16 @@ def test_nobody_on_the_front_is_dominated_and_everybody_else_is(points):
     assert found == [not dominated(i) for i in range(len(points))]
 
 
+@given(few, st.integers(1, 3))
+def test_where_more_time_has_to_buy_something_every_member_does_and_nobody_else(points, least):
+    times, costs = [t for t, _ in points], [c for _, c in points]
+    found = pareto_front(times, costs, least)
+    front = sorted({point for point, member in zip(points, found, strict=True) if member})
+    assert all(after[1] < before[1] - least for before, after in zip(front, front[1:], strict=False))
+    for (time, cost), member in zip(points, found, strict=True):
+        assert member or any(t <= time and c <= cost + least for t, c in front)
+
+
 def test_the_cost_is_the_sum_of_what_every_step_pays(rng):
     roots = rng.normal(size=(6, 6)), rng.normal(size=(3, 3))
     weights = TrackingProblem(*(root @ root.T + np.eye(len(root)) for root in roots), penalized="increments")
