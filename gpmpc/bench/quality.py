@@ -94,7 +94,8 @@ def measure_quality(field: Field, models: Mapping[str, GPPosterior] | None = Non
         typed after ``gpmpc run``, with ``horizon=H``; ``median`` and ``p99`` of a decision [ms]; ``cost`` is the
         geometric mean over the trajectories of its ratio to NMPC's on the same flights, ``cost ...`` by trajectory;
         ``rmse ...`` [m]; ``failed`` counts solves; ``front`` says whether no other controller on a learned model is as
-        good, to 0.1 %, in less time or better in the same. Who lost a flight has none of these numbers, and ``lost`` says how.
+        good, to 0.1 %, in less time or better in the same. Who lost a flight has none of these numbers, and ``lost``
+        says how.
     """
     if models is None:
         models = {name: trained(name) for name in field.trajectories}

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +55,7 @@ def test_where_more_time_has_to_buy_something_every_member_does_and_nobody_else(
     times, costs = [t for t, _ in points], [c for _, c in points]
     found = pareto_front(times, costs, least)
     front = sorted({point for point, member in zip(points, found, strict=True) if member})
-    assert all(after[1] < before[1] - least for before, after in zip(front, front[1:], strict=False))
+    assert all(after[1] < before[1] - least for before, after in pairwise(front))
     for (time, cost), member in zip(points, found, strict=True):
         assert member or any(t <= time and c <= cost + least for t, c in front)
 
