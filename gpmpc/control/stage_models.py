@@ -2,9 +2,9 @@
 
     s+ = A s + B u + c
 
-near a belief and an input, for the s of each covariance mode of ``gpmpc.control.prediction``, and the next belief. All of
-it is torch on the model's device, batched over leading dimensions. Where a feedback can act on the covariance, V is what
-the stage adds to the spread of the state whatever passes through: Sigma+ less A Cov[x, x+] = A Sigma A' (mean
+near a belief and an input, for the s of each covariance mode of ``gpmpc.control.prediction``, and the next belief. All
+of it is torch on the model's device, batched over leading dimensions. Where a feedback can act on the covariance, V is
+what the stage adds to the spread of the state, whatever passes through: Sigma+ less A Cov[x, x+] = A Sigma A' (mean
 equivalence lets nothing pass), projected onto the positive semidefinite matrices.
 """
 
@@ -104,7 +104,7 @@ _MODES = {"full": _full, "diagonal": _diagonal, "zero_order": _zero_order, "none
 
 
 def _rest(after: Tensor, A: Tensor, s: Tensor, B: Tensor, input: Tensor) -> Tensor:
-    """c of s+ = A s + B u + c."""
+    """The constant c of s+ = A s + B u + c."""
     return after - (A @ s[..., None] + B @ input[..., None])[..., 0]
 
 

@@ -1,8 +1,8 @@
 """Problem: exact moments with all first derivatives, in torch: for many beliefs at once and on any device.
 
-``gpmpc.fused.moments`` states the derivatives (with the letters that stand here) and computes them in compiled loops for
-a belief in host memory. Reverse mode through ``moment_matching.moments`` would give the same, one pass an entry of the
-next belief, and keep every N x N product of all pairs of outputs meanwhile. Here one pair of outputs has its N x N
+``gpmpc.fused.moments`` states the derivatives (with the letters that stand here) and computes them in compiled loops
+for a belief in host memory. Reverse mode through ``moment_matching.moments`` would give the same, one pass an entry of
+the next belief, and keep every N x N product of all pairs of outputs meanwhile. Here one pair of outputs has its N x N
 matrix at a time:
 
     dV_ab = sum_ij P_ij dlog Q_ij + sum_ij U_ij d(log Q_ij - log q_ai - log q_bj),   P_ij = U_ij expm1(delta_ij)
@@ -140,7 +140,7 @@ def _slopes(weighted: Tensor, seen: Seen, c: Tensor, J: Tensor, A: Tensor) -> tu
 
 
 def _transposed(matrix: Tensor, vector: Tensor) -> Tensor:
-    """matrix' vector, batch by batch."""
+    """M' v, batch by batch."""
     return (vector[..., None, :] @ matrix)[..., 0, :]
 
 
