@@ -17,13 +17,17 @@ from gpmpc.control.prediction import Prediction, Predictor
 from gpmpc.control.request import Request
 from gpmpc.control.stage_models import StageModel, stage_model
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching
 from gpmpc.propagation.composition import Composition
-from gpmpc.propagation.moment_matching import MomentMatching
 
 Array = np.ndarray
 
-SQUARES = 9  # N x N matrices of one belief that exact moments hold at a time, at most
-ROWS = 6  # (outputs, N, n + m) arrays of one belief that a prediction holds at a time, at most
+BELIEF = ("means", "covariances")  # of a decision
+# What the torch expressions hold at a time for one belief, at most, counted at their peak and rounded up:
+SQUARES = 7  # N x N matrices, in exact moments
+PAIRED = 4  # arrays (pairs of outputs, N, n + 1), in exact moments
+ROWS = 3  # arrays (outputs, N, n + m + 1)
 
 
 def predict_many(
@@ -58,9 +62,6 @@ def predict_many(
             for t, s in zip(solved, before, strict=True):
                 held[t] = predictor.incremented(requests[t], held[t], s)
     return held
-
-
-BELIEF = ("means", "covariances")  # of a decision
 
 
 def _along(
@@ -110,27 +111,32 @@ def _gains(predictor: Predictor, stage: StageModel) -> Tensor:
 
 
 def bytes_per_request(predictor: Predictor) -> int | None:
-    """What ``predict_many`` takes for one of its requests at most [bytes]; None where the model's size is not known.
+    """What ``predict_many`` and a quadratic program take for one request at most [bytes]; None where it is not known.
 
-    Of exact moments it is ``SQUARES`` matrices over the training points, whatever the horizon: one pair of outputs at
-    one stage has its matrix at a time. A prediction at a point needs rows of them only.
+    It is known for GPs whose propagation has derivatives in closed form. Exact moments take ``SQUARES`` matrices over
+    the training points, whatever the horizon: one pair of outputs at one stage has its matrix at a time.
     """
-    p, H = len(predictor.extended(predictor.problem.Q)) * predictor.problem.state_dim, predictor.horizon
-    n, m = predictor.problem.state_dim, predictor.problem.input_dim
-    kept = 3 * H * (p * (p + m + 1) + n * n + m) + 4 * n * n * (n * n + n + m) * (predictor.covariance != "none")
-    program = (H * m) ** 2 * 3 + H * m * H * 4 * n
+    n, m, H, mode = predictor.problem.state_dim, predictor.problem.input_dim, predictor.horizon, predictor.covariance
+    p = len(predictor.extended(predictor.problem.Q)) * n
+    numbers = 3 * H * (p * (p + m + 1) + n * n + m)  # the stages: on the device, stacked, and in host memory
+    numbers += 3 * (H * m) ** 2 + 4 * n * H * m * H  # the program: P, its factor, the rows of states
+    if mode != "none":
+        numbers += 4 * n * n * (n * n + n + m)  # derivatives of the covariance
     if predictor.compiled:
-        return 8 * (kept + program)
-    composition = Composition.of(predictor.model)
-    if composition is None:
+        return 8 * numbers
+    composition, propagator = Composition.of(predictor.model), predictor.propagator
+    exact = mode != "none" and isinstance(propagator, MomentMatching)
+    at_points = isinstance(propagator, Linearization | MeanEquivalence) and not getattr(propagator, "hessian", False)
+    closed_form = mode == "none" or exact or (at_points and isinstance(predictor.model, GPPosterior))
+    if composition is None or not closed_form:
         return None
     f = composition.f
     N, k, d = len(f), f.output_dim, f.state_dim + f.input_dim
-    numbers = ROWS * k * N * (d + 1)
-    if isinstance(predictor.propagator, MomentMatching) and predictor.covariance != "none":
-        pairs = k if predictor.propagator.diagonal else k * (k + 1) // 2
-        numbers += SQUARES * N * N + ROWS * pairs * N * (f.state_dim + 1) + 4 * k * k * n * n
-    return 8 * (numbers + kept + program)
+    numbers += ROWS * k * N * (d + 1)
+    if exact:
+        pairs = k if propagator.diagonal else k * (k + 1) // 2
+        numbers += SQUARES * N * N + PAIRED * pairs * N * (f.state_dim + 1)
+    return 8 * numbers
 
 
 def _belief(predictor: Predictor, means: Array, covariances: Array) -> Gaussian:
