@@ -201,10 +201,8 @@ class ConvexMPC:
         except FAILED:  # one of them spoils the batch: which one, they say alone
             return [self.control(*question) for question in asked]
         spent, predictions = (perf_counter() - began) / max(1, len(known)), dict(zip(known, found, strict=True))
-        decisions = [request.unanswered(Status.INVALID_MEASUREMENT) for request in requests]
-        for t, prediction in predictions.items():
-            decisions[t] = self._answer(requests[t], prediction, previous[t], spent)
-        return decisions
+        answers = {t: self._answer(requests[t], made, previous[t], spent) for t, made in predictions.items()}
+        return [answers.get(t) or r.unanswered(Status.INVALID_MEASUREMENT) for t, r in enumerate(requests)]
 
     @property
     def bytes_per_question(self) -> int | None:
