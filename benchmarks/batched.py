@@ -47,6 +47,7 @@ def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--modes", choices=MODES, nargs="+", default=list(MODES))
     parser.add_argument("--sizes", type=int, nargs="+", default=[10, 50, 189])
     parser.add_argument("--trials", type=int, nargs="+", default=[1, 10, 50, 200])
     parser.add_argument("--steps", type=int, default=3)
@@ -57,11 +58,13 @@ def main() -> None:
     results = []
     print("trials a second (median); over alone: median of paired ratios, and its least")
     print(f"{'':16}{'N':>5}{'T':>5}{'alone':>10}{'together':>10}{'torch':>10}{'over alone: together':>24}{'torch':>16}")
-    for name, mode in MODES.items():
+    for name in arguments.modes:
         for size in arguments.sizes:
             gp = trained("elliptical", size=size)
             for trials in arguments.trials:
-                results.append({"mode": name, "size": size, "trials": trials} | measured(gp, mode, trials, arguments))
+                results.append(
+                    {"mode": name, "size": size, "trials": trials} | measured(gp, MODES[name], trials, arguments)
+                )
                 show(results[-1])
     path = Path(f"outputs/benchmarks/batched-{arguments.device.replace(':', '')}.json")
     path.parent.mkdir(parents=True, exist_ok=True)
