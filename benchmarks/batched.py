@@ -36,6 +36,7 @@ from gpmpc.simulation import closed_loop, closed_loops
 from gpmpc.trajectories import states_along
 
 HORIZON = 10
+TORCH_LIMIT = 2_000_000  # T N^2 of exact moments above which torch on the CPU is left out: minutes a flight
 MODES = {
     "mean": {"propagator": Linearization(), "covariance": "none"},
     "linearised": {"propagator": Linearization(), "covariance": "zero_order"},
@@ -100,7 +101,8 @@ def measured(gp: GPPosterior, mode: dict, trials: int, arguments: argparse.Names
         return 1.0
 
     ways = {"alone": alone, "together": together}
-    if arguments.device == "cpu":
+    exact = isinstance(mode["propagator"], MomentMatching)
+    if arguments.device == "cpu" and not (exact and trials * len(gp) ** 2 > TORCH_LIMIT):
         ways["torch"] = lambda: together("torch")
     clock = time.process_time if arguments.device == "cpu" else time.perf_counter
     seconds = {name: [] for name in ways}
