@@ -60,19 +60,29 @@ def _steps(settings: dict) -> tuple[int, Iterable[Sequence[dict]]]:
     return len(grid), measure_steps(grid)
 
 
-PARTS: dict[str, Callable[[dict], tuple[int, Iterable[Sequence[dict]]]]] = {"steps": _steps}
+def _quality(settings: dict) -> tuple[int, Iterable[Sequence[dict]]]:
+    from gpmpc.bench.contenders import contenders
+    from gpmpc.bench.quality import Field, measure_quality
+
+    field = Field(contenders(), **settings["quality"])
+    return len(field), measure_quality(field)
+
+
+PARTS: dict[str, Callable[[dict], tuple[int, Iterable[Sequence[dict]]]]] = {"steps": _steps, "quality": _quality}
 
 
 def _figures(rows: Sequence[dict]) -> dict[str, bytes]:
-    from gpmpc.plotting import png, speed
+    from gpmpc.plotting import png, quality, speed
 
-    steps = [row for row in rows if row["part"] == "step"]
-    if not steps:
-        return {}
-    sizes, horizons = ({row[key] for row in steps} for key in ("N", "H"))
-    size = min(sizes, key=lambda N: abs(N - FIGURE_SIZE))
-    horizon = min(horizons, key=lambda H: abs(H - FIGURE_HORIZON))
-    return {"bench.png": png(speed(steps, size, horizon))}
+    found = {}
+    if steps := [row for row in rows if row["part"] == "step"]:
+        sizes, horizons = ({row[key] for row in steps} for key in ("N", "H"))
+        size = min(sizes, key=lambda N: abs(N - FIGURE_SIZE))
+        horizon = min(horizons, key=lambda H: abs(H - FIGURE_HORIZON))
+        found["steps.png"] = png(speed(steps, size, horizon))
+    if flown := [row for row in rows if row["part"] == "quality"]:
+        found["quality.png"] = png(quality(flown), dpi=130)
+    return found
 
 
 def _compare(paths: object) -> None:

@@ -22,7 +22,9 @@ from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
+from gpmpc.control.batched_prediction import bytes_per_request, predict_many
 from gpmpc.control.chance_constraints import ChanceConstraints
 from gpmpc.control.condensing import Condenser
 from gpmpc.control.controller import Decision, Reference, Timing
@@ -42,6 +44,10 @@ Array = np.ndarray
 SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 SHORTEST_STEP = 2.0**-12
 ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
+
+
+# A rollout or a program without finite numbers.
+FAILED = (DataError, ProblemError, np.linalg.LinAlgError, torch.linalg.LinAlgError)
 
 
 class _Stacked(NamedTuple):
@@ -161,19 +167,60 @@ class ConvexMPC:
         if not request.finite:
             return request.unanswered(Status.INVALID_MEASUREMENT)
         began = perf_counter()
-        solved = previous is not None and previous.status.solved
-        warm = previous.solution if solved else None
         try:
             if self.iterations > 1:
-                return self._iterate(request, previous, warm)
+                return self._iterate(request, previous, _warm(previous))
             prediction = self.predictor.predict(request, previous)
-            modelled = perf_counter()
+        except FAILED:
+            return request.unanswered(Status.NUMERICAL_TROUBLE, timing=Timing(perf_counter() - began, 0.0, 0.0))
+        return self._answer(request, prediction, previous, perf_counter() - began)
+
+    def control_many(
+        self, beliefs: Sequence[Gaussian], references: Sequence[Reference], previous: Sequence[Decision | None]
+    ) -> list[Decision]:
+        """What ``control`` answers to each of T questions, its model asked for all of them at once.
+
+        The model answers a stage of all T at a time; the quadratic programs are solved one by one. The model's time is
+        shared out equally.
+
+        Args:
+            beliefs: T, one a question.
+            references: T.
+            previous: T decisions, None where there is none.
+
+        Raises:
+            ShapeError: As for ``control``.
+            SettingError: More than one quadratic program a step: each question would need its own line search.
+        """
+        if self.iterations > 1:
+            raise SettingError("iterations", f"many questions at once take 1 quadratic program; got {self.iterations}")
+        asked = list(zip(beliefs, references, previous, strict=True))
+        requests = [read_request(self.predictor, self.initial_input, *question) for question in asked]
+        known, began = [t for t, request in enumerate(requests) if request.finite], perf_counter()
+        try:
+            found = predict_many(self.predictor, [requests[t] for t in known], [previous[t] for t in known])
+        except FAILED:  # one of them spoils the batch: which one, they say alone
+            return [self.control(*question) for question in asked]
+        spent, predictions = (perf_counter() - began) / max(1, len(known)), dict(zip(known, found, strict=True))
+        answers = {t: self._answer(requests[t], made, previous[t], spent) for t, made in predictions.items()}
+        return [answers.get(t) or r.unanswered(Status.INVALID_MEASUREMENT) for t, r in enumerate(requests)]
+
+    @property
+    def bytes_per_question(self) -> int | None:
+        """Memory that ``control_many`` takes for each question at most [bytes]; None where it cannot be known."""
+        return bytes_per_request(self.predictor)
+
+    def _answer(self, request: Request, prediction: Prediction, previous: Decision | None, modelled: float) -> Decision:
+        """The decision of one quadratic program; ``modelled`` is the time that the prediction took [s]."""
+        began = perf_counter()
+        try:
             stacked = self._stack(prediction, request)
             built = perf_counter()
-            solution = self._solve(stacked, warm)
-        except (DataError, ProblemError, np.linalg.LinAlgError):  # a rollout or a program without finite numbers
-            return request.unanswered(Status.NUMERICAL_TROUBLE, timing=Timing(perf_counter() - began, 0.0, 0.0))
-        timing = Timing(modelled - began, built - modelled, perf_counter() - built)
+            solution = self._solve(stacked, _warm(previous))
+        except FAILED:
+            timing = Timing(modelled + perf_counter() - began, 0.0, 0.0)
+            return request.unanswered(Status.NUMERICAL_TROUBLE, timing=timing)
+        timing = Timing(modelled, built - began, perf_counter() - built)
         return self._decide(request, prediction, stacked, solution, solution.status, 1, timing)
 
     def _stack(self, prediction: Prediction, request: Request) -> _Stacked:
@@ -336,6 +383,10 @@ def read_request(
         raise ShapeError(f"{what} needs reference inputs ({H}, {problem.input_dim}); got none")
     request = Request.read(problem, H, initial_input, belief, reference, previous)
     return replace(request, shifted=np.clip(request.shifted, problem.input_lower, problem.input_upper))
+
+
+def _warm(previous: Decision | None) -> QPSolution | None:
+    return previous.solution if previous is not None and previous.status.solved else None
 
 
 class _Clock:

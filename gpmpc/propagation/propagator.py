@@ -74,7 +74,7 @@ def checked_input(model: DynamicsModel, belief: Gaussian, input: Tensor | None) 
 def _check_semidefinite(covariance: Tensor) -> None:
     if not covariance.numel() or not (largest := covariance.abs().amax()):
         return
-    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype)
+    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
     round_off = torch.finfo(covariance.dtype).eps ** 0.5 * largest
     if bool((gap := (covariance - covariance.mT).abs().amax()) > round_off):
         raise DataError(f"the belief's covariance must be symmetric; got entries that differ by {float(gap):.3g}")

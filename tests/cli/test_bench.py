@@ -11,7 +11,7 @@ def test_a_measurement_is_written_and_two_of_them_become_ratios(tmp_path):
     done = gpmpc("bench", *SMALL, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     folder = tmp_path / "outputs/bench"
-    assert {path.name for path in folder.iterdir()} == {"bench.json", "bench.md", "bench.png"}
+    assert {path.name for path in folder.iterdir()} == {"bench.json", "bench.md", "steps.png"}
     assert len(json.loads((folder / "bench.json").read_text())["rows"]) == 7
     assert "paper's form, H = 1" in done.stdout
     path = folder / "bench.json"
