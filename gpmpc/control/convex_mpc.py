@@ -44,10 +44,7 @@ Array = np.ndarray
 SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 SHORTEST_STEP = 2.0**-12
 ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
-
-
-# A rollout or a program without finite numbers.
-FAILED = (DataError, ProblemError, np.linalg.LinAlgError, torch.linalg.LinAlgError)
+FAILED = (DataError, ProblemError, np.linalg.LinAlgError, torch.linalg.LinAlgError)  # no finite numbers
 
 
 class _Stacked(NamedTuple):
