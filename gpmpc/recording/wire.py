@@ -1,8 +1,8 @@
 """Problem: a step has to leave the control loop in a few microseconds, however long it takes to write it to a file.
 
 The loop and the writer are two processes with shared memory between them (``ring``). What crosses it is frames: a kind
-and a length, then, for a step, one packed head and the step's arrays as they lie in memory (float64). Packing costs the
-loop one copy and no serialisation; the writer finds every array by the sizes in the head.
+and a length, then, for a step, one packed head and the step's arrays as they lie in memory (float64). The arrays
+are copied once, from where they are to the shared memory; the writer finds each by the sizes in the head.
 """
 
 import struct
@@ -24,7 +24,6 @@ STATUSES = tuple(Status)
 _HEAD = struct.Struct("<dqqqqqqqqqqddd")
 RECORD_HEADER = 7  # gpmpc.qp.record.HEADER, whose import would cost the writer's start a quarter of a second
 _NUMBERS = {status: number for number, status in enumerate(STATUSES)}
-_float64 = np.dtype(np.float64)
 
 
 def frame(kind: int, content: bytes) -> bytes:
@@ -32,8 +31,8 @@ def frame(kind: int, content: bytes) -> bytes:
     return FRAME.pack(kind, len(content)) + content
 
 
-def pack(step: Step, states: int, inputs: int) -> bytes:
-    """The frame of a step.
+def pack(step: Step, states: int, inputs: int) -> tuple[bytes, list[Array], int]:
+    """The frame of a step: its head, the arrays that follow, and their length [bytes].
 
     Args:
         step: What to pack.
@@ -71,13 +70,14 @@ def pack(step: Step, states: int, inputs: int) -> bytes:
         hard[1] = np.inf
         arrays += [problem.P, problem.q, problem.G, problem.lower, problem.upper, hard]
         expected += _qp_size(variables, rows, 0)
-    length = 0
+    count = 0
     for i, array in enumerate(arrays):
-        if array.__class__ is not np.ndarray or array.dtype is not _float64 or not array.flags.c_contiguous:
-            array = arrays[i] = np.ascontiguousarray(array, dtype=np.float64)
-        length += array.nbytes
-    if length != 8 * expected:
+        if array.__class__ is not np.ndarray:
+            array = arrays[i] = np.asarray(array, dtype=np.float64)
+        count += array.size
+    if count != expected:
         _explain(step, states, inputs)
+    length = 8 * count
     timing = decision.timing
     head = _HEAD.pack(
         step.time,
@@ -95,7 +95,7 @@ def pack(step: Step, states: int, inputs: int) -> bytes:
         timing.build,
         timing.solve,
     )
-    return b"".join([FRAME.pack(STEP, _HEAD.size + length), head, *arrays])
+    return FRAME.pack(STEP, _HEAD.size + length) + head, arrays, length
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import time
 
@@ -179,6 +180,29 @@ def test_a_killed_sweep_goes_on_and_ends_as_if_nothing_had_happened(sweep, tmp_p
     done = gpmpc(*SWEPT, "folder=tree", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert results(tree) == sweep[1]
+
+
+def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(sweep, tmp_path):
+    tree = tmp_path / "tree"
+    shutil.copytree(sweep[0], tree)
+    again = gpmpc(*SWEPT, "folder=tree", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert "4 runs: 0 flown, 4 finished before, 0 failed" in again.stdout
+    path = sorted(tree.glob("*/metrics.json"))[2]
+    found = json.loads(path.read_text())
+    found["settings"]["controller"]["problem"]["Q"][0] = 7.0
+    found["settings"]["gone"] = 1
+    path.write_text(json.dumps(found))
+    (tree / path.parent.name.replace("seed=0", "seed=1") / "metrics.json").unlink()
+    refused = gpmpc(*SWEPT, "folder=tree", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert refused.stderr.count("\n") == 1
+    assert f"folder: tree/{path.parent.name} holds a finished run of other settings" in refused.stderr
+    assert "controller.problem.Q: [7.0, 1.0, 10.0, 1.0, 10.0, 1.0] then, [10.0, 1.0" in refused.stderr
+    assert "gone: 1 then, None now" in refused.stderr
+    assert "choose another folder, or remove that one to fly it again" in refused.stderr
+    assert json.loads(path.read_text()) == found  # nothing was overwritten, nothing else flown
+    assert len(list(tree.glob("*/metrics.json"))) == 3
 
 
 def test_two_sweeps_share_a_tree(sweep, tmp_path):

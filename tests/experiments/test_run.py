@@ -99,9 +99,9 @@ def test_a_folder_is_finished_when_its_metrics_are_there_and_one_process_works_o
         assert folder.failed_at
         folder.begin("steps: 1")
         assert folder.failed_at is None
-        folder.finish({"rmse": 1})
+        folder.finish({"rmse": 1, "settings": {}})
     assert folder.finished
-    assert folder.result() == {"rmse": 1}
+    assert folder.result() == {"rmse": 1, "settings": {}}
     with folder.claimed(wait=False):
         pass
     assert sorted(path.name for path in folder.path.iterdir()) == ["config.yaml", "metrics.json"]
