@@ -21,8 +21,10 @@ if TYPE_CHECKING:
     from gpmpc.experiments.run_folder import RunFolder
 
 ASIDE = ("launcher", "folder")  # settings that a result does not depend on
-GROUPS = ("data", "trajectory", "plant", "model", "controller", "propagation", "solver")
-UNITS = dict.fromkeys("xyz", "m") | {"vx": "m/s", "vy": "m/s", "vz": "m/s", "U1": "N", "ux": "1", "uy": "1"}
+GROUPS = ("data", "trajectory", "subsystem", "plant", "model", "controller", "propagation", "solver")
+UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s") | {"ux": "1", "uy": "1"}
+UNITS |= dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys("pqr", "rad/s")
+UNITS |= dict.fromkeys(("U1", "U2", "U3", "U4"), "N")
 MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
 PATIENCE = 10.0  # with the writer of a recording whose run was killed a moment ago [s]
 
@@ -142,11 +144,12 @@ def experiment_of(config: DictConfig) -> "Experiment":
     checked_folder(config)
     if config.recorder not in ("mcap", "none", None):
         raise SettingError("recorder", f"must be 'mcap' or 'none'; got {config.recorder!r}")
-    for group in ("data", "trajectory", "plant", "model", "controller"):
+    for group in ("data", "trajectory", "subsystem", "plant", "model", "controller"):
         if not config.get(group):
             raise SettingError(group, "choose one")
-    if len(config.trajectory) != 1:
-        raise SettingError("trajectory", f"choose one; got {', '.join(config.trajectory)}")
+    for group in ("trajectory", "subsystem"):
+        if len(config[group]) != 1:
+            raise SettingError(group, f"choose one; got {', '.join(config[group])}")
     for group, part in (("propagation", "propagator"), ("solver", "solver")):
         if config.get(group):
             if part not in config.controller:
@@ -162,6 +165,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
         plant=instantiate(config.plant, _convert_="all"),
         train=instantiate(config.model, _convert_="all"),
         controller=controller,
+        subsystem=next(iter(config.subsystem)),
         name=name,
         size=size,
         propagator=getattr(controller, "keywords", {}).get("propagator"),

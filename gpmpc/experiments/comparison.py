@@ -13,7 +13,7 @@ import numpy as np
 from scipy import stats
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.experiments.report import MEASURES, SEED, Report
+from gpmpc.experiments.report import MEASURES, SEED, Cell, Report
 
 LEVEL = 0.05
 FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
@@ -65,10 +65,13 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         b: The same of group B.
 
     Raises:
-        SettingError: A choice that was not varied, or a value that does not occur.
+        SettingError: A choice that was not varied, a value that does not occur, or runs of both subsystems.
         DataError: The groups have no two seeds in common.
     """
     groups = [_group(report, key, text) for key, text in (("A", a), ("B", b))]
+    units = {run.result["unit"] for group in groups for cell in _cells(report, group) for run in cell.runs.values()}
+    if len(units) > 1:
+        raise SettingError("compare", "errors in m and in rad have no common mean; add subsystem=... to both groups")
     comparisons = []
     for measure in report.measures():
         first, second = (_by_pair(report, group, measure) for group in groups)
@@ -101,15 +104,19 @@ def _group(report: Report, key: str, text: str) -> dict[str, str]:
 def _by_pair(report: Report, group: Mapping[str, str], measure: str) -> dict[tuple[tuple, str], float]:
     """Values by what a partner has to share: the other settings and the seed."""
     found = {}
-    for cell in report.cells:
-        values = dict(zip(report.variables, cell.values, strict=True))
-        if all(values[name] == value for name, value in group.items()):
-            rest = tuple(values[name] for name in report.variables if name not in group)
-            for seed, run in cell.runs.items():
-                value = MEASURES[measure].of(run.result)
-                if value is not None:
-                    found[rest, seed] = float(value)
+    for cell in _cells(report, group):
+        rest = tuple(v for name, v in zip(report.variables, cell.values, strict=True) if name not in group)
+        for seed, run in cell.runs.items():
+            value = MEASURES[measure].of(run.result)
+            if value is not None:
+                found[rest, seed] = float(value)
     return found
+
+
+def _cells(report: Report, group: Mapping[str, str]) -> list[Cell]:
+    """Those of a group."""
+    places = [(report.variables.index(name), value) for name, value in group.items()]
+    return [cell for cell in report.cells if all(cell.values[i] == value for i, value in places)]
 
 
 def _tested(measure: str, pairs: np.ndarray) -> Comparison:
@@ -133,13 +140,13 @@ def _tested(measure: str, pairs: np.ndarray) -> Comparison:
     )
 
 
-def sentences(comparisons: Sequence[Comparison], a: str, b: str) -> list[str]:
+def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str) -> list[str]:
     """A line a measure, with everything that a reader needs to doubt it."""
     lines = [f"A: {a}; B: {b}; pairs are seeds ({SEED}), what else was varied is averaged within a seed."]
     for c in comparisons:
         low, high = c.interval
         lines.append(
-            f"{MEASURES[c.measure].label}: {c.verdict}. Mean {c.means[0]:.4g} against {c.means[1]:.4g}, difference "
+            f"{report.label(c.measure)}: {c.verdict}. Mean {c.means[0]:.4g} against {c.means[1]:.4g}, difference "
             f"{c.difference:.3g} (95 %: {low:.3g} to {high:.3g}); Wilcoxon signed-rank p = {c.wilcoxon:.3g}, paired "
             f"t-test p = {c.t_test:.3g}; rank-biserial {c.rank_biserial:.2f}, d_z {c.standardised:.2f}; n = {c.pairs}"
         )

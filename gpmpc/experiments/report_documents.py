@@ -73,7 +73,7 @@ def render(report: Report) -> Table:
     for name in (*(report.variables or ("runs",)), "seeds"):
         table.add_column(name.replace(".", ".\n"), justify="right", no_wrap=True)
     for name in shown:
-        unit = MEASURES[name].label.rpartition(" [")[2]
+        unit = report.label(name).rpartition(" [")[2]
         table.add_column(f"{SHOWN[name]}\n\\[{unit}", justify="right", no_wrap=True)
     for cell in report.cells:
         texts = [_text(cell, name, "\n").replace("[", "\\[") for name in shown]
@@ -136,7 +136,7 @@ def figures(report: Report) -> dict[str, bytes]:
                 for cell in cells:
                     values[cell.values[index]] += cell.numbers(name)
                 series.append(Series(label, list(values.values())))
-            panels.append((MEASURES[name].label, MEASURES[name].logarithmic, series))
+            panels.append((report.label(name), MEASURES[name].logarithmic, series))
         drawn[f"over-{variable.replace('/', '-')}.png"] = png(over_variable(variable, positions, panels), dpi=130)
     return drawn
 
@@ -181,7 +181,7 @@ def _lines(report: Report, index: int) -> dict[str, list[Cell]]:
 
 
 def _header(report: Report) -> list[str]:
-    return [*(report.variables or ("runs",)), "seeds", *(MEASURES[name].label for name in report.measures())]
+    return [*(report.variables or ("runs",)), "seeds", *(report.label(name) for name in report.measures())]
 
 
 def _rows(report: Report) -> list[list[str]]:
