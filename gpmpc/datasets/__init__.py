@@ -4,4 +4,13 @@ from gpmpc.datasets.attitudes import rotational_states_along
 from gpmpc.datasets.excitation import Excitation, ExcitedData
 from gpmpc.datasets.flights import SUBSYSTEMS, DataSource, NMPCData, PaperData, Tracking
 
-__all__ = ["SUBSYSTEMS", "DataSource", "Excitation", "ExcitedData", "NMPCData", "PaperData", "Tracking", "rotational_states_along"]
+__all__ = [
+    "SUBSYSTEMS",
+    "DataSource",
+    "Excitation",
+    "ExcitedData",
+    "NMPCData",
+    "PaperData",
+    "Tracking",
+    "rotational_states_along",
+]

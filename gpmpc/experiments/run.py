@@ -87,7 +87,9 @@ class Experiment:
         if names != expected:
             what = f"must have the states of the {self.subsystem} subsystem, {', '.join(expected)}"
             whole = "; the whole quadrotor is flown by gpmpc.simulation.cascade_loop"
-            raise SettingError("plant", f"{what}; got {', '.join(names)}{whole if names == Coupled.state_names else ''}")
+            raise SettingError(
+                "plant", f"{what}; got {', '.join(names)}{whole if names == Coupled.state_names else ''}"
+            )
         if self.subsystem == "rotational" and isinstance(self.plant, Map):
             raise SettingError("plant", "the rotational subsystem is flown at its own rate; a Map has none")
         if self.loop == "model" and not self.learns:
