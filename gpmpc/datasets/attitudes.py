@@ -1,12 +1,12 @@
 """Problem: the rotational subsystem is to follow the attitudes that a flight along a trajectory asks for.
 
-The trajectory alone says which: between two outer steps the velocity has to change by v[k+1] - v[k], so the thrust has to
-give the mean acceleration a = (v[k+1] - v[k]) / T beside the weight. With z downwards
+The trajectory alone says which: between two outer steps the velocity has to change by v[k+1] - v[k], so the thrust has
+to give the mean acceleration a = (v[k+1] - v[k]) / T beside the weight. With z downwards
 
     U1 / m = |a - g e_z|,   ux = a_x / (U1 / m),   uy = a_y / (U1 / m),
 
-and eq. (2) of Cao, Lai and Alam (2017), inverted, makes roll and pitch of that direction, at a yaw of zero. The inner loop
-approaches each at first order, (angle_d - angle) / response time, as a ``gpmpc.control.cascade.Cascade`` asks it to.
+and eq. (2) of Cao, Lai and Alam (2017), inverted, makes roll and pitch of that direction, at a yaw of zero. The inner
+loop approaches each at first order, (angle_d - angle) / response time, as ``gpmpc.control.cascade.Cascade`` asks it to.
 """
 
 import numpy as np

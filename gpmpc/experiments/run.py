@@ -3,9 +3,10 @@
     data -> a random subset -> training -> controller -> closed loop -> metrics
 
 ``Experiment`` holds the ingredients as objects, ``fly`` does the work, ``metrics`` says in plain data what came of it.
-Neither knows files or settings. Flown is the translational subsystem along a trajectory, or the rotational one on its own,
-at its own rate, along the attitudes that the trajectory asks for (``gpmpc.datasets.attitudes``). The seed is that of the subset, of the training's random starts and of the noise: the
-same seed gives the same numbers, and the subsets of one seed are nested, so that sizes can be compared in pairs.
+Neither knows files or settings. Flown is the translational subsystem along a trajectory, or the rotational one on its
+own, at its own rate, along the attitudes that the trajectory asks for (``gpmpc.datasets.attitudes``). The seed is that
+of the subset, of the training's random starts and of the noise: the same seed gives the same numbers, and the subsets
+of one seed are nested, so that sizes can be compared in pairs.
 """
 
 import inspect
