@@ -3,7 +3,8 @@
 Runs of one seed share their training rows and their noise, so they are compared in pairs: what else was varied is
 averaged within a seed first, and a seed counts once. Two paired tests are stated. The signed-rank test (Wilcoxon, 1945)
 decides: it asks only that the differences are spread symmetrically. Student's t-test beside it asks for normal ones.
-With fewer than six pairs nothing can make the first one significant at 5 %.
+With fewer than six pairs nothing can make the first one significant at 5 %. Where the seed decides nothing (all rows,
+one start, no noise) its runs are copies of one, and no test may count them: a difference that never varies is undecided.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,10 +48,17 @@ class Comparison:
     pairs: int
 
     @property
+    def copies(self) -> bool:
+        """Whether every pair differs by exactly the same."""
+        return self.difference != 0 and self.interval[0] == self.interval[1]
+
+    @property
     def verdict(self) -> str:
         """In words."""
         if self.pairs < FEWEST:
             return f"undecided: {self.pairs} pairs cannot show anything at 5 %; fly {FEWEST} seeds or more"
+        if self.copies:
+            return "undecided: every seed gave the same, so all are one; vary what the seed draws (data.size, noise)"
         if self.wilcoxon < LEVEL:
             return f"A is {'larger' if self.rank_biserial > 0 else 'smaller'} than B"
         return "no difference shown"
@@ -123,6 +131,8 @@ def _tested(measure: str, pairs: np.ndarray) -> Comparison:
     """Of pairs (n, 2)."""
     differences = pairs[:, 0] - pairs[:, 1]
     n, mean, spread = len(differences), float(differences.mean()), float(differences.std(ddof=1))
+    if not np.ptp(differences):  # not even by rounding
+        mean, spread = float(differences[0]), 0.0
     nothing = not differences.any()
     half = float(stats.t.ppf(0.975, n - 1)) * spread / np.sqrt(n)
     ranks = stats.rankdata(np.abs(differences[differences != 0]))
@@ -145,9 +155,16 @@ def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str)
     lines = [f"A: {a}; B: {b}; pairs are seeds ({SEED}), what else was varied is averaged within a seed."]
     for c in comparisons:
         low, high = c.interval
+        tests = (
+            ""
+            if c.copies
+            else (
+                f" (95 %: {low:.3g} to {high:.3g}); Wilcoxon signed-rank p = {c.wilcoxon:.3g}, paired t-test p = "
+                f"{c.t_test:.3g}; rank-biserial {c.rank_biserial:.2f}, d_z {c.standardised:.2f}"
+            )
+        )
         lines.append(
             f"{report.label(c.measure)}: {c.verdict}. Mean {c.means[0]:.4g} against {c.means[1]:.4g}, difference "
-            f"{c.difference:.3g} (95 %: {low:.3g} to {high:.3g}); Wilcoxon signed-rank p = {c.wilcoxon:.3g}, paired "
-            f"t-test p = {c.t_test:.3g}; rank-biserial {c.rank_biserial:.2f}, d_z {c.standardised:.2f}; n = {c.pairs}"
+            f"{c.difference:.3g}{tests}; n = {c.pairs}"
         )
     return lines

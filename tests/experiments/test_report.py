@@ -133,6 +133,13 @@ def test_equal_groups_and_few_pairs_show_nothing(tmp_path):
         for controller in ("lqr", "convex"):
             add(tmp_path, controller, seed, 0.1 + 0.01 * seed)
     assert compare(report(tmp_path), "controller=lqr", "controller=convex")[0].verdict == "no difference shown"
+    copies = tmp_path / "copies"
+    for seed in range(7):
+        add(copies, "lqr", seed, 0.2)
+        add(copies, "convex", seed, 0.1)
+    found = compare(report(copies), "controller=lqr", "controller=convex")
+    assert found[0].verdict.startswith("undecided: every seed gave the same")
+    assert "p =" not in sentences(report(copies), found[:1], "controller=lqr", "controller=convex")[1]
     few = tmp_path / "few"
     for seed in range(5):
         add(few, "lqr", seed, 0.2)
