@@ -4,7 +4,8 @@ Runs of one seed share their training rows and their noise, so they are compared
 averaged within a seed first, and a seed counts once. Two paired tests are stated. The signed-rank test (Wilcoxon, 1945)
 decides: it asks only that the differences are spread symmetrically. Student's t-test beside it asks for normal ones.
 With fewer than six pairs nothing can make the first one significant at 5 %. Where the seed decides nothing (all rows,
-one start, no noise) its runs are copies of one, and no test may count them: a difference that never varies is undecided.
+one start, no noise) its runs are copies of one, and no test may count them: a difference that never varies is
+undecided.
 """
 
 from collections.abc import Mapping, Sequence

@@ -67,8 +67,7 @@ def title(report: Report) -> str:
 
 def render(report: Report) -> Table:
     """The table for a terminal: mean, and the quartiles below it; what is zero everywhere is left out."""
-    known = [name for name in SHOWN if name in report.measures()]
-    shown = [name for name in known if any(any(cell.numbers(name)) for cell in report.cells)]
+    shown = [name for name in SHOWN if name in _telling(report)]
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title(report), title_justify="left")
     for name in (*(report.variables or ("runs",)), "seeds"):
         table.add_column(name.replace(".", ".\n"), justify="right", no_wrap=True)
@@ -121,7 +120,7 @@ def latex(report: Report) -> str:
 def figures(report: Report) -> dict[str, bytes]:
     """One figure (PNG) a varied setting, by file name."""
     drawn = {}
-    measures = [name for name in DRAWN if name in report.measures()]
+    measures = [name for name in DRAWN if name in _telling(report)]
     if not measures or not report.variables:
         return drawn
     for variable in report.variables:
@@ -162,6 +161,11 @@ def page(report: Report, drawn: dict[str, bytes], comparison: Sequence[str] = ()
         parts += ["<h2>To fill the gaps</h2>", f"<pre>{commands}</pre>"]
     head = f'<meta charset="utf-8"><title>{escape(report.tree.name)}</title><style>{STYLE}</style>'
     return f"<!doctype html>\n<html lang=en><head>{head}</head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
+
+
+def _telling(report: Report) -> list[str]:
+    """Measures that are not zero everywhere."""
+    return [name for name in report.measures() if any(any(cell.numbers(name)) for cell in report.cells)]
 
 
 def _lines(report: Report, index: int) -> dict[str, list[Cell]]:
