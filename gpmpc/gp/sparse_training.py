@@ -17,11 +17,12 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, TrainingError, check_number
+from gpmpc.gp.hyperparameter_search import FAILED, spread
 from gpmpc.gp.kernel import kernel_matrix
 from gpmpc.gp.posterior import GPPosterior, Predicts
 from gpmpc.gp.scaling import Scaling, identity
 from gpmpc.gp.sparse import JITTER, Method, collapsed_bound, sparse_posterior
-from gpmpc.gp.training import FAILED, Trainer, spread
+from gpmpc.gp.training import Trainer
 from gpmpc.gp.transitions import Transitions
 
 log = logging.getLogger(__name__)

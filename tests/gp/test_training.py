@@ -5,7 +5,7 @@ from scipy.optimize import approx_fprime
 
 from gpmpc.exceptions import SettingError, TrainingError
 from gpmpc.gp import SoftLimits, Transitions, train
-from gpmpc.gp.training import spread
+from gpmpc.gp.hyperparameter_search import spread
 
 
 def pendulum(rows=60, noise=1e-3, seed=0):
