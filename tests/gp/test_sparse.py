@@ -8,8 +8,8 @@ import torch
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Budget, GPPosterior, SparseTrainer, Trainer, Transitions, sparse_posterior, standardize
+from gpmpc.gp.collapsed_bound import collapsed_bound
 from gpmpc.gp.kernel import kernel_matrix
-from gpmpc.gp.sparse import collapsed_bound
 from gpmpc.gp.sparse_training import greedy_points
 from gpmpc.propagation import MomentMatching, MonteCarlo
 
