@@ -27,7 +27,7 @@ from gpmpc.memory import GIB, available_memory
 
 log = logging.getLogger(__name__)
 # N x N matrices that one evaluation of the likelihood holds, measured; the posterior holds one an output.
-MATRICES = {"closed_form": 1, "gpytorch": 18}
+MATRICES = {"closed_form": 1, "gpytorch": 13}
 MANY = 1000  # points: from here on the log has a line an output
 
 
