@@ -165,12 +165,12 @@ class Predictor:
                 its bounds: u_k + K (mu_k - follow_k) for k = 1 .. H-1.
         """
         if self._compiles and host_arrays(self.model.weights) is not None:
-            noisy = self.covariance == "zero_order" and self.propagator.observation_noise
-            noise = _array(self.model.noise_covariance) if noisy else np.zeros_like(request.covariance)
-            known = self._belief(request.state, request.covariance).covariance.numpy()
-            uncertain = self.covariance == "zero_order"
-            start, problem = request.state, self.problem
-            found = roll_out(self.model, problem, start, known, inputs, follow, self.feedback, uncertain, noise)
+            uncertain, start = self.covariance == "zero_order", request.state
+            noisy = uncertain and self.propagator.observation_noise
+            nothing = np.zeros_like(request.covariance)
+            noise = _array(self.model.noise_covariance) if noisy else nothing
+            known = request.covariance if uncertain else nothing
+            found = roll_out(self.model, self.problem, start, known, inputs, follow, self.feedback, uncertain, noise)
             return Prediction(found.A, found.B, found.c, start, found.covariances, found.inputs)
         belief, gain, stages, plan = self._belief(request.state, request.covariance), None, [], np.array(inputs)
         covariances, n = [_array(belief.covariance)], self.problem.state_dim

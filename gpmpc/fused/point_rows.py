@@ -114,3 +114,28 @@ def explain(triangle, q, solved):
         for j in range(length):
             solved[j] = solved[j] + v0 * row0[j] + v1 * row1[j] + v2 * row2[j] + v3 * row3[j]
     return total
+
+
+@borrowing
+def explain_several(triangle, q, totals):
+    """Adds |L^-1 q_h|^2 of the rows of q, a multiple of four of them, to ``totals``, in one pass over L^-1."""
+    widest()
+    for start in range(0, q.shape[1], 4):
+        length = start // 8 * 8 + 8
+        at = start // 8 * 8 * length // 2 + start % 8 * length
+        row0, row1 = triangle[at : at + length], triangle[at + length : at + 2 * length]
+        row2, row3 = triangle[at + 2 * length : at + 3 * length], triangle[at + 3 * length : at + 4 * length]
+        for h in range(0, len(q), 4):
+            q0, q1, q2, q3 = q[h], q[h + 1], q[h + 2], q[h + 3]
+            a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = 0.0
+            c0 = c1 = c2 = c3 = d0 = d1 = d2 = d3 = 0.0
+            for j in range(length):
+                r0, r1, r2, r3 = row0[j], row1[j], row2[j], row3[j]
+                a0, a1, a2, a3 = a0 + r0 * q0[j], a1 + r1 * q0[j], a2 + r2 * q0[j], a3 + r3 * q0[j]
+                b0, b1, b2, b3 = b0 + r0 * q1[j], b1 + r1 * q1[j], b2 + r2 * q1[j], b3 + r3 * q1[j]
+                c0, c1, c2, c3 = c0 + r0 * q2[j], c1 + r1 * q2[j], c2 + r2 * q2[j], c3 + r3 * q2[j]
+                d0, d1, d2, d3 = d0 + r0 * q3[j], d1 + r1 * q3[j], d2 + r2 * q3[j], d3 + r3 * q3[j]
+            totals[h] += a0 * a0 + a1 * a1 + a2 * a2 + a3 * a3
+            totals[h + 1] += b0 * b0 + b1 * b1 + b2 * b2 + b3 * b3
+            totals[h + 2] += c0 * c0 + c1 * c1 + c2 * c2 + c3 * c3
+            totals[h + 3] += d0 * d0 + d1 * d1 + d2 * d2 + d3 * d3
