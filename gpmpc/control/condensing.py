@@ -21,6 +21,8 @@ import numpy as np
 
 from gpmpc.compiled import compiled
 from gpmpc.control.tracking import TrackingProblem
+from gpmpc.fused.point_rows import aligned_rows
+from gpmpc.qp.lanes import combine
 
 Array = np.ndarray
 
@@ -163,19 +165,6 @@ def _weigh(W, x, y):
 
 
 @compiled
-def _add_product(A, X, width, Y):
-    """Y += A X on the first ``width`` columns; entries of A that are zero cost nothing."""
-    for r in range(len(A)):
-        out = Y[r]
-        for c in range(A.shape[1]):
-            a = A[r, c]
-            if a != 0.0:
-                row = X[c]
-                for i in range(width):
-                    out[i] += a * row[i]
-
-
-@compiled
 def _dot(x, y):
     total = 0.0
     for i in range(len(x)):
@@ -185,43 +174,54 @@ def _dot(x, y):
 
 @compiled
 def _varying_curvature(A, B, W, T, rows, H, P, G):
-    """Adds 2 Gamma' W Gamma to P, and writes E Gamma to G."""
-    held, held_rows = len(A) - 1, len(rows) - 1
-    p, m, r = B.shape[1], B.shape[2], rows.shape[1]
-    n = W.shape[1]
-    M, MA = np.zeros((p, p)), np.zeros((p, p))
-    MB = np.zeros((H, p, m))
-    for k in range(H - 1, -1, -1):  # backward: B_k' M_{k+1}
-        at = min(k, held)
-        weight = T if k == H - 1 else W
-        for b in range(len(W)):  # M_{k+1} = W_{k+1} + A' M A, the second part is there already
+    """Adds 2 Gamma' W Gamma to P, and writes E Gamma to G; whole registers at a time, in padded copies."""
+    p, m, r, n, size = B.shape[1], B.shape[2], rows.shape[1], W.shape[1], H * B.shape[2]
+    M, MA, MB = _zeros(p, p), _zeros(p, p), _zeros(p, m)
+    here, back, reach = _zeros(p, p), np.empty((p, p)), _zeros(p, m)  # A, A' and B of a stage
+    pull = np.empty((H, m, p))  # B_k' M_{k+1}, twice
+    for k in range(H - 1, -1, -1):  # backward: M_{k+1} = W_{k+1} + A' M A, the second part is there already
+        at, weight = min(k, len(A) - 1), T if k == H - 1 else W
+        for b in range(len(W)):
             for i in range(n):
                 for j in range(n):
                     M[b * n + i, b * n + j] += weight[b, i, j]
-        _add_product(M, B[at], m, MB[k])
-        MA[:] = 0.0
-        _add_product(M, A[at], p, MA)
-        M[:] = 0.0
-        _add_product(A[at].T, MA, p, M)
-    gamma, moved = np.zeros((p, H * m)), np.zeros((p, H * m))
-    for k in range(H):  # forward: Gamma_{k+1}
-        at, row_at = min(k, held), min(k, held_rows)
-        moved[:] = 0.0
-        _add_product(A[at], gamma, k * m, moved)
-        gamma, moved = moved, gamma
         for i in range(p):
+            for j in range(p):
+                here[i, j] = back[j, i] = A[at, i, j]
             for j in range(m):
-                gamma[i, k * m + j] = B[at, i, j]
-        width = (k + 1) * m
+                reach[i, j] = B[at, i, j]
+        for i in range(p):
+            combine(reach, p, M[i], 0, m, MB[i])
+            combine(here, p, M[i], 0, p, MA[i])
+            for j in range(m):
+                pull[k, j, i] = 2.0 * MB[i, j]
+        for i in range(p):
+            combine(MA, p, back[i], 0, p, M[i])
+    gamma, moved, row = _zeros(p, size), _zeros(p, size), _zeros(1, size)[0]
+    for k in range(H):  # forward: Gamma_{k+1}
+        at, width = min(k, len(A) - 1), (k + 1) * m
+        for i in range(p):
+            combine(gamma, p, A[at, i], 0, k * m, moved[i])
+            for j in range(m):
+                moved[i, k * m + j] = B[at, i, j]
+        gamma, moved = moved, gamma
         for a in range(m):
+            combine(gamma, p, pull[k, a], 0, width, row)
             out = P[k * m + a]
-            for i in range(p):
-                weight_i = 2.0 * MB[k, i, a]
-                row = gamma[i]
-                for j in range(width):
-                    out[j] += weight_i * row[j]
-        _add_product(rows[row_at], gamma, width, G[k * r : (k + 1) * r])
-    _mirror(P, m)
+            for j in range(width):
+                out[j] += row[j]
+        for e in range(r):
+            combine(gamma, p, rows[min(k, len(rows) - 1), e], 0, width, row)
+            G[k * r + e, :width] = row[:width]
+    _mirror(P)
+
+
+@compiled
+def _zeros(rows, columns):
+    """Zeros in rows of whole registers, on cache lines."""
+    matrix = aligned_rows(rows, (columns + 7) // 8 * 8)
+    matrix[:] = 0.0
+    return matrix
 
 
 @compiled
@@ -257,15 +257,18 @@ def _held_curvature(A, B, W, T, same, rows, H, P, G):
                 value = _dot(rows[e], X[d, b])
                 for k in range(d, H):
                     G[k * r + e, (k - d) * m + b] = value
-    _mirror(P, m)
+    _mirror(P)
 
 
 @compiled
-def _mirror(P, m):
-    """Takes the upper triangle from the lower one."""
-    for i in range(len(P)):
-        for j in range(i):
-            P[j, i] = P[i, j]
+def _mirror(P):
+    """Takes the upper triangle from the lower one; in blocks, which stay in the cache."""
+    size = len(P)
+    for top in range(0, size, 8):
+        for left in range(0, top + 1, 8):
+            for i in range(top, min(top + 8, size)):
+                for j in range(left, min(left + 8, i)):
+                    P[j, i] = P[i, j]
 
 
 @compiled
