@@ -39,51 +39,50 @@ class Stages(NamedTuple):
     inputs: Array
 
 
-def roll_out(
-    model: GPPosterior,
-    problem: TrackingProblem,
-    start: Array,
-    covariance: Array,
-    plan: Array,
-    follow: Array | None,
-    feedback: bool,
-    uncertain: bool,
-    noise: Array,
-) -> Stages:
-    """The stages along a plan.
+class CompiledRollout:
+    """Rolls plans out on one model; what stays the same is looked up once.
 
     Args:
         model: Predicts next states or differences; float64, in host memory.
         problem: Weights of the feedback, and the inputs' bounds.
-        start: x_0 (n,).
-        covariance: Of x_0 (n, n).
-        plan: (H, m).
-        follow: Means (H, n) that the rollout follows under the feedback; None follows none.
         feedback: Whether there is any.
         uncertain: Predicts covariances; they are zero otherwise.
-        noise: Added to every predicted covariance (n, n).
+        observation_noise: Adds the model's noise to every predicted covariance.
     """
-    (H, m), n, packed = plan.shape, len(start), model.packed
-    found = Stages(np.empty((H, n, n)), np.empty((H, n, m)), np.empty((H, n)), np.zeros((H + 1, n, n)), plan.copy())
-    found.covariances[0] = covariance
-    _stages(
-        uncertain,
-        feedback,
-        (packed.points, packed.inverse_squares, packed.log_signal, packed.weights),
-        packed.inverse_cholesky if uncertain else NOTHING,
-        (model.offset.numpy(), model.predicts == "difference"),
-        (problem.Q, problem.R, problem.terminal),
-        (problem.input_lower, problem.input_upper),
-        start,
-        NOTHING if follow is None else follow,
-        noise,
-        found,
-    )
-    return found
+
+    def __init__(
+        self, model: GPPosterior, problem: TrackingProblem, feedback: bool, uncertain: bool, observation_noise: bool
+    ):
+        packed, n = model.packed, model.state_dim
+        noise = model.noise_covariance.numpy() if observation_noise else np.zeros((n, n))
+        self._known = (
+            uncertain,
+            feedback,
+            (packed.points, packed.inverse_squares, packed.log_signal, packed.weights),
+            packed.inverse_cholesky if uncertain else NOTHING,
+            (model.offset.numpy(), model.predicts == "difference"),
+            (problem.Q, problem.R, problem.terminal),
+            (problem.input_lower, problem.input_upper),
+            noise,
+        )
+
+    def __call__(self, start: Array, covariance: Array, plan: Array, follow: Array | None) -> Stages:
+        """The stages along a plan.
+
+        Args:
+            start: x_0 (n,).
+            covariance: Of x_0 (n, n).
+            plan: (H, m).
+            follow: Means (H, n) that the rollout follows under the feedback; None follows none.
+        """
+        (H, m), n = plan.shape, len(start)
+        found = Stages(np.empty((H, n, n)), np.empty((H, n, m)), np.empty((H, n)), np.zeros((H + 1, n, n)), plan.copy())
+        _stages(*self._known, start, covariance, NOTHING if follow is None else follow, found)
+        return found
 
 
 @compiled
-def _stages(uncertain, feedback, gp, inverse_cholesky, outer, weights, limits, start, follow, noise, out):
+def _stages(uncertain, feedback, gp, inverse_cholesky, outer, weights, limits, noise, start, covariance, follow, out):
     points, _, log_signal, _ = gp
     offset, adds_state = outer
     Q, R, terminal = weights
@@ -117,6 +116,7 @@ def _stages(uncertain, feedback, gp, inverse_cholesky, outer, weights, limits, s
                 c[k, i] -= B[k, i, j] * u[j]
         x[:] = M
     if uncertain:
+        covariances[0] = covariance
         kept[:, H:] = 0.0
         explained = np.zeros((n, places))
         for a in range(n):

@@ -93,11 +93,11 @@ class Condenser:
         """
         H, m = self.horizon, len(last)
         q, values = np.zeros((H, m)), np.zeros((H, rows.shape[1]))
-        _slope(A, B, c, start, rows, targets, self._weight, self._terminal, q, values)
         if self.problem.penalized == "deviations":
             q -= 2 * wanted @ self.problem.R
         elif self.problem.penalized == "increments":
             q[0] -= 2 * last @ self.problem.R
+        _slope(A, B, c, start, rows, targets, self._weight, self._terminal, q, values)
         return q.ravel(), values
 
     def bounds(self, last: Array, lower: Array, upper: Array) -> tuple[Array, Array]:

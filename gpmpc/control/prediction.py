@@ -18,13 +18,14 @@ Torch ends here: what comes out is NumPy float64.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from gpmpc.control.ancillary_feedback import lqr_gain, own_spread, spread
-from gpmpc.control.compiled_rollout import roll_out
+from gpmpc.control.compiled_rollout import CompiledRollout
 from gpmpc.control.condensing import respond
 from gpmpc.control.controller import Decision
 from gpmpc.control.request import Request
@@ -112,6 +113,12 @@ class Predictor:
         self._first_order = exact and type(propagator) is Linearization and not propagator.hessian
         self._compiles = exact and (covariance == "none" or (covariance == "zero_order" and self._first_order))
 
+    @cached_property
+    def _rollout(self) -> CompiledRollout:
+        uncertain = self.covariance == "zero_order"
+        noisy = uncertain and self.propagator.observation_noise
+        return CompiledRollout(self.model, self.problem, self.feedback, uncertain, noisy)
+
     def extended(self, weight: Array) -> Array:
         """The weight of s that belongs to a weight of x (n, n): the blocks on its diagonal (p / n, n, n)."""
         n = self.problem.state_dim
@@ -165,13 +172,8 @@ class Predictor:
                 its bounds: u_k + K (mu_k - follow_k) for k = 1 .. H-1.
         """
         if self._compiles and host_arrays(self.model.weights) is not None:
-            uncertain, start = self.covariance == "zero_order", request.state
-            noisy = uncertain and self.propagator.observation_noise
-            nothing = np.zeros_like(request.covariance)
-            noise = _array(self.model.noise_covariance) if noisy else nothing
-            known = request.covariance if uncertain else nothing
-            found = roll_out(self.model, self.problem, start, known, inputs, follow, self.feedback, uncertain, noise)
-            return Prediction(found.A, found.B, found.c, start, found.covariances, found.inputs)
+            found = self._rollout(request.state, request.covariance, inputs, follow)
+            return Prediction(found.A, found.B, found.c, request.state, found.covariances, found.inputs)
         belief, gain, stages, plan = self._belief(request.state, request.covariance), None, [], np.array(inputs)
         covariances, n = [_array(belief.covariance)], self.problem.state_dim
         for k, input in enumerate(plan):

@@ -144,8 +144,7 @@ def check_controller(
 
 def _array(value: object) -> np.ndarray:
     """A tensor or array as float64 in host memory."""
-    value = value.detach().cpu() if hasattr(value, "detach") else value
-    return np.asarray(value, dtype=float)
+    return np.asarray(value.numpy(force=True) if hasattr(value, "detach") else value, dtype=float)
 
 
 def _all_finite(values: np.ndarray) -> bool:
