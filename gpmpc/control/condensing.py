@@ -19,7 +19,7 @@ diag(Q, I_n kron Q) is never written out.
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import borrowing, compiled
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.fused.point_rows import aligned_rows
 from gpmpc.qp.lanes import combine
@@ -153,18 +153,6 @@ def respond(A, B, c, start, inputs, states):
 
 
 @compiled
-def _weigh(W, x, y):
-    """Writes W x for a block-diagonal W to ``y``."""
-    n = W.shape[1]
-    for b in range(len(W)):
-        for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += W[b, i, j] * x[b * n + j]
-            y[b * n + i] = total
-
-
-@compiled
 def _dot(x, y):
     total = 0.0
     for i in range(len(x)):
@@ -227,37 +215,59 @@ def _zeros(rows, columns):
 @compiled
 def _held_curvature(A, B, W, T, same, rows, H, P, G):
     """The same with one A, B and E for all stages."""
-    p, m, r = B.shape[0], B.shape[1], rows.shape[0]
-    X, WX, TX = np.empty((H, m, p)), np.empty((H, m, p)), np.empty((H, m, p))  # X_l = A^(l-1) B, transposed
-    for a in range(m):
+    p, m, r, size = B.shape[0], B.shape[1], rows.shape[0], H * B.shape[1]
+    X, back, strip = _zeros(size, p), _zeros(p, p), _zeros(p, size)  # rows l m + a of X: column a of A^l B
+    W, T = _widened(W), _widened(T)
+    for i in range(p):
+        for j in range(p):
+            back[j, i] = A[i, j]
+        for a in range(m):
+            X[a, i] = B[i, a]
+    for l in range(m, size):
+        combine(back, p, X[l - m], 0, p, X[l])
+    for l in range(size):
         for i in range(p):
-            X[0, a, i] = B[i, a]
-        for k in range(1, H):
-            for i in range(p):
-                X[k, a, i] = _dot(A[i], X[k - 1, a])
-        for k in range(H):
-            _weigh(W, X[k, a], WX[k, a])
+            strip[i, l] = X[l, i]
+    total, usual, last = _zeros(m, size), _zeros(1, size)[0], _zeros(1, size)[0]
+    weighed = _zeros(1, p + 8)[0]
+    for k in range(H):
+        # Block (j, j - d) is the sum over l <= k = H - 1 - j of X_l' W X_{l + d}, the last one with the terminal weight.
+        j, start = H - 1 - k, k * m
+        for a in range(m):
+            _weigh(W, X[start + a], weighed)
+            combine(strip, p, weighed, start, size - start, usual)
             if not same:
-                _weigh(T, X[k, a], TX[k, a])
-    total = np.empty((m, m))
-    for d in range(H):
-        # Block (j, j - d) is the sum over l <= H - j of X_l' W X_{l + d}, with the terminal weight at the last l.
-        total[:] = 0.0
-        for k in range(H - d):
-            j = H - 1 - k
-            for a in range(m):
+                _weigh(T, X[start + a], weighed)
+                combine(strip, p, weighed, start, size - start, last)
+            ends, sums, out = usual if same else last, total[a], P[j * m + a]
+            for d in range(j + 1):
                 for b in range(m):
-                    usual = _dot(WX[k, a], X[k + d, b])
-                    last = usual if same else _dot(TX[k, a], X[k + d, b])
-                    P[j * m + a, (j - d) * m + b] += 2.0 * (total[a, b] + last)
-                    total[a, b] += usual
+                    out[(j - d) * m + b] += 2.0 * (sums[d * m + b] + ends[start + d * m + b])
+            for i in range(size - start):
+                sums[i] += usual[start + i]
     for e in range(r):
-        for d in range(H):
-            for b in range(m):
-                value = _dot(rows[e], X[d, b])
-                for k in range(d, H):
-                    G[k * r + e, (k - d) * m + b] = value
+        combine(strip, p, rows[e], 0, size, usual)
+        for k in range(H):
+            for d in range(k + 1):
+                for b in range(m):
+                    G[k * r + e, (k - d) * m + b] = usual[d * m + b]
     _mirror(P)
+
+
+@compiled
+def _widened(W):
+    """The blocks of a weight, symmetric, in rows of whole registers (p / n, n, n padded)."""
+    wide = np.zeros((len(W), W.shape[1], (W.shape[1] + 7) // 8 * 8))
+    wide[:, :, : W.shape[1]] = W
+    return wide
+
+
+@borrowing
+def _weigh(W, x, y):
+    """Writes W x for the blocks of ``_widened`` to ``y``, and up to seven numbers after it."""
+    n = W.shape[1]
+    for b in range(len(W)):
+        combine(W[b], n, x[b * n :], 0, n, y[b * n :])
 
 
 @compiled
@@ -279,7 +289,8 @@ def _slope(A, B, c, start, rows, targets, W, T, q, values):
     p, m, r = B.shape[1], B.shape[2], rows.shape[1]
     free, nothing = np.empty((H + 1, p)), np.zeros((H, m))
     respond(A, B, c, start, nothing, free)
-    error, slope, pulled = np.empty(p), np.zeros(p), np.zeros(p)
+    W, T = _widened(W), _widened(T)
+    error, slope, pulled = np.empty(p), np.zeros(p + 8), np.zeros(p)
     for k in range(H - 1, -1, -1):
         at, row_at = min(k, held), min(k, held_rows)
         for e in range(r):
