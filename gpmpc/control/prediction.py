@@ -36,7 +36,6 @@ from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.gp.evaluation import host_arrays, point_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation import Linearization, Propagator, differentiate, linearize
-from gpmpc.propagation.local_model import extended_state
 
 Array = np.ndarray
 
@@ -131,7 +130,9 @@ class Predictor:
     def state(self, mean: Array, covariance: Array) -> Array:
         """The vector s (p,) of a belief."""
         if self.covariance == "full":
-            return _array(extended_state(self._belief(mean, covariance))[0])
+            eigenvalues, vectors = np.linalg.eigh(covariance)
+            root = (vectors * np.sqrt(eigenvalues.clip(0))) @ vectors.T
+            return np.concatenate((mean, root.ravel()))
         if self.covariance == "diagonal":
             return np.concatenate([mean, np.sqrt(np.clip(np.diag(covariance), 0, None))])
         return mean
@@ -196,7 +197,8 @@ class Predictor:
         A, B, c, after, V = self._linearise(belief, self._tensor(input))
         now, after = _array(belief.covariance), _array(after.covariance)
         if V is None:
-            covariances = np.concatenate([now[None], np.tile(after, (H, 1, 1))])
+            covariances = np.empty((H + 1, *now.shape))
+            covariances[0], covariances[1:] = now, after
         else:
             covariances = spread(A + B @ self._gain(A, B) if self.feedback else A, V, now, H)
         start = self.state(request.state, now)
