@@ -114,7 +114,9 @@ def square_root_differential(r: Tensor, U: Tensor, change: Tensor) -> Tensor:
 def _congruent(U: Tensor, matrices: Tensor) -> Tensor:
     """U X U' for symmetric X, as many as wanted along the last dimension (*batch, n, n, j)."""
     half = U @ matrices.flatten(-2)  # its rows are of U X, one X beside the other
-    return (U @ half.unflatten(-1, matrices.shape[-2:]).transpose(-3, -2).flatten(-2)).unflatten(-1, matrices.shape[-2:])
+    return (U @ half.unflatten(-1, matrices.shape[-2:]).transpose(-3, -2).flatten(-2)).unflatten(
+        -1, matrices.shape[-2:]
+    )
 
 
 def _plain(value: Tensor) -> bool:

@@ -61,9 +61,7 @@ class Packed:
     @cached_property
     def inverse_cholesky(self) -> Array:
         """L_a^-1 as block triangles (k, triangle_size(P))."""
-        size = len(self.cholesky[0])
-        eye = np.eye(size)
-        return self._triangles(lambda a: scipy.linalg.solve_triangular(self.cholesky[a], eye, lower=True))
+        return self._triangles(lambda a: scipy.linalg.lapack.dtrtri(self.cholesky[a], lower=1)[0])
 
     @cached_property
     def centred(self) -> Array:
