@@ -50,9 +50,10 @@ def main() -> None:
     results = []
     for size in arguments.sizes:
         result = measured(size)
-        row = [result[key] for key in ("ms_median", "ms_p99", "ns_per_square", "floor_ms", "ratio", "streamed_ms")]
         print(
-            f"{size:6}" + "".join(f"{v:{w}.{d}f}" for v, w, d in zip(row, (10, 10, 9, 10, 8, 13), (3, 3, 2, 3, 2, 3)))
+            f"{size:6}{result['ms_median']:10.3f}{result['ms_p99']:10.3f}{result['ns_per_square']:9.2f}"
+            f"{result['floor_ms']:10.3f}{result['ratio']:8.2f}{result['streamed_ms']:13.3f}",
+            flush=True,
         )
         results.append(result)
     path = Path("outputs/benchmarks/floor.json")

@@ -59,7 +59,7 @@ class CompiledRollout:
             uncertain,
             feedback,
             (packed.points, packed.inverse_squares, packed.log_signal, packed.weights),
-            packed.inverse_cholesky if uncertain else NOTHING,
+            packed.columns if uncertain else NOTHING[None],
             (model.offset.numpy(), model.predicts == "difference"),
             (problem.Q, problem.R, problem.terminal),
             (problem.input_lower, problem.input_upper),
@@ -82,7 +82,7 @@ class CompiledRollout:
 
 
 @compiled
-def _stages(uncertain, feedback, gp, inverse_cholesky, outer, weights, limits, noise, start, covariance, follow, out):
+def _stages(uncertain, feedback, gp, columns, outer, weights, limits, noise, start, covariance, follow, out):
     points, _, log_signal, _ = gp
     offset, adds_state = outer
     Q, R, terminal = weights
@@ -120,7 +120,7 @@ def _stages(uncertain, feedback, gp, inverse_cholesky, outer, weights, limits, n
         kept[:, H:] = 0.0
         explained = np.zeros((n, places))
         for a in range(n):
-            explain_several(inverse_cholesky[a], kept[a], explained[a])
+            explain_several(columns[a], kept[a], explained[a])
         V = noise.copy()
         for k in range(H):
             for i in range(n):

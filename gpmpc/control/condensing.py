@@ -223,15 +223,15 @@ def _held_curvature(A, B, W, T, same, rows, H, P, G):
             back[j, i] = A[i, j]
         for a in range(m):
             X[a, i] = B[i, a]
-    for l in range(m, size):
-        combine(back, p, X[l - m], 0, p, X[l])
-    for l in range(size):
+    for row in range(m, size):
+        combine(back, p, X[row - m], 0, p, X[row])
+    for row in range(size):
         for i in range(p):
-            strip[i, l] = X[l, i]
+            strip[i, row] = X[row, i]
     total, usual, last = _zeros(m, size), _zeros(1, size)[0], _zeros(1, size)[0]
     weighed = _zeros(1, p + 8)[0]
     for k in range(H):
-        # Block (j, j - d) is the sum over l <= k = H - 1 - j of X_l' W X_{l + d}, the last one with the terminal weight.
+        # Block (j, j - d) is the sum over l <= k = H - 1 - j of X_l' W X_{l + d}, the last with the terminal weight.
         j, start = H - 1 - k, k * m
         for a in range(m):
             _weigh(W, X[start + a], weighed)

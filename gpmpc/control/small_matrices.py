@@ -1,4 +1,4 @@
-"""Problem: in the compiled loops over stages, matrices have a handful of rows: a library call costs more than its work."""
+"""Problem: matrices of a handful of rows, in compiled loops over stages: a library call costs more than its work."""
 
 import math
 

@@ -59,6 +59,11 @@ class Packed:
         return np.log(self.signal_variance)
 
     @cached_property
+    def columns(self) -> Array:
+        """L_a by columns (k, N, N); a view where the factor lies in memory so, as LAPACK makes it."""
+        return np.ascontiguousarray(self.cholesky.transpose(0, 2, 1))
+
+    @cached_property
     def inverse_cholesky(self) -> Array:
         """L_a^-1 as block triangles (k, triangle_size(P))."""
         return self._triangles(lambda a: scipy.linalg.lapack.dtrtri(self.cholesky[a], lower=1)[0])
