@@ -3,7 +3,7 @@
 PYTHON ?= python3
 ENV := .venv/.installed
 
-.PHONY: tables figures test lint clean
+.PHONY: tables figures test lint guard clean
 
 tables: $(ENV)  ## The paper's Tables 1 and 2 beside ours; settings: make tables SET="draws=50 data=paper data.folder=DIR"
 	.venv/bin/gpmpc tables $(SET)
@@ -18,6 +18,9 @@ lint: $(ENV)  ## Format check, linter and import contracts
 	.venv/bin/ruff format --check .
 	.venv/bin/ruff check .
 	.venv/bin/lint-imports
+
+guard: $(ENV)  ## Whether anything became slower, against reference kernels in the same run
+	.venv/bin/python benchmarks/guard.py
 
 $(ENV): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' \

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from quadrotor_flights import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
 
+from gpmpc.bench.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
 from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.control.state_form import StateFormMPC

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from quadrotor_flights import HOVER, INNER, OUTER, TRAJECTORIES, problem, trained
 
+from gpmpc.bench.quadrotor import HOVER, INNER, OUTER, TRAJECTORIES, problem, trained
 from gpmpc.control.cascade import Cascade
 from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.control.nmpc import NMPC

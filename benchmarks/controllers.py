@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from quadrotor_flights import HOVER, TRAJECTORIES, Asked, problem, recorded, trained
 
+from gpmpc.bench.quadrotor import HOVER, TRAJECTORIES, Asked, problem, recorded, trained
 from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.gp import GPPosterior

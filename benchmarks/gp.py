@@ -20,16 +20,13 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 from collections.abc import Callable
 from pathlib import Path
 
-import gpytorch
 import numpy as np
 import torch
 
 from gpmpc import fused
-from gpmpc.fused.packed import pack
+from gpmpc.bench.linearisations import linearisation_groups
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.gp.model import BatchExactGP, exact_inference
-from gpmpc.propagation.moment_matching import moments
 from gpmpc.provenance import provenance
 
 STATES, INPUTS = 6, 3
@@ -46,7 +43,7 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
     results, began = [], time.perf_counter()
-    gps, at, u = packed(posterior(8)), belief(), np.zeros(INPUTS)
+    gps, at, u = posterior(8).packed, belief(), np.zeros(INPUTS)
     fused.mean_with_jacobian(gps, at.mean.numpy(), u)
     fused.point_with_jacobian(gps, at.mean.numpy(), u)
     fused.moments_with_jacobian(gps, at.mean.numpy(), at.covariance.numpy(), u)
@@ -94,12 +91,6 @@ def posterior(size: int) -> GPPosterior:
     return GPPosterior.from_hyperparameters(features, targets, scales, signal, 1e-3 * signal, INPUTS)
 
 
-def packed(gp: GPPosterior):
-    """The same for the compiled kernels."""
-    parts = (gp.features, gp.lengthscales, gp.signal_variance, gp.cholesky, gp.weights)
-    return pack(*(part.numpy() for part in parts), gp.state_dim)
-
-
 def belief() -> Gaussian:
     """Mean near the middle of the data, standard deviations near 0.3."""
     root = 0.3 * torch.randn(STATES, STATES, generator=torch.Generator().manual_seed(1)) / STATES**0.5
@@ -108,59 +99,7 @@ def belief() -> Gaussian:
 
 def contenders(size: int, torch_jacobian: bool) -> list[dict[str, Callable]]:
     """Groups that answer the same question, ours first; each call returns what is compared."""
-    gp, at = posterior(size), belief()
-    gps, control = packed(gp), torch.linspace(-0.3, 0.3, INPUTS)
-    mu, S, u = at.mean.numpy(), at.covariance.numpy(), control.numpy()
-
-    def by_torch(mean, covariance, control):
-        return moments(gp, Gaussian(mean, covariance), control)[:2]
-
-    def jacobian_by_torch():
-        dM, dV = torch.func.jacrev(by_torch, argnums=(0, 1, 2))(at.mean, at.covariance, control)
-        return [dM[0], (dM[1] + dM[1].mT) / 2, dM[2], dV[0], (dV[1] + dV[1].mT) / 2, dV[2]]
-
-    def jacobian():
-        d = fused.moments_with_jacobian(gps, mu, S, u)
-        return [d.J, d.dM_dS, d.dM_du, d.dV_dmu, d.dV_dS, d.dV_du]
-
-    model = BatchExactGP(gp.features, gp.targets)
-    deviation, noise = gp.signal_variance.log() / 2, gp.noise_variance.log() / 2
-    model.set_hyperparameters(torch.cat([gp.lengthscales.log(), torch.stack([deviation, deviation - noise], 1)], 1))
-    model.eval().requires_grad_(False)
-    query = torch.cat([at.mean, control])
-
-    def by_gpytorch():
-        with exact_inference(), gpytorch.settings.skip_posterior_variances():  # the mean alone, from its cache
-            return torch.autograd.functional.jacobian(lambda x: model(x[None]).mean[:, 0], query).split(STATES, dim=1)
-
-    trained = BatchExactGP(gp.features, gp.targets)  # as it comes from training
-    trained.load_state_dict(model.state_dict())
-    trained.eval()
-
-    def by_gpytorch_as_usual():
-        return torch.autograd.functional.jacobian(lambda x: trained(x[None]).mean[:, 0], query).split(STATES, dim=1)
-
-    def gradient_by_torch():
-        mean = torch.func.jacrev(lambda x: gp.predict(x[:STATES], x[STATES:]).mean)
-        return mean(query).split(STATES, dim=1)
-
-    groups = [
-        {"moments": lambda: fused.moments(gps, mu, S, u)[:2], "moments, torch": lambda: by_torch(*at_all)},
-        {"moments with Jacobians": jacobian},
-        {"moments, diagonal": lambda: fused.moments(gps, mu, S, u, diagonal=True)},
-        {"diagonal with Jacobians": lambda: fused.moments_with_jacobian(gps, mu, S, u, diagonal=True)[:8]},
-        {"linearised": lambda: fused.point_with_jacobian(gps, mu, u)[:8]},
-        {
-            "mean with Jacobian": lambda: fused.mean_with_jacobian(gps, mu, u)[1:],
-            "mean with Jacobian, torch jacrev": gradient_by_torch,
-            "mean with Jacobian, GPyTorch, frozen": by_gpytorch,
-            "mean with Jacobian, GPyTorch": by_gpytorch_as_usual,
-        },
-    ]
-    at_all = (at.mean, at.covariance, control)
-    if torch_jacobian:
-        groups[1]["moments with Jacobians, torch jacrev"] = jacobian_by_torch
-    return groups
+    return linearisation_groups(posterior(size), belief(), torch.linspace(-0.3, 0.3, INPUTS), torch_jacobian)
 
 
 def take_turns(group: dict[str, Callable], seconds: float) -> dict[str, list[float]]:

@@ -35,7 +35,7 @@ class Gaussian:
     @classmethod
     def certain(cls, value: Any) -> "Gaussian":
         """A belief without doubt, such as a measured state (*batch, n), from a tensor, an array or a list."""
-        mean = torch.as_tensor(value)
+        mean = value if isinstance(value, Tensor) else torch.as_tensor(value)
         mean = mean if mean.is_floating_point() else mean.to(torch.float64)
         return cls(mean, torch.zeros(*mean.shape, mean.shape[-1], dtype=mean.dtype, device=mean.device))
 

@@ -43,11 +43,11 @@ def test_the_writer_of_recordings_starts_without_torch_and_without_compilers():
 @pytest.mark.parametrize(
     ("library", "rooms"),
     [
-        ("gpytorch", ["gp/model.py", "gp/gpytorch_posterior.py", "gp/gpytorch_training.py"]),
+        ("gpytorch", ["gp/model.py", "gp/gpytorch_posterior.py", "gp/gpytorch_training.py", "bench"]),
         ("hydra", ["cli"]),
         ("omegaconf", ["cli"]),
         ("matplotlib", ["plotting"]),
-        ("casadi", ["control", "gp/casadi_.py"]),
+        ("casadi", ["control", "gp/casadi_.py", "bench"]),
         ("rich", ["cli", "experiments", "simulation/trials.py"]),
         ("mcap", ["recording"]),
         ("mcap_protobuf", ["recording"]),

@@ -74,19 +74,3 @@ def step_spread(A, V, before, scratch, after):
             for c in range(n):
                 total += scratch[c] * A[j, c]
             after[i, j] = after[j, i] = total
-
-
-def own_spread(A: Array, cross: Array, open_loop: Array) -> Array:
-    """V (n, n): what a step adds to the spread of the state, from what a propagator says of the step.
-
-    Sigma+ less the part that passes through linearly, A Cov[x, x+] = A Sigma A'; a propagator that lets nothing pass
-    (mean equivalence) has no such part. Projected onto the positive semidefinite matrices.
-
-    Args:
-        A: d mu+ / d mu (n, n).
-        cross: Cov[x, x+] (n, n).
-        open_loop: Sigma+ (n, n).
-    """
-    passed = A @ cross
-    eigenvalues, vectors = np.linalg.eigh(open_loop - (passed + passed.T) / 2)
-    return (vectors * np.clip(eigenvalues, 0, None)) @ vectors.T

@@ -120,17 +120,33 @@ class Condenser:
             wanted: (H, m).
             last: u_{-1} (m,).
         """
-        error = states[1:].copy()
-        error[:, : targets.shape[1]] -= targets
-        blocks = error.reshape(len(error), *self._weight.shape[:2])
-        penalized = inputs
+        v = inputs
         if self.problem.penalized == "deviations":
-            penalized = inputs - wanted
+            v = inputs - wanted
         elif self.problem.penalized == "increments":
-            penalized = np.diff(inputs, axis=0, prepend=last[None])
-        total = np.einsum("kbi,bij,kbj->", blocks[:-1], self._weight, blocks[:-1])
-        total += np.einsum("bi,bij,bj->", blocks[-1], self._terminal, blocks[-1])
-        return float(total + np.einsum("ki,ij,kj->", penalized, self.problem.R, penalized))
+            v = np.empty_like(inputs)
+            np.subtract(inputs[1:], inputs[:-1], out=v[1:])
+            v[0] = inputs[0] - last
+        return _cost(states, targets, v, self._weight, self._terminal, self.problem.R)
+
+
+@compiled
+def _cost(states, targets, v, W, T, R):
+    H, n = targets.shape
+    total, error = 0.0, np.empty(states.shape[1])
+    for k in range(H):
+        error[:] = states[k + 1]
+        for i in range(n):
+            error[i] -= targets[k, i]
+        weight = T if k == H - 1 else W
+        for b in range(len(W)):
+            for i in range(n):
+                for j in range(n):
+                    total += error[b * n + i] * weight[b, i, j] * error[b * n + j]
+        for i in range(len(R)):
+            for j in range(len(R)):
+                total += v[k, i] * R[i, j] * v[k, j]
+    return total
 
 
 @compiled

@@ -22,12 +22,15 @@ from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
+from gpmpc.control.batched_prediction import bytes_per_request, predict_many
 from gpmpc.control.chance_constraints import ChanceConstraints
 from gpmpc.control.condensing import Condenser
 from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.prediction import Covariance, Form, Prediction, Predictor
 from gpmpc.control.request import Request, check_controller, check_dynamics
+from gpmpc.control.sequential import MEMORY, corrected, kkt_share
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import DataError, ProblemError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
@@ -40,7 +43,8 @@ Array = np.ndarray
 
 SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 SHORTEST_STEP = 2.0**-12
-ROUND_OFF = 1e-13  # share of the merit below which a difference says nothing
+ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
+FAILED = (DataError, ProblemError, np.linalg.LinAlgError, torch.linalg.LinAlgError)  # no finite numbers
 
 
 class _Stacked(NamedTuple):
@@ -78,7 +82,7 @@ class ConvexMPC:
         covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see there.
         solver: Of the quadratic program; ``DualActiveSet()`` by default, which state bounds with a price need.
         iterations: Quadratic programs a step at most; more than one for ``"trajectory"`` only.
-        tolerance: Of more iterations: largest change of an input, over max(1, largest input), that counts as none.
+        tolerance: Of more iterations: how far the plan may be from a KKT point, as a cosine (``sequential.kkt_share``).
         feedback: Rolls plans out, and predicts the covariances of ``"zero_order"``, under an ancillary feedback,
             without which no long horizon with state bounds is feasible. ``"full"`` and ``"diagonal"`` predict their
             covariances without feedback.
@@ -101,7 +105,7 @@ class ConvexMPC:
         covariance: Covariance = "zero_order",
         solver: QPSolver | None = None,
         iterations: int = 1,
-        tolerance: float = 1e-8,
+        tolerance: float = 1e-6,
         feedback: bool = True,
     ):
         self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
@@ -160,19 +164,60 @@ class ConvexMPC:
         if not request.finite:
             return request.unanswered(Status.INVALID_MEASUREMENT)
         began = perf_counter()
-        solved = previous is not None and previous.status.solved
-        warm = previous.solution if solved else None
         try:
             if self.iterations > 1:
-                return self._iterate(request, previous, warm)
+                return self._iterate(request, previous, _warm(previous))
             prediction = self.predictor.predict(request, previous)
-            modelled = perf_counter()
+        except FAILED:
+            return request.unanswered(Status.NUMERICAL_TROUBLE, timing=Timing(perf_counter() - began, 0.0, 0.0))
+        return self._answer(request, prediction, previous, perf_counter() - began)
+
+    def control_many(
+        self, beliefs: Sequence[Gaussian], references: Sequence[Reference], previous: Sequence[Decision | None]
+    ) -> list[Decision]:
+        """What ``control`` answers to each of T questions, its model asked for all of them at once.
+
+        The model answers a stage of all T at a time; the quadratic programs are solved one by one. The model's time is
+        shared out equally.
+
+        Args:
+            beliefs: T, one a question.
+            references: T.
+            previous: T decisions, None where there is none.
+
+        Raises:
+            ShapeError: As for ``control``.
+            SettingError: More than one quadratic program a step: each question would need its own line search.
+        """
+        if self.iterations > 1:
+            raise SettingError("iterations", f"many questions at once take 1 quadratic program; got {self.iterations}")
+        asked = list(zip(beliefs, references, previous, strict=True))
+        requests = [read_request(self.predictor, self.initial_input, *question) for question in asked]
+        known, began = [t for t, request in enumerate(requests) if request.finite], perf_counter()
+        try:
+            found = predict_many(self.predictor, [requests[t] for t in known], [previous[t] for t in known])
+        except FAILED:  # one of them spoils the batch: which one, they say alone
+            return [self.control(*question) for question in asked]
+        spent, predictions = (perf_counter() - began) / max(1, len(known)), dict(zip(known, found, strict=True))
+        answers = {t: self._answer(requests[t], made, previous[t], spent) for t, made in predictions.items()}
+        return [answers.get(t) or r.unanswered(Status.INVALID_MEASUREMENT) for t, r in enumerate(requests)]
+
+    @property
+    def bytes_per_question(self) -> int | None:
+        """Memory that ``control_many`` takes for each question at most [bytes]; None where it cannot be known."""
+        return bytes_per_request(self.predictor)
+
+    def _answer(self, request: Request, prediction: Prediction, previous: Decision | None, modelled: float) -> Decision:
+        """The decision of one quadratic program; ``modelled`` is the time that the prediction took [s]."""
+        began = perf_counter()
+        try:
             stacked = self._stack(prediction, request)
             built = perf_counter()
-            solution = self._solve(stacked, warm)
-        except (DataError, ProblemError, np.linalg.LinAlgError):  # a rollout or a program without finite numbers
-            return request.unanswered(Status.NUMERICAL_TROUBLE, timing=Timing(perf_counter() - began, 0.0, 0.0))
-        timing = Timing(modelled - began, built - modelled, perf_counter() - built)
+            solution = self._solve(stacked, _warm(previous))
+        except FAILED:
+            timing = Timing(modelled + perf_counter() - began, 0.0, 0.0)
+            return request.unanswered(Status.NUMERICAL_TROUBLE, timing=timing)
+        timing = Timing(modelled, built - began, perf_counter() - built)
         return self._decide(request, prediction, stacked, solution, solution.status, 1, timing)
 
     def _stack(self, prediction: Prediction, request: Request) -> _Stacked:
@@ -220,20 +265,22 @@ class ConvexMPC:
 
     def _iterate(self, request: Request, previous: Decision | None, warm: QPSolution | None) -> Decision:
         """Sequential quadratic programming from the last plan."""
-        spent, price, status = np.zeros(3), 0.0, Status.ITERATION_LIMIT
-        clock, taken, corrections = _Clock(spent), None, []
+        spent, price, status, share = np.zeros(3), 0.0, Status.ITERATION_LIMIT, np.inf
+        clock, taken = _Clock(spent), None
+        pairs = np.empty((2, 0, request.shifted.size))
         prediction = self.predictor.predict(request, previous)
         inputs = prediction.inputs
+        cost = self._cost(request, prediction, inputs)
         clock.charge(0)
         for count in range(1, self.iterations + 1):
             stacked = self._stack(prediction, request)
-            slope = stacked.P @ inputs.ravel() + stacked.q
+            slope, diagonal = stacked.P @ inputs.ravel() + stacked.q, stacked.P.diagonal()
             if taken is not None:  # how the Lagrangian's slope changed over the last step, at its multipliers
                 step, multipliers, before = taken
-                corrections.append((step, slope + stacked.G.T @ multipliers - before))
-                P = stacked.P
-                for pair in corrections:
-                    P = _damped_update(P, *pair)
+                if step @ stacked.P @ step > ROUND_OFF * cost:
+                    pair = np.stack([step, slope + stacked.G.T @ multipliers - before])
+                    pairs = np.concatenate([pairs[:, -MEMORY + 1 :], pair[:, None]], axis=1)
+                P = corrected(stacked.P, *pairs)
                 stacked = stacked._replace(P=P, q=slope - P @ inputs.ravel(), prepared=None)
             clock.charge(1)
             solution = self._solve(stacked, warm)
@@ -242,49 +289,60 @@ class ConvexMPC:
                 status = solution.status
                 break
             warm, proposed = solution, solution.x.reshape(inputs.shape)
-            size = max(1.0, float(np.abs(proposed).max()))
-            if np.abs(proposed - inputs).max() <= self.tolerance * size:
+            bounds, last_share = (stacked.lower, stacked.upper), share
+            share = kkt_share(diagonal, slope, stacked.G, solution.z, inputs.ravel(), solution.x, *bounds, cost)
+            # The program's plan is better by about the rate of the last one (Hairer and Wanner, 1996, eq. (IV.8.10)).
+            rate = share / last_share if taken is not None else 1.0
+            if share * min(1.0, rate / max(1.0 - rate, 1e-9)) <= self.tolerance:
                 status = Status.SOLVED
                 break
             if count == self.iterations:
                 break
             row_multipliers = np.abs(solution.z[self._condenser.rate_rows :])
             price = max(price, 2.0 * float(row_multipliers.max(initial=0.0)))
-            found = self._search(request, prediction, inputs, proposed, slope, price)
+            found = self._search(request, prediction, inputs, cost, proposed, slope, price)
             clock.charge(0)
             if found is None:
                 status = Status.NUMERICAL_TROUBLE
                 break
             taken = (found[0] - inputs).ravel(), solution.z, slope + stacked.G.T @ solution.z
-            inputs, prediction = found
+            inputs, prediction, cost = found
         return self._decide(request, prediction, stacked, solution, status, count, Timing(*spent))
 
     def _search(
-        self, request: Request, prediction: Prediction, inputs: Array, proposed: Array, slope: Array, price: float
-    ) -> tuple[Array, Prediction] | None:
-        """The next plan between ``inputs`` and ``proposed``, with the stage models along it; None if none is better.
+        self,
+        request: Request,
+        prediction: Prediction,
+        inputs: Array,
+        cost: float,
+        proposed: Array,
+        slope: Array,
+        price: float,
+    ) -> tuple[Array, Prediction, float] | None:
+        """The next plan between ``inputs`` and ``proposed``, its stage models and its cost; None if none is better.
 
         The stage models are exact along the plan that they were made at: there their cost and violations are the true
         ones.
         """
         limits = self._chance.limits(prediction)  # tightening of zero_order stays during the search
         violated = self._violation_price(prediction, inputs, limits, price)
-        here = self._cost(request, prediction, inputs) + violated
+        here = cost + violated
         promised = float(slope @ (proposed - inputs).ravel())
         promised += self._violation_price(prediction, proposed, limits, price) - violated
-        whole = not self._keeps_input_bounds(inputs, request.last)  # a first guess outside is left in one step
+        whole = not self._keeps_rates(inputs, request.last)  # a first guess outside is left in one step
         step = 1.0
         while step >= SHORTEST_STEP:
             trial = proposed if step == 1.0 else inputs + step * (proposed - inputs)
             try:
                 moved = self.predictor.along(request, trial)
-                merit = self._cost(request, moved, trial) + self._violation_price(moved, trial, limits, price)
+                cost = self._cost(request, moved, trial)
+                merit = cost + self._violation_price(moved, trial, limits, price)
             except DataError:  # the rollout left the finite numbers
                 if whole:
                     return None
                 merit = np.inf
             if whole or merit <= here + SUFFICIENT_DECREASE * step * promised + ROUND_OFF * abs(here):
-                return trial, moved
+                return trial, moved, cost
             step /= 2
         return None
 
@@ -301,12 +359,11 @@ class ConvexMPC:
         lower, upper = limits
         return self._chance.price(np.maximum(0.0, np.maximum(values - upper, lower - values)), price)
 
-    def _keeps_input_bounds(self, inputs: Array, last: Array) -> bool:
+    def _keeps_rates(self, inputs: Array, last: Array) -> bool:
+        if not self._condenser.rate_rows:
+            return True
         problem, rates = self.problem, np.diff(inputs, axis=0, prepend=last[None])
-        return bool(
-            ((inputs >= problem.input_lower) & (inputs <= problem.input_upper)).all()
-            and ((rates >= problem.rate_lower - 1e-9) & (rates <= problem.rate_upper + 1e-9)).all()
-        )
+        return bool(((rates >= problem.rate_lower - 1e-9) & (rates <= problem.rate_upper + 1e-9)).all())
 
 
 def read_request(
@@ -324,14 +381,8 @@ def read_request(
     return Request.read(problem, H, initial_input, belief, reference, previous)
 
 
-def _damped_update(P: Array, step: Array, change: Array) -> Array:
-    """BFGS with Powell's damping, which keeps P positive definite (Nocedal and Wright, 2006, procedure 18.2)."""
-    moved = P @ step
-    curvature, found = step @ moved, step @ change
-    if found < 0.2 * curvature:
-        share = 0.8 * curvature / (curvature - found)
-        change, found = share * change + (1 - share) * moved, 0.2 * curvature
-    return P - np.outer(moved, moved) / curvature + np.outer(change, change) / found
+def _warm(previous: Decision | None) -> QPSolution | None:
+    return previous.solution if previous is not None and previous.status.solved else None
 
 
 class _Clock:

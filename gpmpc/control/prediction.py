@@ -24,18 +24,19 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from gpmpc.control.ancillary_feedback import lqr_gain, own_spread, spread
+from gpmpc.control.ancillary_feedback import lqr_gain, spread
 from gpmpc.control.compiled_rollout import CompiledRollout
 from gpmpc.control.condensing import respond
 from gpmpc.control.controller import Decision
 from gpmpc.control.request import Request
+from gpmpc.control.stage_models import is_first_order, stage_model
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.gp.evaluation import host_arrays, point_arrays
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.propagation import Linearization, Propagator, differentiate, linearize
+from gpmpc.propagation import Propagator
 
 Array = np.ndarray
 
@@ -107,10 +108,14 @@ class Predictor:
             raise SettingError("feedback", f"must be true or false; got {feedback!r}")
         self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
         self.form, self.covariance, self.feedback = form, covariance, feedback
-        self._linearise = getattr(self, f"_{covariance}")
+        at_points = covariance == "zero_order" and is_first_order(propagator, model)
         exact = isinstance(model, GPPosterior) and model.predicts in ("next_state", "difference")
-        self._first_order = exact and type(propagator) is Linearization and not propagator.hessian
-        self._compiles = exact and (covariance == "none" or (covariance == "zero_order" and self._first_order))
+        self._compiles = at_points or (covariance == "none" and exact)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether compiled loops answer: a rollout takes microseconds, and many of them go one by one."""
+        return self._compiles and host_arrays(self.model.weights) is not None
 
     @cached_property
     def _rollout(self) -> CompiledRollout:
@@ -128,13 +133,14 @@ class Predictor:
         return weight[None]
 
     def state(self, mean: Array, covariance: Array) -> Array:
-        """The vector s (p,) of a belief."""
+        """The vectors s (*batch, p) of beliefs."""
         if self.covariance == "full":
             eigenvalues, vectors = np.linalg.eigh(covariance)
-            root = (vectors * np.sqrt(eigenvalues.clip(0))) @ vectors.T
-            return np.concatenate((mean, root.ravel()))
+            root = (vectors * np.sqrt(eigenvalues.clip(0))[..., None, :]) @ vectors.mT
+            return np.concatenate((mean, root.reshape(*mean.shape[:-1], -1)), axis=-1)
         if self.covariance == "diagonal":
-            return np.concatenate([mean, np.sqrt(np.clip(np.diag(covariance), 0, None))])
+            variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+            return np.concatenate([mean, np.sqrt(np.clip(variance, 0, None))], axis=-1)
         return mean
 
     def beliefs(self, prediction: Prediction, inputs: Array) -> tuple[Array, Array]:
@@ -150,13 +156,18 @@ class Predictor:
     def predict(self, request: Request, previous: Decision | None) -> Prediction:
         """The stage models of a step: about its request, and for ``increment`` about the step before."""
         if self.form == "trajectory":
-            return self.along(request, request.shifted, self._followed(request, previous))
-        if self.form == "deviation":
-            return self.held(request, request.wanted[0])
-        prediction = self.held(request, request.last)
-        if previous is None or not previous.status.solved:
+            return self.along(request, request.shifted, self.followed(request, previous))
+        prediction = self.held(request, self.about(request))
+        if self.form == "deviation" or previous is None or not previous.status.solved:
             return prediction  # no step before: the increment that the local model itself predicts
-        before = self.state(previous.means[0], previous.covariances[0])
+        return self.incremented(request, prediction, self.state(previous.means[0], previous.covariances[0]))
+
+    def about(self, request: Request) -> Array:
+        """The input (m,) that a held model is made at."""
+        return request.wanted[0] if self.form == "deviation" else request.last
+
+    def incremented(self, request: Request, prediction: Prediction, before: Array) -> Prediction:
+        """A held model as that of the increments since s_{-1}, ``before`` (p,)."""
         c = prediction.start - prediction.A[0] @ before - prediction.B[0] @ request.last
         if not request.covariance.any():
             n = self.problem.state_dim
@@ -172,7 +183,7 @@ class Predictor:
             follow: Means (H, n) that the rollout is to follow by the ancillary feedback, which changes the plan within
                 its bounds: u_k + K (mu_k - follow_k) for k = 1 .. H-1.
         """
-        if self._compiles and host_arrays(self.model.weights) is not None:
+        if self.compiled:
             found = self._rollout(request.state, request.covariance, inputs, follow)
             return Prediction(found.A, found.B, found.c, request.state, found.covariances, found.inputs)
         belief, gain, stages, plan = self._belief(request.state, request.covariance), None, [], np.array(inputs)
@@ -183,7 +194,7 @@ class Predictor:
                 input[:] = np.clip(moved, self.problem.input_lower, self.problem.input_upper)
             A, B, c, belief, V = self._linearise(belief, self._tensor(input))
             if self.feedback and gain is None and (follow is not None or V is not None):
-                gain = self._gain(np.ascontiguousarray(A[:n, :n]), np.ascontiguousarray(B[:n]))
+                gain = self.gain(np.ascontiguousarray(A[:n, :n]), np.ascontiguousarray(B[:n]))
             if self.feedback and V is not None:
                 belief = Gaussian(belief.mean, self._tensor(spread(A + B @ gain, V, covariances[-1], 1)[1]))
             covariances.append(_array(belief.covariance))
@@ -193,18 +204,24 @@ class Predictor:
 
     def held(self, request: Request, input: Array) -> Prediction:
         """The local model about the belief and an input (m,), for all stages."""
-        belief, H = self._belief(request.state, request.covariance), self.horizon
+        belief = self._belief(request.state, request.covariance)
         A, B, c, after, V = self._linearise(belief, self._tensor(input))
-        now, after = _array(belief.covariance), _array(after.covariance)
+        now = _array(belief.covariance)
+        return self.hold(self.state(request.state, now), input, A, B, c, now, _array(after.covariance), V)
+
+    def hold(
+        self, start: Array, input: Array, A: Array, B: Array, c: Array, now: Array, after: Array, V: Array | None
+    ) -> Prediction:
+        """One stage, made at s_0 = ``start``, Sigma_0 = ``now`` and an input, for all of them."""
+        H = self.horizon
         if V is None:
             covariances = np.empty((H + 1, *now.shape))
             covariances[0], covariances[1:] = now, after
         else:
-            covariances = spread(A + B @ self._gain(A, B) if self.feedback else A, V, now, H)
-        start = self.state(request.state, now)
+            covariances = spread(A + B @ self.gain(A, B) if self.feedback else A, V, now, H)
         return Prediction(A[None], B[None], c[None], start, covariances, np.tile(input, (H, 1)))
 
-    def _followed(self, request: Request, previous: Decision | None) -> Array | None:
+    def followed(self, request: Request, previous: Decision | None) -> Array | None:
         """What the rollout of a shifted plan has to follow: its own means, or without one the reference.
 
         Open-loop, over a long horizon, the smallest error leads the rollout out of the data and the bounds.
@@ -215,68 +232,27 @@ class Predictor:
             return previous.means[1:]
         return np.concatenate([request.state[None], request.targets[:-1]])
 
-    # One stage, by covariance mode: A, B, c, the next belief, and, where feedback can act on it, what the covariance
-    # gains in the stage, V = Sigma+ - A Sigma A'.
-
-    def _full(self, belief: Gaussian, input: torch.Tensor) -> tuple[Array, Array, Array, Gaussian, None]:
-        local = linearize(self.propagator, self.model, belief, input)
-        return _array(local.A), _array(local.B), _array(local.c), local.next, None
-
-    def _diagonal(self, belief: Gaussian, input: torch.Tensor) -> tuple[Array, Array, Array, Gaussian, None]:
-        belief = Gaussian(belief.mean, torch.diag_embed(belief.variance))
-        moved, d = differentiate(self.propagator, self.model, belief, input)
-        deviations = np.sqrt(_array(belief.variance))
-        after = np.sqrt(_array(moved.belief.variance))
-        # d Sigma_cc = 2 sd_c d sd_c, and the same backwards; where the next deviation is zero it has no derivative.
-        backwards = np.divide(0.5, after, out=np.zeros_like(after), where=after > 0)[:, None]
-        mean_by_deviation = 2 * _array(d.mean_by_covariance.diagonal(dim1=-2, dim2=-1)) * deviations
-        variance_by_mean = _array(d.covariance_by_mean.diagonal(dim1=0, dim2=1)).T
-        variance_by_variance = d.covariance_by_covariance.diagonal(dim1=-2, dim2=-1).diagonal(dim1=0, dim2=1)
-        variance_by_deviation = 2 * _array(variance_by_variance).T * deviations
-        variance_by_input = _array(d.covariance_by_input.diagonal(dim1=0, dim2=1)).T
-        A = np.block(
-            [
-                [_array(d.mean_by_mean), mean_by_deviation],
-                [backwards * variance_by_mean, backwards * variance_by_deviation],
-            ]
-        )
-        B = np.concatenate([_array(d.mean_by_input), backwards * variance_by_input])
-        s = np.concatenate([_array(belief.mean), deviations])
-        c = np.concatenate([_array(moved.belief.mean), after]) - A @ s - B @ _array(input)
-        return A, B, c, Gaussian(moved.belief.mean, torch.diag_embed(moved.belief.variance)), None
-
-    def _zero_order(self, belief: Gaussian, input: torch.Tensor) -> tuple[Array, Array, Array, Gaussian, Array]:
-        x, u, S = _array(belief.mean), _array(input), _array(belief.covariance)
-        if self._first_order and host_arrays(self.model.weights) is not None:
+    def _linearise(self, belief: Gaussian, input: torch.Tensor) -> tuple[Array, Array, Array, Gaussian, Array | None]:
+        """One ``StageModel``; compiled where a point is all that it needs."""
+        if not self.compiled:
+            stage = stage_model(self.covariance, self.propagator, self.model, belief, input)
+            A, B, c = (_array(part) for part in stage[:3])
+            return A, B, c, stage.next, None if stage.V is None else _array(stage.V)
+        x, u = _array(belief.mean), _array(input)
+        if self.covariance == "none":
+            (mean, A, B), V = point_arrays(self.model, "mean_with_jacobian", x, u), None
+            S = belief.covariance
+        else:
             mean, variance, A, B = point_arrays(self.model, "point_with_jacobian", x, u)
             V = np.diag(variance)
             if self.propagator.observation_noise:
                 V += _array(self.model.noise_covariance)
-            after = Gaussian(torch.from_numpy(mean), torch.from_numpy(A @ S @ A.T + V))
-            return A, np.ascontiguousarray(B), mean - A @ x - B @ u, after, V
-        moved, d = differentiate(self.propagator, self.model, belief, input)
-        A, B = _array(d.mean_by_mean), _array(d.mean_by_input)
-        c = _array(moved.belief.mean) - A @ x - B @ u
-        V = own_spread(A, _array(moved.cross_covariance), _array(moved.belief.covariance))
-        return A, B, c, moved.belief, V
+            S = self._tensor(A @ _array(belief.covariance) @ A.T + V)
+        A, B = np.ascontiguousarray(A), np.ascontiguousarray(B)
+        return A, B, mean - A @ x - B @ u, Gaussian(self._tensor(mean), S), V
 
-    def _none(self, belief: Gaussian, input: torch.Tensor) -> tuple[Array, Array, Array, Gaussian, None]:
-        x, u = _array(belief.mean), _array(input)
-        if isinstance(self.model, GPPosterior) and host_arrays(self.model.weights) is not None:
-            mean, A, B = point_arrays(self.model, "mean_with_jacobian", x, u)
-        else:
-            moved, A, B = self.model.predict_with_jacobian(belief.mean, input)
-            mean, A, B = _array(moved.mean), _array(A), _array(B)
-        c = mean - A @ x - B @ u
-        return (
-            np.ascontiguousarray(A),
-            np.ascontiguousarray(B),
-            c,
-            Gaussian(self._tensor(mean), belief.covariance),
-            None,
-        )
-
-    def _gain(self, A: Array, B: Array) -> Array:
+    def gain(self, A: Array, B: Array) -> Array:
+        """K (m, n) of the ancillary feedback, from dmu+/dmu (n, n) and dmu+/du (n, m)."""
         problem = self.problem
         return lqr_gain(A, B, problem.Q, problem.R, problem.terminal, self.horizon)
 

@@ -5,6 +5,7 @@ the last plan that was solved, moved on in time as if it had been made one step 
 first input. A plan that is used up holds its last input.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -65,12 +66,58 @@ def command(
     """
     check_policy(on_failure)
     plan = None if last is None else last.plan
-    status, decision = Status.INVALID_MEASUREMENT, None
-    if bool(torch.isfinite(belief.mean).all() and torch.isfinite(belief.covariance).all()):
-        decision = controller.control(belief, reference, plan)
-        status = decision.status
-        if status.solved:
-            return Command(decision.input, status, decision, decision)
+    decision = controller.control(belief, reference, plan) if is_known(belief) else None
+    return concluded(controller, decision, reference, last, on_failure, step)
+
+
+def commands(
+    controller: Controller,
+    beliefs: Sequence[Gaussian],
+    reference: Reference,
+    last: Sequence[Command | None],
+    on_failure: OnFailure = "raise",
+    step: int = 0,
+) -> list[Command | SolverFailure]:
+    """``command`` for many systems that follow one reference; where it would raise ``SolverFailure``, that instead.
+
+    A controller with ``control_many`` is asked once for all of them.
+    """
+    check_policy(on_failure)
+    asked = [t for t, belief in enumerate(beliefs) if is_known(belief)]
+    plans = [None if command is None else command.plan for command in last]
+    many = getattr(controller, "control_many", None)
+    if many is None:
+        found = [controller.control(beliefs[t], reference, plans[t]) for t in asked]
+    else:
+        found = many([beliefs[t] for t in asked], [reference] * len(asked), [plans[t] for t in asked])
+    decisions = dict(zip(asked, found, strict=True))
+    outcomes: list[Command | SolverFailure] = []
+    for t, before in enumerate(last):
+        try:
+            outcomes.append(concluded(controller, decisions.get(t), reference, before, on_failure, step))
+        except SolverFailure as failure:
+            outcomes.append(failure)
+    return outcomes
+
+
+def is_known(belief: Gaussian) -> bool:
+    """Whether a controller may be asked: every entry is finite."""
+    return bool(torch.isfinite(belief.mean).all() and torch.isfinite(belief.covariance).all())
+
+
+def concluded(
+    controller: Controller,
+    decision: Decision | None,
+    reference: Reference,
+    last: Command | None,
+    on_failure: OnFailure,
+    step: int,
+) -> Command:
+    """What comes of a controller's decision, or of its not being asked (None); see ``command``."""
+    plan = None if last is None else last.plan
+    status = Status.INVALID_MEASUREMENT if decision is None else decision.status
+    if status.solved:
+        return Command(decision.input, status, decision, decision)
     if on_failure == "raise":
         raise SolverFailure(step, status.advice)
     if plan is not None and plan.status.solved:

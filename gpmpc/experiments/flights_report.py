@@ -16,7 +16,7 @@ from rich.text import Text
 
 from gpmpc.experiments.tables_report import markdown_table, number
 from gpmpc.metrics import binomial_interval, time_quantiles
-from gpmpc.plotting import Curve, over_settings, tracking
+from gpmpc.plotting import Curve, over_settings, png, tracking
 
 STYLE = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0), "title_justify": "left", "title_style": "bold"}
 ERRORS = ("x - reference [m]", "y - reference [m]", "z - reference [m]")
@@ -254,7 +254,7 @@ def pictures(rows: Sequence[Summary], records: Sequence[dict]) -> dict[str, byte
                 elif there:
                     shown.append((labels, [_curve(r, "states", range(0, 6, 2)) for r in there]))
             if shown:
-                found[f"{figure}{suffix}.png"] = _png(tracking(shown))
+                found[f"{figure}{suffix}.png"] = png(tracking(shown))
         inputs = [
             (
                 tuple(f"{trajectory}: {label}" for label in INPUTS),
@@ -263,12 +263,12 @@ def pictures(rows: Sequence[Summary], records: Sequence[dict]) -> dict[str, byte
             for trajectory in dict.fromkeys(r["trajectory"] for r in chosen)
         ]
         if inputs:
-            found[f"figure4{suffix}.png"] = _png(tracking(inputs))
+            found[f"figure4{suffix}.png"] = png(tracking(inputs))
     curves = (
         ("horizon.png", _over_horizon(rows), "horizon H", {"logarithmic": True}),
         ("confidence.png", _over_confidence(rows), "allowed rate 1 - eta", {"diagonal": True}),
     )
-    return found | {name: _png(over_settings(panels, at, **how)) for name, panels, at, how in curves if panels}
+    return found | {name: png(over_settings(panels, at, **how)) for name, panels, at, how in curves if panels}
 
 
 def _flies(record: dict) -> bool:
@@ -318,9 +318,3 @@ def _over_confidence(rows: Sequence[Summary]) -> dict[str, list[Curve]]:
                 curve = Curve(f"{name}, H = {H}, {label}", at, rates[:, None], interval=ends)
                 panels.setdefault(f"{trajectory}: rate of violations", []).append(curve)
     return panels
-
-
-def _png(figure: object) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150)
-    return buffer.getvalue()

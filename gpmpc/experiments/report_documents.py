@@ -13,7 +13,7 @@ from rich.table import Table
 
 from gpmpc.experiments.report import MEASURES, Cell, Report, in_order
 from gpmpc.experiments.tables_report import number
-from gpmpc.plotting import Series, over_variable
+from gpmpc.plotting import Series, over_variable, png
 
 DRAWN = ("rmse", "failed", "decision")  # the panels of a figure
 SHOWN = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
@@ -137,9 +137,7 @@ def figures(report: Report) -> dict[str, bytes]:
                     values[cell.values[index]] += cell.numbers(name)
                 series.append(Series(label, list(values.values())))
             panels.append((MEASURES[name].label, MEASURES[name].logarithmic, series))
-        buffer = io.BytesIO()
-        over_variable(variable, positions, panels).savefig(buffer, format="png", dpi=130)
-        drawn[f"over-{variable.replace('/', '-')}.png"] = buffer.getvalue()
+        drawn[f"over-{variable.replace('/', '-')}.png"] = png(over_variable(variable, positions, panels), dpi=130)
     return drawn
 
 

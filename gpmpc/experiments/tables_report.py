@@ -15,7 +15,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from gpmpc.plotting import Panel, error_over_size
+from gpmpc.plotting import Panel, error_over_size, png
 
 MEASURES = {"training_mse": "training MSE", "test_mse": "test MSE", "average_variance": "average variance"}
 CALIBRATION = {
@@ -263,9 +263,7 @@ def _figure(draws: Sequence[dict]) -> bytes:
         printed = paper_figures().get((*name, draw["size"]))
         if printed:
             panel.paper[draw["size"]] = float(printed["test_mse"])
-    buffer = io.BytesIO()
-    error_over_size(list(panels.values()), "test MSE").savefig(buffer, format="png", dpi=150)
-    return buffer.getvalue()
+    return png(error_over_size(list(panels.values()), "test MSE"))
 
 
 def _in_sections(

@@ -348,6 +348,13 @@ class GPPosterior:
         squares = torch.linalg.solve_triangular(self.cholesky, columns, upper=False).square().sum(-2)
         return squares.mT.unflatten(0, k.shape[:-2])
 
+    def solved(self, k: Tensor) -> Tensor:
+        """(K_a + sn2_a I)^-1 k_a (*batch, k, N) of k (*batch, k, N), likewise."""
+        if k.dim() == 2:
+            return torch.cholesky_solve(k[..., None], self.cholesky)[..., 0]
+        columns = k.flatten(0, -3).movedim(0, -1)  # (k, N, batch)
+        return torch.cholesky_solve(columns, self.cholesky).movedim(-1, 0).unflatten(0, k.shape[:-2])
+
     def _correlations(self, state: Tensor, input: Tensor | None) -> tuple[Tensor, Tensor]:
         """k(x~_i, x~) (*batch, k, N) and (x~_i - x~) / l (*batch, k, N, d)."""
         input = state[..., :0] if input is None else input

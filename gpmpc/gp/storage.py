@@ -159,7 +159,10 @@ def _checked(path: Path, tensors: dict, shapes: dict[str, tuple], dtype: torch.d
         value = tensors[name]
         if tuple(value.shape) != shape or value.dtype != dtype:
             raise DataError(f"{path}: {name} must be {dtype} {shape}; got {value.dtype} {tuple(value.shape)}")
-        if not all(np.isfinite(part.numpy(force=True)).all() for part in (value if value.dim() == 3 else [value])):
+        if not all(
+            np.isfinite(part.to(torch.float64).numpy(force=True)).all()
+            for part in (value if value.dim() == 3 else [value])
+        ):
             raise DataError(f"{path}: {name} must be finite; got {float(value[~torch.isfinite(value)][0])}")
     return {name: tensors[name] for name in shapes}
 

@@ -1,7 +1,7 @@
 """The systems that are controlled."""
 
 from gpmpc.plants.coupled import Coupled, attitude_at_yaw, thrust_direction
-from gpmpc.plants.plant import Dynamics, Integrated, Map, Plant, step
+from gpmpc.plants.plant import Dynamics, Integrated, Map, Plant, step, step_many
 from gpmpc.plants.quadrotor import ATTITUDES, Rotational, Translational, attitude_for_thrust_direction
 
 __all__ = [
@@ -16,5 +16,6 @@ __all__ = [
     "attitude_at_yaw",
     "attitude_for_thrust_direction",
     "step",
+    "step_many",
     "thrust_direction",
 ]

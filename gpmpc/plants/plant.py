@@ -105,3 +105,9 @@ class Integrated:
 def step(plant: Plant, state: np.ndarray, input: np.ndarray) -> np.ndarray:
     """The next state (n,) of a plant from a state (n,) and an input (m,)."""
     return np.array(plant.successor(state, input), dtype=float)
+
+
+def step_many(plant: Plant, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+    """The next states (T, n) of T copies of a plant, from states (T, n) and inputs (T, m), in one evaluation."""
+    entries = plant.successor(states.T, inputs.T)
+    return np.stack([np.broadcast_to(np.asarray(entry, dtype=float), len(states)) for entry in entries], axis=1)

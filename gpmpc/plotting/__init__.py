@@ -4,8 +4,11 @@ Every function returns a ``Figure`` made without pyplot, so nothing global is to
 """
 
 from gpmpc.plotting.animation import animate, ffmpeg_exists
+from gpmpc.plotting.image import png
+from gpmpc.plotting.quality import quality
 from gpmpc.plotting.recorded import inputs_figure, timing_figure, tracking_figure
 from gpmpc.plotting.results import Curve, Panel, calibration_figure, error_over_size, over_settings, tracking
+from gpmpc.plotting.speed import speed
 from gpmpc.plotting.sweeps import Series, over_variable
 
 __all__ = [
@@ -19,6 +22,9 @@ __all__ = [
     "inputs_figure",
     "over_settings",
     "over_variable",
+    "png",
+    "quality",
+    "speed",
     "timing_figure",
     "tracking",
     "tracking_figure",

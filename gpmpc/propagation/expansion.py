@@ -1,4 +1,4 @@
-"""Problem: what linearised propagation and its derivatives need of a model at one point, from compiled loops."""
+"""Problem: what linearised propagation and its derivatives need of a model at one point, from one evaluation."""
 
 from typing import NamedTuple
 
@@ -34,16 +34,35 @@ class Expansion(NamedTuple):
 
 
 def expand(model: DynamicsModel, state: Tensor, input: Tensor) -> Expansion | None:
-    """The expansion of a ``GPPosterior``; None for other models, and where torch has to follow."""
-    if not isinstance(model, GPPosterior) or (arrays := host_arrays(model.weights, state, input)) is None:
+    """The expansion of a ``GPPosterior``, compiled or by torch; None for other models."""
+    if not isinstance(model, GPPosterior):
         return None
-    from gpmpc import fused  # loads numba
+    if (arrays := host_arrays(model.weights, state, input)) is None:
+        parts = _by_torch(model, state, input)
+    else:
+        from gpmpc import fused  # loads numba
 
-    batch = state.shape[:-1]
-    flat = arrays[1].reshape(-1, model.state_dim)
-    found = fused.point_with_jacobian(model.packed, flat, arrays[2].reshape(len(flat), model.input_dim))
-    parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found[:8]]
+        batch = state.shape[:-1]
+        flat = arrays[1].reshape(-1, model.state_dim)
+        found = fused.point_with_jacobian(model.packed, flat, arrays[2].reshape(len(flat), model.input_dim))
+        parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found[:8]]
     mean, A = parts[0] + model.offset, parts[2]
     if model.predicts == "difference":
-        mean, A = mean + state, A + torch.eye(model.state_dim, dtype=A.dtype)
+        mean, A = mean + state, A + torch.eye(model.state_dim, dtype=A.dtype, device=A.device)
     return Expansion(Gaussian(mean, torch.diag_embed(parts[1])), A, *parts[3:])
+
+
+def _by_torch(model: GPPosterior, state: Tensor, input: Tensor) -> list[Tensor]:
+    """The first eight entries of ``fused.Expansion``."""
+    n, inverse_squares = model.state_dim, model.lengthscales**-2
+    difference = (model.features - torch.cat([state, input], dim=-1)[..., None, :])[..., None, :, :]
+    z = difference * inverse_squares[:, None, :]  # (*batch, k, N, d)
+    k = model.signal_variance[:, None] * torch.exp(-(z * difference).sum(-1) / 2)
+    weighted, explained_by = model.weights * k, model.solved(k)
+    jacobian = (weighted[..., None, :] @ z)[..., 0, :]
+    variance_by = -2 * ((explained_by * k)[..., None, :] @ z)[..., 0, :]
+    own = torch.diag_embed(inverse_squares)[:, :n]
+    second = (weighted[..., None] * z[..., :n]).mT @ z - weighted.sum(-1)[..., None, None] * own
+    variance = (model.signal_variance - model.explained(k)).clamp_min(0)
+    parts = [half for whole in (jacobian, variance_by, second) for half in (whole[..., :n], whole[..., n:])]
+    return [weighted.sum(-1), variance, *parts]

@@ -21,7 +21,7 @@ is small. Here each product is centred before it is summed, which loses nothing:
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -63,15 +63,19 @@ class MomentMatching:
 
     def differentiate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None
-    ) -> tuple[Propagation, Sensitivity] | None:
-        """``propagate`` with all derivatives in closed form; None where only torch can follow."""
+    ) -> tuple[Propagation, Sensitivity]:
+        """``propagate`` with all derivatives in closed form, compiled or by torch."""
+        from gpmpc.propagation.moment_derivatives import moments_with_jacobian  # which builds on this module
+
         input = checked_input(model, belief, input)
         composition = self._composition(model)
         seen, control = composition.seen(belief, input)
         arrays = host_arrays(composition.f.weights, seen.mean, seen.covariance, control)
+        cross = composition.A is not None
         if arrays is None:
-            return None
-        f = self._compiled(composition.f, seen.mean.shape[:-1], arrays[1:], composition.A is not None)
+            f = moments_with_jacobian(composition.f, seen, control, self.diagonal, cross)
+        else:
+            f = self._compiled(composition.f, seen.mean.shape[:-1], arrays[1:], cross)
         sensitivity = composition.sensitivity(belief.covariance, f)
         if self.diagonal:
             sensitivity = sensitivity.of_variances()
@@ -114,54 +118,115 @@ class MomentMatching:
         return Propagation(Gaussian(mean, covariance), cross, deficit)
 
 
+class Seen(NamedTuple):
+    """The training points as seen from a belief, one row an output; the letters are those of the module's text.
+
+    Attributes:
+        D: The diagonals of Lam_a^-1 (k, n).
+        z: (*batch, k, N, n).
+        control: u_i - u (*batch, 1, N, m).
+        q: (*batch, k, N).
+        log_q: (*batch, k, N).
+        half_logdet: 1/2 log|I + S Lam_a^-1| (*batch, k).
+        inverse: G_a = (I + S Lam_a^-1)^-1 (*batch, k, n, n).
+        T: (*batch, k, n, n).
+    """
+
+    D: Tensor
+    z: Tensor
+    control: Tensor
+    q: Tensor
+    log_q: Tensor
+    half_logdet: Tensor
+    inverse: Tensor
+    T: Tensor
+
+
+class Pairs(NamedTuple):
+    """The pairs of outputs a <= b with delta_ij = rise_i - fall_j + left_i . z_bj; P of them.
+
+    Attributes:
+        a: (P,).
+        b: (P,).
+        rise: (*batch, P, N).
+        fall: (*batch, P, N).
+        left: (*batch, P, N, n).
+        inverse: G_ab = (I + S (Lam_a^-1 + Lam_b^-1))^-1 (*batch, P, n, n).
+    """
+
+    a: list[int]
+    b: list[int]
+    rise: Tensor
+    fall: Tensor
+    left: Tensor
+    inverse: Tensor
+
+
 def moments(
     model: GPPosterior, belief: Gaussian, input: Tensor, diagonal: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
     """M (*batch, k), V (*batch, k, k) and J = E[df/dx] (*batch, k, n) of the latent functions f; the module's text."""
-    n, k = model.state_dim, model.output_dim
-    S = belief.covariance[..., None, :, :]  # (*batch, 1, n, n), one copy an output or pair
-    inverse_squares = model.lengthscales[:, :n].square().reciprocal()  # the diagonals of Lam_a^-1, (k, n)
-    nu = (model.features[:, :n] - belief.mean[..., None, :])[..., None, :, :]  # (*batch, 1, N, n)
-    control = (model.features[:, n:] - input[..., None, :])[..., None, :, :] / model.lengthscales[:, None, n:]
-    z = nu * inverse_squares[:, None, :]  # (*batch, k, N, n)
-
-    half_logdet, factor, T = _against(S, inverse_squares)
-    root = inverse_squares.sqrt()
-    whitened = torch.linalg.solve_triangular(factor, (nu * root[:, None, :]).mT, upper=False)
-    log_q = (
-        model.signal_variance.log()[:, None]
-        - (control.square().sum(-1) + whitened.square().sum(-2)) / 2
-        - half_logdet[..., None]
-    )  # (*batch, k, N)
-    q = log_q.exp()
-    mean = (model.weights * q).sum(-1) + model.offset
-    slope = ((model.weights * q)[..., None, :] @ z)[..., 0, :]
-    slope = root * torch.cholesky_solve((slope / root)[..., None], factor)[..., 0]
-
-    a, b = torch.triu_indices(k, k, device=nu.device)  # the pairs of outputs a <= b
-    if diagonal:
-        a = b = torch.arange(k, device=nu.device)
-    half_logdet_ab, _, T_ab = _against(S, inverse_squares[a] + inverse_squares[b])
-    z_a, z_b = z[..., a, :, :], z[..., b, :, :]
-    of_i = _quadratic(z_a, T_ab @ (inverse_squares[b][:, :, None] * T[..., a, :, :])) / 2
-    of_j = _quadratic(z_b, T_ab @ (inverse_squares[a][:, :, None] * T[..., b, :, :])) / 2
-    r = half_logdet[..., a] + half_logdet[..., b] - half_logdet_ab
-    of_i, z_a = r[..., None] - of_i, z_a @ T_ab
-    explained = model.explained(q)
-
-    entries = {}
-    for pair, (i, j) in enumerate(zip(a.tolist(), b.tolist(), strict=True)):  # one at a time: (N, N) fits the cache
-        delta = of_i[..., pair, :, None] - of_j[..., pair, None, :] + z_a[..., pair, :, :] @ z_b[..., pair, :, :].mT
-        centred = _centred_product(log_q[..., i, :, None] + log_q[..., j, None, :], delta)
+    seen = see(model, belief, input)
+    pairs = pair(belief, seen, diagonal)
+    weighted = model.weights * seen.q
+    mean = weighted.sum(-1) + model.offset
+    slope = (weighted[..., None, :] @ seen.z @ seen.inverse)[..., 0, :]
+    explained = model.explained(seen.q)
+    entries = []
+    for p, (i, j) in enumerate(zip(pairs.a, pairs.b, strict=True)):  # one at a time: (N, N) fits the cache
+        centred = centred_products(seen, pairs, p)
         entry = ((centred @ model.weights[j]) * model.weights[i]).sum(-1)
         if i == j:
             reduction = (model.precision[i] * centred).sum((-2, -1))
             entry = entry + model.signal_variance[i] - explained[..., i] - reduction
-        entries[i, j] = entries[j, i] = entry
+        entries.append(entry)
+    return mean, gathered(entries, pairs, model.output_dim), slope
+
+
+def see(model: GPPosterior, belief: Gaussian, input: Tensor) -> Seen:
+    """Whatever each output has alone."""
+    n = model.state_dim
+    D = model.lengthscales[:, :n].square().reciprocal()
+    nu = (model.features[:, :n] - belief.mean[..., None, :])[..., None, :, :]  # (*batch, 1, N, n)
+    control = (model.features[:, n:] - input[..., None, :])[..., None, :, :]
+    half_logdet, factor, T = _against(belief.covariance[..., None, :, :], D)
+    whitened = torch.linalg.solve_triangular(factor, (nu * D.sqrt()[:, None, :]).mT, upper=False)
+    certain = (control / model.lengthscales[:, None, n:]).square().sum(-1)
+    exponent = (certain + whitened.square().sum(-2)) / 2
+    log_q = model.signal_variance.log()[:, None] - exponent - half_logdet[..., None]
+    return Seen(D, nu * D[:, None, :], control, log_q.exp(), log_q, half_logdet, _inverse(factor, D), T)
+
+
+def pair(belief: Gaussian, seen: Seen, diagonal: bool) -> Pairs:
+    """Whatever each pair has that is no larger than the points; with ``diagonal`` the pairs a = b alone."""
+    k, D, z = len(seen.D), seen.D, seen.z
+    a, b = torch.triu_indices(k, k, device=z.device)
     if diagonal:
-        return mean, torch.diag_embed(torch.stack([entries[i, i] for i in range(k)], dim=-1)), slope
-    rows = [torch.stack([entries[i, j] for j in range(k)], dim=-1) for i in range(k)]
-    return mean, torch.stack(rows, dim=-2), slope
+        a = b = torch.arange(k, device=z.device)
+    half_logdet, factor, T = _against(belief.covariance[..., None, :, :], D[a] + D[b])
+    z_a, z_b = z[..., a, :, :], z[..., b, :, :]
+    of_i = _quadratic(z_a, T @ (D[b][:, :, None] * seen.T[..., a, :, :])) / 2
+    of_j = _quadratic(z_b, T @ (D[a][:, :, None] * seen.T[..., b, :, :])) / 2
+    r = seen.half_logdet[..., a] + seen.half_logdet[..., b] - half_logdet
+    return Pairs(a.tolist(), b.tolist(), r[..., None] - of_i, of_j, z_a @ T, _inverse(factor, D[a] + D[b]))
+
+
+def centred_products(seen: Seen, pairs: Pairs, p: int) -> Tensor:
+    """q_ai q_bj expm1(delta_ij) (*batch, N, N) of the pair p."""
+    i, j = pairs.a[p], pairs.b[p]
+    delta = pairs.left[..., p, :, :] @ seen.z[..., j, :, :].mT
+    delta = delta + (pairs.rise[..., p, :, None] - pairs.fall[..., p, None, :])
+    return _centred_product(seen.log_q[..., i, :, None] + seen.log_q[..., j, None, :], delta)
+
+
+def gathered(entries: Sequence[Tensor], pairs: Pairs, k: int) -> Tensor:
+    """A symmetric matrix (*batch, k, k, ...) from its entries (*batch, ...), a pair each; zero where there is none."""
+    places = {}
+    for p, place in enumerate(zip(pairs.a, pairs.b, strict=True)):
+        places[place] = places[place[::-1]] = entries[p]
+    nothing, first = torch.zeros_like(entries[0]), entries[0].dim() - len(pairs.rise.shape[:-2])
+    rows = [torch.stack([places.get((i, j), nothing) for j in range(k)], -1 - first) for i in range(k)]
+    return torch.stack(rows, -2 - first)
 
 
 def _against(S: Tensor, D: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -174,6 +239,13 @@ def _against(S: Tensor, D: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     half_logdet = torch.linalg.eigvalsh(B).log1p().sum(-1) / 2
     factor = torch.linalg.cholesky(B + torch.eye(B.shape[-1], dtype=B.dtype, device=B.device))
     return half_logdet, factor, torch.cholesky_solve(B, factor) / (root[..., :, None] * root[..., None, :])
+
+
+def _inverse(factor: Tensor, D: Tensor) -> Tensor:
+    """(I + S D)^-1 from the factor of I + B."""
+    root, eye = D.sqrt(), torch.eye(D.shape[-1], dtype=D.dtype, device=D.device)
+    inverse = torch.cholesky_solve(eye.expand_as(factor), factor)  # cholesky_inverse has no right forward derivative
+    return inverse * (root[..., None, :] / root[..., :, None])
 
 
 def _quadratic(z: Tensor, M: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """Closed loops: a controller on a plant or on a model, with noise, disturbances and many seeds."""
 
+from gpmpc.simulation.batched_loop import closed_loops
 from gpmpc.simulation.cascade_loop import CascadeRollout, cascade_loop
 from gpmpc.simulation.disturbances import Disturbance, Dropout, Gust, Replaced
 from gpmpc.simulation.loop import Rollout, Step, closed_loop
@@ -20,6 +21,7 @@ __all__ = [
     "Trial",
     "cascade_loop",
     "closed_loop",
+    "closed_loops",
     "tell",
     "trials",
 ]

@@ -18,7 +18,7 @@ from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.plants import Coupled, Plant
 from gpmpc.simulation.disturbances import Disturbance
-from gpmpc.simulation.loop import Rollout, Step, checked_references, rollout, window
+from gpmpc.simulation.loop import Rollout, Step, checked_references, kept, rollout, window
 from gpmpc.simulation.systems import Noise, RunningPlant
 
 OUTER, INNER = slice(0, 6), slice(6, 12)
@@ -144,8 +144,8 @@ def _rollouts(taken: Sequence[CascadeStep], ratio: int, references: Reference, t
     return CascadeRollout(
         states=np.array([*(step.state for step in whole), last.next_state]),
         inputs=np.array([step.input for step in whole]),
-        outer=rollout(outer, references, ratio * time_step),
-        inner=rollout(inner, attitudes, time_step),
+        outer=rollout([kept(step) for step in outer], references, ratio * time_step, outer[-1].next_state),
+        inner=rollout([kept(step) for step in inner], attitudes, time_step, inner[-1].next_state),
     )
 
 

@@ -8,11 +8,11 @@ after the step and outside of everything that is timed.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpmpc.control.controller import Controller, Decision, Reference, Timing
+from gpmpc.control.controller import Controller, Reference, Timing
 from gpmpc.control.supervision import Command, OnFailure, check_policy, command
 from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.plants import Plant
@@ -140,11 +140,12 @@ def closed_loop(
     taken, last = [], None
     for k in range(steps):
         ahead = window(references, k, controller.horizon)
-        taken.append(one_step(running, controller, ahead, last, on_failure, k, round(k * system.time_step, 9)))
-        last = taken[-1].command
+        step = one_step(running, controller, ahead, last, on_failure, k, round(k * system.time_step, 9))
+        taken.append(kept(step))
+        last = step.command
         if on_step is not None:
-            on_step(taken[-1])
-    return rollout(taken, references, system.time_step, running.covariance)
+            on_step(step)
+    return rollout(taken, references, system.time_step, running.mean, running.covariance)
 
 
 def one_step(
@@ -164,29 +165,57 @@ def one_step(
     return Step(k, time, state, covariance, measured, reference, asked, acted, running.mean)
 
 
+class Kept(NamedTuple):
+    """What a ``Rollout`` keeps of a step: none of its quadratic program, and one row of its plan."""
+
+    state: np.ndarray
+    covariance: np.ndarray
+    measured: np.ndarray
+    input: np.ndarray
+    expected: np.ndarray  # mean of the next state; NaN where nothing was solved
+    expected_covariance: np.ndarray
+    status: Status
+    iterations: int
+    timing: Timing
+
+
+def kept(step: Step) -> Kept:
+    """See ``Kept``."""
+    decision, n = step.command.decision, len(step.state)
+    expected, covariance = np.full(n, np.nan), np.full((n, n), np.nan)
+    iterations, timing = 0, Timing(0.0, 0.0, 0.0)
+    if decision is not None:
+        iterations, timing = decision.iterations, decision.timing
+        if decision.status.solved:
+            expected, covariance = np.array(decision.means[1]), np.array(decision.covariances[1])
+    taken = (step.state, step.covariance, step.measured, step.input, expected, covariance)
+    return Kept(*taken, step.command.status, iterations, timing)
+
+
 def rollout(
-    steps: Sequence[Step], references: Reference, time_step: float, final_covariance: np.ndarray | None = None
+    steps: Sequence[Kept],
+    references: Reference,
+    time_step: float,
+    final: np.ndarray,
+    final_covariance: np.ndarray | None = None,
 ) -> Rollout:
-    """The arrays of all steps; the last state's covariance (n, n) is zero by default."""
-    last = steps[-1].next_state
-    n, nothing = len(last), Timing(0.0, 0.0, 0.0)
+    """The arrays of all steps, and the last state (n,); its covariance (n, n) is zero by default."""
+    n = len(final)
     final_covariance = np.zeros((n, n)) if final_covariance is None else final_covariance
-    decisions: list[Decision | None] = [step.command.decision for step in steps]
-    expected = [d if d is not None and d.status.solved else None for d in decisions]
     rows = references.states[: len(steps) + 1]
     if len(rows) == len(steps):
         rows = np.concatenate([rows, rows[-1:]])
     return Rollout(
-        states=np.array([*(step.state for step in steps), last]),
+        states=np.array([*(step.state for step in steps), final]),
         covariances=np.array([*(step.covariance for step in steps), final_covariance]),
         measured=np.array([step.measured for step in steps]),
         inputs=np.array([step.input for step in steps]),
         references=np.array(rows, dtype=float),
-        predicted_means=np.array([np.full(n, np.nan) if d is None else d.means[1] for d in expected]),
-        predicted_covariances=np.array([np.full((n, n), np.nan) if d is None else d.covariances[1] for d in expected]),
-        statuses=tuple(step.command.status for step in steps),
-        iterations=np.array([0 if d is None else d.iterations for d in decisions]),
-        timings=tuple(nothing if d is None else d.timing for d in decisions),
+        predicted_means=np.array([step.expected for step in steps]),
+        predicted_covariances=np.array([step.expected_covariance for step in steps]),
+        statuses=tuple(step.status for step in steps),
+        iterations=np.array([step.iterations for step in steps]),
+        timings=tuple(step.timing for step in steps),
         time_step=time_step,
     )
 

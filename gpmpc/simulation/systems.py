@@ -138,14 +138,26 @@ class RunningPlant:
         Raises:
             Diverged: The next state is not finite.
         """
-        plant, input = self._acting(time), self._noisy("input", input)
+        plant, input = self.act(time, input)
         with np.errstate(over="ignore", invalid="ignore"):
             state = step(plant, self.mean, input)
+        self.arrive(state, input)
+        return input
+
+    def act(self, time: float, input: np.ndarray) -> tuple[Plant, np.ndarray]:
+        """The first half of ``apply``: the plant that is there at this time, and the input that acts on it (m,)."""
+        return self._acting(time), self._noisy("input", input)
+
+    def arrive(self, state: np.ndarray, input: np.ndarray) -> None:
+        """The second half: where that plant went under that input.
+
+        Raises:
+            Diverged: The state is not finite.
+        """
         if not np.isfinite(state).all():
             raise Diverged(self._steps, f"the plant's state is not finite any more; it was {self.mean}, input {input}")
         self.mean = self._noisy("process", state)
         self._steps += 1
-        return input
 
     def _acting(self, time: float) -> Plant:
         plant = self.plant

@@ -60,20 +60,13 @@ def trials(
         SettingError: No seeds, a seed twice, or a worker count below 1.
         GpmpcError: A worker process died.
     """
-    if isinstance(seeds, int | np.integer):
-        check_number("seeds", int(seeds), least=1, whole=True)
-        seeds = range(int(seeds))
-    seeds = [int(seed) if isinstance(seed, np.integer) else seed for seed in seeds]
-    for seed in seeds:
-        check_number("seeds", seed, least=0, whole=True)
-    if not seeds or len(set(seeds)) < len(seeds):
-        raise SettingError("seeds", f"must be one or more different whole numbers; got {seeds}")
+    seeds = checked_seeds(seeds)
     if workers is not None:
         check_number("workers", workers, least=1, whole=True)
     run = partial(_run, trial)
     serial = (workers or cores()) == 1 or len(seeds) == 1
     found: dict[int, Trial] = {}
-    with _bar(label, len(seeds), progress) as advance:
+    with progress_bar(label, len(seeds), progress) as advance:
         try:
             with closing(_here(run, seeds) if serial else in_processes(run, seeds, workers)) as finished:
                 for index, outcome in finished:
@@ -87,6 +80,28 @@ def trials(
     return [found[index] for index in range(len(seeds))]
 
 
+def checked_seeds(seeds: int | Sequence[int]) -> list[int]:
+    """The seeds one by one.
+
+    Raises:
+        SettingError: There are none, or one is there twice or is no whole number from 0 on.
+    """
+    if isinstance(seeds, int | np.integer):
+        check_number("seeds", int(seeds), least=1, whole=True)
+        seeds = range(int(seeds))
+    seeds = [int(seed) if isinstance(seed, np.integer) else seed for seed in seeds]
+    for seed in seeds:
+        check_number("seeds", seed, least=0, whole=True)
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise SettingError("seeds", f"must be one or more different whole numbers; got {seeds}")
+    return seeds
+
+
+def failed(seed: int, error: Exception) -> Trial:
+    """The trial of a seed that came to nothing."""
+    return Trial(f"seed {seed}", seed, None, f"{type(error).__name__}: {error}")
+
+
 def _run(trial: Callable[[int], Any], seed: int) -> Trial:
     """One trial; its error is a result like any other, so that the others go on."""
     threads = torch.get_num_threads()
@@ -94,7 +109,7 @@ def _run(trial: Callable[[int], Any], seed: int) -> Trial:
     try:
         return Trial(f"seed {seed}", seed, trial(seed), None)
     except Exception as error:
-        return Trial(f"seed {seed}", seed, None, f"{type(error).__name__}: {error}")
+        return failed(seed, error)
     finally:
         torch.set_num_threads(threads)
 
@@ -105,7 +120,7 @@ def _here(run: Callable[[int], Trial], seeds: Sequence[int]) -> Iterator[tuple[i
 
 
 @contextmanager
-def _bar(label: str, total: int, shown: bool) -> Iterator[Callable[[], None]]:
+def progress_bar(label: str, total: int, shown: bool) -> Iterator[Callable[[], None]]:
     """One progress bar, or none; gives the function to call after every trial."""
     if not shown:
         yield lambda: None

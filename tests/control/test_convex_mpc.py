@@ -182,7 +182,7 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
     problem, reference = quadrotor_problem(state_bounds=limits), at_origin(H)
     state = np.array([0.8, -0.1, -0.4, 0.1, 0.3, 0.0])
     model = gp(20 if isinstance(moves, MomentMatching) else 60)
-    controller = ConvexMPC(model, moves, problem, H, HOVER, "trajectory", covariance, iterations=30)
+    controller = ConvexMPC(model, moves, problem, H, HOVER, "trajectory", covariance, iterations=30, tolerance=1e-8)
     kappa = 0.0 if covariance == "none" else limits.kappa
     merits, search = [], controller._search
 
@@ -193,8 +193,8 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
         outside = (rows[:, :3] - 0.9).clamp_min(0).sum() + (-0.35 - rows[:, 3:]).clamp_min(0).sum()
         return cost, rows, outside, u, means
 
-    def watched(request, prediction, inputs, proposed, slope, price):
-        found = search(request, prediction, inputs, proposed, slope, price)
+    def watched(request, prediction, inputs, reached, proposed, slope, price):
+        found = search(request, prediction, inputs, reached, proposed, slope, price)
         merits.append([(cost + price * out).item() for cost, _, out, _, _ in (exact(inputs), exact(found[0]))])
         return found
 
@@ -202,7 +202,7 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
     decision = controller.control(Gaussian.certain(state), reference)
     assert decision.status is Status.SOLVED
     assert 2 < decision.iterations < 25
-    assert all(later <= earlier + 1e-10 for earlier, later in merits[1:])  # the first guess breaks the rates
+    assert all(later <= earlier * (1 + 1e-8) for earlier, later in merits[1:])  # the first guess breaks the rates
     cost, rows, outside, u, means = exact(decision.inputs)
     assert outside < 1e-6
     assert np.allclose(decision.means[1:], means.detach(), atol=1e-7)

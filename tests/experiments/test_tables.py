@@ -257,7 +257,7 @@ def test_the_full_rows_are_the_papers_on_the_authors_data(paper_data, tmp_path, 
 def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row(paper_data, tmp_path):
     """Why our own rotational rows differ: the authors' yaw channels are solver residue, ours are at rest."""
     from gpmpc.trajectories import Elliptical
-    from tests.test_datasets import NMPC_DATA
+    from tests.datasets.test_flights import NMPC_DATA
 
     class Mixed:
         def transitions(self, name, trajectory, subsystem):

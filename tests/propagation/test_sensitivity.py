@@ -40,14 +40,16 @@ PROPAGATORS = [
 ]
 
 
+@pytest.mark.parametrize("choice", ["auto", "torch"])
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("propagator", PROPAGATORS, ids=lambda p: f"{type(p).__name__}{sorted(vars(p).items())}")
-def test_closed_forms_are_autograds_derivatives(propagator, name, batch):
+def test_closed_forms_are_autograds_derivatives(propagator, name, batch, choice):
     gp, at = MODELS[name], belief(3)
     at = Gaussian(at.mean + 0.3 * draw(*batch, 3), at.covariance.expand(*batch, 3, 3).clone())
     control = draw(*batch, gp.input_dim)
-    moved, closed_form = differentiate(propagator, gp, at, control)
+    with evaluation(choice):
+        moved, closed_form = differentiate(propagator, gp, at, control)
     with evaluation("torch"):
         expected, automatic = by_autograd(propagator, gp, at, control)
     pairs = [(getattr(closed_form, part), getattr(automatic, part)) for part in vars(automatic)]
@@ -62,6 +64,28 @@ def test_closed_forms_are_autograds_derivatives(propagator, name, batch):
         assert torch.allclose(
             mine, other, rtol=1e-9, atol=1e-10 * max(1.0, float(other.abs().max()) if other.numel() else 1)
         )
+
+
+@pytest.mark.parametrize("propagator", [MeanEquivalence(), Linearization(), MomentMatching()], ids=str)
+def test_closed_forms_by_torch_can_be_differentiated_again(propagator):
+    gp, at, control = MODELS["difference"], belief(3), torch.zeros(2)
+    step = torch.tensor([1e-5, 0.0, 0.0])
+
+    def slope(mean):
+        return differentiate(propagator, gp, Gaussian(mean, at.covariance), control)[1].covariance_by_mean.sum()
+
+    mean = at.mean.clone().requires_grad_()
+    (curvature,) = torch.autograd.grad(slope(mean), mean)
+    numeric = (slope(at.mean + step) - slope(at.mean - step)) / 2e-5
+    assert torch.allclose(curvature[0], numeric, rtol=1e-6, atol=1e-7)
+
+
+def test_nobody_has_derivatives_too():
+    nobody = Gaussian(draw(0, 3), draw(0, 3, 3))
+    with evaluation("torch"):
+        for propagator in PROPAGATORS:
+            _, d = differentiate(propagator, MODELS["difference"], nobody, draw(0, 2))
+            assert d.covariance_by_covariance.shape == (0, 3, 3, 3, 3)
 
 
 def test_the_evaluation_can_be_forced_and_refuses_what_it_cannot_do():

@@ -40,9 +40,10 @@ class Asked:
     decision: Decision
 
 
-def trained(trajectory: str, subsystem: str = "translational") -> GPPosterior:
-    """GPs on 189 transitions of a dithered flight."""
+def trained(trajectory: str, subsystem: str = "translational", size: int = 189) -> GPPosterior:
+    """GPs on 189 transitions of a dithered flight, or on some of them."""
     data = DATA.transitions(trajectory, TRAJECTORIES[trajectory], subsystem)
+    data = data[sorted(np.random.default_rng(0).permutation(len(data))[:size].tolist())]
     return TRAINER(data, seed=0).posterior
 
 

@@ -1,0 +1,137 @@
+"""How many trials a second fly together, and one at a time.
+
+    .venv/bin/python benchmarks/batched.py [--device cuda] [--sizes 10 50 189] [--trials 1 10 50 200] [--steps 3]
+
+The quadrotor's translational subsystem with the plant in the loop, H = 10. *alone*: ``closed_loop``, a trial after
+the other, the model in host memory (compiled loops). *together*: ``closed_loops`` with the model on ``--device``; on
+the CPU that is the same compiled loops, asked for all trials at once. *torch*: the same by the torch expressions that
+answer on a GPU, here on the CPU. *mean* and *linearised* are the ``trajectory`` form with H stages a step;
+*moment-matched* is the paper's form with one exact Jacobian a step.
+
+One process, one thread on the host, in turns; process time, on a GPU wall time. Trials alone are independent: no more
+than ``--alone`` of them are flown and their time is scaled. Ratios are paired; above 1 the crowd is faster. Writes
+``outputs/benchmarks/batched-DEVICE.json``.
+"""
+
+import argparse
+import json
+import os
+import time
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[variable] = "1"
+
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+import torch
+from quadrotor_flights import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
+
+from gpmpc.control.convex_mpc import ConvexMPC
+from gpmpc.gp import GPPosterior, evaluation
+from gpmpc.propagation import Linearization, MomentMatching
+from gpmpc.provenance import provenance
+from gpmpc.simulation import closed_loop, closed_loops
+from gpmpc.trajectories import states_along
+
+HORIZON = 10
+TORCH_LIMIT = 2_000_000  # T N^2 of exact moments above which torch on the CPU is left out: minutes a flight
+MODES = {
+    "mean": {"propagator": Linearization(), "covariance": "none"},
+    "linearised": {"propagator": Linearization(), "covariance": "zero_order"},
+    "moment-matched": {"propagator": MomentMatching(), "covariance": "full", "form": "increment"},
+}
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--modes", choices=MODES, nargs="+", default=list(MODES))
+    parser.add_argument("--sizes", type=int, nargs="+", default=[10, 50, 189])
+    parser.add_argument("--trials", type=int, nargs="+", default=[1, 10, 50, 200])
+    parser.add_argument("--steps", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--alone", type=int, default=10)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    results = []
+    print("trials a second (median); over alone: median of paired ratios, and its least")
+    print(f"{'':16}{'N':>5}{'T':>5}{'alone':>10}{'together':>10}{'torch':>10}{'over alone: together':>24}{'torch':>16}")
+    for name in arguments.modes:
+        for size in arguments.sizes:
+            gp = trained("elliptical", size=size)
+            for trials in arguments.trials:
+                results.append(
+                    {"mode": name, "size": size, "trials": trials} | measured(gp, MODES[name], trials, arguments)
+                )
+                show(results[-1])
+    path = Path(f"outputs/benchmarks/batched-{arguments.device.replace(':', '')}.json")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    meta = provenance() | {"threads": 1, "device": arguments.device, "horizon": HORIZON, "steps": arguments.steps}
+    if arguments.device != "cpu":
+        meta["device_name"] = torch.cuda.get_device_name(arguments.device)
+    path.write_text(json.dumps({"meta": meta, "results": results}, indent=1))
+    print(f"written to {path}")
+
+
+def measured(gp: GPPosterior, mode: dict, trials: int, arguments: argparse.Namespace) -> dict:
+    """Trials a second and ratios to those alone at one number of trials."""
+    states = states_along(TRAJECTORIES["elliptical"], np.arange(arguments.steps + HORIZON + 1.0))
+    flight = {"references": states, "initial": states[0], "steps": arguments.steps, "noise": NOISE}
+    here = ConvexMPC(gp, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
+    there = here
+    if arguments.device != "cpu":
+        moved = gp.to(arguments.device)
+        there = ConvexMPC(moved, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
+
+    def alone() -> float:
+        flown = range(min(trials, arguments.alone))
+        for seed in flown:
+            closed_loop(OUTER, here, **flight, seed=seed)
+        return trials / len(flown)
+
+    def together(choice: str = "auto") -> float:
+        with nullcontext() if choice == "auto" else evaluation(choice):
+            flown = closed_loops(OUTER, there, **flight, seeds=trials)
+        errors = {trial.error for trial in flown if trial.error}
+        if errors:
+            raise SystemExit(f"a flight failed: {errors}")
+        return 1.0
+
+    ways = {"alone": alone, "together": together}
+    exact = isinstance(mode["propagator"], MomentMatching)
+    if arguments.device == "cpu" and not (exact and trials * len(gp) ** 2 > TORCH_LIMIT):
+        ways["torch"] = lambda: together("torch")
+    clock = time.process_time if arguments.device == "cpu" else time.perf_counter
+    seconds = {name: [] for name in ways}
+    for repeat in range(arguments.repeats + 1):
+        for name, way in ways.items():
+            began = clock()
+            share = way()
+            if repeat:  # the first compiles, or loads
+                seconds[name].append((clock() - began) * share)
+    taken = {name: np.array(values) for name, values in seconds.items()}
+    ratios = {name: taken["alone"] / values for name, values in taken.items() if name != "alone"}
+    return {
+        "trials_per_second": {name: trials / float(np.median(values)) for name, values in taken.items()},
+        "over_alone": {name: float(np.median(values)) for name, values in ratios.items()},
+        "over_alone_least": {name: float(values.min()) for name, values in ratios.items()},
+        "chunk": None if there.bytes_per_question is None else int(2**30 // there.bytes_per_question),
+    }
+
+
+def show(result: dict) -> None:
+    """One row of the table."""
+    row = f"{result['mode']:16}{result['size']:5}{result['trials']:5}"
+    for name in ("alone", "together", "torch"):
+        row += f"{result['trials_per_second'].get(name, np.nan):10.1f}"
+    for name, width in (("together", 14), ("torch", 6)):
+        middle, least = (result[key].get(name, np.nan) for key in ("over_alone", "over_alone_least"))
+        row += f"{middle:{width + 4}.2f} ({least:4.2f})"[: width + 12]
+    print(row, flush=True)
+
+
+if __name__ == "__main__":
+    main()

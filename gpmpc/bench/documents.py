@@ -1,0 +1,149 @@
+"""Problem: what was measured has to be read by people, by programs, and beside what was measured before.
+
+One measurement is one JSON document: where (machine, versions, commit), how (settings) and the rows, plain dictionaries
+that all have ``part``, ``what`` and ``median`` [ms]. Markdown and figures are made from it, and ratios of two of them.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gpmpc.exceptions import DataError
+
+TIMES = """Processor time of one thread in milliseconds. Contenders take turns, call by call; a call is one sample.
+*Flushed* calls come after a walk through memory that empties the core's own caches."""
+
+Row = Mapping[str, object]
+
+TIMES_OF = ("median", "p95", "p99", "max", "samples", "model", "build", "solve")
+RESULTS = ("unsolved", "ratio", "kkt", "cost", "rmse", "failed", "flights", "front", "lost", "peak_mb")
+
+
+def write_json(rows: Sequence[Row], machine: Mapping, settings: Mapping, provenance: Mapping) -> str:
+    """The document itself."""
+    meta = {"machine": machine, "settings": settings, "provenance": provenance}
+    return json.dumps({"gpmpc bench": 1, **meta, "rows": rows}, indent=1, allow_nan=True) + "\n"
+
+
+def read_json(path: str | Path) -> dict:
+    """A document that was written before.
+
+    Raises:
+        DataError: There is no such file, or it holds something else.
+    """
+    try:
+        found = json.loads(Path(path).read_text())
+    except OSError as error:
+        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise DataError(f"{path} is no JSON document of gpmpc bench: {error}") from error
+    if not isinstance(found, dict) or "gpmpc bench" not in found or not isinstance(found.get("rows"), list):
+        raise DataError(f"{path} is no JSON document of gpmpc bench")
+    return found
+
+
+def described(machine: Mapping) -> str:
+    """The machine in a sentence."""
+    caches = ", ".join(f"{level} {size}" for level, size in machine["caches"].items()) or "caches unknown"
+    load = "" if machine["load"] is None else f"; load when it began: {machine['load']}"
+    return (
+        f"{machine['processor']}, {machine['cores']} cores, {caches}; {machine['threads']} thread; "
+        f"{machine['dgemm_gflops']} GFlop/s in a matrix product, {machine['memory_gb_per_s']} GB/s from memory{load}"
+    )
+
+
+def markdown(rows: Sequence[Row], machine: Mapping) -> str:
+    """The document for people."""
+    sections = [f"# What it costs\n\n{described(machine)}.", TIMES]
+    steps = [row for row in rows if row["part"] in ("linearisation", "step")]
+    if steps:
+        sections += ["## Control steps\n\nMilliseconds, median (99 %).", steps_markdown(steps)]
+    for part in dict.fromkeys(row["part"] for row in rows if row["part"] not in ("linearisation", "step")):
+        sections += [f"## {part.capitalize()}", plain_markdown([row for row in rows if row["part"] == part])]
+    return "\n\n".join(sections) + "\n"
+
+
+def table(header: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown; all but the first column aligned to the right."""
+    lines = [header, ["---", *["---:"] * (len(header) - 1)], *cells]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def ms(value: float) -> str:
+    """Milliseconds with three digits."""
+    return f"{value:.3g}" if value < 100 else f"{value:.0f}"
+
+
+def steps_markdown(rows: Sequence[Row]) -> str:
+    """Part ``steps``: a table for every n and cache, sizes down, horizons across."""
+    sections = []
+    for cache, n in dict.fromkeys((row["cache"], row["n"]) for row in rows):
+        here = [row for row in rows if (row["cache"], row["n"]) == (cache, n)]
+        columns = list(dict.fromkeys((row["what"], row["H"]) for row in here))
+        found = {(row["N"], row["what"], row["H"]): row for row in here}
+        sizes = sorted({row["N"] for row in here})
+        header = ["", *(f"{N} points" for N in sizes)]
+        cells = []
+        for what, horizon in sorted(columns, key=lambda c: (c[1] is not None, [w for w, _ in columns].index(c[0]))):
+            name = what if horizon is None else f"{what}, H = {horizon}"
+            values = [found.get((N, what, horizon)) for N in sizes]
+            cells.append([name, *("" if v is None else f"{ms(v['median'])} ({ms(v['p99'])})" for v in values)])
+        sections.append(f"### n = {n}, m = {n // 2}, {cache} caches\n\n{table(header, cells)}")
+    return "\n\n".join(sections)
+
+
+def plain_markdown(rows: Sequence[Row]) -> str:
+    """Any other part: one table, a row a row, with every column that any of them has."""
+    columns = [c for c in dict.fromkeys(key for row in rows for key in row) if c != "part"]
+    return table(columns, [[_cell(row.get(column)) for column in columns] for row in rows])
+
+
+def compared(old: Mapping, new: Mapping) -> list[dict]:
+    """Ratios new / old of the medians of all rows that both documents have, the greatest first.
+
+    Beside each stands the ratio after the two machines' rates of a matrix product are divided out (``per_gflop``).
+    """
+    before = {_identity(row): row for row in old["rows"]}
+    speed = new["machine"]["dgemm_gflops"] / old["machine"]["dgemm_gflops"]
+    found = []
+    for row in new["rows"]:
+        same = before.get(_identity(row))
+        if same is None or not same.get("median") or not row.get("median"):
+            continue
+        ratio = row["median"] / same["median"]
+        sizes = {key: value for key, value in row.items() if not _measured(key)}
+        values = {"old": same["median"], "new": row["median"], "ratio": ratio, "per_gflop": ratio * speed}
+        found.append(sizes | values)
+    return sorted(found, key=lambda row: -row["ratio"])
+
+
+def compared_markdown(old: Mapping, new: Mapping) -> str:
+    """The same as a document, the medians of the ratios of every part first."""
+    rows = compared(old, new)
+    if not rows:
+        raise DataError("the two measurements have no row in common")
+    lines = [f"old: {described(old['machine'])}", f"new: {described(new['machine'])}", ""]
+    for part in dict.fromkeys(row["part"] for row in rows):
+        ratios = np.array([row["ratio"] for row in rows if row["part"] == part])
+        middle, low, high = np.quantile(ratios, [0.5, 0.05, 0.95])
+        lines.append(
+            f"{part}: new / old {middle:.2f} in the median of {len(ratios)} rows (90 %: {low:.2f} to {high:.2f})"
+        )
+    return "\n".join(lines) + "\n\n" + plain_markdown(rows)
+
+
+def _identity(row: Row) -> tuple:
+    return tuple(sorted((key, str(value)) for key, value in row.items() if not _measured(key)))
+
+
+def _measured(key: str) -> bool:
+    """Whether a column is a result; all others say what was measured. ``cost lorenz`` is one, as ``cost`` is."""
+    return key.split()[0] in TIMES_OF + RESULTS
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

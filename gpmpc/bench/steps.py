@@ -1,0 +1,178 @@
+"""Problem: what a control step costs over the size of the GPs, the horizon and the state's dimension.
+
+A cell is one n, N and H. A flight of the pendulums records questions, the beliefs and references of its steps; every
+controller answers them in turns, warm-started from its own last answer, as in a loop. ``model``, ``build`` and
+``solve`` are the medians of the decisions' own accounts (wall time); all other figures are processor time.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import cycle
+
+import numpy as np
+import torch
+
+from gpmpc.bench.pendulums import pendulum_gp, pendulum_plant, pendulum_references
+from gpmpc.bench.timing import Times, take_turns
+from gpmpc.control.controller import Controller, Decision, Reference
+from gpmpc.control.convex_mpc import ConvexMPC
+from gpmpc.control.tracking import TrackingProblem
+from gpmpc.exceptions import SettingError, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import GPPosterior
+from gpmpc.propagation import Linearization, MomentMatching, differentiate
+from gpmpc.simulation import closed_loop
+
+QUESTIONS = 40  # steps of the recorded flight
+STD = 0.01  # [rad, rad/s] of the beliefs: a full covariance is propagated, as with an estimator in the loop
+CACHES = ("hot", "flushed")
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Which cells are measured.
+
+    Attributes:
+        states: n; even.
+        sizes: N.
+        horizons: H.
+        caches: Among ``"hot"`` and ``"flushed"``.
+        seconds: Processor time a cell [s]; every controller answers ten times at least.
+        seed: Of the GPs' data.
+
+    Raises:
+        SettingError: A list is empty, or one of its entries is out of range.
+    """
+
+    states: Sequence[int]
+    sizes: Sequence[int]
+    horizons: Sequence[int]
+    caches: Sequence[str] = CACHES
+    seconds: float = 0.5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("states", "sizes", "horizons", "caches"):
+            if not isinstance(getattr(self, name), list | tuple) or not getattr(self, name):
+                raise SettingError(name, f"must be a list with something in it; got {getattr(self, name)!r}")
+        for n in self.states:
+            check_number("states", n, least=2, whole=True)
+            if n % 2:
+                raise SettingError("states", f"a pendulum has two states, so n is even; got {n}")
+        for name, least in (("sizes", 2), ("horizons", 1)):
+            for value in getattr(self, name):
+                check_number(name, value, least=least, whole=True)
+        for cache in self.caches:
+            if cache not in CACHES:
+                raise SettingError("caches", f"must be among {', '.join(CACHES)}; got {cache!r}")
+        check_number("seconds", self.seconds, above=0, unit="[s]")
+        check_number("seed", self.seed, least=0, whole=True)
+
+    def __len__(self) -> int:
+        """Rounds of measurement: for every n and N one of the GPs alone, and one for every horizon."""
+        return len(self.states) * len(self.sizes) * (1 + len(self.horizons)) * len(self.caches)
+
+
+def measure_steps(grid: Grid) -> Iterator[list[dict]]:
+    """Measures round after round, ``len(grid)`` of them, and yields the rows of each."""
+    for n in grid.states:
+        for size in grid.sizes:
+            gp = pendulum_gp(n, size, grid.seed)
+            for cache in grid.caches:
+                yield _linearisations(gp, cache, grid)
+                for horizon in grid.horizons:
+                    yield _whole_steps(gp, horizon, cache, grid)
+
+
+def controllers(gp: GPPosterior, horizon: int) -> dict[str, Controller]:
+    """The convex controllers that are compared, by name."""
+    m = gp.state_dim // 2
+    problem = TrackingProblem([10.0, 1.0] * m, [0.1] * m, input_lower=[-6.0] * m, input_upper=[6.0] * m)
+    asked = (problem, horizon, [0.0] * m)
+    return {
+        "paper's form": ConvexMPC(gp, MomentMatching(), *asked, form="increment", covariance="full"),
+        "zero order": ConvexMPC(gp, Linearization(), *asked),
+        "mean only": ConvexMPC(gp, Linearization(), *asked, covariance="none"),
+    }
+
+
+@dataclass
+class Answering:
+    """Puts recorded questions to a controller, one a call, in an endless round.
+
+    Attributes:
+        controller: Who answers.
+        questions: What is asked.
+        decisions: All answers so far.
+    """
+
+    controller: Controller
+    questions: Sequence[tuple[Gaussian, Reference]]
+    decisions: list[Decision] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._round = cycle(self.questions)
+
+    def __call__(self) -> Decision:
+        """The next answer, warm-started from the last one."""
+        last = self.decisions[-1] if self.decisions else None
+        self.decisions.append(self.controller.control(*next(self._round), last))
+        return self.decisions[-1]
+
+
+def recorded_questions(gp: GPPosterior, controller: Controller, steps: int) -> list[tuple[Gaussian, Reference]]:
+    """The beliefs and references of a flight of the pendulums under a controller."""
+    n, questions = gp.state_dim, []
+
+    class Recording:
+        horizon, problem = controller.horizon, controller.problem
+
+        def control(self, belief, reference, previous=None):
+            belief = Gaussian(belief.mean, STD**2 * torch.eye(n, dtype=torch.float64))
+            questions.append((belief, reference))
+            return controller.control(belief, reference, previous)
+
+    references = pendulum_references(n, steps + controller.horizon + 1)
+    closed_loop(pendulum_plant(n), Recording(), references, references[0], steps, on_failure="previous_plan")
+    return questions
+
+
+def _linearisations(gp: GPPosterior, cache: str, grid: Grid) -> list[dict]:
+    """The GPs alone: the mean, the EKF's terms, exact moments, each with all derivatives."""
+    n, exact = gp.state_dim, MomentMatching()
+    references = torch.from_numpy(pendulum_references(n, QUESTIONS))
+    covariance, input = STD**2 * torch.eye(n, dtype=torch.float64), torch.zeros(n // 2, dtype=torch.float64)
+
+    def asking(answer: Callable[[Gaussian], object]) -> Callable[[], object]:
+        beliefs = cycle([Gaussian(mean, covariance) for mean in references])
+        return lambda: answer(next(beliefs))
+
+    contenders = {
+        "mean": asking(lambda belief: gp.mean_with_jacobian(belief.mean, input)),
+        "mean and variance": asking(lambda belief: gp.predict_with_jacobian(belief.mean, input)),
+        "exact moments": asking(lambda belief: exact(gp, belief, input)),
+        "exact moments, all Jacobians": asking(lambda belief: differentiate(exact, gp, belief, input)),
+    }
+    times = take_turns(contenders, grid.seconds, least=10, flushed=cache == "flushed")
+    return [_row("linearisation", gp, None, cache, name, taken) for name, taken in times.items()]
+
+
+def _whole_steps(gp: GPPosterior, horizon: int, cache: str, grid: Grid) -> list[dict]:
+    """The controllers, from a belief to an input."""
+    contenders = controllers(gp, horizon)
+    questions = recorded_questions(gp, contenders["mean only"], QUESTIONS)
+    answering = {name: Answering(controller, questions) for name, controller in contenders.items()}
+    times = take_turns(answering, grid.seconds, least=10, flushed=cache == "flushed")
+    rows = []
+    for name, taken in times.items():
+        decisions = answering[name].decisions[-len(taken.seconds) :]
+        parts = {part: [getattr(d.timing, part) for d in decisions] for part in ("model", "build", "solve")}
+        row = _row("step", gp, horizon, cache, name, taken)
+        row |= {part: 1e3 * float(np.median(values)) for part, values in parts.items()}
+        rows.append(row | {"unsolved": sum(not d.status.solved for d in decisions)})
+    return rows
+
+
+def _row(part: str, gp: GPPosterior, horizon: int | None, cache: str, name: str, times: Times) -> dict:
+    sizes = {"n": gp.state_dim, "m": gp.state_dim // 2, "N": len(gp), "H": horizon}
+    return {"part": part, "what": name, **sizes, "cache": cache, **times.summary()}

@@ -1,0 +1,110 @@
+"""The figure of quality over time: what every controller pays in cost, and what its decisions take."""
+
+from collections.abc import Mapping, Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+SIZE = (9.0, 6.2)  # [in]: at 100 dots an inch as wide as a README
+COLOURS = (
+    "#111111", "#8c6d31", "#c0392b", "#e8871e", "#2e8b57", "#1f6fb4", "#79b8e8", "#12a5a5", "#d070b0", "#6a3d9a",
+)  # fmt: skip
+MARKERS = ("o", "^", "s", "D", "v", "P", "X")
+FRONT = "0.35"
+TICKS = (-1, 0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # [%]
+LINEAR = 1.0  # [%] of cost up to which the axis is linear
+
+
+def quality(rows: Sequence[Mapping]) -> Figure:
+    """Cost above NMPC on the true model over milliseconds a decision, with the front of the best.
+
+    A line is one choice of settings at growing horizons. The members of the front are numbered, and
+    named by what is typed after ``gpmpc run``.
+
+    Args:
+        rows: Of ``gpmpc.bench.quality``; lost ones are counted in the corner.
+    """
+    flown = [row for row in rows if row["lost"] is None]
+    families, horizons = list(dict.fromkeys(row["family"] for row in rows)), sorted({row["H"] for row in rows})
+    colours = {family: COLOURS[i % len(COLOURS)] for i, family in enumerate(families)}
+    markers = {horizon: MARKERS[i % len(MARKERS)] for i, horizon in enumerate(horizons)}
+    figure = Figure(figsize=SIZE, layout="constrained")
+    axis = figure.subplots()
+    axis.axhline(0, color=COLOURS[0], linewidth=0.8, linestyle=(0, (5, 3)), zorder=1)
+    for words in dict.fromkeys(row["what"] for row in flown):
+        line = sorted((row for row in flown if row["what"] == words), key=lambda row: row["H"])
+        colour, at = colours[line[0]["family"]], [(row["median"], _excess(row)) for row in line]
+        axis.plot(*zip(*at, strict=True), color=colour, linewidth=0.9, alpha=0.4, zorder=2)
+        for row, (x, y) in zip(line, at, strict=True):
+            axis.plot(x, y, markers[row["H"]], color=colour, markersize=5.5, zorder=3)
+    _scales(axis, flown)
+    _front(axis, [row for row in flown if row["front"]])
+    _legends(axis, colours, markers, len(rows) - len(flown))
+    return figure
+
+
+def _excess(row: Mapping) -> float:
+    """[%]."""
+    return 100 * (row["cost"] - 1)
+
+
+def _scales(axis: Axes, rows: Sequence[Mapping]) -> None:
+    axis.set_xscale("log")
+    axis.set_yscale("symlog", linthresh=LINEAR, linscale=0.4)
+    axis.set_xlabel("median time of a decision [ms], one thread")
+    axis.set_ylabel("closed-loop cost above NMPC on the true model")
+    axis.xaxis.set_major_locator(LogLocator(10, (1, 2, 5)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
+    values = [_excess(row) for row in rows] or [0.0]
+    low, high = min(values), max(values)
+    reach = [tick for tick in TICKS if low * 1.5 - 1 <= tick <= high * 1.5 + 1]
+    axis.set_yticks(reach, [f"{tick:+d} %" if tick else "0" for tick in reach])
+    axis.yaxis.set_minor_locator(NullLocator())
+    axis.set_ylim(min(1.5 * low, 0) - 0.4, 1.7 * max(high, LINEAR))
+    times = [row["median"] for row in rows] or [1.0]
+    axis.set_xlim(min(times) / 1.7, max(times) * 1.6)
+    axis.grid(color="0.92")
+    axis.set_axisbelow(True)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _front(axis: Axes, members: Sequence[Mapping]) -> None:
+    """A stair that nobody is below of; its members are numbered, and named under the axis."""
+    members = sorted(members, key=lambda row: (row["median"], -row["cost"]))
+    if not members:
+        return
+    at = [(row["median"], _excess(row)) for row in members]
+    right, top = axis.get_xlim()[1], axis.get_ylim()[1]
+    stair = [(at[0][0], top)]
+    for x, y in at:
+        stair += [(x, stair[-1][1]), (x, y)]
+    axis.plot(*zip(*stair, (right, at[-1][1]), strict=True), color=FRONT, linewidth=1.4, zorder=1.5)
+    axis.set_xlim(right=right)
+    axis.set_ylim(top=top)
+    for number, (x, y) in enumerate(at, 1):
+        axis.plot(x, y, "o", markersize=11, markerfacecolor="none", markeredgecolor=FRONT, markeredgewidth=1.2)
+        # Below and left of a member of the front there is nobody.
+        axis.annotate(str(number), (x, y), (-6, -8), textcoords="offset points", ha="right", va="center", weight="bold")
+    names = [f"{number}  {row['what']} horizon={row['H']}" for number, row in enumerate(members, 1)]
+    axis.figure.legend(
+        handles=[Line2D([], [], linestyle="none", label=name) for name in names],
+        loc="outside lower left",
+        frameon=False,
+        handlelength=0,
+        prop={"family": "monospace", "size": 8.5},
+    )
+
+
+def _legends(axis: Axes, colours: Mapping[str, str], markers: Mapping[int, str], lost: int) -> None:
+    """Families by colour above, horizons by marker inside."""
+    plain = {"linestyle": "none", "markersize": 5.5}
+    families = [Line2D([], [], color=colour, marker="o", **plain, label=name) for name, colour in colours.items()]
+    families.append(Line2D([], [], color=FRONT, linewidth=1.4, label="front: none is better and faster"))
+    axis.figure.legend(handles=families, loc="outside upper center", ncols=4, frameon=False, fontsize=8.5)
+    horizons = [Line2D([], [], color="0.4", marker=kind, **plain, label=f"H = {H}") for H, kind in markers.items()]
+    axis.legend(handles=horizons, loc="upper right", ncols=len(markers), frameon=False, fontsize=8.5, handletextpad=0.1)
+    if lost:
+        axis.text(0.99, 0.9, f"lost: {lost}", transform=axis.transAxes, ha="right", va="top", color=FRONT)
