@@ -8,6 +8,10 @@ W (s^0 - r) + ..., s^0 the response to no input at all: (38)-(39) of Cao, Lai an
 paper's unknowns are the increments dU = D U; in U the same problem has the input bounds as a box. Bounds on the
 increments are rows.
 
+A stage-structured (Riccati) factorisation costs O(H), and a pair of its recursions for every working constraint. With
+n = 6, m = 3 and nothing working, condensing with the dense factor takes 0.9 of its time at H = 30, 1.1 at H = 50 and 2.4
+at H = 100; where constraints work, condensing gains. So every horizon is condensed.
+
 Multiplying the stacked matrices out costs O(H^3). Here it is O(H^2): Gamma is made a stage at a time, and with the cost
 to go M_H = W_H, M_k = W_k + A_k' M_{k+1} A_k of a system without input, block (k, i <= k) of P is 2 B_k' M_{k+1}
 Gamma_{k+1,i} (Andersson, 2013; Axehill, 2015, show that this order is reached). Where A
