@@ -9,8 +9,8 @@ paper's unknowns are the increments dU = D U; in U the same problem has the inpu
 increments are rows.
 
 A stage-structured (Riccati) factorisation costs O(H), and a pair of its recursions for every working constraint. With
-n = 6, m = 3 and nothing working, condensing with the dense factor takes 0.9 of its time at H = 30, 1.1 at H = 50 and 2.4
-at H = 100; where constraints work, condensing gains. So every horizon is condensed.
+n = 6, m = 3 and nothing working, condensing with the dense factor takes 0.9 of its time at H = 30, 1.1 at H = 50 and
+2.4 at H = 100; where constraints work, condensing gains. So every horizon is condensed.
 
 Multiplying the stacked matrices out costs O(H^3). Here it is O(H^2): Gamma is made a stage at a time, and with the cost
 to go M_H = W_H, M_k = W_k + A_k' M_{k+1} A_k of a system without input, block (k, i <= k) of P is 2 B_k' M_{k+1}
@@ -96,12 +96,22 @@ class Condenser:
             last: u_{-1} (m,), used where R weighs increments.
         """
         H, m = self.horizon, len(last)
-        q, values = np.zeros((H, m)), np.zeros((H, rows.shape[1]))
-        if self.problem.penalized == "deviations":
-            q -= 2 * wanted @ self.problem.R
-        elif self.problem.penalized == "increments":
-            q[0] -= 2 * last @ self.problem.R
-        _slope(A, B, c, start, rows, targets, self._weight, self._terminal, q, values)
+        q, values = np.zeros((H, m)), np.empty((H, rows.shape[1]))
+        centre = {"inputs": wanted[:0], "deviations": wanted, "increments": last[None]}[self.problem.penalized]
+        _slope(
+            A,
+            B,
+            c,
+            start,
+            rows,
+            targets,
+            self._weight,
+            self._terminal,
+            np.ascontiguousarray(centre),
+            self.problem.R,
+            q,
+            values,
+        )
         return q.ravel(), values
 
     def bounds(self, last: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
@@ -302,13 +312,17 @@ def _mirror(P):
 
 
 @compiled
-def _slope(A, B, c, start, rows, targets, W, T, q, values):
-    """Adds 2 Gamma' W (s^0 - r) to q by the adjoint recursion, and writes E s^0 to ``values``."""
+def _slope(A, B, c, start, rows, targets, W, T, centre, R, q, values):
+    """Adds 2 Gamma' W (s^0 - r) - 2 R centre to q by the adjoint recursion, and writes E s^0 to ``values``."""
     held, held_rows = len(A) - 1, len(rows) - 1
     H, n = targets.shape
     p, m, r = B.shape[1], B.shape[2], rows.shape[1]
     free, nothing = np.empty((H + 1, p)), np.zeros((H, m))
     respond(A, B, c, start, nothing, free)
+    for k in range(len(centre)):
+        for i in range(m):
+            for j in range(m):
+                q[k, i] -= 2.0 * R[i, j] * centre[k, j]
     W, T = _widened(W), _widened(T)
     error, slope, pulled = np.empty(p), np.zeros(p + 8), np.zeros(p)
     for k in range(H - 1, -1, -1):

@@ -39,6 +39,7 @@ from gpmpc.fused.point_rows import (
     multiply,
     project,
     second_moments,
+    summed,
     transform,
 )
 
@@ -147,7 +148,7 @@ def evaluate_single(belief, D, signal, beta, a, single, n):
             z[c, j] = D[c] * nu[c, j]
     transform(T, z, moved, n)
     project(single.weighted[a], z, single.first[a])
-    return single.weighted[a].sum()
+    return summed(single.weighted[a])
 
 
 @compiled
@@ -165,7 +166,7 @@ def differentiate_single(belief, D, a, single, solved, n, M, to, work, x, y):
         to.dM_du[a, c] = controls[c] * D[R + c]
 
     multiply(solved, single.q[a], e)
-    single.e_total[a] = e.sum()
+    single.e_total[a] = summed(e)
     project(e, single.z[a], single.e_first[a])
     second_moments(e, single.z[a], single.e_second[a], n, work[0])
     project(e, control, controls)

@@ -15,7 +15,7 @@ import numpy as np
 
 from gpmpc.compiled import borrowing, compiled
 from gpmpc.fused.exponential import exp_all
-from gpmpc.fused.point_rows import LINE, aligned_rows, combine, explain, multiply, project
+from gpmpc.fused.point_rows import LINE, aligned_rows, combine, explain, multiply, project, summed
 
 JACOBIAN, HESSIAN = 1, 2  # how much is wanted: up to second derivatives of M, up to third
 
@@ -69,7 +69,7 @@ def means_along(points, inverse_squares, log_signal, beta, queries, n, memory, o
             D, answer = inverse_squares[a], out[h, a]
             correlate(log_signal[a], D, squares, sums, k)
             multiply(k, beta[a], k)
-            answer[0] = k.sum()
+            answer[0] = summed(k)
             project(k, difference, sums)
             for c in range(len(answer) - 1):
                 row = c if c < n else c + skipped
@@ -99,7 +99,7 @@ def expand_at(gp, x, u, memory, kept, place, M, J, J_u):
         D, k = inverse_squares[a], kept[a, place]
         correlate(log_signal[a], D, squares, sums, k)
         multiply(k, beta[a], weighted)
-        M[a] = weighted.sum()
+        M[a] = summed(weighted)
         project(weighted, difference, sums)
         for c in range(n):
             J[a, c] = D[c] * sums[c]
@@ -133,7 +133,7 @@ def points_along(order, points, inverse_squares, log_signal, beta, inverse_chole
                 dvar_du[h, a, c] = -2 * D[U + c] * sums[U + c]
 
             multiply(k, beta[a], weighted)
-            M[h, a] = weighted.sum()
+            M[h, a] = summed(weighted)
             project(weighted, difference, sums)
             J, J_u = dM_dx[h, a], dM_du[h, a]
             for c in range(n):
