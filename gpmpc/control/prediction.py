@@ -32,6 +32,7 @@ from gpmpc.control.request import Request
 from gpmpc.control.stage_models import is_first_order, stage_model
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
+from gpmpc.fused.extended import roots
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.gp.evaluation import host_arrays, point_arrays
@@ -135,9 +136,9 @@ class Predictor:
     def state(self, mean: Array, covariance: Array) -> Array:
         """The vectors s (*batch, p) of beliefs."""
         if self.covariance == "full":
-            eigenvalues, vectors = np.linalg.eigh(covariance)
-            root = (vectors * np.sqrt(eigenvalues.clip(0))[..., None, :]) @ vectors.mT
-            return np.concatenate((mean, root.reshape(*mean.shape[:-1], -1)), axis=-1)
+            S = np.empty(covariance.shape)
+            roots(np.ascontiguousarray(covariance).reshape(-1, *S.shape[-2:]), S.reshape(-1, *S.shape[-2:]))
+            return np.concatenate((mean, S.reshape(*mean.shape[:-1], -1)), axis=-1)
         if self.covariance == "diagonal":
             variance = np.diagonal(covariance, axis1=-2, axis2=-1)
             return np.concatenate([mean, np.sqrt(np.clip(variance, 0, None))], axis=-1)

@@ -62,6 +62,13 @@ def extended_models(means, covariances, inputs, next_means, next_covariances, de
 
 
 @compiled
+def roots(covariances, out):
+    """Writes the symmetric roots of covariances (H, n, n)."""
+    for h in range(len(covariances)):
+        root(covariances[h], out[h])
+
+
+@compiled
 def root(covariance, out):
     """Writes the symmetric root; returns its eigenvalues and eigenvectors."""
     r, U = np.linalg.eigh(covariance)
