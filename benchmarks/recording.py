@@ -133,7 +133,8 @@ def writer_cost(steps: list[Step], settings: dict) -> float:
         "z_down": True,
         "start_time_ns": 0,
     } | settings
-    frames = [wire.pack(step, len(STATES), len(INPUTS))[FRAME.size :] for step in steps * 10]
+    packed = [wire.pack(step, len(STATES), len(INPUTS)) for step in steps]
+    frames = [head[FRAME.size :] + b"".join(arrays) for head, arrays, _ in packed] * 10
     with tempfile.TemporaryFile() as file:
         writer = StepWriter(file, setup)
         writer.write(frames[0])

@@ -18,7 +18,21 @@ TIMES = """Processor time of one thread in milliseconds. Contenders take turns, 
 Row = Mapping[str, object]
 
 TIMES_OF = ("median", "p95", "p99", "max", "samples", "model", "build", "solve")
-RESULTS = ("unsolved", "ratio", "kkt", "cost", "rmse", "failed", "flights", "front", "lost", "peak_mb")
+RESULTS = (
+    "unsolved",
+    "ratio",
+    "kkt",
+    "kkt_worst",
+    "within",
+    "ratio_warm",
+    "cost",
+    "rmse",
+    "failed",
+    "flights",
+    "front",
+    "lost",
+    "peak_mb",
+)
 
 
 def write_json(rows: Sequence[Row], machine: Mapping, settings: Mapping, provenance: Mapping) -> str:
@@ -61,7 +75,11 @@ def markdown(rows: Sequence[Row], machine: Mapping) -> str:
     if steps:
         sections += ["## Control steps\n\nMilliseconds, median (99 %).", steps_markdown(steps)]
     for part in dict.fromkeys(row["part"] for row in rows if row["part"] not in ("linearisation", "step")):
-        sections += [f"## {part.capitalize()}", plain_markdown([row for row in rows if row["part"] == part])]
+        here = [row for row in rows if row["part"] == part]
+        sections.append(f"## {part.capitalize()}")
+        for kind in dict.fromkeys(row.get("kind") for row in here):
+            sections += [f"### {kind.capitalize()}"] if kind else []
+            sections.append(plain_markdown([row for row in here if row.get("kind") == kind]))
     return "\n\n".join(sections) + "\n"
 
 
@@ -96,7 +114,11 @@ def steps_markdown(rows: Sequence[Row]) -> str:
 
 def plain_markdown(rows: Sequence[Row]) -> str:
     """Any other part: one table, a row a row, with every column that any of them has."""
-    columns = [c for c in dict.fromkeys(key for row in rows for key in row) if c != "part"]
+    columns = [
+        c
+        for c in dict.fromkeys(key for row in rows for key in row)
+        if c not in ("part", "kind", "tolerance", "lost", "family")
+    ]
     return table(columns, [[_cell(row.get(column)) for column in columns] for row in rows])
 
 

@@ -27,7 +27,7 @@ class Plan(NamedTuple):
 
 def gpytorch_model(gp: GPPosterior) -> BatchExactGP:
     """The GPyTorch model that a posterior could have come from, frozen; its predictions lack the posterior's offset."""
-    model = BatchExactGP(gp.features, gp.targets)
+    model = BatchExactGP(gp.features, gp.targets - gp.offset)  # its prior mean is zero
     deviation, noise = gp.signal_variance.log() / 2, gp.noise_variance.log() / 2
     model.set_hyperparameters(torch.cat([gp.lengthscales.log(), torch.stack([deviation, deviation - noise], 1)], 1))
     return model.eval().requires_grad_(False)

@@ -13,8 +13,8 @@ one another:
 * ``linearisation``: one prediction with derivatives, compiled and by automatic differentiation.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ from gpmpc.control.controller import Controller, Decision, Timing
 from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.control.tracking import TrackingProblem
+from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.propagation import Linearization
@@ -47,7 +48,6 @@ PATIENCE = 10  # horizon above which those are left out that take minutes
 
 Solve = Callable[[Question, Any], Any]
 """From a question and the last answer (None at first) to an answer, which has ``inputs`` (H, m)."""
-Tell = Callable[[str], None]
 
 
 class Pilot:
@@ -144,39 +144,57 @@ def one_program(gp: GPPosterior, problem: TrackingProblem, horizon: int) -> list
     return groups
 
 
-def measure_peers(horizons: Sequence[int], seconds: float, tell: Tell = print) -> list[dict]:
-    """Times of ours and theirs, as plain rows.
+@dataclass(frozen=True)
+class Comparison:
+    """How much of a comparison.
 
-    A row has ``part``, ``kind``, ``what``, ``horizon`` (None for ``linearisation``), the summary of its ``Times`` [ms],
+    Attributes:
+        horizons: H.
+        seconds: Processor time of each group of contenders [s]; those that take seconds a solve take three calls' time.
+
+    Raises:
+        SettingError: A number out of range, or no horizon.
+    """
+
+    horizons: Sequence[int] = (1, 10, 20)
+    seconds: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.horizons, list | tuple) or not self.horizons:
+            raise SettingError("horizons", f"must be a list with something in it; got {self.horizons!r}")
+        for horizon in self.horizons:
+            check_number("horizons", horizon, least=1, whole=True)
+        check_number("seconds", self.seconds, above=0, unit="[s]")
+
+    def __len__(self) -> int:
+        """Groups of contenders: two of either kind at every horizon, and the linearisations."""
+        return 4 * len(self.horizons) + 1
+
+
+def measure_peers(comparison: Comparison) -> Iterator[list[dict]]:
+    """Times of ours and theirs: yields the rows of every group of contenders, ``len(comparison)`` of them.
+
+    A row has ``part``, ``kind``, ``what``, ``H`` (None for ``linearisation``), the summary of its ``Times`` [ms],
     and ``ratio``, the median over ours of the same turns. Plans have the common residual, ``kkt`` (median) and
     ``kkt_worst``; converged ones ``tolerance``, and ``within``, the share of them that is. Where ours is there twice,
     the first comes after a contender that has emptied the caches, the second right after the first, and ``ratio_warm``
     is the one over that. What is not installed has a ``note`` instead of all that.
-
-    Args:
-        horizons: H.
-        seconds: Processor time of each group of contenders [s]; those that take seconds a solve take three calls' time.
-        tell: Is told what happens.
-
-    Raises:
-        SettingError: No time.
     """
-    tell("peers: training the GPs, flying the questions")
-    gp, task, rows = trained(TRAJECTORY), peers_problem(), []
-    for horizon in horizons:
+    gp, task = trained(TRAJECTORY), peers_problem()
+    for horizon in comparison.horizons:
         questions = questions_of_a_flight(gp, task, horizon, STEPS)
         for kind, groups in (("one program", one_program), ("converged", converged)):
             for number, group in enumerate(groups(gp, task, horizon)):
                 least = FEW if kind == "converged" and number else 2 * FEW
-                rows += _measured(kind, group, gp, task, horizon, questions, (seconds, least), tell)
+                yield _measured(kind, group, gp, task, horizon, questions, (comparison.seconds, least))
     at = Gaussian(questions[len(questions) // 2].belief.mean, STD**2 * torch.eye(gp.state_dim, dtype=torch.float64))
+    rows = []
     for group in linearisation_groups(gp, at, torch.tensor(HOVER, dtype=torch.float64), reverse_mode=True):
-        tell(f"peers: linearisation, {', '.join(group)}")
-        times = take_turns(group, seconds, least=FEW)
+        times = take_turns(group, comparison.seconds, least=FEW)
         ours = next(iter(times.values()))
-        common = {"part": "peers", "kind": "linearisation", "horizon": None}
+        common = {"part": "peers", "kind": "linearisation", "H": None}
         rows += [common | {"what": name, **t.summary(), "ratio": t.over(ours)} for name, t in times.items()]
-    return rows
+    yield rows
 
 
 def _measured(
@@ -187,19 +205,17 @@ def _measured(
     horizon: int,
     questions: Sequence[Question],
     patience: tuple[float, int],
-    tell: Tell,
 ) -> list[dict]:
     """The rows of one group that takes turns, for a time and a number of rounds."""
     pilots = {}
     for name, make in group.items():
         if make is not None:
-            tell(f"peers: {kind}, H = {horizon}: {name}")
             pilots[name] = Pilot(make(), questions)
     times = take_turns(pilots, patience[0], least=patience[1])
     ours, rows = next(iter(times.values())), []
     warm = next((taken for name, taken in times.items() if name.endswith(WARM)), None)
     for name in group:
-        row = {"part": "peers", "kind": kind, "what": name, "horizon": horizon}
+        row = {"part": "peers", "kind": kind, "what": name, "H": horizon}
         if name not in times:
             rows.append(row | {"note": peer_do_mpc.MISSING})
             continue

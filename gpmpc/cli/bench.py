@@ -60,6 +60,13 @@ def _steps(settings: dict) -> tuple[int, Iterable[Sequence[dict]]]:
     return len(grid), measure_steps(grid)
 
 
+def _peers(settings: dict) -> tuple[int, Iterable[Sequence[dict]]]:
+    from gpmpc.bench.peers import Comparison, measure_peers
+
+    comparison = Comparison(**settings["peers"])
+    return len(comparison), measure_peers(comparison)
+
+
 def _quality(settings: dict) -> tuple[int, Iterable[Sequence[dict]]]:
     from gpmpc.bench.contenders import contenders
     from gpmpc.bench.quality import Field, measure_quality
@@ -68,7 +75,11 @@ def _quality(settings: dict) -> tuple[int, Iterable[Sequence[dict]]]:
     return len(field), measure_quality(field)
 
 
-PARTS: dict[str, Callable[[dict], tuple[int, Iterable[Sequence[dict]]]]] = {"steps": _steps, "quality": _quality}
+PARTS: dict[str, Callable[[dict], tuple[int, Iterable[Sequence[dict]]]]] = {
+    "steps": _steps,
+    "peers": _peers,
+    "quality": _quality,
+}
 
 
 def _figures(rows: Sequence[dict]) -> dict[str, bytes]:

@@ -31,7 +31,7 @@ def report(arguments: list[str]) -> None:
     from gpmpc.files import write_whole
 
     found = put_together(given.tree)
-    lines = sentences(compare(found, *given.compare), *given.compare) if given.compare else []
+    lines = sentences(found, compare(found, *given.compare), *given.compare) if given.compare else []
     folder = given.to or given.tree / "report"
     written = documents(found, lines)
     try:

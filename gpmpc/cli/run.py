@@ -3,7 +3,7 @@
 import shlex
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,8 +21,10 @@ if TYPE_CHECKING:
     from gpmpc.experiments.run_folder import RunFolder
 
 ASIDE = ("launcher", "folder")  # settings that a result does not depend on
-GROUPS = ("data", "trajectory", "plant", "model", "controller", "propagation", "solver")
-UNITS = dict.fromkeys("xyz", "m") | {"vx": "m/s", "vy": "m/s", "vz": "m/s", "U1": "N", "ux": "1", "uy": "1"}
+GROUPS = ("data", "trajectory", "subsystem", "plant", "model", "controller", "propagation", "solver")
+UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s") | {"ux": "1", "uy": "1"}
+UNITS |= dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys("pqr", "rad/s")
+UNITS |= dict.fromkeys(("U1", "U2", "U3", "U4"), "N")
 MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
 PATIENCE = 10.0  # with the writer of a recording whose run was killed a moment ago [s]
 
@@ -38,8 +40,7 @@ def run(config: DictConfig) -> None:
         experiment_of(config)  # what a user can get wrong is found out before anything is written
         outcome = fly_one(config)
     if "error" in outcome:
-        where = f" (traceback: {outcome['folder']}/error.json)" if outcome["kept"] else ""
-        print(f"gpmpc: {outcome['error']}{where}", file=sys.stderr)
+        print(f"gpmpc: {outcome['error']} (traceback: {outcome['folder']}/error.json)", file=sys.stderr)
         sys.exit(2 if outcome["mistake"] else 1)
     console.print(summary(outcome["result"]))
     state = "finished before" if outcome["skipped"] else "written to"
@@ -55,7 +56,7 @@ def fly_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
 
     Raises:
         Busy: Another process works on it, and ``wait`` is false.
-        SettingError: The folder cannot be written.
+        SettingError: The folder cannot be written, or holds a finished run of other settings.
     """
     import torch
     from threadpoolctl import threadpool_limits
@@ -63,14 +64,13 @@ def fly_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
     from gpmpc.experiments.run_folder import RunFolder, folder_name, record
 
     overrides = HydraConfig.get().overrides.task
-    options = {group: HydraConfig.get().runtime.choices.get(group) for group in GROUPS}
     folder = RunFolder(Path(checked_folder(config)) / folder_name(choices(overrides)))
     outcome = {"folder": str(folder.path), "skipped": False}
     try:
         with folder.claimed(wait):
-            settings = plain_settings(config, options)
+            settings = plain_settings(config, HydraConfig.get().runtime.choices)
             if folder.finished:
-                return outcome | {"skipped": True} | _found(folder, settings)
+                return outcome | {"skipped": True, "result": check_same(folder, settings)}
             about = record(choices(overrides), settings, command_of(overrides))
             torch.set_num_threads(1)  # the same sums in the same order, whatever the launcher
             try:
@@ -80,7 +80,7 @@ def fly_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
                 folder.finish(result)
             except Exception as error:
                 folder.fail(error, about)
-                return outcome | {"error": reason_of(error), "mistake": isinstance(error, MISTAKES), "kept": True}
+                return outcome | {"error": reason_of(error), "mistake": isinstance(error, MISTAKES)}
     except OSError as error:
         raise SettingError("folder", f"cannot write to {folder.path}: {error.strerror or error}") from error
     return outcome | {"result": result}
@@ -144,11 +144,12 @@ def experiment_of(config: DictConfig) -> "Experiment":
     checked_folder(config)
     if config.recorder not in ("mcap", "none", None):
         raise SettingError("recorder", f"must be 'mcap' or 'none'; got {config.recorder!r}")
-    for group in ("data", "trajectory", "plant", "model", "controller"):
+    for group in ("data", "trajectory", "subsystem", "plant", "model", "controller"):
         if not config.get(group):
             raise SettingError(group, "choose one")
-    if len(config.trajectory) != 1:
-        raise SettingError("trajectory", f"choose one; got {', '.join(config.trajectory)}")
+    for group in ("trajectory", "subsystem"):
+        if len(config[group]) != 1:
+            raise SettingError(group, f"choose one; got {', '.join(config[group])}")
     for group, part in (("propagation", "propagator"), ("solver", "solver")):
         if config.get(group):
             if part not in config.controller:
@@ -164,6 +165,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
         plant=instantiate(config.plant, _convert_="all"),
         train=instantiate(config.model, _convert_="all"),
         controller=controller,
+        subsystem=next(iter(config.subsystem)),
         name=name,
         size=size,
         propagator=getattr(controller, "keywords", {}).get("propagator"),
@@ -173,9 +175,10 @@ def experiment_of(config: DictConfig) -> "Experiment":
     )
 
 
-def plain_settings(config: DictConfig, options: dict[str, Any]) -> dict[str, Any]:
+def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, Any]:
     """All that a result depends on, as plain data: the settings, and the chosen option by group."""
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    options = {group: chosen.get(group) for group in GROUPS}
     return {key: value for key, value in settings.items() if key not in ASIDE} | {"options": options}
 
 
@@ -215,15 +218,21 @@ def reason_of(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
-def _found(folder: "RunFolder", settings: dict[str, Any]) -> dict[str, Any]:
-    """The result of a run that was finished before, or that it was another one."""
+def check_same(folder: "RunFolder", settings: dict[str, Any]) -> dict[str, Any]:
+    """The result of a finished run, if it is the one that is asked for now.
+
+    Raises:
+        SettingError: It was flown with other settings: those of a file have changed meanwhile.
+        DataError: What is there is not what a run writes.
+    """
     result = folder.result()
     differing = differences(result["settings"], settings)
-    if not differing:
-        return {"result": result}
-    first = ", ".join(f"{key}: {then!r} then, {now!r} now" for key, then, now in differing[:3])
-    message = f"folder: {folder.path} holds a finished run of other settings ({first}); choose another folder"
-    return {"error": message, "mistake": True, "kept": False}
+    if differing:
+        first = ", ".join(f"{key}: {then!r} then, {now!r} now" for key, then, now in differing[:3])
+        more = f", and {len(differing) - 3} more" if len(differing) > 3 else ""
+        reason = f"{folder.path} holds a finished run of other settings ({first}{more})"
+        raise SettingError("folder", f"{reason}; choose another folder, or remove that one to fly it again")
+    return result
 
 
 def differences(then: Any, now: Any, key: str = "") -> list[tuple[str, Any, Any]]:

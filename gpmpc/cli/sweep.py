@@ -2,8 +2,9 @@
 
 Hydra composes every run's settings and its launcher plugins start the runs; what is kept, and whether it is finished,
 is in the runs' folders alone. So a sweep is resumed by the same command: finished runs are not launched again, failed
-and unfinished ones are. The parent only looks at the folders to show how far it is. Several sweeps may share a tree: a
-run that another process works on is left to it, and looked at again at the end.
+and unfinished ones are. A finished run passes for one that is asked for only if all its settings are the same; else the
+sweep is refused before anything is launched. The parent only looks at the folders to show how far it is. Several sweeps
+may share a tree: a run that another process works on is left to it, and looked at again at the end.
 """
 
 import hashlib
@@ -27,9 +28,10 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.types import HydraContext, RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict
 
-from gpmpc.cli.run import checked_folder, choices, fly_one
+from gpmpc.cli.run import check_same, checked_folder, choices, fly_one, plain_settings
+from gpmpc.cli.screen import progress_bar
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.experiments.run_folder import PLAN, Busy, RunFolder, folder_name
 from gpmpc.files import write_whole
@@ -73,9 +75,12 @@ def sweep(overrides: Sequence[str], conf: Path) -> None:
         context, config = _composed(overrides, conf)
         jobs = _jobs(overrides, config)
         _check(jobs, context, config)
+        waiting, finished = [], []
+        for job in jobs:
+            (finished if job.folder.finished else waiting).append(job)
+        with console.status(f"comparing the settings of {len(finished)} finished runs"):
+            _check_finished(finished, context, config)
         _keep_plan(jobs, Path(config.folder))
-        waiting = [job for job in jobs if not job.folder.finished]
-        skipped = len(jobs) - len(waiting)
         with _progress(jobs, console):
             outcomes = _launch(waiting, False, context, config)
             left = [job for job, outcome in zip(waiting, outcomes, strict=True) if "busy" in outcome]
@@ -83,7 +88,7 @@ def sweep(overrides: Sequence[str], conf: Path) -> None:
     finally:
         GlobalHydra.instance().clear()
     failed = [outcome for outcome in chain(outcomes, again) if "error" in outcome]
-    text = f"{len(jobs)} runs: {len(jobs) - skipped - len(failed)} flown, {skipped} finished before"
+    text = f"{len(jobs)} runs: {len(waiting) - len(failed)} flown, {len(finished)} finished before"
     console.print(f"{text}, {len(failed)} failed; in {config.folder}", soft_wrap=True, highlight=False, markup=False)
     for outcome in failed:
         print(f"gpmpc: failed: {outcome['folder']}: {outcome['error']}", file=sys.stderr)
@@ -139,6 +144,16 @@ def _check(jobs: Sequence[Job], context: HydraContext, config: DictConfig) -> No
             seen.update(job.overrides)
 
 
+def _check_finished(jobs: Sequence[Job], context: HydraContext, config: DictConfig) -> None:
+    """Raises where a finished run is another one than is asked for now."""
+    for job in jobs:
+        composed = context.config_loader.load_sweep_config(config, job.overrides)
+        options = composed.hydra.runtime.choices
+        with open_dict(composed):
+            del composed["hydra"]
+        check_same(job.folder, plain_settings(composed, options))
+
+
 def _keep_plan(jobs: Sequence[Job], tree: Path) -> None:
     """Writes what was asked for, so that a report knows what is missing; equal sweeps write the same file."""
     plan = [choices(job.overrides) for job in jobs]
@@ -169,18 +184,7 @@ def _launch(jobs: Sequence[Job], wait: bool, context: HydraContext, config: Dict
 @contextmanager
 def _progress(jobs: Sequence[Job], console: Any) -> Iterator[None]:
     """One bar for the whole sweep, drawn by a thread that looks at the folders."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
-    columns += [TextColumn("left"), TimeRemainingColumn()]
-    with Progress(*columns, console=console) as bar:
+    with progress_bar(console) as bar:
         task, over, open_jobs = bar.add_task("flying", total=len(jobs)), Event(), list(jobs)
 
         def look() -> None:

@@ -21,6 +21,7 @@ import numpy as np
 
 from gpmpc.control.nmpc import NMPC
 from gpmpc.control.tracking import TrackingProblem
+from gpmpc.datasets.attitudes import approached
 from gpmpc.datasets.flights import SUBSYSTEMS, check_weights, transitions_of
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gp.transitions import Transitions
@@ -128,10 +129,4 @@ class ExcitedData:
         """Rotational states (samples + horizon, 6) that approach rows of ``angles`` (K, 2) [rad] one after another."""
         count = self.samples + self.rotational.horizon
         chosen = angles[generator.integers(len(angles), size=-(-count // self.hold))]
-        left = np.exp(-self.rotational.plant.time_step / self.response_time)  # of the way, after one step
-        states, at = np.zeros((count, 6)), chosen[0]
-        for j in range(count):
-            wanted = chosen[j // self.hold]
-            states[j, [0, 2]], states[j, [1, 3]] = at, (wanted - at) / self.response_time
-            at = wanted + left * (at - wanted)
-        return states
+        return approached(chosen, count, self.hold, self.rotational.plant.time_step, self.response_time)

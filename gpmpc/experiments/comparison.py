@@ -3,7 +3,9 @@
 Runs of one seed share their training rows and their noise, so they are compared in pairs: what else was varied is
 averaged within a seed first, and a seed counts once. Two paired tests are stated. The signed-rank test (Wilcoxon, 1945)
 decides: it asks only that the differences are spread symmetrically. Student's t-test beside it asks for normal ones.
-With fewer than six pairs nothing can make the first one significant at 5 %.
+With fewer than six pairs nothing can make the first one significant at 5 %. Where the seed decides nothing (all rows,
+one start, no noise) its runs are copies of one, and no test may count them: a difference that never varies is
+undecided.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.experiments.report import MEASURES, SEED, Report
+from gpmpc.experiments.report import MEASURES, SEED, Cell, Report
 
 LEVEL = 0.05
 FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
@@ -47,10 +49,17 @@ class Comparison:
     pairs: int
 
     @property
+    def copies(self) -> bool:
+        """Whether every pair differs by exactly the same."""
+        return self.difference != 0 and self.interval[0] == self.interval[1]
+
+    @property
     def verdict(self) -> str:
         """In words."""
         if self.pairs < FEWEST:
             return f"undecided: {self.pairs} pairs cannot show anything at 5 %; fly {FEWEST} seeds or more"
+        if self.copies:
+            return "undecided: every seed gave the same, so all are one; vary what the seed draws (data.size, noise)"
         if self.wilcoxon < LEVEL:
             return f"A is {'larger' if self.rank_biserial > 0 else 'smaller'} than B"
         return "no difference shown"
@@ -65,10 +74,13 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         b: The same of group B.
 
     Raises:
-        SettingError: A choice that was not varied, or a value that does not occur.
+        SettingError: A choice that was not varied, a value that does not occur, or runs of both subsystems.
         DataError: The groups have no two seeds in common.
     """
     groups = [_group(report, key, text) for key, text in (("A", a), ("B", b))]
+    units = {run.result["unit"] for group in groups for cell in _cells(report, group) for run in cell.runs.values()}
+    if len(units) > 1:
+        raise SettingError("compare", "errors in m and in rad have no common mean; add subsystem=... to both groups")
     comparisons = []
     for measure in report.measures():
         first, second = (_by_pair(report, group, measure) for group in groups)
@@ -101,21 +113,27 @@ def _group(report: Report, key: str, text: str) -> dict[str, str]:
 def _by_pair(report: Report, group: Mapping[str, str], measure: str) -> dict[tuple[tuple, str], float]:
     """Values by what a partner has to share: the other settings and the seed."""
     found = {}
-    for cell in report.cells:
-        values = dict(zip(report.variables, cell.values, strict=True))
-        if all(values[name] == value for name, value in group.items()):
-            rest = tuple(values[name] for name in report.variables if name not in group)
-            for seed, run in cell.runs.items():
-                value = MEASURES[measure].of(run.result)
-                if value is not None:
-                    found[rest, seed] = float(value)
+    for cell in _cells(report, group):
+        rest = tuple(v for name, v in zip(report.variables, cell.values, strict=True) if name not in group)
+        for seed, run in cell.runs.items():
+            value = MEASURES[measure].of(run.result)
+            if value is not None:
+                found[rest, seed] = float(value)
     return found
+
+
+def _cells(report: Report, group: Mapping[str, str]) -> list[Cell]:
+    """Those of a group."""
+    places = [(report.variables.index(name), value) for name, value in group.items()]
+    return [cell for cell in report.cells if all(cell.values[i] == value for i, value in places)]
 
 
 def _tested(measure: str, pairs: np.ndarray) -> Comparison:
     """Of pairs (n, 2)."""
     differences = pairs[:, 0] - pairs[:, 1]
     n, mean, spread = len(differences), float(differences.mean()), float(differences.std(ddof=1))
+    if not np.ptp(differences):  # not even by rounding
+        mean, spread = float(differences[0]), 0.0
     nothing = not differences.any()
     half = float(stats.t.ppf(0.975, n - 1)) * spread / np.sqrt(n)
     ranks = stats.rankdata(np.abs(differences[differences != 0]))
@@ -133,14 +151,21 @@ def _tested(measure: str, pairs: np.ndarray) -> Comparison:
     )
 
 
-def sentences(comparisons: Sequence[Comparison], a: str, b: str) -> list[str]:
+def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str) -> list[str]:
     """A line a measure, with everything that a reader needs to doubt it."""
     lines = [f"A: {a}; B: {b}; pairs are seeds ({SEED}), what else was varied is averaged within a seed."]
     for c in comparisons:
         low, high = c.interval
+        tests = (
+            ""
+            if c.copies
+            else (
+                f" (95 %: {low:.3g} to {high:.3g}); Wilcoxon signed-rank p = {c.wilcoxon:.3g}, paired t-test p = "
+                f"{c.t_test:.3g}; rank-biserial {c.rank_biserial:.2f}, d_z {c.standardised:.2f}"
+            )
+        )
         lines.append(
-            f"{MEASURES[c.measure].label}: {c.verdict}. Mean {c.means[0]:.4g} against {c.means[1]:.4g}, difference "
-            f"{c.difference:.3g} (95 %: {low:.3g} to {high:.3g}); Wilcoxon signed-rank p = {c.wilcoxon:.3g}, paired "
-            f"t-test p = {c.t_test:.3g}; rank-biserial {c.rank_biserial:.2f}, d_z {c.standardised:.2f}; n = {c.pairs}"
+            f"{report.label(c.measure)}: {c.verdict}. Mean {c.means[0]:.4g} against {c.means[1]:.4g}, difference "
+            f"{c.difference:.3g}{tests}; n = {c.pairs}"
         )
     return lines

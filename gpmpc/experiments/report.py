@@ -27,7 +27,7 @@ class Measure:
     """One number of a run.
 
     Attributes:
-        label: With its unit.
+        label: With its unit; ``{unit}`` stands for that of the runs' positions or angles.
         of: From a run's result to the number; None where the run has none.
         logarithmic: How it is drawn.
     """
@@ -38,7 +38,7 @@ class Measure:
 
 
 MEASURES = {
-    "rmse": Measure("RMSE [m]", lambda r: r["rmse"]["total"]),
+    "rmse": Measure("RMSE [{unit}]", lambda r: r["rmse"]["total"]),
     "outside": Measure("steps outside bounds [%]", lambda r: _outside(r), logarithmic=False),
     "failed": Measure("failed solves [%]", lambda r: 100 * sum(r["failures"].values()) / r["steps"], logarithmic=False),
     "decision": Measure("decision, median [ms]", lambda r: 1e3 * r["times"]["total"]["median"]),
@@ -106,6 +106,11 @@ class Report:
     def measures(self) -> list[str]:
         """Those of which any run has a number."""
         return [name for name in MEASURES if any(cell.numbers(name) for cell in self.cells)]
+
+    def label(self, measure: str) -> str:
+        """Of a measure, with its unit; with both where the runs are of both subsystems."""
+        units = {run.result["unit"] for cell in self.cells for run in cell.runs.values()}
+        return MEASURES[measure].label.format(unit=" or ".join(sorted(units)) or "m")
 
     def commands(self) -> list[str]:
         """What would fill the cells in which runs are missing or failed, one a cell."""
@@ -202,7 +207,7 @@ def _read(path: Path, name: str) -> RunRecord:
         choices = {key: value for key, _, value in (choice.partition("=") for choice in content["choices"])}
         settings, result = content["settings"], None
         if name == METRICS:  # what the measures need
-            result = {key: content[key] for key in ("steps", "rmse", "violations", "failures", "times")}
+            result = {key: content[key] for key in ("steps", "rmse", "unit", "violations", "failures", "times")}
         error = None if result else content["error"]
     except (OSError, ValueError, KeyError, TypeError) as reason:
         raise DataError(f"{path}: is not what a run writes: {type(reason).__name__}: {reason}") from reason

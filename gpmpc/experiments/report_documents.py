@@ -67,13 +67,12 @@ def title(report: Report) -> str:
 
 def render(report: Report) -> Table:
     """The table for a terminal: mean, and the quartiles below it; what is zero everywhere is left out."""
-    known = [name for name in SHOWN if name in report.measures()]
-    shown = [name for name in known if any(any(cell.numbers(name)) for cell in report.cells)]
+    shown = [name for name in SHOWN if name in _telling(report)]
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title(report), title_justify="left")
     for name in (*(report.variables or ("runs",)), "seeds"):
         table.add_column(name.replace(".", ".\n"), justify="right", no_wrap=True)
     for name in shown:
-        unit = MEASURES[name].label.rpartition(" [")[2]
+        unit = report.label(name).rpartition(" [")[2]
         table.add_column(f"{SHOWN[name]}\n\\[{unit}", justify="right", no_wrap=True)
     for cell in report.cells:
         texts = [_text(cell, name, "\n").replace("[", "\\[") for name in shown]
@@ -121,7 +120,7 @@ def latex(report: Report) -> str:
 def figures(report: Report) -> dict[str, bytes]:
     """One figure (PNG) a varied setting, by file name."""
     drawn = {}
-    measures = [name for name in DRAWN if name in report.measures()]
+    measures = [name for name in DRAWN if name in _telling(report)]
     if not measures or not report.variables:
         return drawn
     for variable in report.variables:
@@ -136,7 +135,7 @@ def figures(report: Report) -> dict[str, bytes]:
                 for cell in cells:
                     values[cell.values[index]] += cell.numbers(name)
                 series.append(Series(label, list(values.values())))
-            panels.append((MEASURES[name].label, MEASURES[name].logarithmic, series))
+            panels.append((report.label(name), MEASURES[name].logarithmic, series))
         drawn[f"over-{variable.replace('/', '-')}.png"] = png(over_variable(variable, positions, panels), dpi=130)
     return drawn
 
@@ -164,6 +163,11 @@ def page(report: Report, drawn: dict[str, bytes], comparison: Sequence[str] = ()
     return f"<!doctype html>\n<html lang=en><head>{head}</head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
 
 
+def _telling(report: Report) -> list[str]:
+    """Measures that are not zero everywhere."""
+    return [name for name in report.measures() if any(any(cell.numbers(name)) for cell in report.cells)]
+
+
 def _lines(report: Report, index: int) -> dict[str, list[Cell]]:
     """Cells by what else was varied; by one setting only where all together were too many lines."""
     others = [i for i in range(len(report.variables)) if i != index]
@@ -181,7 +185,7 @@ def _lines(report: Report, index: int) -> dict[str, list[Cell]]:
 
 
 def _header(report: Report) -> list[str]:
-    return [*(report.variables or ("runs",)), "seeds", *(MEASURES[name].label for name in report.measures())]
+    return [*(report.variables or ("runs",)), "seeds", *(report.label(name) for name in report.measures())]
 
 
 def _rows(report: Report) -> list[list[str]]:

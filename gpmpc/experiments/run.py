@@ -3,8 +3,10 @@
     data -> a random subset -> training -> controller -> closed loop -> metrics
 
 ``Experiment`` holds the ingredients as objects, ``fly`` does the work, ``metrics`` says in plain data what came of it.
-Neither knows files or settings. The seed is that of the subset, of the training's random starts and of the noise: the
-same seed gives the same numbers, and the subsets of one seed are nested, so that sizes can be compared in pairs.
+Neither knows files or settings. Flown is the translational subsystem along a trajectory, or the rotational one on its
+own, at its own rate, along the attitudes that the trajectory asks for (``gpmpc.datasets.attitudes``). The seed is that
+of the subset, of the training's random starts and of the noise: the same seed gives the same numbers, and the subsets
+of one seed are nested, so that sizes can be compared in pairs.
 """
 
 import inspect
@@ -17,21 +19,23 @@ import numpy as np
 
 from gpmpc.control.controller import Controller, Reference
 from gpmpc.control.supervision import OnFailure, check_policy
-from gpmpc.datasets import DataSource
+from gpmpc.datasets import DataSource, rotational_states_along
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gp import Training, Transitions
 from gpmpc.metrics import ViolationRate, time_quantiles, tracking_error, violation_rate
-from gpmpc.plants import Plant
+from gpmpc.plants import Coupled, Map, Plant, Rotational, Translational
 from gpmpc.propagation import MomentMatching, Propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, Rollout, Step, closed_loop
 from gpmpc.trajectories import Trajectory, states_along
 
+NAMES = {"translational": Translational.state_names, "rotational": Rotational.state_names}
+UNITS = {"translational": "m", "rotational": "rad"}  # of the positions and angles that errors are stated in
 STAGES = ("model", "build", "solve", "total")  # of a decision's time
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """One flight of the translational subsystem, with everything that it depends on.
+    """One flight of one subsystem, with everything that it depends on.
 
     Attributes:
         data: Where transitions come from.
@@ -39,6 +43,7 @@ class Experiment:
         plant: What flies, and what a controller on the true model believes in.
         train: From transitions and a ``seed`` to a ``Training``.
         controller: From a model, or from a ``plant`` where its first argument is called so, to a ``Controller``.
+        subsystem: Which of the two is learned and flown.
         name: Of the trajectory, which data from files are filed under.
         size: Rows drawn for the training; None takes all.
         steps: Of the flight.
@@ -58,6 +63,7 @@ class Experiment:
     plant: Plant
     train: Callable[..., Training]
     controller: Callable[..., Controller]
+    subsystem: Literal["translational", "rotational"] = "translational"
     name: str = "elliptical"
     size: int | None = None
     steps: int = 100
@@ -76,8 +82,17 @@ class Experiment:
         check_policy(self.on_failure)
         if self.loop not in ("plant", "model"):
             raise SettingError("loop", f"must be 'plant' or 'model'; got {self.loop!r}")
-        if len(self.plant.dynamics.state_names) != 6 or "vx" not in self.plant.dynamics.state_names:
-            raise SettingError("plant", "must be translational: x, vx, y, vy, z, vz")
+        if self.subsystem not in NAMES:
+            raise SettingError("subsystem", f"must be one of {', '.join(NAMES)}; got {self.subsystem!r}")
+        expected, names = NAMES[self.subsystem], tuple(self.plant.dynamics.state_names)
+        if names != expected:
+            what = f"must have the states of the {self.subsystem} subsystem, {', '.join(expected)}"
+            whole = "; the whole quadrotor is flown by gpmpc.simulation.cascade_loop"
+            raise SettingError(
+                "plant", f"{what}; got {', '.join(names)}{whole if names == Coupled.state_names else ''}"
+            )
+        if self.subsystem == "rotational" and isinstance(self.plant, Map):
+            raise SettingError("plant", "the rotational subsystem is flown at its own rate; a Map has none")
         if self.loop == "model" and not self.learns:
             raise SettingError("loop", "a model loop needs a controller that learns a model; this one knows the plant")
 
@@ -129,8 +144,7 @@ def fly(
     if experiment.loop == "model":
         propagator = experiment.propagator or MomentMatching()
         system = ModelLoop(training.posterior, propagator, time_step=plant.time_step)
-    times = plant.time_step * np.arange(experiment.steps + controller.horizon + 1)
-    states = states_along(experiment.trajectory, times)
+    states = references(experiment, experiment.steps + controller.horizon + 1)
     resting = np.asarray(controller.initial_input)  # falls back on it where the very first solve fails
     on_step = None if prepared is None else prepared(controller, training)
     rollout = closed_loop(
@@ -148,6 +162,14 @@ def fly(
     return Flight(rollout, controller, training)
 
 
+def references(experiment: Experiment, count: int) -> np.ndarray:
+    """The states to follow (count, n), one a step of the plant."""
+    time_step = experiment.plant.time_step
+    if experiment.subsystem == "rotational":
+        return rotational_states_along(experiment.trajectory, count, time_step)
+    return states_along(experiment.trajectory, time_step * np.arange(count))
+
+
 def training_rows(experiment: Experiment) -> Transitions:
     """The rows drawn, in the order of the flight that they come from.
 
@@ -155,7 +177,7 @@ def training_rows(experiment: Experiment) -> Transitions:
         SettingError: More rows asked for than there are.
         ShapeError: The data have other dimensions than the plant.
     """
-    data = experiment.data.transitions(experiment.name, experiment.trajectory, "translational")
+    data = experiment.data.transitions(experiment.name, experiment.trajectory, experiment.subsystem)
     expected = len(experiment.plant.dynamics.state_names), len(experiment.plant.dynamics.input_names)
     if (data.state_dim, data.input_dim) != expected:
         raise ShapeError(f"data and plant must have the same dimensions; got {data.state_dim, data.input_dim}")
@@ -178,6 +200,7 @@ def metrics(experiment: Experiment, flight: Flight) -> dict[str, Any]:
     training = flight.training
     return {
         "steps": experiment.steps,
+        "unit": UNITS[experiment.subsystem],
         "rmse": {name: float(value) for name, value in zip(names, error.axes, strict=True)} | {"total": error.total},
         "violations": {name: _violations(rate) for name, rate in violations.items()},
         "failures": dict(Counter(status.name for _, status in rollout.failures)),

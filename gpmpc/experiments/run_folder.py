@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gpmpc.exceptions import GpmpcError
+from gpmpc.exceptions import DataError, GpmpcError
 from gpmpc.files import write_whole
 from gpmpc.provenance import provenance
 
@@ -97,8 +97,18 @@ class RunFolder:
         write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")
 
     def result(self) -> dict[str, Any]:
-        """What came of the finished run."""
-        return json.loads((self.path / METRICS).read_text(encoding="utf-8"))
+        """What came of the finished run.
+
+        Raises:
+            DataError: What is there is not what a run writes.
+        """
+        path = self.path / METRICS
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            content["settings"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{path}: is not what a run writes: {type(error).__name__}: {error}") from error
+        return content
 
 
 def record(choices: Sequence[str], settings: Mapping[str, Any], command: str) -> dict[str, Any]:

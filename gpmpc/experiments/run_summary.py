@@ -13,13 +13,14 @@ def summary(result: Mapping[str, Any]) -> Table:
     table.add_column(style="bold", no_wrap=True)
     table.add_column()
     options, training, times = result["settings"]["options"], result["training"], result["times"]
-    table.add_row("flight", f"{result['steps']} steps of {options['trajectory']} with {options['controller']}")
+    flown = options["trajectory"] if options["subsystem"] == "translational" else f"{options['trajectory']} attitude"
+    table.add_row("flight", f"{result['steps']} steps of {flown} with {options['controller']}")
     if training:
         table.add_row("training", f"{training['size']} rows, {times['training']:.2f} s")
     rmse = dict(result["rmse"])
     total = rmse.pop("total")
     axes = ", ".join(f"{name} {value:.3g}" for name, value in rmse.items())
-    table.add_row(r"RMSE \[m]", f"{total:.3g}  ({axes})")
+    table.add_row(rf"RMSE \[{result['unit']}]", f"{total:.3g}  ({axes})")
     for name, rate in result["violations"].items():
         low, high = 100 * rate["low"], 100 * rate["high"]
         text = f"{rate['violations']} of {rate['steps']} steps outside (95 %: {low:.2g} to {high:.2g} %)"

@@ -5,6 +5,7 @@ from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.gp.evaluation import evaluation
 from gpmpc.gp.gpytorch_posterior import KernelPosterior
 from gpmpc.gp.gpytorch_training import fit
+from gpmpc.gp.many import train_many
 from gpmpc.gp.penalties import SoftLimits
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.residual import Affine, ResidualModel
@@ -35,4 +36,5 @@ __all__ = [
     "sparse_posterior",
     "standardize",
     "train",
+    "train_many",
 ]

@@ -16,8 +16,8 @@ import torch
 from scipy.optimize import minimize
 
 from gpmpc.exceptions import TrainingError, check_number
+from gpmpc.gp.hyperparameter_search import FAILED
 from gpmpc.gp.model import exact_inference, members
-from gpmpc.gp.training import FAILED
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,12 @@
 """Problem: the SE-ARD kernel between two sets of points, its noisy matrix factorised, and what may go into it."""
 
-from torch import Tensor, float64, isfinite, linalg, nonzero, zeros
+from torch import Tensor, float64, int32, isfinite, linalg, nonzero, zeros
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 
 PREDICTS = ("next_state", "difference", "value")
+MANY = 1000  # points: from here on kernel matrices are made and factorised one after another, in place
+ROWS = 64  # of such a matrix at a time: they fit the cache
 FEW = 16  # columns of a kernel matrix whose differences, all at once, fit the cache
 
 
@@ -30,9 +32,12 @@ def factorised(inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, no
     Raises:
         SettingError: The matrix of an output is not positive definite in double precision.
     """
-    kernel = kernel_matrix(inputs, inputs, lengthscales, signal_variance)
-    kernel.diagonal(dim1=-2, dim2=-1).add_(noise_variance[:, None])
-    cholesky, info = linalg.cholesky_ex(kernel)
+    if len(inputs) > MANY and not any(t.requires_grad for t in (inputs, lengthscales, signal_variance, noise_variance)):
+        cholesky, info = _factorised_in_place(inputs, lengthscales, signal_variance, noise_variance)
+    else:
+        kernel = kernel_matrix(inputs, inputs, lengthscales, signal_variance)
+        kernel.diagonal(dim1=-2, dim2=-1).add_(noise_variance[:, None])
+        cholesky, info = linalg.cholesky_ex(kernel)
     if bool(info.any()):
         output = int(nonzero(info)[0])
         raise SettingError(
@@ -41,6 +46,23 @@ def factorised(inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, no
             f"signal-to-noise ratio {float((signal_variance / noise_variance)[output]):.1e}: raise the noise",
         )
     return cholesky
+
+
+def _factorised_in_place(
+    inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The same numbers in the memory of the result (k, N, N) and little more; with LAPACK's info (k,)."""
+    (size, _), outputs = inputs.shape, len(lengthscales)
+    info = zeros(outputs, dtype=int32, device=inputs.device)
+    cholesky = inputs.new_empty(outputs, size, size).mT  # columns contiguous, as LAPACK wants them
+    for a, factor in enumerate(cholesky):
+        for end in range(ROWS, size + ROWS, ROWS):  # the lower triangle
+            rows, columns = slice(end - ROWS, end), slice(0, end)
+            scales = lengthscales[a, None], signal_variance[a, None]
+            factor[rows, columns] = kernel_matrix(inputs[rows], inputs[columns], *scales)[0]
+        factor.diagonal().add_(noise_variance[a])
+        linalg.cholesky_ex(factor, out=(factor, info[a]))
+    return cholesky, info
 
 
 def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> None:

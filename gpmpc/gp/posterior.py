@@ -109,7 +109,8 @@ class GPPosterior:
         check_posterior(given, input_dim, predicts)
         inputs, targets, lengthscales, signal_variance, noise_variance, offset = (v.clone() for v in given.values())
         cholesky = factorised(inputs, lengthscales, signal_variance, noise_variance)
-        weights = torch.cholesky_solve((targets - offset).mT[..., None], cholesky)[..., 0]
+        rights = (targets - offset).mT[..., None]  # one after another: torch copies the factors it is given
+        weights = torch.stack([torch.cholesky_solve(b, L)[:, 0] for b, L in zip(rights, cholesky, strict=True)])
         hyperparameters = (lengthscales, signal_variance, noise_variance, offset)
         return cls(inputs, targets, *hyperparameters, cholesky, weights, input_dim, predicts)
 

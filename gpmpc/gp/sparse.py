@@ -13,22 +13,19 @@ A = Lz^-1 Kzx Lam^-1/2 and A A' = U diag(b) U',
     C = Lz^-T U diag(b / (1 + b)) U' Lz^-1,   beta = Lz^-T U diag(1 / (1 + b)) U' A Lam^-1/2 (y - offset)
     cholesky of C^-1:  R', where Q R = diag(sqrt((1 + b) / b)) U' Lz'    (never squared: C^-1 is huge where b is small)
 
-Hyperparameters and Z maximise the collapsed bound log N(y | 0, Q + Lam) - tr(Kxx - Qxx) / (2 sn2) (Titsias, 2009, eq.
-(9)); for FITC the last term is missing. A jitter on Kzz makes u = f(Z) + noise; the bound stays one.
+How good hyperparameters and Z are says ``gpmpc.gp.collapsed_bound``. A jitter on Kzz makes u = f(Z) + noise; the bound
+stays one.
 """
 
 from dataclasses import replace
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
-from gpmpc.gp.kernel import kernel_matrix
+from gpmpc.gp.collapsed_bound import JITTER, Method, data_sums, inducing_factor
 from gpmpc.gp.posterior import GPPosterior, Predicts
 
-Method = Literal["sgpr", "fitc"]
-JITTER = 1e-8  # of Kzz, in units of sf2
 UNINFORMED = 1e-10  # directions of which the data tell less than this (b) get a pseudo-noise of 1 / this
 
 
@@ -67,6 +64,8 @@ def sparse_posterior(
     """
     if jitter is not None:
         check_number("jitter", jitter, least=0)
+    if method not in ("sgpr", "fitc"):
+        raise SettingError("method", f"must be 'sgpr' or 'fitc'; got {method!r}")
     offset = torch.zeros_like(targets[0]) if offset is None else offset
     if inducing.dim() != 2 or inducing.shape[1:] != features.shape[1:] or not len(inducing):
         raise ShapeError(f"inducing must be (M, {features.shape[-1]}), M > 0; got {tuple(inducing.shape)}")
@@ -79,87 +78,20 @@ def sparse_posterior(
     for name, value in (("inducing", inducing), ("features", features), ("targets", targets)):
         if value.dtype != torch.float64 or not bool(torch.isfinite(value).all()):
             raise SettingError(name, "must be finite and in float64")
-    given = (inducing, features, lengthscales, signal_variance, noise_variance, method)
     try:
-        Lz, A, root = _projection(*given, jitter or 0.0)
-    except SettingError as error:
-        if jitter is not None or error.key != "inducing":
+        Lz = inducing_factor(inducing, lengthscales, signal_variance, jitter or 0.0)
+    except SettingError:
+        if jitter is not None:
             raise
-        Lz, A, root = _projection(*given, JITTER)
-    b, U = torch.linalg.eigh(A @ A.mT)  # ascending: the largest rows of what is factorised come first, as QR needs
+        Lz = inducing_factor(inducing, lengthscales, signal_variance, JITTER)
+    kernel = (lengthscales, signal_variance, noise_variance)
+    sums = data_sums(Lz, inducing, features, targets - offset, *kernel, method)
+    # Ascending: the largest rows of what is factorised come first, as QR needs.
+    b, U = torch.linalg.eigh(sums.gram)
     b = b.clamp_min(UNINFORMED)
     upper = torch.linalg.qr(((1 + b) / b).sqrt()[..., None] * (Lz @ U).mT).R
     cholesky = (upper * upper.diagonal(dim1=-2, dim2=-1).sign()[..., None]).mT.contiguous()
-    told = U.mT @ (A @ ((targets - offset).mT / root)[..., None])
+    told = U.mT @ sums.told[..., None]
     weights = torch.linalg.solve_triangular(Lz.mT, U @ (told / (1 + b)[..., None]), upper=True)
     pseudo_targets = (cholesky @ (cholesky.mT @ weights))[..., 0].mT + offset
     return replace(shell, features=inducing.clone(), targets=pseudo_targets, cholesky=cholesky, weights=weights[..., 0])
-
-
-def collapsed_bound(
-    inducing: Tensor,
-    features: Tensor,
-    targets: Tensor,
-    lengthscales: Tensor,
-    signal_variance: Tensor,
-    noise_variance: Tensor,
-    method: Method = "sgpr",
-    jitter: float = JITTER,
-) -> Tensor:
-    """The bound of the module's text on the log marginal likelihood (SGPR), or FITC's own, of every output (k,).
-
-    Differentiable by all of its tensors; arguments as in ``sparse_posterior``.
-
-    Raises:
-        SettingError: Kzz is not positive definite.
-    """
-    _, A, root = _projection(inducing, features, lengthscales, signal_variance, noise_variance, method, jitter)
-    y = targets.mT / root
-    LB = torch.linalg.cholesky(A @ A.mT + torch.eye(len(inducing), dtype=A.dtype, device=A.device))
-    explained = torch.linalg.solve_triangular(LB, A @ y[..., None], upper=False).square().sum((-2, -1))
-    logdet = 2 * LB.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 2 * root.expand_as(y).log().sum(-1)
-    size = len(features)
-    bound = -(size * torch.log(torch.tensor(2 * torch.pi)) + logdet + y.square().sum(-1) - explained) / 2
-    if method == "sgpr":
-        bound = bound - (size * signal_variance / noise_variance - A.square().sum((-2, -1))) / 2
-    return bound
-
-
-def _projection(
-    inducing: Tensor,
-    features: Tensor,
-    lengthscales: Tensor,
-    signal_variance: Tensor,
-    noise_variance: Tensor,
-    method: Method,
-    jitter: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Lz (k, M, M), A = Lz^-1 Kzx Lam^-1/2 (k, M, N) and the diagonal of Lam^1/2 (k, N) or (k, 1)."""
-    if method not in ("sgpr", "fitc"):
-        raise SettingError("method", f"must be 'sgpr' or 'fitc'; got {method!r}")
-    Kzz = kernel_matrix(inducing, inducing, lengthscales, signal_variance)
-    Kzz = Kzz + torch.diag_embed((jitter * signal_variance)[:, None].expand(-1, len(inducing)))
-    Lz, info = torch.linalg.cholesky_ex(Kzz)
-    if bool(info.any()):
-        output = int(torch.nonzero(info)[0])
-        raise SettingError(
-            "inducing",
-            f"their kernel matrix of output {output} is not positive definite: points too near each other for its "
-            "length-scales; take fewer, or a larger jitter",
-        )
-    whitened = torch.linalg.solve_triangular(Lz, _cross(inducing, features, lengthscales, signal_variance), upper=False)
-    if method == "sgpr":
-        root = noise_variance.sqrt()[:, None]
-    else:
-        left = (signal_variance[:, None] - whitened.square().sum(-2)).clamp_min(0)
-        root = (left + noise_variance[:, None]).sqrt()
-    return Lz, whitened / root[:, None, :], root
-
-
-def _cross(inducing: Tensor, features: Tensor, lengthscales: Tensor, signal_variance: Tensor) -> Tensor:
-    """Kzx (k, M, N) by one matrix product an output; around a common centre, so that little cancels."""
-    centre = features.detach().mean(0)
-    z = (inducing - centre) / lengthscales[:, None, :]
-    x = (features - centre) / lengthscales[:, None, :]
-    half = z.square().sum(-1)[..., :, None] / 2 + x.square().sum(-1)[..., None, :] / 2
-    return signal_variance[:, None, None] * (z @ x.mT - half).clamp_max(0).exp()

@@ -17,11 +17,13 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, TrainingError, check_number
+from gpmpc.gp.collapsed_bound import JITTER, Method, collapsed_bound_with_gradient
+from gpmpc.gp.hyperparameter_search import FAILED, spread
 from gpmpc.gp.kernel import kernel_matrix
 from gpmpc.gp.posterior import GPPosterior, Predicts
 from gpmpc.gp.scaling import Scaling, identity
-from gpmpc.gp.sparse import JITTER, Method, collapsed_bound, sparse_posterior
-from gpmpc.gp.training import FAILED, Trainer, spread
+from gpmpc.gp.sparse import sparse_posterior
+from gpmpc.gp.training import Trainer
 from gpmpc.gp.transitions import Transitions
 
 log = logging.getLogger(__name__)
@@ -241,14 +243,16 @@ class _Bound:
         """The sum over the outputs, and its gradient."""
         self.evaluations += 1
         variables = torch.from_numpy(vector.copy()).requires_grad_()
-        theta, Z = self.parts(variables)
         with torch.enable_grad():
-            try:
-                total = -self._bounds(theta, Z).sum()
-                total.backward()
-            except (SettingError, torch.linalg.LinAlgError):
-                return FAILED, np.zeros_like(vector)
-        value, gradient = float(total.detach()), variables.grad.numpy()
+            theta, Z = self.parts(variables)
+            tensors = (Z, *hyperparameters(theta))
+        try:
+            bounds, slopes = self._bounds(tuple(t.detach() for t in tensors))
+        except (SettingError, torch.linalg.LinAlgError):
+            return FAILED, np.zeros_like(vector)
+        chain = [(t, -slope) for t, slope in zip(tensors, slopes, strict=True) if t.requires_grad]
+        (gradient,) = torch.autograd.grad([t for t, _ in chain], variables, [slope for _, slope in chain])
+        value, gradient = -float(bounds.sum()), gradient.numpy()
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             return FAILED, np.zeros_like(vector)
         self._last = value
@@ -256,9 +260,9 @@ class _Bound:
 
     def values(self, vector: np.ndarray) -> np.ndarray:
         """Minus the bound of every output (k,); infinite where a matrix is not positive definite."""
+        theta, Z = self.parts(torch.from_numpy(vector))
         try:
-            with torch.no_grad():
-                return -self._bounds(*self.parts(torch.from_numpy(vector))).numpy()
+            return -self._bounds((Z, *hyperparameters(theta)))[0].numpy()
         except (SettingError, torch.linalg.LinAlgError):
             return np.full(self.shape[0], np.inf)
 
@@ -268,6 +272,7 @@ class _Bound:
         if self.iteration % EVERY == 0:
             log.info("sparse training: iteration %d, minus the bound %.6g", self.iteration, self._last)
 
-    def _bounds(self, theta: Tensor, Z: Tensor) -> Tensor:
+    def _bounds(self, tensors: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
+        Z, *hyperparameters = tensors
         trainer = self.trainer
-        return collapsed_bound(Z, self.x, self.y, *hyperparameters(theta), trainer.method, trainer.jitter)
+        return collapsed_bound_with_gradient(Z, self.x, self.y, *hyperparameters, trainer.method, trainer.jitter)

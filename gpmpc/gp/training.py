@@ -1,15 +1,13 @@
 """Problem: find every output's hyperparameters by maximum marginal likelihood, reliably, on nearly noise-free data.
 
-Each output is fitted on its own by L-BFGS (Byrd, Lu, Nocedal and Zhu, 1995; scipy's L-BFGS-B) over
-theta = (log length-scales, log sf, log(sf / sn)) inside a wide box. The likelihood has local optima that differ by a
-factor of a hundred in prediction error, so the search explores a few iterations from the paper's starting point and
-from random ones, and goes on to convergence from the best two. (Measured on the paper's data: a single start without
-exploration reached the best known optimum for about 75 % of the outputs; four starts and two finalists for about 98 %,
-at two and a half times the evaluations.)
+Each output is fitted on its own, over theta = (log length-scales, log sf, log(sf / sn)) inside a wide box; how, says
+``gpmpc.gp.hyperparameter_search``. What is found is frozen to a ``GPPosterior``. Exact GPs are cubic in time and square
+in memory over the points: one factor of 200 MB an output at N = 5000. What cannot fit is refused before the work.
 
 Cao, Lai and Alam (2017), eq. (9); the penalty is the one of their experiment.
 """
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,24 +15,20 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 
-from gpmpc.exceptions import SettingError, ShapeError, TrainingError, UnsupportedModel, check_number
-from gpmpc.gp.evidence import LogEvidence
-from gpmpc.gp.model import BatchExactGP, GPyTorchEvidence
+from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError, UnsupportedModel, check_number
+from gpmpc.gp.hyperparameter_search import FAILED, Found, Task, find_hyperparameters
+from gpmpc.gp.model import BatchExactGP
 from gpmpc.gp.penalties import Penalty
-from gpmpc.gp.posterior import IGNORED, GPPosterior, Predicts
+from gpmpc.gp.posterior import GPPosterior, Predicts
 from gpmpc.gp.scaling import Scaling, identity
 from gpmpc.gp.transitions import Transitions
+from gpmpc.memory import GIB, available_memory
 
-Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
-
-
-EXPLORATION = 16  # L-BFGS iterations from every start, before ...
-FINALISTS = 2  # ... this many of the best go on to convergence
-LONGER = 1.0  # mean of log l over log std(x~) at the random starts: smooth dynamics prefer long length-scales
-CONSTANT = 1e-8  # a column that moves by less than this part of its magnitude is constant
-FAILED = 1e12  # objective where the kernel matrix is not positive definite: finite, so that a line search steps back
+log = logging.getLogger(__name__)
+# N x N matrices that one evaluation of the likelihood holds, measured; the posterior holds one an output.
+MATRICES = {"closed_form": 1, "gpytorch": 13}
+MANY = 1000  # points: from here on the log has a line an output
 
 
 @dataclass(frozen=True)
@@ -45,9 +39,10 @@ class Training:
         posterior: The trained GPs, frozen.
         theta: Rows (log l, log sf, log(sf / sn)), one an output (n, d + 2), in the units of the data.
         objective: Negative log marginal likelihood plus penalty where the search ended (n,).
-        explored: The same where the exploration from every start ended (n, restarts + 1); ``FAILED`` where none could.
+        explored: The same where the exploration from every start ended (n, restarts + 1), over the subset if there is
+            one; ``FAILED`` where none could.
         evaluations: Likelihood evaluations, all starts and outputs together.
-        seconds: Wall time [s].
+        seconds: Wall time [s]; of ``train_many`` the sum over the outputs.
     """
 
     posterior: GPPosterior
@@ -74,6 +69,8 @@ class Trainer:
             units of the data all the same. Without it the prior mean is zero in those units.
         penalty: Added to every output's negative log marginal likelihood; none by default.
         restarts: Random starts besides the first, which has l = std(x~), sf = std(y), sn = std(y) / 10.
+        subset: Of more points than this a random subset of as many is searched first, from all starts; the search over
+            all points goes on from its best. None searches over all of them from every start.
         likelihood: How it is evaluated: in closed form, or by GPyTorch's automatic differentiation (slower; the same).
         tolerance: Relative decrease of the objective at which L-BFGS stops.
         lengthscale_limit: The box holds length-scales within this factor of their input's spread.
@@ -81,14 +78,15 @@ class Trainer:
             about 1e10 in double precision.
 
     Raises:
-        SettingError: Fewer than no restarts, an unknown ``likelihood`` or ``predicts``, a tolerance that is not
-            positive, or a limit of 1 or less.
+        SettingError: Fewer than no restarts, a subset of none, an unknown ``likelihood`` or ``predicts``, a tolerance
+            that is not positive, or a limit of 1 or less.
     """
 
     predicts: Predicts = "next_state"
     scaling: Callable[[torch.Tensor, Sequence[str]], Scaling] = identity
     penalty: Penalty | None = None
     restarts: int = 3
+    subset: int | None = 1000
     likelihood: Literal["closed_form", "gpytorch"] = "closed_form"
     tolerance: float = 1e-8
     lengthscale_limit: float = 1e4
@@ -98,6 +96,8 @@ class Trainer:
         if self.predicts not in ("next_state", "difference"):
             raise SettingError("predicts", f"must be 'next_state' or 'difference'; got {self.predicts!r}")
         check_number("restarts", self.restarts, least=0, whole=True)
+        if self.subset is not None:
+            check_number("subset", self.subset, least=1, whole=True)
         if self.likelihood not in ("closed_form", "gpytorch"):
             raise SettingError("likelihood", f"must be 'closed_form' or 'gpytorch'; got {self.likelihood!r}")
         for key, least in (("tolerance", 0), ("lengthscale_limit", 1), ("signal_to_noise_limit", 1)):
@@ -105,10 +105,15 @@ class Trainer:
 
     def __call__(self, transitions: Transitions, seed: int = 0, start: GPPosterior | None = None) -> Training:
         """Trains on transitions; see ``fit``."""
-        learned = transitions.next_states
+        return self.fit(
+            transitions.features, self.learned(transitions), transitions.input_dim, self.predicts, seed, start
+        )
+
+    def learned(self, transitions: Transitions) -> torch.Tensor:
+        """What the GPs are told of transitions (N, n): next states, or differences."""
         if self.predicts == "difference":
-            learned = learned - transitions.states
-        return self.fit(transitions.features, learned, transitions.input_dim, self.predicts, seed, start)
+            return transitions.next_states - transitions.states
+        return transitions.next_states
 
     def refit(self, posterior: GPPosterior, transitions: Transitions | None = None, seed: int = 0) -> Training:
         """Trains on the points a posterior holds, and on new ones, from its hyperparameters on.
@@ -156,107 +161,117 @@ class Trainer:
 
         Raises:
             ShapeError: ``start`` has other dimensions.
+            DataError: The kernel matrices would not fit the memory that is available.
             TrainingError: Every start failed for an output, which is named.
         """
         begin = time.perf_counter()
-        names = [f"x{i + 1}" for i in range(features.shape[1] - input_dim)]
-        names += [f"u{i + 1}" for i in range(input_dim)]
+        problem = self.problem(features, targets, input_dim, predicts, seed, start)
+        found = []
+        for task in problem.tasks:
+            found.append(find_hyperparameters(task, self))
+            if len(features) > MANY:
+                log.info("training: %s: %d evaluations, %.1f s", task.name, found[-1].evaluations, found[-1].seconds)
+        return problem.solved(found, begin)
+
+    def problem(
+        self,
+        features: torch.Tensor,
+        targets: torch.Tensor,
+        input_dim: int,
+        predicts: Predicts,
+        seed: int = 0,
+        start: GPPosterior | None = None,
+    ) -> "Problem":
+        """What ``fit`` solves, one task an output, for those that solve the tasks themselves; arguments as there."""
+        (size, d), outputs = features.shape, targets.shape[1]
+        check_memory([(size, outputs)], self.likelihood)
+        names = [f"x{i + 1}" for i in range(d - input_dim)] + [f"u{i + 1}" for i in range(input_dim)]
         feature_scaling = self.scaling(features, names)
-        target_scaling = self.scaling(targets, [f"y{a + 1}" for a in range(targets.shape[1])])
-        inputs, targets = feature_scaling.scale(features).numpy(), target_scaling.scale(targets).numpy()
-        outputs, d = targets.shape[1], inputs.shape[1]
-        rng = np.random.default_rng(seed)
+        target_scaling = self.scaling(targets, [f"y{a + 1}" for a in range(outputs)])
+        x, y = feature_scaling.scale(features).numpy(), target_scaling.scale(targets).numpy()
         first: list[np.ndarray | None] = [None] * outputs
         if start is not None:
             first = list(log_hyperparameters(start, feature_scaling, target_scaling))
+        rng = np.random.default_rng(seed)
         perturbations = rng.normal(size=(outputs, self.restarts + 1, d + 2))
-        fits = [self._fit(inputs, targets[:, a], perturbations[a], first[a]) for a in range(outputs)]
-        failed = [a for a, fit in enumerate(fits) if fit.objective >= FAILED]
+        rows = None
+        known = start is not None and not self.restarts  # where to begin: a subset tells no more
+        if self.subset is not None and size > self.subset and not known:
+            rows = np.sort(rng.permutation(size)[: self.subset])
+        tasks = [
+            Task(f"output {a + 1} of {outputs}", x, y[:, a], first[a], perturbations[a], rows) for a in range(outputs)
+        ]
+        return Problem(features, targets, feature_scaling, target_scaling, input_dim, predicts, tasks)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A data set's training, taken apart by outputs; ``Trainer.problem`` makes it.
+
+    Attributes:
+        features: x~ = (x, u) (N, n + m).
+        targets: (N, k).
+        feature_scaling: Of the features in the tasks.
+        target_scaling: Of the targets.
+        input_dim: m.
+        predicts: What the targets mean.
+        tasks: One an output (k).
+    """
+
+    features: torch.Tensor
+    targets: torch.Tensor
+    feature_scaling: Scaling
+    target_scaling: Scaling
+    input_dim: int
+    predicts: Predicts
+    tasks: Sequence[Task]
+
+    def solved(self, found: Sequence[Found], begin: float | None = None) -> Training:
+        """The training that the outputs' results make.
+
+        Args:
+            found: One a task.
+            begin: When the work began (``time.perf_counter``); by default their seconds add up.
+
+        Raises:
+            TrainingError: Every start failed for an output, which is named.
+        """
+        assembling = time.perf_counter()
+        failed = [a for a, one in enumerate(found) if one.objective >= FAILED]
         if failed:
             raise TrainingError(
                 failed,
-                f"no start of {self.restarts + 1} led to a positive definite kernel matrix for output "
+                f"no start of {len(found[0].explored)} led to a positive definite kernel matrix for output "
                 f"{', '.join(str(a) for a in failed)}: lower signal_to_noise_limit, or remove duplicate rows",
             )
-        theta = np.array([fit.theta for fit in fits])
-        found = torch.from_numpy(theta)
+        theta = np.array([one.theta for one in found])
+        theta[:, :-2] += self.feature_scaling.factor.log().numpy()
+        theta[:, -2] += self.target_scaling.factor.log().numpy()
+        physical = torch.from_numpy(theta)
         posterior = GPPosterior.from_hyperparameters(
-            torch.from_numpy(inputs),
-            torch.from_numpy(targets),
-            lengthscales=found[:, :-2].exp(),
-            signal_variance=(2 * found[:, -2]).exp(),
-            noise_variance=(2 * (found[:, -2] - found[:, -1])).exp(),
-            input_dim=input_dim,
-            predicts=predicts,
-        ).unscaled(feature_scaling, target_scaling)
-        theta[:, :-2] += feature_scaling.factor.log().numpy()
-        theta[:, -2] += target_scaling.factor.log().numpy()
+            self.features,
+            self.targets,
+            lengthscales=physical[:, :-2].exp(),
+            signal_variance=(2 * physical[:, -2]).exp(),
+            noise_variance=(2 * (physical[:, -2] - physical[:, -1])).exp(),
+            input_dim=self.input_dim,
+            predicts=self.predicts,
+            offset=self.target_scaling.offset,
+        )
+        spent = sum(one.seconds for one in found) + time.perf_counter() - assembling
         return Training(
             posterior,
             theta,
-            objective=np.array([fit.objective for fit in fits]),
-            explored=np.array([fit.explored for fit in fits]),
-            evaluations=sum(fit.evaluations for fit in fits),
-            seconds=time.perf_counter() - begin,
+            objective=np.array([one.objective for one in found]),
+            explored=np.array([one.explored for one in found]),
+            evaluations=sum(one.evaluations for one in found),
+            seconds=spent if begin is None else time.perf_counter() - begin,
         )
-
-    def _fit(
-        self, inputs: np.ndarray, targets: np.ndarray, perturbations: np.ndarray, given: np.ndarray | None
-    ) -> "_Fit":
-        """Fits one output, targets (N,), from the first start and from perturbations (restarts + 1, d + 2) of it."""
-        log_inputs, log_output = np.log(spread(inputs)), np.log(spread(targets[:, None])[0])
-        centre = np.append(log_inputs, [log_output, 0.0])
-        reach = np.append(
-            np.full(inputs.shape[1], np.log(self.lengthscale_limit)), [np.log(1e6), np.log(self.signal_to_noise_limit)]
-        )
-        search = _Search(_objective(self.likelihood, inputs, targets, self.penalty, log_inputs), centre, reach)
-        first = np.append(log_inputs, [log_output, np.log(10.0)])
-        longer = np.append(np.full(inputs.shape[1], LONGER), [0.0, 0.0])
-        starts = [first if given is None else given, *(first + longer + shift for shift in perturbations[1:])]
-
-        ends = [search(start, EXPLORATION, self.tolerance) for start in starts]
-        finalists = sorted(ends, key=lambda end: end[1])[:FINALISTS]
-        theta, value = min((search(end, 1000, self.tolerance) for end, _ in finalists), key=lambda end: end[1])
-        # Nothing can be learned about an input that never moved, and nothing is: it drops out of the kernel.
-        constant = np.ptp(inputs, axis=0) <= CONSTANT * np.abs(inputs).max(axis=0)
-        theta[:-2][constant] = log_inputs[constant] + np.log(IGNORED)
-        return _Fit(theta, value, [end[1] for end in ends], search.evaluations)
 
 
 def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
     """``Trainer(**settings)(transitions, seed)``: fits one GP per output in one call."""
     return Trainer(**settings)(transitions, seed)
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """What was found for one output."""
-
-    theta: np.ndarray
-    objective: float
-    explored: list[float]
-    evaluations: int
-
-
-class _Search:
-    """L-BFGS in a box around ``centre``; counts the evaluations."""
-
-    def __init__(self, objective: Objective, centre: np.ndarray, reach: np.ndarray):
-        self.objective, self.lower, self.upper = objective, centre - reach, centre + reach
-        self.evaluations = 0
-
-    def __call__(self, start: np.ndarray, iterations: int, tolerance: float) -> tuple[np.ndarray, float]:
-        """The end point and its objective."""
-        outcome = minimize(
-            self.objective,
-            np.clip(start, self.lower, self.upper),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=np.column_stack([self.lower, self.upper]),
-            options={"ftol": tolerance, "gtol": 1e-6, "maxiter": iterations, "maxfun": 5 * iterations},
-        )
-        self.evaluations += outcome.nfev
-        return outcome.x, float(outcome.fun)
 
 
 def log_hyperparameters(posterior: GPPosterior, features: Scaling, targets: Scaling) -> np.ndarray:
@@ -283,35 +298,32 @@ def log_hyperparameters(posterior: GPPosterior, features: Scaling, targets: Scal
     return torch.cat(columns, dim=1).numpy()
 
 
-def spread(columns: np.ndarray) -> np.ndarray:
-    """The standard deviation (d,) of columns (N, d); of a constant column its magnitude, or 1 where that is 0."""
-    magnitude = np.abs(columns).max(axis=0)
-    magnitude = np.where(magnitude > 0, magnitude, 1.0)
-    relative = (columns / magnitude).std(axis=0, ddof=1) if len(columns) > 1 else np.zeros_like(magnitude)
-    return magnitude * np.where(relative > CONSTANT, relative, 1.0)
+def check_memory(shapes: Sequence[tuple[int, int]], likelihood: str, workers: int = 1) -> None:
+    """Raises where trainings would not fit the memory that is available.
+
+    Args:
+        shapes: Points N and outputs k of every training whose result is kept.
+        likelihood: The trainer's.
+        workers: Searches at a time.
+
+    Raises:
+        DataError: They would not; the text has the numbers, and what to do.
+    """
+    free, needed = available_memory(), needed_memory(shapes, likelihood, workers)
+    if free is None or needed <= free:
+        return
+    size, outputs = max(shapes)
+    fitting = int((free / needed) ** 0.5 * size)
+    many = f"{len(shapes)} trainings of exact GPs of up to" if len(shapes) > 1 else "exact GPs of"
+    raise DataError(
+        f"{many} {size} points and {outputs} outputs need {needed / GIB:.3g} GiB, {8 * size**2 / GIB:.3g} GiB a kernel "
+        f"matrix; {free / GIB:.3g} GiB are available: train on {fitting} points or fewer, or sparse GPs (SparseTrainer)"
+    )
 
 
-def _objective(
-    likelihood: str, inputs: np.ndarray, targets: np.ndarray, penalty: Penalty | None, log_spread: np.ndarray
-) -> Objective:
-    """Negative log marginal likelihood plus penalty of one output over theta."""
-    if likelihood == "closed_form":
-        evidence = LogEvidence(inputs, targets)
-    else:
-        batch = GPyTorchEvidence(BatchExactGP(torch.from_numpy(inputs), torch.from_numpy(targets)[:, None]))
-
-        def evidence(theta: np.ndarray) -> tuple[float, np.ndarray]:
-            values, gradients = batch(theta[None])
-            return values[0], gradients[0]
-
-    def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
-        with np.errstate(over="ignore", invalid="ignore"):
-            value, gradient = evidence(theta)
-        if not (np.isfinite(value) and np.isfinite(gradient).all()):
-            return FAILED, np.zeros_like(theta)
-        if penalty is not None:
-            wall, slope = penalty(theta, log_spread)
-            value, gradient = value + wall, gradient + slope
-        return value, gradient
-
-    return objective
+def needed_memory(shapes: Sequence[tuple[int, int]], likelihood: str, workers: int = 1) -> int:
+    """The bytes that ``check_memory`` asks for: of the searches, or of the posteriors, whichever take more."""
+    tasks = sorted((size for size, outputs in shapes for _ in range(outputs)), reverse=True)
+    searches = sum(8 * MATRICES[likelihood] * size**2 for size in tasks[:workers])
+    kept = sum(8 * outputs * size**2 for size, outputs in shapes)
+    return max(searches, kept + 2 * 8 * max(tasks) ** 2)  # two more while a factor is made

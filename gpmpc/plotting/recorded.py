@@ -16,15 +16,17 @@ if TYPE_CHECKING:
     from gpmpc.recording import Run
 
 FLOWN, REFERENCE, TUBE, BOUND, FAILED = "#1f4e79", "#c0392b", "#9dc3e6", "0.45", "#e08e0b"
-POSITIONS = ("x", "y", "z")
+POSITIONS, ANGLES = ("x", "y", "z"), ("phi", "theta", "psi")
 STAGES = ("model", "build", "solve")
 STAGE_COLOURS = ("#1f4e79", "#7fb2e5", "#c0392b")
 
 
 def positions_of(run: "Run") -> list[int]:
-    """Indices of the states x, y, z; of all states where there is none of these."""
-    found = [run.state_names.index(name) for name in POSITIONS if name in run.state_names]
-    return found or list(range(len(run.state_names)))
+    """Indices of the states x, y, z; without them of the angles phi, theta, psi; of all states without either."""
+    for names in (POSITIONS, ANGLES):
+        if found := [run.state_names.index(name) for name in names if name in run.state_names]:
+            return found
+    return list(range(len(run.state_names)))
 
 
 def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -115,7 +115,7 @@ class McapRecorder:
         """
         if self._error is not None:
             raise RecordingError(self._error)
-        self._send(wire.pack(step, self._n, self._m))
+        self._send(*wire.pack(step, self._n, self._m))
 
     def close(self, outcome: str = "complete") -> None:
         """Waits until everything is on the disk and the file finished.
@@ -186,11 +186,11 @@ class McapRecorder:
         self._doorbell = self._process.stdin.fileno()
         os.set_blocking(self._doorbell, False)
 
-    def _send(self, frame: bytes, ring: bool = False) -> None:
+    def _send(self, head: bytes, arrays: Sequence[np.ndarray] = (), length: int = 0, ring: bool = False) -> None:
         """Puts a frame into the shared memory, and rings if enough has come together or enough time has passed."""
-        if 2 * len(frame) > CAPACITY:
-            raise RecordingError(f"{self.path}: a step of {len(frame)} bytes is too large; at most {CAPACITY // 2}")
-        while not self._ring.give(frame):
+        if 2 * (size := len(head) + length) > CAPACITY:
+            raise RecordingError(f"{self.path}: a step of {size} bytes is too large; at most {CAPACITY // 2}")
+        while not self._ring.give(head, arrays, length):
             self._announce()
             if self._process.poll() is not None:
                 self._fail(self._answer())

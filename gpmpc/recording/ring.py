@@ -12,6 +12,9 @@ import mmap
 import os
 import struct
 import tempfile
+from collections.abc import Sequence
+
+import numpy as np
 
 FRAME = struct.Struct("<qq")  # kind, length of what follows [bytes]
 POSITION = struct.Struct("<q")  # what the doorbell carries
@@ -54,6 +57,7 @@ class Ring:
         self._memory = memoryview(self._map)
         self._positions = self._memory[:16].cast("q")  # given, taken
         self._bytes = self._memory[_POSITIONS:]
+        self._numbers = np.frombuffer(self._bytes, np.float64)
 
     def touch(self) -> None:
         """Makes the system provide the memory now, not page by page in the loop."""
@@ -64,14 +68,16 @@ class Ring:
         """Position behind the last frame."""
         return self._positions[0]
 
-    def give(self, frame: bytes) -> bool:
+    def give(self, head: bytes, arrays: Sequence[np.ndarray] = (), length: int = 0) -> bool:
         """Appends a frame, if there is room.
 
         Args:
-            frame: ``FRAME`` and what follows, no longer than half the ring.
+            head: ``FRAME`` and what follows; of whole multiples of eight bytes where arrays follow.
+            arrays: Numbers behind it, of any shape, written row by row as float64.
+            length: Of all arrays together [bytes]; with the head no more than half the ring.
         """
         given, taken = self._positions
-        size = -(-len(frame) // _ALIGNMENT) * _ALIGNMENT
+        size = -(-(len(head) + length) // _ALIGNMENT) * _ALIGNMENT
         start = given % CAPACITY
         skipped = CAPACITY - start if start + size > CAPACITY else 0
         if given + skipped + size - taken > CAPACITY:
@@ -79,7 +85,12 @@ class Ring:
         if skipped:
             FRAME.pack_into(self._bytes, start, SKIP, skipped - FRAME.size)
             start = 0
-        self._bytes[start : start + len(frame)] = frame
+        self._bytes[start : start + len(head)] = head
+        at, numbers = (start + len(head)) // 8, self._numbers
+        for array in arrays:
+            end = at + array.size
+            numbers[at:end] = array.ravel()
+            at = end
         self._positions[0] = given + skipped + size
         return True
 

@@ -1,8 +1,9 @@
 """Problem: a step has to leave the control loop in a few microseconds, however long it takes to write it to a file.
 
 The loop and the writer are two processes with shared memory between them (``ring``). What crosses it is frames: a kind
-and a length, then, for a step, one packed head and the step's arrays as they lie in memory (float64). Packing costs the
-loop one copy and no serialisation; the writer finds every array by the sizes in the head.
+and a length, then, for a step, one packed head and the step's arrays as they lie in memory (float64). The small
+arrays are gathered behind the head, since a call for each costs more than a copy; P and G go from where they are to the
+shared memory in one. The writer finds every array by the sizes in the head.
 """
 
 import struct
@@ -23,8 +24,8 @@ STATUSES = tuple(Status)
 # time, k, gp_size, gp_version, status, iterations, failed, H, n and m of the QP, length of its record, timing
 _HEAD = struct.Struct("<dqqqqqqqqqqddd")
 RECORD_HEADER = 7  # gpmpc.qp.record.HEADER, whose import would cost the writer's start a quarter of a second
-_NUMBERS = {status: number for number, status in enumerate(STATUSES)}
 _float64 = np.dtype(np.float64)
+_NUMBERS = {status: number for number, status in enumerate(STATUSES)}
 
 
 def frame(kind: int, content: bytes) -> bytes:
@@ -32,8 +33,8 @@ def frame(kind: int, content: bytes) -> bytes:
     return FRAME.pack(kind, len(content)) + content
 
 
-def pack(step: Step, states: int, inputs: int) -> bytes:
-    """The frame of a step.
+def pack(step: Step, states: int, inputs: int) -> tuple[bytes, list[Array], int]:
+    """The frame of a step: its head with all small arrays, the large ones that follow, and their length [bytes].
 
     Args:
         step: What to pack.
@@ -59,25 +60,29 @@ def pack(step: Step, states: int, inputs: int) -> bytes:
     expected = _size(states, inputs, H)
     solution, problem = decision.solution, decision.problem
     variables = rows = record = 0
+    large: list[Array] = []
     if solution is not None:
         (P, G, softness), q = solution.terms, solution.q
         variables, rows = len(q), len(G)
         record = RECORD_HEADER + 3 * variables + 2 * rows  # without the factor
-        arrays += [P, q, G, solution.lower, solution.upper, softness, solution.record[:record]]
-        expected += _qp_size(variables, rows, record)
+        arrays += [q, solution.lower, solution.upper, softness, solution.record[:record]]
+        large = [P, G]
     elif problem is not None:
-        variables, rows = len(problem.q), len(problem.G)
+        P, G, variables, rows = problem.P, problem.G, len(problem.q), len(problem.G)
         hard = np.zeros((2, variables + rows))
         hard[1] = np.inf
-        arrays += [problem.P, problem.q, problem.G, problem.lower, problem.upper, hard]
-        expected += _qp_size(variables, rows, 0)
+        arrays += [problem.q, problem.lower, problem.upper, hard]
+        large = [P, G]
+    if large:
+        expected += 5 * variables + 4 * rows + record
     length = 0
     for i, array in enumerate(arrays):
         if array.__class__ is not np.ndarray or array.dtype is not _float64 or not array.flags.c_contiguous:
             array = arrays[i] = np.ascontiguousarray(array, dtype=np.float64)
         length += array.nbytes
-    if length != 8 * expected:
+    if length != 8 * expected or (large and (P.shape != (variables, variables) or G.shape != (rows, variables))):
         _explain(step, states, inputs)
+    following = 8 * variables * (variables + rows)
     timing = decision.timing
     head = _HEAD.pack(
         step.time,
@@ -95,7 +100,7 @@ def pack(step: Step, states: int, inputs: int) -> bytes:
         timing.build,
         timing.solve,
     )
-    return b"".join([FRAME.pack(STEP, _HEAD.size + length), head, *arrays])
+    return b"".join([FRAME.pack(STEP, _HEAD.size + length + following), head, *arrays]), large, following
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,17 +169,13 @@ def unpack(content: bytes | memoryview, states: int, inputs: int) -> PackedStep:
     arrays = [*vectors, take(m), take(n, n), take(H, m), take(H + 1, n), take(H + 1, n, n)]
     qp, v, M = None, variables, variables + rows
     if variables:
-        qp = PackedQP(take(v, v), take(v), take(rows, v), take(M), take(M), take(2, M), take(record))
+        small = {"q": take(v), "lower": take(M), "upper": take(M), "softness": take(2, M), "record": take(record)}
+        qp = PackedQP(P=take(v, v), G=take(rows, v), **small)
     return PackedStep(*head, *arrays, qp)
 
 
 def _size(n: int, m: int, H: int) -> int:
     return 4 * n + m + n * n + H * m + (H + 1) * (n + n * n)
-
-
-def _qp_size(variables: int, rows: int, record: int) -> int:
-    M = variables + rows
-    return variables**2 + variables + rows * variables + 4 * M + record
 
 
 def _explain(step: Step, n: int, m: int) -> None:

@@ -1,6 +1,7 @@
 """Contenders are asked the same question and judged by the same measure, which knows an optimum when it sees one."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -36,7 +37,8 @@ def gp():
     features = np.concatenate([states, inputs], axis=1)
     scales, signal = np.tile(4.0 * features.std(0), (6, 1)), 10.0 * changes.var(0)
     parts = map(torch.from_numpy, (features, changes, scales, signal, 1e-5 * signal))
-    return GPPosterior.from_hyperparameters(*parts, 3, predicts="difference")
+    offset = torch.from_numpy(changes.mean(0))  # as a trained model has one
+    return GPPosterior.from_hyperparameters(*parts, 3, "difference", offset)
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +176,8 @@ class _Plan:
 
 def test_ways_to_linearise_give_the_same_derivatives(gp):
     at = Gaussian(torch.full((6,), 0.2, dtype=torch.float64), 0.01 * torch.eye(6, dtype=torch.float64))
-    for group in linearisation_groups(gp, at, torch.from_numpy(HOVER), reverse_mode=True):
+    latent = replace(gp, offset=torch.zeros_like(gp.offset))  # the kernels know the latent functions alone
+    for group in linearisation_groups(latent, at, torch.from_numpy(HOVER), reverse_mode=True):
         own, *others = [call() for call in group.values()]
         for answer in others:
             for a, b in zip(own, answer, strict=True):

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import time
 
@@ -78,6 +79,24 @@ def test_a_recorded_flight_is_drawn(single):
     assert "Ignoring" not in done.stderr
 
 
+def test_the_attitude_alone_is_flown_recorded_drawn_and_reported_in_radians(tmp_path):
+    settings = ["subsystem=rotational", "trajectory=lorenz", *TINY, "steps=70", "horizon=3", "folder=tree"]
+    done = gpmpc("run", *settings, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "70 steps of lorenz attitude with convex" in done.stdout
+    assert "RMSE [rad]" in done.stdout
+    (folder,) = (tmp_path / "tree").iterdir()
+    run = read_run(folder / "run.mcap")
+    assert run.state_names == ("phi", "p", "theta", "q", "psi", "r")
+    assert run.metadata["units"]["state.phi"] == "rad"
+    assert run.times[1] == 0.05
+    assert np.abs(run.states - run.references)[:, ::2].max() < 0.02 < np.ptp(run.references[:, 0])
+    assert gpmpc("plot", str(folder), "--to", "figures", cwd=tmp_path).returncode == 0
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"tracking.png", "inputs.png", "timing.png"}
+    assert gpmpc("report", "tree", cwd=tmp_path).returncode == 0
+    assert "RMSE [rad]" in (tmp_path / "tree" / "report" / "report.md").read_text()
+
+
 def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_them(single):
     cwd, _ = single
     (folder,) = (cwd / "tree").iterdir()
@@ -105,6 +124,8 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
         (["controller=lqr", "propagation=unscented"], "propagation: this controller has none to choose"),
         (["recorder=mpac"], "recorder: must be 'mcap' or 'none'; got 'mpac'"),
         (["horizon=1,2"], "horizon: a list is written in brackets, horizon=[1,2]; a sweep takes -m"),
+        (["plant=coupled"], "the whole quadrotor is flown by gpmpc.simulation.cascade_loop"),
+        (["subsystem=rotational", "plant=rotational_map"], "plant: the rotational subsystem is flown at its own rate"),
         (["folder=null"], "folder: must be the path of a folder; got None"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -179,6 +200,29 @@ def test_a_killed_sweep_goes_on_and_ends_as_if_nothing_had_happened(sweep, tmp_p
     done = gpmpc(*SWEPT, "folder=tree", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert results(tree) == sweep[1]
+
+
+def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(sweep, tmp_path):
+    tree = tmp_path / "tree"
+    shutil.copytree(sweep[0], tree)
+    again = gpmpc(*SWEPT, "folder=tree", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert "4 runs: 0 flown, 4 finished before, 0 failed" in again.stdout
+    path = sorted(tree.glob("*/metrics.json"))[2]
+    found = json.loads(path.read_text())
+    found["settings"]["controller"]["problem"]["Q"][0] = 7.0
+    found["settings"]["gone"] = 1
+    path.write_text(json.dumps(found))
+    (tree / path.parent.name.replace("seed=0", "seed=1") / "metrics.json").unlink()
+    refused = gpmpc(*SWEPT, "folder=tree", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert refused.stderr.count("\n") == 1
+    assert f"folder: tree/{path.parent.name} holds a finished run of other settings" in refused.stderr
+    assert "controller.problem.Q: [7.0, 1.0, 10.0, 1.0, 10.0, 1.0] then, [10.0, 1.0" in refused.stderr
+    assert "gone: 1 then, None now" in refused.stderr
+    assert "choose another folder, or remove that one to fly it again" in refused.stderr
+    assert json.loads(path.read_text()) == found  # nothing was overwritten, nothing else flown
+    assert len(list(tree.glob("*/metrics.json"))) == 3
 
 
 def test_two_sweeps_share_a_tree(sweep, tmp_path):

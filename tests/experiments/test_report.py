@@ -108,9 +108,24 @@ def test_pairs_show_what_means_alone_do_not(tree):
     assert rmse.verdict == "A is larger than B"
     assert rmse.rank_biserial == 1
     assert rmse.interval[0] < rmse.difference < rmse.interval[1]
-    text = sentences([rmse], "controller=lqr", "controller=convex")[1]
+    text = sentences(report(tree), [rmse], "controller=lqr", "controller=convex")[1]
     for word in ("Wilcoxon signed-rank p = 0.0312", "t-test", "rank-biserial", "n = 6"):
         assert word in text
+
+
+def test_errors_of_both_subsystems_keep_their_units_and_are_not_averaged_together(tmp_path):
+    for seed in range(6):
+        for subsystem, unit in (("translational", "m"), ("rotational", "rad")):
+            for controller in ("lqr", "convex"):
+                choices = [f"controller={controller}", f"seed={seed}", f"subsystem={subsystem}"]
+                settings = SETTINGS | {"seed": seed, "options": {"controller": controller, "subsystem": subsystem}}
+                made_up_run(tmp_path, choices, settings, result=metrics_of(0.1 + 0.01 * seed) | {"unit": unit})
+    found = report(tmp_path)
+    assert "RMSE [m or rad]" in documents(found)["report.md"]
+    with pytest.raises(SettingError, match="errors in m and in rad have no common mean; add subsystem="):
+        compare(found, "controller=lqr", "controller=convex")
+    groups = [f"controller={name},subsystem=rotational" for name in ("lqr", "convex")]
+    assert compare(found, *groups)[0].pairs == 6
 
 
 def test_equal_groups_and_few_pairs_show_nothing(tmp_path):
@@ -118,6 +133,13 @@ def test_equal_groups_and_few_pairs_show_nothing(tmp_path):
         for controller in ("lqr", "convex"):
             add(tmp_path, controller, seed, 0.1 + 0.01 * seed)
     assert compare(report(tmp_path), "controller=lqr", "controller=convex")[0].verdict == "no difference shown"
+    copies = tmp_path / "copies"
+    for seed in range(7):
+        add(copies, "lqr", seed, 0.2)
+        add(copies, "convex", seed, 0.1)
+    found = compare(report(copies), "controller=lqr", "controller=convex")
+    assert found[0].verdict.startswith("undecided: every seed gave the same")
+    assert "p =" not in sentences(report(copies), found[:1], "controller=lqr", "controller=convex")[1]
     few = tmp_path / "few"
     for seed in range(5):
         add(few, "lqr", seed, 0.2)

@@ -13,10 +13,10 @@ from gpmpc.exceptions import SettingError
 from gpmpc.experiments.run import Experiment, fly, metrics, training_rows
 from gpmpc.experiments.run_folder import Busy, RunFolder, folder_name
 from gpmpc.gp import Trainer
-from gpmpc.plants import Coupled, Integrated, Translational
+from gpmpc.plants import Coupled, Integrated, Map, Rotational, Translational
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise
-from gpmpc.trajectories import Elliptical
+from gpmpc.trajectories import Elliptical, Lorenz
 
 PLANT = Integrated(Translational(), time_step=1.0, substeps=1)
 PROBLEM = TrackingProblem(
@@ -74,7 +74,10 @@ def test_a_model_loop_never_meets_the_plant_and_the_true_model_needs_no_data():
         ({"steps": 0}, "steps: must be a whole number, 1 or more"),
         ({"loop": "plan"}, "loop: must be 'plant' or 'model'; got 'plan'"),
         ({"on_failure": "cry"}, "on_failure: must be one of"),
-        ({"plant": Integrated(Coupled())}, "plant: must be translational"),
+        ({"plant": Integrated(Coupled())}, "the translational subsystem, x, vx, y, vy, z, vz; got x, .*cascade_loop"),
+        ({"subsystem": "rotational"}, "must have the states of the rotational subsystem, phi, p"),
+        ({"subsystem": "rotational", "plant": Map(Rotational())}, "flown at its own rate; a Map has none"),
+        ({"subsystem": "whole"}, "subsystem: must be one of translational, rotational; got 'whole'"),
         ({"controller": ON_THE_PLANT, "loop": "model"}, "loop: a model loop needs a controller that learns"),
     ],
     ids=str,
@@ -82,6 +85,24 @@ def test_a_model_loop_never_meets_the_plant_and_the_true_model_needs_no_data():
 def test_what_cannot_be_flown_is_refused(changes, message):
     with pytest.raises(SettingError, match=message):
         experiment(**changes)
+
+
+def test_the_rotational_subsystem_follows_the_attitudes_of_the_trajectory_at_its_own_rate():
+    plant = Integrated(Rotational(), time_step=0.05, substeps=5)
+    excited = Excitation(plant, [1] * 6, [1] * 3, [0] * 3, [0.05] * 3, [1e-4, 1e-3] * 3)
+    problem = TrackingProblem([100, 1] * 3, [1] * 3, penalized="increments", input_lower=[-2] * 3, input_upper=[2] * 3)
+    settings = {"propagator": Linearization(), "problem": problem, "horizon": 5, "initial_input": [0] * 3}
+    turning = experiment(
+        subsystem="rotational", plant=plant, trajectory=Lorenz(), data=ExcitedData(EXCITED, excited, samples=60),
+        controller=partial(ConvexMPC, **settings), size=None, steps=100,
+    )  # fmt: skip
+    flight = fly(turning)
+    found = metrics(turning, flight)
+    assert flight.rollout.time_step == 0.05
+    assert np.ptp(flight.rollout.references[:, 0]) > 0.03  # [rad]: there was something to follow
+    assert set(found["rmse"]) == {"phi", "theta", "psi", "total"}
+    assert found["unit"] == "rad"
+    assert found["rmse"]["total"] < 0.005
 
 
 def test_more_rows_than_there_are_are_refused():
@@ -99,9 +120,9 @@ def test_a_folder_is_finished_when_its_metrics_are_there_and_one_process_works_o
         assert folder.failed_at
         folder.begin("steps: 1")
         assert folder.failed_at is None
-        folder.finish({"rmse": 1})
+        folder.finish({"rmse": 1, "settings": {}})
     assert folder.finished
-    assert folder.result() == {"rmse": 1}
+    assert folder.result() == {"rmse": 1, "settings": {}}
     with folder.claimed(wait=False):
         pass
     assert sorted(path.name for path in folder.path.iterdir()) == ["config.yaml", "metrics.json"]

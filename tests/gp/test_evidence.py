@@ -1,9 +1,12 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 import torch
 from scipy.optimize import approx_fprime
 
 from gpmpc.gp.evidence import LogEvidence
+from gpmpc.gp.evidence_in_place import InPlaceEvidence
 from gpmpc.gp.model import BatchExactGP, GPyTorchEvidence
 
 
@@ -50,3 +53,32 @@ def test_a_kernel_matrix_that_is_not_positive_definite_has_infinite_evidence():
     value, gradient = LogEvidence(x, np.ones(5))(np.array([0.0, 0.0, 0.0, 20.0]))  # five equal points without noise
     assert value == np.inf
     assert not gradient.any()
+
+
+@pytest.mark.parametrize("size", [1, 2, 255, 256, 257, 600])
+def test_the_evidence_in_place_is_the_evidence_call_after_call(size):
+    x, y, theta = problem(size)
+    in_place, separate = InPlaceEvidence(x, y[:, 0]), LogEvidence(x, y[:, 0])
+    for point in (theta[0], theta[1], theta[0]):
+        (value, gradient), (expected, slopes) = in_place(point), separate(point)
+        assert value == pytest.approx(expected, rel=1e-10, abs=1e-9)
+        assert np.allclose(gradient, slopes, rtol=1e-8, atol=1e-8 * (1 + np.abs(slopes).max()))
+
+
+def test_the_evidence_in_place_is_infinite_where_the_matrix_is_not_positive_definite_and_recovers():
+    x, y, theta = problem(30)
+    x[1] = x[0]
+    evidence = InPlaceEvidence(x, y[:, 0])
+    value, gradient = evidence(np.append(theta[0][:-1], 40.0))
+    assert value == np.inf
+    assert not gradient.any()
+    assert evidence(theta[0])[0] == pytest.approx(LogEvidence(x, y[:, 0])(theta[0])[0], rel=1e-10)
+
+
+def test_the_evidence_in_place_takes_one_matrix_and_a_few_blocks():
+    x, y, theta = problem(1500)
+    tracemalloc.start()
+    InPlaceEvidence(x, y[:, 0])(theta[0])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert 1.0 < peak / (8 * 1500**2) < 1.8

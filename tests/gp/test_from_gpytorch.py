@@ -20,8 +20,8 @@ from gpytorch.means import ConstantMean, LinearMean, ZeroMean
 from gpmpc.exceptions import SettingError, ShapeError, TrainingError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, KernelPosterior, fit
+from gpmpc.gp.collapsed_bound import collapsed_bound
 from gpmpc.gp.model import exact_inference
-from gpmpc.gp.sparse import collapsed_bound
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, differentiate
 
 

@@ -8,8 +8,8 @@ import torch
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Budget, GPPosterior, SparseTrainer, Trainer, Transitions, sparse_posterior, standardize
+from gpmpc.gp.collapsed_bound import collapsed_bound, collapsed_bound_with_gradient
 from gpmpc.gp.kernel import kernel_matrix
-from gpmpc.gp.sparse import collapsed_bound
 from gpmpc.gp.sparse_training import greedy_points
 from gpmpc.propagation import MomentMatching, MonteCarlo
 
@@ -101,6 +101,19 @@ def test_the_bounds_gradient_is_right():
             return collapsed_bound(Z, x, y, *hyperparameters, method=method)
 
         assert torch.autograd.gradcheck(bound, [leaf.clone().requires_grad_() for leaf in leaves], atol=1e-4)
+
+
+@pytest.mark.parametrize("method", ["sgpr", "fitc"])
+def test_the_bound_and_its_gradient_in_blocks_are_those_in_one_piece(method, monkeypatch):
+    monkeypatch.setattr("gpmpc.gp.collapsed_bound.ENTRIES", 1)  # 64 points at a time
+    x, y, settings = problem(150)
+    leaves = [leaf.clone().requires_grad_() for leaf in (x[:12], *settings.values())]
+    whole = collapsed_bound(leaves[0], x, y, *leaves[1:], method=method)
+    slopes = torch.autograd.grad(whole.sum(), leaves)
+    value, gradients = collapsed_bound_with_gradient(x[:12], x, y, *settings.values(), method=method)
+    assert torch.allclose(value, whole.detach(), rtol=1e-12)
+    for ours, theirs in zip(gradients, slopes, strict=True):
+        assert torch.allclose(ours, theirs, rtol=1e-8, atol=1e-8 * float(theirs.abs().max()))
 
 
 @pytest.mark.parametrize("method", ["sgpr", "fitc"])

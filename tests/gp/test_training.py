@@ -3,9 +3,9 @@ import pytest
 import torch
 from scipy.optimize import approx_fprime
 
-from gpmpc.exceptions import SettingError, TrainingError
-from gpmpc.gp import SoftLimits, Transitions, train
-from gpmpc.gp.training import spread
+from gpmpc.exceptions import DataError, SettingError, TrainingError
+from gpmpc.gp import SoftLimits, Trainer, Transitions, train
+from gpmpc.gp.hyperparameter_search import spread
 
 
 def pendulum(rows=60, noise=1e-3, seed=0):
@@ -106,9 +106,41 @@ def test_when_all_starts_fail_the_output_is_named():
     assert caught.value.outputs == [1]
 
 
+def test_a_search_that_begins_with_a_subset_ends_at_the_same_optimum():
+    data = pendulum(420, noise=1e-2)
+    everywhere, first_a_part = train(data, subset=None), train(data, subset=100)
+    assert np.allclose(first_a_part.objective, everywhere.objective, rtol=1e-6)
+    assert np.allclose(first_a_part.theta, everywhere.theta, atol=0.02)
+    assert (first_a_part.explored > everywhere.explored + 100).all()  # of fewer points: less evidence
+
+
+def test_a_start_that_is_known_is_searched_from_over_all_points():
+    data, trainer = pendulum(120, noise=1e-2), Trainer(restarts=0, subset=40)
+    first = trainer(data)
+    again = trainer.refit(first.posterior)
+    assert again.evaluations < first.evaluations
+    assert np.allclose(again.explored[:, 0], first.objective, rtol=1e-6)
+
+
+def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(monkeypatch):
+    monkeypatch.setattr("gpmpc.gp.training.available_memory", lambda: 2 * 2**20)
+    with pytest.raises(DataError) as refused:
+        train(pendulum(400))
+    assert str(refused.value) == (
+        "exact GPs of 400 points and 2 outputs need 0.00477 GiB, 0.00119 GiB a kernel matrix; 0.00195 GiB are "
+        "available: train on 256 points or fewer, or sparse GPs (SparseTrainer)"
+    )
+    with pytest.raises(DataError, match="exact GPs of 160 points"):  # GPyTorch's likelihood holds more
+        train(pendulum(160), likelihood="gpytorch")
+    assert len(train(pendulum(250), restarts=0, tolerance=1e-3).posterior) == 250
+    monkeypatch.setattr("gpmpc.gp.training.available_memory", lambda: None)
+    assert len(train(pendulum(20), restarts=0).posterior) == 20
+
+
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
+        ({"subset": 0}, "subset: must be a whole number, 1 or more; got 0"),
         ({"restarts": -1}, "restarts: must be a whole number, 0 or more; got -1"),
         ({"predicts": "delta"}, "'next_state' or 'difference'; got 'delta'"),
         ({"likelihood": "exact"}, "'closed_form' or 'gpytorch'; got 'exact'"),

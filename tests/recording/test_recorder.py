@@ -4,7 +4,6 @@ import json
 import multiprocessing
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -394,31 +393,6 @@ def test_the_wire_knows_the_layout_of_a_solvers_record():
     from gpmpc.qp import record
 
     assert record.HEADER == wire.RECORD_HEADER
-
-
-def _node_reads_mcap():
-    node = shutil.which("node")
-    found = node and subprocess.run([node, "-e", "require.resolve('@mcap/core')"], capture_output=True, check=False)
-    return bool(found) and found.returncode == 0
-
-
-@pytest.mark.skipif(not _node_reads_mcap(), reason="node's @mcap/core is not installed")
-def test_the_reader_of_another_language_agrees(recorded):
-    path, _ = recorded
-    script = """
-const {McapStreamReader} = require('@mcap/core');
-const reader = new McapStreamReader({decompressHandlers: {zstd: (data, size) => Buffer.alloc(Number(size))},
-                                     includeChunks: true, validateCrcs: false});
-reader.append(require('fs').readFileSync(process.argv[1]));
-const counts = {};
-for (let r; (r = reader.nextRecord());) counts[r.type] = (counts[r.type] || 0) + 1;
-console.log(JSON.stringify(counts));
-"""
-    output = subprocess.run(["node", "-e", script, str(path)], capture_output=True, text=True, check=True).stdout
-    counts = json.loads(output)
-    assert counts["Attachment"] == 1
-    assert counts["Metadata"] == 4
-    assert counts["Footer"] == 1
 
 
 def test_the_foxglove_layout_names_only_what_is_recorded(recorded):

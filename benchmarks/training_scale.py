@@ -1,0 +1,286 @@
+"""How time and memory of training grow with the number of points: exact GPs to 5000, sparse ones to 20000.
+
+    python benchmarks/training_scale.py                      # about ten minutes
+    python benchmarks/training_scale.py --quick              # to 1000 points; a minute
+    python benchmarks/training_scale.py --threads 2
+
+One output of nine features; every case in a process of its own, whose peak resident set less that after the imports is
+the memory. Times are processor time (of all threads together, as many as ``--threads``): of one evaluation of the
+likelihood with its gradient, and of whole trainings with the error they end with. Beside it GPyTorch's own route, exact
+(automatic differentiation through Cholesky) and sparse (``InducingPointKernel``), to the sizes that are bearable; the
+ratio, its time over ours, is from taking turns in one process. Written to ``--out``: training_scale.json and
+training_scale.png.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+EXACT, GPYTORCH, SPARSE, GPYTORCH_SPARSE = "exact", "GPyTorch", "sparse", "GPyTorch sparse"
+D, NOISE = 9, 0.05
+TEST_ROWS = 2000
+COLOURS = {EXACT: "C0", GPYTORCH: "C1", SPARSE: "C2", GPYTORCH_SPARSE: "C3"}
+
+
+def main() -> None:
+    """Measures every case in a process of its own; prints, writes and draws."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="to 1000 points")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=15, help="after them no other case is begun")
+    parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks"))
+    parser.add_argument("--case", help=argparse.SUPPRESS)
+    settings = parser.parse_args()
+    if settings.case:
+        print(json.dumps(measure(**json.loads(settings.case))))
+        return
+    environment = dict(os.environ)
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        environment[variable] = str(settings.threads)
+    results, left_out, began = [], [], time.monotonic()
+    print(f"{'case':38}{'median [s]':>12}{'p99 [s]':>12}{'ratio':>8}{'memory [MB]':>13}{'test RMSE':>11}")
+    for case in cases(settings.quick):
+        if time.monotonic() - began > 60 * settings.minutes:
+            left_out.append(case)
+            continue
+        command = [sys.executable, __file__, "--case", json.dumps(case)]
+        finished = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
+        results.append(case | json.loads(finished.stdout.splitlines()[-1]))
+        print(described(results[-1]), flush=True)
+    from gpmpc.provenance import provenance
+
+    settings.out.mkdir(parents=True, exist_ok=True)
+    meta = provenance() | {"threads": settings.threads, "load": os.getloadavg()[0], "left out": left_out}
+    (settings.out / "training_scale.json").write_text(json.dumps({"meta": meta, "results": results}, indent=1))
+    draw(results, settings.out / "training_scale.png", settings.threads)
+    if left_out:
+        print(f"{len(left_out)} cases left out after {settings.minutes:g} minutes, the largest")
+    print(f"written to {settings.out}")
+
+
+def cases(quick: bool) -> list[dict]:
+    """What is measured: evaluations, trainings, a posterior; the smallest first."""
+    sizes, many = (100, 200, 500, 1000), (1000,)
+    if not quick:
+        sizes, many = (*sizes, 2000, 5000), (*many, 5000, 20000)
+    found = [{"what": "evaluation", "route": EXACT, "size": size} for size in sizes]
+    found += [{"what": "evaluation", "route": GPYTORCH, "size": size} for size in sizes if size <= 2000]
+    found += [{"what": "evaluation", "route": SPARSE, "size": size, "inducing": M} for M in (200, 500) for size in many]
+    found += [{"what": "evaluation", "route": GPYTORCH_SPARSE, "size": size, "inducing": 200} for size in many]
+    found += [{"what": "training", "route": EXACT, "size": size} for size in sizes]
+    found += [{"what": "training", "route": SPARSE, "size": size, "inducing": 200} for size in many]
+    return [*sorted(found, key=lambda case: case["size"]), {"what": "posterior", "route": EXACT, "size": sizes[-1]}]
+
+
+def measure(what: str, route: str, size: int, inducing: int = 0) -> dict:
+    """One case, in this process."""
+    import gpytorch  # noqa: F401  # before the memory is read
+    import torch
+
+    import gpmpc.gp  # noqa: F401
+
+    torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+    x, y = data(size)
+    imported = peak_megabytes()
+    if what == "posterior":
+        return posterior(x, y, imported)
+    if what == "training":
+        return training(route, x, y, inducing, imported)
+    evaluate = evaluation(route, x, y, inducing)
+    imported = peak_megabytes()  # what is loaded at first use is no matrix
+    evaluate()
+    count, found = repeats(evaluate), {"megabytes": peak_megabytes() - imported}
+    if route in (EXACT, SPARSE):
+        return quantiles([seconds_of(evaluate) for _ in range(count)]) | found
+    ours = evaluation(EXACT if route == GPYTORCH else SPARSE, x, y, inducing)
+    ours()
+    turns = [(seconds_of(evaluate), seconds_of(ours)) for _ in range(count)]
+    ratio = quantiles([theirs / own for theirs, own in turns])
+    return quantiles([theirs for theirs, _ in turns]) | {"ratio": ratio["median"], "ratio p99": ratio["p99"]} | found
+
+
+def data(size: int, seed: int = 0):
+    """x~ (N, 9) and one target (N, 1) with noise."""
+    import torch
+
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn(size, D, generator=generator, dtype=torch.float64)
+    return x, function(x) + NOISE * torch.randn(size, 1, generator=generator, dtype=torch.float64)
+
+
+def function(x):
+    """What is learned (N, 1)."""
+    return (x[:, 0].sin() + 0.5 * x[:, 0] * x[:, 1] + 0.3 * (x[:, 2] + x[:, 3]).cos())[:, None]
+
+
+def evaluation(route: str, x, y, inducing: int):
+    """A function of nothing: the likelihood or bound and its gradient, at one point of the search."""
+    import numpy as np
+    import torch
+
+    from gpmpc.gp.collapsed_bound import collapsed_bound_with_gradient
+    from gpmpc.gp.evidence import LogEvidence
+    from gpmpc.gp.evidence_in_place import InPlaceEvidence
+    from gpmpc.gp.hyperparameter_search import IN_PLACE
+    from gpmpc.gp.model import BatchExactGP, GPyTorchEvidence
+
+    theta = np.append(np.linspace(0.5, 1.5, D), [0.5, np.log(30.0)])
+    if route == EXACT:
+        evidence = (LogEvidence if len(x) < IN_PLACE else InPlaceEvidence)(x.numpy(), y[:, 0].numpy())
+        return lambda: evidence(theta)
+    if route == GPYTORCH:
+        batch = GPyTorchEvidence(BatchExactGP(x, y))
+        return lambda: batch(theta[None])
+    scales, sf2 = torch.from_numpy(np.exp(theta[None, :D])), torch.tensor([np.exp(1.0)], dtype=torch.float64)
+    if route == SPARSE:
+        return lambda: collapsed_bound_with_gradient(x[:inducing], x, y, scales, sf2, sf2 / 900)
+    return gpytorch_sparse(x, y, inducing, scales, sf2)
+
+
+def gpytorch_sparse(x, y, inducing: int, scales, sf2):
+    """GPyTorch's collapsed bound (SGPR) and its gradient, as its documentation builds it."""
+    import gpytorch
+    import torch
+
+    likelihood = gpytorch.likelihoods.GaussianLikelihood().double()
+    likelihood.noise = float(sf2 / 900)
+
+    class Sparse(gpytorch.models.ExactGP):
+        def __init__(self):
+            super().__init__(x, y[:, 0], likelihood)
+            self.mean_module = gpytorch.means.ZeroMean()
+            base = gpytorch.kernels.ScaleKernel(gpytorch.kernels.RBFKernel(ard_num_dims=D)).double()
+            base.base_kernel.lengthscale, base.outputscale = scales, sf2[0]
+            self.covar_module = gpytorch.kernels.InducingPointKernel(base, x[:inducing].clone(), likelihood)
+
+        def forward(self, z):
+            return gpytorch.distributions.MultivariateNormal(self.mean_module(z), self.covar_module(z))
+
+    model = Sparse().train()
+    bound = gpytorch.mlls.ExactMarginalLogLikelihood(likelihood, model)
+
+    def evaluate():
+        model.zero_grad()
+        with torch.enable_grad():
+            (-bound(model(x), y[:, 0])).backward()
+
+    return evaluate
+
+
+def training(route: str, x, y, inducing: int, imported: float) -> dict:
+    """A whole training of one output, and its error on fresh rows without noise."""
+    import torch
+
+    from gpmpc.gp import SparseTrainer, Trainer
+
+    trainer = Trainer() if route == EXACT else SparseTrainer(inducing=inducing)
+    begin = time.process_time()
+    trained = trainer.fit(x, y, 0, "value")
+    seconds, megabytes = time.process_time() - begin, peak_megabytes() - imported
+    queries = data(TEST_ROWS, seed=1)[0].split(100)
+    error = torch.cat([trained.posterior.mean_with_jacobian(query)[0] - function(query) for query in queries])
+    return {
+        "median": seconds,
+        "megabytes": megabytes,
+        "evaluations": trained.evaluations,
+        "test RMSE": float(error.square().mean().sqrt()),
+        "minus log evidence": float(trained.objective[0]),
+    }
+
+
+def posterior(x, y, imported: float) -> dict:
+    """Six outputs frozen, linearised and moment-matched: seconds of a second call."""
+    import torch
+
+    from gpmpc.gaussian import Gaussian
+    from gpmpc.gp import GPPosterior
+    from gpmpc.propagation import Linearization, MomentMatching, linearize
+
+    k, begin, size = 6, time.process_time(), len(x)
+    scales = torch.linspace(2, 4, D, dtype=torch.float64).expand(k, D)
+    one = torch.ones(k, dtype=torch.float64)
+    gp = GPPosterior.from_hyperparameters(x, y.expand(size, k), scales, one, 1e-3 * one, input_dim=3)
+    found = {"median": time.process_time() - begin, "built megabytes": peak_megabytes() - imported}
+    belief = Gaussian(x[0, :6], 0.01 * torch.eye(6, dtype=torch.float64))
+    for propagator in (Linearization(), MomentMatching()):
+        name = type(propagator).__name__
+        linearize(propagator, gp, belief, x[0, 6:])
+        found[name] = seconds_of(lambda propagator=propagator: linearize(propagator, gp, belief, x[0, 6:]))
+        found[f"{name} megabytes"] = peak_megabytes() - imported
+    return found | {"megabytes": peak_megabytes() - imported}
+
+
+def seconds_of(call) -> float:
+    """Processor time of one call."""
+    begin = time.process_time()
+    call()
+    return time.process_time() - begin
+
+
+def repeats(call) -> int:
+    """As many calls as take some three seconds, from 3 to 50."""
+    return int(min(max(3.0 / max(seconds_of(call), 1e-4), 3), 50))
+
+
+def quantiles(seconds: list[float]) -> dict[str, float]:
+    """Median and 99th percentile."""
+    import numpy as np
+
+    return {"median": float(np.median(seconds)), "p99": float(np.quantile(seconds, 0.99))}
+
+
+def peak_megabytes() -> float:
+    """Of this process so far; Linux counts in KiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def described(result: dict) -> str:
+    """One line of the table."""
+    name = f"{result['route']} {result['what']}, N = {result['size']}"
+    name += f", M = {result['inducing']}" if "inducing" in result else ""
+    cells = [(result.get("median"), 12, ".4g"), (result.get("p99"), 12, ".4g"), (result.get("ratio"), 8, ".3g")]
+    cells += [(result.get("megabytes"), 13, ".0f"), (result.get("test RMSE"), 11, ".3g")]
+    return f"{name:38}" + "".join(" " * width if v is None else f"{v:{width}{form}}" for v, width, form in cells)
+
+
+def draw(results: list[dict], path: Path, threads: int) -> None:
+    """Time and memory over N."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, (times, memory) = plt.subplots(1, 2, figsize=(11, 4.8))
+    lines: dict[tuple, list[dict]] = {}
+    for result in results:
+        if result["what"] in ("evaluation", "training"):
+            lines.setdefault((result["what"], result["route"], result.get("inducing")), []).append(result)
+    for (what, route, inducing), line in lines.items():
+        label = f"{route}, {what}" + (f", M = {inducing}" if inducing else "")
+        marker = {"evaluation": "o", "training": "s"}[what]
+        style = ":" if what == "training" else "--" if inducing == 500 else "-"
+        look = {"color": COLOURS[route], "marker": marker, "linestyle": style, "markersize": 4, "label": label}
+        x = [one["size"] for one in line]
+        times.loglog(x, [one["median"] for one in line], **look)
+        if what == "evaluation":
+            memory.loglog(x, [max(one["megabytes"], 0.1) for one in line], **look)
+    sizes = sorted({one["size"] for one in results if one["route"] == EXACT})
+    memory.loglog(sizes, [8 * size**2 / 2**20 for size in sizes], color="0.6", zorder=0, label="one N x N matrix")
+    times.set(ylabel=f"processor time [s], {threads} thread(s)", title="value and gradient; whole trainings")
+    memory.set(ylabel="peak memory beyond the imports [MB]", title="value and gradient")
+    for axis in (times, memory):
+        axis.set_xlabel("training points N")
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8, frameon=False)
+    figure.suptitle("Training one output of nine features")
+    figure.tight_layout()
+    figure.savefig(path, dpi=150)
+
+
+if __name__ == "__main__":
+    main()

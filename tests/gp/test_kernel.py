@@ -1,0 +1,37 @@
+import pytest
+import torch
+
+from gpmpc.exceptions import SettingError
+from gpmpc.gp.kernel import factorised
+
+
+def arguments(size=150, outputs=3, d=4):
+    scales = 0.5 + torch.rand(outputs, d)
+    return torch.randn(size, d), scales, 1 + torch.rand(outputs), torch.full((outputs,), 1e-3)
+
+
+def test_factors_made_in_place_are_the_same_bit_by_bit(monkeypatch):
+    given = arguments()
+    at_once = factorised(*given)
+    monkeypatch.setattr("gpmpc.gp.kernel.MANY", 10)
+    in_place = factorised(*given)
+    assert torch.equal(in_place, at_once)
+    assert in_place.stride() == at_once.stride()
+
+
+def test_of_factors_made_in_place_the_output_that_fails_is_named(monkeypatch):
+    monkeypatch.setattr("gpmpc.gp.kernel.MANY", 10)
+    points, scales, signal, noise = arguments(size=100)
+    points[50:] = points[:50]
+    noise[2] = 1e-300
+    with pytest.raises(SettingError, match="the kernel matrix of output 2 is not positive definite"):
+        factorised(points, scales, signal, noise)
+
+
+def test_gradients_pass_through_factors_of_any_size(monkeypatch):
+    monkeypatch.setattr("gpmpc.gp.kernel.MANY", 10)
+    points, scales, signal, noise = arguments(size=20, outputs=1)
+    noise.requires_grad_()
+    factorised(points, scales, signal, noise).diagonal(dim1=-2, dim2=-1).log().sum().backward()
+    K = factorised(points, scales, signal, noise.detach())[0]
+    assert float(noise.grad) == pytest.approx(float(torch.cholesky_inverse(K).trace()) / 2)
