@@ -106,10 +106,17 @@ def square_root_differential(r: Tensor, U: Tensor, change: Tensor) -> Tensor:
         dR (*batch, n, n, j); zero where r_i + r_j is.
     """
     total = (r[..., :, None] + r[..., None, :])[..., None]
+    rotated = _congruent(U.mT, change)
     positive = total > 0
-    rotated = torch.einsum("...ki,...klj,...lm->...imj", U, change, U)
-    solution = torch.where(positive, rotated / torch.where(positive, total, 1.0), 0.0)
-    return torch.einsum("...ik,...klj,...ml->...imj", U, solution, U)
+    return _congruent(U, torch.where(positive, rotated / torch.where(positive, total, 1.0), 0.0))
+
+
+def _congruent(U: Tensor, matrices: Tensor) -> Tensor:
+    """U X U' for symmetric X, as many as wanted along the last dimension (*batch, n, n, j)."""
+    half = U @ matrices.flatten(-2)  # its rows are of U X, one X beside the other
+    return (U @ half.unflatten(-1, matrices.shape[-2:]).transpose(-3, -2).flatten(-2)).unflatten(
+        -1, matrices.shape[-2:]
+    )
 
 
 def _plain(value: Tensor) -> bool:

@@ -11,7 +11,8 @@ exists whatever A and B are. The bounds of the inputs hold for u_k, not for what
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import borrowing, compiled
+from gpmpc.control.small_matrices import add_product, add_transposed_product, solve_positive
 
 Array = np.ndarray
 
@@ -21,16 +22,29 @@ SETTLED = 1e-9  # relative change of the cost to go at which the recursion has r
 @compiled
 def lqr_gain(A, B, Q, R, terminal, horizon):
     """K (m, n) of u = K x for x+ = A x + B u under sum x'Qx + u'Ru and x_H' terminal x_H."""
-    M = terminal.copy()
-    K = np.zeros((B.shape[1], B.shape[0]))
+    n, m = B.shape
+    M, cost, MA, MB = terminal.copy(), np.empty((n, n)), np.empty((n, n)), np.empty((n, m))
+    K, W, MBA = np.zeros((m, n)), np.empty((m, m)), np.empty((m, n))
     for _ in range(horizon):
-        MA = M @ A
-        K = -np.linalg.solve(R + B.T @ M @ B, B.T @ MA)
-        cost = Q + A.T @ (MA + M @ B @ K)
-        cost = (cost + cost.T) / 2.0
-        change = np.abs(cost - M).max()
-        M = cost
-        if change <= SETTLED * np.abs(M).max():
+        MA[:], MB[:], MBA[:], W[:], cost[:] = 0.0, 0.0, 0.0, R, Q
+        add_product(M, A, MA)
+        add_product(M, B, MB)
+        add_transposed_product(MB, A, MBA)
+        add_transposed_product(B, MB, W)
+        K[:] = MBA
+        solve_positive(W, K)
+        for j in range(m):
+            for i in range(n):
+                K[j, i] = -K[j, i]
+        add_transposed_product(A, MA, cost)
+        add_transposed_product(MBA, K, cost)
+        change, size = 0.0, 0.0
+        for i in range(n):
+            for j in range(i + 1):
+                value = (cost[i, j] + cost[j, i]) / 2.0
+                change, size = max(change, abs(value - M[i, j])), max(size, abs(value))
+                M[i, j] = M[j, i] = value
+        if change <= SETTLED * size:
             break
     return K
 
@@ -38,9 +52,25 @@ def lqr_gain(A, B, Q, R, terminal, horizon):
 @compiled
 def spread(A, V, start, horizon):
     """Sigma_0 .. Sigma_H (H + 1, n, n) of Sigma+ = A Sigma A' + V."""
-    covariances = np.empty((horizon + 1, A.shape[0], A.shape[1]))
+    covariances, scratch = np.empty((horizon + 1, A.shape[0], A.shape[1])), np.empty(len(A))
     covariances[0] = start
     for k in range(horizon):
-        S = A @ covariances[k] @ A.T + V
-        covariances[k + 1] = (S + S.T) / 2.0
+        step_spread(A, V, covariances[k], scratch, covariances[k + 1])
     return covariances
+
+
+@borrowing
+def step_spread(A, V, before, scratch, after):
+    """Writes A Sigma A' + V."""
+    n = len(A)
+    for i in range(n):
+        for j in range(n):
+            scratch[j] = 0.0
+        for c in range(n):
+            for j in range(n):
+                scratch[j] += A[i, c] * before[c, j]
+        for j in range(i + 1):
+            total = (V[i, j] + V[j, i]) / 2.0
+            for c in range(n):
+                total += scratch[c] * A[j, c]
+            after[i, j] = after[j, i] = total

@@ -67,8 +67,10 @@ class ChanceConstraints:
 
     def limits(self, prediction: Prediction) -> tuple[Array, Array]:
         """l_k and h_k (H, r)."""
+        if not self.per_stage:
+            return np.empty((self._horizon, 0)), np.empty((self._horizon, 0))
         bound = np.tile(self._bound, (self._horizon, 1))
-        if self._covariance == "zero_order" and self.per_stage:
+        if self._covariance == "zero_order":
             variance = np.diagonal(prediction.covariances[1:], axis1=1, axis2=2)[:, self._state]
             bound = bound - self._sign * self._kappa * np.sqrt(np.clip(variance, 0, None))
         lower, upper = np.where(self._sign > 0, -np.inf, bound), np.where(self._sign > 0, bound, np.inf)

@@ -4,18 +4,21 @@ The rollout of ``gpmpc.control.prediction`` for SE-ARD posteriors whose stages n
 the variance at the mean (``Linearization``): one compiled loop, with the feedback of ``ancillary_feedback``.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from gpmpc.compiled import compiled
-from gpmpc.control.ancillary_feedback import lqr_gain
+from gpmpc.control.ancillary_feedback import lqr_gain, step_spread
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.fused.point import expand_at
-from gpmpc.fused.point_rows import aligned_rows
+from gpmpc.fused.point_rows import aligned_rows, explain_several
 from gpmpc.gp.posterior import GPPosterior
 
 Array = np.ndarray
+
+NOTHING = np.empty((0, 0))
 
 
 class Stages(NamedTuple):
@@ -36,80 +39,90 @@ class Stages(NamedTuple):
     inputs: Array
 
 
-def roll_out(
-    model: GPPosterior,
-    problem: TrackingProblem,
-    start: Array,
-    covariance: Array,
-    plan: Array,
-    follow: Array | None,
-    feedback: bool,
-    uncertain: bool,
-    noise: Array,
-) -> Stages:
-    """The stages along a plan.
+class CompiledRollout:
+    """Rolls plans out on one model; what stays the same is looked up once.
 
     Args:
         model: Predicts next states or differences; float64, in host memory.
         problem: Weights of the feedback, and the inputs' bounds.
-        start: x_0 (n,).
-        covariance: Of x_0 (n, n).
-        plan: (H, m).
-        follow: Means (H, n) that the rollout follows under the feedback; None follows none.
         feedback: Whether there is any.
         uncertain: Predicts covariances; they are zero otherwise.
-        noise: Added to every predicted covariance (n, n).
+        observation_noise: Adds the model's noise to every predicted covariance.
     """
-    (H, m), n, packed = plan.shape, len(start), model.packed
-    found = Stages(
-        np.empty((H, n, n)), np.empty((H, n, m)), np.empty((H, n)), np.zeros((H + 1, n, n)), np.array(plan, dtype=float)
-    )
-    found.covariances[0] = covariance
-    _stages(
-        uncertain,
-        feedback,
-        (packed.points, packed.inverse_squares, packed.log_signal, packed.weights),
-        packed.inverse_cholesky if uncertain else np.empty((n, 0)),
-        (model.offset.numpy(), model.predicts == "difference"),
-        (problem.Q, problem.R, problem.terminal),
-        (problem.input_lower, problem.input_upper),
-        np.array(start, dtype=float),
-        np.empty((0, n)) if follow is None else np.ascontiguousarray(follow, dtype=float),
-        np.ascontiguousarray(noise),
-        found,
-    )
-    return found
+
+    def __init__(
+        self, model: GPPosterior, problem: TrackingProblem, feedback: bool, uncertain: bool, observation_noise: bool
+    ):
+        packed, n = model.packed, model.state_dim
+        noise = model.noise_covariance.numpy() if observation_noise else np.zeros((n, n))
+        self._known = (
+            uncertain,
+            feedback,
+            (packed.points, packed.inverse_squares, packed.log_signal, packed.weights),
+            packed.columns if uncertain else NOTHING[None],
+            (model.offset.numpy(), model.predicts == "difference"),
+            (problem.Q, problem.R, problem.terminal),
+            (problem.input_lower, problem.input_upper),
+            noise,
+        )
+
+    def __call__(self, start: Array, covariance: Array, plan: Array, follow: Array | None) -> Stages:
+        """The stages along a plan.
+
+        Args:
+            start: x_0 (n,).
+            covariance: Of x_0 (n, n).
+            plan: (H, m).
+            follow: Means (H, n) that the rollout follows under the feedback; None follows none.
+        """
+        (H, m), n = plan.shape, len(start)
+        found = Stages(np.empty((H, n, n)), np.empty((H, n, m)), np.empty((H, n)), np.zeros((H + 1, n, n)), plan.copy())
+        _stages(*self._known, start, covariance, NOTHING if follow is None else follow, found)
+        return found
 
 
 @compiled
-def _stages(uncertain, feedback, gp, inverse_cholesky, outer, weights, limits, x, follow, noise, out):
-    points = gp[0]
+def _stages(uncertain, feedback, gp, columns, outer, weights, limits, noise, start, covariance, follow, out):
+    points, _, log_signal, _ = gp
     offset, adds_state = outer
     Q, R, terminal = weights
     lower, upper = limits
     A, B, c, covariances, plan = out
-    H, m, n = len(plan), plan.shape[1], len(x)
-    memory = aligned_rows(2 * len(points) + 2, points.shape[1])
-    M, variance, J, J_u, K = np.empty(n), np.zeros(n), np.empty((n, n)), np.empty((n, m)), np.zeros((m, n))
+    (H, m), n, padded = plan.shape, len(start), points.shape[1]
+    memory = aligned_rows(2 * len(points) + 2, padded)
+    places = (H + 3) // 4 * 4 if uncertain else 1  # where k(x~_i, x~) of each stage is kept, (n, places, P)
+    kept = aligned_rows(n * places, padded).reshape(n, places, padded)
+    M, K, x = np.empty(n), np.zeros((m, n)), start.copy()
     for k in range(H):
         u = plan[k]
         if k > 0 and len(follow) > 0:
-            change = K @ (x - follow[k])
             for j in range(m):
-                u[j] = min(max(u[j] + change[j], lower[j]), upper[j])
-        expand_at(uncertain, gp, inverse_cholesky, x, u, memory, M, variance, J, J_u)
+                for i in range(n):
+                    u[j] += K[j, i] * (x[i] - follow[k, i])
+                u[j] = min(max(u[j], lower[j]), upper[j])
+        expand_at(gp, x, u, memory, kept, k if uncertain else 0, M, A[k], B[k])
         for i in range(n):
             M[i] += offset[i]
             if adds_state:
                 M[i] += x[i]
-                J[i, i] += 1.0
+                A[k, i, i] += 1.0
         if k == 0 and feedback and (uncertain or len(follow) > 0):
-            K[:] = lqr_gain(J, J_u, Q, R, terminal, H)
-        A[k], B[k], c[k] = J, J_u, M - J @ x - J_u @ u
-        if uncertain:
-            closed = J + J_u @ K
-            S = closed @ covariances[k] @ closed.T + noise
-            for i in range(n):
-                S[i, i] += variance[i]
-            covariances[k + 1] = (S + S.T) / 2.0
+            K[:] = lqr_gain(A[k], B[k], Q, R, terminal, H)
+        for i in range(n):
+            c[k, i] = M[i]
+            for j in range(n):
+                c[k, i] -= A[k, i, j] * x[j]
+            for j in range(m):
+                c[k, i] -= B[k, i, j] * u[j]
         x[:] = M
+    if uncertain:
+        covariances[0] = covariance
+        kept[:, H:] = 0.0
+        explained = np.zeros((n, places))
+        for a in range(n):
+            explain_several(columns[a], kept[a], explained[a])
+        V = noise.copy()
+        for k in range(H):
+            for i in range(n):
+                V[i, i] = noise[i, i] + max(math.exp(log_signal[i]) - explained[i, k], 0.0)
+            step_spread(A[k] + B[k] @ K, V, covariances[k], M, covariances[k + 1])

@@ -378,8 +378,7 @@ def read_request(
     if reference.inputs is None and (predictor.form == "deviation" or problem.penalized == "deviations"):
         what = "form 'deviation'" if predictor.form == "deviation" else "penalized 'deviations'"
         raise ShapeError(f"{what} needs reference inputs ({H}, {problem.input_dim}); got none")
-    request = Request.read(problem, H, initial_input, belief, reference, previous)
-    return replace(request, shifted=np.clip(request.shifted, problem.input_lower, problem.input_upper))
+    return Request.read(problem, H, initial_input, belief, reference, previous)
 
 
 def _warm(previous: Decision | None) -> QPSolution | None:

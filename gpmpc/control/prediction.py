@@ -18,25 +18,26 @@ Torch ends here: what comes out is NumPy float64.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from gpmpc.control.ancillary_feedback import lqr_gain, spread
-from gpmpc.control.compiled_rollout import roll_out
+from gpmpc.control.compiled_rollout import CompiledRollout
 from gpmpc.control.condensing import respond
 from gpmpc.control.controller import Decision
 from gpmpc.control.request import Request
 from gpmpc.control.stage_models import is_first_order, stage_model
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
+from gpmpc.fused.extended import roots
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.gp.evaluation import host_arrays, point_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation import Propagator
-from gpmpc.propagation.local_model import extended_state
 
 Array = np.ndarray
 
@@ -117,6 +118,12 @@ class Predictor:
         """Whether compiled loops answer: a rollout takes microseconds, and many of them go one by one."""
         return self._compiles and host_arrays(self.model.weights) is not None
 
+    @cached_property
+    def _rollout(self) -> CompiledRollout:
+        uncertain = self.covariance == "zero_order"
+        noisy = uncertain and self.propagator.observation_noise
+        return CompiledRollout(self.model, self.problem, self.feedback, uncertain, noisy)
+
     def extended(self, weight: Array) -> Array:
         """The weight of s that belongs to a weight of x (n, n): the blocks on its diagonal (p / n, n, n)."""
         n = self.problem.state_dim
@@ -129,7 +136,9 @@ class Predictor:
     def state(self, mean: Array, covariance: Array) -> Array:
         """The vectors s (*batch, p) of beliefs."""
         if self.covariance == "full":
-            return _array(extended_state(self._belief(mean, covariance))[0])
+            S = np.empty(covariance.shape)
+            roots(np.ascontiguousarray(covariance).reshape(-1, *S.shape[-2:]), S.reshape(-1, *S.shape[-2:]))
+            return np.concatenate((mean, S.reshape(*mean.shape[:-1], -1)), axis=-1)
         if self.covariance == "diagonal":
             variance = np.diagonal(covariance, axis1=-2, axis2=-1)
             return np.concatenate([mean, np.sqrt(np.clip(variance, 0, None))], axis=-1)
@@ -176,13 +185,8 @@ class Predictor:
                 its bounds: u_k + K (mu_k - follow_k) for k = 1 .. H-1.
         """
         if self.compiled:
-            noisy = self.covariance == "zero_order" and self.propagator.observation_noise
-            noise = _array(self.model.noise_covariance) if noisy else np.zeros_like(request.covariance)
-            known = self._belief(request.state, request.covariance).covariance.numpy()
-            uncertain = self.covariance == "zero_order"
-            start, problem = request.state, self.problem
-            found = roll_out(self.model, problem, start, known, inputs, follow, self.feedback, uncertain, noise)
-            return Prediction(found.A, found.B, found.c, start, found.covariances, found.inputs)
+            found = self._rollout(request.state, request.covariance, inputs, follow)
+            return Prediction(found.A, found.B, found.c, request.state, found.covariances, found.inputs)
         belief, gain, stages, plan = self._belief(request.state, request.covariance), None, [], np.array(inputs)
         covariances, n = [_array(belief.covariance)], self.problem.state_dim
         for k, input in enumerate(plan):
@@ -212,7 +216,8 @@ class Predictor:
         """One stage, made at s_0 = ``start``, Sigma_0 = ``now`` and an input, for all of them."""
         H = self.horizon
         if V is None:
-            covariances = np.concatenate([now[None], np.tile(after, (H, 1, 1))])
+            covariances = np.empty((H + 1, *now.shape))
+            covariances[0], covariances[1:] = now, after
         else:
             covariances = spread(A + B @ self.gain(A, B) if self.feedback else A, V, now, H)
         return Prediction(A[None], B[None], c[None], start, covariances, np.tile(input, (H, 1)))

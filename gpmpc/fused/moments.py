@@ -30,14 +30,16 @@ from gpmpc.fused.belief_algebra import (
     transposed_times,
 )
 from gpmpc.fused.exponential import exp_all
-from gpmpc.fused.pair_sums import Side, pair_sums
+from gpmpc.fused.pair_sums import Side, pair_sums, tile_memory
 from gpmpc.fused.point_rows import (
     add_products,
+    aligned,
     aligned_rows,
     explain,
     multiply,
     project,
     second_moments,
+    summed,
     transform,
 )
 
@@ -146,7 +148,7 @@ def evaluate_single(belief, D, signal, beta, a, single, n):
             z[c, j] = D[c] * nu[c, j]
     transform(T, z, moved, n)
     project(single.weighted[a], z, single.first[a])
-    return single.weighted[a].sum()
+    return summed(single.weighted[a])
 
 
 @compiled
@@ -164,7 +166,7 @@ def differentiate_single(belief, D, a, single, solved, n, M, to, work, x, y):
         to.dM_du[a, c] = controls[c] * D[R + c]
 
     multiply(solved, single.q[a], e)
-    single.e_total[a] = e.sum()
+    single.e_total[a] = summed(e)
     project(e, single.z[a], single.e_first[a])
     second_moments(e, single.z[a], single.e_second[a], n, work[0])
     project(e, control, controls)
@@ -205,7 +207,7 @@ def differentiate_cross(belief, D, a, single, n, J, to, work):
 
 
 @compiled
-def evaluate_pair(belief, D_a, D_b, a, b, single, triangle, n, order, work, left, G_ab, x):
+def evaluate_pair(belief, D_a, D_b, a, b, single, triangle, n, order, work, left, tiles, G_ab, x):
     """sum_ij P_ij of the pair; its parts go to ``work[3:]``, G_ab is filled."""
     T_ab, D_ab, rise, fall = np.zeros_like(G_ab), D_a + D_b, work[1], work[2]
     r = single.half_logdet[a] + single.half_logdet[b] - condition(belief.S, D_ab, n, x, G_ab)
@@ -222,7 +224,7 @@ def evaluate_pair(belief, D_a, D_b, a, b, single, triangle, n, order, work, left
         rise += fall
     weights_a, weights_b = (single.q[a], single.q[b]) if a == b else (single.weighted[a], single.weighted[b])
     rows, columns = Side(single.z[a], rise, weights_a), Side(single.z[b], fall, weights_b)
-    return pair_sums(a == b, order > VALUE, triangle, left, rows, columns, work[3:])
+    return pair_sums(a == b, order > VALUE, triangle, left, rows, columns, tiles, work[3:])
 
 
 @compiled
@@ -293,7 +295,7 @@ def moments_at(
     belief = seen_from(points, mu, S, u)
     R = len(belief.nu)
     single = room(k, R, padded)
-    work, left = aligned_rows(R + 5, padded), aligned_rows(R, padded)
+    work, left, tiles = aligned_rows(R + 5, padded), aligned_rows(R, padded), aligned(tile_memory(R))
     left[:] = 0.0
     G_ab, x, y, H = np.zeros((R, R)), np.zeros((R, R)), np.zeros((R, R)), np.zeros((R, R))
     V[:] = 0.0
@@ -312,7 +314,7 @@ def moments_at(
     for a in range(k):
         for b in range(a, a + 1 if diagonal else k):
             D_a, D_b = inverse_squares[a], inverse_squares[b]
-            total = evaluate_pair(belief, D_a, D_b, a, b, single, centred[a], n, order, work, left, G_ab, x)
+            total = evaluate_pair(belief, D_a, D_b, a, b, single, centred[a], n, order, work, left, tiles, G_ab, x)
             V[a, b] += total
             V[b, a] = V[a, b]
             if order >= JACOBIAN:

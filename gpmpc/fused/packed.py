@@ -59,11 +59,14 @@ class Packed:
         return np.log(self.signal_variance)
 
     @cached_property
+    def columns(self) -> Array:
+        """L_a by columns (k, N, N); a view where the factor lies in memory so, as LAPACK makes it."""
+        return np.ascontiguousarray(self.cholesky.transpose(0, 2, 1))
+
+    @cached_property
     def inverse_cholesky(self) -> Array:
         """L_a^-1 as block triangles (k, triangle_size(P))."""
-        size = len(self.cholesky[0])
-        eye = np.eye(size)
-        return self._triangles(lambda a: scipy.linalg.solve_triangular(self.cholesky[a], eye, lower=True))
+        return self._triangles(lambda a: scipy.linalg.lapack.dtrtri(self.cholesky[a], lower=1)[0])
 
     @cached_property
     def centred(self) -> Array:

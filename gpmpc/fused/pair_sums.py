@@ -18,9 +18,8 @@ from typing import NamedTuple
 
 from numpy import ndarray
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import borrowing
 from gpmpc.fused.exponential import EXACT, capped_expm1, widest
-from gpmpc.fused.point_rows import aligned
 
 TILE = 200  # columns a tile: whole cache lines, and the four rows do not fall on each other in the cache
 BLOCK = 4  # rows that meet a tile together
@@ -41,7 +40,7 @@ class Side(NamedTuple):
     weights: ndarray
 
 
-@compiled(fastmath=EXACT)
+@borrowing(fastmath=EXACT)
 def exponents(values, length, left, rise, i, right, fall):
     """Writes delta_ij of four rows from i on."""
     widest()
@@ -68,7 +67,7 @@ def exponents(values, length, left, rise, i, right, fall):
                 values[3 * TILE + j] = values[3 * TILE + j] + x3 * u + y3 * v + z3 * w
 
 
-@compiled(fastmath=EXACT)
+@borrowing(fastmath=EXACT)
 def exponentials(values, length):
     """Replaces delta by expm1(delta)."""
     widest()
@@ -79,7 +78,7 @@ def exponentials(values, length):
         values[3 * TILE + j] = capped_expm1(values[3 * TILE + j])
 
 
-@compiled(fastmath=EXACT)
+@borrowing(fastmath=EXACT)
 def weigh(values, length, triangle, at, step, q):
     """For a = b: P_ij = E_ij q_j value, and R_ij = P_ij + E_ij q_j beside it, both without q_i."""
     widest()
@@ -94,7 +93,7 @@ def weigh(values, length, triangle, at, step, q):
         values[EXTENDED + 3 * TILE + j] = e3 * p3 + e3
 
 
-@compiled(fastmath=EXACT)
+@borrowing(fastmath=EXACT)
 def add_weighed(sums, length, values, i, weights, triangle, at, step):
     """For a = b: adds weights_i E_ij values_ij of four rows to the columns' sums."""
     widest()
@@ -105,7 +104,7 @@ def add_weighed(sums, length, values, i, weights, triangle, at, step):
         sums[j] = total + (w2 * row2[j]) * values[2 * TILE + j] + (w3 * row3[j]) * values[3 * TILE + j]
 
 
-@compiled(fastmath=EXACT)
+@borrowing(fastmath=EXACT)
 def add_columns(sums, length, values, i, weights):
     """Adds weights_i values_ij of four rows to the columns' sums."""
     widest()
@@ -115,7 +114,7 @@ def add_columns(sums, length, values, i, weights):
         sums[j] = total + w2 * values[2 * TILE + j] + w3 * values[3 * TILE + j]
 
 
-@compiled
+@borrowing
 def add_rows(sums, length, values, i, weights, factors):
     """Adds weights_i values_ij factors_j of four rows to the rows' sums."""
     widest()
@@ -132,7 +131,7 @@ def add_rows(sums, length, values, i, weights, factors):
     sums[i + 3] += weights[i + 3] * sum3
 
 
-@compiled(fastmath=EXACT)
+@borrowing(fastmath=EXACT)
 def add_vectors(sums, length, values, i, weights, z):
     """Adds weights_i z_i values_ij of four rows to the columns' vectors, a component a TILE."""
     widest()
@@ -150,8 +149,14 @@ def add_vectors(sums, length, values, i, weights, z):
             target[2 * TILE + j] = target[2 * TILE + j] + t0 * v0 + t1 * v1 + t2 * v2 + t3 * v3
 
 
-@compiled
-def pair_sums(same, derivatives, triangle, left, rows, columns, out):
+@borrowing
+def tile_memory(dims):
+    """Numbers that ``pair_sums`` works in, for vectors z of ``dims`` entries."""
+    return (2 * BLOCK + 2 * dims + 2) * TILE
+
+
+@borrowing
+def pair_sums(same, derivatives, triangle, left, rows, columns, memory, out):
     """The sums of the module's text.
 
     Args:
@@ -161,13 +166,13 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, out):
         left: (R, P).
         rows: ``Side`` of output a.
         columns: ``Side`` of output b; its z is right_j.
+        memory: Lent to work in, ``tile_memory`` numbers that start on a cache line.
         out: Receives p_i, p_j and the rows of g (2 + R, P), where derivatives are wanted.
 
     Returns:
         sum_ij P_ij.
     """
     dims, padded = left.shape
-    memory = aligned((2 * BLOCK + 2 * dims + 2) * TILE)
     values, right = memory[: 2 * EXTENDED], memory[2 * EXTENDED : 2 * EXTENDED + dims * TILE]
     sums, ones = memory[2 * EXTENDED + dims * TILE :], memory[2 * EXTENDED + (2 * dims + 1) * TILE :]
     extended, vectors, p_i = values[EXTENDED:], sums[TILE:], out[0]
@@ -177,7 +182,8 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, out):
     for start in range(0, padded, TILE):
         stop = min(start + TILE, padded)
         for d in range(dims):
-            right[d * TILE : d * TILE + stop - start] = columns.z[d, start:stop]
+            for j in range(stop - start):
+                right[d * TILE + j] = columns.z[d, start + j]
         sums[: (dims + 1) * TILE] = 0.0
         fall, weights = columns.shift[start:stop], columns.weights[start:stop]
         factors = ones if same and derivatives else weights  # what the columns' sums still lack at the end
@@ -200,7 +206,8 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, out):
             sums[j] *= factors[j]
             total += sums[j]
         if derivatives:
-            out[1, start:stop] = sums[: stop - start]
+            for j in range(stop - start):
+                out[1, start + j] = sums[j]
             for d in range(dims):
                 for j in range(stop - start):
                     out[2 + d, start + j] = sums[(d + 1) * TILE + j] * factors[j]

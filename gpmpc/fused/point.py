@@ -15,7 +15,7 @@ import numpy as np
 
 from gpmpc.compiled import borrowing, compiled
 from gpmpc.fused.exponential import exp_all
-from gpmpc.fused.point_rows import LINE, aligned_rows, combine, explain, multiply, project
+from gpmpc.fused.point_rows import LINE, aligned_rows, combine, explain, multiply, project, summed
 
 JACOBIAN, HESSIAN = 1, 2  # how much is wanted: up to second derivatives of M, up to third
 
@@ -69,7 +69,7 @@ def means_along(points, inverse_squares, log_signal, beta, queries, n, memory, o
             D, answer = inverse_squares[a], out[h, a]
             correlate(log_signal[a], D, squares, sums, k)
             multiply(k, beta[a], k)
-            answer[0] = k.sum()
+            answer[0] = summed(k)
             project(k, difference, sums)
             for c in range(len(answer) - 1):
                 row = c if c < n else c + skipped
@@ -82,28 +82,25 @@ def padded_inputs(m):
     return (m + 2) // 3 * 3
 
 
-@compiled
-def expand_at(uncertain, gp, inverse_cholesky, x, u, memory, M, variance, J, J_u):
-    """M, its gradient J (k, n), J_u (k, m), and the variance where ``uncertain``, at one point, for other loops.
+@borrowing
+def expand_at(gp, x, u, memory, kept, place, M, J, J_u):
+    """M, its gradient J (k, n) and J_u (k, m) at one point, for other loops; the k_a stay in ``kept[:, place]``.
 
     ``gp`` holds the first four arrays of ``means_along``; ``memory`` has 2 R + 2 aligned rows.
     """
     points, inverse_squares, log_signal, beta = gp
     rows, n, m = len(points), len(x), len(u)
     U = rows - padded_inputs(m)
-    difference, squares, k, solved = memory[:rows], memory[rows : 2 * rows], memory[2 * rows], memory[2 * rows + 1]
-    sums = np.empty(rows)
+    difference, squares, weighted, sums = memory[:rows], memory[rows : 2 * rows], memory[2 * rows], memory[2 * rows + 1]
     offsets(points, x, u, difference)
     for c in range(rows):
         multiply(difference[c], difference[c], squares[c])
     for a in range(len(beta)):
-        D = inverse_squares[a]
+        D, k = inverse_squares[a], kept[a, place]
         correlate(log_signal[a], D, squares, sums, k)
-        if uncertain:
-            variance[a] = max(np.exp(log_signal[a]) - explain(inverse_cholesky[a], k, solved), 0.0)
-        multiply(k, beta[a], k)
-        M[a] = k.sum()
-        project(k, difference, sums)
+        multiply(k, beta[a], weighted)
+        M[a] = summed(weighted)
+        project(weighted, difference, sums)
         for c in range(n):
             J[a, c] = D[c] * sums[c]
         for c in range(m):
@@ -136,7 +133,7 @@ def points_along(order, points, inverse_squares, log_signal, beta, inverse_chole
                 dvar_du[h, a, c] = -2 * D[U + c] * sums[U + c]
 
             multiply(k, beta[a], weighted)
-            M[h, a] = weighted.sum()
+            M[h, a] = summed(weighted)
             project(weighted, difference, sums)
             J, J_u = dM_dx[h, a], dM_du[h, a]
             for c in range(n):

@@ -52,6 +52,16 @@ def project(row, rows, out):
 
 
 @borrowing
+def summed(row):
+    """The sum of a row: numba's own adds one number after the other."""
+    widest()
+    result = 0.0
+    for j in range(len(row)):
+        result += row[j]
+    return result
+
+
+@borrowing
 def multiply(row, other, out):
     """Writes the elementwise product to ``out``."""
     widest()
@@ -114,3 +124,52 @@ def explain(triangle, q, solved):
         for j in range(length):
             solved[j] = solved[j] + v0 * row0[j] + v1 * row1[j] + v2 * row2[j] + v3 * row3[j]
     return total
+
+
+@borrowing
+def explain_several(columns, q, totals):
+    """Adds |L^-1 q_h|^2 of the rows of q, a multiple of four of them, to ``totals``; q is overwritten.
+
+    Forward substitution that reads L, of which ``columns[j]`` is column j, once and four columns at a time.
+    """
+    widest()
+    size, j = len(columns), 0
+    while j + 4 <= size:
+        c0, c1, c2, c3 = columns[j], columns[j + 1], columns[j + 2], columns[j + 3]
+        at = max(0, size - (size - j - 4 + 7) // 8 * 8)  # whole registers; what comes before j + 4 is done with
+        d0, d1, d2, d3 = c0[at:], c1[at:], c2[at:], c3[at:]
+        for h in range(0, len(q), 4):
+            r0, r1, r2, r3 = q[h, at:size], q[h + 1, at:size], q[h + 2, at:size], q[h + 3, at:size]
+            e0, e1, e2, e3 = solve_four(c0, c1, c2, c3, j, q[h])
+            f0, f1, f2, f3 = solve_four(c0, c1, c2, c3, j, q[h + 1])
+            g0, g1, g2, g3 = solve_four(c0, c1, c2, c3, j, q[h + 2])
+            h0, h1, h2, h3 = solve_four(c0, c1, c2, c3, j, q[h + 3])
+            totals[h] += e0 * e0 + e1 * e1 + e2 * e2 + e3 * e3
+            totals[h + 1] += f0 * f0 + f1 * f1 + f2 * f2 + f3 * f3
+            totals[h + 2] += g0 * g0 + g1 * g1 + g2 * g2 + g3 * g3
+            totals[h + 3] += h0 * h0 + h1 * h1 + h2 * h2 + h3 * h3
+            for i in range(len(r0)):
+                x0, x1, x2, x3 = d0[i], d1[i], d2[i], d3[i]
+                r0[i] -= e0 * x0 + e1 * x1 + e2 * x2 + e3 * x3
+                r1[i] -= f0 * x0 + f1 * x1 + f2 * x2 + f3 * x3
+                r2[i] -= g0 * x0 + g1 * x1 + g2 * x2 + g3 * x3
+                r3[i] -= h0 * x0 + h1 * x1 + h2 * x2 + h3 * x3
+        j += 4
+    while j < size:
+        column = columns[j]
+        for h in range(len(q)):
+            row, value = q[h], q[h, j] / column[j]
+            totals[h] += value * value
+            for i in range(j + 1, size):
+                row[i] -= value * column[i]
+        j += 1
+
+
+@borrowing
+def solve_four(c0, c1, c2, c3, j, row):
+    """Entries j to j + 3 of L^-1 q, where what the columns before have to say is in ``row`` already."""
+    v0 = row[j] / c0[j]
+    v1 = (row[j + 1] - v0 * c0[j + 1]) / c1[j + 1]
+    v2 = (row[j + 2] - v0 * c0[j + 2] - v1 * c1[j + 2]) / c2[j + 2]
+    v3 = (row[j + 3] - v0 * c0[j + 3] - v1 * c1[j + 3] - v2 * c2[j + 3]) / c3[j + 3]
+    return v0, v1, v2, v3

@@ -12,6 +12,7 @@ predicts what was saved, bit by bit.
 
 import io
 import json
+import mmap
 import zipfile
 from dataclasses import fields
 from pathlib import Path
@@ -158,7 +159,10 @@ def _checked(path: Path, tensors: dict, shapes: dict[str, tuple], dtype: torch.d
         value = tensors[name]
         if tuple(value.shape) != shape or value.dtype != dtype:
             raise DataError(f"{path}: {name} must be {dtype} {shape}; got {value.dtype} {tuple(value.shape)}")
-        if not bool(torch.isfinite(value).all()):
+        if not all(
+            np.isfinite(part.to(torch.float64).numpy(force=True)).all()
+            for part in (value if value.dim() == 3 else [value])
+        ):
             raise DataError(f"{path}: {name} must be finite; got {float(value[~torch.isfinite(value)][0])}")
     return {name: tensors[name] for name in shapes}
 
@@ -223,8 +227,8 @@ def _read(path: Path, kind: str) -> tuple[dict, dict[str, Tensor]]:
         raise DataError(f"{path}: has the kernel {header.get('kernel')!r}; expected 'SE-ARD'")
     try:
         with zipfile.ZipFile(path) as archive:
-            arrays = {name[:-4]: archive.read(name) for name in archive.namelist() if name.endswith(".npy")}
-        tensors = {name: _restored(name, content, header["memory_order"][name]) for name, content in arrays.items()}
+            names = [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
+            tensors = {name: _restored(name, archive, header["memory_order"][name]) for name in names}
     except Exception as error:
         raise DataError(f"{path}: damaged; expected a saved {kind} ({error})") from error
     return header, tensors
@@ -243,14 +247,24 @@ def _packed(name: str, value: Tensor) -> Tensor:
     return value[..., rows, columns]
 
 
-def _restored(name: str, content: bytes, order: list[int]) -> Tensor:
-    """The tensor of a ``.npy`` file's content, lying in memory as it did when it was saved."""
-    stored = torch.from_numpy(np.lib.format.read_array(io.BytesIO(content), allow_pickle=False))
-    if name.endswith("cholesky"):
-        size = round((2 * stored.shape[-1] + 0.25) ** 0.5 - 0.5)
-        rows, columns = torch.tril_indices(size, size)
-        square = torch.zeros(len(stored), size, size, dtype=stored.dtype)
-        square[:, rows, columns] = stored
-        stored = square
-    inverse = sorted(range(stored.dim()), key=order.__getitem__)
-    return torch.empty_like(stored.permute(order), memory_format=torch.contiguous_format).permute(inverse).copy_(stored)
+def _restored(name: str, archive: zipfile.ZipFile, order: list[int]) -> Tensor:
+    """The tensor of an archive's ``.npy`` file, lying in memory as it did when it was saved.
+
+    The zeros above the diagonal of a factor are pages that nobody writes, which take no memory.
+    """
+    with archive.open(f"{name}.npy") as file:
+        stored = torch.from_numpy(np.lib.format.read_array(file, allow_pickle=False))
+        file.read()  # the checksum is compared at the end
+    triangular = name.endswith("cholesky")
+    size = round((2 * stored.shape[-1] + 0.25) ** 0.5 - 0.5) if triangular else 0
+    shape = (len(stored), size, size) if triangular else tuple(stored.shape)
+    inverse = sorted(range(len(shape)), key=order.__getitem__)
+    if not triangular:
+        return torch.empty([shape[d] for d in order], dtype=stored.dtype).permute(inverse).copy_(stored)
+    pages = mmap.mmap(-1, len(stored) * size * size * stored.element_size(), access=mmap.ACCESS_COPY)
+    tensor = torch.frombuffer(pages, dtype=stored.dtype, count=len(stored) * size * size)
+    tensor = tensor.view([shape[d] for d in order]).permute(inverse)
+    for row in range(size):
+        start = row * (row + 1) // 2
+        tensor[:, row, : row + 1] = stored[:, start : start + row + 1]
+    return tensor

@@ -111,22 +111,29 @@ class Composition(NamedTuple):
         if self.A is None:
             return Sensitivity(J, dM_dS, dM_du, dV_dmu, dV_dS, dV_du)
 
-        A, n = self.A, len(self.A)
-        B = torch.eye(n, dtype=A.dtype, device=A.device) if self.B is None else self.B
+        A = self.A
         AS = (A @ S) if self.states is None else (A @ S)[..., self.states]  # A C = (A S) J' B'
-        by_mean = torch.einsum("...is,ja,...asc->...ijc", AS, B, self._by_state(2 * f.dM_dS))
-        by_input = torch.einsum("...is,ja,...asc->...ijc", AS, B, self._by_input(f.dJ_du))
-        by_covariance = torch.einsum("...is,ja,...ascd->...ijcd", AS, B, self._by_state(f.dJ_dS, 2))
-        by_covariance = by_covariance + _symmetric(torch.einsum("ic,...jd->...ijcd", A, J))
-        by_covariance = by_covariance + by_covariance.transpose(-4, -3)
+        dJ_dmu, dJ_dS = self._by_state(2 * f.dM_dS), self._by_state(f.dJ_dS, 2)
+        by_mean = self._doubled(AS, dJ_dmu)
+        by_input = self._doubled(AS, self._by_input(f.dJ_du))
+        by_covariance = self._doubled(AS, dJ_dS.flatten(-2)).unflatten(-1, dJ_dS.shape[-2:])
+        # of A S A' + A S J' B' + B J S A' at a held J
+        outer = A[:, None, :, None] * (A + J)[..., None, :, None, :] + J[..., :, None, :, None] * A[:, None, :]
         return Sensitivity(
             A + J,
             dM_dS,
             dM_du if self.nominal is None else self.nominal.B + dM_du,
-            dV_dmu + by_mean + by_mean.transpose(-3, -2),
-            dV_dS + by_covariance + _symmetric(torch.einsum("ic,jd->ijcd", A, A)),
-            dV_du + by_input + by_input.transpose(-3, -2),
+            dV_dmu + by_mean,
+            dV_dS + by_covariance + (outer + outer.mT) / 2,
+            dV_du + by_input,
         )
+
+    def _doubled(self, AS: Tensor, dJ: Tensor) -> Tensor:
+        """A S dJ' B' and its transpose (*batch, n, n, j), for derivatives dJ (*batch, k, n_s, j)."""
+        moved = AS[..., None, :, :] @ dJ  # (*batch, k, n, j)
+        if self.B is not None:
+            moved = torch.einsum("ja,...aic->...jic", self.B, moved)
+        return moved + moved.transpose(-3, -2)
 
     def outer(self, hessian: Tensor) -> Tensor:
         """Second derivatives of B f by the whole state (*batch, n, n, n), from those of f (*batch, k, n_s, n_s)."""
@@ -151,7 +158,3 @@ class Composition(NamedTuple):
         full = derivative.new_zeros(*derivative.shape[:-1], self.nominal.B.shape[1])
         full[..., self.inputs] = derivative
         return full
-
-
-def _symmetric(derivative: Tensor) -> Tensor:
-    return (derivative + derivative.mT) / 2

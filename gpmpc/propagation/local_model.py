@@ -11,16 +11,18 @@ Sigma+ depends on S to second order only; where Sigma+ is singular the root has 
 the null space.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, square_root_differential
 from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.gp.evaluation import host_arrays
 from gpmpc.propagation.propagator import Propagator
-from gpmpc.propagation.sensitivity import differentiate
+from gpmpc.propagation.sensitivity import Sensitivity, differentiate
 
 
 @dataclass(frozen=True)
@@ -70,15 +72,33 @@ def linearize(
     if model.output_dim != belief.dim:
         raise ShapeError(f"a local model needs an output a state; got {belief.dim} states, {model.output_dim} outputs")
     moved, d = differentiate(propagator, model, belief, input)
+    batch, n, m = belief.mean.shape[:-1], belief.dim, input.shape[-1]
+    input = input.expand(*batch, m)
+    parts = belief.mean, belief.covariance, input, moved.belief.mean, moved.belief.covariance
+    derivatives = [getattr(d, field.name) for field in fields(d)]
+    arrays = host_arrays(*parts, *derivatives)
+    if arrays is None:
+        return LocalModel(*_extended(belief, input, moved.belief, d), moved.belief)
+    from gpmpc.fused.extended import extended_models  # loads numba
+
+    H, p = batch.numel(), n + n * n
+    arrays = [np.ascontiguousarray(array.reshape(H, *array.shape[len(batch) :])) for array in arrays]
+    out = np.empty((H, p, p)), np.empty((H, p, m)), np.empty((H, p))
+    extended_models(*arrays[:5], tuple(arrays[5:]), *out)
+    return LocalModel(*(torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in out), moved.belief)
+
+
+def _extended(belief: Gaussian, input: Tensor, after: Gaussian, d: Sensitivity) -> tuple[Tensor, Tensor, Tensor]:
+    """A, B and c by torch."""
     s, _, _ = extended_state(belief)
-    s_next, r_next, U_next = extended_state(moved.belief)
+    s_next, r_next, U_next = extended_state(after)
     n = belief.dim
     S = s[..., n:].unflatten(-1, (n, n))
 
     # dSigma = E S' + S E' for a unit change E_kl of S: a derivative D by Sigma becomes 2 D S.
     mean_by_root = 2 * d.mean_by_covariance @ S[..., None, :, :]
     covariance_by_root = 2 * d.covariance_by_covariance @ S[..., None, None, :, :]
-    k = moved.belief.dim
+    k = after.dim
     covariance_rows = torch.cat(
         [d.covariance_by_mean.flatten(-3, -2), covariance_by_root.flatten(-2).flatten(-3, -2)], dim=-1
     )
@@ -91,7 +111,7 @@ def linearize(
     A = torch.cat([torch.cat([d.mean_by_mean, mean_by_root.flatten(-2)], dim=-1), roots[..., :p]], dim=-2)
     B = torch.cat([d.mean_by_input, roots[..., p:]], dim=-2)
     c = s_next - (A @ s[..., None] + B @ input[..., None])[..., 0]
-    return LocalModel(A, B, c, moved.belief)
+    return A, B, c
 
 
 def rollout(propagator: Propagator, model: DynamicsModel, belief: Gaussian, inputs: Tensor) -> Gaussian:

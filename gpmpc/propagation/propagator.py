@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
@@ -67,25 +66,27 @@ def checked_input(model: DynamicsModel, belief: Gaussian, input: Tensor | None) 
     for name, array in zip(("the belief's mean", "the belief's covariance", "the input"), arrays, strict=True):
         if not np.isfinite(array).all():
             raise DataError(f"{name} must be finite; got {array}")
-    _check_semidefinite(belief.covariance)
+    _check_semidefinite(arrays[1])
     return input
 
 
-def _check_semidefinite(covariance: Tensor) -> None:
-    if not covariance.numel() or not (largest := covariance.abs().amax()):
+def _check_semidefinite(covariance: np.ndarray) -> None:
+    largest = np.abs(covariance).max(initial=0.0)
+    if not largest:
         return
-    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
-    round_off = torch.finfo(covariance.dtype).eps ** 0.5 * largest
-    if bool((gap := (covariance - covariance.mT).abs().amax()) > round_off):
+    round_off = np.finfo(covariance.dtype).eps ** 0.5 * largest
+    gap = np.abs(covariance - covariance.mT).max()
+    if gap > round_off:
         raise DataError(f"the belief's covariance must be symmetric; got entries that differ by {float(gap):.3g}")
-    if not bool(torch.linalg.cholesky_ex(covariance + round_off * eye).info.any()):
-        return
-    lowest = float(torch.linalg.eigvalsh(covariance).amin())
-    if lowest < -float(round_off):
-        raise DataError(
-            f"the belief's covariance must be positive semidefinite; got an eigenvalue of {lowest:.3g} "
-            f"(largest entry {float(largest):.3g})"
-        )
+    try:
+        np.linalg.cholesky(covariance + round_off * np.eye(covariance.shape[-1], dtype=covariance.dtype))
+    except np.linalg.LinAlgError:
+        lowest = float(np.linalg.eigvalsh(covariance).min())
+        if lowest < -round_off:
+            raise DataError(
+                f"the belief's covariance must be positive semidefinite; got an eigenvalue of {lowest:.3g} "
+                f"(largest entry {float(largest):.3g})"
+            ) from None
 
 
 def unsupported(method: Any, model: Any, possible: str) -> UnsupportedModel:

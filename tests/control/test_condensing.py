@@ -34,6 +34,20 @@ def stacked_response(A, B, c, start, H):
     return gamma, free
 
 
+@pytest.mark.parametrize("terminal", ["own", "the same"])
+def test_a_held_model_is_one_that_varies_and_does_not(terminal, rng):
+    n, m, r, blocks, H = 3, 2, 2, 4, 9
+    Q, R = spd(rng, n), spd(rng, m)
+    T = spd(rng, n) if terminal == "own" else Q
+    condenser = Condenser(TrackingProblem(Q, R, terminal=T), H, np.tile(Q, (blocks, 1, 1)), np.tile(T, (blocks, 1, 1)))
+    A, B, _, _ = stages(rng, n, blocks, m, H, held=True)
+    E = rng.normal(size=(1, r, n * blocks))
+    held = condenser.curvature(A, B, E)
+    varying = condenser.curvature(*(np.repeat(part, H, axis=0) for part in (A, B, E)))
+    for one, other in zip(held, varying, strict=True):
+        assert np.allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(other).max())
+
+
 @pytest.mark.parametrize("H", [1, 2, 7])
 @pytest.mark.parametrize("blocks", [1, 2, 4])
 @pytest.mark.parametrize("held", [True, False], ids=["held", "varying"])

@@ -13,7 +13,8 @@ import torch
 from gpmpc import fused
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.fused.exponential import capped_expm1, exp_all
-from gpmpc.fused.packed import pack
+from gpmpc.fused.packed import aligned_zeros, pack
+from gpmpc.fused.point_rows import explain, explain_several
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation.moment_matching import moments
 from tests.propagation.test_moment_matching import belief, by_mpmath, model
@@ -247,6 +248,16 @@ def test_without_covariance_the_moments_are_the_expansion_at_the_mean(covariance
     diagonal = np.arange(3)
     close(d.dV_dmu[diagonal, diagonal], point.dvariance_dx, 1e-9)
     close(d.dV_du[diagonal, diagonal], point.dvariance_du, 1e-9)
+
+
+@pytest.mark.parametrize("size", [3, 21])
+def test_several_vectors_are_explained_as_each_alone(size):
+    mine = packed(model(size=size))
+    q = aligned_zeros(8, mine.points.shape[1])
+    q[:5, :size] = np.random.default_rng(0).normal(size=(5, size))
+    alone, totals = [explain(mine.inverse_cholesky[1], row, np.empty_like(row)) for row in q], np.zeros(8)
+    explain_several(mine.columns[1], q, totals)
+    assert np.allclose(totals, alone, rtol=1e-12, atol=0)
 
 
 def test_many_points_are_the_loop_over_them():

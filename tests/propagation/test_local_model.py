@@ -5,6 +5,7 @@ import torch
 
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, square_root
+from gpmpc.gp.evaluation import evaluation
 from gpmpc.propagation import MomentMatching, linearize, linearize_along, rollout
 from gpmpc.propagation.local_model import extended_state
 from tests.propagation.test_propagators import ALL, DETERMINISTIC, belief, gp, linear
@@ -70,6 +71,18 @@ def test_a_plan_of_stages_is_the_loop_over_them(name):
         for part in ("A", "B", "c"):
             assert torch.allclose(getattr(together, part)[k], getattr(alone, part), atol=1e-9)
         assert torch.allclose(together.next.covariance[k], alone.next.covariance, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_compiled_local_model_is_that_of_torch(name):
+    model, propagator = gp(predicts="difference"), ALL[name]()
+    covariances = torch.stack([belief(scale=scale).covariance for scale in (0.0, 0.1, 0.4)])
+    at, inputs = Gaussian(torch.randn(3, 2), covariances), torch.tensor([0.3])  # one input for all
+    compiled = linearize(propagator, model, at, inputs)
+    with evaluation("torch"):
+        other = linearize(propagator, model, at, inputs)
+    for part in ("A", "B", "c"):
+        assert torch.allclose(getattr(compiled, part), getattr(other, part), atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ALL)

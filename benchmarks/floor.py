@@ -1,0 +1,143 @@
+"""How far one moment-matched Jacobian is from what its instructions must take, over the number of training points.
+
+    .venv/bin/python benchmarks/floor.py [--sizes 100 189 500 1000 2000]
+
+One process, one thread, process CPU time. The floor counts the arithmetic that ``gpmpc.fused`` has to issue for a pair
+of points and of outputs, in registers of eight numbers, and divides it by the rate at which this machine, in the same
+process, issues independent multiply-adds from registers. Loads, stores, loops and everything that grows slower than N^2
+are not in it. ``streamed`` is what reading the two triangles once from memory would take, at the rate of a sum over an
+array of that size; at large N they no longer fit the caches. Writes ``outputs/benchmarks/floor.json``.
+"""
+
+import argparse
+import json
+import os
+import time
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[variable] = "1"
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gpmpc import fused
+from gpmpc.compiled import compiled
+from gpmpc.gp import GPPosterior
+from gpmpc.provenance import provenance
+from gpmpc.qp.lanes import lanes, plus, put
+
+STATES, INPUTS, LANES = 6, 3, 8
+# Vector instructions for eight pairs of points, R states:
+DELTA = STATES + 1  # rise + fall + left . right
+EXPM1 = (
+    20  # two comparisons and a blend, rounding and its inverse, reduction, 10 of the polynomial, r^2, the scaling (4)
+)
+SUMS = 2 + STATES  # of columns, of rows, of the vectors z
+WEIGHT = 3  # a = b: E_ij q_j, P_ij, R_ij
+EXPLAINED = 2  # an entry of L^-1: L^-1 q, and L^-T of it
+TIMES = {"seconds": 1.0, "least": 7}  # of one size
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[100, 189, 300, 500, 1000, 2000])
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    print(f"{'N':>6}{'ms':>10}{'p99':>10}{'ns/N^2':>9}{'floor ms':>10}{'ratio':>8}{'streamed ms':>13}")
+    results = []
+    for size in arguments.sizes:
+        result = measured(size)
+        print(
+            f"{size:6}{result['ms_median']:10.3f}{result['ms_p99']:10.3f}{result['ns_per_square']:9.2f}"
+            f"{result['floor_ms']:10.3f}{result['ratio']:8.2f}{result['streamed_ms']:13.3f}",
+            flush=True,
+        )
+        results.append(result)
+    path = Path("outputs/benchmarks/floor.json")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
+    print(f"written to {path}")
+
+
+def measured(size: int) -> dict:
+    """One moment-matched Jacobian of six GPs over ``size`` points, beside its floor."""
+    packed, S = posterior(size).packed, 0.01 * np.eye(STATES) + 0.001
+    asked = packed, np.zeros(STATES), S, np.zeros(INPUTS)
+    fused.moments_with_jacobian(*asked)
+    times, rates, began = [], [], time.process_time()
+    while time.process_time() - began < TIMES["seconds"] or len(times) < TIMES["least"]:
+        rates.append(issue_rate())
+        start = time.process_time()
+        fused.moments_with_jacobian(*asked)
+        times.append(time.process_time() - start)
+    middle, floor = float(np.median(times)), instructions(packed) / max(rates)
+    triangles = packed.inverse_cholesky, packed.centred
+    return {
+        "N": size,
+        "ms_median": 1e3 * middle,
+        "ms_p99": 1e3 * float(np.quantile(times, 0.99)),
+        "ns_per_square": 1e9 * middle / size**2,
+        "floor_ms": 1e3 * floor,
+        "ratio": middle / floor,
+        "streamed_ms": 1e3 * sum(map(summed, triangles)),
+        "instructions_per_second": max(rates),
+    }
+
+
+def instructions(packed: fused.Packed) -> float:
+    """Vector instructions that a Jacobian must issue over all pairs."""
+    k, padded = packed.output_dim, packed.points.shape[1]
+    square, triangle = padded**2 / LANES, padded * (padded + LANES) / 2 / LANES
+    each = DELTA + EXPM1 + SUMS
+    return k * (k - 1) / 2 * square * each + k * triangle * (each + WEIGHT + EXPLAINED)
+
+
+def issue_rate(count: int = 200_000) -> float:
+    """Independent multiply-adds of eight numbers a second."""
+    values = np.full(14 * LANES, 1e-9)
+    start = time.process_time()
+    multiply_add(values, count)
+    return 12 * count / (time.process_time() - start)
+
+
+@compiled
+def multiply_add(values, count):
+    """Twelve chains of ``count`` multiply-adds in registers: two a cycle hide a latency of four."""
+    a, b, c, d = lanes(values, 0), lanes(values, 8), lanes(values, 16), lanes(values, 24)
+    e, f, g, h = lanes(values, 32), lanes(values, 40), lanes(values, 48), lanes(values, 56)
+    i, j, k, m = lanes(values, 64), lanes(values, 72), lanes(values, 80), lanes(values, 88)
+    added, factor = lanes(values, 96), values[104]
+    for _ in range(count):
+        a, b, c, d = plus(added, factor, a), plus(added, factor, b), plus(added, factor, c), plus(added, factor, d)
+        e, f, g, h = plus(added, factor, e), plus(added, factor, f), plus(added, factor, g), plus(added, factor, h)
+        i, j, k, m = plus(added, factor, i), plus(added, factor, j), plus(added, factor, k), plus(added, factor, m)
+    put(values, 0, a), put(values, 8, b), put(values, 16, c), put(values, 24, d)
+    put(values, 32, e), put(values, 40, f), put(values, 48, g), put(values, 56, h)
+    put(values, 64, i), put(values, 72, j), put(values, 80, k), put(values, 88, m)
+
+
+def summed(array: np.ndarray) -> float:
+    """Seconds that a sum over an array takes, the best of three."""
+    times = []
+    for _ in range(3):
+        start = time.process_time()
+        array.sum()
+        times.append(time.process_time() - start)
+    return min(times)
+
+
+def posterior(size: int, seed: int = 0) -> GPPosterior:
+    """Six GPs over random points; what they learned does not matter for the time."""
+    generator = torch.Generator().manual_seed(seed)
+    features = torch.randn(size, STATES + INPUTS, generator=generator, dtype=torch.float64)
+    targets = torch.randn(size, STATES, generator=generator, dtype=torch.float64)
+    lengthscales = 2.0 + torch.rand(STATES, STATES + INPUTS, generator=generator, dtype=torch.float64)
+    ones = torch.ones(STATES, dtype=torch.float64)
+    return GPPosterior.from_hyperparameters(features, targets, lengthscales, ones, 1e-2 * ones, INPUTS)
+
+
+if __name__ == "__main__":
+    main()

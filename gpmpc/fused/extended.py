@@ -1,0 +1,110 @@
+"""Problem: from the derivatives of the next belief to those of its extended state s = [mu; vec S], S = Sigma^(1/2).
+
+``gpmpc.propagation.local_model`` states the mathematics and serves torch; here are the same loops compiled, for H
+beliefs. dSigma = E S + S E for a change E of the root turns derivatives D by Sigma into 2 D S; the next root's
+derivative X solves X S+ + S+ X = dSigma+, entry by entry in the eigenbasis of S+.
+"""
+
+import math
+
+import numpy as np
+
+from gpmpc.compiled import borrowing, compiled
+
+
+@compiled
+def extended_models(means, covariances, inputs, next_means, next_covariances, derivatives, A, B, c):
+    """Writes A (H, p, p), B (H, p, m) and c (H, p).
+
+    Args:
+        means: mu (H, n).
+        covariances: Sigma (H, n, n).
+        inputs: u (H, m).
+        next_means: (H, n).
+        next_covariances: (H, n, n).
+        derivatives: The six of ``gpmpc.propagation.Sensitivity``, in its order, H in front.
+        A: Out.
+        B: Out.
+        c: Out.
+    """
+    mean_by_mean, mean_by_covariance, mean_by_input, by_mean, by_covariance, by_input = derivatives
+    H, n = means.shape
+    m, p = inputs.shape[1], n + n * n
+    now, after, S, S_next = np.empty(p), np.empty(p), np.empty((n, n)), np.empty((n, n))
+    change, turned = np.empty((n * n, p + m)), np.empty((n * n, p + m))
+    for h in range(H):
+        root(covariances[h], S)
+        r, U = root(next_covariances[h], S_next)
+        now[:n], after[:n] = means[h], next_means[h]
+        now[n:], after[n:] = S.reshape(n * n), S_next.reshape(n * n)
+        for i in range(n):
+            A[h, i, :n], B[h, i] = mean_by_mean[h, i], mean_by_input[h, i]
+            by_root(mean_by_covariance[h, i], S, A[h, i, n:])
+            for j in range(n):
+                row = change[i * n + j]
+                row[:n], row[p:] = by_mean[h, i, j], by_input[h, i, j]
+                by_root(by_covariance[h, i, j], S, row[n:p])
+        turn(U.T.copy(), change, turned)
+        turn(U.T.copy(), turned, change)
+        for i in range(n):
+            for j in range(n):
+                total = r[i] + r[j]
+                change[i * n + j] *= 1.0 / total if total > 0.0 else 0.0
+        turn(U, change, turned)
+        turn(U, turned, change)
+        A[h, n:], B[h, n:] = change[:, :p], change[:, p:]
+        for i in range(p):
+            c[h, i] = after[i]
+            for j in range(p):
+                c[h, i] -= A[h, i, j] * now[j]
+            for j in range(m):
+                c[h, i] -= B[h, i, j] * inputs[h, j]
+
+
+@compiled
+def roots(covariances, out):
+    """Writes the symmetric roots of covariances (H, n, n)."""
+    for h in range(len(covariances)):
+        root(covariances[h], out[h])
+
+
+@compiled
+def root(covariance, out):
+    """Writes the symmetric root; returns its eigenvalues and eigenvectors."""
+    r, U = np.linalg.eigh(covariance)
+    n = len(r)
+    for i in range(n):
+        r[i] = math.sqrt(max(r[i], 0.0))
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(n):
+                total += U[i, k] * r[k] * U[j, k]
+            out[i, j] = out[j, i] = total
+    return r, U.copy()
+
+
+@borrowing
+def by_root(D, S, row):
+    """Writes 2 D S, row by row."""
+    n = len(S)
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(n):
+                total += D[i, k] * S[k, j]
+            row[i * n + j] = 2.0 * total
+
+
+@borrowing
+def turn(U, matrices, out):
+    """Writes (U X)' of each column's matrix X; twice in a row U X U'."""
+    n = len(U)
+    for i in range(n):
+        for j in range(n):
+            target = out[j * n + i]
+            target[:] = 0.0
+            for k in range(n):
+                factor, row = U[i, k], matrices[k * n + j]
+                for column in range(len(row)):
+                    target[column] += factor * row[column]
