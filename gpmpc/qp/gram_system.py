@@ -23,10 +23,10 @@ def gram_system(terms: Terms) -> tuple[Array, Array]:
     K = C @ responses
     K = 0.5 * (K + K.T)
     diagonal = np.diagonal(K)
-    weights = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scales = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     ends = ((C != 0) * np.arange(1, len(P) + 1)).max(axis=1)
     ends[len(P) :] = np.maximum.accumulate(ends[len(P) :])  # so that the last of several rows has the largest
-    traits = np.vstack([np.linalg.norm(C, axis=1), weights, softness, ends])
+    traits = np.vstack([np.linalg.norm(C, axis=1), scales, softness, ends])
     n, m = len(P), len(G)
     system = aligned(2 * len(C) + n, padded(len(C)))
     system[: n + m, : n + m] = K

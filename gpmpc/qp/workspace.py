@@ -6,19 +6,20 @@ whose rows have an entry per constraint; to slice it costs nothing. Its first ro
 the others are otherwise undefined:
 
     iteration limit, tolerance, whether rows are soft, n, M, tag
-    traits (5 rows, see ``gpmpc.qp.working_set``; lazy mode fills in norms, weights and ends itself)
+    traits (5 rows, see ``gpmpc.qp.working_set``; lazy mode fills in norms, scales and ends of the rows of G)
     vectors, members (integers), R, and in lazy mode L and rows
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpmpc.compiled import borrowing
+from gpmpc.compiled import woven
 
 Array = NDArray[np.float64]
 
 LIMIT, TOLERANCE, SOFT, VARIABLES, CONSTRAINTS, TAG, SETTINGS = 0, 1, 2, 3, 4, 5, 6
 TRAITS, VECTORS, MEMBERS = 5, 23, 4  # rows of each
+END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
 
 
 def gram_workspace(settings: Array, traits: Array) -> Array:
@@ -29,7 +30,9 @@ def gram_workspace(settings: Array, traits: Array) -> Array:
 def lazy_workspace(settings: Array, softness: Array) -> Array:
     """Memory for solves in lazy mode with these settings (6,) and softness (2, M)."""
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
-    traits = np.vstack([np.zeros((2, M)), softness, np.zeros((1, M))])
+    box = np.arange(M) < n
+    ends = np.minimum(n, (np.arange(M) // END_STEP + 1) * END_STEP)
+    traits = np.vstack([box, box, softness, box * ends])
     return _workspace(settings, traits, n * (padded(n) + most_working(n, M, bool(settings[SOFT])) + 2))
 
 
@@ -50,19 +53,25 @@ def aligned(rows: int, columns: int) -> Array:
     return memory[start : start + rows * columns].reshape(rows, columns)
 
 
-@borrowing
+@woven
 def most_working(n, M, soft):
     """How many constraints can work at once."""
     return M if soft else min(n, M)
 
 
-@borrowing
+@woven
 def padded(size):
     """The next multiple of eight."""
     return (size + 7) // 8 * 8
 
 
-@borrowing
+@woven
+def round_end(end, n):
+    """The number of leading entries that are looked at where ``end`` may not be zero."""
+    return min(n, (end + END_STEP - 1) // END_STEP * END_STEP)
+
+
+@woven
 def carve(work):
     """The kernels' arrays: settings, traits, vectors, members, R, and the rest of the memory."""
     settings = work[0]
