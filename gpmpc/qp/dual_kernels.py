@@ -59,14 +59,14 @@ from gpmpc.qp.working_set import (
     take,
     watch,
 )
-from gpmpc.qp.workspace import carve, most_working, padded, round_end
+from gpmpc.qp.workspace import carve, matrix, most_working, padded, round_end
 
 STATUS, ITERATIONS, VARIABLES, CONSTRAINTS = record.STATUS, record.ITERATIONS, record.VARIABLES, record.CONSTRAINTS
 WORKING, TAG, AGE, HEADER = record.WORKING, record.TAG, record.AGE, record.HEADER
 SOLVED, INFEASIBLE, ITERATION_LIMIT = record.SOLVED, record.INFEASIBLE, record.ITERATION_LIMIT
 NUMERICAL_TROUBLE, MISUSE, NO_TAG = record.NUMERICAL_TROUBLE, record.MISUSE, record.NO_TAG
 
-GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1])"
+GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 
 ABSENT = 1e20  # a bound of this size or more is none
@@ -143,8 +143,8 @@ def write_ray(p, above, k, bounds, members, r, mu):
 
 @borrowing  # woven into ``optimise`` it would cost the solves that need no step a twentieth of a microsecond
 def climb(
-    lazy, n, q, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch, y, now, seen, excess, gradient,
-    slope, k, capacity, soft, limit, iterations, sweeps, count,
+    lazy, n, q, inverse, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch, y, now, seen, excess,
+    gradient, slope, k, capacity, soft, limit, iterations, sweeps, count,
 ):  # fmt: skip
     """Changes the working set until none of the constraints is violated; ``count`` are, and listed.
 
@@ -181,7 +181,7 @@ def climb(
                 ignore(p, bounds)
             if soft:
                 sweeps = SWEEPS  # caps may have changed what ``pull`` says
-        fresh = several or soft or iterations >= limit
+        fresh = several or soft or count == 1 or iterations >= limit
         if not fresh:  # first satisfy those that were seen to be violated, then look at all
             follow_listed(lazy, n, v, rows, L, G, mu, k, members, traits, seen, gradient, y, listed, count, now)
             count = keep_violated(now, traits[SCALE], bounds, excess, listed, count)
@@ -190,7 +190,7 @@ def climb(
             if not lazy:
                 follow(rows, mu, seen, candidates, gradient, y)
             elif soft:
-                evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y)
+                evaluate(lazy, n, q, inverse, L, G, mu, k, members, traits, soft, slope, y)
             else:
                 follow_lazily(n, v, rows, L, mu, k, members, gradient, y)
                 row_values(lazy, L, G, n, traits, y)
@@ -199,8 +199,8 @@ def climb(
 
 
 @woven
-def optimise(lazy, P, linear, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out):
-    """Both modes after their set-up; ``rows`` is K and L is G' in Gram mode."""
+def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out):
+    """Both modes after their set-up; ``rows`` is K and L is G' in Gram mode, which knows P's inverse."""
     M = len(lower)
     limit, tolerance, soft = (
         int(settings[workspace.LIMIT]),
@@ -256,7 +256,7 @@ def optimise(lazy, P, linear, G, n, rows, L, traits, vectors, members, R, lower,
         follow_lazily(n, v, rows, L, mu, k, members, gradient, y)
         row_values(lazy, L, G, n, traits, y)
     else:
-        evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y)
+        evaluate(lazy, n, q, inverse, L, G, mu, k, members, traits, soft, slope, y)
     iterations, rounds, status, worst = 0, 0, NUMERICAL_TROUBLE, np.inf
     interrupted = guessed and warm[STATUS] == ITERATION_LIMIT
     sweeps = SWEEPS if interrupted else 0  # the dual objective climbs with single steps only, and so the end is sure
@@ -265,8 +265,8 @@ def optimise(lazy, P, linear, G, n, rows, L, traits, vectors, members, R, lower,
     while True:
         if count > 0:
             status, k, iterations, sweeps = climb(
-                lazy, n, q, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch, y, now, seen, excess,
-                gradient, slope, k, capacity, soft, limit, iterations, sweeps, count,
+                lazy, n, q, inverse, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch, y, now, seen,
+                excess, gradient, slope, k, capacity, soft, limit, iterations, sweeps, count,
             )  # fmt: skip
             if status != SOLVED:
                 break
@@ -311,8 +311,16 @@ def solve_gram(q, lower, upper, warm, system, work, out):
     dense = is_dense(q) and is_dense(lower) and is_dense(upper) and is_dense(warm)
     if not dense or len(q) != n or len(lower) != M or len(upper) != M or not all_finite(q):
         return MISUSE
-    K, P, transposed, G = system[:M], system[M : M + n], system[M + n : M + 2 * n], system[M + 2 * n :]
-    return optimise(False, P, q, G, n, K, transposed, traits, vectors, members, R, lower, upper, warm, settings, out)
+    m, wide, wide_rows = M - n, padded(n), padded(M - n)
+    a = M * padded(M)
+    b = a + n * wide
+    c = b + n * wide
+    d = c + n * wide_rows
+    K, inverse, P = matrix(system, 0, M, padded(M)), matrix(system, a, n, wide), matrix(system, b, n, wide)
+    turned, G = matrix(system, c, n, wide_rows), matrix(system, d, m, wide)
+    return optimise(
+        False, P, inverse, q, G, n, K, turned, traits, vectors, members, R, lower, upper, warm, settings, out
+    )
 
 
 @woven
@@ -326,14 +334,12 @@ def solve_lazy(P, q, G, lower, upper, warm, work, out):
     if not shaped or not dense or not all_finite(q):
         return MISUSE
     settings, traits, vectors, members, R, rest = carve(work)
-    dense = rest.reshape(rest.size)  # rows without gaps are nearer to each other
-    size = n * padded(n)
-    L, rows = dense[:size].reshape((n, padded(n))), dense[size : size + n * (len(R) + 1)].reshape((len(R) + 1, n))
+    L, rows = matrix(rest, 0, n, padded(n)), matrix(rest, n * padded(n), len(R) + 1, n)  # nearer without gaps
     if not factorise(P, L):
         return MISUSE
     if not measure(G, n, traits):
         return MISUSE
-    return optimise(True, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
+    return optimise(True, P, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
 
 
 @woven

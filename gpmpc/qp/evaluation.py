@@ -1,14 +1,14 @@
 """The point that belongs to a set of multipliers, and how well the two solve the QP.
 
 x minimises the Lagrangian, P x = -(q + C'mu), and y = C x are the constraints' values. Gram mode multiplies with P^-1,
-the upper left corner of K, and may later move y by the rows of K whose multipliers changed; lazy mode, P = L'L,
+and may later move y by the rows of K whose multipliers changed; lazy mode, P = L'L,
 solves. What is called L is the transposed G in Gram mode, which adds its rows faster than it multiplies those of G.
 """
 
 from gpmpc.compiled import woven
 from gpmpc.qp.factor import backward_solve, dot, forward_solve, four_dots, multiply, subtract_rows
 from gpmpc.qp.hessian import solve_lower, solve_transposed
-from gpmpc.qp.lanes import combine, lanes, larger, largest, no_lanes, plus, put
+from gpmpc.qp.lanes import any_nonzero, combine, lanes, larger, largest, less, no_lanes, plus, put, some_lanes
 from gpmpc.qp.working_set import BOUND, END, LEAST, MOST, NAME, PLACE, SCRATCH, SOFTNESS, couple
 from gpmpc.qp.workspace import padded
 
@@ -37,7 +37,7 @@ def add_row(weight, row, n, target):
 
 
 @woven
-def evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y):
+def evaluate(lazy, n, q, inverse, L, G, mu, k, members, traits, soft, slope, y):
     """``y = C x`` for the multipliers; leaves ``slope = q + C' mu``."""
     add_pull(G, n, q, mu, k, members, traits, soft, slope)
     if lazy:
@@ -46,7 +46,7 @@ def evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y):
         solve_transposed(L, n, y)
         solve_lower(L, n, y)
     else:
-        combine(rows, n, slope, 0, n, y)  # K is symmetric
+        combine(inverse, n, slope, 0, n, y)  # which is symmetric
     for i in range(n):
         y[i] = -y[i]
     row_values(lazy, L, G, n, traits, y)
@@ -85,11 +85,13 @@ def follow_lazily(n, v, rows, L, mu, k, members, weights, y):
 @woven
 def changes_since(mu, seen, changed, amounts):
     """Lists the multipliers that are not those, ``seen``, that y knows; returns how many."""
-    count = 0
-    for p in range(len(mu)):
-        if mu[p] != seen[p]:
-            changed[count], amounts[count] = p, mu[p] - seen[p]
-            count += 1
+    count, M = 0, len(mu)
+    for start in range(0, M, 8):
+        if any_nonzero(less(some_lanes(mu, start), 1.0, some_lanes(seen, start))):
+            for p in range(start, min(start + 8, M)):
+                if mu[p] != seen[p]:
+                    changed[count], amounts[count] = p, mu[p] - seen[p]
+                    count += 1
     return count
 
 

@@ -11,6 +11,9 @@ the others are otherwise undefined:
 """
 
 import numpy as np
+from numba.core import types
+from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
 
 from gpmpc.compiled import woven
@@ -69,6 +72,23 @@ def padded(size):
 def round_end(end, n):
     """The number of leading entries that are looked at where ``end`` may not be zero."""
     return min(n, (end + END_STEP - 1) // END_STEP * END_STEP)
+
+
+@intrinsic
+def matrix(typing_context, memory, start, rows, columns):
+    """The stretch of a contiguous array from entry ``start`` on as (rows, columns); numba's reshape takes 20 ns more."""
+    kind = types.Array(types.float64, 2, "C")
+
+    def generate(context, builder, signature, arguments):
+        source, start, rows, columns = arguments
+        data = builder.gep(context.make_array(memory)(context, builder, source).data, [start])
+        step = context.get_constant(types.intp, 8)
+        view = context.make_array(kind)(context, builder)
+        strides = builder.mul(columns, step), step
+        populate_array(view, data=data, shape=(rows, columns), strides=strides, itemsize=step, meminfo=None)
+        return view._getvalue()
+
+    return kind(memory, types.intp, types.intp, types.intp), generate
 
 
 @woven
