@@ -303,7 +303,7 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
     return status
 
 
-@woven
+@borrowing(locked=True)
 def solve_gram(q, lower, upper, warm, system, work, out):
     """Gram mode; ``system`` is of ``gpmpc.qp.gram_system``, ``work`` of ``gpmpc.qp.workspace``."""
     settings, traits, vectors, members, R, _ = carve(work)
@@ -323,12 +323,12 @@ def solve_gram(q, lower, upper, warm, system, work, out):
     )
 
 
-@woven
+@borrowing(locked=True)
 def solve_lazy(P, q, G, lower, upper, warm, work, out):
     """Lazy mode; ``work`` is of ``gpmpc.qp.workspace``."""
     n, m = P.shape[0], len(G)
     M = n + m
-    shaped = P.shape[1] == n and len(q) == n and (m == 0 or G.shape[1] == n) and len(lower) == M and len(upper) == M
+    shaped = P.shape[1] == n and len(q) == n and G.shape[1] == n and len(lower) == M and len(upper) == M
     dense = is_dense(q) and is_dense(lower) and is_dense(upper) and is_dense(warm)
     dense &= is_dense_matrix(P) and is_dense_matrix(G)
     if not shaped or not dense or not all_finite(q):

@@ -1,7 +1,7 @@
 """The memory that a solve works in, besides the record that it writes.
 
-To ask the system for it costs as much as a small solve, so each prepared problem or shape keeps what it has used
-before: ``list.pop`` and ``list.append`` are atomic, so two threads never hold the same workspace. It is one matrix,
+To ask the system for it costs as much as a small solve, so each prepared problem or shape keeps it. Threads may share
+it: a solve keeps the interpreter's lock. It is one matrix,
 whose rows have an entry per constraint; to slice it costs nothing. Its first rows stay the same from solve to solve,
 the others are otherwise undefined:
 
