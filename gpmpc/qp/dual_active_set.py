@@ -128,7 +128,7 @@ class DualActiveSet:
             problem = QuadraticProgram.from_stacked(P, q, G, lower, upper)  # raises if it is misuse indeed
             P, q, G, lower, upper = problem.P, problem.q, problem.G, problem.lower, problem.upper
             n, m = len(P), len(G)
-            softness, settings, work, size, where = self._plan(m, n, soft)
+            softness, _, work, size, where = self._plan(m, n, soft)
             record, warm = np.empty(size), _as_record(warm_start, n, n + m)
             status = solve_lazy(P, q, G, lower, upper, warm, work, record)
         terms = new(Terms, (P, G, softness))

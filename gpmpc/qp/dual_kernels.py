@@ -19,7 +19,7 @@ from gpmpc.qp import record, workspace
 from gpmpc.qp.cholesky import factorise
 from gpmpc.qp.dual_iteration import CONTRADICTION, keep_violated, list_violated, most_violated, step_to
 from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, follow_listed, refine, residuals, row_values
-from gpmpc.qp.factor import dot, multiply_at, pack, unpack
+from gpmpc.qp.factor import multiply_at, pack, unpack
 from gpmpc.qp.hessian import solve_transposed
 from gpmpc.qp.lanes import (
     any_nonzero,

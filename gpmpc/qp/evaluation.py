@@ -1,8 +1,8 @@
 """The point that belongs to a set of multipliers, and how well the two solve the QP.
 
-x minimises the Lagrangian, P x = -(q + C'mu), and y = C x are the constraints' values. Gram mode multiplies with P^-1,
-and may later move y by the rows of K whose multipliers changed; lazy mode, P = L'L,
-solves. What is called L is the transposed G in Gram mode, which adds its rows faster than it multiplies those of G.
+x minimises the Lagrangian, P x = -(q + C'mu), and y = C x are the constraints' values. Gram mode multiplies with P^-1
+and may later move y by the rows of K whose multipliers changed; lazy mode, P = L'L, solves. What is called L is the
+transposed G in Gram mode, which adds its rows faster than it multiplies those of G.
 """
 
 from gpmpc.compiled import woven

@@ -1,9 +1,8 @@
 """The memory that a solve works in, besides the record that it writes.
 
 To ask the system for it costs as much as a small solve, so each prepared problem or shape keeps it. Threads may share
-it: a solve keeps the interpreter's lock. It is one matrix,
-whose rows have an entry per constraint; to slice it costs nothing. Its first rows stay the same from solve to solve,
-the others are otherwise undefined:
+it, since a solve keeps the interpreter's lock. It is one matrix, whose rows have an entry per constraint; to slice it
+costs nothing. Its first rows stay the same from solve to solve, the others are otherwise undefined:
 
     iteration limit, tolerance, whether rows are soft, n, M, tag
     traits (5 rows, see ``gpmpc.qp.working_set``; lazy mode fills in norms, scales and ends of the rows of G)
@@ -76,7 +75,7 @@ def round_end(end, n):
 
 @intrinsic
 def matrix(typing_context, memory, start, rows, columns):
-    """The stretch of a contiguous array from entry ``start`` on as (rows, columns); numba's reshape takes 20 ns more."""
+    """The entries of a contiguous array from ``start`` on as (rows, columns); numba's reshape takes 20 ns more."""
     kind = types.Array(types.float64, 2, "C")
 
     def generate(context, builder, signature, arguments):
