@@ -115,7 +115,7 @@ class DualActiveSet:
         began = perf_counter()
         try:
             plan = self._plans.get(G.shape) if soft is None else None
-            softness, settings, work, size, where = plan or self._plan(*G.shape, soft)
+            softness, work, size, where = plan or self._plan(*G.shape, soft)
             record = empty(size)
             warm = layout.NO_RECORD if warm_start is None else warm_start.record
             if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is FLOAT:
@@ -128,7 +128,7 @@ class DualActiveSet:
             problem = QuadraticProgram.from_stacked(P, q, G, lower, upper)  # raises if it is misuse indeed
             P, q, G, lower, upper = problem.P, problem.q, problem.G, problem.lower, problem.upper
             n, m = len(P), len(G)
-            softness, _, work, size, where = self._plan(m, n, soft)
+            softness, work, size, where = self._plan(m, n, soft)
             record, warm = np.empty(size), _as_record(warm_start, n, n + m)
             status = solve_lazy(P, q, G, lower, upper, warm, work, record)
         terms = new(Terms, (P, G, softness))
@@ -156,11 +156,11 @@ class DualActiveSet:
         terms = Terms(problem.P, problem.G, stack_softness(soft, n, m))
         return Prepared(self, terms, self._settings(n, n + m, soft is not None, float(next(_tags))))
 
-    def _plan(self, m: int, n: int, soft: SoftRows | None) -> tuple[Array, Array, Array, int, slice]:
-        """For a shape of G, softness, settings, workspace, the record's length, and where x is in it."""
+    def _plan(self, m: int, n: int, soft: SoftRows | None) -> tuple[Array, Array, int, slice]:
+        """For a shape of G, softness, workspace, the record's length, and where x is in it."""
         softness, settings = stack_softness(soft, n, m), self._settings(n, n + m, soft is not None)
         work, where = lazy_workspace(settings, softness), slice(layout.HEADER, layout.HEADER + n)
-        plan = softness, settings, work, layout.record_size(n, n + m), where
+        plan = softness, work, layout.record_size(n, n + m), where
         if soft is None:
             self._plans[m, n] = plan
         return plan
