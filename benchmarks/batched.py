@@ -26,8 +26,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from quadrotor_flights import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
 
+from gpmpc.bench.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
 from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.gp import GPPosterior, evaluation
 from gpmpc.propagation import Linearization, MomentMatching

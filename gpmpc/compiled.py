@@ -1,4 +1,4 @@
-"""How the kernels of this package are compiled: serially, without the interpreter's lock, and once per machine.
+"""How the kernels of this package are compiled: serially, mostly without the interpreter's lock, once per machine.
 
 numba keeps the machine code beside the source, or in the user's cache folder when the installation is read-only. When
 neither can be written it refuses to cache; the kernels are then compiled anew in each process. Sums may be reordered
@@ -18,7 +18,12 @@ REORDERED = frozenset({"reassoc", "contract", "nsz"})
 
 
 def compiled(
-    function: Callable | None = None, *, fastmath: frozenset[str] = REORDERED, allocates: bool = True
+    function: Callable | None = None,
+    *,
+    fastmath: frozenset[str] = REORDERED,
+    allocates: bool = True,
+    woven: bool = False,
+    locked: bool = False,
 ) -> Callable:
     """Compiles ``function`` at its first call.
 
@@ -27,10 +32,14 @@ def compiled(
         fastmath: LLVM's flags for it.
         allocates: False if it, and all that it calls, make no array but views of those they are given. numba then
             counts no references: an atomic operation for each view, which is 40 % of a solve of two microseconds.
+        woven: Whether its code is put into each of its callers. A call hands over an array as seven numbers, so that
+            one with a dozen arrays takes longer than the work on a few short vectors.
+        locked: Whether it keeps the interpreter's lock, as a kernel of microseconds may: two threads are then never in
+            it at once and can share its workspace. To let go of the lock takes a fortieth of a microsecond.
     """
     if function is None:
-        return partial(compiled, fastmath=fastmath, allocates=allocates)
-    options = {"nogil": True, "fastmath": set(fastmath)}
+        return partial(compiled, fastmath=fastmath, allocates=allocates, woven=woven, locked=locked)
+    options = {"nogil": not locked, "fastmath": set(fastmath), "forceinline": woven}
     if not allocates and _counting_is_optional():
         options["_nrt"] = False
     return _jit(function, options)
@@ -54,6 +63,9 @@ def _jit(function: Callable, options: dict) -> Callable:
 
 borrowing = partial(compiled, allocates=False)
 """Compiles a function whose arrays are all borrowed from its caller."""
+
+woven = partial(borrowing, woven=True)
+"""Compiles such a function as a part of its callers."""
 
 
 def compile_for(kernel: Callable, signature: str) -> None:

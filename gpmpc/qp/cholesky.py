@@ -11,14 +11,14 @@ four have been solved for each other. The four pivots wait for one division each
 
 import math
 
-from gpmpc.compiled import borrowing
+from gpmpc.compiled import woven
 from gpmpc.qp.lanes import lanes, less, put, scaled
 
 WIDTH, BLOCK = 8, 4
 SMALLEST = 2.3e-16  # times n: share of P_ii below which a pivot is rounding
 
 
-@borrowing
+@woven
 def factorise(P, L):
     """Fills L; False if P is not symmetric, finite and positive definite."""
     n = len(P)
@@ -34,7 +34,7 @@ def factorise(P, L):
     return good
 
 
-@borrowing
+@woven
 def finish_last_rows(P, L, top):
     """The rows from ``top`` on, fewer than four."""
     n = len(P)
@@ -56,13 +56,13 @@ def finish_last_rows(P, L, top):
     return True
 
 
-@borrowing
+@woven
 def is_pivot(pivot, diagonal, n):
     """Whether a pivot is positive, finite, and more than rounding."""
     return (pivot > n * SMALLEST * diagonal) & (pivot < math.inf)
 
 
-@borrowing
+@woven
 def finish_four_rows(P, L, top):
     """Rows ``top`` to ``top + 3``, given those below."""
     n = len(P)
@@ -150,7 +150,7 @@ def finish_four_rows(P, L, top):
     return True
 
 
-@borrowing
+@woven
 def is_symmetric(P):
     """Whether P equals its transpose but for rounding; read in blocks that stay in the cache."""
     n = len(P)

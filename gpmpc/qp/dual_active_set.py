@@ -114,34 +114,28 @@ class DualActiveSet:
         """
         began = perf_counter()
         try:
-            n, m = len(P), len(G)
-            plan = self._plans.get((n, m)) if soft is None else None
-            softness, settings, idle, size, where = plan or self._plan(n, m, soft)
+            plan = self._plans.get(G.shape) if soft is None else None
+            softness, work, size, where = plan or self._plan(*G.shape, soft)
             record = empty(size)
-            try:
-                work = idle.pop()
-            except IndexError:
-                work = lazy_workspace(settings, softness)
             warm = layout.NO_RECORD if warm_start is None else warm_start.record
             if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is FLOAT:
                 status = run_lazy(P, q, G, lower, upper, warm, work, record)
             else:  # may still be float64: a dtype that was pickled is another object
                 status = solve_lazy(P, q, G, lower, upper, warm, work, record)
-            idle.append(work)
         except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
             status = layout.MISUSE
         if status == layout.MISUSE:
             problem = QuadraticProgram.from_stacked(P, q, G, lower, upper)  # raises if it is misuse indeed
             P, q, G, lower, upper = problem.P, problem.q, problem.G, problem.lower, problem.upper
             n, m = len(P), len(G)
-            softness, settings, _, size, where = self._plan(n, m, soft)
-            record, warm, work = np.empty(size), _as_record(warm_start, n, n + m), lazy_workspace(settings, softness)
+            softness, work, size, where = self._plan(m, n, soft)
+            record, warm = np.empty(size), _as_record(warm_start, n, n + m)
             status = solve_lazy(P, q, G, lower, upper, warm, work, record)
         terms = new(Terms, (P, G, softness))
         if status != layout.SOLVED:
 
             def again(guess: Array, record: Array) -> int:
-                return solve_lazy(P, q, G, lower, upper, guess, lazy_workspace(settings, softness), record)
+                return solve_lazy(P, q, G, lower, upper, guess, work, record)
 
             record = self._settle(again, terms, q, lower, upper, record, began)
         return new(QPSolution, (record[where], terms, q, lower, upper, record, 0.0, perf_counter() - began))
@@ -162,12 +156,13 @@ class DualActiveSet:
         terms = Terms(problem.P, problem.G, stack_softness(soft, n, m))
         return Prepared(self, terms, self._settings(n, n + m, soft is not None, float(next(_tags))))
 
-    def _plan(self, n: int, m: int, soft: SoftRows | None) -> tuple[Array, Array, list[Array], int, slice]:
-        """For a shape, softness, settings, idle workspaces, the record's length, and where x is in it."""
+    def _plan(self, m: int, n: int, soft: SoftRows | None) -> tuple[Array, Array, int, slice]:
+        """For a shape of G, softness, workspace, the record's length, and where x is in it."""
         softness, settings = stack_softness(soft, n, m), self._settings(n, n + m, soft is not None)
-        plan = softness, settings, [], layout.record_size(n, n + m), slice(layout.HEADER, layout.HEADER + n)
+        work, where = lazy_workspace(settings, softness), slice(layout.HEADER, layout.HEADER + n)
+        plan = softness, work, layout.record_size(n, n + m), where
         if soft is None:
-            self._plans[n, m] = plan
+            self._plans[m, n] = plan
         return plan
 
     def _limit(self, M: int) -> int:
@@ -204,7 +199,7 @@ class Prepared:
         build_seconds: Time that the preparation took [s].
     """
 
-    __slots__ = ("_idle", "_settings", "_size", "_solver", "_system", "_traits", "_x", "build_seconds", "terms")
+    __slots__ = ("_settings", "_size", "_solver", "_system", "_traits", "_work", "_x", "build_seconds", "terms")
 
     def __init__(self, solver: DualActiveSet, terms: Terms, settings: Array):
         global run_gram
@@ -213,7 +208,7 @@ class Prepared:
         began = perf_counter()
         self.terms, self._solver, self._settings = terms, solver, settings
         self._system, self._traits = gram_system(terms)
-        self._idle = []
+        self._work = gram_workspace(settings, self._traits)
         n, M = len(terms.P), sum(terms.G.shape)
         self._size = layout.record_size(n, M) + layout.factor_size(n, M)
         self._x = slice(layout.HEADER, layout.HEADER + n)
@@ -234,18 +229,13 @@ class Prepared:
         began = perf_counter()
         record = empty(self._size)
         try:
-            work = self._idle.pop()
-        except IndexError:
-            work = gram_workspace(self._settings, self._traits)
-        try:
             warm = layout.NO_RECORD if warm_start is None else warm_start.record
             if q.dtype is lower.dtype is upper.dtype is FLOAT:
-                status = run_gram(q, lower, upper, warm, self._system, work, record)
+                status = run_gram(q, lower, upper, warm, self._system, self._work, record)
             else:  # may still be float64: a dtype that was pickled is another object
-                status = solve_gram(q, lower, upper, warm, self._system, work, record)
+                status = solve_gram(q, lower, upper, warm, self._system, self._work, record)
         except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
             status = layout.MISUSE
-        self._idle.append(work)
         if status:
             return self._solve_carefully(q, lower, upper, warm_start, record, status, began)
         return new(QPSolution, (record[self._x], self.terms, q, lower, upper, record, 0.0, perf_counter() - began))
@@ -258,8 +248,7 @@ class Prepared:
             q, lower, upper = problem.q, problem.lower, problem.upper
 
         def again(guess: Array, record: Array) -> int:
-            work = gram_workspace(self._settings, self._traits)
-            return solve_gram(q, lower, upper, guess, self._system, work, record)
+            return solve_gram(q, lower, upper, guess, self._system, self._work, record)
 
         if status == layout.MISUSE:
             status = again(_as_record(warm_start, len(q), len(lower)), record)

@@ -10,7 +10,7 @@ or never (d = 0: the constraints contradict each other, and (r, -1) is Farkas' p
 
 import numpy as np
 
-from gpmpc.compiled import borrowing
+from gpmpc.compiled import woven
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, subtract_rows
 from gpmpc.qp.working_set import (
     END,
@@ -37,37 +37,38 @@ DEPENDENT = 1e-12  # d below this share of K_pp: the constraint depends on the w
 DOUBTFUL = 1e-4  # d below this share of K_pp is computed again without cancellation (lazy mode)
 
 
-@borrowing
-def list_violated(y, weights, bounds, excess, listed):
-    """Lists the constraints outside their watch, and by how much after weighting; returns how many there are."""
+@woven
+def list_violated(y, scales, bounds, excess, listed):
+    """Lists the constraints outside their watch, and by how much in units of ``scales``; returns how many there are."""
     lo, hi = bounds[LOW_WATCH], bounds[HIGH_WATCH]
     violated = 0
     for p in range(len(y)):
-        excess[p] = max(y[p] - hi[p], lo[p] - y[p]) * weights[p]
+        excess[p] = max(y[p] - hi[p], lo[p] - y[p])
         violated += excess[p] > 0.0
     if violated > 0:
         count = 0
         for p in range(len(y)):
             if excess[p] > 0.0:
+                excess[p] /= scales[p]
                 listed[count] = p
                 count += 1
     return violated
 
 
-@borrowing
-def keep_violated(now, weights, bounds, excess, listed, count):
+@woven
+def keep_violated(now, scales, bounds, excess, listed, count):
     """The same for the listed constraints, which stay listed if they are still outside their watch."""
     kept = 0
     for i in range(count):
         p = listed[i]
-        excess[p] = max(now[p] - bounds[HIGH_WATCH, p], bounds[LOW_WATCH, p] - now[p]) * weights[p]
+        excess[p] = max(now[p] - bounds[HIGH_WATCH, p], bounds[LOW_WATCH, p] - now[p]) / scales[p]
         if excess[p] > 0.0:
             listed[kept] = p
             kept += 1
     return kept
 
 
-@borrowing
+@woven
 def most_violated(excess, listed, count):
     """The one of the listed constraints with the largest excess."""
     worst = listed[0]
@@ -77,7 +78,7 @@ def most_violated(excess, listed, count):
     return worst
 
 
-@borrowing
+@woven
 def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch):
     """Changes multipliers until constraint p, whose value is given, is satisfied.
 
@@ -137,7 +138,7 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
         return REACHED, k, changes
 
 
-@borrowing
+@woven
 def distance_to_span(row, k, n, rows, members, r, rest):
     """|row - sum r_i row_i|^2: what is left of a row outside the span of the working ones (lazy mode)."""
     for j in range(n):
@@ -146,7 +147,7 @@ def distance_to_span(row, k, n, rows, members, r, rest):
     return dot(rest, rest, n)
 
 
-@borrowing
+@woven
 def first_block(step, sense, k, mu, slots, members, r):
     """The longest step, up to ``step``, that keeps the multipliers in range, and the slot that ends it (or k)."""
     size = 0.0

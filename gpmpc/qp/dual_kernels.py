@@ -14,13 +14,29 @@ import math
 
 import numpy as np
 
-from gpmpc.compiled import borrowing
+from gpmpc.compiled import borrowing, woven
 from gpmpc.qp import record, workspace
 from gpmpc.qp.cholesky import factorise
 from gpmpc.qp.dual_iteration import CONTRADICTION, keep_violated, list_violated, most_violated, step_to
 from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, follow_listed, refine, residuals, row_values
-from gpmpc.qp.factor import dot, multiply_at, pack, unpack
+from gpmpc.qp.factor import multiply_at, pack, unpack
 from gpmpc.qp.hessian import solve_transposed
+from gpmpc.qp.lanes import (
+    any_nonzero,
+    bounded,
+    lanes,
+    larger,
+    largest,
+    less,
+    negative,
+    no_lanes,
+    plus,
+    plus_product,
+    put,
+    scaled,
+    some_lanes,
+    total,
+)
 from gpmpc.qp.working_set import (
     CAP,
     END,
@@ -31,10 +47,10 @@ from gpmpc.qp.working_set import (
     NAME,
     NORM,
     PLACE,
+    SCALE,
     SCRATCH,
     SLACK,
     UPPER,
-    WEIGHT,
     admit,
     choose_guess,
     choose_violated,
@@ -43,14 +59,14 @@ from gpmpc.qp.working_set import (
     take,
     watch,
 )
-from gpmpc.qp.workspace import carve, most_working, padded
+from gpmpc.qp.workspace import carve, matrix, most_working, padded, round_end
 
 STATUS, ITERATIONS, VARIABLES, CONSTRAINTS = record.STATUS, record.ITERATIONS, record.VARIABLES, record.CONSTRAINTS
 WORKING, TAG, AGE, HEADER = record.WORKING, record.TAG, record.AGE, record.HEADER
 SOLVED, INFEASIBLE, ITERATION_LIMIT = record.SOLVED, record.INFEASIBLE, record.ITERATION_LIMIT
 NUMERICAL_TROUBLE, MISUSE, NO_TAG = record.NUMERICAL_TROUBLE, record.MISUSE, record.NO_TAG
 
-GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1])"
+GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 
 ABSENT = 1e20  # a bound of this size or more is none
@@ -61,27 +77,27 @@ SWEPT = 0.5  # those violated by more than this share of the worst
 ROUNDS = 10  # returns from the residuals to the iteration
 REFINEMENTS = 3
 FINE = 1e-11  # scaled residual at which refinement stops
-END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
 OLD = 1000  # changes after which a factor is computed anew
 
 
-@borrowing
+@woven
 def read_bounds(lower, upper, norms, bounds):
     """Copies the bounds, with absent ones infinite; True if any are crossed or undefined."""
-    bad = 0
-    for p in range(len(lower)):
-        low, high = lower[p], upper[p]
-        bad += not ((low <= high) & (low < ABSENT) & (high > -ABSENT))
-        has_low, has_high = low > -ABSENT, high < ABSENT
-        size = max(norms[p], max(abs(low) if has_low else 0.0, abs(high) if has_high else 0.0))
-        low, high = low if has_low else -np.inf, high if has_high else np.inf
-        slack = TOLERATED * size
-        bounds[LOWER, p], bounds[UPPER, p], bounds[SLACK, p] = low, high, slack
-        bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = low - slack, high + slack
-    return bad > 0
+    crossed = no_lanes()
+    for p in range(0, len(lower), 8):
+        low, high = some_lanes(lower, p), some_lanes(upper, p)
+        size = larger(larger(lanes(norms, p), bounded(low, ABSENT, 0.0)), bounded(high, ABSENT, 0.0))
+        low, high = bounded(low, ABSENT, np.inf), bounded(high, ABSENT, np.inf)
+        crossed = plus(crossed, 1.0, negative(less(high, 1.0, low)))
+        put(bounds[LOWER], p, low)
+        put(bounds[UPPER], p, high)
+        put(bounds[SLACK], p, scaled(TOLERATED, size))
+        put(bounds[LOW_WATCH], p, less(low, TOLERATED, size))
+        put(bounds[HIGH_WATCH], p, plus(high, TOLERATED, size))
+    return largest(crossed) > 0.0
 
 
-@borrowing
+@woven
 def keep_capped(n, warm, traits, bounds, mu):
     """Starts with the guess's multipliers that are at their caps: soft rows that stay violated."""
     for p in range(n, len(mu)):
@@ -91,7 +107,7 @@ def keep_capped(n, warm, traits, bounds, mu):
             watch(p, mu, bounds)
 
 
-@borrowing
+@woven
 def count_above(values, threshold, listed, count):
     """How many of the listed values are above the threshold."""
     above = 0
@@ -100,7 +116,7 @@ def count_above(values, threshold, listed, count):
     return above
 
 
-@borrowing
+@woven
 def all_present(names, bounds, mu):
     """Whether every one of the named bounds is there to be held (it may have become absent since)."""
     for name in names:
@@ -112,7 +128,7 @@ def all_present(names, bounds, mu):
     return True
 
 
-@borrowing
+@woven
 def write_ray(p, above, k, bounds, members, r, mu):
     """Farkas' proof that constraint p contradicts the working ones, ``C' ray = 0`` and ``ray' bounds < 0``, into mu."""
     sense = 1.0 if above else -1.0
@@ -125,9 +141,66 @@ def write_ray(p, above, k, bounds, members, r, mu):
     mu[p] = sense
 
 
-@borrowing
-def optimise(lazy, P, linear, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out):
-    """Both modes after their set-up; ``rows`` is K and L is G' in Gram mode."""
+@borrowing  # woven into ``optimise`` it would cost the solves that need no step a twentieth of a microsecond
+def climb(
+    lazy, n, q, inverse, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch, y, now, seen, excess,
+    gradient, slope, k, capacity, soft, limit, iterations, sweeps, count,
+):  # fmt: skip
+    """Changes the working set until none of the constraints is violated; ``count`` are, and listed.
+
+    Returns:
+        ``SOLVED``, ``INFEASIBLE`` or ``ITERATION_LIMIT``, the size of the working set, iterations and sweeps so far.
+    """
+    candidates, listed, fresh = members[SCRATCH], members[LISTED], True
+    for p in range(len(mu)):
+        seen[p] = mu[p]
+    while count > 0:
+        if iterations >= limit:
+            return ITERATION_LIMIT, k, iterations, sweeps
+        p = most_violated(excess, listed, count)
+        value, several = y[p] if fresh else now[p], False
+        if fresh and sweeps < SWEEPS and count_above(excess, SWEPT * excess[p], listed, count) > 1:
+            sweeps += 1
+            before = k
+            chosen = choose_violated(SWEPT * excess[p], capacity - k, y, excess, listed, count, bounds, mu, candidates)
+            k = take(
+                lazy, candidates, chosen, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch[1]
+            )
+            several = k > before
+            iterations += k - before
+            k = settle(k, bounds, mu, slots, members, R, scratch)
+        if not several:
+            outcome, k, changes = step_to(
+                lazy, p, value, k, capacity, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch
+            )
+            iterations += changes
+            if outcome == CONTRADICTION:
+                if excess[p] * traits[SCALE, p] > NOISE * bounds[SLACK, p] / TOLERATED:
+                    write_ray(p, value > bounds[UPPER, p], k, bounds, members, scratch[2], mu)
+                    return INFEASIBLE, k, iterations, sweeps
+                ignore(p, bounds)
+            if soft:
+                sweeps = SWEEPS  # caps may have changed what ``pull`` says
+        fresh = several or soft or count == 1 or iterations >= limit
+        if not fresh:  # first satisfy those that were seen to be violated, then look at all
+            follow_listed(lazy, n, v, rows, L, G, mu, k, members, traits, seen, gradient, y, listed, count, now)
+            count = keep_violated(now, traits[SCALE], bounds, excess, listed, count)
+            fresh = count == 0
+        if fresh:
+            if not lazy:
+                follow(rows, mu, seen, candidates, gradient, y)
+            elif soft:
+                evaluate(lazy, n, q, inverse, L, G, mu, k, members, traits, soft, slope, y)
+            else:
+                follow_lazily(n, v, rows, L, mu, k, members, gradient, y)
+                row_values(lazy, L, G, n, traits, y)
+            count = list_violated(y, traits[SCALE], bounds, excess, listed)
+    return SOLVED, k, iterations, sweeps
+
+
+@woven
+def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out):
+    """Both modes after their set-up; ``rows`` is K and L is G' in Gram mode, which knows P's inverse."""
     M = len(lower)
     limit, tolerance, soft = (
         int(settings[workspace.LIMIT]),
@@ -179,81 +252,42 @@ def optimise(lazy, P, linear, G, n, rows, L, traits, vectors, members, R, lower,
                 lazy, candidates, count, 0, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch[1]
             )
         k = settle(k, bounds, mu, slots, members, R, scratch)
-    evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y)
-    if not lazy:
-        for i in range(M):
-            seen[i] = mu[i]
-    current, iterations, rounds, status, worst = True, 0, 0, NUMERICAL_TROUBLE, np.inf
+    if lazy and not soft:
+        follow_lazily(n, v, rows, L, mu, k, members, gradient, y)
+        row_values(lazy, L, G, n, traits, y)
+    else:
+        evaluate(lazy, n, q, inverse, L, G, mu, k, members, traits, soft, slope, y)
+    iterations, rounds, status, worst = 0, 0, NUMERICAL_TROUBLE, np.inf
     interrupted = guessed and warm[STATUS] == ITERATION_LIMIT
     sweeps = SWEEPS if interrupted else 0  # the dual objective climbs with single steps only, and so the end is sure
-    count, fresh = list_violated(y, traits[WEIGHT], bounds, excess, listed), True
+    count = list_violated(y, traits[SCALE], bounds, excess, listed)
+    current, moved = not lazy or soft, False  # whether slope belongs to mu, and x is not what was last looked at
     while True:
         if count > 0:
-            if iterations >= limit:
-                status = ITERATION_LIMIT
+            status, k, iterations, sweeps = climb(
+                lazy, n, q, inverse, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch, y, now, seen,
+                excess, gradient, slope, k, capacity, soft, limit, iterations, sweeps, count,
+            )  # fmt: skip
+            if status != SOLVED:
                 break
-            current = False
-            p = most_violated(excess, listed, count)
-            value, several = y[p] if fresh else now[p], False
-            if fresh and sweeps < SWEEPS and count_above(excess, SWEPT * excess[p], listed, count) > 1:
-                sweeps += 1
-                before = k
-                chosen = choose_violated(
-                    SWEPT * excess[p], capacity - k, y, excess, listed, count, bounds, mu, candidates
-                )
-                k = take(
-                    lazy, candidates, chosen, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R,
-                    scratch[1],
-                )  # fmt: skip
-                several = k > before
-                iterations += k - before
-                k = settle(k, bounds, mu, slots, members, R, scratch)
-            if not several:
-                outcome, k, changes = step_to(
-                    lazy, p, value, k, capacity, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch
-                )
-                iterations += changes
-                if outcome == CONTRADICTION:
-                    if excess[p] > NOISE * traits[WEIGHT, p] * bounds[SLACK, p] / TOLERATED:
-                        status = INFEASIBLE
-                        write_ray(p, value > bounds[UPPER, p], k, bounds, members, scratch[2], mu)
-                        break
-                    ignore(p, bounds)
-                if soft:
-                    sweeps = SWEEPS  # caps may have changed what ``pull`` says
-            fresh = several or soft or iterations >= limit
-            if not fresh:  # first satisfy those that were seen to be violated, then look at all
-                follow_listed(
-                    lazy, n, v, rows, L, G, mu, k, members, traits, seen, gradient, y, listed, count, now
-                )  # fmt: skip
-                count = keep_violated(now, traits[WEIGHT], bounds, excess, listed, count)
-                fresh = count == 0
-            if fresh:
-                if not lazy:
-                    follow(rows, mu, seen, candidates, gradient, y)
-                elif soft:
-                    evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y)
-                else:
-                    follow_lazily(n, v, rows, L, mu, k, members, gradient, y)
-                    row_values(lazy, L, G, n, traits, y)
-                count = list_violated(y, traits[WEIGHT], bounds, excess, listed)
-            continue
-        if not current:
+            current, moved = False, True
             if not lazy:
                 row_values(lazy, L, G, n, traits, y)
+        if not current:
             add_pull(G, n, q, mu, k, members, traits, soft, slope)
         best = np.inf
         for attempt in range(REFINEMENTS + 1):
             worst = residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, active)
             if worst <= FINE or attempt == REFINEMENTS or not worst < 0.5 * best:
                 break
-            best = worst
+            best, moved = worst, True
             refine(lazy, k, n, rows, L, G, slots, members, traits, R, mu, y, gradient, active, scratch[0], scratch[2])
             add_pull(G, n, q, mu, k, members, traits, soft, slope)
         status = SOLVED if worst <= tolerance else NUMERICAL_TROUBLE
         rounds += 1
-        unchanged = current and attempt == 0
-        count = 0 if unchanged or rounds == ROUNDS else list_violated(y, traits[WEIGHT], bounds, excess, listed)
+        if not moved or rounds == ROUNDS:
+            break
+        count = list_violated(y, traits[SCALE], bounds, excess, listed)
         if count == 0:
             break
     out[STATUS], out[ITERATIONS], out[WORKING] = status, iterations, k
@@ -269,7 +303,7 @@ def optimise(lazy, P, linear, G, n, rows, L, traits, vectors, members, R, lower,
     return status
 
 
-@borrowing
+@borrowing(locked=True)
 def solve_gram(q, lower, upper, warm, system, work, out):
     """Gram mode; ``system`` is of ``gpmpc.qp.gram_system``, ``work`` of ``gpmpc.qp.workspace``."""
     settings, traits, vectors, members, R, _ = carve(work)
@@ -277,64 +311,78 @@ def solve_gram(q, lower, upper, warm, system, work, out):
     dense = is_dense(q) and is_dense(lower) and is_dense(upper) and is_dense(warm)
     if not dense or len(q) != n or len(lower) != M or len(upper) != M or not all_finite(q):
         return MISUSE
-    K, P, transposed, G = system[:M], system[M : M + n], system[M + n : M + 2 * n], system[M + 2 * n :]
-    return optimise(False, P, q, G, n, K, transposed, traits, vectors, members, R, lower, upper, warm, settings, out)
+    m, wide, wide_rows = M - n, padded(n), padded(M - n)
+    a = M * padded(M)
+    b = a + n * wide
+    c = b + n * wide
+    d = c + n * wide_rows
+    K, inverse, P = matrix(system, 0, M, padded(M)), matrix(system, a, n, wide), matrix(system, b, n, wide)
+    turned, G = matrix(system, c, n, wide_rows), matrix(system, d, m, wide)
+    return optimise(
+        False, P, inverse, q, G, n, K, turned, traits, vectors, members, R, lower, upper, warm, settings, out
+    )
 
 
-@borrowing
+@borrowing(locked=True)
 def solve_lazy(P, q, G, lower, upper, warm, work, out):
     """Lazy mode; ``work`` is of ``gpmpc.qp.workspace``."""
     n, m = P.shape[0], len(G)
     M = n + m
-    shaped = P.shape[1] == n and len(q) == n and (m == 0 or G.shape[1] == n) and len(lower) == M and len(upper) == M
+    shaped = P.shape[1] == n and len(q) == n and G.shape[1] == n and len(lower) == M and len(upper) == M
     dense = is_dense(q) and is_dense(lower) and is_dense(upper) and is_dense(warm)
     dense &= is_dense_matrix(P) and is_dense_matrix(G)
     if not shaped or not dense or not all_finite(q):
         return MISUSE
     settings, traits, vectors, members, R, rest = carve(work)
-    dense = rest.reshape(rest.size)  # rows without gaps are nearer to each other
-    size = n * padded(n)
-    L, rows = dense[:size].reshape((n, padded(n))), dense[size : size + n * (len(R) + 1)].reshape((len(R) + 1, n))
+    L, rows = matrix(rest, 0, n, padded(n)), matrix(rest, n * padded(n), len(R) + 1, n)  # nearer without gaps
     if not factorise(P, L):
         return MISUSE
     if not measure(G, n, traits):
         return MISUSE
-    return optimise(True, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
+    return optimise(True, P, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
 
 
-@borrowing
+@woven
 def measure(G, n, traits):
-    """Writes the norms, weights and ends of the constraints; False if G is not finite."""
-    for p in range(n):
-        traits[NORM, p], traits[WEIGHT, p], traits[END, p] = 1.0, 1.0, min(n, (p // END_STEP + 1) * END_STEP)
+    """Writes the norms, scales and ends of the rows of G; False if G is not finite."""
+    norms, scales, ends = traits[NORM, n:], traits[SCALE, n:], traits[END, n:]
     undefined, end = 0.0, 0
     for p in range(len(G)):
-        row = G[p]
-        if dot(row[end:], row[end:], n - end) != 0.0:  # longer than the row before
+        row, near, far = G[p], no_lanes(), no_lanes()
+        head, tail = row[:end], row[end:]
+        for j in range(0, end, 8):
+            values = some_lanes(head, j)
+            near = plus_product(near, values, values)
+        for j in range(0, n - end, 8):
+            values = some_lanes(tail, j)
+            far = plus_product(far, values, values)
+        if any_nonzero(far):  # longer than the row before
             end = n
             while end > 0 and row[end - 1] == 0.0:
                 end -= 1
-            end = min(n, (end + END_STEP - 1) // END_STEP * END_STEP)
-        norm = math.sqrt(dot(row, row, end))
+            end = round_end(end, n)
+        norms[p], ends[p] = total(plus(near, 1.0, far)), end
+    for p in range(len(G)):
+        norm = math.sqrt(norms[p])
+        norms[p], scales[p] = norm, norm if norm > 0.0 else 1.0
         undefined += norm * 0.0
-        traits[NORM, n + p], traits[WEIGHT, n + p], traits[END, n + p] = norm, 1.0 / norm if norm > 0.0 else 1.0, end
     return undefined == 0.0
 
 
-@borrowing
+@woven
 def is_dense(vector):
     """Whether a vector is as contiguous as its type claims: ``gpmpc.compiled.direct`` does not ask."""
     return vector.strides[0] == vector.itemsize or len(vector) <= 1
 
 
-@borrowing
+@woven
 def is_dense_matrix(A):
     """The same for a matrix."""
     rows, columns = A.shape
     return (A.strides[0] == columns * A.itemsize and A.strides[1] == A.itemsize) or rows * columns == 0
 
 
-@borrowing
+@woven
 def all_finite(vector):
     """Whether no entry is infinite or NaN."""
     undefined = 0.0

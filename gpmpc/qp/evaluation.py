@@ -1,21 +1,19 @@
 """The point that belongs to a set of multipliers, and how well the two solve the QP.
 
-x minimises the Lagrangian, P x = -(q + C'mu), and y = C x are the constraints' values. Gram mode multiplies with P^-1,
-the upper left corner of K, and may later move y by the rows of K whose multipliers changed; lazy mode, P = L'L,
-solves. What is called L is the transposed G in Gram mode, which adds its rows faster than it multiplies those of G.
+x minimises the Lagrangian, P x = -(q + C'mu), and y = C x are the constraints' values. Gram mode multiplies with P^-1
+and may later move y by the rows of K whose multipliers changed; lazy mode, P = L'L, solves. What is called L is the
+transposed G in Gram mode, which adds its rows faster than it multiplies those of G.
 """
 
-from gpmpc.compiled import borrowing
+from gpmpc.compiled import woven
 from gpmpc.qp.factor import backward_solve, dot, forward_solve, four_dots, multiply, subtract_rows
 from gpmpc.qp.hessian import solve_lower, solve_transposed
-from gpmpc.qp.lanes import combine, lanes, larger, largest, no_lanes, plus, put
+from gpmpc.qp.lanes import any_nonzero, combine, lanes, larger, largest, less, no_lanes, plus, put, some_lanes
 from gpmpc.qp.working_set import BOUND, END, LEAST, MOST, NAME, PLACE, SCRATCH, SOFTNESS, couple
 from gpmpc.qp.workspace import padded
 
-FEW = 16  # variables below which four inner products at a time are faster than rows in whole registers
 
-
-@borrowing
+@woven
 def add_pull(G, n, q, mu, k, members, traits, soft, slope):
     """``slope = q + C' mu``; only where rows are soft can others than the working ones have a multiplier."""
     for i in range(n):
@@ -31,15 +29,15 @@ def add_pull(G, n, q, mu, k, members, traits, soft, slope):
                 add_row(mu[p], G[p - n], int(traits[END, p]), slope)
 
 
-@borrowing
+@woven
 def add_row(weight, row, n, target):
     """``target += weight row``."""
     for i in range(n):
         target[i] += weight * row[i]
 
 
-@borrowing
-def evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y):
+@woven
+def evaluate(lazy, n, q, inverse, L, G, mu, k, members, traits, soft, slope, y):
     """``y = C x`` for the multipliers; leaves ``slope = q + C' mu``."""
     add_pull(G, n, q, mu, k, members, traits, soft, slope)
     if lazy:
@@ -47,23 +45,21 @@ def evaluate(lazy, n, q, rows, L, G, mu, k, members, traits, soft, slope, y):
             y[i] = slope[i]
         solve_transposed(L, n, y)
         solve_lower(L, n, y)
-    elif n < FEW:
-        multiply(rows, n, slope, n, y)
     else:
-        combine(rows, n, slope, 0, n, y)  # K is symmetric
+        combine(inverse, n, slope, 0, n, y)  # which is symmetric
     for i in range(n):
         y[i] = -y[i]
     row_values(lazy, L, G, n, traits, y)
 
 
-@borrowing
+@woven
 def row_values(lazy, L, G, n, traits, y):
     """``y[n:] = G y[:n]``, several rows at a time, as far as they may not be zero."""
     product, ends, m = y[n:], traits[END, n:], len(G)
     p = 0
-    if not lazy and n >= FEW:
+    if not lazy:
         while p < m:
-            size = min(32, m - p)
+            size = min(16, m - p)
             combine(L, int(ends[p + size - 1]), y, p, size, product)
             p += size
     while p + 4 <= m:
@@ -75,7 +71,7 @@ def row_values(lazy, L, G, n, traits, y):
         p += 1
 
 
-@borrowing
+@woven
 def follow_lazily(n, v, rows, L, mu, k, members, weights, y):
     """Lazy mode without soft rows: x from ``L x = v - sum mu_i w_i``."""
     for i in range(n):
@@ -86,18 +82,20 @@ def follow_lazily(n, v, rows, L, mu, k, members, weights, y):
     solve_lower(L, n, y)
 
 
-@borrowing
+@woven
 def changes_since(mu, seen, changed, amounts):
     """Lists the multipliers that are not those, ``seen``, that y knows; returns how many."""
-    count = 0
-    for p in range(len(mu)):
-        if mu[p] != seen[p]:
-            changed[count], amounts[count] = p, mu[p] - seen[p]
-            count += 1
+    count, M = 0, len(mu)
+    for start in range(0, M, 8):
+        if any_nonzero(less(some_lanes(mu, start), 1.0, some_lanes(seen, start))):
+            for p in range(start, min(start + 8, M)):
+                if mu[p] != seen[p]:
+                    changed[count], amounts[count] = p, mu[p] - seen[p]
+                    count += 1
     return count
 
 
-@borrowing
+@woven
 def follow(rows, mu, seen, changed, amounts, y):
     """Gram mode: moves y by the rows of K whose multipliers are not those, ``seen``, that y knows."""
     count = changes_since(mu, seen, changed, amounts)
@@ -106,7 +104,7 @@ def follow(rows, mu, seen, changed, amounts, y):
     subtract_rows(y, rows, changed, amounts, count, len(mu))
 
 
-@borrowing
+@woven
 def follow_listed(lazy, n, v, rows, L, G, mu, k, members, traits, seen, weights, y, listed, count, now):
     """The values ``now`` of a few constraints, without those of all others (in lazy mode y then begins with x)."""
     if lazy:
@@ -125,14 +123,14 @@ def follow_listed(lazy, n, v, rows, L, G, mu, k, members, traits, seen, weights,
             now[p] = value
 
 
-@borrowing
+@woven
 def residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, active):
     """The largest scaled residual of (x, mu), x = y[:n]: stationarity, violation of the working set, duality gap.
 
     Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where y = C x and slope = q + C' mu. The
     vectors gradient, slope and q are padded, the latter two with zeros.
     """
-    if lazy or n < FEW:
+    if lazy:
         multiply(P, n, y, n, gradient)
         for i in range(n, padded(n)):
             gradient[i] = 0.0
@@ -154,7 +152,7 @@ def residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, 
     return max(max(stationarity / size, infeasibility), abs(gap) / max(1.0, abs(dot(q, y, n))))
 
 
-@borrowing
+@woven
 def refine(lazy, k, n, rows, L, G, slots, members, traits, R, mu, y, gradient, active, correction, trial):
     """One Newton step on the working set for the residuals ``gradient`` and ``active``; multipliers stay in range."""
     size = n if lazy else len(y)

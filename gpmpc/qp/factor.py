@@ -8,10 +8,10 @@ section 6.5.2). The diagonal holds reciprocals, so that no solve divides.
 
 import math
 
-from gpmpc.compiled import borrowing
+from gpmpc.compiled import woven
 
 
-@borrowing
+@woven
 def dot(a, b, size):
     """Inner product of the first ``size`` entries."""
     total = 0.0
@@ -20,7 +20,7 @@ def dot(a, b, size):
     return total
 
 
-@borrowing
+@woven
 def subtract_rows(state, rows, places, factors, count, size):
     """``state -= sum_i factors[i] rows[places[i]]``, four rows at a time."""
     i = 0
@@ -37,7 +37,7 @@ def subtract_rows(state, rows, places, factors, count, size):
         i += 1
 
 
-@borrowing
+@woven
 def multiply(A, count, vector, size, product):
     """``product[i] = A[i] . vector`` for the first ``count`` rows, four at a time."""
     i = 0
@@ -49,7 +49,7 @@ def multiply(A, count, vector, size, product):
         i += 1
 
 
-@borrowing
+@woven
 def multiply_at(A, places, count, vector, size, product):
     """``product[i] = A[places[i]] . vector``, four at a time."""
     i = 0
@@ -62,7 +62,7 @@ def multiply_at(A, places, count, vector, size, product):
         i += 1
 
 
-@borrowing
+@woven
 def four_dots(r0, r1, r2, r3, vector, size, product):
     """Four inner products with one vector, which is read once and whose sums hide each other's latency."""
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
@@ -75,7 +75,7 @@ def four_dots(r0, r1, r2, r3, vector, size, product):
     product[0], product[1], product[2], product[3] = s0, s1, s2, s3
 
 
-@borrowing
+@woven
 def forward_solve(R, k, a):
     """``a <- L^-1 a`` in place, four columns at a time."""
     j = 0
@@ -99,7 +99,7 @@ def forward_solve(R, k, a):
         j += 1
 
 
-@borrowing
+@woven
 def backward_solve(R, k, a):
     """``a <- L^-T a`` in place, four columns at a time."""
     j = k
@@ -119,7 +119,7 @@ def backward_solve(R, k, a):
         rest[0], rest[1], rest[2], rest[3] = f0, f1, f2, f3
 
 
-@borrowing
+@woven
 def append_row(R, k, solved, pivot):
     """Row k of L: ``solved = L^-1 K_Wp`` and ``pivot = K_pp - |solved|^2 > 0``."""
     for j in range(k):
@@ -127,7 +127,7 @@ def append_row(R, k, solved, pivot):
     R[k, k] = 1.0 / math.sqrt(pivot)
 
 
-@borrowing
+@woven
 def remove_row(R, k, gone, carry, solved):
     """Deletes row ``gone`` of L, which has k rows, and solves ``solved = L^-1 a`` for a without entry ``gone``.
 
@@ -157,7 +157,7 @@ def remove_row(R, k, gone, carry, solved):
         rest = rest[: len(old)]
 
 
-@borrowing
+@woven
 def pack(R, k, packed):
     """Copies the triangle of k rows to a flat array of k (k + 1) / 2 entries."""
     at = 0
@@ -168,7 +168,7 @@ def pack(R, k, packed):
         at += len(column)
 
 
-@borrowing
+@woven
 def unpack(packed, k, R):
     """The inverse of ``pack``."""
     at = 0

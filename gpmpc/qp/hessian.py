@@ -1,24 +1,24 @@
 """Lazy mode's work with the factor of P (``gpmpc.qp.cholesky``): the rows w_p = L^-T c_p of constraints that enter."""
 
-from gpmpc.compiled import borrowing
+from gpmpc.compiled import woven
 from gpmpc.qp.factor import dot, four_dots
 
 
-@borrowing
+@woven
 def subtract(target, factor, row, size):
     """``target -= factor row``."""
     for j in range(size):
         target[j] -= factor * row[j]
 
 
-@borrowing
+@woven
 def subtract_four(target, a, b, c, d, fa, fb, fc, fd, size):
     """``target -= fa a + fb b + fc c + fd d``."""
     for j in range(size):
         target[j] -= fa * a[j] + fb * b[j] + fc * c[j] + fd * d[j]
 
 
-@borrowing
+@woven
 def solve_transposed(L, end, a):
     """``a <- L^-T a`` in place, where a is zero from ``end`` on."""
     j = end
@@ -37,7 +37,7 @@ def solve_transposed(L, end, a):
         subtract_four(a, r0, r1, r2, r3, a0, a1, a2, a3, j)
 
 
-@borrowing
+@woven
 def solve_lower(L, n, a):
     """``a <- L^-1 a`` in place."""
     i = 0
@@ -56,7 +56,7 @@ def solve_lower(L, n, a):
         i += 1
 
 
-@borrowing
+@woven
 def write_constraint(p, n, G, ends, row):
     """``row = c_p``, row p of C = [I; G]; returns the number of its leading entries that may not be zero."""
     if p >= n:
@@ -70,13 +70,13 @@ def write_constraint(p, n, G, ends, row):
     return int(ends[p])
 
 
-@borrowing
+@woven
 def make_row(p, n, L, G, ends, row):
     """``row = L^-T c_p``."""
     solve_transposed(L, write_constraint(p, n, G, ends, row), row)
 
 
-@borrowing
+@woven
 def make_rows(names, count, n, L, G, ends, rows, places):
     """``rows[places[i]] = L^-T c_p`` for the constraints p with signed numbers ``names``."""
     for i in range(count):

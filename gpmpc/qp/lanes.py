@@ -1,7 +1,7 @@
 """Eight numbers at once, for loops that LLVM's vectoriser cuts badly: short, triangular, or with several sums.
 
 A value of this type is a vector register of 512 bits, or two or four smaller ones where the processor has no such. The
-functions are for compiled code only. None of them looks at the array's length.
+functions are for compiled code only. Only ``some_lanes`` looks at the array's length.
 """
 
 from llvmlite import ir
@@ -9,10 +9,11 @@ from numba.core import cgutils, types
 from numba.core.errors import TypingError
 from numba.extending import intrinsic, models, register_model
 
-from gpmpc.compiled import borrowing
+from gpmpc.compiled import woven
 
 WIDTH = 8
 VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
+WHOLE = ir.VectorType(ir.IntType(64), WIDTH)
 FUSED = ("contract", "reassoc", "nsz")
 
 
@@ -32,14 +33,19 @@ class _LanesModel(models.PrimitiveModel):
 LANES = Lanes()
 
 
-def _spread(builder, number):
-    first = builder.insert_element(ir.Constant(VECTOR, ir.Undefined), number, ir.IntType(32)(0))
+def _spread(builder, number, kind=VECTOR):
+    first = builder.insert_element(ir.Constant(kind, ir.Undefined), number, ir.IntType(32)(0))
     return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH))
 
 
 def _place(context, builder, array_type, array, index):
     data = context.make_array(array_type)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), VECTOR.as_pointer())
+
+
+def _call(builder, name, *vectors):
+    kind = ir.FunctionType(VECTOR, [VECTOR] * len(vectors))
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), vectors)
 
 
 @intrinsic
@@ -59,6 +65,22 @@ def lanes(typing_context, array, index):
     def generate(context, builder, signature, arguments):
         place = _place(context, builder, signature.args[0], *arguments)
         return builder.load(place, align=8)
+
+    return LANES(array, types.intp), generate
+
+
+@intrinsic
+def some_lanes(typing_context, array, index):
+    """The same of an array that may end before; zeros from there on."""
+
+    def generate(context, builder, signature, arguments):
+        place = _place(context, builder, signature.args[0], *arguments)
+        size = context.make_array(signature.args[0])(context, builder, arguments[0]).nitems
+        left = _spread(builder, builder.sub(size, arguments[1]), WHOLE)
+        present = builder.icmp_signed("<", ir.Constant(WHOLE, list(range(WIDTH))), left)
+        kind = ir.FunctionType(VECTOR, [place.type, ir.IntType(32), present.type, VECTOR])
+        load = cgutils.get_or_insert_function(builder.module, kind, "llvm.masked.load.v8f64.p0v8f64")
+        return builder.call(load, [place, ir.IntType(32)(8), present, ir.Constant(VECTOR, [0.0] * WIDTH)])
 
     return LANES(array, types.intp), generate
 
@@ -108,13 +130,56 @@ def plus(typing_context, values, factor, others):
 
 
 @intrinsic
+def plus_product(typing_context, values, ones, others):
+    """``values + ones others``, entry by entry."""
+
+    def generate(context, builder, signature, arguments):
+        product = builder.fmul(arguments[1], arguments[2], flags=FUSED)
+        return builder.fadd(arguments[0], product, flags=FUSED)
+
+    return LANES(LANES, LANES, LANES), generate
+
+
+@intrinsic
+def bounded(typing_context, values, limit, beyond):
+    """The entries below ``limit`` in size; ``beyond``, with the entry's sign, in place of the others. NaN stays."""
+
+    def generate(context, builder, signature, arguments):
+        values, limit, beyond = arguments
+        inside = builder.fcmp_unordered("<", _call(builder, "llvm.fabs.v8f64", values), _spread(builder, limit))
+        return builder.select(inside, values, _call(builder, "llvm.copysign.v8f64", _spread(builder, beyond), values))
+
+    return LANES(LANES, types.float64, types.float64), generate
+
+
+@intrinsic
+def negative(typing_context, values):
+    """One where an entry is negative or undefined, zero elsewhere."""
+
+    def generate(context, builder, signature, arguments):
+        below = builder.fcmp_unordered("<", arguments[0], ir.Constant(VECTOR, [0.0] * WIDTH))
+        return builder.uitofp(below, VECTOR)
+
+    return LANES(LANES), generate
+
+
+@intrinsic
+def any_nonzero(typing_context, values):
+    """Whether an entry is not zero; NaN is not."""
+
+    def generate(context, builder, signature, arguments):
+        nonzero = builder.fcmp_unordered("!=", arguments[0], ir.Constant(VECTOR, [0.0] * WIDTH))
+        return builder.icmp_unsigned("!=", builder.bitcast(nonzero, ir.IntType(WIDTH)), ir.IntType(WIDTH)(0))
+
+    return types.boolean(LANES), generate
+
+
+@intrinsic
 def larger(typing_context, values, others):
     """Entry by entry the larger one of ``values`` and ``|others|``; NaN in ``others`` is passed over."""
 
     def generate(context, builder, signature, arguments):
-        kind = ir.FunctionType(VECTOR, [VECTOR])
-        sizes = cgutils.get_or_insert_function(builder.module, kind, "llvm.fabs.v8f64")
-        size = builder.call(sizes, [arguments[1]])
+        size = _call(builder, "llvm.fabs.v8f64", arguments[1])
         return builder.select(builder.fcmp_ordered(">", size, arguments[0]), size, arguments[0])
 
     return LANES(LANES, LANES), generate
@@ -144,7 +209,7 @@ def folded(typing_context, values, distance):
     return LANES(LANES, distance), generate
 
 
-@borrowing
+@woven
 def largest(values):
     """The largest size among eight numbers."""
     values = larger(values, folded(values, 4))
@@ -152,35 +217,48 @@ def largest(values):
     return max(lane(values, 0), lane(values, 1))
 
 
-@borrowing
+@woven
+def total(values):
+    """The sum of eight numbers."""
+    values = plus(values, 1.0, folded(values, 4))
+    values = plus(values, 1.0, folded(values, 2))
+    return lane(values, 0) + lane(values, 1)
+
+
+@woven
 def combine(rows, count, factors, start, width, target):
     """``target[start:][:width] = sum_j factors[j] rows[j, start:][:width]`` over ``count`` rows, in whole lanes.
 
-    Rows and target are padded: what lies between ``start + width`` and the next whole lane is written too.
+    Rows and target are padded: what lies between ``start + width`` and the next whole lane is written too. Several
+    sums at a time hide the latency of one.
     """
     at, end = start, start + width
-    while at + 24 < end:
-        a, b, c, d = no_lanes(), no_lanes(), no_lanes(), no_lanes()
-        for j in range(count):
-            row, factor = rows[j], factors[j]
-            a, b = plus(a, factor, lanes(row, at)), plus(b, factor, lanes(row, at + 8))
-            c, d = plus(c, factor, lanes(row, at + 16)), plus(d, factor, lanes(row, at + 24))
-        put(target, at, a)
-        put(target, at + 8, b)
-        put(target, at + 16, c)
-        put(target, at + 24, d)
-        at += 32
     while at + 8 < end:
-        a, b = no_lanes(), no_lanes()
-        for j in range(count):
+        a = b = c = d = e = f = g = h = no_lanes()
+        j = 0
+        while j + 4 <= count:
+            r0, r1, r2, r3 = rows[j], rows[j + 1], rows[j + 2], rows[j + 3]
+            f0, f1, f2, f3 = factors[j], factors[j + 1], factors[j + 2], factors[j + 3]
+            a, b = plus(a, f0, lanes(r0, at)), plus(b, f0, lanes(r0, at + 8))
+            c, d = plus(c, f1, lanes(r1, at)), plus(d, f1, lanes(r1, at + 8))
+            e, f = plus(e, f2, lanes(r2, at)), plus(f, f2, lanes(r2, at + 8))
+            g, h = plus(g, f3, lanes(r3, at)), plus(h, f3, lanes(r3, at + 8))
+            j += 4
+        while j < count:
             row, factor = rows[j], factors[j]
             a, b = plus(a, factor, lanes(row, at)), plus(b, factor, lanes(row, at + 8))
-        put(target, at, a)
-        put(target, at + 8, b)
+            j += 1
+        put(target, at, plus(plus(a, 1.0, c), 1.0, plus(e, 1.0, g)))
+        put(target, at + 8, plus(plus(b, 1.0, d), 1.0, plus(f, 1.0, h)))
         at += 16
-    while at < end:
-        a = no_lanes()
-        for j in range(count):
+    if at < end:
+        a = b = c = d = no_lanes()
+        j = 0
+        while j + 4 <= count:
+            a, b = plus(a, factors[j], lanes(rows[j], at)), plus(b, factors[j + 1], lanes(rows[j + 1], at))
+            c, d = plus(c, factors[j + 2], lanes(rows[j + 2], at)), plus(d, factors[j + 3], lanes(rows[j + 3], at))
+            j += 4
+        while j < count:
             a = plus(a, factors[j], lanes(rows[j], at))
-        put(target, at, a)
-        at += 8
+            j += 1
+        put(target, at, plus(plus(a, 1.0, b), 1.0, plus(c, 1.0, d)))

@@ -9,8 +9,8 @@ Everything lives in a few arrays that the kernels hand around, a column per cons
   infinite unless the row is soft with a linear weight; a constraint that leaves at its cap stays violated.
 * ``members`` (4, capacity + 2) integers: the signed number +-(p + 1) of the constraint in each slot, where its row is,
   scratch for lists of candidates, and the list of violated constraints.
-* ``traits`` (5, M): norm, weight in the choice of the most violated, softness 1/rho and cap (``gpmpc.qp.soft_rows``),
-  and the number of leading entries of c_p that may not be zero.
+* ``traits`` (5, M): norm, what a violation is divided by in the choice of the most violated, softness 1/rho and cap
+  (``gpmpc.qp.soft_rows``), and the number of leading entries of c_p that may not be zero.
 * ``mu`` (M): multipliers; zero outside the working set except at a cap.
 * ``R``: the Cholesky factor of K_WW + softness (``gpmpc.qp.factor``).
 
@@ -20,19 +20,19 @@ p is K_p, known beforehand; in lazy mode, P = L'L, it is w_p = L^-T c_p, made wh
 
 import numpy as np
 
-from gpmpc.compiled import borrowing
+from gpmpc.compiled import woven
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, multiply_at, remove_row
 from gpmpc.qp.hessian import make_row, make_rows
 
 LOWER, UPPER, SLACK, LOW_WATCH, HIGH_WATCH = 0, 1, 2, 3, 4  # rows of ``bounds``
 BOUND, FREE_VALUE, LEAST, MOST = 0, 1, 2, 3  # rows of ``slots``
 NAME, PLACE, SCRATCH, LISTED = 0, 1, 2, 3  # rows of ``members``
-NORM, WEIGHT, SOFTNESS, CAP, END = 0, 1, 2, 3, 4  # rows of ``traits``
+NORM, SCALE, SOFTNESS, CAP, END = 0, 1, 2, 3, 4  # rows of ``traits``
 
 GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
 
 
-@borrowing
+@woven
 def watch(p, mu, bounds):
     """Puts constraint p, outside the working set, under the watch of ``most_violated``.
 
@@ -46,13 +46,13 @@ def watch(p, mu, bounds):
         bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = -np.inf, bounds[LOWER, p] + slack
 
 
-@borrowing
+@woven
 def ignore(p, bounds):
     """Takes constraint p out of the watch of ``most_violated``."""
     bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = -np.inf, np.inf
 
 
-@borrowing
+@woven
 def find_row(lazy, p, k, n, rows, L, G, traits, members):
     """Where row p is; in lazy mode it is made in the place that slot k has free."""
     if not lazy:
@@ -62,7 +62,7 @@ def find_row(lazy, p, k, n, rows, L, G, traits, members):
     return place
 
 
-@borrowing
+@woven
 def couple(lazy, row, k, size, rows, members, product):
     """The products of a row (``size`` entries in lazy mode) with those of the working set, K_Wp if it is row p."""
     if lazy:
@@ -72,7 +72,7 @@ def couple(lazy, row, k, size, rows, members, product):
             product[i] = row[abs(members[NAME, i]) - 1]
 
 
-@borrowing
+@woven
 def admit(k, p, above, place, traits, free, bounds, slots, members):
     """Writes constraint p into slot k, at its upper bound (``above``) or its lower one."""
     members[NAME, k], members[PLACE, k] = (p + 1 if above else -(p + 1)), place
@@ -83,7 +83,7 @@ def admit(k, p, above, place, traits, free, bounds, slots, members):
     slots[MOST, k] = cap if equality or above else 0.0
 
 
-@borrowing
+@woven
 def evict(k, slot, slots, members, R, solved, scratch):
     """Deletes a slot of the working set of k members; its place is free for the next row.
 
@@ -98,13 +98,13 @@ def evict(k, slot, slots, members, R, solved, scratch):
     members[PLACE, k - 1] = place
 
 
-@borrowing
+@woven
 def free_value(lazy, row, v, q, n):
     """c_p'x_u, the constraint's value at the unconstrained minimiser: from v = -L^-T q, or from row p of K and q."""
     return dot(row, v, n) if lazy else -dot(row, q, n)
 
 
-@borrowing
+@woven
 def choose_guess(names, room, bounds, mu, candidates):
     """Writes the guessed constraints that can be taken, at most ``room``, to ``candidates``; returns how many."""
     count = 0
@@ -119,9 +119,9 @@ def choose_guess(names, room, bounds, mu, candidates):
     return count
 
 
-@borrowing
+@woven
 def choose_violated(share, room, y, excess, listed, violated, bounds, mu, candidates):
-    """The same for the listed constraints whose weighted excess is above ``share``, except those at a cap."""
+    """The same for the listed constraints whose scaled excess is above ``share``, except those at a cap."""
     count = 0
     for i in range(violated):
         p = listed[i]
@@ -132,7 +132,7 @@ def choose_violated(share, room, y, excess, listed, violated, bounds, mu, candid
     return count
 
 
-@borrowing
+@woven
 def take(lazy, candidates, count, k, n, q, v, rows, L, G, traits, bounds, mu, slots, members, R, solved):
     """Takes the candidates into the working set, but for those that depend on the others; returns its size."""
     first = k
@@ -157,7 +157,7 @@ def take(lazy, candidates, count, k, n, q, v, rows, L, G, traits, bounds, mu, sl
     return k
 
 
-@borrowing
+@woven
 def settle(k, bounds, mu, slots, members, R, scratch):
     """The multipliers of the working set; drops the most wrong one until all are in range. Returns the size.
 

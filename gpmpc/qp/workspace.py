@@ -1,24 +1,27 @@
 """The memory that a solve works in, besides the record that it writes.
 
-To ask the system for it costs as much as a small solve, so each prepared problem or shape keeps what it has used
-before: ``list.pop`` and ``list.append`` are atomic, so two threads never hold the same workspace. It is one matrix,
-whose rows have an entry per constraint; to slice it costs nothing. Its first rows stay the same from solve to solve,
-the others are otherwise undefined:
+To ask the system for it costs as much as a small solve, so each prepared problem or shape keeps it. Threads may share
+it, since a solve keeps the interpreter's lock. It is one matrix, whose rows have an entry per constraint; to slice it
+costs nothing. Its first rows stay the same from solve to solve, the others are otherwise undefined:
 
     iteration limit, tolerance, whether rows are soft, n, M, tag
-    traits (5 rows, see ``gpmpc.qp.working_set``; lazy mode fills in norms, weights and ends itself)
+    traits (5 rows, see ``gpmpc.qp.working_set``; lazy mode fills in norms, scales and ends of the rows of G)
     vectors, members (integers), R, and in lazy mode L and rows
 """
 
 import numpy as np
+from numba.core import types
+from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
 
-from gpmpc.compiled import borrowing
+from gpmpc.compiled import woven
 
 Array = NDArray[np.float64]
 
 LIMIT, TOLERANCE, SOFT, VARIABLES, CONSTRAINTS, TAG, SETTINGS = 0, 1, 2, 3, 4, 5, 6
 TRAITS, VECTORS, MEMBERS = 5, 23, 4  # rows of each
+END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
 
 
 def gram_workspace(settings: Array, traits: Array) -> Array:
@@ -29,7 +32,9 @@ def gram_workspace(settings: Array, traits: Array) -> Array:
 def lazy_workspace(settings: Array, softness: Array) -> Array:
     """Memory for solves in lazy mode with these settings (6,) and softness (2, M)."""
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
-    traits = np.vstack([np.zeros((2, M)), softness, np.zeros((1, M))])
+    box = np.arange(M) < n
+    ends = np.minimum(n, (np.arange(M) // END_STEP + 1) * END_STEP)
+    traits = np.vstack([box, box, softness, box * ends])
     return _workspace(settings, traits, n * (padded(n) + most_working(n, M, bool(settings[SOFT])) + 2))
 
 
@@ -50,19 +55,42 @@ def aligned(rows: int, columns: int) -> Array:
     return memory[start : start + rows * columns].reshape(rows, columns)
 
 
-@borrowing
+@woven
 def most_working(n, M, soft):
     """How many constraints can work at once."""
     return M if soft else min(n, M)
 
 
-@borrowing
+@woven
 def padded(size):
     """The next multiple of eight."""
     return (size + 7) // 8 * 8
 
 
-@borrowing
+@woven
+def round_end(end, n):
+    """The number of leading entries that are looked at where ``end`` may not be zero."""
+    return min(n, (end + END_STEP - 1) // END_STEP * END_STEP)
+
+
+@intrinsic
+def matrix(typing_context, memory, start, rows, columns):
+    """The entries of a contiguous array from ``start`` on as (rows, columns); numba's reshape takes 20 ns more."""
+    kind = types.Array(types.float64, 2, "C")
+
+    def generate(context, builder, signature, arguments):
+        source, start, rows, columns = arguments
+        data = builder.gep(context.make_array(memory)(context, builder, source).data, [start])
+        step = context.get_constant(types.intp, 8)
+        view = context.make_array(kind)(context, builder)
+        strides = builder.mul(columns, step), step
+        populate_array(view, data=data, shape=(rows, columns), strides=strides, itemsize=step, meminfo=None)
+        return view._getvalue()
+
+    return kind(memory, types.intp, types.intp, types.intp), generate
+
+
+@woven
 def carve(work):
     """The kernels' arrays: settings, traits, vectors, members, R, and the rest of the memory."""
     settings = work[0]
