@@ -193,7 +193,8 @@ def over_settings(
                 (line,) = axis.plot(curve.at, value, "o-", color=colour, markersize=4, linewidth=1.3)
             else:
                 ends = np.abs(curve.interval.T - value)
-                line = axis.errorbar(curve.at, value, ends, fmt="o-", color=colour, markersize=4, capsize=3)
+                aside = 0.012 * (i - (len(curves) - 1) / 2) * float(curve.at.max())  # intervals beside each other
+                line = axis.errorbar(curve.at + aside, value, ends, fmt="o-", color=colour, markersize=4, capsize=3)
             handles.setdefault(curve.label, line)
         if logarithmic:
             axis.set_xscale("log")
