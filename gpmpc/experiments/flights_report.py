@@ -32,9 +32,9 @@ LEGEND = (
     "plan. lost: trials that left the finite numbers or had nothing to fall back on. Times: wall time of a decision."
 )
 BOUNDS_LEGEND = (
-    " broken: steps outside the state bounds, with the exact binomial interval; at a bound: of the steps whose plan "
-    "ended the next one at a bound, where 1 - eta is what the program promises. paid: steps whose program could not "
-    "keep a bound."
+    " broken: steps outside the state bounds, with the exact binomial interval (95 %); at a bound: of the steps whose "
+    "plan led to a bound at once, where 1 - eta is what the program promises. paid: steps whose program could not keep "
+    "a bound."
 )
 
 
@@ -146,18 +146,8 @@ HEADER = (
     "largest",
 )
 SHORT = [0, 1, 2, 4, 5, 6, 7, 8]  # columns of the same for a terminal
-SHORT_BOUNDS = [0, 1, 2, 3, 4, 6, 8]
-BOUNDS_HEADER = (
-    "",
-    "trajectory",
-    "H",
-    "allowed",
-    "broken [95 %]",
-    "of steps",
-    "broken at a bound [95 %]",
-    "of steps",
-    "paid",
-)
+SHORT_BOUNDS = [0, 1, 2, 3, 4, 6]  # the same
+BOUNDS_HEADER = ("", "trajectory", "H", "allowed %", "broken %", "of steps", "at a bound %", "of steps", "paid")
 TIMES_HEADER = ("", "trajectory", "our s", "paper's s", "paper's / ours")
 
 
@@ -168,17 +158,17 @@ def _cells(row: Summary) -> list[str]:
     trials = str(row.trials) + (f" ({row.lost} lost)" if row.lost else "")
     if not row.trials:
         return [name, shown, str(row.horizon), "—", "—", trials, "—", "—", "—", "—", "—"]
-    excess = "no bounds" if row.excess is None else "0" if row.excess <= 0 else f"{row.excess:.0e}"
-    times = [f"{value:.2f}" for value in row.milliseconds]
+    excess = "—" if row.excess is None else "0" if row.excess <= 0 else f"{row.excess:.0e}"
+    times = [f"{value:.3g}" if value < 100 else f"{value:.0f}" for value in row.milliseconds]
     axes = ", ".join(map(number, row.rmse))
     return [name, shown, str(row.horizon), axes, number(row.total), trials, excess, str(row.failed), *times]
 
 
 def _bounds_cells(row: Summary) -> list[str]:
-    cells = [row.name, row.trajectory, str(row.horizon), f"{100 * (1 - row.confidence):.3g} %"]
+    cells = [row.name, row.trajectory, str(row.horizon), f"{100 * (1 - row.confidence):.3g}"]
     for violated, steps in (row.violations, row.at_bound):
         low, high = binomial_interval(violated, steps) if steps else (0.0, 1.0)
-        share = f"{100 * violated / steps:.1f} %" if steps else "—"
+        share = f"{100 * violated / steps:.1f}" if steps else "—"
         cells += [f"{share} [{100 * low:.1f}, {100 * high:.1f}]", str(steps)]
     return [*cells, str(row.paid)]
 
@@ -223,9 +213,7 @@ def render(rows: Sequence[Summary], note: str) -> Group:
         table = Table(title=f"\n{title}", **STYLE)
         columns = {HEADER: SHORT, BOUNDS_HEADER: SHORT_BOUNDS}.get(header, range(len(header)))
         for column in columns:
-            table.add_column(
-                header[column], overflow="fold", min_width=None if column else 24 if header is HEADER else 12
-            )
+            table.add_column(header[column], overflow="fold", no_wrap=column > 1)
         for line in lines:
             table.add_row(*(line[column] for column in columns))
         parts.append(table)
