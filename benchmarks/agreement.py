@@ -5,7 +5,8 @@
 1. ``trajectory`` iterated to tolerance against ``NonlinearGPMPC`` on sampled steps of flights, full covariances: the
    nonlinear objective at the one's plan over that at the other's.
 2. The condensed program by our dual active set, the paper's primal one and Clarabel, and the state form in CVXPY, on
-   recorded steps with active bounds: the largest difference of an input, in its own unit.
+   recorded steps with active bounds of inputs and increments, and half as many with state bounds at a price (dual
+   active set and state form): the largest difference of an input, in its own unit.
 3. A horizon of 50 with state bounds: how many programs had no solution.
 
 One process, one thread. Writes ``outputs/benchmarks/agreement.json``.
@@ -19,6 +20,7 @@ import time
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,8 @@ from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.provenance import provenance
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
 
+# Bounds that bite at about one step in ten: of ux and uy [-], and of the increments of U1 [N], ux, uy.
+TIGHT = {"elliptical": (0.015, [0.014, 0.004, 0.004]), "lorenz": (0.04, [0.2, 0.02, 0.03])}
 PROPAGATIONS = {"linearization": Linearization(), "moment_matching": MomentMatching()}
 
 
@@ -97,11 +101,12 @@ def solvers(posteriors: dict, count: int) -> dict:
     found = {name: [] for name in ("primal_active_set", "clarabel", "state_form")}
     active, unsolved = 0, dict.fromkeys(found, 0)
     for trajectory, gp in posteriors.items():
-        # Bounds that bite: of the inputs, and of positions, with a margin that noise does not leave.
+        # Bounds that bite: of the inputs and their increments, and of positions.
         bounds = StateBounds(*(0.95 * np.asarray(side) for side in STATE_BOUNDS[trajectory]), l1=1e3)
-        hard = (problem(tilt=0.1), 10, HOVER)
+        tilt, rate = TIGHT[trajectory]
+        hard = (replace(problem(tilt=tilt), rate_lower=np.negative(rate), rate_upper=rate), 10, HOVER)
         soft = (problem(bounds), 10, HOVER)
-        for asked, kinds in ((hard, ("primal_active_set", "clarabel", "state_form")), (soft, ("state_form",))):
+        for asked, kinds, steps in ((hard, tuple(found), count // 2), (soft, ("state_form",), count // 4)):
             ours = ConvexMPC(gp, Linearization(), *asked)
             others = {
                 "primal_active_set": lambda a=asked, g=gp: ConvexMPC(g, Linearization(), *a, solver=PrimalActiveSet()),
@@ -109,7 +114,7 @@ def solvers(posteriors: dict, count: int) -> dict:
                 "state_form": lambda a=asked, g=gp: StateFormMPC(g, Linearization(), *a),
             }
             others = {kind: others[kind]() for kind in kinds}
-            for step in recorded(ours, trajectory, count // 4):
+            for step in recorded(ours, trajectory, steps):
                 if not step.decision.status.solved:
                     continue
                 active += bool(len(step.decision.solution.active_set))

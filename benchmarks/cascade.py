@@ -1,6 +1,6 @@
 """The whole quadrotor on learned models: two GPs at 1 and 20 Hz beside the same cascade on the true models.
 
-    .venv/bin/python benchmarks/cascade.py [--steps 189] [--seeds 3]
+    .venv/bin/python benchmarks/cascade.py [--steps 189] [--seeds 5]
 
 Twelve states; outer and inner controller are convex GP-MPC, and NMPC on the true subsystems for comparison. Flown
 along both trajectories as they are, with a gust, and with a mass that is 20 % larger than the models know. RMSE of the
@@ -47,7 +47,7 @@ def main() -> None:
     """Flies and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=189, help="outer steps")
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=5)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     results = []

@@ -31,6 +31,11 @@ LEGEND = (
     "squares. outside: the farthest that an input left its bounds. failed: steps without a solve, bridged by the last "
     "plan. lost: trials that left the finite numbers or had nothing to fall back on. Times: wall time of a decision."
 )
+BOUNDS_LEGEND = (
+    " broken: steps outside the state bounds, with the exact binomial interval (95 %); at a bound: of the steps whose "
+    "plan led to a bound at once, where 1 - eta is what the program promises. paid: steps whose program could not keep "
+    "a bound."
+)
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,8 @@ class Summary:
         milliseconds: Median, 95 % quantile and largest time of a decision [ms].
         seconds: Of all decisions of a trial, median over the trials [s].
         violations: Steps outside the state bounds, and all steps.
-        pressed: The same where the reference lies outside.
+        at_bound: The same where the plan's next state was at a bound: there 1 - eta is what the bound promises.
+        paid: Steps whose program could not keep a bound.
     """
 
     name: str
@@ -77,7 +83,8 @@ class Summary:
     milliseconds: tuple[float, float, float] = (float("nan"),) * 3
     seconds: float = float("nan")
     violations: tuple[int, int] | None = None
-    pressed: tuple[int, int] | None = None
+    at_bound: tuple[int, int] | None = None
+    paid: int | None = None
 
 
 def summarise(records: Sequence[dict]) -> list[Summary]:
@@ -98,7 +105,7 @@ def _summary(named: dict, group: list[dict]) -> Summary:
     excesses = [record["input_excess"] for record in good if record["input_excess"] is not None]
     times = time_quantiles(np.concatenate([record["seconds"] for record in good]))
     pooled = {
-        key: np.sum([r[key] for r in good], axis=0).tolist() for key in ("violations", "pressed") if key in good[0]
+        key: np.sum([r[key] for r in good], axis=0).tolist() for key in ("violations", "at_bound") if key in good[0]
     }
     return Summary(
         **counts,
@@ -110,6 +117,7 @@ def _summary(named: dict, group: list[dict]) -> Summary:
         milliseconds=(1e3 * times.median, 1e3 * times.p95, 1e3 * times.largest),
         seconds=float(np.median([sum(record["seconds"]) for record in good])),
         **{key: tuple(value) for key, value in pooled.items()},
+        paid=sum(record["paid"] for record in good) if pooled else None,
     )
 
 
@@ -138,7 +146,8 @@ HEADER = (
     "largest",
 )
 SHORT = [0, 1, 2, 4, 5, 6, 7, 8]  # columns of the same for a terminal
-BOUNDS_HEADER = ("", "trajectory", "H", "eta", "allowed", "broken [95 % interval]", "where the reference is outside")
+SHORT_BOUNDS = [0, 1, 2, 3, 4, 6]  # the same
+BOUNDS_HEADER = ("", "trajectory", "H", "allowed %", "broken %", "of steps", "at a bound %", "of steps", "paid")
 TIMES_HEADER = ("", "trajectory", "our s", "paper's s", "paper's / ours")
 
 
@@ -149,18 +158,19 @@ def _cells(row: Summary) -> list[str]:
     trials = str(row.trials) + (f" ({row.lost} lost)" if row.lost else "")
     if not row.trials:
         return [name, shown, str(row.horizon), "—", "—", trials, "—", "—", "—", "—", "—"]
-    excess = "no bounds" if row.excess is None else "0" if row.excess <= 0 else f"{row.excess:.0e}"
-    times = [f"{value:.2f}" for value in row.milliseconds]
+    excess = "—" if row.excess is None else "0" if row.excess <= 0 else f"{row.excess:.0e}"
+    times = [f"{value:.3g}" if value < 100 else f"{value:.0f}" for value in row.milliseconds]
     axes = ", ".join(map(number, row.rmse))
     return [name, shown, str(row.horizon), axes, number(row.total), trials, excess, str(row.failed), *times]
 
 
 def _bounds_cells(row: Summary) -> list[str]:
-    parts = []
-    for violated, steps in (row.violations, row.pressed):
+    cells = [row.name, row.trajectory, str(row.horizon), f"{100 * (1 - row.confidence):.3g}"]
+    for violated, steps in (row.violations, row.at_bound):
         low, high = binomial_interval(violated, steps) if steps else (0.0, 1.0)
-        parts.append(f"{violated / max(steps, 1):.4f} [{low:.4f}, {high:.4f}] of {steps}")
-    return [row.name, row.trajectory, str(row.horizon), f"{row.confidence:g}", f"{1 - row.confidence:.4g}", *parts]
+        share = f"{100 * violated / steps:.1f}" if steps else "—"
+        cells += [f"{share} [{100 * low:.1f}, {100 * high:.1f}]", str(steps)]
+    return [*cells, str(row.paid)]
 
 
 def timing(rows: Sequence[Summary]) -> list[list[str]]:
@@ -186,9 +196,14 @@ def _tables(rows: Sequence[Summary]) -> list[tuple[str, Sequence[str], list[list
     """Titles, headers and lines of all tables."""
     tables = [(title, HEADER, [_cells(row) for row in rows if row.loop == loop]) for loop, title in LOOPS.items()]
     bounded = [_bounds_cells(row) for row in rows if row.violations is not None]
-    tables.append(("State bounds, each to hold with probability eta", BOUNDS_HEADER, bounded))
+    tables.append(("State bounds that may be broken with probability 1 - eta", BOUNDS_HEADER, bounded))
     tables.append(("Time of 189 steps beside section 5.2", TIMES_HEADER, timing(rows)))
     return [table for table in tables if table[2]]
+
+
+def legend(rows: Sequence[Summary]) -> str:
+    """What the columns of the tables mean."""
+    return LEGEND + (BOUNDS_LEGEND if any(row.violations is not None for row in rows) else "")
 
 
 def render(rows: Sequence[Summary], note: str) -> Group:
@@ -196,13 +211,13 @@ def render(rows: Sequence[Summary], note: str) -> Group:
     parts = []
     for title, header, lines in _tables(rows):
         table = Table(title=f"\n{title}", **STYLE)
-        columns = SHORT if header is HEADER else range(len(header))
+        columns = {HEADER: SHORT, BOUNDS_HEADER: SHORT_BOUNDS}.get(header, range(len(header)))
         for column in columns:
-            table.add_column(header[column], overflow="fold", min_width=24 if column == 0 else None)
+            table.add_column(header[column], overflow="fold", no_wrap=column > 1)
         for line in lines:
             table.add_row(*(line[column] for column in columns))
         parts.append(table)
-    return Group(*parts, Text(f"{LEGEND}\n{note}"))
+    return Group(*parts, Text(f"{legend(rows)}\n{note}"))
 
 
 def documents(rows: Sequence[Summary], records: Sequence[dict], meta: dict, note: str) -> dict[str, str | bytes]:
@@ -210,7 +225,7 @@ def documents(rows: Sequence[Summary], records: Sequence[dict], meta: dict, note
     parts = ["# Flights", ""]
     for title, header, lines in _tables(rows):
         parts += [f"## {title}", "", *markdown_table(list(header), lines), ""]
-    parts += [LEGEND, "", note, "", "## Made by", "", "```json", json.dumps(meta, indent=2), "```", ""]
+    parts += [legend(rows), "", note, "", "## Made by", "", "```json", json.dumps(meta, indent=2), "```", ""]
     plain = [{k: v for k, v in record.items() if k != "drawn"} for record in records]
     written = {
         "figures.md": "\n".join(parts),
@@ -226,13 +241,23 @@ def comma_separated(rows: Sequence[Summary]) -> str:
     writer = csv.writer(buffer, lineterminator="\n")
     plain = ["name", "loop", "controller", "trajectory", "subsystem", "horizon", "size", "confidence", "trials", "lost"]
     more = ["rmse_1", "rmse_2", "rmse_3", "total", "total_min", "total_max", "input_excess", "failed_steps"]
-    more += ["ms_median", "ms_p95", "ms_max", "seconds", "violations", "steps", "violations_pressed", "steps_pressed"]
+    more += [
+        "ms_median",
+        "ms_p95",
+        "ms_max",
+        "seconds",
+        "violations",
+        "steps",
+        "violations_at_bound",
+        "steps_at_bound",
+        "steps_paid",
+    ]
     writer.writerow(plain + more)
     for row in rows:
         axes = row.rmse or ("", "", "")
         line = [getattr(row, key) for key in plain]
         line += [*axes, row.total, *row.spread, row.excess, row.failed, *row.milliseconds, row.seconds]
-        writer.writerow([*line, *(row.violations or ("", "")), *(row.pressed or ("", ""))])
+        writer.writerow([*line, *(row.violations or ("", "")), *(row.at_bound or ("", "")), row.paid])
     return buffer.getvalue()
 
 
@@ -291,8 +316,9 @@ def _over_horizon(rows: Sequence[Summary]) -> dict[str, list[Curve]]:
     panels: dict[str, list[Curve]] = {}
     for measure, label in (("total", "RMSE [m]"), ("milliseconds", "median time of a step [ms]")):
         for trajectory in dict.fromkeys(row.trajectory for row in rows):
-            for name, size in dict.fromkeys((row.name, row.size) for row in rows if row.loop == "plant"):
-                chosen = [r for r in rows if (r.name, r.size, r.trajectory) == (name, size, trajectory) and r.trials]
+            free = [row for row in rows if row.loop == "plant" and row.confidence is None and row.trials]
+            for name, size in dict.fromkeys((row.name, row.size) for row in free):
+                chosen = [r for r in free if (r.name, r.size, r.trajectory) == (name, size, trajectory)]
                 values = [r.total if measure == "total" else r.milliseconds[0] for r in chosen]
                 title = f"{name}, N = {size}" if size else name
                 if len(chosen) > 1:
@@ -308,13 +334,13 @@ def _over_confidence(rows: Sequence[Summary]) -> dict[str, list[Curve]]:
             group = [r for r in rows if (r.name, r.horizon, r.trajectory) == (name, H, trajectory) and r.violations]
             if len(group) < 2:
                 continue
-            for which, label in (("violations", "all steps"), ("pressed", "reference outside")):
+            for which, label in (("violations", "all steps"), ("at_bound", "steps planned at a bound")):
                 counts = [getattr(r, which) for r in group]
                 if not all(steps for _, steps in counts):
                     continue
                 ends = np.array([binomial_interval(*count) for count in counts])
                 rates = np.array([violated / steps for violated, steps in counts])
                 at = np.array([1 - r.confidence for r in group])
-                curve = Curve(f"{name}, H = {H}, {label}", at, rates[:, None], interval=ends)
-                panels.setdefault(f"{trajectory}: rate of violations", []).append(curve)
+                curve = Curve(f"{name}, H = {H}", at, rates[:, None], interval=ends)
+                panels.setdefault(f"{trajectory}: broken, share of {label}", []).append(curve)
     return panels

@@ -171,7 +171,11 @@ def tracking(groups: Sequence[tuple[Sequence[str], Sequence[Curve]]]) -> Figure:
     for axis in axes[-1]:
         axis.set_xlabel("time step k")
     figure.legend(
-        handles.values(), handles.keys(), loc="outside upper center", ncols=min(4, len(handles)), frameon=False
+        handles.values(),
+        handles.keys(),
+        loc="outside upper center",
+        ncols=min(5 if columns > 2 else 3, len(handles)),
+        frameon=False,
     )
     return figure
 
@@ -188,12 +192,15 @@ def over_settings(
     for axis, (title, curves) in zip(axes, panels.items(), strict=False):
         axis.set_title(title, fontsize="medium")
         for i, curve in enumerate(curves):
-            colour, value = COLOURS[i % len(COLOURS)], curve.values[:, 0]
+            colour, dash, value = COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)], curve.values[:, 0]
             if curve.interval is None:
-                (line,) = axis.plot(curve.at, value, "o-", color=colour, markersize=4, linewidth=1.3)
+                (line,) = axis.plot(
+                    curve.at, value, marker="o", linestyle=dash, color=colour, markersize=4, linewidth=1.3
+                )
             else:
                 ends = np.abs(curve.interval.T - value)
-                line = axis.errorbar(curve.at, value, ends, fmt="o-", color=colour, markersize=4, capsize=3)
+                aside = 0.012 * (i - (len(curves) - 1) / 2) * float(curve.at.max())  # intervals beside each other
+                line = axis.errorbar(curve.at + aside, value, ends, fmt="o-", color=colour, markersize=4, capsize=3)
             handles.setdefault(curve.label, line)
         if logarithmic:
             axis.set_xscale("log")

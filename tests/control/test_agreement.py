@@ -1,5 +1,7 @@
 """Roads to one answer meet, on a few steps; ``benchmarks/agreement.py`` has the hundreds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,7 @@ from gpmpc.control.controller import Reference
 from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.control.state_form import StateFormMPC
-from gpmpc.control.tracking import TrackingProblem
+from gpmpc.control.tracking import StateBounds, TrackingProblem
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import PrimalActiveSet
@@ -52,3 +54,22 @@ def test_dual_primal_and_state_form_give_the_same_inputs():
         for other in (primal, state_form):
             assert np.allclose(other.control(belief, reference).inputs, plan.inputs, atol=1e-6)
     assert active
+
+
+def test_a_bound_that_takes_a_large_step_of_the_inputs_is_kept_by_iterated_programs_only():
+    """Thrust and tilt multiply: where both have to change at once, one linearisation at the last inputs is far off."""
+    gp, limit = quadrotor_gp(150), 0.05
+    sides = np.full(6, np.inf)
+    sides[0] = limit
+    bounded = replace(problem(0.5), state_bounds=StateBounds(-np.inf * np.ones(6), sides, confidence=0.99, l1=100))
+    start = np.array([0.0, 0.4, 0.0, 0.0, 0.0, -0.5])
+    belief, reference = Gaussian.certain(start), Reference(np.stack([start, [0.2, 0.4, 0.0, 0.0, 0.3, 0.5]]))
+    reached = []
+    for iterations in (1, 30):
+        asked = (gp, Linearization(observation_noise=True), bounded, 1, HOVER)
+        plan = ConvexMPC(*asked, iterations=iterations, tolerance=1e-6).control(belief, reference)
+        assert plan.status.solved
+        after = Linearization(observation_noise=True)(gp, belief, torch.tensor(plan.input))
+        reached.append(float(after.mean[0] + bounded.state_bounds.kappa * after.covariance[0, 0].sqrt()) - limit)
+    assert abs(reached[0]) > 0.01  # [m]
+    assert abs(reached[1]) < 1e-5

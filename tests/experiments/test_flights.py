@@ -6,9 +6,11 @@ import os
 import subprocess
 import sys
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hydra import compose, initialize_config_dir
 
 from gpmpc.control.controller import Reference
 from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
@@ -23,6 +25,7 @@ from gpmpc.plants import Integrated, Translational
 from gpmpc.propagation import MomentMatching
 from gpmpc.trajectories import Elliptical, Lorenz
 
+CONF = Path(__file__).resolve().parents[2] / "conf"
 COLUMNS = ["x", "vx", "y", "vy", "z", "vz", "U1", "ux", "uy", "x+", "vx+", "y+", "vy+", "z+", "vz+"]
 BOUNDS = {
     "model": {
@@ -113,6 +116,33 @@ def test_a_row_that_means_nothing_is_refused(changes, message):
 def test_lists_of_settings_make_a_row_for_every_combination():
     rows = Row(**(OURS | {"horizon": [1, 5], "confidence": [0.9, 0.95]})).variants()
     assert [(row.horizon, row.confidence) for row in rows] == [(1, 0.9), (1, 0.95), (5, 0.9), (5, 0.95)]
+
+
+@pytest.mark.parametrize(("study", "trials"), [("flights", 50), ("horizon", 5), ("confidence", 12)])
+def test_a_study_says_how_many_trials_it_needs_and_the_command_line_has_the_last_word(study, trials):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        assert compose("figures", [f"study={study}"]).trials == trials
+        assert compose("figures", [f"study={study}", "trials=2"]).trials == 2
+
+
+def test_bounds_are_counted_over_all_steps_and_over_those_planned_at_a_bound(tmp_path):
+    bounded = ["study=confidence", "steps=20", "rows.once=null", "rows.without_noise=null", "loop=plant"]
+    bounded += [
+        "rows.convex.horizon=1",
+        "rows.convex.confidence=[0.9,0.99]",
+        "state_bounds.lorenz.upper=[-1,null,4,null,null,null]",
+    ]
+    run = gpmpc(*TINY, *bounded, cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert "State bounds that may be broken" in run.stdout
+    assert (tmp_path / "out/confidence.png").exists()
+    assert not (tmp_path / "out/horizon.png").exists()
+    rows = list(csv.DictReader((tmp_path / "out/figures.csv").read_text().splitlines()))
+    assert [float(row["confidence"]) for row in rows] == [0.9, 0.99]
+    for row in rows:
+        assert int(row["steps"]) == 20
+        assert 0 < int(row["steps_at_bound"]) <= 20
+        assert int(row["violations_at_bound"]) <= int(row["violations"]) < 20
 
 
 def test_the_papers_seconds_are_those_of_section_5_2():

@@ -66,3 +66,15 @@ def test_an_answer_that_its_residuals_do_not_bear_out_is_not_called_solved(rng):
 def test_an_iteration_limit_is_translated(rng):
     solution = CvxpySolver("CLARABEL", {"max_iter": 2}).solve(feasible_problem(rng, 10, 15))
     assert solution.status is Status.ITERATION_LIMIT
+
+
+def test_a_minimiser_far_from_zero_costs_no_digits(rng):
+    """The thrust that carries the vehicle makes x'Px huge; what is to be found is a small change of it."""
+    for _ in range(20):
+        basis = np.linalg.qr(rng.normal(size=(30, 30)))[0]
+        P = (basis * np.geomspace(4.0, 2e5, 30)) @ basis.T
+        P, centre = (P + P.T) / 2, np.tile([7.0, 0.0, 0.0], 10)
+        q = -P @ (centre + rng.normal(scale=0.1, size=30))
+        problem = QuadraticProgram(P, q, lb=centre - 0.1, ub=centre + 0.1)
+        ours = DualActiveSet().solve(problem)
+        np.testing.assert_allclose(CvxpySolver().solve(problem).x, ours.x, atol=1e-8)
