@@ -109,7 +109,25 @@ def steps_markdown(rows: Sequence[Row]) -> str:
             values = [found.get((N, what, horizon)) for N in sizes]
             cells.append([name, *("" if v is None else f"{ms(v['median'])} ({ms(v['p99'])})" for v in values)])
         sections.append(f"### n = {n}, m = {n // 2}, {cache} caches\n\n{table(header, cells)}")
-    return "\n\n".join(sections)
+    return "\n\n".join([*sections, _shares(rows)])
+
+
+def _shares(rows: Sequence[Row]) -> str:
+    """Where a step goes: model, build and solve of the largest n, in the middle of the sizes, the first cache."""
+    steps = [row for row in rows if row["part"] == "step"]
+    if not steps:
+        return ""
+    cache, n = steps[0]["cache"], max(row["n"] for row in steps)
+    sizes = sorted({row["N"] for row in steps})
+    size = sizes[len(sizes) // 2]
+    header = ["", "model", "build", "solve", "whole step"]
+    cells = [
+        [f"{row['what']}, H = {row['H']}", *(ms(row[part]) for part in ("model", "build", "solve", "median"))]
+        for row in steps
+        if (row["cache"], row["n"], row["N"]) == (cache, n, size)
+    ]
+    title = f"### Where a step goes: n = {n}, {size} points, {cache} caches (model, build and solve by the wall clock)"
+    return f"{title}\n\n{table(header, cells)}"
 
 
 def plain_markdown(rows: Sequence[Row]) -> str:

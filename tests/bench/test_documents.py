@@ -17,6 +17,7 @@ HERE = {
 
 def row(N, H, median, what="mean only", part="step", **others):
     times = {"median": median, "p95": median, "p99": 2 * median, "max": 3 * median, "samples": 7}
+    times |= {"model": median / 2, "build": median / 4, "solve": median / 8}
     return {"part": part, "what": what, "n": 2, "m": 1, "N": N, "H": H, "cache": "hot", **times, **others}
 
 
@@ -40,6 +41,10 @@ def test_markdown_holds_every_median_and_names_the_machine():
     assert "P, 2 cores, L1 48K; 1 thread; 50.0 GFlop/s" in text
     for found in ROWS:
         assert f"{found['median']:.3g} ({found['p99']:.3g})" in text
+
+
+def test_markdown_says_where_a_step_goes():
+    assert "| mean only, H = 10 | 2.5 | 1.25 | 0.625 | 5 |" in markdown(ROWS, HERE)
 
 
 def test_other_parts_are_shown_with_all_their_columns():
