@@ -14,7 +14,7 @@ import torch
 
 from gpmpc.bench.pendulums import pendulum_gp, pendulum_plant, pendulum_references
 from gpmpc.bench.timing import Times, take_turns
-from gpmpc.control.controller import Controller, Decision, Reference
+from gpmpc.control.controller import Controller, Decision, Reference, Timing
 from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError, check_number
@@ -22,6 +22,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.simulation import closed_loop
+from gpmpc.status import Status
 
 QUESTIONS = 40  # steps of the recorded flight
 STD = 0.01  # [rad, rad/s] of the beliefs: a full covariance is propagated, as with an estimator in the loop
@@ -103,21 +104,21 @@ class Answering:
     Attributes:
         controller: Who answers.
         questions: What is asked.
-        decisions: All answers so far.
+        kept: Status and timing of every answer so far.
     """
 
     controller: Controller
     questions: Sequence[tuple[Gaussian, Reference]]
-    decisions: list[Decision] = field(default_factory=list)
+    kept: list[tuple[Status, Timing]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._round = cycle(self.questions)
+        self._round, self._last = cycle(self.questions), None
 
     def __call__(self) -> Decision:
         """The next answer, warm-started from the last one."""
-        last = self.decisions[-1] if self.decisions else None
-        self.decisions.append(self.controller.control(*next(self._round), last))
-        return self.decisions[-1]
+        self._last = self.controller.control(*next(self._round), self._last)
+        self.kept.append((self._last.status, self._last.timing))
+        return self._last
 
 
 def recorded_questions(gp: GPPosterior, controller: Controller, steps: int) -> list[tuple[Gaussian, Reference]]:
@@ -165,11 +166,11 @@ def _whole_steps(gp: GPPosterior, horizon: int, cache: str, grid: Grid) -> list[
     times = take_turns(answering, grid.seconds, least=10, flushed=cache == "flushed")
     rows = []
     for name, taken in times.items():
-        decisions = answering[name].decisions[-len(taken.seconds) :]
-        parts = {part: [getattr(d.timing, part) for d in decisions] for part in ("model", "build", "solve")}
+        kept = answering[name].kept[-len(taken.seconds) :]
+        parts = {part: [getattr(timing, part) for _, timing in kept] for part in ("model", "build", "solve")}
         row = _row("step", gp, horizon, cache, name, taken)
         row |= {part: 1e3 * float(np.median(values)) for part, values in parts.items()}
-        rows.append(row | {"unsolved": sum(not d.status.solved for d in decisions)})
+        rows.append(row | {"unsolved": sum(not status.solved for status, _ in kept)})
     return rows
 
 

@@ -1,6 +1,7 @@
 """``gpmpc bench``: measures what everything costs on this machine, or compares two measurements."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -23,34 +24,43 @@ def bench(config: DictConfig) -> None:
     from gpmpc.provenance import provenance
 
     parts = settings["parts"] if isinstance(settings["parts"], list) else [settings["parts"]]
-    for part in parts:
-        if part not in PARTS:
-            raise SettingError("parts", f"must be among {', '.join(PARTS)}; got {part!r}")
+    if not parts or not all(isinstance(part, str) and part in PARTS for part in parts):
+        raise SettingError("parts", f"must be one or more of {', '.join(PARTS)}; got {settings['parts']!r}")
+    for part in ("peers", "quality"):
+        if not isinstance(settings[part], dict):
+            raise SettingError(part, f"has settings of its own, such as {part}.seconds; got {settings[part]!r}")
     if not isinstance(settings["folder"], str):
         raise SettingError("folder", f"must be the path of a folder; got {settings['folder']!r}")
     folder, console = Path(settings["folder"]), told_console()
     one_thread()
     planned = {part: PARTS[part](settings) for part in parts}  # finds out what a user can get wrong
-    try:
+    with _writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        here, rows = machine(), []
-        console.print(described(here))
-        for part, (rounds, measured) in planned.items():
-            with progress_bar(console) as progress:
-                task = progress.add_task(f"measuring {part}", total=rounds)
-                for found in measured:
-                    rows += found
-                    progress.advance(task)
-        written = {
-            "bench.json": write_json(rows, here, settings, provenance()),
-            "bench.md": markdown(rows, here),
-        } | _figures(rows)
+    here, rows = machine(), []
+    console.print(described(here))
+    for part, (rounds, measured) in planned.items():
+        with progress_bar(console) as progress:
+            task = progress.add_task(f"measuring {part}", total=rounds)
+            for found in measured:
+                rows += found
+                progress.advance(task)
+    written = {
+        "bench.json": write_json(rows, here, settings, provenance()),
+        "bench.md": markdown(rows, here),
+    } | _figures(rows)
+    with _writing(folder):
         for name, content in written.items():
             write_whole(folder / name, content)
-    except OSError as error:
-        raise SettingError("folder", f"cannot write to {folder}: {error.strerror or error}") from error
     console.print(written["bench.md"], soft_wrap=True, highlight=False, markup=False)
     console.print(f"written to {folder}: {', '.join(sorted(written))}", soft_wrap=True)
+
+
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise SettingError("folder", f"cannot write to {folder}: {error.strerror or error}") from error
 
 
 def _steps(settings: dict) -> tuple[int, Iterable[Sequence[dict]]]:

@@ -11,6 +11,7 @@ its derivatives by the sums, all M x M; then block by block once more the deriva
 differentiation with one checkpoint, Griewank and Walther, 2008, chapter 12). Memory stays that of a block, for any N.
 """
 
+import math
 from typing import Literal, NamedTuple
 
 import torch
@@ -40,6 +41,16 @@ class Sums(NamedTuple):
     logdet: Tensor
 
 
+def check_method(method: str) -> None:
+    """Raises where a method is neither of the two.
+
+    Raises:
+        SettingError: So.
+    """
+    if method not in ("sgpr", "fitc"):
+        raise SettingError("method", f"must be 'sgpr' or 'fitc'; got {method!r}")
+
+
 def collapsed_bound(
     inducing: Tensor,
     features: Tensor,
@@ -55,8 +66,9 @@ def collapsed_bound(
     Differentiable by all of its tensors, in one piece; arguments as in ``gpmpc.gp.sparse.sparse_posterior``.
 
     Raises:
-        SettingError: Kzz is not positive definite.
+        SettingError: Kzz is not positive definite, or the method is unknown.
     """
+    check_method(method)
     Lz = inducing_factor(inducing, lengthscales, signal_variance, jitter)
     sums = _block_sums(Lz, inducing, features, targets, lengthscales, signal_variance, noise_variance, method)
     return _bound(sums, len(features), signal_variance, noise_variance, method)
@@ -79,8 +91,9 @@ def collapsed_bound_with_gradient(
         (k,).
 
     Raises:
-        SettingError: Kzz is not positive definite.
+        SettingError: Kzz is not positive definite, or the method is unknown.
     """
+    check_method(method)
     values, by_inducing, by_others = [], torch.zeros_like(inducing), []
     for a in range(targets.shape[1]):
         y = targets[:, a : a + 1]
@@ -180,7 +193,7 @@ def _bound(sums: Sums, size: int, signal_variance: Tensor, noise_variance: Tenso
     LB = torch.linalg.cholesky(sums.gram + eye)
     explained = torch.linalg.solve_triangular(LB, sums.told[..., None], upper=False).square().sum((-2, -1))
     logdet = 2 * LB.diagonal(dim1=-2, dim2=-1).log().sum(-1) + sums.logdet
-    bound = -(size * torch.log(torch.tensor(2 * torch.pi)) + logdet + sums.squares - explained) / 2
+    bound = -(size * math.log(2 * math.pi) + logdet + sums.squares - explained) / 2
     if method == "sgpr":
         trace = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
         bound = bound - (size * signal_variance / noise_variance - trace) / 2

@@ -14,7 +14,9 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 
-from gpmpc.exceptions import ShapeError, TrainingError
+import numpy as np
+
+from gpmpc.exceptions import ShapeError, TrainingError, check_number
 from gpmpc.gp.hyperparameter_search import Found, find_hyperparameters
 from gpmpc.gp.training import Trainer, Training, check_memory, needed_memory
 from gpmpc.gp.transitions import Transitions
@@ -45,10 +47,15 @@ def train_many(
         One training a set, in their order; the error instead where every start failed for one of its outputs.
 
     Raises:
+        SettingError: A seed or the number of workers is out of range.
         ShapeError: There are not as many seeds as sets.
         DataError: The kernel matrices would not fit the memory that is available, those of all workers or all results.
     """
-    seeds = [seeds] * len(sets) if isinstance(seeds, int) else list(seeds)
+    if workers is not None:
+        check_number("workers", workers, least=1, whole=True)
+    seeds = [int(seeds)] * len(sets) if isinstance(seeds, int | np.integer) else list(seeds)
+    for seed in seeds:
+        check_number("seeds", seed, least=0, whole=True)
     if len(seeds) != len(sets):
         raise ShapeError(f"one seed a set is needed, or one for all; got {len(seeds)} for {len(sets)} sets")
     problems = [

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
-from gpmpc.gp.collapsed_bound import JITTER, Method, data_sums, inducing_factor
+from gpmpc.gp.collapsed_bound import JITTER, Method, check_method, data_sums, inducing_factor
 from gpmpc.gp.posterior import GPPosterior, Predicts
 
 UNINFORMED = 1e-10  # directions of which the data tell less than this (b) get a pseudo-noise of 1 / this
@@ -64,8 +64,7 @@ def sparse_posterior(
     """
     if jitter is not None:
         check_number("jitter", jitter, least=0)
-    if method not in ("sgpr", "fitc"):
-        raise SettingError("method", f"must be 'sgpr' or 'fitc'; got {method!r}")
+    check_method(method)
     offset = torch.zeros_like(targets[0]) if offset is None else offset
     if inducing.dim() != 2 or inducing.shape[1:] != features.shape[1:] or not len(inducing):
         raise ShapeError(f"inducing must be (M, {features.shape[-1]}), M > 0; got {tuple(inducing.shape)}")

@@ -22,7 +22,10 @@ def test_a_measurement_is_written_and_two_of_them_become_ratios(tmp_path):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("parts=[nothing]", "parts: must be among"),
+        ("parts=[nothing]", "parts: must be one or more of steps, peers, quality; got ['nothing']"),
+        ("parts=[]", "parts: must be one or more of"),
+        ("parts=[[steps]]", "parts: must be one or more of"),
+        ("peers=null", "peers: has settings of its own"),
         ("states=[3]", "states: a pendulum has two states, so n is even; got 3"),
         ("compare=[a.json]", "compare: takes two documents"),
         ("compare=[a.json,b.json]", "cannot read a.json"),

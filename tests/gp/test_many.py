@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.exceptions import DataError, ShapeError, TrainingError
+from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError
 from gpmpc.gp import Trainer, Transitions, standardize, train_many
 from gpmpc.gp.many import PROCESS, _workers_that_fit
 
@@ -55,3 +55,9 @@ def test_there_are_as_many_workers_as_memory_holds(monkeypatch):
     assert _workers_that_fit([(100, 2)], "closed_form", 2) == 2
     monkeypatch.setattr("gpmpc.gp.many.available_memory", lambda: None)
     assert _workers_that_fit([(100, 6)], "closed_form", 6) == 6
+
+
+@pytest.mark.parametrize("setting", [{"workers": 0}, {"workers": 1.5}, {"seeds": "a"}, {"seeds": [-1]}])
+def test_seeds_and_workers_out_of_range_are_refused(setting):
+    with pytest.raises(SettingError, match=next(iter(setting))):
+        train_many(Trainer(), [], **setting)

@@ -204,3 +204,10 @@ def test_misuse_is_refused_with_the_rule(change, error, message):
     good = {"inducing": x[:4], "features": x, "targets": y, **settings, "input_dim": 1, "predicts": "value"}
     with pytest.raises(error, match=message):
         sparse_posterior(**(good | change))
+
+
+def test_the_bound_itself_refuses_a_method_that_it_does_not_know():
+    z, one = torch.zeros(1, 2, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+    for bound in (collapsed_bound, collapsed_bound_with_gradient):
+        with pytest.raises(SettingError, match="method: must be 'sgpr' or 'fitc'; got 'foo'"):
+            bound(z, z, z[:, :1], torch.ones_like(z), one, one, "foo")
