@@ -109,7 +109,7 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
     (folder / "metrics.json").write_text(json.dumps(found))
     other = gpmpc(*arguments, cwd=cwd)
     assert other.returncode == 2
-    assert "holds a finished run of other settings (controller.tolerance: 1 then, 1e-08 now)" in other.stderr
+    assert "holds a finished run of other settings (controller.tolerance: 1 then, 1e-06 now)" in other.stderr
 
 
 @pytest.mark.parametrize(
