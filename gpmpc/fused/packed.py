@@ -71,7 +71,13 @@ class Packed:
     @cached_property
     def centred(self) -> Array:
         """E_a as block triangles, doubled below the diagonal (k, triangle_size(P))."""
-        return self._triangles(self._centred_square)
+        triangles = self._triangles(self._centred_square)
+        for start in range(0, self.points.shape[1], LANES):
+            length = start + LANES
+            rows = triangles[:, start * length // 2 : start * length // 2 + LANES * length]
+            blocks = rows.reshape(-1, LANES, length // LANES, LANES).swapaxes(1, 2)
+            rows[:] = blocks.reshape(rows.shape)
+        return triangles
 
     def _centred_square(self, a: int) -> Array:
         size = len(self.cholesky[a])
