@@ -9,7 +9,7 @@ these stand next to each other in an array, eight of them from ``at`` on; a vect
 """
 
 from llvmlite import ir
-from numba.core import types
+from numba.core import cgutils, types
 from numba.extending import intrinsic, models, register_model
 
 from gpmpc.fused import exponential as e
@@ -144,9 +144,7 @@ def expm1(typing_context, block):
             g = each(lambda g, v, c=coefficient: _multiply_add(builder, g, v, constant(c)), g, r)
         g = each(lambda g, v: _multiply_add(builder, g, multiply(v, v), v), g, r)
         scale = each(scale_of, rounded)
-        return _block(
-            builder, each(lambda g, s: _multiply_add(builder, g, s, add(s, constant(-1.0))), g, scale)
-        )
+        return _block(builder, each(lambda g, s: _multiply_add(builder, g, s, add(s, constant(-1.0))), g, scale))
 
     return BLOCK(BLOCK), generate
 
@@ -160,6 +158,23 @@ def block(typing_context, array, at):
         return _block(builder, [_load(builder, array, arguments[1], k * EDGE) for k in range(EDGE)])
 
     return BLOCK(ARRAY, types.intp), generate
+
+
+@intrinsic
+def fetch(typing_context, array, at):
+    """Asks for the block in ``array`` from ``at`` on, which may lie behind its end."""
+
+    def generate(context, builder, signature, arguments):
+        data = _numbers(context, builder, arguments[0])
+        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+        ask = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        for k in range(EDGE):
+            place = builder.gep(data, [builder.add(arguments[1], arguments[1].type(k * EDGE))])
+            builder.call(ask, [builder.bitcast(place, byte), number(0), number(3), number(1)])
+        return context.get_dummy_value()
+
+    return types.none(ARRAY, types.intp), generate
 
 
 @intrinsic
@@ -200,16 +215,70 @@ def add_to_columns(typing_context, sums, place, block, rows, at):
 
 
 @intrinsic
-def add_to_rows(typing_context, sums, at, block, columns, place):
-    """Adds block_ij columns_j to the block ``sums``, whose rows are still to be summed."""
+def plus_scaled(typing_context, block, other, columns, place):
+    """block_ij + other_ij columns_j."""
 
     def generate(context, builder, signature, arguments):
-        sums, columns = (_numbers(context, builder, arguments[k]) for k in (0, 3))
-        column = _load(builder, columns, arguments[4])
-        for k, row in enumerate(_rows(builder, arguments[2])):
-            total = _multiply_add(builder, row, column, _load(builder, sums, arguments[1], k * EDGE))
-            where = builder.add(arguments[1], arguments[1].type(k * EDGE))
-            builder.store(total, _vector(builder, sums, where), align=8)
+        column = _load(builder, _numbers(context, builder, arguments[2]), arguments[3])
+        pairs = zip(*(_rows(builder, block) for block in arguments[:2]), strict=True)
+        return _block(builder, [_multiply_add(builder, b, column, a) for a, b in pairs])
+
+    return BLOCK(BLOCK, BLOCK, ARRAY, types.intp), generate
+
+
+@intrinsic
+def add_row_sums(typing_context, sums, at, block, rows, first):
+    """Adds rows_i sum_j block_ij to eight numbers ``sums``."""
+
+    def generate(context, builder, signature, arguments):
+        sums, factors = (_numbers(context, builder, arguments[k]) for k in (0, 3))
+        even, odd = (
+            ir.Constant(ir.VectorType(ir.IntType(32), EDGE), list(range(start, 2 * EDGE, 2))) for start in (0, 1)
+        )
+        parts = _rows(builder, arguments[2])
+        while len(parts) > 1:  # sums of neighbours, of two vectors at a time
+            parts = [
+                builder.fadd(builder.shuffle_vector(a, b, even), builder.shuffle_vector(a, b, odd), flags=FUSED)
+                for a, b in zip(parts[::2], parts[1::2], strict=True)
+            ]
+        total = _load(builder, sums, arguments[1])
+        total = _multiply_add(builder, _load(builder, factors, arguments[4]), parts[0], total)
+        builder.store(total, _vector(builder, sums, arguments[1]), align=8)
         return context.get_dummy_value()
 
     return types.none(ARRAY, types.intp, BLOCK, ARRAY, types.intp), generate
+
+
+@intrinsic
+def zeros(typing_context):
+    """A block of zeros."""
+
+    def generate(context, builder, signature, arguments):
+        return ir.Constant(ir.ArrayType(VECTOR, EDGE), [[0.0] * EDGE] * EDGE)
+
+    return BLOCK(), generate
+
+
+@intrinsic
+def copy(typing_context, target, place, source, at):
+    """Copies eight numbers."""
+
+    def generate(context, builder, signature, arguments):
+        target, source = (_numbers(context, builder, arguments[k]) for k in (0, 2))
+        builder.store(_load(builder, source, arguments[3]), _vector(builder, target, arguments[1]), align=8)
+        return context.get_dummy_value()
+
+    return types.none(ARRAY, types.intp, ARRAY, types.intp), generate
+
+
+@intrinsic
+def copy_product(typing_context, target, place, source, at, factors, first):
+    """Writes the products of eight numbers and eight factors."""
+
+    def generate(context, builder, signature, arguments):
+        target, source, factors = (_numbers(context, builder, arguments[k]) for k in (0, 2, 4))
+        pair = _load(builder, source, arguments[3]), _load(builder, factors, arguments[5])
+        builder.store(builder.fmul(*pair, flags=FUSED), _vector(builder, target, arguments[1]), align=8)
+        return context.get_dummy_value()
+
+    return types.none(ARRAY, types.intp, ARRAY, types.intp, ARRAY, types.intp), generate

@@ -52,6 +52,18 @@ def widest(typing_context):
 
 
 @intrinsic
+def inlined(typing_context):
+    """Makes LLVM copy the calling function to where it is called: blocks of vectors then stay in registers."""
+
+    def generate(context, builder, signature, arguments):
+        with contextlib.suppress(TypeError, AttributeError):
+            set.add(builder.function.attributes, "alwaysinline")
+        return context.get_dummy_value()
+
+    return types.none(), generate
+
+
+@intrinsic
 def bits_of(typing_context, number):
     """The 64 bits of a float as an integer."""
 

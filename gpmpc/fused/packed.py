@@ -4,11 +4,13 @@ A vector over the training points is a row: contiguous, N padded to a multiple o
 of the last point with weight zero, which change no sum. The inputs x~ = (x, u) are such rows too: n states, then m
 controls, each block padded to a multiple of 3 rows, because the loops take three rows at a time.
 
-Symmetric and triangular N x N matrices are kept as lower block triangles: rows 8I .. 8I + 7 hold their first 8 (I + 1)
-columns and start at 32 I (I + 1), zeros above the diagonal. The two that exist then fit the memory of one square:
+Symmetric and triangular N x N matrices are kept as lower block triangles: of rows 8I .. 8I + 7 the first 8 (I + 1)
+columns, zeros above the diagonal. The two that exist then fit the memory of one square:
 
-    inverse_cholesky  L_a^-1, for |L_a^-1 q|^2 and (K_a + sn2_a I)^-1 q
-    centred           E_a = beta_a beta_a' - (K_a + sn2_a I)^-1, doubled below the diagonal: sums over i >= j suffice
+    inverse_cholesky  L_a^-1, for |L_a^-1 q|^2 and (K_a + sn2_a I)^-1 q; row after row, rows 8I .. start at 32 I (I + 1)
+    centred           E_a = beta_a beta_a' - (K_a + sn2_a I)^-1, doubled below the diagonal: sums over i >= j suffice;
+                      block of 8 x 8 after block, in the order in which ``gpmpc.fused.pair_sums`` meets them: tile after
+                      tile, in a tile row after row of blocks. Memory is read in one stream
 """
 
 from dataclasses import dataclass
@@ -22,6 +24,7 @@ from gpmpc.exceptions import SettingError, ShapeError
 
 LANES = 8  # doubles in a vector register
 GROUP = 3  # rows that one loop takes together
+TILE = 24  # times 8 columns: a tile, which all rows meet before the next one
 
 Array = NDArray[np.float64]
 
@@ -70,13 +73,17 @@ class Packed:
 
     @cached_property
     def centred(self) -> Array:
-        """E_a as block triangles, doubled below the diagonal (k, triangle_size(P))."""
+        """E_a by blocks, doubled below the diagonal (k, triangle_size(P))."""
         triangles = self._triangles(self._centred_square)
-        for start in range(0, self.points.shape[1], LANES):
-            length = start + LANES
-            rows = triangles[:, start * length // 2 : start * length // 2 + LANES * length]
-            blocks = rows.reshape(-1, LANES, length // LANES, LANES).swapaxes(1, 2)
-            rows[:] = blocks.reshape(rows.shape)
+        for triangle in triangles:
+            rows, count, place = triangle.copy(), self.points.shape[1] // LANES, 0
+            for start in range(0, count, TILE):
+                for i in range(start, count):
+                    row = rows[triangle_size(i * LANES) : triangle_size((i + 1) * LANES)].reshape(LANES, -1)
+                    met = row[:, start * LANES : (start + TILE) * LANES]
+                    blocks = triangle[place : place + met.size].reshape(-1, LANES, LANES)
+                    blocks[:] = met.reshape(LANES, -1, LANES).swapaxes(0, 1)
+                    place += met.size
         return triangles
 
     def _centred_square(self, a: int) -> Array:

@@ -24,17 +24,23 @@ from gpmpc.fused.block import (
     EDGE,
     SIZE,
     add_to_columns,
-    add_to_rows,
+    add_row_sums,
     block,
+    copy,
+    copy_product,
     expm1,
+    fetch,
     outer_sum,
     plus,
     plus_outer,
+    plus_scaled,
     times,
+    zeros,
 )
-from gpmpc.fused.exponential import EXACT, widest
+from gpmpc.fused.exponential import EXACT, inlined, widest
+from gpmpc.fused.packed import TILE
 
-TILE = 24  # strips of columns that stay in the first cache: 22 kB for six states
+AHEAD = 8 * SIZE
 
 
 class Side(NamedTuple):
@@ -60,24 +66,23 @@ def strip(dims):
 @borrowing
 def tile_memory(dims):
     """Numbers that ``pair_sums`` works in, for vectors z of ``dims`` entries."""
-    return (TILE + 1) * strip(dims) + SIZE
+    return (TILE + 1) * strip(dims)
 
 
 @borrowing
 def fill(memory, at, shift, vectors, weights, first):
     """Writes the first part of the strip of eight points from ``first`` on."""
     dims = len(vectors)
-    for k in range(EDGE):
-        memory[at + k] = shift[first + k]
-        memory[at + (dims + 1) * EDGE + k] = weights[first + k]
+    copy(memory, at, shift, first)
+    copy(memory, at + (dims + 1) * EDGE, weights, first)
     for d in range(dims):
-        for k in range(EDGE):
-            memory[at + (d + 1) * EDGE + k] = vectors[d, first + k]
+        copy(memory, at + (d + 1) * EDGE, vectors[d], first)
 
 
 @borrowing(fastmath=EXACT)
 def values_of(rows, tile, at, dims):
     """expm1(delta) of eight rows and the columns of the strip at ``at``."""
+    inlined()
     x = outer_sum(rows, 0, tile, at)
     for d in range(1, dims + 1, 3):
         x = plus_outer(x, rows, d * EDGE, tile, at + d * EDGE)
@@ -89,6 +94,7 @@ def values_of(rows, tile, at, dims):
 @borrowing(fastmath=EXACT)
 def add_vectors(tile, at, block, rows, first, dims):
     """Adds sum_i weights_i z_i block_ij to the sums of vectors from ``at`` on."""
+    inlined()
     for d in range(0, dims, 3):
         add_to_columns(tile, at + d * EDGE, block, rows, first + d * EDGE)
         add_to_columns(tile, at + (d + 1) * EDGE, block, rows, first + (d + 1) * EDGE)
@@ -96,35 +102,40 @@ def add_vectors(tile, at, block, rows, first, dims):
 
 
 @borrowing(fastmath=EXACT)
-def meet(derivatives, rows, tile, strips, row_sums, dims):
+def meet(derivatives, rows, tile, strips, p_i, i, dims):
     """Eight rows meet a tile of columns of another output."""
     widest()
     weights, sums, step = (dims + 1) * EDGE, (dims + 2) * EDGE, strip(dims)
     if derivatives:
+        sums_of_rows = zeros()
         for at in range(0, strips * step, step):
             value = values_of(rows, tile, at, dims)
             add_to_columns(tile, at + sums, value, rows, weights)
-            add_to_rows(row_sums, 0, value, tile, at + weights)
+            sums_of_rows = plus_scaled(sums_of_rows, value, tile, at + weights)
             add_vectors(tile, at + sums + EDGE, value, rows, weights + EDGE, dims)
+        add_row_sums(p_i, i, sums_of_rows, rows, weights)
     else:
         for at in range(0, strips * step, step):
             add_to_columns(tile, at + sums, values_of(rows, tile, at, dims), rows, weights)
 
 
 @borrowing(fastmath=EXACT)
-def meet_same(derivatives, rows, tile, strips, row_sums, dims, triangle, place):
+def meet_same(derivatives, rows, tile, strips, p_i, i, dims, triangle, place):
     """Eight rows meet a tile of columns of the same output, whose blocks of E start at ``place``."""
     widest()
     weights, sums, step = (dims + 1) * EDGE, (dims + 2) * EDGE, strip(dims)
     if derivatives:
+        sums_of_rows = zeros()
         for at in range(0, strips * step, step):
+            fetch(triangle, place + AHEAD)
             value, E = values_of(rows, tile, at, dims), block(triangle, place)
             P = times(E, value)
             R = plus(P, E)
             add_to_columns(tile, at + sums, P, rows, weights)
-            add_to_rows(row_sums, 0, P, tile, at + weights)
+            sums_of_rows = plus_scaled(sums_of_rows, P, tile, at + weights)
             add_vectors(tile, at + sums + EDGE, R, rows, weights + EDGE, dims)
             place += SIZE
+        add_row_sums(p_i, i, sums_of_rows, rows, weights)
     else:
         for at in range(0, strips * step, step):
             P = times(block(triangle, place), values_of(rows, tile, at, dims))
@@ -151,8 +162,8 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, memory, out):
     """
     dims, padded = left.shape
     step, weights, sums = strip(dims), (dims + 1) * EDGE, (dims + 2) * EDGE
-    tile, row, row_sums = memory[: TILE * step], memory[TILE * step : (TILE + 1) * step], memory[(TILE + 1) * step :]
-    p_i, total, count = out[0], 0.0, padded // EDGE
+    tile, row = memory[: TILE * step], memory[TILE * step :]
+    p_i, total, count, place = out[0], 0.0, padded // EDGE, 0
     p_i[:] = 0.0
     for start in range(0, count, TILE):
         strips = min(TILE, count - start)
@@ -163,25 +174,18 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, memory, out):
             i = I * EDGE
             fill(row, 0, rows.shift, left, rows.weights, i)
             for d in range(dims):
-                for k in range(EDGE):
-                    row[sums + d * EDGE + k] = rows.weights[i + k] * rows.z[d, i + k]
-            row_sums[:] = 0.0
+                copy_product(row, sums + d * EDGE, rows.z[d], i, rows.weights, i)
             if same:
-                place = (I * (I + 1) // 2 + start) * SIZE
-                meet_same(derivatives, row, tile, min(I + 1 - start, strips), row_sums, dims, triangle, place)
+                below = min(I + 1 - start, strips)
+                meet_same(derivatives, row, tile, below, p_i, i, dims, triangle, place)
+                place += below * SIZE
             else:
-                meet(derivatives, row, tile, strips, row_sums, dims)
-            for k in range(EDGE):
-                of_row = 0.0
-                for c in range(EDGE):
-                    of_row += row_sums[k * EDGE + c]
-                p_i[i + k] += rows.weights[i + k] * of_row
+                meet(derivatives, row, tile, strips, p_i, i, dims)
         for J in range(strips):
             at, j = J * step, (start + J) * EDGE
             for k in range(EDGE):
                 total += tile[at + sums + k] * tile[at + weights + k]
             if derivatives:
                 for d in range(dims + 1):
-                    for k in range(EDGE):
-                        out[1 + d, j + k] = tile[at + sums + d * EDGE + k] * tile[at + weights + k]
+                    copy_product(out[1 + d], j, tile, at + sums + d * EDGE, tile, at + weights)
     return total
