@@ -24,7 +24,7 @@ from gpmpc.exceptions import SettingError, ShapeError
 
 LANES = 8  # doubles in a vector register
 GROUP = 3  # rows that one loop takes together
-TILE = 24  # times 8 columns: a tile, which all rows meet before the next one
+TILE = 32  # times 8 columns: a tile, which all rows meet before the next one
 
 Array = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ from gpmpc.compiled import borrowing
 from gpmpc.fused.block import (
     EDGE,
     SIZE,
-    add_to_columns,
     add_row_sums,
+    add_to_columns,
     block,
     copy,
     copy_product,
@@ -40,7 +40,7 @@ from gpmpc.fused.block import (
 from gpmpc.fused.exponential import EXACT, inlined, widest
 from gpmpc.fused.packed import TILE
 
-AHEAD = 8 * SIZE
+AHEAD = 4 * SIZE  # how far ahead of its use E is asked for: four blocks last longer than memory takes to answer
 
 
 class Side(NamedTuple):
@@ -167,22 +167,22 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, memory, out):
     p_i[:] = 0.0
     for start in range(0, count, TILE):
         strips = min(TILE, count - start)
-        for J in range(strips):
-            fill(tile, J * step, columns.shift, columns.z, columns.weights, (start + J) * EDGE)
-            tile[J * step + sums : (J + 1) * step] = 0.0
-        for I in range(start if same else 0, count):
-            i = I * EDGE
+        for column in range(strips):
+            fill(tile, column * step, columns.shift, columns.z, columns.weights, (start + column) * EDGE)
+            tile[column * step + sums : (column + 1) * step] = 0.0
+        for eight in range(start if same else 0, count):
+            i = eight * EDGE
             fill(row, 0, rows.shift, left, rows.weights, i)
             for d in range(dims):
                 copy_product(row, sums + d * EDGE, rows.z[d], i, rows.weights, i)
             if same:
-                below = min(I + 1 - start, strips)
+                below = min(eight + 1 - start, strips)
                 meet_same(derivatives, row, tile, below, p_i, i, dims, triangle, place)
                 place += below * SIZE
             else:
                 meet(derivatives, row, tile, strips, p_i, i, dims)
-        for J in range(strips):
-            at, j = J * step, (start + J) * EDGE
+        for column in range(strips):
+            at, j = column * step, (start + column) * EDGE
             for k in range(EDGE):
                 total += tile[at + sums + k] * tile[at + weights + k]
             if derivatives:
