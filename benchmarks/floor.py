@@ -5,10 +5,10 @@
 One process, one thread, process CPU time. The floor counts the arithmetic that ``gpmpc.fused`` has to issue for a pair
 of points and of outputs, in registers of eight numbers, and divides it by the rate at which this machine, in the same
 process, issues independent multiply-adds from registers. Loads, stores, loops and everything that grows slower than N^2
-are not in it: ``floor``, the arithmetic floor, is what the ratio refers to. ``streamed`` is what reading the two triangles once
-from memory takes, at the rate of a sum over an array of that size; at large N they no longer fit the caches. ``with
-memory`` is the ratio to the arithmetic floor plus that of L^-1, whose two instructions a number cannot hide its
-reading; E's can, and its reading is in no floor. Writes ``outputs/benchmarks/floor.json``.
+are not in it: this is the arithmetic floor, to which ``ratio`` refers. ``streamed`` is what reading the two triangles
+once from memory takes, at the rate of a sum over an array of that size; at large N they no longer fit the caches.
+``with memory`` is the ratio to the arithmetic floor plus the reading of L^-1 alone, whose two instructions for eight
+numbers cannot hide it; those of E can, so its reading is in no floor. Writes ``outputs/benchmarks/floor.json``.
 """
 
 import argparse
