@@ -3,10 +3,17 @@
 numba keeps the machine code beside the source, or in the user's cache folder when the installation is read-only. When
 neither can be written it refuses to cache; the kernels are then compiled anew in each process. Sums may be reordered
 (that is what makes them vectorise); infinities and NaN keep their meaning.
+
+A kernel contains what it calls and the constants that it reads, wherever they are written; numba looks at the kernel's
+own file only. So what is kept here is valid for one state of all modules of the package that the kernel's module
+imports, directly or not.
 """
 
+import hashlib
+import re
+import sys
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from threading import Lock
 
 import numba
@@ -56,9 +63,53 @@ def _counting_is_optional() -> bool:
 
 def _jit(function: Callable, options: dict) -> Callable:
     try:
-        return numba.njit(cache=True, **options)(function)
+        kernel = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # "cannot cache function ...: no locator available"
         return numba.njit(**options)(function)
+    try:
+        index = kernel._cache._cache_file
+        index._source_stamp = index._source_stamp, sources_stamp(function.__module__)
+    except AttributeError:  # another numba: edits of other files go unseen
+        pass
+    return kernel
+
+
+IMPORT = re.compile(
+    rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|.*)|import[ \t]+([\w., \t]+))", re.MULTILINE
+)
+
+
+def sources_stamp(module: str) -> bytes:
+    """A hash of the sources of a module and of all those it imports, directly or not, from its own package or this one.
+
+    The modules must have been imported: of others no kernel can contain anything. Imports are to be absolute.
+    """
+    packages = {name.partition(".")[0] for name in (module, __name__)}
+    pending, seen = [module], {}
+    while pending:
+        name = pending.pop()
+        if name not in seen and name.partition(".")[0] in packages and name in sys.modules:
+            seen[name], imported = _read_source(getattr(sys.modules[name], "__file__", None))
+            pending += imported
+    return hashlib.sha256(b"".join(seen[name] for name in sorted(seen))).digest()
+
+
+@cache
+def _read_source(path: str | None) -> tuple[bytes, list[str]]:
+    """The hash of a file, and the names in its import statements that can be modules."""
+    try:
+        with open(path or "", "rb") as file:
+            source = file.read()
+    except OSError:  # in an archive, or no file at all
+        return b"", []
+    imported = []
+    for parent, names, plain in IMPORT.findall(source):
+        imported += re.findall(r"[\w.]+", plain.decode())
+        if parent:
+            parts = [f"{parent.decode()}.{name}" for name in re.findall(r"\w+", names.decode())]
+            modules = [part for part in parts if part in sys.modules]
+            imported += modules if len(modules) == len(parts) else [parent.decode(), *modules]
+    return hashlib.sha256(source).digest(), imported
 
 
 borrowing = partial(compiled, allocates=False)

@@ -1,0 +1,106 @@
+"""What is compiled once is used again, until a source that it was compiled from has changed."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import pytest
+
+import gpmpc.compiled
+
+ROOT = Path(__file__).resolve().parents[1]
+KERNEL = """
+from gpmpc.compiled import compiled
+from tiny.callee import double
+@compiled
+def kernel(x):
+    return double(x)
+print(kernel(1.0), sum(kernel.stats.cache_hits.values()))
+"""
+CALLEE = """
+from gpmpc.compiled import woven
+from tiny import (
+    constants,  # a module
+)
+FACTOR = constants.FACTOR
+@woven
+def double(x):
+    return FACTOR * x
+"""
+
+
+@pytest.fixture
+def package(tmp_path):
+    """A package of a kernel, the function that it calls, the constant which that reads, and a file of no concern."""
+    folder = tmp_path / "tiny"
+    folder.mkdir()
+    texts = {"__init__": "", "kernel": KERNEL, "callee": CALLEE, "constants": "FACTOR = 2.0\n", "other": "A = 1\n"}
+    for name, text in texts.items():
+        (folder / f"{name}.py").write_text(text)
+    return folder
+
+
+def run(package, **environment):
+    """The kernel's answer to 1 in a new process, and whether its machine code was there already."""
+    result = subprocess.run(
+        [sys.executable, "-B", "-c", "import tiny.other, tiny.kernel"], capture_output=True, text=True, check=True,
+        env=os.environ | {"PYTHONPATH": f"{package.parent}{os.pathsep}{ROOT}"} | environment,
+    )  # fmt: skip
+    answer, hits = result.stdout.split()
+    return float(answer), int(hits) == 1
+
+
+def test_machine_code_is_used_again_until_a_file_that_went_into_it_changes(package):
+    assert run(package) == (2.0, False)
+    (package / "other.py").write_text("A = 3\n")
+    assert run(package) == (2.0, True)
+    (package / "constants.py").write_text("FACTOR = 5.0\n")
+    assert run(package) == (5.0, False)
+    callee = package / "callee.py"
+    callee.write_text(callee.read_text().replace("FACTOR * x", "FACTOR * x + 1.0"))
+    assert run(package) == (6.0, False)
+    assert run(package) == (6.0, True)
+
+
+def test_where_nothing_can_be_kept_kernels_are_compiled_all_the_same(package):
+    (package / "__pycache__").write_text("in the way of the cache beside the source")
+    nowhere = str(package / "other.py")  # a file: no folder can be made below it
+    for _ in range(2):
+        assert run(package, HOME=nowhere, XDG_CACHE_HOME=nowhere, NUMBA_CACHE_DIR="") == (2.0, False)
+
+
+def test_the_stamp_of_a_kernel_covers_constants_and_callees_and_spares_the_rest():
+    import gpmpc.qp
+
+    def covered(module):
+        before = gpmpc.compiled.sources_stamp(module)
+        read, changed = gpmpc.compiled._read_source, set()
+        for name in [name for name in sys.modules if name.startswith("gpmpc.")]:
+            file = getattr(sys.modules[name], "__file__", None)
+
+            def edited(path, file=file):
+                digest, imported = read(path)
+                return (digest[::-1] if path == file else digest), imported
+
+            gpmpc.compiled._read_source = edited
+            try:
+                if gpmpc.compiled.sources_stamp(module) != before:
+                    changed.add(name)
+            finally:
+                gpmpc.compiled._read_source = read
+        return changed
+
+    kernels = covered("gpmpc.qp.dual_kernels")
+    assert {f"gpmpc.qp.{name}" for name in ("dual_iteration", "working_set", "factor", "lanes", "record")} <= kernels
+    assert "gpmpc.compiled" in kernels
+    assert not {"gpmpc.qp", "gpmpc.qp.dual_active_set", "gpmpc.qp.primal_active_set"} & kernels
+
+
+def test_another_numba_caches_in_its_own_way(monkeypatch):
+    class Kernel:
+        """Without the private parts."""
+
+    monkeypatch.setattr(numba, "njit", lambda **options: lambda function: Kernel())
+    assert isinstance(gpmpc.compiled.compiled(len), Kernel)
