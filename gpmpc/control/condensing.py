@@ -246,7 +246,7 @@ def _zeros(rows, columns):
 def _held_curvature(A, B, W, T, same, rows, H, P, G):
     """The same with one A, B and E for all stages."""
     p, m, r, size = B.shape[0], B.shape[1], rows.shape[0], H * B.shape[1]
-    X, back, strip = _zeros(size, p), _zeros(p, p), _zeros(p, size)  # rows l m + a of X: column a of A^l B
+    X, back = _zeros(size, p), _zeros(p, p)  # rows l m + a of X: column a of A^l B
     W, T = _widened(W), _widened(T)
     for i in range(p):
         for j in range(p):
@@ -255,11 +255,12 @@ def _held_curvature(A, B, W, T, same, rows, H, P, G):
             X[a, i] = B[i, a]
     for row in range(m, size):
         combine(back, p, X[row - m], 0, p, X[row])
+    reached = size + 8  # whole registers from any column on
+    strip, usual, last = _zeros(p, reached), _zeros(1, reached)[0], _zeros(1, reached)[0]
     for row in range(size):
         for i in range(p):
             strip[i, row] = X[row, i]
-    total, usual, last = _zeros(m, size), _zeros(1, size)[0], _zeros(1, size)[0]
-    weighed = _zeros(1, p + 8)[0]
+    total, weighed = _zeros(m, size), _zeros(1, p + 8)[0]
     for k in range(H):
         # Block (j, j - d) is the sum over l <= k = H - 1 - j of X_l' W X_{l + d}, the last with the terminal weight.
         j, start = H - 1 - k, k * m
