@@ -285,7 +285,7 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
             add_pull(G, n, q, mu, k, members, traits, soft, slope)
         status = SOLVED if worst <= tolerance else NUMERICAL_TROUBLE
         rounds += 1
-        if not moved or rounds == ROUNDS:
+        if not moved or rounds == ROUNDS or worst == np.inf:
             break
         count = list_violated(y, traits[SCALE], bounds, excess, listed)
         if count == 0:

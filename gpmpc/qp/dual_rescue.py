@@ -19,6 +19,7 @@ from gpmpc.qp.workspace import TOLERANCE, lazy_workspace
 Array = NDArray[np.float64]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite does not convince
 def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, settings: Array) -> Array:
     """The first convincing record; the one with the smallest residuals, as ``NUMERICAL_TROUBLE``, if none convinces."""
     lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
@@ -31,11 +32,11 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, se
             if proves_infeasibility(solution.multipliers, terms.G, lower, upper):
                 return record
         else:
-            residual = max(solution.primal_residual(), solution.dual_residual(), solution.duality_gap())
+            residual = max(map(_finite, (solution.primal_residual(), solution.dual_residual(), solution.duality_gap())))
             if residual <= settings[TOLERANCE]:
                 record[layout.STATUS] = layout.SOLVED
                 return record
-            candidates.append((residual if np.isfinite(residual) else np.inf, len(candidates), record))
+            candidates.append((residual, len(candidates), record))
     if candidates:
         record = min(candidates)[2]
     limited = record[layout.STATUS] == layout.ITERATION_LIMIT
@@ -43,14 +44,18 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, se
     return record
 
 
+def _finite(residual: float) -> float:
+    return residual if np.isfinite(residual) else np.inf
+
+
 def _given(terms, q, lower, upper, record, settings) -> Array:
     return record
 
 
 def _from_nothing(terms, q, lower, upper, record, settings) -> Array:
-    result = np.empty_like(record)
-    solve_lazy(terms.P, q, terms.G, lower, upper, layout.NO_RECORD, lazy_workspace(settings, terms.softness), result)
-    return result
+    result, work = np.empty_like(record), lazy_workspace(settings, terms.softness)
+    status = solve_lazy(terms.P, q, terms.G, lower, upper, layout.NO_RECORD, work, result)
+    return record if status == layout.MISUSE else result  # numerically singular: nothing was written
 
 
 def _equilibrated(terms, q, lower, upper, record, settings) -> Array:
@@ -61,9 +66,10 @@ def _equilibrated(terms, q, lower, upper, record, settings) -> Array:
     P = np.ascontiguousarray(terms.P * np.outer(D, D))
     G = np.ascontiguousarray(terms.G * D * scale[n:, None])
     softness = np.vstack([terms.softness[0] * scale**2, terms.softness[1] / scale])
-    result = np.empty_like(record)
-    work = lazy_workspace(settings, softness)
-    solve_lazy(P, q * D, G, lower * scale, upper * scale, layout.NO_RECORD, work, result)
+    result, work = np.empty_like(record), lazy_workspace(settings, softness)
+    status = solve_lazy(P, q * D, G, lower * scale, upper * scale, layout.NO_RECORD, work, result)
+    if status == layout.MISUSE:  # the scaling overflowed
+        return record
     result[layout.HEADER : layout.HEADER + n] *= D
     result[layout.HEADER + n : layout.HEADER + n + len(lower)] *= scale
     return result

@@ -5,10 +5,12 @@ and may later move y by the rows of K whose multipliers changed; lazy mode, P = 
 transposed G in Gram mode, which adds its rows faster than it multiplies those of G.
 """
 
+import numpy as np
+
 from gpmpc.compiled import woven
 from gpmpc.qp.factor import backward_solve, dot, forward_solve, four_dots, multiply, subtract_rows
 from gpmpc.qp.hessian import solve_lower, solve_transposed
-from gpmpc.qp.lanes import any_nonzero, combine, lanes, larger, largest, less, no_lanes, plus, put, some_lanes
+from gpmpc.qp.lanes import any_nonzero, combine, lanes, larger, largest, less, no_lanes, plus, put, some_lanes, total
 from gpmpc.qp.working_set import BOUND, END, LEAST, MOST, NAME, PLACE, SCRATCH, SOFTNESS, couple
 from gpmpc.qp.workspace import padded
 
@@ -127,6 +129,8 @@ def follow_listed(lazy, n, v, rows, L, G, mu, k, members, traits, seen, weights,
 def residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, active):
     """The largest scaled residual of (x, mu), x = y[:n]: stationarity, violation of the working set, duality gap.
 
+    Infinite where a number that it is made of is not finite: comparisons alone would pass over NaN.
+
     Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where y = C x and slope = q + C' mu. The
     vectors gradient, slope and q are padded, the latter two with zeros.
     """
@@ -143,13 +147,16 @@ def residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, 
         pull = plus(pull, 1.0, slopes)
         put(gradient, i, pull)
         rest, undefined = larger(rest, pull), plus(undefined, 0.0, pull)
-    size, stationarity, infeasibility, gap = max(1.0, largest(sizes)), largest(rest), 0.0, largest(undefined)
+    size, stationarity, infeasibility, gap = max(1.0, largest(sizes)), largest(rest), 0.0, total(undefined)
     for i in range(k):
         p, b = abs(members[NAME, i]) - 1, slots[BOUND, i]
         active[i] = y[p] - traits[SOFTNESS, p] * mu[p] - b
         infeasibility = max(infeasibility, abs(active[i]) / max(1.0, abs(b)))
         gap += mu[p] * active[i]
-    return max(max(stationarity / size, infeasibility), abs(gap) / max(1.0, abs(dot(q, y, n))))
+    gap, slope_along = abs(gap), abs(dot(q, y, n))
+    if not gap + slope_along < np.inf:
+        return np.inf
+    return max(max(stationarity / size, infeasibility), gap / max(1.0, slope_along))
 
 
 @woven

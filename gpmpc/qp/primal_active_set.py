@@ -74,6 +74,7 @@ class PrimalActiveSet:
             if value is not None and not value > 0:
                 raise ProblemError(f"{name} must be positive; got {value}")
 
+    @np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen below
     def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
         """The minimiser, from a warm start of any kind; see ``gpmpc.qp.solver.QPSolver``."""
         began = perf_counter()
@@ -106,9 +107,14 @@ class PrimalActiveSet:
         working = list(np.flatnonzero(rows.equality | _close_to_guess(rows, x, guess)))
         still = full_steps = 0
         for iteration in range(limit):
-            d, multipliers = _minimise_on_rows(
-                problem.P, problem.P @ x + problem.q, rows.A[working], rows.h[working] - rows.A[working] @ x
-            )
+            try:
+                d, multipliers = _minimise_on_rows(
+                    problem.P, problem.P @ x + problem.q, rows.A[working], rows.h[working] - rows.A[working] @ x
+                )
+            except ValueError:  # from SciPy: not finite, or no longer positive definite
+                return finish(Status.NUMERICAL_TROUBLE, x, nothing, nothing, iteration)
+            if not np.isfinite(d).all():
+                return finish(Status.NUMERICAL_TROUBLE, x, nothing, nothing, iteration)
             if full_steps == FULL_STEPS or np.abs(d).max() <= STILL * max(1.0, np.abs(x).max()):
                 droppable = np.where(rows.equality[working], np.inf, multipliers)
                 if not working or droppable.min() >= 0.0:

@@ -129,7 +129,8 @@ class QPSolution(NamedTuple):
 
     def is_optimal(self, eps: float = 1e-9) -> bool:
         """Whether the residuals, whatever the status says, are all at most ``eps``."""
-        return max(self.primal_residual(), self.dual_residual(), self.duality_gap()) <= eps
+        residuals = self.primal_residual(), self.dual_residual(), self.duality_gap()
+        return all(residual <= eps for residual in residuals)  # which NaN is not
 
     def _price(self) -> float:
         softness, caps = self.terms.softness

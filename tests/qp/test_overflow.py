@@ -1,0 +1,75 @@
+"""Numbers beyond the range of float64 end in a status, neither in a solution nor in an exception."""
+
+import numpy as np
+import pytest
+
+from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
+from gpmpc.qp.soft_rows import SoftRows
+from gpmpc.status import Status
+
+FREE = np.full(3, np.inf)
+PROBLEMS = {  # the minimum is at -P^-1 q, which float64 cannot hold
+    "everywhere": (1e-160 * np.eye(3), np.full(3, 1e160)),
+    "in one variable": (np.diag([1e-155, 1.0, 1.0]), np.array([1e155, 1.0, 1.0])),
+    "in the last of many": (np.diag([*np.ones(12), 1e-155]), np.array([*np.ones(12), 1e155])),
+}
+
+
+def solve_in(mode, P, q, G, lower, upper):
+    if mode == "gram":
+        return DualActiveSet().prepare(P, G).solve(q, lower, upper)
+    if mode == "lazy":
+        return DualActiveSet().solve_stacked(P, q, G, lower, upper)
+    return PrimalActiveSet().solve(QuadraticProgram.from_stacked(P, q, G, lower, upper))
+
+
+@pytest.mark.parametrize("mode", ["gram", "lazy", "primal"])
+@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("rows", [0, 2])
+def test_a_minimiser_that_is_not_finite_is_never_called_a_solution(mode, name, rows):
+    P, q = PROBLEMS[name]
+    G = np.eye(rows, len(q))
+    free = np.full(len(q) + rows, np.inf)
+    solution = solve_in(mode, P, q, G, -free, free)
+    assert solution.status is Status.NUMERICAL_TROUBLE
+
+
+@pytest.mark.parametrize("mode", ["gram", "lazy", "primal"])
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_bounds_that_keep_it_finite_give_a_solution_or_an_honest_failure(mode, name):
+    P, q = PROBLEMS[name]
+    bound = np.ones(len(q))
+    solution = solve_in(mode, P, q, np.zeros((0, len(q))), -bound, bound)
+    if solution.status.solved:
+        np.testing.assert_allclose(solution.x, -bound)
+        assert solution.is_optimal(1e-9)
+    else:
+        assert solution.status is Status.NUMERICAL_TROUBLE
+
+
+@pytest.mark.parametrize("size", [1, 3, 4, 5, 8, 9, 13])
+@pytest.mark.parametrize("mode", ["gram", "lazy"])
+def test_one_overflowing_entry_is_seen_wherever_it_stands(size, mode):
+    for place in range(size):
+        P, q = np.ones(size), np.ones(size)
+        P[place], q[place] = 1e-155, -1e155
+        free = np.full(size, np.inf)
+        solution = solve_in(mode, np.diag(P), q, np.zeros((0, size)), -free, free)
+        assert solution.status is Status.NUMERICAL_TROUBLE
+
+
+def test_soft_rows_do_not_hide_it():
+    P, q = PROBLEMS["in one variable"]
+    free = np.append(FREE, 1.0)
+    soft = SoftRows(quadratic=np.array([1.0]))
+    solution = DualActiveSet().solve_stacked(P, q, np.array([[0.0, 1.0, 0.0]]), -free, free, soft=soft)
+    assert solution.status is Status.NUMERICAL_TROUBLE
+
+
+def test_residuals_that_are_undefined_do_not_bear_a_solution_out(rng):
+    solution = DualActiveSet().solve_stacked(np.eye(2), np.ones(2), np.zeros((0, 2)), -np.ones(2), np.ones(2))
+    assert solution.is_optimal()
+    for value in (np.nan, np.inf):
+        x = np.array([value, -1.0])
+        with np.errstate(invalid="ignore"):
+            assert not solution._replace(x=x).is_optimal()
