@@ -18,7 +18,17 @@ from gpmpc.compiled import borrowing, woven
 from gpmpc.qp import record, workspace
 from gpmpc.qp.cholesky import factorise
 from gpmpc.qp.dual_iteration import CONTRADICTION, keep_violated, list_violated, most_violated, step_to
-from gpmpc.qp.evaluation import add_pull, evaluate, follow, follow_lazily, follow_listed, refine, residuals, row_values
+from gpmpc.qp.evaluation import (
+    UNDEFINED,
+    add_pull,
+    evaluate,
+    follow,
+    follow_lazily,
+    follow_listed,
+    refine,
+    residuals,
+    row_values,
+)
 from gpmpc.qp.factor import multiply_at, pack, unpack
 from gpmpc.qp.hessian import solve_transposed
 from gpmpc.qp.lanes import (
@@ -202,11 +212,8 @@ def climb(
 def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out):
     """Both modes after their set-up; ``rows`` is K and L is G' in Gram mode, which knows P's inverse."""
     M = len(lower)
-    limit, tolerance, soft = (
-        int(settings[workspace.LIMIT]),
-        settings[workspace.TOLERANCE],
-        settings[workspace.SOFT] != 0.0,
-    )
+    limit, tolerance = int(settings[workspace.LIMIT]), settings[workspace.TOLERANCE]
+    soft = settings[workspace.SOFT] != 0.0
     capacity = most_working(n, M, soft)
     bounds, slots, scratch, y = vectors[:5], vectors[5:9], vectors[9:13], vectors[13, :M]
     seen, excess, gradient, active = vectors[14], vectors[15], vectors[16], vectors[17]
@@ -285,7 +292,7 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
             add_pull(G, n, q, mu, k, members, traits, soft, slope)
         status = SOLVED if worst <= tolerance else NUMERICAL_TROUBLE
         rounds += 1
-        if not moved or rounds == ROUNDS or worst == np.inf:
+        if not moved or rounds == ROUNDS or worst >= UNDEFINED:
             break
         count = list_violated(y, traits[SCALE], bounds, excess, listed)
         if count == 0:

@@ -14,6 +14,8 @@ from gpmpc.qp.lanes import any_nonzero, combine, lanes, larger, largest, less, n
 from gpmpc.qp.working_set import BOUND, END, LEAST, MOST, NAME, PLACE, SCRATCH, SOFTNESS, couple
 from gpmpc.qp.workspace import padded
 
+UNDEFINED = 1e300  # a residual that overflowed; less than infinity, so that refinement is tried
+
 
 @woven
 def add_pull(G, n, q, mu, k, members, traits, soft, slope):
@@ -129,7 +131,7 @@ def follow_listed(lazy, n, v, rows, L, G, mu, k, members, traits, seen, weights,
 def residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, active):
     """The largest scaled residual of (x, mu), x = y[:n]: stationarity, violation of the working set, duality gap.
 
-    Infinite where a number that it is made of is not finite: comparisons alone would pass over NaN.
+    ``UNDEFINED`` where a number that it is made of is not finite: comparisons alone would pass over NaN.
 
     Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where y = C x and slope = q + C' mu. The
     vectors gradient, slope and q are padded, the latter two with zeros.
@@ -155,7 +157,7 @@ def residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, 
         gap += mu[p] * active[i]
     gap, slope_along = abs(gap), abs(dot(q, y, n))
     if not gap + slope_along < np.inf:
-        return np.inf
+        return UNDEFINED
     return max(max(stationarity / size, infeasibility), gap / max(1.0, slope_along))
 
 

@@ -124,7 +124,9 @@ class QPSolution(NamedTuple):
         bounds = np.where(multipliers > 0, self.upper, self.lower)
         support = float(np.sum(multipliers[multipliers != 0] * bounds[multipliers != 0]))
         curvature, slope = float(x @ self.terms.P @ x), float(self.q @ x)
-        soft = self._price() + 0.5 * float(np.sum(self.terms.softness[0] * multipliers**2))
+        softness = self.terms.softness[0]
+        paying = softness > 0.0  # the squares of others may overflow
+        soft = self._price() + 0.5 * float(np.sum(softness[paying] * multipliers[paying] ** 2))
         return abs(curvature + slope + support + soft) / max(1.0, abs(curvature), abs(slope), abs(support))
 
     def is_optimal(self, eps: float = 1e-9) -> bool:

@@ -34,17 +34,15 @@ def test_a_minimiser_that_is_not_finite_is_never_called_a_solution(mode, name, r
     assert solution.status is Status.NUMERICAL_TROUBLE
 
 
-@pytest.mark.parametrize("mode", ["gram", "lazy", "primal"])
+@pytest.mark.parametrize("mode", ["gram", "lazy"])
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_bounds_that_keep_it_finite_give_a_solution_or_an_honest_failure(mode, name):
+def test_bounds_that_keep_it_finite_give_the_solution(mode, name):
     P, q = PROBLEMS[name]
     bound = np.ones(len(q))
     solution = solve_in(mode, P, q, np.zeros((0, len(q))), -bound, bound)
-    if solution.status.solved:
-        np.testing.assert_allclose(solution.x, -bound)
-        assert solution.is_optimal(1e-9)
-    else:
-        assert solution.status is Status.NUMERICAL_TROUBLE
+    assert solution.status.solved
+    np.testing.assert_allclose(solution.x, -bound)
+    assert solution.is_optimal(1e-9)
 
 
 @pytest.mark.parametrize("size", [1, 3, 4, 5, 8, 9, 13])
@@ -66,7 +64,7 @@ def test_soft_rows_do_not_hide_it():
     assert solution.status is Status.NUMERICAL_TROUBLE
 
 
-def test_residuals_that_are_undefined_do_not_bear_a_solution_out(rng):
+def test_residuals_that_are_undefined_do_not_bear_a_solution_out():
     solution = DualActiveSet().solve_stacked(np.eye(2), np.ones(2), np.zeros((0, 2)), -np.ones(2), np.ones(2))
     assert solution.is_optimal()
     for value in (np.nan, np.inf):
