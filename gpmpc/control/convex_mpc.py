@@ -30,7 +30,7 @@ from gpmpc.control.condensing import Condenser
 from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.prediction import Covariance, Form, Prediction, Predictor
 from gpmpc.control.request import Request, check_controller, check_dynamics
-from gpmpc.control.sequential import MEMORY, corrected, kkt_share
+from gpmpc.control.sequential import MEMORY, corrected, kkt_share, least_costs
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import DataError, ProblemError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
@@ -290,7 +290,8 @@ class ConvexMPC:
                 break
             warm, proposed = solution, solution.x.reshape(inputs.shape)
             bounds, last_share = (stacked.lower, stacked.upper), share
-            share = kkt_share(diagonal, slope, stacked.G, solution.z, inputs.ravel(), solution.x, *bounds, cost)
+            costs = cost + least_costs(diagonal, inputs.ravel(), *bounds)
+            share = kkt_share(diagonal, slope, stacked.G, solution.z, inputs.ravel(), solution.x, *bounds, costs)
             # The program's plan is better by about the rate of the last one (Hairer and Wanner, 1996, eq. (IV.8.10)).
             rate = share / last_share if taken is not None else 1.0
             if share * min(1.0, rate / max(1.0 - rate, 1e-9)) <= self.tolerance:
