@@ -265,7 +265,7 @@ class ConvexMPC:
 
     def _iterate(self, request: Request, previous: Decision | None, warm: QPSolution | None) -> Decision:
         """Sequential quadratic programming from the last plan."""
-        spent, price, status, share = np.zeros(3), 0.0, Status.ITERATION_LIMIT, np.inf
+        spent, price, status, share, rate = np.zeros(3), 0.0, Status.ITERATION_LIMIT, np.inf, 0.0
         clock, taken = _Clock(spent), None
         pairs = np.empty((2, 0, request.shifted.size))
         prediction = self.predictor.predict(request, previous)
@@ -292,9 +292,11 @@ class ConvexMPC:
             bounds, last_share = (stacked.lower, stacked.upper), share
             costs = cost + least_costs(diagonal, inputs.ravel(), *bounds)
             share = kkt_share(diagonal, slope, stacked.G, solution.z, inputs.ravel(), solution.x, *bounds, costs)
-            # The program's plan is better by about the rate of the last one (Hairer and Wanner, 1996, eq. (IV.8.10)).
-            rate = share / last_share if taken is not None else 1.0
-            if share * min(1.0, rate / max(1.0 - rate, 1e-9)) <= self.tolerance:
+            # The program's plan is better by about the last rate (Hairer and Wanner, 1996, eq. (IV.8.10)), or the one
+            # before if that was slower.
+            rate, last_rate = share / last_share, rate
+            slower = max(rate, last_rate) if taken is not None else 1.0
+            if share * min(1.0, slower / max(1.0 - slower, 1e-9)) <= self.tolerance:
                 status = Status.SOLVED
                 break
             if count == self.iterations:
