@@ -10,7 +10,9 @@ A plan is a KKT point exactly where the middle one of g_j, h_j (u_j - lower_j) a
 every j, whatever positive h_j: multipliers of the box are those of the projection (Facchinei and Pang, 2003, section
 1.5.1). With h the diagonal of the Gauss-Newton Hessian all three are gradients. f is a sum of squares, so |g_j| is at
 most sqrt(2 h_j f), and the share of it that is left is the cosine between the residuals and their change with u_j
-(More, 1978, eq. (8.2)), from 0 to 1 whatever the units of inputs and cost. The largest is the residual of a plan.
+(More, 1978, eq. (8.2)), from 0 to 1 whatever the units of the cost. Where f vanishes so does g, and the share
+need not: f is counted with what moving u_j by ``SMALL`` of its size adds to it, h_j (SMALL size)^2 / 2, the size being
+|u_j| or 1, whichever is more, but at most upper_j - lower_j. The largest share is the residual of a plan.
 """
 
 from dataclasses import dataclass
@@ -25,6 +27,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
 
 Array = np.ndarray
+
+SMALL = 1e-3  # share of an input's size
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,8 @@ def kkt_residual(model: DynamicsModel, problem: TrackingProblem, question: Quest
             curvature[k] += 2 * np.einsum("aj,ab,bj->j", response, weights[i], response)
     above, below = curvature * (inputs - problem.input_lower), curvature * (inputs - problem.input_upper)
     left = np.abs(np.maximum(below, np.minimum(gradient, above)))
-    most = np.sqrt(2 * curvature * cost)
+    sizes = np.minimum(np.maximum(1.0, np.abs(inputs)), problem.input_upper - problem.input_lower)
+    most = np.sqrt(2 * curvature * (cost + 0.5 * curvature * (SMALL * sizes) ** 2))
     return float(np.divide(left, most, out=np.where(left > 0, np.inf, 0.0), where=most > 0).max())
 
 

@@ -30,7 +30,7 @@ from gpmpc.control.condensing import Condenser
 from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.prediction import Covariance, Form, Prediction, Predictor
 from gpmpc.control.request import Request, check_controller, check_dynamics
-from gpmpc.control.sequential import MEMORY, corrected, kkt_share, least_costs
+from gpmpc.control.sequential import MEMORY, corrected, kkt_share
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import DataError, ProblemError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
@@ -82,7 +82,9 @@ class ConvexMPC:
         covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see there.
         solver: Of the quadratic program; ``DualActiveSet()`` by default, which state bounds with a price need.
         iterations: Quadratic programs a step at most; more than one for ``"trajectory"`` only.
-        tolerance: Of more iterations: how far the plan may be from a KKT point, as a cosine (``sequential.kkt_share``).
+        tolerance: Of more iterations: how far the plan may be from a KKT point, as a cosine (``sequential.kkt_share``,
+            whose scale does not vanish with the cost); estimated from the slower of the last two rates of convergence,
+            measured to within ten times. Solved is, too, what only steps lost in round-off could better.
         feedback: Rolls plans out, and predicts the covariances of ``"zero_order"``, under an ancillary feedback,
             without which no long horizon with state bounds is feasible. ``"full"`` and ``"diagonal"`` predict their
             covariances without feedback.
@@ -269,8 +271,7 @@ class ConvexMPC:
         clock, taken = _Clock(spent), None
         pairs = np.empty((2, 0, request.shifted.size))
         prediction = self.predictor.predict(request, previous)
-        inputs = prediction.inputs
-        cost = self._cost(request, prediction, inputs)
+        inputs, cost = prediction.inputs, self._cost(request, prediction, prediction.inputs)
         clock.charge(0)
         for count in range(1, self.iterations + 1):
             stacked = self._stack(prediction, request)
@@ -289,13 +290,10 @@ class ConvexMPC:
                 status = solution.status
                 break
             warm, proposed = solution, solution.x.reshape(inputs.shape)
-            bounds, last_share = (stacked.lower, stacked.upper), share
-            costs = cost + least_costs(diagonal, inputs.ravel(), *bounds)
-            share = kkt_share(diagonal, slope, stacked.G, solution.z, inputs.ravel(), solution.x, *bounds, costs)
-            # The program's plan is better by about the last rate (Hairer and Wanner, 1996, eq. (IV.8.10)), or the one
-            # before if that was slower.
-            rate, last_rate = share / last_share, rate
-            slower = max(rate, last_rate) if taken is not None else 1.0
+            plans, bounds, last_share = (inputs.ravel(), solution.x), (stacked.lower, stacked.upper), share
+            share, stepped = kkt_share(diagonal, slope, stacked.G, solution.z, *plans, *bounds, cost)
+            # The program's plan is better by about the slower of two rates (Hairer and Wanner, 1996, eq. (IV.8.10)).
+            rate, slower = share / last_share, 1.0 if taken is None else max(rate, share / last_share)
             if share * min(1.0, slower / max(1.0 - slower, 1e-9)) <= self.tolerance:
                 status = Status.SOLVED
                 break
@@ -306,7 +304,7 @@ class ConvexMPC:
             found = self._search(request, prediction, inputs, cost, proposed, slope, price)
             clock.charge(0)
             if found is None:
-                status = Status.NUMERICAL_TROUBLE
+                status = Status.SOLVED if stepped <= ROUND_OFF else Status.NUMERICAL_TROUBLE
                 break
             taken = (found[0] - inputs).ravel(), solution.z, slope + stacked.G.T @ solution.z
             inputs, prediction, cost = found
@@ -365,8 +363,9 @@ class ConvexMPC:
     def _keeps_rates(self, inputs: Array, last: Array) -> bool:
         if not self._condenser.rate_rows:
             return True
-        problem, rates = self.problem, np.diff(inputs, axis=0, prepend=last[None])
-        return bool(((rates >= problem.rate_lower - 1e-9) & (rates <= problem.rate_upper + 1e-9)).all())
+        rates = np.diff(inputs, axis=0, prepend=last[None])
+        outside = np.maximum(self.problem.rate_lower - rates, rates - self.problem.rate_upper)
+        return bool((outside <= 1e-9 * np.maximum(1.0, np.abs(inputs) + np.abs(rates))).all())
 
 
 def read_request(

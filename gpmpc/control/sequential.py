@@ -9,37 +9,20 @@ import numpy as np
 from gpmpc.compiled import compiled
 
 MEMORY = 10  # pairs of a corrected Hessian
-SMALL = 1e-3  # share of an input's size; what moving by it costs is the least that a gradient is measured by
+SMALL = 1e-3  # share of an input's size
 
 
 @compiled
-def least_costs(h, plan, lower, upper):
-    """What it costs to move one input by ``SMALL`` of its size (n,); a scale where the cost itself vanishes.
-
-    The size of u_j is |u_j| or 1, whichever is more, but at most the range upper_j - lower_j.
-
-    Args:
-        h: Diagonal of the Gauss-Newton Hessian (n,).
-        plan: (n,).
-        lower: Of the inputs; the first n count.
-        upper: Of the inputs.
-    """
-    least = np.empty(len(plan))
-    for j in range(len(plan)):
-        size = min(max(1.0, abs(plan[j])), upper[j] - lower[j])
-        least[j] = 0.5 * h[j] * (SMALL * size) ** 2
-    return least
-
-
-@compiled
-def kkt_share(h, slope, G, z, plan, proposed, lower, upper, costs):
+def kkt_share(h, slope, G, z, plan, proposed, lower, upper, cost):
     """How far a plan is from a KKT point, with multipliers z of the rows: 0 there, a share of 1 elsewhere.
 
     The Lagrangian's gradient g = slope + G'z is projected onto the box (the middle of g, h (u - lower), h (u - upper))
     and divided by the largest that the gradient of such a cost can be, sqrt(2 h cost) (Cauchy and Schwarz): the cosine
     between the residuals and their change with an input (More, 1978, eq. (8.2)). Where the reference can be reached,
-    gradient and root of the cost vanish together, and their ratio does not: ``costs`` are the cost plus ``least_costs``.
-    Where there are rows, also how far they are from where the program wants them, relative to the largest of them or 1.
+    gradient and root of the cost vanish together and their ratio does not. So the cost is counted with what moving the
+    input by ``SMALL`` of its size adds to it, h (SMALL size)^2 / 2; the size is |u| or 1, whichever is more, but at
+    most upper - lower. Where there are rows, also how far they are from where the program wants them, relative to the
+    largest of them or 1.
 
     Args:
         h: Diagonal of the Gauss-Newton Hessian (n,).
@@ -50,9 +33,13 @@ def kkt_share(h, slope, G, z, plan, proposed, lower, upper, costs):
         proposed: The program's solution (n,).
         lower: Of the stacked constraints; the first n are the box.
         upper: Of the stacked constraints.
-        costs: That the gradient is measured by (n,).
+        cost: At the plan, a sum of squares.
+
+    Returns:
+        The share; the most that the program's step in one input changes the cost, h (proposed - plan)^2 / 2, as a share
+        of the same cost.
     """
-    largest, n = 0.0, len(plan)
+    largest, stepped, n = 0.0, 0.0, len(plan)
     gradient = slope.copy()
     moved, reach = 0.0, 1.0
     for r in range(len(G)):
@@ -63,10 +50,13 @@ def kkt_share(h, slope, G, z, plan, proposed, lower, upper, costs):
             change += G[r, j] * (proposed[j] - plan[j])
         moved, reach = max(moved, abs(change)), max(reach, abs(value))
     for j in range(n):
+        size = min(max(1.0, abs(plan[j])), upper[j] - lower[j])
+        counted = cost + 0.5 * h[j] * (SMALL * size) ** 2 + 1e-300
         left = max(h[j] * (plan[j] - upper[j]), min(gradient[j], h[j] * (plan[j] - lower[j])))
         if left != 0.0:
-            largest = max(largest, abs(left) / np.sqrt(2.0 * h[j] * costs[j] + 1e-300))
-    return max(largest, moved / reach)
+            largest = max(largest, abs(left) / np.sqrt(2.0 * h[j] * counted))
+        stepped = max(stepped, 0.5 * h[j] * (proposed[j] - plan[j]) ** 2 / counted)
+    return max(largest, moved / reach), stepped
 
 
 @compiled
