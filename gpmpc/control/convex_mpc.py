@@ -82,9 +82,9 @@ class ConvexMPC:
         covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see there.
         solver: Of the quadratic program; ``DualActiveSet()`` by default, which state bounds with a price need.
         iterations: Quadratic programs a step at most; more than one for ``"trajectory"`` only.
-        tolerance: Of more iterations: how far the plan may be from a KKT point, as a cosine (``sequential.kkt_share``,
-            whose scale does not vanish with the cost); estimated from the slower of the last two rates of convergence,
-            measured to within ten times. Solved is, too, what only steps lost in round-off could better.
+        tolerance: Of more iterations: how far the plan may be from a KKT point, as a cosine (``sequential.kkt_share``);
+            estimated from the slower of the last two rates of convergence, measured to within ten times. It is enough,
+            too, that no step lowers the cost and what is left to gain is round-off. 1e-8 may be out of reach.
         feedback: Rolls plans out, and predicts the covariances of ``"zero_order"``, under an ancillary feedback,
             without which no long horizon with state bounds is feasible. ``"full"`` and ``"diagonal"`` predict their
             covariances without feedback.
@@ -267,7 +267,7 @@ class ConvexMPC:
 
     def _iterate(self, request: Request, previous: Decision | None, warm: QPSolution | None) -> Decision:
         """Sequential quadratic programming from the last plan."""
-        spent, price, status, share, rate = np.zeros(3), 0.0, Status.ITERATION_LIMIT, np.inf, 0.0
+        spent, price, status, share, rate = np.zeros(3), 0.0, Status.ITERATION_LIMIT, np.inf, 1.0
         clock, taken = _Clock(spent), None
         pairs = np.empty((2, 0, request.shifted.size))
         prediction = self.predictor.predict(request, previous)
@@ -291,10 +291,11 @@ class ConvexMPC:
                 break
             warm, proposed = solution, solution.x.reshape(inputs.shape)
             plans, bounds, last_share = (inputs.ravel(), solution.x), (stacked.lower, stacked.upper), share
-            share, stepped = kkt_share(diagonal, slope, stacked.G, solution.z, *plans, *bounds, cost)
+            share = kkt_share(diagonal, slope, stacked.G, solution.z, *plans, *bounds, cost)
             # The program's plan is better by about the slower of two rates (Hairer and Wanner, 1996, eq. (IV.8.10)).
-            rate, slower = share / last_share, 1.0 if taken is None else max(rate, share / last_share)
-            if share * min(1.0, slower / max(1.0 - slower, 1e-9)) <= self.tolerance:
+            rate, last_rate = share / last_share if taken is not None else 1.0, rate
+            slower = max(rate, last_rate)
+            if share <= self.tolerance or share * slower <= self.tolerance * (1.0 - slower):
                 status = Status.SOLVED
                 break
             if count == self.iterations:
@@ -303,8 +304,8 @@ class ConvexMPC:
             price = max(price, 2.0 * float(row_multipliers.max(initial=0.0)))
             found = self._search(request, prediction, inputs, cost, proposed, slope, price)
             clock.charge(0)
-            if found is None:
-                status = Status.SOLVED if stepped <= ROUND_OFF else Status.NUMERICAL_TROUBLE
+            if found is None:  # share^2 of the cost is what an input could gain
+                status = Status.SOLVED if share**2 <= ROUND_OFF else Status.NUMERICAL_TROUBLE
                 break
             taken = (found[0] - inputs).ravel(), solution.z, slope + stacked.G.T @ solution.z
             inputs, prediction, cost = found

@@ -34,12 +34,8 @@ def kkt_share(h, slope, G, z, plan, proposed, lower, upper, cost):
         lower: Of the stacked constraints; the first n are the box.
         upper: Of the stacked constraints.
         cost: At the plan, a sum of squares.
-
-    Returns:
-        The share; the most that the program's step in one input changes the cost, h (proposed - plan)^2 / 2, as a share
-        of the same cost.
     """
-    largest, stepped, n = 0.0, 0.0, len(plan)
+    largest, n = 0.0, len(plan)
     gradient = slope.copy()
     moved, reach = 0.0, 1.0
     for r in range(len(G)):
@@ -55,8 +51,7 @@ def kkt_share(h, slope, G, z, plan, proposed, lower, upper, cost):
         left = max(h[j] * (plan[j] - upper[j]), min(gradient[j], h[j] * (plan[j] - lower[j])))
         if left != 0.0:
             largest = max(largest, abs(left) / np.sqrt(2.0 * h[j] * counted))
-        stepped = max(stepped, 0.5 * h[j] * (proposed[j] - plan[j]) ** 2 / counted)
-    return max(largest, moved / reach), stepped
+    return max(largest, moved / reach)
 
 
 @compiled
