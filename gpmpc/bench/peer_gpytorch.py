@@ -16,21 +16,13 @@ from gpmpc.bench.optimality import Question
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
-from gpmpc.gp.model import BatchExactGP, exact_inference
+from gpmpc.gp.model import exact_inference, gpytorch_model
 
 
 class Plan(NamedTuple):
     """A plan (H, m)."""
 
     inputs: np.ndarray
-
-
-def gpytorch_model(gp: GPPosterior) -> BatchExactGP:
-    """The GPyTorch model that a posterior could have come from, frozen; its predictions lack the posterior's offset."""
-    model = BatchExactGP(gp.features, gp.targets - gp.offset)  # its prior mean is zero
-    deviation, noise = gp.signal_variance.log() / 2, gp.noise_variance.log() / 2
-    model.set_hyperparameters(torch.cat([gp.lengthscales.log(), torch.stack([deviation, deviation - noise], 1)], 1))
-    return model.eval().requires_grad_(False)
 
 
 class GPyTorchSlsqp:
@@ -49,7 +41,11 @@ class GPyTorchSlsqp:
     def __init__(self, gp: GPPosterior, problem: TrackingProblem, horizon: int, tolerance: float):
         if problem.penalized != "increments" or problem.state_bounds is not None or problem.rate_limited:
             raise SettingError("problem", "must weigh increments, and bound nothing but inputs")
-        self._model, self._offset, self._adds_state = gpytorch_model(gp), gp.offset, gp.predicts == "difference"
+        self._model, self._offset, self._adds_state = (
+            gpytorch_model(gp).requires_grad_(False),
+            gp.offset,
+            gp.predicts == "difference",
+        )
         self._horizon, self._tolerance = horizon, tolerance
         self._Q, self._R, self._terminal = map(torch.from_numpy, (problem.Q, problem.R, problem.terminal))
         self._bounds = list(zip(problem.input_lower, problem.input_upper, strict=True)) * horizon

@@ -8,7 +8,7 @@ solver above 800 points, and keeps the noise above 1e-4.
 
 from collections.abc import Sequence
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gpytorch
 import numpy as np
@@ -17,6 +17,9 @@ from gpytorch.constraints import Positive
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
+
+if TYPE_CHECKING:
+    from gpmpc.gp.posterior import GPPosterior
 
 
 @contextmanager
@@ -73,6 +76,15 @@ class BatchExactGP(gpytorch.models.ExactGP):
             self.covar_module.base_kernel.raw_lengthscale.copy_(theta[:, None, :-2])
             self.covar_module.raw_outputscale.copy_(2 * theta[:, -2])
             self.likelihood.noise_covar.raw_noise.copy_(2 * (theta[:, -2:-1] - theta[:, -1:]))
+
+
+def gpytorch_model(posterior: "GPPosterior") -> BatchExactGP:
+    """The GPyTorch model that a posterior could have come from; its targets lack the offset, its prior mean is zero."""
+    model = BatchExactGP(posterior.features, posterior.targets - posterior.offset)
+    deviation, noise = posterior.signal_variance.log() / 2, posterior.noise_variance.log() / 2
+    theta = torch.cat([posterior.lengthscales.log(), torch.stack([deviation, deviation - noise], 1)], 1)
+    model.set_hyperparameters(theta)
+    return model.eval()
 
 
 class GPyTorchEvidence:

@@ -18,7 +18,7 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError, UnsupportedModel, check_number
 from gpmpc.gp.hyperparameter_search import FAILED, Found, Task, find_hyperparameters
-from gpmpc.gp.model import BatchExactGP
+from gpmpc.gp.model import BatchExactGP, gpytorch_model
 from gpmpc.gp.penalties import Penalty
 from gpmpc.gp.posterior import GPPosterior, Predicts
 from gpmpc.gp.scaling import Scaling, identity
@@ -54,9 +54,7 @@ class Training:
 
     def gpytorch_model(self) -> BatchExactGP:
         """The same GPs as a GPyTorch model, to go on with there."""
-        model = BatchExactGP(self.posterior.features, self.posterior.targets - self.posterior.offset)
-        model.set_hyperparameters(torch.from_numpy(self.theta))
-        return model.eval()
+        return gpytorch_model(self.posterior)
 
 
 @dataclass(frozen=True)
