@@ -1,11 +1,10 @@
 """``gpmpc bench``: measures what everything costs on this machine, or compares two measurements."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Callable, Iterable, Sequence
 
 from omegaconf import DictConfig, OmegaConf
 
+from gpmpc.cli.folder import folder_of, writing
 from gpmpc.cli.screen import progress_bar, told_console
 from gpmpc.exceptions import SettingError
 
@@ -29,12 +28,10 @@ def bench(config: DictConfig) -> None:
     for part in ("peers", "quality"):
         if not isinstance(settings[part], dict):
             raise SettingError(part, f"has settings of its own, such as {part}.seconds; got {settings[part]!r}")
-    if not isinstance(settings["folder"], str):
-        raise SettingError("folder", f"must be the path of a folder; got {settings['folder']!r}")
-    folder, console = Path(settings["folder"]), told_console()
+    folder, console = folder_of(settings), told_console()
     one_thread()
     planned = {part: PARTS[part](settings) for part in parts}  # finds out what a user can get wrong
-    with _writing(folder):
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     here, rows = machine(), []
     console.print(described(here))
@@ -48,19 +45,11 @@ def bench(config: DictConfig) -> None:
         "bench.json": write_json(rows, here, settings, provenance()),
         "bench.md": markdown(rows, here),
     } | _figures(rows)
-    with _writing(folder):
+    with writing(folder):
         for name, content in written.items():
             write_whole(folder / name, content)
     console.print(written["bench.md"], soft_wrap=True, highlight=False, markup=False)
     console.print(f"written to {folder}: {', '.join(sorted(written))}", soft_wrap=True)
-
-
-@contextmanager
-def _writing(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise SettingError("folder", f"cannot write to {folder}: {error.strerror or error}") from error
 
 
 def _steps(settings: dict) -> tuple[int, Iterable[Sequence[dict]]]:

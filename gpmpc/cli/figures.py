@@ -2,11 +2,11 @@
 
 import sys
 from concurrent.futures.process import BrokenProcessPool
-from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from gpmpc.cli.folder import folder_of, writing
 from gpmpc.cli.screen import progress_bar, told_console
 from gpmpc.exceptions import GpmpcError, SettingError
 
@@ -24,24 +24,21 @@ def figures(config: DictConfig) -> None:
     console = told_console()
 
     experiment = _experiment(config, settings)
-    if not isinstance(settings["folder"], str):
-        raise SettingError("folder", f"must be the path of a folder; got {settings['folder']!r}")
-    folder, meta = Path(settings["folder"]), provenance() | {"settings": settings}
+    folder, meta = folder_of(settings), provenance() | {"settings": settings}
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with progress_bar(console) as progress:
-            task = progress.add_task("training GPs", total=None)
-            flights = experiment.flights(folder)
-            store = FitStore(folder / "flights.jsonl")
-            progress.update(task, description="flying", total=len(flights))
-            records = experiment.run(store, flights, progress=lambda _: progress.advance(task))
-        rows = summarise(records)
-        note = experiment.data["data"].note
-        written = documents(rows, records, meta, note) | {"config.yaml": OmegaConf.to_yaml(config, resolve=True)}
-        for name, content in written.items():
-            write_whole(folder / name, content)
-    except OSError as error:
-        raise SettingError("folder", f"cannot write to {folder}: {error.strerror or error}") from error
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            with progress_bar(console) as progress:
+                task = progress.add_task("training GPs", total=None)
+                flights = experiment.flights(folder)
+                store = FitStore(folder / "flights.jsonl")
+                progress.update(task, description="flying", total=len(flights))
+                records = experiment.run(store, flights, progress=lambda _: progress.advance(task))
+            rows = summarise(records)
+            note = experiment.data["data"].note
+            written = documents(rows, records, meta, note) | {"config.yaml": OmegaConf.to_yaml(config, resolve=True)}
+            for name, content in written.items():
+                write_whole(folder / name, content)
     except BrokenProcessPool as error:
         raise GpmpcError("a worker process died (out of memory?); the same command goes on where it stopped") from error
 

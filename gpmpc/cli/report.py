@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from gpmpc.cli.arguments import Parser
-from gpmpc.exceptions import SettingError
+from gpmpc.cli.folder import writing
 
 
 def report(arguments: list[str]) -> None:
@@ -34,12 +34,10 @@ def report(arguments: list[str]) -> None:
     lines = sentences(found, compare(found, *given.compare), *given.compare) if given.compare else []
     folder = given.to or given.tree / "report"
     written = documents(found, lines)
-    try:
+    with writing(folder, "to"):
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in written.items():
             write_whole(folder / name, content)
-    except OSError as error:
-        raise SettingError("to", f"cannot write to {folder}: {error.strerror or error}") from error
 
     console = Console()
     console.print(render(found))

@@ -2,10 +2,10 @@
 
 import sys
 from concurrent.futures.process import BrokenProcessPool
-from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from gpmpc.cli.folder import folder_of, writing
 from gpmpc.cli.screen import progress_bar, told_console
 from gpmpc.exceptions import GpmpcError, SettingError
 
@@ -39,23 +39,20 @@ def tables(config: DictConfig) -> None:
     with console.status("generating or reading the data"):
         fits = experiment.fits()
 
-    if not isinstance(settings["folder"], str):
-        raise SettingError("folder", f"must be the path of a folder; got {settings['folder']!r}")
-    folder, meta = Path(settings["folder"]), provenance() | {"settings": settings}
+    folder, meta = folder_of(settings), provenance() | {"settings": settings}
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        store = FitStore(folder / "fits.jsonl")
-        with progress_bar(console) as progress:
-            task = progress.add_task("training GPs", total=len(fits))
-            draws = experiment.run(store, fits, progress=lambda _: progress.advance(task))
-        rows = summarise(draws)
-        written = documents(rows, draws, meta, experiment.data.note) | {
-            "config.yaml": OmegaConf.to_yaml(config, resolve=True)
-        }
-        for name, content in written.items():
-            write_whole(folder / name, content)
-    except OSError as error:
-        raise SettingError("folder", f"cannot write to {folder}: {error.strerror or error}") from error
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            store = FitStore(folder / "fits.jsonl")
+            with progress_bar(console) as progress:
+                task = progress.add_task("training GPs", total=len(fits))
+                draws = experiment.run(store, fits, progress=lambda _: progress.advance(task))
+            rows = summarise(draws)
+            written = documents(rows, draws, meta, experiment.data.note) | {
+                "config.yaml": OmegaConf.to_yaml(config, resolve=True)
+            }
+            for name, content in written.items():
+                write_whole(folder / name, content)
     except BrokenProcessPool as error:
         raise GpmpcError("a worker process died (out of memory?); the same command goes on where it stopped") from error
 
