@@ -144,7 +144,7 @@ def worst_residual(problem: SequenceProblem, answer) -> float:
     x, multipliers = answer
     program = QuadraticProgram.from_stacked(*vars(problem).values())
     solution = make_solution(program, Status.SOLVED, x, multipliers)
-    return max(solution.primal_residual(), solution.dual_residual(), solution.duality_gap())
+    return max(solution.residuals())
 
 
 def measure_cell(horizon: int, mode: str, rows: int, settings: argparse.Namespace) -> dict:

@@ -1,21 +1,34 @@
-"""Quadratic programs and their solvers (NumPy float64)."""
+"""Quadratic programs and their solvers (NumPy float64).
 
-from gpmpc.qp.cvxpy_ import CvxpySolver
-from gpmpc.qp.dual_active_set import DualActiveSet, Prepared
-from gpmpc.qp.primal_active_set import PrimalActiveSet
-from gpmpc.qp.problem import QuadraticProgram
-from gpmpc.qp.soft_rows import SoftRows
-from gpmpc.qp.solution import QPSolution, make_solution
-from gpmpc.qp.solver import QPSolver
+Names are looked up in their modules at first use: whoever needs a problem or a solution only, such as the writer of
+recordings, loads no compiler.
+"""
 
-__all__ = [
-    "CvxpySolver",
-    "DualActiveSet",
-    "Prepared",
-    "PrimalActiveSet",
-    "QPSolution",
-    "QPSolver",
-    "QuadraticProgram",
-    "SoftRows",
-    "make_solution",
-]
+import importlib
+from typing import Any
+
+_MODULES = {
+    "CvxpySolver": "cvxpy_",
+    "DualActiveSet": "dual_active_set",
+    "Prepared": "dual_active_set",
+    "PrimalActiveSet": "primal_active_set",
+    "QPSolution": "solution",
+    "QPSolver": "solver",
+    "QuadraticProgram": "problem",
+    "Residuals": "solution",
+    "SoftRows": "soft_rows",
+    "make_solution": "solution",
+}
+
+__all__ = list(_MODULES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -32,7 +32,7 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, se
             if proves_infeasibility(solution.multipliers, terms.G, lower, upper):
                 return record
         else:
-            residual = max(map(_finite, (solution.primal_residual(), solution.dual_residual(), solution.duality_gap())))
+            residual = max(map(_finite, solution.residuals()))
             if residual <= settings[TOLERANCE]:
                 record[layout.STATUS] = layout.SOLVED
                 return record

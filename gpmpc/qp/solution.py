@@ -26,6 +26,22 @@ class Terms(NamedTuple):
     softness: Array  # (2, M), see gpmpc.qp.soft_rows
 
 
+class Residuals(NamedTuple):
+    """How far a point is from the conditions of optimality; all three are zero at the minimiser.
+
+    Attributes:
+        primal: The largest violation of a hard constraint, or of a soft one beyond what its multiplier pays for;
+            scaled by max(1, |x|, |Gx|) (largest entries).
+        dual: The largest entry of P x + q + G'z + z_box, or multiplier of an absent bound or beyond its weight; scaled
+            by max(1, |Px|, |q|, |G'z|) (largest entries).
+        gap: |primal - dual objective|, scaled by max(1, |x'Px|, |q'x|, |sum of multipliers times bounds|).
+    """
+
+    primal: float
+    dual: float
+    gap: float
+
+
 class QPSolution(NamedTuple):
     """The minimiser with its multipliers, status and residuals. Holds references to the problem's arrays, not copies.
 
@@ -88,56 +104,46 @@ class QPSolution(NamedTuple):
     def objective(self) -> float:
         """1/2 x'Px + q'x, with the price of violated soft rows [the unit of the cost]."""
         x = self.x
-        return float(0.5 * x @ self.terms.P @ x + self.q @ x + self._price())
+        return float(0.5 * x @ self.terms.P @ x + self.q @ x + self._price(self.violation()))
 
     def violation(self) -> Array:
         """(M,) how far each stacked constraint lies outside its bounds, in the constraint's own unit; soft ones too."""
-        values = np.concatenate([self.x, self.terms.G @ self.x])
-        return np.maximum(0.0, np.maximum(values - self.upper, self.lower - values))
+        return self._violation(self.terms.G @ self.x)
 
-    def primal_residual(self) -> float:
-        """The largest violation of a hard constraint, or of a soft one beyond what its multiplier pays for.
+    @np.errstate(all="ignore")  # the multipliers of a failed solve may be anything
+    def residuals(self) -> Residuals:
+        """How far x and the multipliers are from the conditions of optimality; NaN where that cannot be said."""
+        P, G, (softness, caps) = self.terms
+        x, q, multipliers = self.x, self.q, self.multipliers
+        sizes, up, down = np.abs(multipliers), multipliers > 0, multipliers < 0
+        rows, slope, pull = G @ x, P @ x, G.T @ self.z
 
-        Scaled by max(1, |x|, |Gx|) (largest entries).
-        """
-        softness, caps = self.terms.softness
-        paid = np.where(np.abs(self.multipliers) >= caps, np.inf, softness * np.abs(self.multipliers))
-        beyond = np.maximum(0.0, self.violation() - paid)
-        return float(beyond.max() / max(1.0, _size(self.x), _size(self.terms.G @ self.x)))
+        violation = self._violation(rows)
+        beyond = np.maximum(0.0, violation - np.where(sizes >= caps, np.inf, softness * sizes))
+        primal = beyond.max() / max(1.0, _size(x), _size(rows))
 
-    def dual_residual(self) -> float:
-        """The largest entry of P x + q + G'z + z_box, or multiplier of an absent bound or beyond its weight.
+        absent = (up & (self.upper >= ABSENT)) | (down & (self.lower <= -ABSENT))
+        stray = np.where(absent, sizes, np.maximum(0.0, sizes - caps))
+        dual = max(_size(slope + q + pull + self.z_box), _size(stray)) / max(1.0, _size(slope), _size(q), _size(pull))
 
-        Scaled by max(1, |Px|, |q|, |G'z|) (largest entries).
-        """
-        P, G, (_, caps) = self.terms
-        multipliers = self.multipliers
-        slope, pull = P @ self.x, G.T @ self.z
-        stationarity = slope + self.q + pull + self.z_box
-        absent = ((multipliers > 0) & (self.upper >= ABSENT)) | ((multipliers < 0) & (self.lower <= -ABSENT))
-        stray = np.where(absent, np.abs(multipliers), np.maximum(0.0, np.abs(multipliers) - caps))
-        return max(_size(stationarity), _size(stray)) / max(1.0, _size(slope), _size(self.q), _size(pull))
-
-    def duality_gap(self) -> float:
-        """|primal - dual objective|, scaled by max(1, |x'Px|, |q'x|, |sum of multipliers times bounds|)."""
-        multipliers, x = self.multipliers, self.x
-        bounds = np.where(multipliers > 0, self.upper, self.lower)
-        support = float(np.sum(multipliers[multipliers != 0] * bounds[multipliers != 0]))
-        curvature, slope = float(x @ self.terms.P @ x), float(self.q @ x)
-        softness = self.terms.softness[0]
+        support = multipliers[up] @ self.upper[up] + multipliers[down] @ self.lower[down]
         paying = softness > 0.0  # the squares of others may overflow
-        soft = self._price() + 0.5 * float(np.sum(softness[paying] * multipliers[paying] ** 2))
-        return abs(curvature + slope + support + soft) / max(1.0, abs(curvature), abs(slope), abs(support))
+        soft = self._price(violation) + 0.5 * np.sum(softness[paying] * multipliers[paying] ** 2)
+        curvature, gain = x @ slope, q @ x
+        gap = abs(curvature + gain + support + soft) / max(1.0, abs(curvature), abs(gain), abs(support))
+        return Residuals(float(primal), float(dual), float(gap))
 
     def is_optimal(self, eps: float = 1e-9) -> bool:
         """Whether the residuals, whatever the status says, are all at most ``eps``."""
-        residuals = self.primal_residual(), self.dual_residual(), self.duality_gap()
-        return all(residual <= eps for residual in residuals)  # which NaN is not
+        return all(residual <= eps for residual in self.residuals())  # which NaN is not
 
-    def _price(self) -> float:
+    def _violation(self, rows: Array) -> Array:
+        values = np.concatenate([self.x, rows])
+        return np.maximum(0.0, np.maximum(values - self.upper, self.lower - values))
+
+    def _price(self, violation: Array) -> float:
         softness, caps = self.terms.softness
-        violation, soft = self.violation(), softness > 0
-        linear = np.isfinite(caps)
+        soft, linear = softness > 0, np.isfinite(caps)
         return float(0.5 * np.sum(violation[soft] ** 2 / softness[soft]) + np.sum(caps[linear] * violation[linear]))
 
 

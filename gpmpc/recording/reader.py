@@ -209,7 +209,7 @@ def read_run(path: str | Path) -> Run:
     if "state_names" not in about:
         raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
     states, inputs = tuple(about["state_names"].split()), tuple(about["input_names"].split())
-    classes = schemas.message_classes(states, inputs, packed=False)
+    classes = schemas.message_classes(states, inputs, schemas.READ)
     steps = [classes[schemas.STEP].FromString(content) for content in data[STEP]]
     plans = [classes[schemas.PLAN].FromString(content) for content in data[PLAN][: len(steps)]]
     problems = [classes[schemas.QP].FromString(content) for content in data[QP]]

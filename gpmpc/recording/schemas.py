@@ -8,12 +8,14 @@ A descriptor loses comments, so units and frames stand in the file's metadata re
 ``state.x``: ``m``) and ``frames``, written before any message; every MCAP tool shows them, and recovery keeps them.
 
 Large arrays are packed ``repeated double``. Their wire format is the one of ``bytes`` that hold the little-endian
-float64 values, so writer and reader use a twin of each schema with ``bytes`` in their place (``packed=False``): a
-thousand numbers then cost one copy.
+float64 values, so the reader uses a twin of each schema with ``bytes`` in their place (``READ``): a thousand numbers
+then cost one copy. Likewise a nested message is ``bytes`` that hold it serialised, and in the writer's twin
+(``WRITTEN``) these come from ``encoding``.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto
 from google.protobuf.descriptor_pool import DescriptorPool
@@ -23,6 +25,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.status import Status
 
 STEP, PLAN, QP = "gpmpc.Step", "gpmpc.Plan", "gpmpc.QuadraticProgram"
+STATE, INPUT, TIMINGS, RESIDUES, STAGE = "gpmpc.State", "gpmpc.Input", "gpmpc.Timing", "gpmpc.Residuals", "gpmpc.Stage"
 
 _SCALARS = {
     "double": FieldDescriptorProto.TYPE_DOUBLE,
@@ -32,6 +35,8 @@ _SCALARS = {
 }
 TIMING = ("model", "build", "solve", "total")
 RESIDUALS = ("primal", "dual", "gap")
+READ = {"doubles": "bytes"}
+WRITTEN = READ | dict.fromkeys(("State", "Input", "Timing", "Residuals"), "bytes") | {"Stages": "list of bytes"}
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
@@ -52,26 +57,29 @@ def check_names(kind: str, names: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def message_classes(state_names: Sequence[str], input_names: Sequence[str], packed: bool = True) -> dict[str, type]:
-    """The classes of the three messages by full name.
+def message_classes(
+    state_names: Sequence[str], input_names: Sequence[str], twin: Mapping[str, str] = MappingProxyType({})
+) -> dict[str, type]:
+    """The classes of all messages by full name.
 
     Args:
         state_names: Names of the n states.
         input_names: Names of the m inputs.
-        packed: Large arrays are packed ``repeated double``, as a file declares them; otherwise ``bytes`` with the same
-            wire format.
+        twin: Kinds of fields in place of those that a file declares, with the same wire format: ``READ``, ``WRITTEN``.
     """
-    array = "doubles" if packed else "bytes"
     file = FileDescriptorProto(name="gpmpc/recording.proto", package="gpmpc", syntax="proto3")
     status = file.enum_type.add(name="Status")
     for number, value in enumerate(Status):
         status.value.add(name=value.name, number=number)
-    _message(file, "State", dict.fromkeys(state_names, "double"))
-    _message(file, "Input", dict.fromkeys(input_names, "double"))
-    _message(file, "Timing", dict.fromkeys(TIMING, "double"))
-    _message(file, "Residuals", dict.fromkeys(RESIDUALS, "double"))
-    _message(
-        file,
+
+    def add(name: str, fields: dict[str, str]) -> None:
+        _message(file, name, {field: twin.get(kind, kind) for field, kind in fields.items()})
+
+    add("State", dict.fromkeys(state_names, "double"))
+    add("Input", dict.fromkeys(input_names, "double"))
+    add("Timing", dict.fromkeys(TIMING, "double"))
+    add("Residuals", dict.fromkeys(RESIDUALS, "double"))
+    add(
         "Step",
         {
             "time": "double",
@@ -84,7 +92,7 @@ def message_classes(state_names: Sequence[str], input_names: Sequence[str], pack
             "input_upper": "Input",
             "innovation": "State",
             "belief_std": "State",
-            "belief_covariance": array,
+            "belief_covariance": "doubles",
             "status": "Status",
             "iterations": "int64",
             "active_set_size": "int64",
@@ -95,13 +103,16 @@ def message_classes(state_names: Sequence[str], input_names: Sequence[str], pack
             "failed": "bool",
         },
     )
-    _message(file, "Stage", {"time": "double", "mean": "State", "std": "State", "input": "Input"})
-    _message(file, "Plan", {"time": "double", "k": "int64", "stages": "Stages", "covariances": array})
-    arrays = dict.fromkeys(("P", "q", "G", "lower", "upper", "softness", "x", "multipliers"), array)
-    _message(file, "QuadraticProgram", {"time": "double", "k": "int64", "variables": "int64", "rows": "int64"} | arrays)
+    add("Stage", {"time": "double", "mean": "State", "std": "State", "input": "Input"})
+    add("Plan", {"time": "double", "k": "int64", "stages": "Stages", "covariances": "doubles"})
+    arrays = dict.fromkeys(("P", "q", "G", "lower", "upper", "softness", "x", "multipliers"), "doubles")
+    add("QuadraticProgram", {"time": "double", "k": "int64", "variables": "int64", "rows": "int64"} | arrays)
     pool = DescriptorPool()
     pool.Add(file)
-    return {name: GetMessageClass(pool.FindMessageTypeByName(name)) for name in (STEP, PLAN, QP)}
+    return {
+        name: GetMessageClass(pool.FindMessageTypeByName(name))
+        for name in (STEP, PLAN, QP, STATE, INPUT, TIMINGS, RESIDUES, STAGE)
+    }
 
 
 def units_by_field(units: dict[str, str], state_names: Sequence[str], input_names: Sequence[str]) -> dict[str, str]:
@@ -137,6 +148,8 @@ def _message(file: FileDescriptorProto, name: str, fields: dict[str, str]) -> No
             added.type = _SCALARS[kind]
         elif kind == "Status":
             added.type, added.type_name = FieldDescriptorProto.TYPE_ENUM, ".gpmpc.Status"
+        elif kind == "list of bytes":
+            added.type, added.label = FieldDescriptorProto.TYPE_BYTES, FieldDescriptorProto.LABEL_REPEATED
         elif kind == "Stages":
             added.label = FieldDescriptorProto.LABEL_REPEATED
             added.type, added.type_name = FieldDescriptorProto.TYPE_MESSAGE, ".gpmpc.Stage"

@@ -12,7 +12,7 @@ it still holds and leaves the file without footer; if the disk is full, likewise
 import contextlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import BinaryIO
 
 import numpy as np
@@ -21,7 +21,9 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
+from gpmpc.qp.solution import QPSolution, Terms
 from gpmpc.recording import schemas, wire
+from gpmpc.recording.encoding import DoublesEncoder
 from gpmpc.recording.ring import POSITION, Ring
 from gpmpc.recording.scene import CLASSES, LOG, Log, Scene, failure_log
 
@@ -63,9 +65,13 @@ class StepWriter:
                 registered[name] = register_schema(self._writer, message_class)
             self._channels[topic] = self._writer.register_channel(topic, MessageEncoding.Protobuf, registered[name])
 
-        twins = schemas.message_classes(self._states, self._inputs, packed=False)
+        twins = schemas.message_classes(self._states, self._inputs, schemas.WRITTEN)
         self._step, self._plan, self._qp = twins[schemas.STEP], twins[schemas.PLAN], twins[schemas.QP]
-        self._bounds = dict(zip(("input_lower", "input_upper"), setup["input_bounds"] or (), strict=False))
+        groups = (schemas.STATE, schemas.INPUT, schemas.TIMINGS, schemas.RESIDUES, schemas.STAGE)
+        self._encode = {name: DoublesEncoder(declared[name]).encode for name in groups}
+        self._encode_last = DoublesEncoder(declared[schemas.STAGE], without="input").encode
+        bounds = self._encode[schemas.INPUT](np.array(setup["input_bounds"])) if setup["input_bounds"] else ()
+        self._bounds = dict(zip(("input_lower", "input_upper"), bounds, strict=False))
 
     def write(self, content: bytes | memoryview) -> None:
         """Writes the step of a frame."""
@@ -111,45 +117,41 @@ class StepWriter:
         self._file.flush()
         os.fsync(self._file.fileno())
 
-    def _state(self, values: np.ndarray) -> dict[str, float]:
-        return dict(zip(self._states, values.tolist(), strict=True))
-
-    def _input(self, values: np.ndarray) -> dict[str, float]:
-        return dict(zip(self._inputs, values.tolist(), strict=True))
-
     def _step_message(self, step: wire.PackedStep):
         model, build, solve = step.timing
         active, residuals = _quality(step.qp)
+        std = _deviation(step.belief_covariance)
+        states = np.array([step.reference, step.state, step.measured, step.innovation, std])
+        reference, state, measured, innovation, belief_std = self._encode[schemas.STATE](states)
         return self._step(
             time=step.time,
             k=step.k,
-            reference=self._state(step.reference),
-            state=self._state(step.state),
-            measured=self._state(step.measured),
-            input=self._input(step.input),
-            **{name: dict(zip(self._inputs, bound, strict=True)) for name, bound in self._bounds.items()},
-            innovation=self._state(step.innovation),
-            belief_std=self._state(_deviation(step.belief_covariance)),
+            reference=reference,
+            state=state,
+            measured=measured,
+            input=self._one(schemas.INPUT, step.input),
+            **self._bounds,
+            innovation=innovation,
+            belief_std=belief_std,
             belief_covariance=step.belief_covariance.tobytes(),
             status=wire.STATUSES.index(step.status),
             iterations=step.iterations,
             active_set_size=active,
-            timing={"model": model, "build": build, "solve": solve, "total": model + build + solve},
-            residuals=residuals,
+            timing=self._one(schemas.TIMINGS, (model, build, solve, model + build + solve)),
+            residuals=self._one(schemas.RESIDUES, residuals),
             gp_size=step.gp_size,
             gp_version=step.gp_version,
             failed=step.failed,
         )
 
     def _plan_message(self, step: wire.PackedStep):
-        message = self._plan(time=step.time, k=step.k, covariances=step.covariances.tobytes())
-        deviations = _deviation(step.covariances)
-        for i, (mean, std) in enumerate(zip(step.means, deviations, strict=True)):
-            time = step.time + i * self._setup["time_step"]
-            stage = message.stages.add(time=time, mean=self._state(mean), std=self._state(std))
-            if i < len(step.inputs):
-                stage.input.CopyFrom(type(stage.input)(**self._input(step.inputs[i])))
-        return message
+        times = step.time + self._setup["time_step"] * np.arange(len(step.means))
+        table = np.column_stack([times, step.means, _deviation(step.covariances)])
+        stages = self._encode[schemas.STAGE](np.hstack([table[:-1], step.inputs])) + self._encode_last(table[-1:])
+        return self._plan(time=step.time, k=step.k, stages=stages, covariances=step.covariances.tobytes())
+
+    def _one(self, name: str, values: Sequence[float]) -> bytes:
+        return self._encode[name](np.array([values]))[0]
 
     def _qp_message(self, step: wire.PackedStep):
         qp = step.qp
@@ -165,17 +167,13 @@ def _deviation(covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0))
 
 
-def _quality(qp: wire.PackedQP | None) -> tuple[int, dict[str, float]]:
+def _quality(qp: wire.PackedQP | None) -> tuple[int, tuple[float, float, float]]:
     """Size of the active set, and the residuals; zero and NaN where there is no solution to judge."""
-    from gpmpc.qp.solution import QPSolution, Terms  # half the time of the writer's start
-
     if qp is None or not len(qp.record):
-        return 0, dict.fromkeys(("primal", "dual", "gap"), np.nan)
+        return 0, (np.nan, np.nan, np.nan)
     x = qp.record[wire.RECORD_HEADER : wire.RECORD_HEADER + len(qp.q)]
     solution = QPSolution(x, Terms(qp.P, qp.G, qp.softness), qp.q, qp.lower, qp.upper, qp.record, 0.0, 0.0)
-    with np.errstate(all="ignore"):  # the multipliers of a failed solve may be anything
-        values = solution.primal_residual(), solution.dual_residual(), solution.duality_gap()
-    return int(np.count_nonzero(solution.active_set)), dict(zip(("primal", "dual", "gap"), values, strict=True))
+    return int(np.count_nonzero(solution.active_set)), solution.residuals()
 
 
 def serve(ring: Ring, file: BinaryIO, hear: Callable[[], int | None], answer: Callable[[str], None]) -> None:

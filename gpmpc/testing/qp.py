@@ -214,9 +214,8 @@ def _check(solution: QPSolution, reference: ReferenceProblem, tolerance: float) 
         given = np.concatenate([solution.z_box, solution.z])
         error = np.abs(given - reference.multipliers).max() / max(1.0, np.abs(reference.multipliers).max())
         _require(error <= tolerance, f"{name}: [z_box; z] is {given}, should be {reference.multipliers}")
-    for residual in ("primal_residual", "dual_residual", "duality_gap"):
-        value = getattr(solution, residual)()
-        _require(value <= tolerance, f"{name}: the {residual.replace('_', ' ')} is {value:.1e}, above {tolerance:.1e}")
+    for kind, value in solution.residuals()._asdict().items():
+        _require(value <= tolerance, f"{name}: the {kind} residual is {value:.1e}, above {tolerance:.1e}")
 
 
 def _require(condition: bool, message: str) -> None:

@@ -47,7 +47,7 @@ def stacked_rows(problem: QuadraticProgram) -> np.ndarray:
 
 def worst_residual(solution) -> float:
     """The largest of the three scaled KKT residuals."""
-    return max(solution.primal_residual(), solution.dual_residual(), solution.duality_gap())
+    return max(solution.residuals())
 
 
 def distance(problem: QuadraticProgram, x: np.ndarray, other: np.ndarray) -> float:

@@ -30,11 +30,11 @@ def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_go
         else:
             solution = limited.solve(problem, solution)
         objectives.append(solution.objective)
-        assert solution.dual_residual() < 1e-9
+        assert solution.residuals().dual < 1e-9
         if solution.status.solved:
             break
         assert solution.status is Status.ITERATION_LIMIT
-        assert solution.primal_residual() > 0.0
+        assert solution.residuals().primal > 0.0
     assert solution.status.solved
     np.testing.assert_allclose(solution.x, full.x, atol=1e-9)
     # a dual method climbs: each stop is a lower bound on the optimum, better than the one before
@@ -56,7 +56,7 @@ def test_the_time_limit_stops_a_long_solve_and_does_not_touch_a_short_one(mode, 
     hurried = solve(DualActiveSet(time_limit=1e-7))
     assert hurried.status is Status.TIME_LIMIT
     assert hurried.iterations < full.iterations
-    assert hurried.dual_residual() < 1e-9
+    assert hurried.residuals().dual < 1e-9
     patient = solve(DualActiveSet(time_limit=60.0))
     assert patient.status is Status.SOLVED
     assert patient.iterations > 2 * hurried.iterations

@@ -36,22 +36,22 @@ def test_residuals_see_a_point_that_is_moved_and_multipliers_that_are_changed(so
     working = np.flatnonzero(solution.multipliers)[0]
     changed = solution.multipliers.copy()
     changed[working] += sign * 1e-2
-    assert make_solution(problem, Status.SOLVED, solution.x, changed).dual_residual() > 1e-5
+    assert make_solution(problem, Status.SOLVED, solution.x, changed).residuals().dual > 1e-5
 
 
 def test_a_feasible_stationary_point_with_a_multiplier_of_the_wrong_sign_is_not_optimal():
     # min 1/2 x^2 on -1 <= x <= 1: at x = 1 the multiplier -1 is stationary, but says "at the lower bound".
     problem = QuadraticProgram([[1.0]], [0.0], lb=[-1.0], ub=[1.0])
     claim = make_solution(problem, Status.SOLVED, [1.0], [-1.0])
-    assert claim.dual_residual() == 0.0
-    assert claim.primal_residual() == 0.0
-    assert claim.duality_gap() > 0.1
+    assert claim.residuals().dual == 0.0
+    assert claim.residuals().primal == 0.0
+    assert claim.residuals().gap > 0.1
     assert not claim.is_optimal()
 
 
 def test_a_multiplier_of_an_absent_bound_is_a_dual_residual():
     problem = QuadraticProgram([[1.0]], [1.0], ub=[5.0])
-    assert make_solution(problem, Status.SOLVED, [0.0], [-1.0]).dual_residual() == 1.0
+    assert make_solution(problem, Status.SOLVED, [0.0], [-1.0]).residuals().dual == 1.0
 
 
 def test_parts_of_the_wrong_shape_are_refused(solved):

@@ -67,7 +67,7 @@ def test_the_quality_of_every_solution_is_recorded(recorded):
     run = read_run(path)
     for k, step in enumerate(steps):
         solution = step.decision.solution
-        residuals = solution.primal_residual(), solution.dual_residual(), solution.duality_gap()
+        residuals = solution.residuals()
         np.testing.assert_allclose(run.residuals[k], residuals, atol=1e-15)
         assert run.active_set_sizes[k] == np.count_nonzero(solution.active_set)
 
