@@ -18,7 +18,7 @@ from gpmpc.control.request import Request
 from gpmpc.control.stage_models import StageModel, stage_model
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching
+from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from gpmpc.propagation.composition import Composition
 
 Array = np.ndarray
@@ -27,7 +27,8 @@ BELIEF = ("means", "covariances")  # of a decision
 # What the torch expressions hold at a time for one belief, at most, counted at their peak and rounded up:
 SQUARES = 7  # N x N matrices, in exact moments
 PAIRED = 4  # arrays (pairs of outputs, N, n + 1), in exact moments
-ROWS = 3  # arrays (outputs, N, n + m + 1)
+ROWS = 3  # arrays (outputs, N, n + m + 1), at every point where the model is asked
+MOVES = 4  # arrays (points, outputs, n + n^2 + m), in the unscented transform
 
 
 def predict_many(
@@ -126,13 +127,15 @@ def bytes_per_request(predictor: Predictor) -> int | None:
         return 8 * numbers
     composition, propagator = Composition.of(predictor.model), predictor.propagator
     exact = mode != "none" and isinstance(propagator, MomentMatching)
-    at_points = isinstance(propagator, Linearization | MeanEquivalence) and not getattr(propagator, "hessian", False)
+    at_points = isinstance(propagator, Linearization | MeanEquivalence | Unscented)
+    at_points = at_points and not getattr(propagator, "hessian", False)
     closed_form = mode == "none" or exact or (at_points and isinstance(predictor.model, GPPosterior))
     if composition is None or not closed_form:
         return None
     f = composition.f
     N, k, d = len(f), f.output_dim, f.state_dim + f.input_dim
-    numbers += ROWS * k * N * (d + 1)
+    points = 2 * n + 1 if mode != "none" and isinstance(propagator, Unscented) else 1
+    numbers += points * k * (ROWS * N * (d + 1) + MOVES * (points > 1) * (n + n * n + m))
     if exact:
         pairs = k if propagator.diagonal else k * (k + 1) // 2
         numbers += SQUARES * N * N + PAIRED * pairs * N * (f.state_dim + 1)

@@ -29,6 +29,7 @@ MODES = [
     ("diagonal", MomentMatching(diagonal=True)),
     ("full", Linearization()),
     ("full", MomentMatching()),
+    ("full", Unscented()),
 ]
 FORMS = ["increment", "deviation", "trajectory"]
 
@@ -174,6 +175,5 @@ def test_no_question_takes_more_memory_than_it_is_said_to(covariance, propagator
 
 
 def test_what_is_differentiated_by_autograd_takes_an_unknown_amount():
-    for propagator in (Unscented(), Linearization(hessian=True)):
-        assert controller("trajectory", "full", propagator).bytes_per_question is None
+    assert controller("trajectory", "full", Linearization(hessian=True)).bytes_per_question is None
     assert controller("trajectory", "none", Linearization(), linear_gaussian(6, 3)).bytes_per_question is None

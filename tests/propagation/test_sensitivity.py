@@ -37,6 +37,8 @@ PROPAGATORS = [
     MomentMatching(),
     MomentMatching(diagonal=True),
     MomentMatching(observation_noise=True),
+    Unscented(),
+    Unscented(alpha=0.5, beta=2.0, kappa=1.0, observation_noise=True),
 ]
 
 
@@ -66,7 +68,7 @@ def test_closed_forms_are_autograds_derivatives(propagator, name, batch, choice)
         )
 
 
-@pytest.mark.parametrize("propagator", [MeanEquivalence(), Linearization(), MomentMatching()], ids=str)
+@pytest.mark.parametrize("propagator", [MeanEquivalence(), Linearization(), MomentMatching(), Unscented()], ids=str)
 def test_closed_forms_by_torch_can_be_differentiated_again(propagator):
     gp, at, control = MODELS["difference"], belief(3), torch.zeros(2)
     step = torch.tensor([1e-5, 0.0, 0.0])
@@ -78,6 +80,16 @@ def test_closed_forms_by_torch_can_be_differentiated_again(propagator):
     (curvature,) = torch.autograd.grad(slope(mean), mean)
     numeric = (slope(at.mean + step) - slope(at.mean - step)) / 2e-5
     assert torch.allclose(curvature[0], numeric, rtol=1e-6, atol=1e-7)
+
+
+def test_a_root_without_derivative_counts_as_constant_in_closed_form_too():
+    gp, flat = MODELS["difference"], draw(3, 1)
+    for covariance in (torch.zeros(3, 3), flat @ flat.T):
+        at = Gaussian(draw(3), covariance)
+        _, closed_form = differentiate(Unscented(), gp, at, torch.zeros(2))
+        _, automatic = by_autograd(Unscented(), gp, at, torch.zeros(2))
+        for part, value in vars(automatic).items():
+            assert torch.allclose(getattr(closed_form, part), value, atol=1e-8)
 
 
 def test_nobody_has_derivatives_too():

@@ -11,7 +11,7 @@ from gpmpc.exceptions import Diverged, SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import evaluation
 from gpmpc.plants import Coupled, Integrated, Map, Rotational, Translational, step, step_many
-from gpmpc.propagation import Linearization, MomentMatching, Unscented
+from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
 from gpmpc.simulation.batched_loop import chunk_size
 from gpmpc.status import Status
@@ -210,7 +210,7 @@ def test_misuse_is_refused_before_the_first_step(settings, error, message):
 
 
 def test_what_takes_an_unknown_amount_of_memory_needs_a_chunk():
-    asked = controller("full", Unscented())
+    asked = controller("full", Linearization(hessian=True))
     with pytest.raises(SettingError, match="chunk: the memory that this model takes is not known: say how many"):
         fly(asked)
     assert len(fly(asked, 2, chunk=2)) == 2
