@@ -50,6 +50,8 @@ def report(arguments: list[str]) -> None:
     for cell in found.cells:
         for run in cell.failed.values():
             say(f"failed: {run.folder.name}: {run.error}")
+    for line in found.skipped:
+        say(f"skipped: {line}")
     for command in found.commands():
         say(f"to fill: {command}")
     say(f"written to {folder}: {', '.join(sorted(written))}")

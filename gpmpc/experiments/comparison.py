@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.experiments.report import MEASURES, SEED, Cell, Report
+from gpmpc.experiments.report import MEASURES, Cell, Report
 
 LEVEL = 0.05
 FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
@@ -153,12 +153,12 @@ def _tested(measure: str, pairs: np.ndarray) -> Comparison:
 
 def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str) -> list[str]:
     """A line a measure, with everything that a reader needs to doubt it."""
-    lines = [f"A: {a}; B: {b}; pairs are seeds ({SEED}), what else was varied is averaged within a seed."]
+    lines = [f"A: {a}; B: {b}; pairs are seeds, what else was varied is averaged within a seed."]
     for c in comparisons:
         low, high = c.interval
         tests = (
             ""
-            if c.copies
+            if low == high
             else (
                 f" (95 %: {low:.3g} to {high:.3g}); Wilcoxon signed-rank p = {c.wilcoxon:.3g}, paired t-test p = "
                 f"{c.t_test:.3g}; rank-biserial {c.rank_biserial:.2f}, d_z {c.standardised:.2f}"

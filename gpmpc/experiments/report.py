@@ -96,12 +96,14 @@ class Report:
         variables: Settings that were varied, without the seed.
         constants: What was asked for of all runs alike.
         cells: In the order of their values.
+        skipped: What could not be read of it, with the reason, one line each.
     """
 
     tree: Path
     variables: tuple[str, ...]
     constants: Mapping[str, str]
     cells: tuple[Cell, ...]
+    skipped: tuple[str, ...] = ()
 
     def measures(self) -> list[str]:
         """Those of which any run has a number."""
@@ -125,25 +127,25 @@ class Report:
         return commands
 
 
-def read_runs(tree: str | Path) -> list[RunRecord]:
-    """Every run below a folder, finished or failed.
+def read_runs(tree: str | Path) -> tuple[list[RunRecord], tuple[str, ...]]:
+    """Every run below a folder, finished or failed, and what could not be read, with the reason.
 
     Raises:
-        DataError: There is no such folder, no run in it, or a file that is no run's.
+        DataError: There is no such folder, or no run in it that can be read.
     """
     tree = Path(tree)
     if not tree.is_dir():
         raise DataError(f"{tree}: no such folder")
-    found = []
-    for path in sorted(tree.rglob(METRICS)):
-        found.append(_read(path, METRICS))
-    finished = {run.folder for run in found}
-    for path in sorted(tree.rglob(ERROR)):
-        if path.parent not in finished:
-            found.append(_read(path, ERROR))
+    results = {path.parent: path for name in (ERROR, METRICS) for path in sorted(tree.rglob(name))}
+    found, skipped = [], []
+    for path in results.values():
+        try:
+            found.append(_read(path))
+        except DataError as error:
+            skipped.append(str(error))
     if not found:
-        raise DataError(f"{tree}: holds no run, finished or failed")
-    return found
+        raise DataError(skipped[0] if skipped else f"{tree}: holds no run, finished or failed")
+    return found, tuple(skipped)
 
 
 def report(tree: str | Path) -> Report:
@@ -152,7 +154,8 @@ def report(tree: str | Path) -> Report:
     Raises:
         DataError: As ``read_runs``.
     """
-    tree, runs = Path(tree), read_runs(tree)
+    tree = Path(tree)
+    runs, skipped = read_runs(tree)
     asked = _planned(tree)
     chosen = [*(run.choices for run in runs), *asked]
     keys = list(dict.fromkeys([*(key for choices in chosen for key in choices), SEED]))
@@ -186,6 +189,7 @@ def report(tree: str | Path) -> Report:
         tuple(
             Cell(key, *map(_by_seed, cells[key]), tuple(sorted(missing.get(key, []), key=in_order))) for key in in_rows
         ),
+        skipped,
     )
 
 
@@ -201,15 +205,19 @@ def _by_seed(runs: Mapping[str, RunRecord]) -> dict[str, RunRecord]:
     return {seed: runs[seed] for seed in sorted(runs, key=in_order)}
 
 
-def _read(path: Path, name: str) -> RunRecord:
+def _read(path: Path) -> RunRecord:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         choices = {key: value for key, _, value in (choice.partition("=") for choice in content["choices"])}
         settings, result = content["settings"], None
-        if name == METRICS:  # what the measures need
+        if path.name == METRICS:  # what the measures need
             result = {key: content[key] for key in ("steps", "rmse", "unit", "violations", "failures", "times")}
+            for measure in MEASURES.values():
+                measure.of(result)
         error = None if result else content["error"]
-    except (OSError, ValueError, KeyError, TypeError) as reason:
+    except KeyError as reason:
+        raise DataError(f"{path}: is not what a run writes: it lacks {reason}; of an older version?") from reason
+    except (OSError, ValueError, TypeError, AttributeError) as reason:
         raise DataError(f"{path}: is not what a run writes: {type(reason).__name__}: {reason}") from reason
     return RunRecord(path.parent, choices, settings, result, error)
 

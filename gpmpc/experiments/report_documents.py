@@ -5,6 +5,7 @@ import csv
 import io
 from collections.abc import Sequence
 from html import escape
+from itertools import zip_longest
 from statistics import mean, quantiles
 from typing import NamedTuple
 
@@ -15,17 +16,23 @@ from gpmpc.experiments.report import MEASURES, Cell, Report, in_order
 from gpmpc.experiments.tables_report import number
 from gpmpc.plotting import Series, over_variable, png
 
-DRAWN = ("rmse", "failed", "decision")  # the panels of a figure
+DRAWN = ("rmse", "failed", "decision")  # a figure each
 SHOWN = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
 MOST_LINES = 8  # in a figure; what is varied besides is pooled
 LATEX = str.maketrans({c: f"\\{c}" for c in "&%$#_{}"} | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"})
 STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; }
+:root { color-scheme: light; }
+body { font: 15px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-width: 75rem; margin: 2rem auto;
+  padding: 0 1rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .25rem .8rem; text-align: right; border-bottom: 1px solid #e4e4e4; white-space: nowrap; }
-th { border-bottom: 2px solid #1f4e79; } td:first-child, th:first-child { text-align: left; }
-img { max-width: 100%; } code, pre { background: #f5f5f5; padding: .1rem .3rem; overflow-x: auto; }
-pre { padding: .6rem; } .wide { overflow-x: auto; } .bad { color: #b03a2e; }
+th, td { padding: .3rem .7rem; text-align: right; vertical-align: top; border-bottom: 1px solid #e4e4e4; }
+th { border-bottom: 2px solid #1f4e79; vertical-align: bottom; } td:first-child, th:first-child { text-align: left; }
+td, td small { white-space: nowrap; } td small { display: block; color: #666; }
+.wide { overflow-x: auto; margin: 1rem 0; }
+.figures { display: flex; flex-wrap: wrap; gap: 1rem; } .figures img { width: 32rem; max-width: 100%; height: auto; }
+code, pre { background: #f5f5f5; padding: .1rem .3rem; overflow-wrap: anywhere; white-space: pre-wrap; }
+pre { padding: .6rem; } .bad { color: #b03a2e; } li { overflow-wrap: anywhere; }
+@media (max-width: 40rem) { th, td { padding: .3rem .4rem; } ul { padding-left: 1.2rem; } }
 """
 
 
@@ -60,9 +67,10 @@ def documents(report: Report, comparison: Sequence[str] = ()) -> dict[str, str |
 
 
 def title(report: Report) -> str:
-    """What was varied, and how much there is of it."""
+    """How much there is of it."""
     finished, failed, missing = (sum(map(len, group)) for group in zip(*map(_counts, report.cells), strict=True))
-    return f"{finished} finished in {len(report.cells)} cells, {failed} failed, {missing} missing"
+    text = f"{finished} finished in {len(report.cells)} cells, {failed} failed, {missing} missing"
+    return f"{text}, {len(report.skipped)} skipped" if report.skipped else text
 
 
 def render(report: Report) -> Table:
@@ -72,8 +80,7 @@ def render(report: Report) -> Table:
     for name in (*(report.variables or ("runs",)), "seeds"):
         table.add_column(name.replace(".", ".\n"), justify="right", no_wrap=True)
     for name in shown:
-        unit = report.label(name).rpartition(" [")[2]
-        table.add_column(f"{SHOWN[name]}\n\\[{unit}", justify="right", no_wrap=True)
+        table.add_column(f"{SHOWN[name]}\n\\[{_unit(report, name)}]", justify="right", no_wrap=True)
     for cell in report.cells:
         texts = [_text(cell, name, "\n").replace("[", "\\[") for name in shown]
         table.add_row(*_named(report, cell), _seeds(cell, "\n"), *texts)
@@ -82,15 +89,17 @@ def render(report: Report) -> Table:
 
 def markdown(report: Report, drawn: Sequence[str] = (), comparison: Sequence[str] = ()) -> str:
     """The table as Markdown, with what failed, what is missing and how to get it."""
-    rows = [_header(report), ["---"] * len(_header(report)), *_rows(report)]
+    rows = [_header(report), ["---"] * len(_header(report)), *_rows(report, report.measures())]
     out = [f"# {report.tree.name}", "", f"{title(report)}.{_constants(report)}", ""]
-    out += ["| " + " | ".join(row) + " |" for row in rows]
+    out += ["| " + " | ".join(text.replace("|", "\\|") for text in row) + " |" for row in rows]
     out += ["", "Mean [first to third quartile] over the seeds.", ""]
     out += [line for name in drawn for line in (f"![{name}]({name})", "")]
     if comparison:
         out += ["## Comparison", "", *(f"- {line}" for line in comparison), ""]
     if any(cell.failed for cell in report.cells):
         out += ["## Failed", "", *(f"- `{folder}`: {error}" for folder, error in _failures(report)), ""]
+    if report.skipped:
+        out += ["## Skipped", "", *(f"- {line}" for line in report.skipped), ""]
     if report.commands():
         out += ["## To fill the gaps", "", "```", *report.commands(), "```", ""]
     return "\n".join(out)
@@ -100,7 +109,8 @@ def comma_separated(report: Report) -> str:
     """One line a cell."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    measured = [f"{name}_{part}" for name in report.measures() for part in ("mean", "q25", "median", "q75")]
+    parts = ("mean", "q25", "median", "q75")
+    measured = [f"{name}_{part} [{_unit(report, name)}]" for name in report.measures() for part in parts]
     writer.writerow([*report.variables, "finished", "failed", "missing", *measured])
     for cell in report.cells:
         numbers = [value for name in report.measures() for value in spread(cell.numbers(name)) or [""] * 4]
@@ -109,25 +119,34 @@ def comma_separated(report: Report) -> str:
 
 
 def latex(report: Report) -> str:
-    """The table as LaTeX with the rules of the booktabs package."""
-    header = [text.translate(LATEX) for text in _header(report)]
-    out = ["% needs \\usepackage{booktabs}", f"\\begin{{tabular}}{{{'r' * len(header)}}}", "\\toprule"]
-    out += [" & ".join(header) + " \\\\", "\\midrule"]
-    out += [" & ".join(text.translate(LATEX).replace("—", "--") for text in row) + " \\\\" for row in _rows(report)]
-    return "\n".join([*out, "\\bottomrule", "\\end{tabular}", "% mean [first to third quartile] over the seeds", ""])
+    """The table as LaTeX with the rules of the booktabs package; what is zero everywhere is left out."""
+    shown = _telling(report)
+    names = [*(report.variables or ("runs",)), "seeds", *(report.label(name) for name in shown)]
+    names = [name.replace(", ", "\n").replace(" [", "\n[") for name in names]
+    out = ["% needs \\usepackage{booktabs}; mean, and below it the quartiles over the seeds"]
+    out += [f"\\begin{{tabular}}{{{'r' * len(names)}}}", "\\toprule", *_latex_lines(names), "\\midrule"]
+    for row in _rows(report, shown, "\n"):
+        out += _latex_lines(row)
+    return "\n".join([*out, "\\bottomrule", "\\end{tabular}", ""])
+
+
+def _latex_lines(row: Sequence[str]) -> list[str]:
+    """A row whose cells may have several lines."""
+    out = []
+    for i, texts in enumerate(zip_longest(*(text.split("\n") for text in row), fillvalue="")):
+        marked = [text.translate(LATEX).replace("—", "--") for text in texts]
+        line = " & ".join(f"\\footnotesize {text}" if i and text else text for text in marked)
+        out.append(("{}" if line.startswith("[") else "") + line + " \\\\")  # the line before would take a bracket
+    return out
 
 
 def figures(report: Report) -> dict[str, bytes]:
-    """One figure (PNG) a varied setting, by file name."""
+    """One figure (PNG) a varied setting and measure, by file name."""
     drawn = {}
     measures = [name for name in DRAWN if name in _telling(report)]
-    if not measures or not report.variables:
-        return drawn
-    for variable in report.variables:
-        index = report.variables.index(variable)
+    for index, variable in enumerate(report.variables):
         positions = sorted({cell.values[index] for cell in report.cells}, key=in_order)
         lines = _lines(report, index)
-        panels = []
         for name in measures:
             series = []
             for label, cells in lines.items():
@@ -135,32 +154,45 @@ def figures(report: Report) -> dict[str, bytes]:
                 for cell in cells:
                     values[cell.values[index]] += cell.numbers(name)
                 series.append(Series(label, list(values.values())))
-            panels.append((report.label(name), MEASURES[name].logarithmic, series))
-        drawn[f"over-{variable.replace('/', '-')}.png"] = png(over_variable(variable, positions, panels), dpi=130)
+            figure = over_variable(variable, positions, report.label(name), series, MEASURES[name].logarithmic)
+            drawn[f"{name}-over-{variable.replace('/', '-')}.png"] = png(figure, dpi=150)
     return drawn
 
 
 def page(report: Report, drawn: dict[str, bytes], comparison: Sequence[str] = ()) -> str:
     """One HTML file with its figures inside, which opens without a server."""
     row = "".join(f"<th>{escape(name)}</th>" for name in _header(report))
-    body = "\n".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in _rows(report))
-    parts = [f"<h1>{escape(report.tree.name)}</h1>", f"<p>{escape(title(report))}.{escape(_constants(report))}</p>"]
-    parts += [
-        f'<p><img alt="{escape(name)}" src="data:image/png;base64,{base64.b64encode(png).decode()}"></p>'
+    rows = _rows(report, report.measures(), "\n")
+    body = "\n".join("<tr>" + "".join(f"<td>{_html(text)}</td>" for text in row) + "</tr>" for row in rows)
+    images = [
+        f'<img alt="{escape(name.removesuffix(".png"))}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
         for name, png in drawn.items()
     ]
+    parts = [f"<h1>{escape(report.tree.name)}</h1>", f"<p>{escape(title(report))}.{escape(_constants(report))}</p>"]
+    parts.append(f'<div class="figures">{"".join(images)}</div>')
     parts.append(f'<div class="wide"><table><thead><tr>{row}</tr></thead><tbody>\n{body}\n</tbody></table></div>')
     parts.append("<p>Mean [first to third quartile] over the seeds. Figures: medians, quartiles, all runs.</p>")
     if comparison:
-        parts += ["<h2>Comparison</h2>", *(f"<p>{escape(line)}</p>" for line in comparison)]
+        lines = "".join(f"<li>{escape(line)}</li>" for line in comparison)
+        parts += ["<h2>Comparison</h2>", f"<ul>{lines}</ul>"]
     if failures := _failures(report):
         items = "".join(f"<li><code>{escape(f)}</code> <span class=bad>{escape(e)}</span></li>" for f, e in failures)
         parts += ["<h2>Failed</h2>", f"<ul>{items}</ul>"]
+    if report.skipped:
+        items = "".join(f"<li>{escape(line)}</li>" for line in report.skipped)
+        parts += ["<h2>Skipped</h2>", f"<ul>{items}</ul>"]
     if report.commands():
         commands = escape("\n".join(report.commands()))
         parts += ["<h2>To fill the gaps</h2>", f"<pre>{commands}</pre>"]
-    head = f'<meta charset="utf-8"><title>{escape(report.tree.name)}</title><style>{STYLE}</style>'
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    head += f"<title>{escape(report.tree.name)}</title><style>{STYLE}</style>"
     return f"<!doctype html>\n<html lang=en><head>{head}</head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
+
+
+def _html(text: str) -> str:
+    """A cell of the table; what stands below its first line is small."""
+    first, *below = map(escape, text.split("\n"))
+    return first + "".join(f"<small>{line}</small>" for line in below)
 
 
 def _telling(report: Report) -> list[str]:
@@ -184,13 +216,20 @@ def _lines(report: Report, index: int) -> dict[str, list[Cell]]:
     }
 
 
+def _unit(report: Report, measure: str) -> str:
+    return report.label(measure).rpartition(" [")[2].removesuffix("]")
+
+
 def _header(report: Report) -> list[str]:
     return [*(report.variables or ("runs",)), "seeds", *(report.label(name) for name in report.measures())]
 
 
-def _rows(report: Report) -> list[list[str]]:
-    measures = report.measures()
-    return [[*_named(report, cell), _seeds(cell), *(_text(cell, name) for name in measures)] for cell in report.cells]
+def _rows(report: Report, measures: Sequence[str], *separator: str) -> list[list[str]]:
+    """The cells' texts, with ``separator`` between the lines of one."""
+    return [
+        [*_named(report, cell), _seeds(cell, *separator), *(_text(cell, name, *separator) for name in measures)]
+        for cell in report.cells
+    ]
 
 
 def _named(report: Report, cell: Cell) -> Sequence[str]:

@@ -25,54 +25,53 @@ class Series:
 
 
 def over_variable(
-    title: str, positions: Sequence[str], measures: Sequence[tuple[str, bool, Sequence[Series]]]
+    title: str, positions: Sequence[str], label: str, lines: Sequence[Series], logarithmic: bool = False
 ) -> Figure:
-    """Median and quartiles of measures over the values of a variable, every run a dot.
+    """Median and quartiles of a measure over the values of a variable, every run a dot.
 
     Args:
         title: Name of the variable.
         positions: Its values, as text.
-        measures: Label, whether the axis is logarithmic, and the lines of every panel.
+        label: Of the measure, with its unit.
+        lines: What else was varied, a line each; those without a number are left out.
+        logarithmic: Whether the axis is, where the values span enough for it.
     """
-    series = measures[0][2]
-    figure = Figure(figsize=(3.6 * len(measures) + 0.4, 3.4), layout="constrained")
-    axes = figure.subplots(1, len(measures), squeeze=False)[0]
-    for axis, (label, logarithmic, lines) in zip(axes, measures, strict=True):
-        _panel(axis, lines, len(positions))
-        axis.set_title(label, fontsize="medium")
-        axis.set_xlabel(title)
-        axis.set_xticks(range(len(positions)), list(positions))
-        if max(map(len, positions)) * len(positions) > 40:
-            axis.tick_params(axis="x", labelrotation=30)
-        values = [v for line in lines for group in line.values for v in group]
-        if logarithmic and values and min(values) > 0 and max(values) > 3 * min(values):
-            axis.set_yscale("log")
-            if max(values) < 30 * min(values):  # hardly a decade: its name alone says little
-                axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            axis.yaxis.set_minor_formatter(NullFormatter())
-        elif not values or max(values) <= 0:
-            axis.set_ylim(0, 1)
-        elif min(values) >= 0:
-            axis.set_ylim(bottom=0)
-        axis.grid(axis="y", color="0.9")
-        axis.set_axisbelow(True)
-        axis.spines[["top", "right"]].set_visible(False)
-    if len(series) > 1:
-        handles, labels = axes[0].get_legend_handles_labels()
-        columns = max(1, int(110 / (max(map(len, labels)) + 6)))
+    figure = Figure(figsize=(4.4, 3.6), layout="constrained")
+    axis = figure.subplots()
+    _draw(axis, lines, len(positions))
+    axis.set_title(label, fontsize="medium")
+    axis.set_xlabel(title)
+    axis.set_xticks(range(len(positions)), list(positions))
+    if max(map(len, positions)) * len(positions) > 40:
+        axis.tick_params(axis="x", labelrotation=30)
+    values = [v for line in lines for group in line.values for v in group]
+    if logarithmic and values and min(values) > 0 and max(values) > 3 * min(values):
+        axis.set_yscale("log")
+        if max(values) < 30 * min(values):  # hardly a decade: its name alone says little
+            axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.yaxis.set_minor_formatter(NullFormatter())
+    elif not values or max(values) <= 0:
+        axis.set_ylim(0, 1)
+    elif min(values) >= 0:
+        axis.set_ylim(bottom=0)
+    axis.grid(axis="y", color="0.9")
+    axis.set_axisbelow(True)
+    axis.spines[["top", "right"]].set_visible(False)
+    handles, labels = axis.get_legend_handles_labels()
+    if len(labels) > 1:
+        columns = max(1, int(60 / (max(map(len, labels)) + 6)))
         figure.legend(handles, labels, loc="outside lower center", ncols=min(columns, len(labels)), frameon=False)
     return figure
 
 
-def _panel(axis: Axes, lines: Sequence[Series], count: int) -> None:
+def _draw(axis: Axes, lines: Sequence[Series], count: int) -> None:
     width = min(0.14, 0.7 / max(len(lines), 1))
     for i, line in enumerate(lines):
         colour = COLOURS[i % len(COLOURS)]
         offset = (i - (len(lines) - 1) / 2) * width  # lines side by side: their quartiles do not hide each other
         known = [(p + offset, np.quantile(group, [0.25, 0.5, 0.75])) for p, group in enumerate(line.values) if group]
-        if not known:
-            axis.plot([], [], color=colour, marker="o", markersize=4, label=line.label)
+        if not known:  # a line of failed runs alone
             continue
         places, quartiles = np.array([p for p, _ in known]), np.array([q for _, q in known])
         low, middle, high = quartiles.T
@@ -81,5 +80,5 @@ def _panel(axis: Axes, lines: Sequence[Series], count: int) -> None:
         )
         for p, group in enumerate(line.values):
             aside = [0.25 * width * ((7 * j) % 11 / 5 - 1) for j in range(len(group))]
-            axis.plot([p + offset + a for a in aside], group, ".", color=colour, alpha=0.3, markersize=3)
+            axis.plot([p + offset + a for a in aside], group, ".", color=colour, alpha=0.45, markersize=5, mew=0)
     axis.set_xlim(-0.5, count - 0.5)

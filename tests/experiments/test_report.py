@@ -81,18 +81,45 @@ def test_every_document_holds_the_same_numbers_and_the_page_stands_alone(tree):
     written = documents(found)
     rows = list(csv.DictReader(io.StringIO(written["report.csv"])))
     expected = spread(found.cells[0].numbers("rmse"))
-    assert float(rows[0]["rmse_mean"]) == expected.mean
-    assert float(rows[0]["rmse_q25"]) == np.quantile(found.cells[0].numbers("rmse"), 0.25)
+    assert float(rows[0]["rmse_mean [m]"]) == expected.mean
+    assert float(rows[0]["rmse_q25 [m]"]) == np.quantile(found.cells[0].numbers("rmse"), 0.25)
     assert (rows[1]["failed"], rows[1]["missing"]) == ("1", "1")
-    for name in ("report.md", "report.html"):
-        for text in (f"{expected.mean:.3g}", "no start led anywhere", "6, 1 failed, 1 missing", "gpmpc run -m"):
+    for name, seeds in (("report.md", "6, 1 failed, 1 missing"), ("report.html", "6<small>1 failed</small>")):
+        for text in (f"{expected.mean:.3g}", "no start led anywhere", seeds, "gpmpc run -m"):
             assert text in written[name]
     assert f"{expected.mean:.3g}" in written["report.tex"]
-    assert written["over-controller.png"].startswith(b"\x89PNG")
+    assert written["rmse-over-controller.png"].startswith(b"\x89PNG")
     html = written["report.html"]
     assert "data:image/png;base64," in html
     assert not [mark for mark in ("http:", "https:", "<script", "<link") if mark in html]
     assert render(found).row_count == 2
+
+
+def test_a_run_that_cannot_be_read_is_named_and_the_others_are_reported(tree):
+    old = tree / folder_name(chosen("convex", 0)[0]) / METRICS
+    content = json.loads(old.read_text())
+    del content["unit"]  # as an older version left it
+    old.write_text(json.dumps(content))
+    broken = tree / folder_name(chosen("lqr", 0)[0]) / METRICS
+    broken.write_text('{"choices": ')
+    found = report(tree)
+    assert [len(cell.runs) for cell in found.cells] == [7, 5]
+    assert len(found.skipped) == 2
+    for path, reason in ((old, "it lacks 'unit'"), (broken, "JSONDecodeError")):
+        assert any(line.startswith(f"{path}: is not what a run writes") and reason in line for line in found.skipped)
+    written = documents(found)
+    for name in ("report.md", "report.html"):
+        assert "2 skipped" in written[name]
+        assert str(old) in written[name]
+
+
+def test_a_line_of_the_latex_table_never_begins_with_a_bracket(tmp_path):
+    for steps in ("[1,2]", "[1]"):
+        choices, settings = chosen("lqr", 0, steps=steps)
+        made_up_run(tmp_path, choices, settings, result=metrics_of(0.1))
+    lines = documents(report(tmp_path))["report.tex"].splitlines()
+    assert any(line.startswith("{}[1,2] &") for line in lines)
+    assert not any(line.lstrip().startswith("[") for line in lines)
 
 
 def test_what_a_run_says_is_text_in_the_page(tree):
