@@ -1,4 +1,4 @@
-"""``gpmpc log``: what is in a recording, rescue an unfinished one, export its steps as a table."""
+"""``gpmpc log``: what is in a recording, rescue an unfinished one, its steps as a table, a layout to look at it."""
 
 import argparse
 import csv
@@ -22,16 +22,20 @@ def log(arguments: list[str]) -> None:
         GpmpcError: A mistake in the arguments, or a file that cannot be read or written.
     """
     parser = Parser(prog="gpmpc log", description=__doc__)
-    commands = parser.add_subparsers(dest="command", required=True, metavar="info|recover|export")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="info|recover|export|layout")
     info_parser = commands.add_parser("info", help="channels, duration, metadata and how the solves ended")
     recover_parser = commands.add_parser("recover", help="write what is whole in an unfinished file to a new one")
     export_parser = commands.add_parser("export", help="write the steps as a table, one row each")
-    for each in (info_parser, recover_parser, export_parser):
+    layout_parser = commands.add_parser(
+        "layout", help="write a layout for Foxglove or Lichtblick that fits the recording"
+    )
+    for each in (info_parser, recover_parser, export_parser, layout_parser):
         each.add_argument("file", type=Path, help="an MCAP file, finished or not")
     recover_parser.add_argument("output", type=Path, nargs="?", help="default: FILE with .recovered.mcap")
     export_parser.add_argument("output", type=Path, nargs="?", help="ends in .csv or .parquet; default: FILE with .csv")
+    layout_parser.add_argument("output", type=Path, nargs="?", help="ends in .json; default: FILE with .layout.json")
     given = parser.parse_args(arguments)
-    {"info": _info, "recover": _recover, "export": _export}[given.command](given)
+    {"info": _info, "recover": _recover, "export": _export, "layout": _layout}[given.command](given)
 
 
 def _info(given: argparse.Namespace) -> None:
@@ -91,19 +95,33 @@ def _recover(given: argparse.Namespace) -> None:
 
 
 def _export(given: argparse.Namespace) -> None:
-    from gpmpc.files import write_whole
     from gpmpc.recording import read_run
 
     output: Path = given.output or given.file.with_suffix(".csv")
     if output.suffix not in FORMATS:
         raise SettingError("output", f"must end in {' or '.join(FORMATS)}; got {output.name!r}")
     run = read_run(given.file)
-    content = _csv(run) if output.suffix == ".csv" else _parquet(run)
+    _write(output, _csv(run) if output.suffix == ".csv" else _parquet(run))
+    print(f"written to {output}: {len(run.times)} rows, {len(run.columns)} columns")
+
+
+def _layout(given: argparse.Namespace) -> None:
+    from gpmpc.recording import layout, read_run
+
+    output: Path = given.output or given.file.with_suffix(".layout.json")
+    if output.suffix != ".json":
+        raise SettingError("output", f"must end in .json; got {output.name!r}")
+    _write(output, layout(read_run(given.file)))
+    print(f"written to {output}: open {given.file} in Foxglove or Lichtblick, then import it as a layout")
+
+
+def _write(output: Path, content: str | bytes) -> None:
+    from gpmpc.files import write_whole
+
     try:
         write_whole(output, content)
     except OSError as error:
         raise SettingError("output", f"cannot write to {output}: {error.strerror}") from error
-    print(f"written to {output}: {len(run.times)} rows, {len(run.columns)} columns")
 
 
 def _csv(run: "Run") -> str:

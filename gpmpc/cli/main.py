@@ -36,7 +36,7 @@ USAGE = f"""gpmpc {gpmpc.__version__}: Gaussian process model predictive control
 usage: gpmpc COMMAND [SETTING=VALUE ...]
        gpmpc report OUTPUTS [--compare A B] [--to DIR]
        gpmpc plot RUN [--to DIR] [--format png|pdf|svg] [--no-animation]
-       gpmpc log info|recover|export FILE [OUTPUT]
+       gpmpc log info|recover|export|layout FILE [OUTPUT]
 
 commands:
   run       One flight: trains a model, flies with it, records; with -m a sweep of many, resumed where it stopped
@@ -45,7 +45,8 @@ commands:
   plot      A recorded flight as figures and an animation
   figures   Figures 2 to 4 and section 5.2: the flights, in the paper's reading and with the plant in the loop
   bench     What everything costs on this machine, beside others; two measurements as ratios
-  log       What is in a recording (info), rescue an unfinished one (recover), a table of its steps (export)
+  log       What is in a recording (info), rescue an unfinished one (recover), a table of its steps (export),
+            a layout to look at it in Foxglove (layout)
 
 gpmpc COMMAND --help lists a command's settings, --cfg job prints them resolved.
 """

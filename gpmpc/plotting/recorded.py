@@ -79,7 +79,8 @@ def inputs_figure(run: "Run") -> Figure:
     axes = figure.subplots(m, 1, squeeze=False, sharex=True)[:, 0]
     for i, axis in enumerate(axes):
         unit = units.get(f"input.{run.input_names[i]}", "")
-        axis.step(run.times, run.inputs[:, i], where="post", color=FLOWN, linewidth=1.4, label="applied")
+        held = np.append(run.inputs[:, i], run.inputs[-1:, i])  # the last one until its step ends
+        axis.step(_edges(run), held, where="post", color=FLOWN, linewidth=1.4, label="applied")
         _bounds(axis, run.inputs[:, i], run.input_bounds[:, i])
         axis.set_ylabel(f"{run.input_names[i]} [{unit}]" if unit not in ("", "1") else run.input_names[i])
         _failures(run, (axis,))
@@ -95,34 +96,32 @@ def timing_figure(run: "Run") -> Figure:
     milliseconds = 1e3 * run.timings
     figure = Figure(figsize=(8.4, 3.2), layout="constrained")
     over_time, distribution = figure.subplots(1, 2, gridspec_kw={"width_ratios": [3, 2]})
-    width = run.times[1] - run.times[0] if len(run.times) > 1 else 1.0
-    edges = np.append(run.times, run.times[-1] + width)
-    bottom = np.zeros(len(run.times))
+    edges, bottom = _edges(run), np.zeros(len(run.times))
     for j, (name, colour) in enumerate(zip(STAGES, STAGE_COLOURS, strict=True)):
         top = bottom + milliseconds[:, j]
         over_time.stairs(top, edges, baseline=bottom, fill=True, color=colour, label=name)
         bottom = top
     total = np.sort(milliseconds[:, -1])
     total = total[total > 0] if total.any() else total  # a controller that was not asked took no time
-    # A first step that loads and compiles would leave nothing to be seen of the others.
-    ceiling = 1.15 * total[max(0, int(np.ceil(0.98 * len(total))) - 1)] or 1.0
+    # A first step that compiles, and those that waited for a core, would leave nothing to be seen of the others.
+    ceiling = 1.15 * min(total[max(0, int(np.ceil(0.98 * len(total))) - 1)], 5 * float(np.median(total))) or 1.0
     over_time.set_ylim(0, ceiling)
     beyond = int((total > ceiling).sum())
     if beyond:
-        text = f"{beyond} above, up to {total[-1]:.3g} ms"
-        over_time.annotate(text, (0.99, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize="small")
+        over_time.set_title(f"{beyond} of {len(total)} steps above, up to {_duration(total[-1])}", fontsize="small")
     over_time.set_xlabel("time [s]")
     over_time.set_ylabel("decision [ms]")
     distribution.step(total, np.arange(1, len(total) + 1) / len(total), where="post", color=FLOWN)
     if total[0] > 0 and total[-1] > 5 * total[0]:
         distribution.set_xscale("log")
-        distribution.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        if total[-1] < 300 * total[0]:  # few decades: their names alone say little
+            distribution.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         distribution.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         distribution.xaxis.set_minor_formatter(NullFormatter())
     median, most = (float(np.quantile(total, share)) for share in (0.5, 0.99))
     for value in (median, most):
         distribution.axvline(value, color=BOUND, linewidth=1, linestyle=(0, (4, 3)))
-    distribution.set_title(f"median {median:.3g} ms, 99 % below {most:.3g} ms", fontsize="small")
+    distribution.set_title(f"median {_duration(median)}, 99 % below {_duration(most)}", fontsize="small")
     distribution.set_ylim(0, 1.02)
     distribution.set_xlabel("decision [ms]")
     distribution.set_ylabel("share of the steps")
@@ -130,6 +129,16 @@ def timing_figure(run: "Run") -> Figure:
         _plain(axis)
     _legend(figure, [over_time])
     return figure
+
+
+def _edges(run: "Run") -> np.ndarray:
+    """Times at which steps begin, and the end of the last one (K + 1,) [s]."""
+    width = run.times[1] - run.times[0] if len(run.times) > 1 else 1.0
+    return np.append(run.times, run.times[-1] + width)
+
+
+def _duration(milliseconds: float) -> str:
+    return f"{milliseconds:.3g} ms" if milliseconds < 999.5 else f"{milliseconds / 1e3:.3g} s"
 
 
 def _unit(units: dict[str, str], run: "Run", state: int) -> str:

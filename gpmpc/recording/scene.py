@@ -42,7 +42,7 @@ INTERVAL = 1 / 30  # [s]
 DISPLAY = "display"
 VEHICLE = "vehicle"
 SIGMAS = 2.0  # radius of the tube in standard deviations
-_POSITION, _ATTITUDE = ("x", "y", "z"), ("phi", "theta", "psi")
+POSITION, ATTITUDE = ("x", "y", "z"), ("phi", "theta", "psi")
 _TUBE, _LINE = Color(r=0.12, g=0.45, b=0.85, a=0.18), Color(r=0.12, g=0.45, b=0.85, a=0.9)
 
 
@@ -57,9 +57,9 @@ class Scene:
 
     def __init__(self, state_names: Sequence[str], frame: str, z_down: bool):
         self._frame, self._z_down = frame, z_down
-        self._position = [(axis, state_names.index(name)) for axis, name in enumerate(_POSITION) if name in state_names]
-        has_attitude = all(name in state_names for name in _ATTITUDE)
-        self._attitude = [state_names.index(name) for name in _ATTITUDE] if has_attitude else []
+        self._position = [(axis, state_names.index(name)) for axis, name in enumerate(POSITION) if name in state_names]
+        has_attitude = all(name in state_names for name in ATTITUDE)
+        self._attitude = [state_names.index(name) for name in ATTITUDE] if has_attitude else []
         self._next = -np.inf  # time of the next picture [s]
 
     @property
@@ -105,7 +105,7 @@ class Scene:
         return Pose(position=Vector3(**self._coordinates(state)), orientation=_from_angles(roll, pitch, yaw))
 
     def _coordinates(self, state: np.ndarray) -> dict[str, float]:
-        return {_POSITION[axis]: float(state[i]) for axis, i in self._position}
+        return {POSITION[axis]: float(state[i]) for axis, i in self._position}
 
     def _tube(self, step: PackedStep, stamp: Timestamp) -> SceneUpdate:
         axes, indices = [axis for axis, _ in self._position], [i for _, i in self._position]

@@ -5,7 +5,7 @@ from gpmpc.simulation.cascade_loop import CascadeRollout, cascade_loop
 from gpmpc.simulation.disturbances import Disturbance, Dropout, Gust, Replaced
 from gpmpc.simulation.loop import Rollout, Step, closed_loop
 from gpmpc.simulation.systems import ModelLoop, Noise
-from gpmpc.simulation.telling import tell
+from gpmpc.simulation.telling import tell, tell_cascade
 from gpmpc.simulation.trials import Trial, trials
 
 __all__ = [
@@ -23,5 +23,6 @@ __all__ = [
     "closed_loop",
     "closed_loops",
     "tell",
+    "tell_cascade",
     "trials",
 ]

@@ -58,6 +58,24 @@ class CascadeStep:
     reference: Reference
     outer: Command
 
+    def of_outer(self, index: int, end: "CascadeStep | None" = None) -> Step:
+        """The outer loop's step ``index`` that begins here, and ends with the inner step ``end`` (this one)."""
+        return self._part(OUTER, index, self.reference, self.outer, self.outer.input, end or self)
+
+    def of_inner(self) -> Step:
+        """The inner loop's step."""
+        whole = self.whole
+        return self._part(INNER, whole.index, whole.reference, whole.command, whole.input[1:], self)
+
+    def _part(
+        self, part: slice, index: int, reference: Reference, command: Command, input: np.ndarray, end: "CascadeStep"
+    ) -> Step:
+        at, next_state = self.whole, end.whole.next_state[part]
+        covariance = at.covariance[part, part]
+        return Step(
+            index, at.time, at.state[part], covariance, at.measured[part], reference, command, input, next_state
+        )
+
 
 def cascade_loop(
     plant: Plant,
@@ -133,13 +151,8 @@ def _part(belief: Gaussian, states: slice) -> Gaussian:
 def _rollouts(taken: Sequence[CascadeStep], ratio: int, references: Reference, time_step: float) -> CascadeRollout:
     whole = [step.whole for step in taken]
     last = whole[-1]
-    outer = [
-        _loop(first.whole, OUTER, k, first.reference, first.outer, first.outer.input, taken[k * ratio + ratio - 1])
-        for k, first in enumerate(taken[::ratio])
-    ]
-    inner = [
-        _loop(s.whole, INNER, j, s.whole.reference, s.whole.command, s.whole.input[1:], s) for j, s in enumerate(taken)
-    ]
+    outer = [first.of_outer(k, taken[k * ratio + ratio - 1]) for k, first in enumerate(taken[::ratio])]
+    inner = [step.of_inner() for step in taken]
     attitudes = Reference(np.array([step.reference.states[0] for step in whole] + [last.reference.states[1]]))
     return CascadeRollout(
         states=np.array([*(step.state for step in whole), last.next_state]),
@@ -147,12 +160,3 @@ def _rollouts(taken: Sequence[CascadeStep], ratio: int, references: Reference, t
         outer=rollout([kept(step) for step in outer], references, ratio * time_step, outer[-1].next_state),
         inner=rollout([kept(step) for step in inner], attitudes, time_step, inner[-1].next_state),
     )
-
-
-def _loop(
-    at: Step, part: slice, index: int, reference: Reference, command: Command, input: np.ndarray, end: CascadeStep
-) -> Step:
-    """One loop's share of a step that begins ``at`` and ends with another inner step."""
-    covariance = at.covariance[part, part]
-    next_state = end.whole.next_state[part]
-    return Step(index, at.time, at.state[part], covariance, at.measured[part], reference, command, input, next_state)

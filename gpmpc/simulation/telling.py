@@ -11,6 +11,7 @@ import numpy as np
 
 from gpmpc import step as recorded
 from gpmpc.control.controller import Decision, Timing
+from gpmpc.simulation.cascade_loop import CascadeStep
 from gpmpc.simulation.loop import Step
 from gpmpc.status import Status
 
@@ -44,6 +45,27 @@ def tell(recorder: Any, gp_size: int = 0) -> Callable[[Step], None]:
             )
         )
         expected = decision.means[1] if decision is not None and decision.status.solved else None
+
+    return on_step
+
+
+def tell_cascade(outer: Any, inner: Any, gp_sizes: tuple[int, int] = (0, 0)) -> Callable[[CascadeStep], None]:
+    """What ``cascade_loop`` takes as ``on_step`` to have both loops recorded, each at its own rate.
+
+    Args:
+        outer: Any object with ``record(step)``, told of x .. vz and U1, ux, uy once an outer step.
+        inner: The same of phi .. r and U2, U3, U4, once an inner step.
+        gp_sizes: Transitions that the outer model holds, and the inner one.
+    """
+    tell_outer, tell_inner = tell(outer, gp_sizes[0]), tell(inner, gp_sizes[1])
+    begun = 0  # outer steps
+
+    def on_step(step: CascadeStep) -> None:
+        nonlocal begun
+        if step.phase == 0:
+            tell_outer(step.of_outer(begun))
+            begun += 1
+        tell_inner(step.of_inner())
 
     return on_step
 

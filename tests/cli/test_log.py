@@ -13,7 +13,7 @@ import pytest
 sys.path.append(str(Path(__file__).resolve().parents[1] / "recording"))
 import runs
 
-from gpmpc.recording import read_run
+from gpmpc.recording import layout, read_run
 
 
 def gpmpc_log(*arguments, cwd):
@@ -77,6 +77,13 @@ def test_export_writes_parquet(folder):
     np.testing.assert_array_equal(frame["state.vx"], read_run(folder / "run.mcap").states[:, 1])
 
 
+def test_layout_writes_what_foxglove_imports(folder):
+    result = gpmpc_log("layout", "run.mcap", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith("written to run.layout.json: open run.mcap in Foxglove")
+    assert (folder / "run.layout.json").read_text() == layout(read_run(folder / "run.mcap"))
+
+
 MISTAKES = [
     (["info", "missing.mcap"], "missing.mcap: cannot be read: No such file or directory"),
     (["info", "notes.mcap"], "notes.mcap: is not an MCAP file"),
@@ -84,9 +91,10 @@ MISTAKES = [
     (["recover", "run.mcap", "run.mcap"], "run.mcap: a file cannot be recovered into itself"),
     (["export", "run.mcap", "run.xlsx"], "output: must end in .csv or .parquet; got 'run.xlsx'"),
     (["export", "run.mcap", "nowhere/run.csv"], "output: cannot write to nowhere/run.csv: No such file"),
+    (["layout", "run.mcap", "run.yaml"], "output: must end in .json; got 'run.yaml'"),
     (["show", "run.mcap"], "invalid choice: 'show'"),
     (["info"], "the following arguments are required: file"),
-    ([], "the following arguments are required: info|recover|export"),
+    ([], "the following arguments are required: info|recover|export|layout"),
 ]
 if importlib.util.find_spec("pandas") is None:
     MISTAKES.append((["export", "run.mcap", "run.parquet"], "pandas: pip install 'gpmpc[report]'"))

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError, ShapeError, SolverFailure
 from gpmpc.metrics import tracking_error
 from gpmpc.plants import Coupled, Integrated, Map, Rotational, Translational, step, thrust_direction
-from gpmpc.simulation import Dropout, Gust, Noise, Replaced, cascade_loop
+from gpmpc.simulation import Dropout, Gust, Noise, Replaced, cascade_loop, tell_cascade
 from gpmpc.status import Status
 from gpmpc.trajectories import Elliptical, Lorenz, states_along
 
@@ -48,6 +50,23 @@ def test_the_rollouts_are_two_views_of_one_flight():
     assert np.array_equal(np.repeat(flight.outer.inputs[:, 0], 20), flight.inputs[:, 0])
     assert (flight.outer.time_step, flight.inner.time_step) == (1.0, 0.05)
     assert (len(flight.outer.seconds), len(flight.inner.seconds)) == (3, 60)
+
+
+def test_each_loop_is_told_to_a_recorder_at_its_own_rate():
+    class Kept(list):
+        record = list.append
+
+    outer, inner = Kept(), Kept()
+    flight = fly(Elliptical(), 3, noise=NOISE, on_step=tell_cascade(outer, inner, (10, 20)))
+    for told, loop, size in ((outer, flight.outer, 10), (inner, flight.inner, 20)):
+        assert [step.k for step in told] == list(range(len(loop.inputs)))
+        assert [step.time for step in told] == pytest.approx(loop.time_step * np.arange(len(loop.inputs)))
+        for name, expected in (("state", loop.states[:-1]), ("measured", loop.measured), ("input", loop.inputs)):
+            assert np.array_equal([getattr(step, name) for step in told], expected)
+        assert np.array_equal([step.reference for step in told], loop.references[: len(told)])
+        expected = [step.measured - before.decision.means[1] for before, step in pairwise(told)]
+        assert np.array_equal([step.innovation for step in told[1:]], expected)
+        assert {step.gp_size for step in told} == {size}
 
 
 def test_the_attitude_comes_to_where_the_outer_plan_points_the_thrust():

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,8 +20,6 @@ from gpmpc.qp import QuadraticProgram, SoftRows
 from gpmpc.recording import read_run, replay, wire
 from gpmpc.status import Status
 from tests.recording import runs
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -393,18 +390,3 @@ def test_the_wire_knows_the_layout_of_a_solvers_record():
     from gpmpc.qp import record
 
     assert record.HEADER == wire.RECORD_HEADER
-
-
-def test_the_foxglove_layout_names_only_what_is_recorded(recorded):
-    path, _ = recorded
-    layout = (ROOT / "docs" / "foxglove-layout.json").read_text()
-    paths = [item["value"] for panel in json.loads(layout)["configById"].values() for item in panel.get("paths", [])]
-    assert len(paths) > 20
-    for value in paths:
-        topic, *fields = value.replace("[-1]", "").split(".")
-        descriptor = decoded(path, topic)[0][1].DESCRIPTOR
-        for field in fields:
-            assert field in descriptor.fields_by_name, value
-            descriptor = descriptor.fields_by_name[field].message_type
-    topics = json.loads(layout)["configById"]["3D!scene"]["topics"]
-    assert set(topics) <= set(read_run(path).channels)

@@ -1,0 +1,117 @@
+"""A layout for Foxglove shows what the recording holds, whatever was flown."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from gpmpc.control.controller import Decision, Timing
+from gpmpc.plants import Coupled, Rotational
+from gpmpc.recording import McapRecorder, Step, layout, read_run
+from gpmpc.status import Status
+from tests.recording import runs
+
+SHIPPED = Path(__file__).resolve().parents[2] / "docs" / "foxglove-layout.json"
+FLOWN = {
+    "translational": (runs.STATES, runs.INPUTS),
+    "rotational": (Rotational.state_names, Rotational.input_names),
+    "whole": (Coupled.state_names, Coupled.input_names),
+    "pendulum": (("angle", "rate"), ("torque",)),
+}
+
+
+def record(path, states, inputs, steps=3, **settings):
+    n, m, H = len(states), len(inputs), 2
+    rng = np.random.default_rng(0)
+    with McapRecorder(path, states, inputs, time_step=0.1, **settings) as recorder:
+        for k in range(steps):
+            means, covariances = rng.standard_normal((H + 1, n)), np.tile(np.eye(n), (H + 1, 1, 1))
+            decision = Decision(
+                input=np.zeros(m), inputs=np.zeros((H, m)), means=means, covariances=covariances,
+                status=Status.SOLVED, iterations=1, timing=Timing(0.001, 0.002, 0.003),
+            )  # fmt: skip
+            x = means[0]
+            recorder.record(Step(0.1 * k, k, x, x, x, np.zeros(m), decision, np.zeros(n), np.eye(n)))
+    return path
+
+
+@pytest.fixture(scope="module", params=FLOWN)
+def shown(request, tmp_path_factory):
+    """What was flown, its recording and its layout."""
+    states, inputs = FLOWN[request.param]
+    bounds = np.array([-np.ones(len(inputs)), np.ones(len(inputs))])
+    path = record(tmp_path_factory.mktemp("run") / "run.mcap", states, inputs, input_bounds=bounds)
+    return request.param, path, json.loads(layout(read_run(path)))
+
+
+def paths_of(made):
+    return [line["value"] for panel in made["configById"].values() for line in panel.get("paths", ())]
+
+
+def at(message, path):
+    """What a plot finds at a path: names and indices from the front, as in Lichtblick's message paths."""
+    for name, index in re.findall(r"\.(\w+)(?:\[(\d+)\])?", path):
+        assert name in message.DESCRIPTOR.fields_by_name, path
+        message = getattr(message, name)
+        message = message[int(index)] if index else message
+    return message
+
+
+def test_every_path_is_a_number_of_the_recording(shown):
+    _, path, made = shown
+    with path.open("rb") as file:
+        decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+        last = {channel.topic: message for _, channel, _, message in decoded}
+    for value in paths_of(made):
+        topic, fields = re.fullmatch(r"(/\w+)((?:\.\w+(?:\[\d+\])?)+)", value).groups()
+        assert isinstance(at(last[topic], fields), int | float), value
+
+
+def test_every_state_and_every_input_with_its_bounds_is_plotted(shown):
+    flown, _, made = shown
+    states, inputs = FLOWN[flown]
+    groups = [(group, states) for group in ("reference", "state", "measured")]
+    groups += [(group, inputs) for group in ("input", "input_lower", "input_upper")]
+    assert {f"/step.{group}.{name}" for group, names in groups for name in names} <= set(paths_of(made))
+
+
+def test_every_panel_has_its_place_and_every_place_its_panel(shown):
+    _, _, made = shown
+
+    def leaves(node):
+        if isinstance(node, str):
+            return [node]
+        return [*leaves(node["first"]), *leaves(node["second"])]
+
+    placed = leaves(made["layout"])
+    tabs = made["configById"]["Tab!plots"]["tabs"]
+    placed += [leaf for tab in tabs for leaf in leaves(tab["layout"])]
+    assert sorted(placed) == sorted(made["configById"])
+
+
+def test_the_vehicle_is_seen_in_space_where_the_states_tell_about_it(shown):
+    flown, path, made = shown
+    scene = made["configById"].get("3D!scene")
+    assert (scene is None) == (flown == "pendulum")
+    if scene is not None:
+        assert set(scene["topics"]) <= set(read_run(path).channels)
+        assert scene["topics"]["/plan/tube"]["visible"] == (flown != "rotational")
+        assert scene["topics"]["/plan/path"]["visible"] == (flown != "translational")
+        assert scene["followTf"] == ("display" if flown == "rotational" else "vehicle")
+
+
+def test_the_shipped_layout_is_that_of_the_translational_quadrotor(tmp_path):
+    runs.record_run(tmp_path / "run.mcap", steps=2)
+    assert SHIPPED.read_text() == layout(read_run(tmp_path / "run.mcap"))
+
+
+def test_titles_have_units_and_bounds_are_drawn_only_where_there_are_any(tmp_path):
+    path = record(tmp_path / "run.mcap", ("x", "vx"), ("F",), units={"x": "m", "vx": "m/s", "F": "1"})
+    panels = json.loads(layout(read_run(path)))["configById"]
+    assert panels["Plot!state-vx"]["foxglovePanelTitle"] == "vx [m/s]"
+    assert panels["Plot!input-F"]["foxglovePanelTitle"] == "F"
+    assert len(panels["Plot!input-F"]["paths"]) == 1
