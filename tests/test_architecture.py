@@ -6,15 +6,15 @@ import sys
 from pathlib import Path
 
 import pytest
-from importlinter.cli import lint_imports
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def test_every_import_contract_is_kept(monkeypatch, capsys):
-    monkeypatch.chdir(ROOT)
-    exit_code = lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True)
-    assert exit_code == 0, capsys.readouterr().out
+def test_every_import_contract_is_kept():
+    # In a process of its own: the linter's logging configuration silences every logger that exists.
+    code = "from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))"
+    linted = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert linted.returncode == 0, linted.stdout + linted.stderr
 
 
 @pytest.mark.parametrize("module", ["gpmpc.qp"])
