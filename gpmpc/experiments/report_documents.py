@@ -5,7 +5,7 @@ import csv
 import io
 from collections.abc import Sequence
 from html import escape
-from itertools import zip_longest
+from itertools import groupby, zip_longest
 from statistics import mean, quantiles
 from typing import NamedTuple
 
@@ -29,7 +29,8 @@ th, td { padding: .3rem .7rem; text-align: right; vertical-align: top; border-bo
 th { border-bottom: 2px solid #1f4e79; vertical-align: bottom; } td:first-child, th:first-child { text-align: left; }
 td, td small { white-space: nowrap; } td small { display: block; color: #666; }
 .wide { overflow-x: auto; margin: 1rem 0; }
-.figures { display: flex; flex-wrap: wrap; gap: 1rem; } .figures img { width: 32rem; max-width: 100%; height: auto; }
+.figures { display: flex; flex-wrap: wrap; gap: 1rem; align-items: flex-start; margin-bottom: 1rem; }
+.figures img { flex: 1 1 20rem; min-width: 0; max-width: min(32rem, 100%); }
 code, pre { background: #f5f5f5; padding: .1rem .3rem; overflow-wrap: anywhere; white-space: pre-wrap; }
 pre { padding: .6rem; } .bad { color: #b03a2e; } li { overflow-wrap: anywhere; }
 @media (max-width: 40rem) { th, td { padding: .3rem .4rem; } ul { padding-left: 1.2rem; } }
@@ -77,8 +78,9 @@ def render(report: Report) -> Table:
     """The table for a terminal: mean, and the quartiles below it; what is zero everywhere is left out."""
     shown = [name for name in SHOWN if name in _telling(report)]
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title(report), title_justify="left")
-    for name in (*(report.variables or ("runs",)), "seeds"):
-        table.add_column(name.replace(".", ".\n"), justify="right", no_wrap=True)
+    for name in report.variables or ("runs",):
+        table.add_column(name.replace(".", ".\n"), justify="right", overflow="fold")
+    table.add_column("seeds", justify="right", no_wrap=True)
     for name in shown:
         table.add_column(f"{SHOWN[name]}\n\\[{_unit(report, name)}]", justify="right", no_wrap=True)
     for cell in report.cells:
@@ -146,7 +148,7 @@ def figures(report: Report) -> dict[str, bytes]:
     measures = [name for name in DRAWN if name in _telling(report)]
     for index, variable in enumerate(report.variables):
         positions = sorted({cell.values[index] for cell in report.cells}, key=in_order)
-        lines = _lines(report, index)
+        lines, numbers = _lines(report, index), all(in_order(position)[0] == 0 for position in positions)
         for name in measures:
             series = []
             for label, cells in lines.items():
@@ -154,7 +156,8 @@ def figures(report: Report) -> dict[str, bytes]:
                 for cell in cells:
                     values[cell.values[index]] += cell.numbers(name)
                 series.append(Series(label, list(values.values())))
-            figure = over_variable(variable, positions, report.label(name), series, MEASURES[name].logarithmic)
+            logarithmic = MEASURES[name].logarithmic
+            figure = over_variable(variable, positions, report.label(name), series, logarithmic, connected=numbers)
             drawn[f"{name}-over-{variable.replace('/', '-')}.png"] = png(figure, dpi=150)
     return drawn
 
@@ -164,12 +167,9 @@ def page(report: Report, drawn: dict[str, bytes], comparison: Sequence[str] = ()
     row = "".join(f"<th>{escape(name)}</th>" for name in _header(report))
     rows = _rows(report, report.measures(), "\n")
     body = "\n".join("<tr>" + "".join(f"<td>{_html(text)}</td>" for text in row) + "</tr>" for row in rows)
-    images = [
-        f'<img alt="{escape(name.removesuffix(".png"))}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
-        for name, png in drawn.items()
-    ]
     parts = [f"<h1>{escape(report.tree.name)}</h1>", f"<p>{escape(title(report))}.{escape(_constants(report))}</p>"]
-    parts.append(f'<div class="figures">{"".join(images)}</div>')
+    for _, names in groupby(drawn, lambda name: name.partition("-over-")[2]):
+        parts.append(f'<div class="figures">{"".join(_image(name, drawn[name]) for name in names)}</div>')
     parts.append(f'<div class="wide"><table><thead><tr>{row}</tr></thead><tbody>\n{body}\n</tbody></table></div>')
     parts.append("<p>Mean [first to third quartile] over the seeds. Figures: medians, quartiles, all runs.</p>")
     if comparison:
@@ -187,6 +187,11 @@ def page(report: Report, drawn: dict[str, bytes], comparison: Sequence[str] = ()
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
     head += f"<title>{escape(report.tree.name)}</title><style>{STYLE}</style>"
     return f"<!doctype html>\n<html lang=en><head>{head}</head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
+
+
+def _image(name: str, png: bytes) -> str:
+    data = base64.b64encode(png).decode()
+    return f'<img alt="{escape(name.removesuffix(".png"))}" src="data:image/png;base64,{data}">'
 
 
 def _html(text: str) -> str:

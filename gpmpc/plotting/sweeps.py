@@ -25,7 +25,12 @@ class Series:
 
 
 def over_variable(
-    title: str, positions: Sequence[str], label: str, lines: Sequence[Series], logarithmic: bool = False
+    title: str,
+    positions: Sequence[str],
+    label: str,
+    lines: Sequence[Series],
+    logarithmic: bool = False,
+    connected: bool = True,
 ) -> Figure:
     """Median and quartiles of a measure over the values of a variable, every run a dot.
 
@@ -35,10 +40,14 @@ def over_variable(
         label: Of the measure, with its unit.
         lines: What else was varied, a line each; those without a number are left out.
         logarithmic: Whether the axis is, where the values span enough for it.
+        connected: Whether the medians are joined, as over numbers; over words nothing lies between them.
     """
-    figure = Figure(figsize=(4.4, 3.6), layout="constrained")
+    drawn = [line for line in lines if any(line.values)]
+    columns = max(1, int(60 / (max((len(line.label) for line in drawn), default=0) + 6)))
+    legend = -(-len(drawn) // columns) if len(drawn) > 1 else 0  # rows
+    figure = Figure(figsize=(4.4, 3.2 + 0.22 * legend), layout="constrained")
     axis = figure.subplots()
-    _draw(axis, lines, len(positions))
+    _draw(axis, lines, len(positions), "-" if connected else "none")
     axis.set_title(label, fontsize="medium")
     axis.set_xlabel(title)
     axis.set_xticks(range(len(positions)), list(positions))
@@ -58,14 +67,12 @@ def over_variable(
     axis.grid(axis="y", color="0.9")
     axis.set_axisbelow(True)
     axis.spines[["top", "right"]].set_visible(False)
-    handles, labels = axis.get_legend_handles_labels()
-    if len(labels) > 1:
-        columns = max(1, int(60 / (max(map(len, labels)) + 6)))
-        figure.legend(handles, labels, loc="outside lower center", ncols=min(columns, len(labels)), frameon=False)
+    if legend:
+        figure.legend(loc="outside lower center", ncols=min(columns, len(drawn)), frameon=False)
     return figure
 
 
-def _draw(axis: Axes, lines: Sequence[Series], count: int) -> None:
+def _draw(axis: Axes, lines: Sequence[Series], count: int, linestyle: str) -> None:
     width = min(0.14, 0.7 / max(len(lines), 1))
     for i, line in enumerate(lines):
         colour = COLOURS[i % len(COLOURS)]
@@ -75,9 +82,8 @@ def _draw(axis: Axes, lines: Sequence[Series], count: int) -> None:
             continue
         places, quartiles = np.array([p for p, _ in known]), np.array([q for _, q in known])
         low, middle, high = quartiles.T
-        axis.errorbar(
-            places, middle, [middle - low, high - middle], color=colour, marker="o", markersize=4, label=line.label
-        )
+        style = {"color": colour, "marker": "o", "markersize": 4, "linestyle": linestyle}
+        axis.errorbar(places, middle, [middle - low, high - middle], label=line.label, **style)
         for p, group in enumerate(line.values):
             aside = [0.25 * width * ((7 * j) % 11 / 5 - 1) for j in range(len(group))]
             axis.plot([p + offset + a for a in aside], group, ".", color=colour, alpha=0.45, markersize=5, mew=0)
