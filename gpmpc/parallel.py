@@ -33,8 +33,8 @@ def in_processes(function: Callable[[J], R], jobs: Sequence[J], workers: int | N
         return
     workers, before = min(workers or cores(), len(jobs)), set(active_children())
     with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), _quiet_on_interrupt) as pool:
-        running = {pool.submit(function, job): index for index, job in enumerate(jobs)}
-        try:
+        try:  # around the start as well: leaving the pool waits for what was begun
+            running = {pool.submit(function, job): index for index, job in enumerate(jobs)}
             for done in as_completed(running):
                 yield running[done], done.result()
         except BaseException:  # a failed job, Ctrl-C, or a caller that wants no more

@@ -2,6 +2,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 import pytest
@@ -59,6 +60,22 @@ def test_a_worker_that_dies_is_one_clear_error():
 def test_misuse_is_refused_before_the_first_trial(arguments, message):
     with pytest.raises(SettingError, match=message):
         trials(draw, progress=False, **arguments)
+
+
+def test_an_interrupt_between_the_starts_of_two_workers_ends_the_first(monkeypatch):
+    submitted, submit = [], ProcessPoolExecutor.submit
+
+    def interrupted(pool, *job):
+        if submitted:
+            raise KeyboardInterrupt
+        submitted.append(job)
+        return submit(pool, *job)
+
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", interrupted)
+    begin = time.perf_counter()
+    with pytest.raises(KeyboardInterrupt):
+        trials(time.sleep, [60, 61], workers=2, progress=False)
+    assert time.perf_counter() - begin < 30
 
 
 def test_ctrl_c_ends_everything_at_once(tmp_path):
