@@ -1,11 +1,13 @@
-"""Problem: eight rows i and eight columns j of a sum over pairs, held in registers from the exponent to the sums.
+"""Problem: four rows i and sixteen columns j of a sum over pairs, held in registers from the exponent to the sums.
 
 Loops that LLVM vectorises by itself write each step's numbers to memory and start anew; here a value is a block of
 eight vectors of eight numbers, whose instructions are issued side by side: eight independent chains are what two
-multiply-adds a cycle with a latency of four ask for. Where a processor has smaller vectors, LLVM splits them.
+multiply-adds a cycle with a latency of four ask for. Two loads a cycle are the other limit: four rows by two vectors
+load six times for eight multiply-adds, where eight rows by one vector load nine times. Where a processor has smaller
+vectors, LLVM splits them.
 
 The functions are for compiled code only and do not look at the lengths of arrays. Where they take numbers of rows,
-these stand next to each other in an array, eight of them from ``at`` on; a vector over the columns likewise.
+these stand next to each other in an array, four of them from ``at`` on; those of the columns likewise, sixteen.
 """
 
 from llvmlite import ir
@@ -14,14 +16,17 @@ from numba.extending import intrinsic, models, register_model
 
 from gpmpc.fused import exponential as e
 
-EDGE = 8
-SIZE = EDGE * EDGE
-VECTOR = ir.VectorType(ir.DoubleType(), EDGE)
+LANES = 8
+ROWS, COLUMNS = 4, 16
+SIZE = ROWS * COLUMNS
+VECTORS = SIZE // LANES
+ACROSS = COLUMNS // LANES  # vectors
+VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 FUSED = ("contract", "nsz")  # "reassoc" would cancel the constant that rounds
 
 
 class Block(types.Type):
-    """numba's type of eight rows of eight numbers."""
+    """numba's type of such a block: row by row, two vectors each."""
 
     def __init__(self):
         super().__init__(name="Block")
@@ -30,7 +35,7 @@ class Block(types.Type):
 @register_model(Block)
 class _BlockModel(models.PrimitiveModel):
     def __init__(self, manager, block):
-        super().__init__(manager, block, ir.ArrayType(VECTOR, EDGE))
+        super().__init__(manager, block, ir.ArrayType(VECTOR, VECTORS))
 
 
 BLOCK, ARRAY = Block(), types.Array(types.float64, 1, "C")
@@ -48,23 +53,35 @@ def _load(builder, data, at, offset=0):
     return builder.load(_vector(builder, data, builder.add(at, at.type(offset))), align=8)
 
 
+def _store(builder, vector, data, at, offset=0):
+    builder.store(vector, _vector(builder, data, builder.add(at, at.type(offset))), align=8)
+
+
 def _spread(builder, number):
     first = builder.insert_element(ir.Constant(VECTOR, ir.Undefined), number, ir.IntType(32)(0))
-    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), EDGE), [0] * EDGE))
+    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES))
 
 
-def _row_number(builder, data, at, row):
-    return _spread(builder, builder.load(builder.gep(data, [builder.add(at, at.type(row))])))
+def _row_numbers(builder, data, at):
+    """One for each vector of a block."""
+    places = [builder.gep(data, [builder.add(at, at.type(row))]) for row in range(ROWS)]
+    numbers = [_spread(builder, builder.load(place)) for place in places]
+    return [number for number in numbers for _ in range(ACROSS)]
 
 
-def _rows(builder, block):
-    return [builder.extract_value(block, row) for row in range(EDGE)]
+def _column_numbers(builder, data, at):
+    """One for each vector of a block."""
+    return [_load(builder, data, at, k * LANES) for k in range(ACROSS)] * ROWS
 
 
-def _block(builder, rows):
-    block = ir.Constant(ir.ArrayType(VECTOR, EDGE), ir.Undefined)
-    for place, row in enumerate(rows):
-        block = builder.insert_value(block, row, place)
+def _vectors(builder, block):
+    return [builder.extract_value(block, k) for k in range(VECTORS)]
+
+
+def _block(builder, vectors):
+    block = ir.Constant(ir.ArrayType(VECTOR, VECTORS), ir.Undefined)
+    for place, vector in enumerate(vectors):
+        block = builder.insert_value(block, vector, place)
     return block
 
 
@@ -77,12 +94,9 @@ def outer_sum(typing_context, rows, at, columns, place):
     """rows_i + columns_j."""
 
     def generate(context, builder, signature, arguments):
-        rows, columns = (_numbers(context, builder, arguments[k]) for k in (0, 2))
-        column = _load(builder, columns, arguments[3])
-        return _block(
-            builder,
-            [builder.fadd(_row_number(builder, rows, arguments[1], k), column, flags=FUSED) for k in range(EDGE)],
-        )
+        rows = _row_numbers(builder, _numbers(context, builder, arguments[0]), arguments[1])
+        columns = _column_numbers(builder, _numbers(context, builder, arguments[2]), arguments[3])
+        return _block(builder, [builder.fadd(*pair, flags=FUSED) for pair in zip(rows, columns, strict=True)])
 
     return BLOCK(ARRAY, types.intp, ARRAY, types.intp), generate
 
@@ -92,15 +106,10 @@ def plus_outer(typing_context, block, rows, at, columns, place):
     """block_ij + rows_i columns_j."""
 
     def generate(context, builder, signature, arguments):
-        rows, columns = (_numbers(context, builder, arguments[k]) for k in (1, 3))
-        column = _load(builder, columns, arguments[4])
-        return _block(
-            builder,
-            [
-                _multiply_add(builder, _row_number(builder, rows, arguments[2], k), column, row)
-                for k, row in enumerate(_rows(builder, arguments[0]))
-            ],
-        )
+        rows = _row_numbers(builder, _numbers(context, builder, arguments[1]), arguments[2])
+        columns = _column_numbers(builder, _numbers(context, builder, arguments[3]), arguments[4])
+        factors = zip(rows, columns, _vectors(builder, arguments[0]), strict=True)
+        return _block(builder, [_multiply_add(builder, *three) for three in factors])
 
     return BLOCK(BLOCK, ARRAY, types.intp, ARRAY, types.intp), generate
 
@@ -111,7 +120,7 @@ def expm1(typing_context, block):
 
     def generate(context, builder, signature, arguments):
         def constant(value):
-            return ir.Constant(VECTOR, [value] * EDGE)
+            return ir.Constant(VECTOR, [value] * LANES)
 
         def each(operation, *operands):
             return [operation(*row) for row in zip(*operands, strict=True)]
@@ -122,8 +131,8 @@ def expm1(typing_context, block):
             return builder.select(builder.fcmp_ordered(">", x, high), high, x)
 
         def scale_of(rounded):
-            integers = ir.VectorType(ir.IntType(64), EDGE)
-            bits = builder.shl(builder.bitcast(rounded, integers), ir.Constant(integers, [52] * EDGE))
+            integers = ir.VectorType(ir.IntType(64), LANES)
+            bits = builder.shl(builder.bitcast(rounded, integers), ir.Constant(integers, [52] * LANES))
             return builder.bitcast(bits, VECTOR)
 
         def add(a, b):
@@ -135,7 +144,7 @@ def expm1(typing_context, block):
         def multiply(a, b):
             return builder.fmul(a, b, flags=FUSED)
 
-        x = each(capped, _rows(builder, arguments[0]))
+        x = each(capped, _vectors(builder, arguments[0]))
         rounded = each(lambda v: _multiply_add(builder, v, constant(e.PER_LN2), constant(e.BIASED_ROUNDER)), x)
         k = each(lambda v: subtract(v, constant(e.BIASED_ROUNDER)), rounded)
         r = each(lambda v, k: subtract(v, multiply(k, constant(e.LN2_HIGH))), x, k)
@@ -155,7 +164,7 @@ def block(typing_context, array, at):
 
     def generate(context, builder, signature, arguments):
         array = _numbers(context, builder, arguments[0])
-        return _block(builder, [_load(builder, array, arguments[1], k * EDGE) for k in range(EDGE)])
+        return _block(builder, [_load(builder, array, arguments[1], k * LANES) for k in range(VECTORS)])
 
     return BLOCK(ARRAY, types.intp), generate
 
@@ -169,8 +178,8 @@ def fetch(typing_context, array, at):
         byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
         ask = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-        for k in range(EDGE):
-            place = builder.gep(data, [builder.add(arguments[1], arguments[1].type(k * EDGE))])
+        for k in range(VECTORS):
+            place = builder.gep(data, [builder.add(arguments[1], arguments[1].type(k * LANES))])
             builder.call(ask, [builder.bitcast(place, byte), number(0), number(3), number(1)])
         return context.get_dummy_value()
 
@@ -182,7 +191,7 @@ def times(typing_context, block, other):
     """block_ij other_ij."""
 
     def generate(context, builder, signature, arguments):
-        pairs = zip(*(_rows(builder, block) for block in arguments), strict=True)
+        pairs = zip(*(_vectors(builder, block) for block in arguments), strict=True)
         return _block(builder, [builder.fmul(a, b, flags=FUSED) for a, b in pairs])
 
     return BLOCK(BLOCK, BLOCK), generate
@@ -193,7 +202,7 @@ def plus(typing_context, block, other):
     """block_ij + other_ij."""
 
     def generate(context, builder, signature, arguments):
-        pairs = zip(*(_rows(builder, block) for block in arguments), strict=True)
+        pairs = zip(*(_vectors(builder, block) for block in arguments), strict=True)
         return _block(builder, [builder.fadd(a, b, flags=FUSED) for a, b in pairs])
 
     return BLOCK(BLOCK, BLOCK), generate
@@ -201,71 +210,59 @@ def plus(typing_context, block, other):
 
 @intrinsic
 def add_to_columns(typing_context, sums, place, block, rows, at):
-    """Adds sum_i rows_i block_ij to eight numbers ``sums``."""
+    """Adds sum_i rows_i block_ij to sixteen numbers ``sums``."""
 
     def generate(context, builder, signature, arguments):
-        sums, rows = (_numbers(context, builder, arguments[k]) for k in (0, 3))
-        total = _load(builder, sums, arguments[1])
-        for k, row in enumerate(_rows(builder, arguments[2])):
-            total = _multiply_add(builder, _row_number(builder, rows, arguments[4], k), row, total)
-        builder.store(total, _vector(builder, sums, arguments[1]), align=8)
+        sums = _numbers(context, builder, arguments[0])
+        rows = _row_numbers(builder, _numbers(context, builder, arguments[3]), arguments[4])
+        vectors = _vectors(builder, arguments[2])
+        for k in range(ACROSS):
+            total = _load(builder, sums, arguments[1], k * LANES)
+            for row, vector in zip(rows[k::ACROSS], vectors[k::ACROSS], strict=True):
+                total = _multiply_add(builder, row, vector, total)
+            _store(builder, total, sums, arguments[1], k * LANES)
         return context.get_dummy_value()
 
     return types.none(ARRAY, types.intp, BLOCK, ARRAY, types.intp), generate
 
 
 @intrinsic
-def plus_scaled(typing_context, block, other, columns, place):
-    """block_ij + other_ij columns_j."""
+def add_to_rows(typing_context, sums, at, block, columns, place):
+    """Adds block_ij columns_j to four vectors ``sums``, each of which holds parts of its row's sum over j."""
 
     def generate(context, builder, signature, arguments):
-        column = _load(builder, _numbers(context, builder, arguments[2]), arguments[3])
-        pairs = zip(*(_rows(builder, block) for block in arguments[:2]), strict=True)
-        return _block(builder, [_multiply_add(builder, b, column, a) for a, b in pairs])
-
-    return BLOCK(BLOCK, BLOCK, ARRAY, types.intp), generate
-
-
-@intrinsic
-def add_row_sums(typing_context, sums, at, block, rows, first):
-    """Adds rows_i sum_j block_ij to eight numbers ``sums``."""
-
-    def generate(context, builder, signature, arguments):
-        sums, factors = (_numbers(context, builder, arguments[k]) for k in (0, 3))
-        even, odd = (
-            ir.Constant(ir.VectorType(ir.IntType(32), EDGE), list(range(start, 2 * EDGE, 2))) for start in (0, 1)
-        )
-        parts = _rows(builder, arguments[2])
-        while len(parts) > 1:  # sums of neighbours, of two vectors at a time
-            parts = [
-                builder.fadd(builder.shuffle_vector(a, b, even), builder.shuffle_vector(a, b, odd), flags=FUSED)
-                for a, b in zip(parts[::2], parts[1::2], strict=True)
-            ]
-        total = _load(builder, sums, arguments[1])
-        total = _multiply_add(builder, _load(builder, factors, arguments[4]), parts[0], total)
-        builder.store(total, _vector(builder, sums, arguments[1]), align=8)
+        sums = _numbers(context, builder, arguments[0])
+        columns = _column_numbers(builder, _numbers(context, builder, arguments[3]), arguments[4])
+        products = list(zip(_vectors(builder, arguments[2]), columns, strict=True))
+        for row in range(ROWS):
+            total = _load(builder, sums, arguments[1], row * LANES)
+            for vector, column in products[row * ACROSS : (row + 1) * ACROSS]:
+                total = _multiply_add(builder, vector, column, total)
+            _store(builder, total, sums, arguments[1], row * LANES)
         return context.get_dummy_value()
 
     return types.none(ARRAY, types.intp, BLOCK, ARRAY, types.intp), generate
 
 
-@intrinsic
-def zeros(typing_context):
-    """A block of zeros."""
+def _four(builder, data, at):
+    return builder.load(_quarter(builder, data, at), align=8)
 
-    def generate(context, builder, signature, arguments):
-        return ir.Constant(ir.ArrayType(VECTOR, EDGE), [[0.0] * EDGE] * EDGE)
 
-    return BLOCK(), generate
+def _store_four(builder, vector, data, at):
+    builder.store(vector, _quarter(builder, data, at), align=8)
+
+
+def _quarter(builder, data, at):
+    return builder.bitcast(builder.gep(data, [at]), ir.VectorType(ir.DoubleType(), ROWS).as_pointer())
 
 
 @intrinsic
 def copy(typing_context, target, place, source, at):
-    """Copies eight numbers."""
+    """Copies four numbers."""
 
     def generate(context, builder, signature, arguments):
         target, source = (_numbers(context, builder, arguments[k]) for k in (0, 2))
-        builder.store(_load(builder, source, arguments[3]), _vector(builder, target, arguments[1]), align=8)
+        _store_four(builder, _four(builder, source, arguments[3]), target, arguments[1])
         return context.get_dummy_value()
 
     return types.none(ARRAY, types.intp, ARRAY, types.intp), generate
@@ -273,12 +270,12 @@ def copy(typing_context, target, place, source, at):
 
 @intrinsic
 def copy_product(typing_context, target, place, source, at, factors, first):
-    """Writes the products of eight numbers and eight factors."""
+    """Writes the products of four numbers and four factors."""
 
     def generate(context, builder, signature, arguments):
         target, source, factors = (_numbers(context, builder, arguments[k]) for k in (0, 2, 4))
-        pair = _load(builder, source, arguments[3]), _load(builder, factors, arguments[5])
-        builder.store(builder.fmul(*pair, flags=FUSED), _vector(builder, target, arguments[1]), align=8)
+        pair = _four(builder, source, arguments[3]), _four(builder, factors, arguments[5])
+        _store_four(builder, builder.fmul(*pair, flags=FUSED), target, arguments[1])
         return context.get_dummy_value()
 
     return types.none(ARRAY, types.intp, ARRAY, types.intp, ARRAY, types.intp), generate

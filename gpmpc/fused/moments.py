@@ -30,7 +30,7 @@ from gpmpc.fused.belief_algebra import (
     transposed_times,
 )
 from gpmpc.fused.exponential import exp_all
-from gpmpc.fused.pair_sums import Side, pair_sums, tile_memory
+from gpmpc.fused.pair_sums import Side, pair_sums, strips_memory
 from gpmpc.fused.point_rows import (
     add_products,
     aligned,
@@ -295,7 +295,7 @@ def moments_at(
     belief = seen_from(points, mu, S, u)
     R = len(belief.nu)
     single = room(k, R, padded)
-    work, left, tiles = aligned_rows(R + 5, padded), aligned_rows(R, padded), aligned(tile_memory(R))
+    work, left, tiles = aligned_rows(R + 5, padded), aligned_rows(R, padded), aligned(strips_memory(R, padded))
     left[:] = 0.0
     G_ab, x, y, H = np.zeros((R, R)), np.zeros((R, R)), np.zeros((R, R)), np.zeros((R, R))
     V[:] = 0.0

@@ -9,8 +9,8 @@ columns, zeros above the diagonal. The two that exist then fit the memory of one
 
     inverse_cholesky  L_a^-1, for |L_a^-1 q|^2 and (K_a + sn2_a I)^-1 q; row after row, rows 8I .. start at 32 I (I + 1)
     centred           E_a = beta_a beta_a' - (K_a + sn2_a I)^-1, doubled below the diagonal: sums over i >= j suffice;
-                      block of 8 x 8 after block, in the order in which ``gpmpc.fused.pair_sums`` meets them: tile after
-                      tile, in a tile row after row of blocks. Memory is read in one stream
+                      block of 4 x 16 after block, in the order in which ``gpmpc.fused.pair_sums`` meets them: tile
+                      after tile, in a tile row after row of blocks. Memory is read in one stream
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,8 @@ from gpmpc.exceptions import SettingError, ShapeError
 
 LANES = 8  # doubles in a vector register
 GROUP = 3  # rows that one loop takes together
-TILE = 32  # times 8 columns: a tile, which all rows meet before the next one
+ROWS, COLUMNS = 4, 16  # of a block of pairs
+TILE = 16  # times 16 columns: a tile, which all rows meet before the next one
 
 Array = NDArray[np.float64]
 
@@ -73,16 +74,18 @@ class Packed:
 
     @cached_property
     def centred(self) -> Array:
-        """E_a by blocks, doubled below the diagonal (k, triangle_size(P))."""
-        triangles = self._triangles(self._centred_square)
-        for triangle in triangles:
-            rows, count, place = triangle.copy(), self.points.shape[1] // LANES, 0
-            for start in range(0, count, TILE):
-                for i in range(start, count):
-                    row = rows[triangle_size(i * LANES) : triangle_size((i + 1) * LANES)].reshape(LANES, -1)
-                    met = row[:, start * LANES : (start + TILE) * LANES]
-                    blocks = triangle[place : place + met.size].reshape(-1, LANES, LANES)
-                    blocks[:] = met.reshape(LANES, -1, LANES).swapaxes(0, 1)
+        """E_a by blocks, doubled below the diagonal (k, a little more than triangle_size(P))."""
+        padded, width = self.points.shape[1], TILE * COLUMNS
+        size = sum(-(-(i + ROWS) // COLUMNS) for i in range(0, padded, ROWS)) * ROWS * COLUMNS
+        triangles = aligned_zeros(len(self.weights), size)
+        for a, triangle in enumerate(triangles):
+            square, place = self._centred_square(a), 0
+            for start in range(0, padded, width):
+                for i in range(start, padded, ROWS):
+                    count = min(-(-(i + ROWS - start) // COLUMNS), TILE)
+                    met, row = np.zeros((ROWS, count * COLUMNS)), square[i : i + ROWS, start : start + count * COLUMNS]
+                    met[: row.shape[0], : row.shape[1]] = row
+                    triangle[place : place + met.size] = met.reshape(ROWS, count, COLUMNS).swapaxes(0, 1).ravel()
                     place += met.size
         return triangles
 

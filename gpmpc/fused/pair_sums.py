@@ -10,9 +10,9 @@ A large delta is harmless. A kernel is at most sf2, so Q_ij = q_ai q_bj exp(delt
 sf2_b q_ai; the two together give Q_ij <= sf2_a sf2_b exp(-delta_ij). From delta = 300 on it is below 1e-130 sf2_a
 sf2_b, and the exponent may stay there: nothing overflows, and q that underflow belong to nothing that counts.
 
-Eight rows i at a time meet eight columns j (``gpmpc.fused.block``), and nothing of the pair goes to memory but what it
-adds to the sums. What eight columns bring and gather stands together in a strip of vectors of eight; so many strips
-make a tile that it stays in the first cache while all rows pass. What eight rows bring is a strip, too.
+Four rows i at a time meet sixteen columns j (``gpmpc.fused.block``), and nothing of the pair goes to memory but what
+it adds to the sums. What sixteen columns bring and gather stands together in a strip, and so does what four rows bring
+and gather. So many strips of columns make a tile that it stays in the first cache while all rows pass.
 """
 
 from typing import NamedTuple
@@ -21,10 +21,12 @@ from numpy import ndarray
 
 from gpmpc.compiled import borrowing
 from gpmpc.fused.block import (
-    EDGE,
+    COLUMNS,
+    LANES,
+    ROWS,
     SIZE,
-    add_row_sums,
     add_to_columns,
+    add_to_rows,
     block,
     copy,
     copy_product,
@@ -33,9 +35,7 @@ from gpmpc.fused.block import (
     outer_sum,
     plus,
     plus_outer,
-    plus_scaled,
     times,
-    zeros,
 )
 from gpmpc.fused.exponential import EXACT, inlined, widest
 from gpmpc.fused.packed import TILE
@@ -58,89 +58,96 @@ class Side(NamedTuple):
 
 
 @borrowing
-def strip(dims):
-    """Numbers in a strip: shift, vectors, weights; then a sum and the sums of vectors, or weights times z."""
-    return (2 * dims + 3) * EDGE
+def column_strip(dims):
+    """Numbers in a strip of columns: shift, vectors, weights; a sum and the sums of vectors, all of sixteen columns."""
+    return (2 * dims + 3) * COLUMNS
 
 
 @borrowing
-def tile_memory(dims):
-    """Numbers that ``pair_sums`` works in, for vectors z of ``dims`` entries."""
-    return (TILE + 1) * strip(dims)
+def row_strip(dims):
+    """Numbers in a strip of rows: shift, vectors, weights, weights times z, all of four rows; four vectors of sums."""
+    return (2 * dims + 2) * ROWS + ROWS * LANES
 
 
 @borrowing
-def fill(memory, at, shift, vectors, weights, first):
-    """Writes the first part of the strip of eight points from ``first`` on."""
-    dims = len(vectors)
-    copy(memory, at, shift, first)
-    copy(memory, at + (dims + 1) * EDGE, weights, first)
-    for d in range(dims):
-        copy(memory, at + (d + 1) * EDGE, vectors[d], first)
+def strips_memory(dims, padded):
+    """Numbers that ``pair_sums`` works in, for ``padded`` points and vectors z of ``dims`` entries."""
+    return padded // ROWS * row_strip(dims) + -(-padded // COLUMNS) * column_strip(dims)
+
+
+@borrowing
+def fill(strips, step, width, place, values):
+    """Copies the values of ``width`` points to each strip's ``place``."""
+    for first in range(0, len(values), ROWS):
+        copy(strips, first // width * step + place + first % width, values, first)
 
 
 @borrowing(fastmath=EXACT)
-def values_of(rows, tile, at, dims):
-    """expm1(delta) of eight rows and the columns of the strip at ``at``."""
+def values_of(rows, row, tile, at, dims):
+    """expm1(delta) of the rows of the strip at ``row`` and the columns of the strip at ``at``."""
     inlined()
-    x = outer_sum(rows, 0, tile, at)
+    x = outer_sum(rows, row, tile, at)
     for d in range(1, dims + 1, 3):
-        x = plus_outer(x, rows, d * EDGE, tile, at + d * EDGE)
-        x = plus_outer(x, rows, (d + 1) * EDGE, tile, at + (d + 1) * EDGE)
-        x = plus_outer(x, rows, (d + 2) * EDGE, tile, at + (d + 2) * EDGE)
+        x = plus_outer(x, rows, row + d * ROWS, tile, at + d * COLUMNS)
+        x = plus_outer(x, rows, row + (d + 1) * ROWS, tile, at + (d + 1) * COLUMNS)
+        x = plus_outer(x, rows, row + (d + 2) * ROWS, tile, at + (d + 2) * COLUMNS)
     return expm1(x)
 
 
 @borrowing(fastmath=EXACT)
-def add_vectors(tile, at, block, rows, first, dims):
+def add_vectors(tile, at, block, rows, row, dims):
     """Adds sum_i weights_i z_i block_ij to the sums of vectors from ``at`` on."""
     inlined()
     for d in range(0, dims, 3):
-        add_to_columns(tile, at + d * EDGE, block, rows, first + d * EDGE)
-        add_to_columns(tile, at + (d + 1) * EDGE, block, rows, first + (d + 1) * EDGE)
-        add_to_columns(tile, at + (d + 2) * EDGE, block, rows, first + (d + 2) * EDGE)
+        add_to_columns(tile, at + d * COLUMNS, block, rows, row + d * ROWS)
+        add_to_columns(tile, at + (d + 1) * COLUMNS, block, rows, row + (d + 1) * ROWS)
+        add_to_columns(tile, at + (d + 2) * COLUMNS, block, rows, row + (d + 2) * ROWS)
 
 
 @borrowing(fastmath=EXACT)
-def meet(derivatives, rows, tile, strips, p_i, i, dims):
-    """Eight rows meet a tile of columns of another output."""
+def meet(derivatives, rows, tile, dims):
+    """All rows meet a tile of columns of another output."""
     widest()
-    weights, sums, step = (dims + 1) * EDGE, (dims + 2) * EDGE, strip(dims)
-    if derivatives:
-        sums_of_rows = zeros()
-        for at in range(0, strips * step, step):
-            value = values_of(rows, tile, at, dims)
-            add_to_columns(tile, at + sums, value, rows, weights)
-            sums_of_rows = plus_scaled(sums_of_rows, value, tile, at + weights)
-            add_vectors(tile, at + sums + EDGE, value, rows, weights + EDGE, dims)
-        add_row_sums(p_i, i, sums_of_rows, rows, weights)
-    else:
-        for at in range(0, strips * step, step):
-            add_to_columns(tile, at + sums, values_of(rows, tile, at, dims), rows, weights)
+    weights_i, moments_i, sums_i = (dims + 1) * ROWS, (dims + 2) * ROWS, (2 * dims + 2) * ROWS
+    weights, sums, moments, step = (dims + 1) * COLUMNS, (dims + 2) * COLUMNS, (dims + 3) * COLUMNS, column_strip(dims)
+    for row in range(0, len(rows), row_strip(dims)):
+        if derivatives:
+            for at in range(0, len(tile), step):
+                value = values_of(rows, row, tile, at, dims)
+                add_to_columns(tile, at + sums, value, rows, row + weights_i)
+                add_to_rows(rows, row + sums_i, value, tile, at + weights)
+                add_vectors(tile, at + moments, value, rows, row + moments_i, dims)
+        else:
+            for at in range(0, len(tile), step):
+                add_to_columns(tile, at + sums, values_of(rows, row, tile, at, dims), rows, row + weights_i)
 
 
 @borrowing(fastmath=EXACT)
-def meet_same(derivatives, rows, tile, strips, p_i, i, dims, triangle, place):
-    """Eight rows meet a tile of columns of the same output, whose blocks of E start at ``place``."""
+def meet_same(derivatives, rows, tile, dims, triangle):
+    """Rows meet a tile of columns of the same output; returns how much of E, which starts with the tile's, was used."""
     widest()
-    weights, sums, step = (dims + 1) * EDGE, (dims + 2) * EDGE, strip(dims)
-    if derivatives:
-        sums_of_rows = zeros()
-        for at in range(0, strips * step, step):
-            fetch(triangle, place + AHEAD)
-            value, E = values_of(rows, tile, at, dims), block(triangle, place)
-            P = times(E, value)
-            R = plus(P, E)
-            add_to_columns(tile, at + sums, P, rows, weights)
-            sums_of_rows = plus_scaled(sums_of_rows, P, tile, at + weights)
-            add_vectors(tile, at + sums + EDGE, R, rows, weights + EDGE, dims)
-            place += SIZE
-        add_row_sums(p_i, i, sums_of_rows, rows, weights)
-    else:
-        for at in range(0, strips * step, step):
-            P = times(block(triangle, place), values_of(rows, tile, at, dims))
-            add_to_columns(tile, at + sums, P, rows, weights)
-            place += SIZE
+    weights_i, moments_i, sums_i = (dims + 1) * ROWS, (dims + 2) * ROWS, (2 * dims + 2) * ROWS
+    weights, sums, moments, step = (dims + 1) * COLUMNS, (dims + 2) * COLUMNS, (dims + 3) * COLUMNS, column_strip(dims)
+    place = i = 0
+    for row in range(0, len(rows), row_strip(dims)):
+        i += ROWS
+        below = min(len(tile), -(-i // COLUMNS) * step)
+        if derivatives:
+            for at in range(0, below, step):
+                fetch(triangle, place + AHEAD)
+                value, E = values_of(rows, row, tile, at, dims), block(triangle, place)
+                P = times(E, value)
+                R = plus(P, E)
+                add_to_columns(tile, at + sums, P, rows, row + weights_i)
+                add_to_rows(rows, row + sums_i, P, tile, at + weights)
+                add_vectors(tile, at + moments, R, rows, row + moments_i, dims)
+                place += SIZE
+        else:
+            for at in range(0, below, step):
+                P = times(block(triangle, place), values_of(rows, row, tile, at, dims))
+                add_to_columns(tile, at + sums, P, rows, row + weights_i)
+                place += SIZE
+    return place
 
 
 @borrowing
@@ -154,38 +161,46 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, memory, out):
         left: (R, P).
         rows: ``Side`` of output a.
         columns: ``Side`` of output b; its z is right_j.
-        memory: Lent to work in, ``tile_memory`` numbers that start on a cache line.
+        memory: Lent to work in, ``strips_memory`` numbers that start on a cache line.
         out: Receives p_i, p_j and the rows of g (2 + R, P), where derivatives are wanted.
 
     Returns:
         sum_ij P_ij.
     """
     dims, padded = left.shape
-    step, weights, sums = strip(dims), (dims + 1) * EDGE, (dims + 2) * EDGE
-    tile, row = memory[: TILE * step], memory[TILE * step :]
-    p_i, total, count, place = out[0], 0.0, padded // EDGE, 0
-    p_i[:] = 0.0
-    for start in range(0, count, TILE):
-        strips = min(TILE, count - start)
-        for column in range(strips):
-            fill(tile, column * step, columns.shift, columns.z, columns.weights, (start + column) * EDGE)
-            tile[column * step + sums : (column + 1) * step] = 0.0
-        for eight in range(start if same else 0, count):
-            i = eight * EDGE
-            fill(row, 0, rows.shift, left, rows.weights, i)
-            for d in range(dims):
-                copy_product(row, sums + d * EDGE, rows.z[d], i, rows.weights, i)
-            if same:
-                below = min(eight + 1 - start, strips)
-                meet_same(derivatives, row, tile, below, p_i, i, dims, triangle, place)
-                place += below * SIZE
-            else:
-                meet(derivatives, row, tile, strips, p_i, i, dims)
-        for column in range(strips):
-            at, j = column * step, (start + column) * EDGE
-            for k in range(EDGE):
-                total += tile[at + sums + k] * tile[at + weights + k]
-            if derivatives:
-                for d in range(dims + 1):
-                    copy_product(out[1 + d], j, tile, at + sums + d * EDGE, tile, at + weights)
+    step_i, step_j, start = row_strip(dims), column_strip(dims), padded // ROWS * row_strip(dims)
+    weights, sums = (dims + 1) * COLUMNS, (dims + 2) * COLUMNS
+    strips_i, strips_j = memory[:start], memory[start : strips_memory(dims, padded)]
+    strips_i[:] = 0.0
+    strips_j[:] = 0.0
+    fill(strips_i, step_i, ROWS, 0, rows.shift)
+    fill(strips_i, step_i, ROWS, (dims + 1) * ROWS, rows.weights)
+    fill(strips_j, step_j, COLUMNS, 0, columns.shift)
+    fill(strips_j, step_j, COLUMNS, weights, columns.weights)
+    for d in range(dims):
+        fill(strips_i, step_i, ROWS, (d + 1) * ROWS, left[d])
+        fill(strips_j, step_j, COLUMNS, (d + 1) * COLUMNS, columns.z[d])
+        for i in range(0, padded, ROWS):
+            copy_product(strips_i, i // ROWS * step_i + (dims + 2 + d) * ROWS, rows.z[d], i, rows.weights, i)
+    place = 0
+    for at in range(0, len(strips_j), TILE * step_j):
+        tile = strips_j[at : at + TILE * step_j]
+        if same:
+            place += meet_same(derivatives, strips_i[at // step_j * COLUMNS // ROWS * step_i :], tile, dims, triangle[place:])
+        else:
+            meet(derivatives, strips_i, tile, dims)
+    total = 0.0
+    for j in range(padded):
+        at = j // COLUMNS * step_j + j % COLUMNS
+        total += strips_j[at + sums] * strips_j[at + weights]
+    if derivatives:
+        for i in range(padded):
+            at, part = i // ROWS * step_i + (2 * dims + 2) * ROWS + i % ROWS * LANES, 0.0
+            for k in range(LANES):
+                part += strips_i[at + k]
+            out[0, i] = rows.weights[i] * part
+        for d in range(dims + 1):
+            for j in range(0, padded, ROWS):
+                at = j // COLUMNS * step_j + j % COLUMNS
+                copy_product(out[1 + d], j, strips_j, at + sums + d * COLUMNS, strips_j, at + weights)
     return total

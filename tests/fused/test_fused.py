@@ -310,19 +310,19 @@ def test_not_a_number_is_passed_on():
 
 @numba.njit
 def add_expm1(x, row, one, sums):
-    for at in range(0, len(x), 8):
+    for at in range(0, len(x), 16):
         add_to_columns(sums, at, expm1(outer_sum(row, 0, x, at)), one, 0)
 
 
 def block_expm1(values):
     """expm1 of a block, read off its rows in turn."""
-    x, sums = np.zeros((2, -(-len(values) // 8) * 8))
+    x, sums = np.zeros((2, -(-len(values) // 16) * 16))
     x[: len(values)] = values
     answers = []
-    for one in np.eye(8):
+    for one in np.eye(4):
         sums[:] = 0.0
         with np.errstate(invalid="ignore"):
-            add_expm1(x, np.zeros(8), one, sums)
+            add_expm1(x, np.zeros(4), one, sums)
         answers.append(sums[: len(values)].copy())
     assert all(np.array_equal(answer, answers[0], equal_nan=True) for answer in answers)
     return answers[0]
