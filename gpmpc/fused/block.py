@@ -244,6 +244,29 @@ def add_to_rows(typing_context, sums, at, block, columns, place):
     return types.none(ARRAY, types.intp, BLOCK, ARRAY, types.intp), generate
 
 
+@intrinsic
+def sum_rows(typing_context, target, place, sums, at, factors, first):
+    """Writes the sums of four vectors ``sums``, times four factors."""
+
+    def generate(context, builder, signature, arguments):
+        target, sums, factors = (_numbers(context, builder, arguments[k]) for k in (0, 2, 4))
+        parts = [_load(builder, sums, arguments[3], row * LANES) for row in range(ROWS)]
+        for length in (LANES, LANES, ROWS):  # sums of neighbours, of two vectors at a time
+            even, odd = (
+                ir.Constant(ir.VectorType(ir.IntType(32), length), list(range(start, 2 * length, 2))) for start in (0, 1)
+            )
+            pairs = list(zip(parts[::2], parts[-1::-2][::-1], strict=True))
+            parts = [
+                builder.fadd(builder.shuffle_vector(a, b, even), builder.shuffle_vector(a, b, odd), flags=FUSED)
+                for a, b in pairs
+            ]
+        total = builder.fmul(parts[0], _four(builder, factors, arguments[5]), flags=FUSED)
+        _store_four(builder, total, target, arguments[1])
+        return context.get_dummy_value()
+
+    return types.none(ARRAY, types.intp, ARRAY, types.intp, ARRAY, types.intp), generate
+
+
 def _four(builder, data, at):
     return builder.load(_quarter(builder, data, at), align=8)
 

@@ -35,10 +35,12 @@ from gpmpc.fused.block import (
     outer_sum,
     plus,
     plus_outer,
+    sum_rows,
     times,
 )
 from gpmpc.fused.exponential import EXACT, inlined, widest
 from gpmpc.fused.packed import TILE
+from gpmpc.fused.point_rows import summed
 
 AHEAD = 4 * SIZE  # how far ahead of its use E is asked for: four blocks last longer than memory takes to answer
 
@@ -78,8 +80,19 @@ def strips_memory(dims, padded):
 @borrowing
 def fill(strips, step, width, place, values):
     """Copies the values of ``width`` points to each strip's ``place``."""
-    for first in range(0, len(values), ROWS):
-        copy(strips, first // width * step + place + first % width, values, first)
+    for first in range(0, len(values), width):
+        for at in range(first, min(first + width, len(values)), ROWS):
+            copy(strips, place + at - first, values, at)
+        place += step
+
+
+@borrowing
+def gather(strips, step, place, weights, out):
+    """Writes the sums of columns at each strip's ``place``, times their weights."""
+    for first in range(0, len(out), COLUMNS):
+        for at in range(first, min(first + COLUMNS, len(out)), ROWS):
+            copy_product(out, at, strips, place + at - first, weights, at)
+        place += step
 
 
 @borrowing(fastmath=EXACT)
@@ -162,7 +175,7 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, memory, out):
         rows: ``Side`` of output a.
         columns: ``Side`` of output b; its z is right_j.
         memory: Lent to work in, ``strips_memory`` numbers that start on a cache line.
-        out: Receives p_i, p_j and the rows of g (2 + R, P), where derivatives are wanted.
+        out: Receives p_i, p_j and the rows of g (2 + R, P); without derivatives p_j only.
 
     Returns:
         sum_ij P_ij.
@@ -180,8 +193,10 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, memory, out):
     for d in range(dims):
         fill(strips_i, step_i, ROWS, (d + 1) * ROWS, left[d])
         fill(strips_j, step_j, COLUMNS, (d + 1) * COLUMNS, columns.z[d])
+        at = (dims + 2 + d) * ROWS
         for i in range(0, padded, ROWS):
-            copy_product(strips_i, i // ROWS * step_i + (dims + 2 + d) * ROWS, rows.z[d], i, rows.weights, i)
+            copy_product(strips_i, at, rows.z[d], i, rows.weights, i)
+            at += step_i
     place = 0
     for at in range(0, len(strips_j), TILE * step_j):
         tile = strips_j[at : at + TILE * step_j]
@@ -189,18 +204,12 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, memory, out):
             place += meet_same(derivatives, strips_i[at // step_j * COLUMNS // ROWS * step_i :], tile, dims, triangle[place:])
         else:
             meet(derivatives, strips_i, tile, dims)
-    total = 0.0
-    for j in range(padded):
-        at = j // COLUMNS * step_j + j % COLUMNS
-        total += strips_j[at + sums] * strips_j[at + weights]
+    gather(strips_j, step_j, sums, columns.weights, out[1])
     if derivatives:
-        for i in range(padded):
-            at, part = i // ROWS * step_i + (2 * dims + 2) * ROWS + i % ROWS * LANES, 0.0
-            for k in range(LANES):
-                part += strips_i[at + k]
-            out[0, i] = rows.weights[i] * part
-        for d in range(dims + 1):
-            for j in range(0, padded, ROWS):
-                at = j // COLUMNS * step_j + j % COLUMNS
-                copy_product(out[1 + d], j, strips_j, at + sums + d * COLUMNS, strips_j, at + weights)
-    return total
+        for d in range(dims):
+            gather(strips_j, step_j, sums + (d + 1) * COLUMNS, columns.weights, out[2 + d])
+        at = (2 * dims + 2) * ROWS
+        for i in range(0, padded, ROWS):
+            sum_rows(out[0], i, strips_i, at, rows.weights, i)
+            at += step_i
+    return summed(out[1])
