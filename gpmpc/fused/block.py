@@ -280,7 +280,30 @@ def _quarter(builder, data, at):
 
 
 @intrinsic
+def clear(typing_context, target, place):
+    """Writes eight zeros."""
+
+    def generate(context, builder, signature, arguments):
+        _store(builder, ir.Constant(VECTOR, [0.0] * LANES), _numbers(context, builder, arguments[0]), arguments[1])
+        return context.get_dummy_value()
+
+    return types.none(ARRAY, types.intp), generate
+
+
+@intrinsic
 def copy(typing_context, target, place, source, at):
+    """Copies eight numbers."""
+
+    def generate(context, builder, signature, arguments):
+        target, source = (_numbers(context, builder, arguments[k]) for k in (0, 2))
+        _store(builder, _load(builder, source, arguments[3]), target, arguments[1])
+        return context.get_dummy_value()
+
+    return types.none(ARRAY, types.intp, ARRAY, types.intp), generate
+
+
+@intrinsic
+def copy_four(typing_context, target, place, source, at):
     """Copies four numbers."""
 
     def generate(context, builder, signature, arguments):

@@ -28,7 +28,9 @@ from gpmpc.fused.block import (
     add_to_columns,
     add_to_rows,
     block,
+    clear,
     copy,
+    copy_four,
     copy_product,
     expm1,
     fetch,
@@ -78,12 +80,35 @@ def strips_memory(dims, padded):
 
 
 @borrowing
-def fill(strips, step, width, place, values):
-    """Copies the values of ``width`` points to each strip's ``place``."""
-    for first in range(0, len(values), width):
-        for at in range(first, min(first + width, len(values)), ROWS):
-            copy(strips, place + at - first, values, at)
-        place += step
+def fill_rows(strips, step, shift, left, weights, z):
+    """Writes what the rows bring, and zeros for what they gather."""
+    dims, padded = left.shape
+    flat_left, flat_z, at = left.reshape(left.size), z.reshape(z.size), 0
+    for i in range(0, padded, ROWS):
+        copy_four(strips, at, shift, i)
+        copy_four(strips, at + (dims + 1) * ROWS, weights, i)
+        for d in range(dims):
+            copy_four(strips, at + (d + 1) * ROWS, flat_left, i + d * padded)
+            copy_product(strips, at + (d + dims + 2) * ROWS, flat_z, i + d * padded, weights, i)
+        for k in range((2 * dims + 2) * ROWS, step, LANES):
+            clear(strips, at + k)
+        at += step
+
+
+@borrowing
+def fill_columns(strips, step, shift, z, weights):
+    """Writes what the columns bring, and zeros for what they gather and for eight columns that may be missing."""
+    dims, padded = z.shape
+    flat_z, at = z.reshape(z.size), 0
+    for first in range(0, padded, COLUMNS):
+        for k in range(0, step, LANES):
+            clear(strips, at + k)
+        for k in range(0, min(COLUMNS, padded - first), LANES):
+            copy(strips, at + k, shift, first + k)
+            copy(strips, at + k + (dims + 1) * COLUMNS, weights, first + k)
+            for d in range(dims):
+                copy(strips, at + k + (d + 1) * COLUMNS, flat_z, first + k + d * padded)
+        at += step
 
 
 @borrowing
@@ -182,21 +207,10 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, memory, out):
     """
     dims, padded = left.shape
     step_i, step_j, start = row_strip(dims), column_strip(dims), padded // ROWS * row_strip(dims)
-    weights, sums = (dims + 1) * COLUMNS, (dims + 2) * COLUMNS
+    sums = (dims + 2) * COLUMNS
     strips_i, strips_j = memory[:start], memory[start : strips_memory(dims, padded)]
-    strips_i[:] = 0.0
-    strips_j[:] = 0.0
-    fill(strips_i, step_i, ROWS, 0, rows.shift)
-    fill(strips_i, step_i, ROWS, (dims + 1) * ROWS, rows.weights)
-    fill(strips_j, step_j, COLUMNS, 0, columns.shift)
-    fill(strips_j, step_j, COLUMNS, weights, columns.weights)
-    for d in range(dims):
-        fill(strips_i, step_i, ROWS, (d + 1) * ROWS, left[d])
-        fill(strips_j, step_j, COLUMNS, (d + 1) * COLUMNS, columns.z[d])
-        at = (dims + 2 + d) * ROWS
-        for i in range(0, padded, ROWS):
-            copy_product(strips_i, at, rows.z[d], i, rows.weights, i)
-            at += step_i
+    fill_rows(strips_i, step_i, rows.shift, left, rows.weights, rows.z)
+    fill_columns(strips_j, step_j, columns.shift, columns.z, columns.weights)
     place = 0
     for at in range(0, len(strips_j), TILE * step_j):
         tile = strips_j[at : at + TILE * step_j]
