@@ -29,13 +29,13 @@ from gpmpc.fused.belief_algebra import (
     transposed_product,
     transposed_times,
 )
+from gpmpc.fused.explained import explain_rest, unexplained
 from gpmpc.fused.exponential import exp_all
 from gpmpc.fused.pair_sums import Side, pair_sums, strips_memory
 from gpmpc.fused.point_rows import (
     add_products,
     aligned,
     aligned_rows,
-    explain,
     multiply,
     project,
     second_moments,
@@ -152,9 +152,9 @@ def evaluate_single(belief, D, signal, beta, a, single, n):
 
 
 @compiled
-def differentiate_single(belief, D, a, single, solved, n, M, to, work, x, y):
-    """Fills the sums of output a, dM and what -|L_a^-1 q_a|^2 adds to dV_aa."""
-    control, R, G, e = belief.control, len(belief.nu), single.G[a], work[1]
+def differentiate_mean(belief, D, a, single, n, M, to, work, x, y):
+    """Fills the second moments of output a and dM."""
+    control, R, G = belief.control, len(belief.nu), single.G[a]
     controls = np.empty(len(control))
     second_moments(single.weighted[a], single.z[a], single.second[a], n, work[0])
     congruent(G, single.second[a], n, y, x)
@@ -165,6 +165,12 @@ def differentiate_single(belief, D, a, single, solved, n, M, to, work, x, y):
     for c in range(belief.inputs):
         to.dM_du[a, c] = controls[c] * D[R + c]
 
+
+@compiled
+def differentiate_explained(belief, D, a, single, solved, n, to, work, x, y):
+    """Fills the sums over e_i of output a and what -|L_a^-1 q_a|^2 adds to dV_aa."""
+    control, R, G, e = belief.control, len(belief.nu), single.G[a], work[1]
+    controls = np.empty(len(control))
     multiply(solved, single.q[a], e)
     single.e_total[a] = summed(e)
     project(e, single.z[a], single.e_first[a])
@@ -207,7 +213,7 @@ def differentiate_cross(belief, D, a, single, n, J, to, work):
 
 
 @compiled
-def evaluate_pair(belief, D_a, D_b, a, b, single, triangle, n, order, work, left, tiles, G_ab, x):
+def evaluate_pair(belief, D_a, D_b, a, b, single, triangle, explained, n, order, work, left, strips, G_ab, x):
     """sum_ij P_ij of the pair; its parts go to ``work[3:]``, G_ab is filled."""
     T_ab, D_ab, rise, fall = np.zeros_like(G_ab), D_a + D_b, work[1], work[2]
     r = single.half_logdet[a] + single.half_logdet[b] - condition(belief.S, D_ab, n, x, G_ab)
@@ -224,7 +230,7 @@ def evaluate_pair(belief, D_a, D_b, a, b, single, triangle, n, order, work, left
         rise += fall
     weights_a, weights_b = (single.q[a], single.q[b]) if a == b else (single.weighted[a], single.weighted[b])
     rows, columns = Side(single.z[a], rise, weights_a), Side(single.z[b], fall, weights_b)
-    return pair_sums(a == b, order > VALUE, triangle, left, rows, columns, tiles, work[3:])
+    return pair_sums(a == b, order > VALUE, triangle, left, rows, columns, explained, strips, work[3:])
 
 
 @compiled
@@ -295,7 +301,7 @@ def moments_at(
     belief = seen_from(points, mu, S, u)
     R = len(belief.nu)
     single = room(k, R, padded)
-    work, left, tiles = aligned_rows(R + 5, padded), aligned_rows(R, padded), aligned(strips_memory(R, padded))
+    work, left, strips = aligned_rows(R + 5, padded), aligned_rows(R, padded), aligned(strips_memory(R, padded))
     left[:] = 0.0
     G_ab, x, y, H = np.zeros((R, R)), np.zeros((R, R)), np.zeros((R, R)), np.zeros((R, R))
     V[:] = 0.0
@@ -306,15 +312,24 @@ def moments_at(
         D = inverse_squares[a]
         M[a] = evaluate_single(belief, D, signal[a], beta[a], a, single, n)
         transposed_times(single.G[a], single.first[a], n, J[a])
-        V[a, a] = signal[a] - explain(inverse_cholesky[a], single.q[a], work[2])
         if order >= JACOBIAN:
-            differentiate_single(belief, D, a, single, work[2], n, M[a], to, work, x, y)
+            differentiate_mean(belief, D, a, single, n, M[a], to, work, x, y)
         if order == CROSS:
             differentiate_cross(belief, D, a, single, n, J[a], to, work)
-    for a in range(k):
-        for b in range(a, a + 1 if diagonal else k):
+    explained = unexplained(inverse_cholesky, single.q)
+    for apart in range(0 if diagonal else k - 1, -1, -1):  # a = b last: what is explained is needed there only
+        if apart == 0:
+            explain_rest(explained)
+        for a in range(k - apart):
+            b = a + apart
             D_a, D_b = inverse_squares[a], inverse_squares[b]
-            total = evaluate_pair(belief, D_a, D_b, a, b, single, centred[a], n, order, work, left, tiles, G_ab, x)
+            if a == b:
+                V[a, a] = signal[a] - explained.totals[a]
+                if order >= JACOBIAN:
+                    differentiate_explained(belief, D_a, a, single, explained.solved[a], n, to, work, x, y)
+            total = evaluate_pair(
+                belief, D_a, D_b, a, b, single, centred[a], explained, n, order, work, left, strips, G_ab, x
+            )
             V[a, b] += total
             V[b, a] = V[a, b]
             if order >= JACOBIAN:

@@ -40,6 +40,7 @@ from gpmpc.fused.block import (
     sum_rows,
     times,
 )
+from gpmpc.fused.explained import ASKED, explain_asked
 from gpmpc.fused.exponential import EXACT, inlined, widest
 from gpmpc.fused.packed import TILE
 from gpmpc.fused.point_rows import summed
@@ -143,21 +144,28 @@ def add_vectors(tile, at, block, rows, row, dims):
 
 
 @borrowing(fastmath=EXACT)
-def meet(derivatives, rows, tile, dims):
-    """All rows meet a tile of columns of another output."""
+def meet(derivatives, rows, tile, dims, explained):
+    """All rows meet a tile of columns of another output; memory is idle meanwhile and is asked for what comes next."""
     widest()
+    asked, last = explained.progress[ASKED], len(explained.triangles)
     weights_i, moments_i, sums_i = (dims + 1) * ROWS, (dims + 2) * ROWS, (2 * dims + 2) * ROWS
     weights, sums, moments, step = (dims + 1) * COLUMNS, (dims + 2) * COLUMNS, (dims + 3) * COLUMNS, column_strip(dims)
     for row in range(0, len(rows), row_strip(dims)):
         if derivatives:
             for at in range(0, len(tile), step):
+                fetch(explained.triangles, asked)
+                asked = min(asked + SIZE, last)
                 value = values_of(rows, row, tile, at, dims)
                 add_to_columns(tile, at + sums, value, rows, row + weights_i)
                 add_to_rows(rows, row + sums_i, value, tile, at + weights)
                 add_vectors(tile, at + moments, value, rows, row + moments_i, dims)
         else:
             for at in range(0, len(tile), step):
+                fetch(explained.triangles, asked)
+                asked = min(asked + SIZE, last)
                 add_to_columns(tile, at + sums, values_of(rows, row, tile, at, dims), rows, row + weights_i)
+        explained.progress[ASKED] = asked
+        explain_asked(explained)
 
 
 @borrowing(fastmath=EXACT)
@@ -189,7 +197,7 @@ def meet_same(derivatives, rows, tile, dims, triangle):
 
 
 @borrowing
-def pair_sums(same, derivatives, triangle, left, rows, columns, memory, out):
+def pair_sums(same, derivatives, triangle, left, rows, columns, explained, memory, out):
     """The sums of the module's text.
 
     Args:
@@ -199,6 +207,7 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, memory, out):
         left: (R, P).
         rows: ``Side`` of output a.
         columns: ``Side`` of output b; its z is right_j.
+        explained: Goes on while a and b differ.
         memory: Lent to work in, ``strips_memory`` numbers that start on a cache line.
         out: Receives p_i, p_j and the rows of g (2 + R, P); without derivatives p_j only.
 
@@ -217,7 +226,7 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, memory, out):
         if same:
             place += meet_same(derivatives, strips_i[at // step_j * COLUMNS // ROWS * step_i :], tile, dims, triangle[place:])
         else:
-            meet(derivatives, strips_i, tile, dims)
+            meet(derivatives, strips_i, tile, dims, explained)
     gather(strips_j, step_j, sums, columns.weights, out[1])
     if derivatives:
         for d in range(dims):

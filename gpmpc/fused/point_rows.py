@@ -106,24 +106,30 @@ def add_products(out, factors, rows, others, n):
 @borrowing
 def explain(triangle, q, solved):
     """Returns |L^-1 q|^2 and writes (K + sn2 I)^-1 q to ``solved``, in one pass over the block triangle of L^-1."""
-    widest()
     solved[:] = 0.0
-    total = 0.0
-    for start in range(0, len(q), 4):
-        length = start // 8 * 8 + 8
-        at = start // 8 * 8 * length // 2 + start % 8 * length
-        row0, row1 = triangle[at : at + length], triangle[at + length : at + 2 * length]
-        row2, row3 = triangle[at + 2 * length : at + 3 * length], triangle[at + 3 * length : at + 4 * length]
-        v0 = v1 = v2 = v3 = 0.0
-        for j in range(length):
-            v0 += row0[j] * q[j]
-            v1 += row1[j] * q[j]
-            v2 += row2[j] * q[j]
-            v3 += row3[j] * q[j]
-        total += v0 * v0 + v1 * v1 + v2 * v2 + v3 * v3
-        for j in range(length):
-            solved[j] = solved[j] + v0 * row0[j] + v1 * row1[j] + v2 * row2[j] + v3 * row3[j]
+    total, at = 0.0, 0
+    for row in range(0, len(q), 4):
+        length = row // 8 * 8 + 8
+        total += explain_four(triangle, at, length, q, solved)
+        at += 4 * length
     return total
+
+
+@borrowing
+def explain_four(triangle, at, length, q, solved):
+    """The part of four rows of L^-1, which start at ``at``: returns theirs of the square, adds theirs to ``solved``."""
+    widest()
+    row0, row1 = triangle[at : at + length], triangle[at + length : at + 2 * length]
+    row2, row3 = triangle[at + 2 * length : at + 3 * length], triangle[at + 3 * length : at + 4 * length]
+    v0 = v1 = v2 = v3 = 0.0
+    for j in range(length):
+        v0 += row0[j] * q[j]
+        v1 += row1[j] * q[j]
+        v2 += row2[j] * q[j]
+        v3 += row3[j] * q[j]
+    for j in range(length):
+        solved[j] = solved[j] + v0 * row0[j] + v1 * row1[j] + v2 * row2[j] + v3 * row3[j]
+    return v0 * v0 + v1 * v1 + v2 * v2 + v3 * v3
 
 
 @borrowing
