@@ -153,7 +153,7 @@ def meet(derivatives, rows, tile, dims, explained):
     for row in range(0, len(rows), row_strip(dims)):
         if derivatives:
             for at in range(0, len(tile), step):
-                fetch(explained.triangles, asked)
+                fetch(explained.triangles, min(asked, last - SIZE))
                 asked = min(asked + SIZE, last)
                 value = values_of(rows, row, tile, at, dims)
                 add_to_columns(tile, at + sums, value, rows, row + weights_i)
@@ -161,7 +161,7 @@ def meet(derivatives, rows, tile, dims, explained):
                 add_vectors(tile, at + moments, value, rows, row + moments_i, dims)
         else:
             for at in range(0, len(tile), step):
-                fetch(explained.triangles, asked)
+                fetch(explained.triangles, min(asked, last - SIZE))
                 asked = min(asked + SIZE, last)
                 add_to_columns(tile, at + sums, values_of(rows, row, tile, at, dims), rows, row + weights_i)
         explained.progress[ASKED] = asked
