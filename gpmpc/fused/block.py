@@ -180,7 +180,7 @@ def fetch(typing_context, array, at):
         ask = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
         for k in range(VECTORS):
             place = builder.gep(data, [builder.add(arguments[1], arguments[1].type(k * LANES))])
-            builder.call(ask, [builder.bitcast(place, byte), number(0), number(3), number(1)])
+            builder.call(ask, [builder.bitcast(place, byte), number(0), number(2), number(1)])
         return context.get_dummy_value()
 
     return types.none(ARRAY, types.intp), generate

@@ -45,7 +45,7 @@ from gpmpc.fused.exponential import EXACT, inlined, widest
 from gpmpc.fused.packed import TILE
 from gpmpc.fused.point_rows import summed
 
-AHEAD = 4 * SIZE  # how far ahead of its use E is asked for: four blocks last longer than memory takes to answer
+AHEAD = 16 * SIZE  # how far ahead of its use E is asked for: four blocks last longer than memory takes to answer
 
 
 class Side(NamedTuple):
