@@ -114,19 +114,28 @@ def plus_outer(typing_context, block, rows, at, columns, place):
     return BLOCK(BLOCK, ARRAY, types.intp, ARRAY, types.intp), generate
 
 
+def _constant(value):
+    return ir.Constant(VECTOR, [value] * LANES)
+
+
+def _each(operation, *operands):
+    return [operation(*row) for row in zip(*operands, strict=True)]
+
+
+def _reduced_expm1(builder, r):
+    g = _each(lambda v: _multiply_add(builder, v, _constant(e.G9), _constant(e.G8)), r)
+    for coefficient in (e.G7, e.G6, e.G5, e.G4, e.G3, e.G2, e.G1, e.G0):
+        g = _each(lambda g, v, c=coefficient: _multiply_add(builder, g, v, _constant(c)), g, r)
+    return _each(lambda g, v: _multiply_add(builder, g, builder.fmul(v, v, flags=FUSED), v), g, r)
+
+
 @intrinsic
 def expm1(typing_context, block):
     """exp(x) - 1 for x <= 300 and exp(300) above; the low part of ln 2 is left out, worth a third of x's last digit."""
 
     def generate(context, builder, signature, arguments):
-        def constant(value):
-            return ir.Constant(VECTOR, [value] * LANES)
-
-        def each(operation, *operands):
-            return [operation(*row) for row in zip(*operands, strict=True)]
-
         def capped(x):  # NaN stays NaN
-            low, high = constant(e.SATURATED), constant(e.LARGE)
+            low, high = _constant(e.SATURATED), _constant(e.LARGE)
             x = builder.select(builder.fcmp_ordered("<", x, low), low, x)
             return builder.select(builder.fcmp_ordered(">", x, high), high, x)
 
@@ -141,19 +150,22 @@ def expm1(typing_context, block):
         def subtract(a, b):
             return builder.fsub(a, b, flags=FUSED)
 
-        def multiply(a, b):
-            return builder.fmul(a, b, flags=FUSED)
+        x = _each(capped, _vectors(builder, arguments[0]))
+        rounded = _each(lambda v: _multiply_add(builder, v, _constant(e.PER_LN2), _constant(e.BIASED_ROUNDER)), x)
+        k = _each(lambda v: subtract(v, _constant(e.BIASED_ROUNDER)), rounded)
+        r = _each(lambda v, k: subtract(v, builder.fmul(k, _constant(e.LN2_HIGH), flags=FUSED)), x, k)
+        g, scale = _reduced_expm1(builder, r), _each(scale_of, rounded)
+        return _block(builder, _each(lambda g, s: _multiply_add(builder, g, s, add(s, _constant(-1.0))), g, scale))
 
-        x = each(capped, _vectors(builder, arguments[0]))
-        rounded = each(lambda v: _multiply_add(builder, v, constant(e.PER_LN2), constant(e.BIASED_ROUNDER)), x)
-        k = each(lambda v: subtract(v, constant(e.BIASED_ROUNDER)), rounded)
-        r = each(lambda v, k: subtract(v, multiply(k, constant(e.LN2_HIGH))), x, k)
-        g = each(lambda v: _multiply_add(builder, v, constant(e.G9), constant(e.G8)), r)
-        for coefficient in (e.G7, e.G6, e.G5, e.G4, e.G3, e.G2, e.G1, e.G0):
-            g = each(lambda g, v, c=coefficient: _multiply_add(builder, g, v, constant(c)), g, r)
-        g = each(lambda g, v: _multiply_add(builder, g, multiply(v, v), v), g, r)
-        scale = each(scale_of, rounded)
-        return _block(builder, each(lambda g, s: _multiply_add(builder, g, s, add(s, constant(-1.0))), g, scale))
+    return BLOCK(BLOCK), generate
+
+
+@intrinsic
+def expm1_near_zero(typing_context, block):
+    """The same, to the last bit, where no x is beyond ``exponential.NEAR_ZERO``."""
+
+    def generate(context, builder, signature, arguments):
+        return _block(builder, _reduced_expm1(builder, _vectors(builder, arguments[0])))
 
     return BLOCK(BLOCK), generate
 

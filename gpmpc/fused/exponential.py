@@ -38,6 +38,7 @@ G5, G6, G7, G8, G9 = (
 )
 SATURATED = -60.0  # expm1 is -1 from here on
 LARGE = 300.0  # the capped expm1 stays here
+NEAR_ZERO = 0.34  # below ln(2)/2: k = 0
 
 
 @intrinsic

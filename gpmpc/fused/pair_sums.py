@@ -15,6 +15,7 @@ it adds to the sums. What sixteen columns bring and gather stands together in a 
 and gather. So many strips of columns make a tile that it stays in the first cache while all rows pass.
 """
 
+import math
 from typing import NamedTuple
 
 from numpy import ndarray
@@ -33,6 +34,7 @@ from gpmpc.fused.block import (
     copy_four,
     copy_product,
     expm1,
+    expm1_near_zero,
     fetch,
     outer_sum,
     plus,
@@ -41,9 +43,9 @@ from gpmpc.fused.block import (
     times,
 )
 from gpmpc.fused.explained import ASKED, explain_asked
-from gpmpc.fused.exponential import EXACT, inlined, widest
+from gpmpc.fused.exponential import EXACT, NEAR_ZERO, inlined, widest
 from gpmpc.fused.packed import TILE
-from gpmpc.fused.point_rows import summed
+from gpmpc.fused.point_rows import largest, squared_lengths, summed
 
 AHEAD = 16 * SIZE  # how far ahead of its use E is asked for: four blocks last longer than memory takes to answer
 
@@ -122,7 +124,7 @@ def gather(strips, step, place, weights, out):
 
 
 @borrowing(fastmath=EXACT)
-def values_of(rows, row, tile, at, dims):
+def values_of(near, rows, row, tile, at, dims):
     """expm1(delta) of the rows of the strip at ``row`` and the columns of the strip at ``at``."""
     inlined()
     x = outer_sum(rows, row, tile, at)
@@ -130,7 +132,7 @@ def values_of(rows, row, tile, at, dims):
         x = plus_outer(x, rows, row + d * ROWS, tile, at + d * COLUMNS)
         x = plus_outer(x, rows, row + (d + 1) * ROWS, tile, at + (d + 1) * COLUMNS)
         x = plus_outer(x, rows, row + (d + 2) * ROWS, tile, at + (d + 2) * COLUMNS)
-    return expm1(x)
+    return expm1_near_zero(x) if near else expm1(x)
 
 
 @borrowing(fastmath=EXACT)
@@ -144,7 +146,7 @@ def add_vectors(tile, at, block, rows, row, dims):
 
 
 @borrowing(fastmath=EXACT)
-def meet(derivatives, rows, tile, dims, explained):
+def meet(derivatives, near, rows, tile, dims, explained):
     """All rows meet a tile of columns of another output; memory is idle meanwhile and is asked for what comes next."""
     widest()
     asked, last = explained.progress[ASKED], len(explained.triangles)
@@ -155,7 +157,7 @@ def meet(derivatives, rows, tile, dims, explained):
             for at in range(0, len(tile), step):
                 fetch(explained.triangles, min(asked, last - SIZE))
                 asked = min(asked + SIZE, last)
-                value = values_of(rows, row, tile, at, dims)
+                value = values_of(near, rows, row, tile, at, dims)
                 add_to_columns(tile, at + sums, value, rows, row + weights_i)
                 add_to_rows(rows, row + sums_i, value, tile, at + weights)
                 add_vectors(tile, at + moments, value, rows, row + moments_i, dims)
@@ -163,13 +165,13 @@ def meet(derivatives, rows, tile, dims, explained):
             for at in range(0, len(tile), step):
                 fetch(explained.triangles, min(asked, last - SIZE))
                 asked = min(asked + SIZE, last)
-                add_to_columns(tile, at + sums, values_of(rows, row, tile, at, dims), rows, row + weights_i)
+                add_to_columns(tile, at + sums, values_of(near, rows, row, tile, at, dims), rows, row + weights_i)
         explained.progress[ASKED] = asked
         explain_asked(explained)
 
 
 @borrowing(fastmath=EXACT)
-def meet_same(derivatives, rows, tile, dims, triangle):
+def meet_same(derivatives, near, rows, tile, dims, triangle):
     """Rows meet a tile of columns of the same output; returns how much of E, which starts with the tile's, was used."""
     widest()
     weights_i, moments_i, sums_i = (dims + 1) * ROWS, (dims + 2) * ROWS, (2 * dims + 2) * ROWS
@@ -181,7 +183,7 @@ def meet_same(derivatives, rows, tile, dims, triangle):
         if derivatives:
             for at in range(0, below, step):
                 fetch(triangle, place + AHEAD)
-                value, E = values_of(rows, row, tile, at, dims), block(triangle, place)
+                value, E = values_of(near, rows, row, tile, at, dims), block(triangle, place)
                 P = times(E, value)
                 R = plus(P, E)
                 add_to_columns(tile, at + sums, P, rows, row + weights_i)
@@ -190,10 +192,19 @@ def meet_same(derivatives, rows, tile, dims, triangle):
                 place += SIZE
         else:
             for at in range(0, below, step):
-                P = times(block(triangle, place), values_of(rows, row, tile, at, dims))
+                P = times(block(triangle, place), values_of(near, rows, row, tile, at, dims))
                 add_to_columns(tile, at + sums, P, rows, row + weights_i)
                 place += SIZE
     return place
+
+
+@borrowing
+def largest_exponent(left, rows, columns, work):
+    """What no |delta_ij| exceeds, by Cauchy and Schwarz."""
+    squared_lengths(left, work)
+    square = largest(work)
+    squared_lengths(columns.z, work)
+    return largest(rows.shift) + largest(columns.shift) + math.sqrt(square * largest(work))
 
 
 @borrowing
@@ -218,15 +229,17 @@ def pair_sums(same, derivatives, triangle, left, rows, columns, explained, memor
     step_i, step_j, start = row_strip(dims), column_strip(dims), padded // ROWS * row_strip(dims)
     sums = (dims + 2) * COLUMNS
     strips_i, strips_j = memory[:start], memory[start : strips_memory(dims, padded)]
+    near = largest_exponent(left, rows, columns, out[1]) <= NEAR_ZERO
     fill_rows(strips_i, step_i, rows.shift, left, rows.weights, rows.z)
     fill_columns(strips_j, step_j, columns.shift, columns.z, columns.weights)
     place = 0
     for at in range(0, len(strips_j), TILE * step_j):
         tile = strips_j[at : at + TILE * step_j]
         if same:
-            place += meet_same(derivatives, strips_i[at // step_j * COLUMNS // ROWS * step_i :], tile, dims, triangle[place:])
+            below = strips_i[at // step_j * COLUMNS // ROWS * step_i :]
+            place += meet_same(derivatives, near, below, tile, dims, triangle[place:])
         else:
-            meet(derivatives, strips_i, tile, dims, explained)
+            meet(derivatives, near, strips_i, tile, dims, explained)
     gather(strips_j, step_j, sums, columns.weights, out[1])
     if derivatives:
         for d in range(dims):

@@ -7,7 +7,7 @@ memory does three multiplications. Lengths are multiples of 8, numbers of rows m
 import numpy as np
 
 from gpmpc.compiled import borrowing, compiled
-from gpmpc.fused.exponential import EXACT, widest
+from gpmpc.fused.exponential import EXACT, bits_of, float_of, widest
 
 LINE = 8  # doubles in a cache line
 
@@ -59,6 +59,27 @@ def summed(row):
     for j in range(len(row)):
         result += row[j]
     return result
+
+
+@borrowing
+def largest(row):
+    """The largest magnitude; NaN is the largest of all. Compared as integers, which LLVM turns into full vectors."""
+    widest()
+    most = 0
+    for j in range(len(row)):
+        most = max(most, bits_of(row[j]) & 0x7FFFFFFFFFFFFFFF)
+    return float_of(most)
+
+
+@borrowing
+def squared_lengths(rows, out):
+    """Writes sum_d rows[d]^2."""
+    widest()
+    for d in range(0, len(rows), 3):
+        row0, row1, row2 = rows[d], rows[d + 1], rows[d + 2]
+        for j in range(len(out)):
+            before = out[j] if d > 0 else 0.0
+            out[j] = before + row0[j] * row0[j] + row1[j] * row1[j] + row2[j] * row2[j]
 
 
 @borrowing
