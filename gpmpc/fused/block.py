@@ -263,14 +263,12 @@ def sum_rows(typing_context, target, place, sums, at, factors, first):
     def generate(context, builder, signature, arguments):
         target, sums, factors = (_numbers(context, builder, arguments[k]) for k in (0, 2, 4))
         parts = [_load(builder, sums, arguments[3], row * LANES) for row in range(ROWS)]
-        for length in (LANES, LANES, ROWS):  # sums of neighbours, of two vectors at a time
-            even, odd = (
-                ir.Constant(ir.VectorType(ir.IntType(32), length), list(range(start, 2 * length, 2))) for start in (0, 1)
-            )
-            pairs = list(zip(parts[::2], parts[-1::-2][::-1], strict=True))
+        for length in (LANES, LANES, ROWS):  # sums of neighbours, of two vectors at a time, the last of one with itself
+            kind = ir.VectorType(ir.IntType(32), length)
+            even, odd = (ir.Constant(kind, list(range(start, 2 * length, 2))) for start in (0, 1))
             parts = [
                 builder.fadd(builder.shuffle_vector(a, b, even), builder.shuffle_vector(a, b, odd), flags=FUSED)
-                for a, b in pairs
+                for a, b in zip(parts[::2], parts[-1::-2][::-1], strict=True)
             ]
         total = builder.fmul(parts[0], _four(builder, factors, arguments[5]), flags=FUSED)
         _store_four(builder, total, target, arguments[1])
