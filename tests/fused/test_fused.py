@@ -13,9 +13,10 @@ import torch
 
 from gpmpc import fused
 from gpmpc.exceptions import SettingError, ShapeError
-from gpmpc.fused.block import add_to_columns, expm1, outer_sum
-from gpmpc.fused.exponential import exp_all
+from gpmpc.fused.block import add_to_columns, expm1, expm1_near_zero, outer_sum
+from gpmpc.fused.exponential import NEAR_ZERO, exp_all
 from gpmpc.fused.packed import aligned_zeros, pack
+from gpmpc.fused.pair_sums import Side, largest_exponent
 from gpmpc.fused.point_rows import explain, explain_several
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation.moment_matching import moments
@@ -309,12 +310,13 @@ def test_not_a_number_is_passed_on():
 
 
 @numba.njit
-def add_expm1(x, row, one, sums):
+def add_expm1(x, row, one, sums, near):
     for at in range(0, len(x), 16):
-        add_to_columns(sums, at, expm1(outer_sum(row, 0, x, at)), one, 0)
+        x_ij = outer_sum(row, 0, x, at)
+        add_to_columns(sums, at, expm1_near_zero(x_ij) if near else expm1(x_ij), one, 0)
 
 
-def block_expm1(values):
+def block_expm1(values, near=False):
     """expm1 of a block, read off its rows in turn."""
     x, sums = np.zeros((2, -(-len(values) // 16) * 16))
     x[: len(values)] = values
@@ -322,7 +324,7 @@ def block_expm1(values):
     for one in np.eye(4):
         sums[:] = 0.0
         with np.errstate(invalid="ignore"):
-            add_expm1(x, np.zeros(4), one, sums)
+            add_expm1(x, np.zeros(4), one, sums, near)
         answers.append(sums[: len(values)].copy())
     assert all(np.array_equal(answer, answers[0], equal_nan=True) for answer in answers)
     return answers[0]
@@ -342,6 +344,27 @@ def test_the_exponentials_are_those_of_fifty_digits(low, high):
         exact = np.array([float(mpmath.expm1(v)) for v in x])
         y = block_expm1(x)
         assert (np.abs(y - exact) <= (4e-16 + 3.4e-17 * np.maximum(x, 0)) * np.abs(exact)).all()
+
+
+def test_near_zero_the_exponentials_without_reduction_are_the_same_to_the_last_bit():
+    x = np.random.default_rng(1).uniform(-NEAR_ZERO, NEAR_ZERO, 2000) * np.geomspace(1e-12, 1, 2000)
+    x[:2] = -NEAR_ZERO, NEAR_ZERO
+    assert np.array_equal(block_expm1(x), block_expm1(x, near=True))
+
+
+@pytest.mark.parametrize("dims", [3, 6])
+def test_no_exponent_of_a_pair_is_beyond_its_bound(dims):
+    generator = np.random.default_rng(dims)
+    left, z, shifts = (generator.standard_normal(shape) for shape in ((dims, 16), (dims, 16), (2, 16)))
+    z[:, 3], left[:, 5] = 8.0, 2.0  # parallel: the bound is met
+    delta = np.add.outer(*shifts) + left.T @ z
+    rows, columns = Side(left, shifts[0], shifts[0]), Side(z, shifts[1], shifts[1])
+    bound = largest_exponent(left, rows, columns, np.empty(16))
+    assert np.abs(delta).max() <= bound <= np.abs(delta).max() + 2 * np.abs(shifts).max(axis=1).sum()
+    for array in (left, z, shifts[0], shifts[1]):
+        last, array[..., -1] = array[..., -1].copy(), np.nan
+        assert np.isnan(largest_exponent(left, rows, columns, np.empty(16)))
+        array[..., -1] = last
 
 
 def test_the_exponentials_keep_the_limits():
@@ -372,7 +395,17 @@ def test_what_does_not_fit_is_refused():
 
 
 def test_the_compiled_moments_load_no_torch_of_their_own():
-    names = ["belief_algebra", "block", "exponential", "moments", "point", "packed", "pair_sums", "point_rows"]
+    names = [
+        "belief_algebra",
+        "block",
+        "explained",
+        "exponential",
+        "moments",
+        "point",
+        "packed",
+        "pair_sums",
+        "point_rows",
+    ]
     code = (
         "import pathlib, gpmpc.fused as f; folder = pathlib.Path(f.__file__).parent; "
         f"print([n for n in {names} if 'torch' in (folder / (n + '.py')).read_text()])"
