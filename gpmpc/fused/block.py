@@ -15,9 +15,8 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic, models, register_model
 
 from gpmpc.fused import exponential as e
+from gpmpc.fused.packed import COLUMNS, LANES, ROWS
 
-LANES = 8
-ROWS, COLUMNS = 4, 16
 SIZE = ROWS * COLUMNS
 VECTORS = SIZE // LANES
 ACROSS = COLUMNS // LANES  # vectors

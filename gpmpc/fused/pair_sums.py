@@ -25,9 +25,6 @@ from numpy import ndarray
 
 from gpmpc.compiled import borrowing
 from gpmpc.fused.block import (
-    COLUMNS,
-    LANES,
-    ROWS,
     SIZE,
     add_to_columns,
     add_to_rows,
@@ -47,7 +44,7 @@ from gpmpc.fused.block import (
 )
 from gpmpc.fused.explained import ASKED, explain_asked
 from gpmpc.fused.exponential import EXACT, NEAR_ZERO, inlined, widest
-from gpmpc.fused.packed import TILE
+from gpmpc.fused.packed import COLUMNS, LANES, ROWS, TILE
 from gpmpc.fused.point_rows import largest, squared_lengths, summed
 
 AHEAD = 16 * SIZE  # how far ahead of its use E is asked for: sixteen blocks last longer than memory takes to answer
