@@ -112,7 +112,8 @@ def tighten(known, covariances, low, high):
     state, sign, bound, kappa, _ = known
     for k in range(len(low)):
         for e in range(len(state)):
-            margin = kappa * math.sqrt(max(covariances[k + 1, state[e], state[e]], 0.0))
+            j = int(state[e])
+            margin = kappa * math.sqrt(max(covariances[k + 1, j, j], 0.0))
             inside = bound[e] - sign[e] * margin
             low[k, e], high[k, e] = (-np.inf, inside) if sign[e] > 0.0 else (inside, np.inf)
 

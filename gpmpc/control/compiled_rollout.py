@@ -81,13 +81,13 @@ class CompiledRollout:
         """
         (H, m), n = plan.shape, len(start)
         found = Stages(np.empty((H, n, n)), np.empty((H, n, m)), np.empty((H, n)), np.zeros((H + 1, n, n)), plan.copy())
-        roll_out(self.known, start, covariance, NOTHING if follow is None else follow, found)
+        roll_out(self.known, start, covariance, NOTHING if follow is None else follow, tuple(found))
         return found
 
 
 @compiled
 def roll_out(known, start, covariance, follow, out):
-    """Writes the stages along the plan in ``out``, a ``Stages``, and may change that plan; see ``CompiledRollout``."""
+    """Writes the stages along the plan in ``out`` (the parts of ``Stages``), following ``follow`` if there is any."""
     uncertain, feedback, gp, columns, outer, weights, limits, noise = known
     points, _, log_signal, _ = gp
     offset, adds_state = outer

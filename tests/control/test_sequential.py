@@ -9,7 +9,7 @@ from gpmpc.bench.pendulums import pendulum_gp
 from gpmpc.control.controller import Reference
 from gpmpc.control.convergence import kkt_share
 from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.sequential import keeps_rates
+from gpmpc.control.sequential_loop import keeps_rates
 from gpmpc.control.tracking import StateBounds, TrackingProblem
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
