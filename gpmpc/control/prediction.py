@@ -35,7 +35,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.fused.extended import roots
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
-from gpmpc.gp.evaluation import host_arrays, point_arrays
+from gpmpc.gp.evaluation import chosen_evaluation, host_arrays, point_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation import Propagator
 
@@ -116,7 +116,13 @@ class Predictor:
     @property
     def compiled(self) -> bool:
         """Whether compiled loops answer: a rollout takes microseconds, and many of them go one by one."""
+        if chosen_evaluation() == "auto":
+            return self._compiles and self._in_host_memory
         return self._compiles and host_arrays(self.model.weights) is not None
+
+    @cached_property
+    def _in_host_memory(self) -> bool:
+        return host_arrays(self.model.weights) is not None
 
     @cached_property
     def rollout(self) -> CompiledRollout:
