@@ -5,10 +5,8 @@ The belief's future is taken as affine in the inputs (``gpmpc.control.prediction
 Alam (2017, section 4), and its time-varying relatives.
 
 With ``form="trajectory"`` the program is that of a Gauss-Newton step from the last plan, shifted: one of them a control
-step is the real-time iteration (Diehl, Bock and Schloeder, 2005). More of them solve the nonlinear problem itself by
-sequential quadratic programming. The step length is then found by backtracking on the true cost along the true rollout,
-with an exact penalty for the state bounds, and the Gauss-Newton Hessian is corrected by damped BFGS updates for the
-curvature of the Lagrangian that it misses (Nocedal and Wright, 2006, section 18.3). What is stationary there:
+step is the real-time iteration (Diehl, Bock and Schloeder, 2005). More of them solve the nonlinear problem itself, by
+sequential quadratic programming (``gpmpc.control.sequential``). What is stationary there:
 
 * ``full``, ``diagonal``: the expected cost of the propagated belief, tr(Q Sigma) included, under chance constraints.
 * ``zero_order``: the cost of the means under bounds tightened by the covariances that the solution itself leads to;
@@ -167,7 +165,7 @@ class ConvexMPC:
         began = perf_counter()
         try:
             if self._sequence is not None:
-                return self._reached(request, self._sequence(request, previous, _warm(previous)))
+                return self._decide(request, self._sequence(request, previous, _warm(previous)))
             prediction = self.predictor.predict(request, previous)
         except FAILED:
             return request.unanswered(Status.NUMERICAL_TROUBLE, timing=Timing(perf_counter() - began, 0.0, 0.0))
@@ -219,12 +217,9 @@ class ConvexMPC:
             timing = Timing(modelled + perf_counter() - began, 0.0, 0.0)
             return request.unanswered(Status.NUMERICAL_TROUBLE, timing=timing)
         timing = Timing(modelled, built - began, perf_counter() - built)
-        program, states = (
-            QuadraticProgram.unchecked(*stacked[:5]),
-            prediction.states(solution.x.reshape(request.shifted.shape)),
-        )
+        program, states = QuadraticProgram.unchecked(*stacked[:5]), prediction.states(_inputs(request, solution))
         reached = Reached(solution.status, 1, timing, program, solution, states, prediction.covariances)
-        return self._reached(request, reached)
+        return self._decide(request, reached)
 
     def _stack(self, prediction: Prediction, request: Request) -> _Stacked:
         A, B, rows = prediction.A, prediction.B, self._chance.rows(prediction)
@@ -252,11 +247,11 @@ class ConvexMPC:
         warm = warm if warm is not None and len(warm.q) == len(q) and len(warm.lower) == len(lower) else None
         return self.solver.solve(QuadraticProgram.from_stacked(P, q, G, lower, upper), warm)
 
-    def _reached(self, request: Request, reached: Reached) -> Decision:
+    def _decide(self, request: Request, reached: Reached) -> Decision:
         status, count, timing, program, solution, states, covariances = reached
         if not status.solved:
             return replace(request.unanswered(status, count, timing), problem=program, solution=solution)
-        inputs = np.array(solution.x).reshape(request.shifted.shape)
+        inputs = _inputs(request, solution).copy()
         means, covariances = self.predictor.moments(states, covariances)
         return Decision(inputs[0], inputs, means, covariances, status, count, timing, program, solution)
 
@@ -278,3 +273,8 @@ def read_request(
 
 def _warm(previous: Decision | None) -> QPSolution | None:
     return previous.solution if previous is not None and previous.status.solved else None
+
+
+def _inputs(request: Request, solution: QPSolution) -> Array:
+    """The plan (H, m) that solves a program, a view."""
+    return solution.x.reshape(request.shifted.shape)

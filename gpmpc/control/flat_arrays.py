@@ -37,13 +37,8 @@ class Layout:
         self.size = int(ends[-1])
         self._places = [(slice(a, a + size), shape) for a, size, shape in zip(starts, sizes, shapes, strict=True)]
 
-    def part(self, flat: Array, number: int) -> Array:
-        """One of the arrays, a view."""
-        place, shape = self._places[number]
-        return flat[place].reshape(shape)
-
     def parts(self, flat: Array) -> list[Array]:
-        """All of them, views."""
+        """The arrays in a flat one, views."""
         return [flat[place].reshape(shape) for place, shape in self._places]
 
 
@@ -58,5 +53,5 @@ def flattened(arrays: Sequence[Array]) -> tuple[Array, Array]:
 
 @compiled(woven=True)
 def part(flat, table, number):
-    """``Layout.part`` in compiled code, with two dimensions."""
+    """One of ``Layout.parts`` in compiled code, with two dimensions."""
     return matrix(flat, table[number, 0], table[number, 1], table[number, 2])

@@ -16,9 +16,9 @@ def correct(P, steps, changes, moved, change):
     for k in range(len(steps)):
         curvature, found = 0.0, 0.0
         for i in range(n):
-            total = 0.0
+            total, row = 0.0, P[i]
             for j in range(n):
-                total += P[i, j] * steps[k, j]
+                total += row[j] * steps[k, j]
             moved[i] = total
             curvature += steps[k, i] * total
             found += steps[k, i] * changes[k, i]
@@ -29,6 +29,6 @@ def correct(P, steps, changes, moved, change):
         for i in range(n):
             change[i] = share * changes[k, i] + (1.0 - share) * moved[i]
         for i in range(n):
-            a, b = change[i] / found, moved[i] / curvature
+            a, b, row = change[i] / found, moved[i] / curvature, P[i]
             for j in range(n):
-                P[i, j] += a * change[j] - b * moved[j]
+                row[j] += a * change[j] - b * moved[j]

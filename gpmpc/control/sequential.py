@@ -3,13 +3,13 @@
 Sequential quadratic programming (Nocedal and Wright, 2006, chapter 18): linearise along the plan, solve the program, go
 as far towards its solution as the true cost falls, and again, until the plan is a KKT point. The step length is found
 by backtracking on the cost along the true rollout, with an exact penalty for the state bounds, and the Gauss-Newton
-Hessian is corrected for what the Lagrangian's slope did over the last steps.
+Hessian is corrected by damped BFGS updates for the curvature of the Lagrangian that it misses (section 18.3 there).
 
-Between the model's and the solver's arithmetic stands little, on few numbers; in Python it would cost more than both,
-and most of it where other work has emptied the caches between two control steps. So the sequence is one compiled loop.
-What it cannot compute it asks for, by yielding ``MODEL`` or ``PROGRAM``, and goes on when its caller has answered: the
-stages along a plan, where no compiled rollout gives them, and the solution of a program, where the solver is not
-``DualActiveSet`` or ended otherwise than well.
+Between the model's and the solver's arithmetic stands little, on few numbers. In Python it would cost more than both,
+most where other work has emptied the caches between two control steps; so the sequence is one compiled loop
+(``gpmpc.control.sequential_loop``). What it cannot compute it asks for, by yielding ``MODEL`` or ``PROGRAM``, and goes
+on when its caller has answered: the stages along a plan, where no compiled rollout gives them, and the solution of a
+program, where the solver is not ``DualActiveSet`` or ended otherwise than well.
 """
 
 from functools import cached_property
@@ -133,7 +133,6 @@ class SequentialPrograms:
         compiled, follow = predictor.compiled, predictor.followed(request, previous)
         columns, known, places = self._with_rollout if compiled else self._without_rollout
         along, answer = np.empty(self._along.size), np.empty(self._answer.size)
-        self._along.part(along, loop.PLAN)[:] = request.shifted
         start = predictor.state(request.state, request.covariance)
         sequence = _run(
             compiled,
@@ -142,7 +141,7 @@ class SequentialPrograms:
             known,
             places,
             self._work,
-            (start, request.covariance, request.targets, request.wanted, request.last),
+            (start, request.covariance, request.targets, request.wanted, request.last, request.shifted),
             NOTHING if follow is None else np.ascontiguousarray(follow),
             layout.NO_RECORD if warm is None or not self._ours else warm.record,
             along,

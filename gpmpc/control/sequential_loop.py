@@ -52,16 +52,16 @@ def programs(compiled, ours, columns, known, places, work, question, follow, gue
         known: What stays, flat.
         places: Its table.
         work: Workspace of ``solve_lazy``.
-        question: State s_0, covariance, targets, reference inputs and last input of a ``Request``.
+        question: s_0, and covariance, targets, reference inputs, last input and shifted plan of a ``Request``.
         follow: Means that the first rollout follows, or nothing.
         guess: Record of a solution to start from.
-        along: The stages along the plan in it, flat, which is the plan to start from at first.
+        along: The stages along the plan in it, flat.
         table: Its table.
         answer: What comes out, flat.
         parts: Its table.
     """
     model, condenser, chance, (rate_lower, rate_upper), constant, (limit, tolerance) = told(known, places, columns)
-    start, covariance, targets, wanted, last = question
+    start, covariance, targets, wanted, last, shifted = question
     H, m = wanted.shape
     kept = np.empty_like(along)  # of the plan that was reached; ``along`` is of the one that is tried
     stages, rows, low, high = linearised(along, table)
@@ -78,7 +78,7 @@ def programs(compiled, ours, columns, known, places, work, question, follow, gue
     scratch, change = vectors[5], vectors[6]
     inputs, proposed, moved = plan.reshape(H, m), solution.reshape(H, m), trial.reshape(size)
     status, price, share, rate, taken = ITERATION_LIMIT, 0.0, np.inf, 1.0, False
-    outcome[:], spread[:] = 0.0, 0.0
+    outcome[:], spread[:], trial[:] = 0.0, 0.0, shifted
     if constant.shape[0] > 0:
         rows[:] = constant.reshape(rows.shape)
     if compiled:

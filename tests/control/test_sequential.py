@@ -1,4 +1,5 @@
 from dataclasses import replace
+from time import perf_counter
 
 import numpy as np
 import pytest
@@ -177,3 +178,27 @@ def test_what_the_loop_asks_for_and_what_it_computes_are_the_same(quadrotor, cov
             assert np.allclose(getattr(last, name), getattr(other, name), rtol=0, atol=1e-12, equal_nan=True)
         programs += last.iterations * last.status.solved
     assert programs > 16
+
+
+def test_the_order_in_memory_of_what_is_asked_changes_nothing(quadrotor):
+    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
+    controller = ConvexMPC(quadrotor, Linearization(), problem, 5, HOVER, iterations=30)
+    random = np.random.default_rng(3)
+    states, inputs = 0.3 * random.uniform(-1, 1, (6, 6)), HOVER + 0.1 * random.uniform(-1, 1, (5, 3))
+    S = torch.tensor(np.cov(random.normal(size=(6, 40)))) * 1e-3
+    plain = controller.control(Gaussian(torch.tensor(states[0]), S), Reference(states, inputs))
+    mean = torch.tensor(np.repeat(states[0], 2))[::2]
+    strided = Reference(np.asfortranarray(states), np.repeat(inputs, 2, axis=0)[::2])
+    other = controller.control(Gaussian(mean, S.mT), strided)
+    assert plain.status is Status.SOLVED
+    assert np.array_equal(plain.inputs, other.inputs)
+    assert np.array_equal(plain.covariances, other.covariances)
+
+
+def test_the_parts_of_the_time_are_within_what_the_step_took(quadrotor, reachable):
+    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
+    controller = ConvexMPC(quadrotor, Linearization(), problem, 5, HOVER, covariance="none", iterations=30)
+    began = perf_counter()
+    timing = controller.control(Gaussian.certain(np.zeros(6)), reachable).timing
+    assert timing.total <= perf_counter() - began
+    assert min(timing.model, timing.build, timing.solve) > 0
