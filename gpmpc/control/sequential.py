@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpmpc.compiled import direct
+from gpmpc.compiled import compile_for, direct
 from gpmpc.control import sequential_loop as loop
 from gpmpc.control.chance_constraints import ChanceConstraints
 from gpmpc.control.compiled_rollout import NO_MODEL, NOTHING
@@ -35,6 +35,8 @@ from gpmpc.qp.solution import Terms
 from gpmpc.status import Status
 
 Array = np.ndarray
+
+run = loop.programs  # until it is compiled
 
 
 class Reached(NamedTuple):
@@ -83,6 +85,9 @@ class SequentialPrograms:
         limit: int,
         tolerance: float,
     ):
+        global run
+        compile_for(loop.programs, loop.SIGNATURE)
+        run = direct(loop.programs)
         self._predictor, self._chance, self._solver, self._soft = predictor, chance, solver, soft
         self._condenser, self._limits = condenser, (limit, tolerance)
         problem, H, r = predictor.problem, predictor.horizon, len(chance.known[0])
@@ -134,7 +139,7 @@ class SequentialPrograms:
         columns, known, places = self._with_rollout if compiled else self._without_rollout
         along, answer = np.empty(self._along.size), np.empty(self._answer.size)
         start = predictor.state(request.state, request.covariance)
-        sequence = _run(
+        sequence = run(
             compiled,
             self._ours,
             columns,
@@ -188,15 +193,3 @@ class SequentialPrograms:
         _, q, _, lower, _ = program
         fits = warm is not None and len(warm.q) == len(q) and len(warm.lower) == len(lower)
         return self._solver.solve(QuadraticProgram.from_stacked(*program), warm if fits else None)
-
-
-def _run(*arguments):
-    """``programs``, without numba's look at the arguments: there are many, of types that never change."""
-    global _entry
-    if _entry is None:
-        loop.programs(*arguments)
-        _entry = direct(loop.programs)
-    return _entry(*arguments)
-
-
-_entry = None

@@ -7,6 +7,7 @@ The loop of ``gpmpc.control.sequential``, compiled, with what it is told and wha
 import math
 
 import numpy as np
+from numba import types
 
 from gpmpc.compiled import borrowing, clock, compiled
 from gpmpc.control.chance_constraints import tighten, violation_price
@@ -39,6 +40,14 @@ STATUS, COUNT, BUILD, SOLVE, OUTCOMES = range(5)  # BUILD and SOLVE are times [s
 SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 SHORTEST_STEP = 2.0**-12
 ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
+
+
+FLAT, VECTOR, MATRIX, TABLE = types.float64[::1], types.float64[::1], types.float64[:, ::1], types.int64[:, ::1]
+QUESTION = types.Tuple([VECTOR, MATRIX, MATRIX, MATRIX, VECTOR, MATRIX])
+SIGNATURE = (
+    *(types.boolean, types.boolean, types.float64[:, :, ::1], FLAT, TABLE, MATRIX),
+    *(QUESTION, MATRIX, VECTOR, FLAT, TABLE, FLAT, TABLE),
+)
 
 
 @compiled(locked=True)  # all programs of a size share the solver's workspace
