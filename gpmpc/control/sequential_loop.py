@@ -50,8 +50,7 @@ SIGNATURE = (
 )
 
 
-@compiled(locked=True)  # all programs of a size share the solver's workspace
-def programs(compiled, ours, columns, known, places, work, question, follow, guess, along, table, answer, parts):
+def sequence(compiled, ours, columns, known, places, work, question, follow, guess, along, table, answer, parts):
     """The loop, a generator: yields ``MODEL`` to have the stages along the plan, or ``PROGRAM`` for the record.
 
     Args:
@@ -189,6 +188,11 @@ def programs(compiled, ours, columns, known, places, work, question, follow, gue
     respond(A, B, c, start, proposed, states)
     part(answer, parts, PREDICTED)[:] = covariances.reshape(-1, covariances.shape[2])
     outcome[STATUS] = status
+
+
+# numba keeps a generator on disk with its Python function, by name where that name still means it: otherwise by value,
+# with all that it calls, which every load would then compile anew. It is locked: programs share the solver's workspace.
+programs = compiled(locked=True)(sequence)
 
 
 @compiled

@@ -7,6 +7,7 @@ import torch
 
 from gpmpc.bench.optimality import Question, kkt_residual
 from gpmpc.bench.pendulums import pendulum_gp
+from gpmpc.control import sequential_loop
 from gpmpc.control.controller import Reference
 from gpmpc.control.convergence import kkt_share
 from gpmpc.control.convex_mpc import ConvexMPC
@@ -202,3 +203,8 @@ def test_the_parts_of_the_time_are_within_what_the_step_took(quadrotor, reachabl
     timing = controller.control(Gaussian.certain(np.zeros(6)), reachable).timing
     assert timing.total <= perf_counter() - began
     assert min(timing.model, timing.build, timing.solve) > 0
+
+
+def test_the_loop_is_kept_on_disk_by_its_name():
+    """By value it would carry all kernels that it calls, to be compiled by every process that loads it."""
+    assert getattr(sequential_loop, sequential_loop.programs.py_func.__name__) is sequential_loop.programs.py_func
