@@ -12,11 +12,15 @@ imports, directly or not.
 import hashlib
 import re
 import sys
+import time
 from collections.abc import Callable
 from functools import cache, partial
 from threading import Lock
 
 import numba
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
 
 _compiling = Lock()
 
@@ -140,3 +144,22 @@ def direct(kernel: Callable) -> Callable:
         return next(iter(kernel.overloads.values())).entry_point
     except (AttributeError, StopIteration):  # another numba
         return kernel
+
+
+@intrinsic
+def clock(typing_context):
+    """Seconds since some moment, inside compiled code; zero where the system has no monotonic POSIX clock."""
+
+    def generate(context, builder, signature, arguments):
+        if not hasattr(time, "CLOCK_MONOTONIC"):
+            return context.get_constant(types.float64, 0.0)
+        whole, narrow = ir.IntType(64), ir.IntType(32)
+        moment = cgutils.alloca_once(builder, ir.ArrayType(whole, 2))  # struct timespec
+        kind = ir.FunctionType(narrow, [narrow, moment.type])
+        read = cgutils.get_or_insert_function(builder.module, kind, "clock_gettime")
+        builder.call(read, [narrow(time.CLOCK_MONOTONIC), moment])
+        parts = [builder.extract_value(builder.load(moment), i) for i in range(2)]
+        seconds, nanoseconds = (builder.sitofp(part, ir.DoubleType()) for part in parts)
+        return builder.fadd(seconds, builder.fmul(nanoseconds, ir.DoubleType()(1e-9)))
+
+    return types.float64(), generate

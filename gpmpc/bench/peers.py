@@ -14,7 +14,7 @@ one another:
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,7 @@ IPOPT, SLSQP, OURS, NEWTON = 1e-6, 1e-12, 1e-6, 1e-8  # tolerances of the conten
 STD = 0.01  # [m, m/s] of the belief that is propagated in ``linearisation``
 FEW = 3  # rounds at least with contenders that take seconds
 WARM = ", caches warm"  # of who comes right after its like
+NO_TIME = Timing(0.0, 0.0, 0.0)
 PATIENCE = 10  # horizon above which those are left out that take minutes
 
 Solve = Callable[[Question, Any], Any]
@@ -73,7 +74,12 @@ def by_controller(controller: Controller) -> Solve:
     """A controller of this package as a contender."""
 
     def solve(question: Question, last: Decision | None) -> Decision:
-        previous = _begun(question) if last is None else replace(last, input=question.last)
+        if last is None:
+            previous = _begun(question)
+        else:  # ``dataclasses.replace`` takes as long as a program
+            previous = Decision(
+                question.last, last.inputs, last.means, last.covariances, last.status, 0, NO_TIME, None, last.solution
+            )
         return controller.control(question.belief, question.reference, previous)
 
     return solve
@@ -83,7 +89,7 @@ def _begun(question: Question) -> Decision:
     """No plan yet, but an input before."""
     H, n = question.targets.shape
     inputs, nothing = np.tile(question.last, (H, 1)), np.full((H + 1, n, n), np.nan)
-    return Decision(inputs[0], inputs, nothing[:, 0], nothing, Status.ITERATION_LIMIT, 0, Timing(0.0, 0.0, 0.0))
+    return Decision(inputs[0], inputs, nothing[:, 0], nothing, Status.ITERATION_LIMIT, 0, NO_TIME)
 
 
 def peers_problem() -> TrackingProblem:

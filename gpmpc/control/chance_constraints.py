@@ -7,8 +7,11 @@ S_jj for it, which is right for a diagonal S only.) The norm is convex: the row 
 Where covariances are predicted beside the program, the bounds move inwards by kappa sd_j.
 """
 
+import math
+
 import numpy as np
 
+from gpmpc.compiled import compiled
 from gpmpc.control.prediction import Covariance, Prediction
 from gpmpc.control.tracking import StateBounds
 from gpmpc.qp import SoftRows
@@ -24,6 +27,10 @@ class ChanceConstraints:
         state_dim: n.
         horizon: H.
         covariance: What s holds of the belief; see ``gpmpc.control.prediction``.
+
+    Attributes:
+        known: What ``tighten`` and ``violation_price`` take of it.
+        constant: E (1, r, p) where it is the same whatever the prediction, None elsewhere.
     """
 
     def __init__(self, bounds: StateBounds | None, state_dim: int, horizon: int, covariance: Covariance):
@@ -39,6 +46,12 @@ class ChanceConstraints:
         prices = [] if bounds is None else [(bounds.l1, None), (None, bounds.l2)]
         self._prices = [price for price in prices if price != (None, None)]
         self._copies = max(1, len(self._prices))
+        paid = [(l1 or 0.0, l2 or 0.0) for l1, l2 in self._prices] or [(np.inf, 0.0)]  # infinite: hard
+        prices = np.repeat(np.array(paid), self.per_stage, axis=0)
+        columns = [np.tile(part, self._copies) for part in (self._state, self._sign, self._bound)]
+        self.known = *columns, float(self._kappa), np.ascontiguousarray(prices.T)
+        moves = covariance == "full" and self.per_stage > 0
+        self.constant = None if moves else self._rows(np.zeros((1, state_dim, state_dim)))
 
     @property
     def soft(self) -> bool:
@@ -47,16 +60,16 @@ class ChanceConstraints:
 
     def rows(self, prediction: Prediction) -> Array:
         """E_k (H, r, p), or (1, r, p) where it is the same for all k."""
-        n, r, p = self._n, self.per_stage, len(prediction.start)
-        if not r:
-            return np.zeros((1, 0, p))
-        if self._covariance == "full" and len(prediction.A) > 1:
-            normals = _row_directions(prediction.covariances[1:])
-        elif self._covariance == "full":
-            normals = _row_directions(prediction.covariances[1:2])
-        else:
-            normals = np.ones((1, n, 1))
-        E, each = np.zeros((len(normals), r, p)), np.arange(r)
+        if self.constant is not None:
+            return self.constant
+        last = None if len(prediction.A) > 1 else 2  # a held model has one covariance for the stages 1 to H
+        return self._rows(_row_directions(prediction.covariances[1:last]))
+
+    def _rows(self, normals: Array) -> Array:
+        """E_k, with the directions (K, n, n) of the rows of S where these are part of the state."""
+        n, r = self._n, self.per_stage
+        extended = {"full": n + n * n, "diagonal": 2 * n}.get(self._covariance, n)
+        E, each = np.zeros((len(normals), r, extended)), np.arange(r)
         E[:, each, self._state] = 1.0
         if self._covariance == "diagonal":
             E[:, each, n + self._state] = self._sign * self._kappa
@@ -92,15 +105,33 @@ class ChanceConstraints:
             np.concatenate([hard, np.tile(linear, self._horizon)]),
         )
 
-    def price(self, violations: Array, hard_price: float) -> float:
-        """What violations (H, r) cost: their declared price, or ``hard_price`` per unit where there is none."""
-        if not self.soft:
-            return hard_price * float(violations.sum())
-        total, r = 0.0, self.per_stage
-        for i, (l1, l2) in enumerate(self._prices):
-            v = violations[:, i * r : (i + 1) * r]
-            total += float((l1 or 0.0) * v.sum() + (l2 or 0.0) * np.square(v).sum())
-        return total
+
+@compiled
+def tighten(known, covariances, low, high):
+    """Writes ``ChanceConstraints.limits`` where the states' covariances (H + 1, n, n) are beside the program."""
+    state, sign, bound, kappa, _ = known
+    for k in range(len(low)):
+        for e in range(len(state)):
+            j = int(state[e])
+            margin = kappa * math.sqrt(max(covariances[k + 1, j, j], 0.0))
+            inside = bound[e] - sign[e] * margin
+            low[k, e], high[k, e] = (-np.inf, inside) if sign[e] > 0.0 else (inside, np.inf)
+
+
+@compiled
+def violation_price(known, rows, states, low, high, hard_price):
+    """What violations along states s_0 .. s_H cost: their declared price, or ``hard_price`` per unit without one."""
+    prices, total = known[4], 0.0
+    for k in range(len(low)):
+        E, s = rows[min(k, len(rows) - 1)], states[k + 1]
+        for e in range(len(E)):
+            value = 0.0
+            for i in range(len(s)):
+                value += E[e, i] * s[i]
+            outside = max(0.0, value - high[k, e], low[k, e] - value)
+            linear = hard_price if prices[0, e] == np.inf else prices[0, e]
+            total += (linear + prices[1, e] * outside) * outside
+    return total
 
 
 def _row_directions(covariances: Array) -> Array:

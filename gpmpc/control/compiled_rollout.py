@@ -19,6 +19,10 @@ from gpmpc.gp.posterior import GPPosterior
 Array = np.ndarray
 
 NOTHING = np.empty((0, 0))
+NO_MODEL = (  # in the place of what is known of one
+    *(False, False, (NOTHING, NOTHING, NOTHING[0:0].ravel(), NOTHING), NOTHING[None], (NOTHING.ravel(), False)),
+    *((NOTHING, NOTHING, NOTHING), (NOTHING.ravel(), NOTHING.ravel()), NOTHING),
+)
 
 
 class Stages(NamedTuple):
@@ -55,7 +59,7 @@ class CompiledRollout:
     ):
         packed, n = model.packed, model.state_dim
         noise = model.noise_covariance.numpy() if observation_noise else np.zeros((n, n))
-        self._known = (
+        self.known = (
             uncertain,
             feedback,
             (packed.points, packed.inverse_squares, packed.log_signal, packed.weights),
@@ -77,12 +81,14 @@ class CompiledRollout:
         """
         (H, m), n = plan.shape, len(start)
         found = Stages(np.empty((H, n, n)), np.empty((H, n, m)), np.empty((H, n)), np.zeros((H + 1, n, n)), plan.copy())
-        _stages(*self._known, start, covariance, NOTHING if follow is None else follow, found)
+        roll_out(self.known, start, covariance, NOTHING if follow is None else follow, tuple(found))
         return found
 
 
 @compiled
-def _stages(uncertain, feedback, gp, columns, outer, weights, limits, noise, start, covariance, follow, out):
+def roll_out(known, start, covariance, follow, out):
+    """Writes the stages along the plan in ``out`` (the parts of ``Stages``), following ``follow`` if there is any."""
+    uncertain, feedback, gp, columns, outer, weights, limits, noise = known
     points, _, log_signal, _ = gp
     offset, adds_state = outer
     Q, R, terminal = weights

@@ -30,9 +30,15 @@ from gpmpc.qp.lanes import combine
 
 Array = np.ndarray
 
+PENALIZED = ("inputs", "deviations", "increments")
+INPUTS, DEVIATIONS, INCREMENTS = range(3)
+
 
 class Condenser:
     """Condenses the stages of one tracking problem, input weights and bounds included.
+
+    Attributes:
+        known: What ``condense`` and ``tracking_cost`` take of it.
 
     Args:
         problem: Weights and bounds of the inputs.
@@ -54,6 +60,11 @@ class Condenser:
         self._rate_rows = difference if problem.rate_limited else difference[:0]
         self._box = np.tile(problem.input_lower, horizon), np.tile(problem.input_upper, horizon)
         self._rates = np.tile(problem.rate_lower, horizon), np.tile(problem.rate_upper, horizon)
+        lower, upper = self.bounds(np.zeros(m), np.empty(0), np.empty(0))
+        self.known = (
+            (self._weight, self._terminal, np.ascontiguousarray(problem.R), PENALIZED.index(problem.penalized)),
+            (self._input_hessian, np.ascontiguousarray(self._rate_rows), lower, upper),
+        )
 
     @property
     def rate_rows(self) -> int:
@@ -134,20 +145,15 @@ class Condenser:
             wanted: (H, m).
             last: u_{-1} (m,).
         """
-        v = inputs
-        if self.problem.penalized == "deviations":
-            v = inputs - wanted
-        elif self.problem.penalized == "increments":
-            v = np.empty_like(inputs)
-            np.subtract(inputs[1:], inputs[:-1], out=v[1:])
-            v[0] = inputs[0] - last
-        return _cost(states, targets, v, self._weight, self._terminal, self.problem.R)
+        return tracking_cost(self.known, states, inputs, targets, wanted, last)
 
 
 @compiled
-def _cost(states, targets, v, W, T, R):
-    H, n = targets.shape
-    total, error = 0.0, np.empty(states.shape[1])
+def tracking_cost(known, states, inputs, targets, wanted, last):
+    """``Condenser.cost``; all arrays contiguous."""
+    W, T, R, penalized = known[0]
+    (H, n), m = targets.shape, len(R)
+    total, error, v = 0.0, np.empty(states.shape[1]), np.empty(m)
     for k in range(H):
         error[:] = states[k + 1]
         for i in range(n):
@@ -157,10 +163,51 @@ def _cost(states, targets, v, W, T, R):
             for i in range(n):
                 for j in range(n):
                     total += error[b * n + i] * weight[b, i, j] * error[b * n + j]
-        for i in range(len(R)):
-            for j in range(len(R)):
-                total += v[k, i] * R[i, j] * v[k, j]
+        for i in range(m):
+            v[i] = inputs[k, i]
+            if penalized == DEVIATIONS:
+                v[i] -= wanted[k, i]
+            elif penalized == INCREMENTS:
+                v[i] -= inputs[k - 1, i] if k > 0 else last[i]
+        for i in range(m):
+            for j in range(m):
+                total += v[i] * R[i, j] * v[j]
     return total
+
+
+@compiled
+def condense(known, stages, start, targets, wanted, last, program):
+    """Writes the program of stages that vary to ``program``: P, q, G and the bounds of the stacked constraints.
+
+    Args:
+        known: Of a ``Condenser``.
+        stages: A (H, p, p), B (H, p, m), c (H, p), rows (H, r, p) or (1, r, p), and their bounds (H, r) each.
+        start: s_0 (p,).
+        targets: As for ``Condenser.slope``.
+        wanted: As for ``Condenser.slope``.
+        last: As for ``Condenser.slope``.
+        program: (H m, H m), (H m,), (rows, H m), (H m + rows,) twice.
+    """
+    (W, T, R, penalized), (hessian, rate_rows, box_lower, box_upper) = known
+    A, B, c, rows, low, high = stages
+    P, q, G, lower, upper = program
+    (H, m), r, first, given = wanted.shape, rows.shape[1], len(rate_rows), len(box_lower)
+    P[:] = hessian
+    G[:first] = rate_rows
+    G[first:] = 0.0
+    _varying_curvature(A, B, W, T, rows, H, P, G[first:])
+    q[:] = 0.0
+    centre = wanted[: H if penalized == DEVIATIONS else 0]
+    if penalized == INCREMENTS:
+        centre = last.reshape(1, m)
+    values = np.empty((H, r))
+    _slope(A, B, c, start, rows, targets, W, T, centre, R, q.reshape(H, m), values)
+    for i in range(given):
+        shift = last[i - len(q)] if len(q) <= i < len(q) + m else 0.0
+        lower[i], upper[i] = box_lower[i] + shift, box_upper[i] + shift
+    for k in range(H):
+        for e in range(r):
+            lower[given + k * r + e], upper[given + k * r + e] = low[k, e] - values[k, e], high[k, e] - values[k, e]
 
 
 @compiled

@@ -5,10 +5,8 @@ The belief's future is taken as affine in the inputs (``gpmpc.control.prediction
 Alam (2017, section 4), and its time-varying relatives.
 
 With ``form="trajectory"`` the program is that of a Gauss-Newton step from the last plan, shifted: one of them a control
-step is the real-time iteration (Diehl, Bock and Schloeder, 2005). More of them solve the nonlinear problem itself by
-sequential quadratic programming. The step length is then found by backtracking on the true cost along the true rollout,
-with an exact penalty for the state bounds, and the Gauss-Newton Hessian is corrected by damped BFGS updates for the
-curvature of the Lagrangian that it misses (Nocedal and Wright, 2006, section 18.3). What is stationary there:
+step is the real-time iteration (Diehl, Bock and Schloeder, 2005). More of them solve the nonlinear problem itself, by
+sequential quadratic programming (``gpmpc.control.sequential``). What is stationary there:
 
 * ``full``, ``diagonal``: the expected cost of the propagated belief, tr(Q Sigma) included, under chance constraints.
 * ``zero_order``: the cost of the means under bounds tightened by the covariances that the solution itself leads to;
@@ -30,7 +28,7 @@ from gpmpc.control.condensing import Condenser
 from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.prediction import Covariance, Form, Prediction, Predictor
 from gpmpc.control.request import Request, check_controller, check_dynamics
-from gpmpc.control.sequential import MEMORY, corrected, kkt_share
+from gpmpc.control.sequential import Reached, SequentialPrograms
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import DataError, ProblemError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
@@ -41,9 +39,6 @@ from gpmpc.status import Status
 
 Array = np.ndarray
 
-SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
-SHORTEST_STEP = 2.0**-12
-ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
 FAILED = (DataError, ProblemError, np.linalg.LinAlgError, torch.linalg.LinAlgError)  # no finite numbers
 
 
@@ -126,6 +121,8 @@ class ConvexMPC:
             raise SettingError(
                 "solver", f"state bounds with a price (l1, l2) need DualActiveSet; got {type(self.solver).__name__}"
             )
+        rest = (self._chance, self.solver, self.soft, iterations, tolerance)
+        self._sequence = SequentialPrograms(self.predictor, self._condenser, *rest) if iterations > 1 else None
         self._held: _Held | None = None  # remembered for speed; no answer depends on it
 
     def build(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> QuadraticProgram:
@@ -167,8 +164,8 @@ class ConvexMPC:
             return request.unanswered(Status.INVALID_MEASUREMENT)
         began = perf_counter()
         try:
-            if self.iterations > 1:
-                return self._iterate(request, previous, _warm(previous))
+            if self._sequence is not None:
+                return self._decide(request, self._sequence(request, previous, _warm(previous)))
             prediction = self.predictor.predict(request, previous)
         except FAILED:
             return request.unanswered(Status.NUMERICAL_TROUBLE, timing=Timing(perf_counter() - began, 0.0, 0.0))
@@ -220,7 +217,9 @@ class ConvexMPC:
             timing = Timing(modelled + perf_counter() - began, 0.0, 0.0)
             return request.unanswered(Status.NUMERICAL_TROUBLE, timing=timing)
         timing = Timing(modelled, built - began, perf_counter() - built)
-        return self._decide(request, prediction, stacked, solution, solution.status, 1, timing)
+        program, states = QuadraticProgram.unchecked(*stacked[:5]), prediction.states(_inputs(request, solution))
+        reached = Reached(solution.status, 1, timing, program, solution, states, prediction.covariances)
+        return self._decide(request, reached)
 
     def _stack(self, prediction: Prediction, request: Request) -> _Stacked:
         A, B, rows = prediction.A, prediction.B, self._chance.rows(prediction)
@@ -248,125 +247,13 @@ class ConvexMPC:
         warm = warm if warm is not None and len(warm.q) == len(q) and len(warm.lower) == len(lower) else None
         return self.solver.solve(QuadraticProgram.from_stacked(P, q, G, lower, upper), warm)
 
-    def _decide(
-        self,
-        request: Request,
-        prediction: Prediction,
-        stacked: _Stacked,
-        solution: QPSolution,
-        status: Status,
-        iterations: int,
-        timing: Timing,
-    ) -> Decision:
-        program = QuadraticProgram.unchecked(*stacked[:5])
+    def _decide(self, request: Request, reached: Reached) -> Decision:
+        status, count, timing, program, solution, states, covariances = reached
         if not status.solved:
-            return replace(request.unanswered(status, iterations, timing), problem=program, solution=solution)
-        inputs = np.array(solution.x).reshape(request.shifted.shape)
-        means, covariances = self.predictor.beliefs(prediction, inputs)
-        return Decision(inputs[0], inputs, means, covariances, status, iterations, timing, program, solution)
-
-    def _iterate(self, request: Request, previous: Decision | None, warm: QPSolution | None) -> Decision:
-        """Sequential quadratic programming from the last plan."""
-        spent, price, status, share, rate = np.zeros(3), 0.0, Status.ITERATION_LIMIT, np.inf, 1.0
-        clock, taken = _Clock(spent), None
-        pairs = np.empty((2, 0, request.shifted.size))
-        prediction = self.predictor.predict(request, previous)
-        inputs, cost = prediction.inputs, self._cost(request, prediction, prediction.inputs)
-        clock.charge(0)
-        for count in range(1, self.iterations + 1):
-            stacked = self._stack(prediction, request)
-            slope, diagonal = stacked.P @ inputs.ravel() + stacked.q, stacked.P.diagonal()
-            if taken is not None:  # how the Lagrangian's slope changed over the last step, at its multipliers
-                step, multipliers, before = taken
-                if step @ stacked.P @ step > ROUND_OFF * cost:
-                    pair = np.stack([step, slope + stacked.G.T @ multipliers - before])
-                    pairs = np.concatenate([pairs[:, -MEMORY + 1 :], pair[:, None]], axis=1)
-                P = corrected(stacked.P, *pairs)
-                stacked = stacked._replace(P=P, q=slope - P @ inputs.ravel(), prepared=None)
-            clock.charge(1)
-            solution = self._solve(stacked, warm)
-            clock.charge(2)
-            if not solution.status.solved:
-                status = solution.status
-                break
-            warm, proposed = solution, solution.x.reshape(inputs.shape)
-            plans, bounds, last_share = (inputs.ravel(), solution.x), (stacked.lower, stacked.upper), share
-            share = kkt_share(diagonal, slope, stacked.G, solution.z, *plans, *bounds, cost)
-            # The program's plan is better by about the slower of two rates (Hairer and Wanner, 1996, eq. (IV.8.10)).
-            rate, last_rate = share / last_share if taken is not None else 1.0, rate
-            slower = max(rate, last_rate)
-            if share <= self.tolerance or share * slower <= self.tolerance * (1.0 - slower):
-                status = Status.SOLVED
-                break
-            if count == self.iterations:
-                break
-            row_multipliers = np.abs(solution.z[self._condenser.rate_rows :])
-            price = max(price, 2.0 * float(row_multipliers.max(initial=0.0)))
-            found = self._search(request, prediction, inputs, cost, proposed, slope, price)
-            clock.charge(0)
-            if found is None:  # share^2 of the cost is what an input could gain
-                status = Status.SOLVED if share**2 <= ROUND_OFF else Status.NUMERICAL_TROUBLE
-                break
-            taken = (found[0] - inputs).ravel(), solution.z, slope + stacked.G.T @ solution.z
-            inputs, prediction, cost = found
-        return self._decide(request, prediction, stacked, solution, status, count, Timing(*spent))
-
-    def _search(
-        self,
-        request: Request,
-        prediction: Prediction,
-        inputs: Array,
-        cost: float,
-        proposed: Array,
-        slope: Array,
-        price: float,
-    ) -> tuple[Array, Prediction, float] | None:
-        """The next plan between ``inputs`` and ``proposed``, its stage models and its cost; None if none is better.
-
-        The stage models are exact along the plan that they were made at: there their cost and violations are the true
-        ones.
-        """
-        limits = self._chance.limits(prediction)  # tightening of zero_order stays during the search
-        violated = self._violation_price(prediction, inputs, limits, price)
-        here = cost + violated
-        promised = float(slope @ (proposed - inputs).ravel())
-        promised += self._violation_price(prediction, proposed, limits, price) - violated
-        whole = not self._keeps_rates(inputs, request.last)  # a first guess outside is left in one step
-        step = 1.0
-        while step >= SHORTEST_STEP:
-            trial = proposed if step == 1.0 else inputs + step * (proposed - inputs)
-            try:
-                moved = self.predictor.along(request, trial)
-                cost = self._cost(request, moved, trial)
-                merit = cost + self._violation_price(moved, trial, limits, price)
-            except DataError:  # the rollout left the finite numbers
-                if whole:
-                    return None
-                merit = np.inf
-            if whole or merit <= here + SUFFICIENT_DECREASE * step * promised + ROUND_OFF * abs(here):
-                return trial, moved, cost
-            step /= 2
-        return None
-
-    def _cost(self, request: Request, prediction: Prediction, inputs: Array) -> float:
-        states = prediction.states(inputs)
-        return self._condenser.cost(states, inputs, request.targets, request.wanted, request.last)
-
-    def _violation_price(
-        self, prediction: Prediction, inputs: Array, limits: tuple[Array, Array], price: float
-    ) -> float:
-        if not self._chance.per_stage:
-            return 0.0
-        values = (self._chance.rows(prediction) @ prediction.states(inputs)[1:, :, None])[..., 0]
-        lower, upper = limits
-        return self._chance.price(np.maximum(0.0, np.maximum(values - upper, lower - values)), price)
-
-    def _keeps_rates(self, inputs: Array, last: Array) -> bool:
-        if not self._condenser.rate_rows:
-            return True
-        rates = np.diff(inputs, axis=0, prepend=last[None])
-        outside = np.maximum(self.problem.rate_lower - rates, rates - self.problem.rate_upper)
-        return bool((outside <= 1e-9 * np.maximum(1.0, np.abs(inputs) + np.abs(rates))).all())
+            return replace(request.unanswered(status, count, timing), problem=program, solution=solution)
+        inputs = _inputs(request, solution).copy()
+        means, covariances = self.predictor.moments(states, covariances)
+        return Decision(inputs[0], inputs, means, covariances, status, count, timing, program, solution)
 
 
 def read_request(
@@ -388,13 +275,6 @@ def _warm(previous: Decision | None) -> QPSolution | None:
     return previous.solution if previous is not None and previous.status.solved else None
 
 
-class _Clock:
-    """Charges the time since it was last asked to one of several accounts."""
-
-    def __init__(self, accounts: Array):
-        self._accounts, self._last = accounts, perf_counter()
-
-    def charge(self, account: int) -> None:
-        now = perf_counter()
-        self._accounts[account] += now - self._last
-        self._last = now
+def _inputs(request: Request, solution: QPSolution) -> Array:
+    """The plan (H, m) that solves a program, a view."""
+    return solution.x.reshape(request.shifted.shape)

@@ -35,7 +35,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.fused.extended import roots
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
-from gpmpc.gp.evaluation import host_arrays, point_arrays
+from gpmpc.gp.evaluation import chosen_evaluation, host_arrays, point_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation import Propagator
 
@@ -116,10 +116,17 @@ class Predictor:
     @property
     def compiled(self) -> bool:
         """Whether compiled loops answer: a rollout takes microseconds, and many of them go one by one."""
+        if chosen_evaluation() == "auto":
+            return self._compiles and self._in_host_memory
         return self._compiles and host_arrays(self.model.weights) is not None
 
     @cached_property
-    def _rollout(self) -> CompiledRollout:
+    def _in_host_memory(self) -> bool:
+        return host_arrays(self.model.weights) is not None
+
+    @cached_property
+    def rollout(self) -> CompiledRollout:
+        """The compiled loop, where ``compiled`` says that there is one."""
         uncertain = self.covariance == "zero_order"
         noisy = uncertain and self.propagator.observation_noise
         return CompiledRollout(self.model, self.problem, self.feedback, uncertain, noisy)
@@ -146,13 +153,17 @@ class Predictor:
 
     def beliefs(self, prediction: Prediction, inputs: Array) -> tuple[Array, Array]:
         """Predicted means (H + 1, n) and covariances (H + 1, n, n) under inputs (H, m), by the stage models."""
-        n, states = self.problem.state_dim, prediction.states(inputs)
+        return self.moments(prediction.states(inputs), prediction.covariances)
+
+    def moments(self, states: Array, covariances: Array) -> tuple[Array, Array]:
+        """Means and covariances of the states s (K, p); ``covariances`` where s does not hold them."""
+        n = self.problem.state_dim
         if self.covariance == "full":
             roots = states[:, n:].reshape(-1, n, n)
             return states[:, :n], roots @ roots.mT
         if self.covariance == "diagonal":
             return states[:, :n], states[:, n:, None] ** 2 * np.eye(n)
-        return states, prediction.covariances
+        return states, covariances
 
     def predict(self, request: Request, previous: Decision | None) -> Prediction:
         """The stage models of a step: about its request, and for ``increment`` about the step before."""
@@ -185,7 +196,7 @@ class Predictor:
                 its bounds: u_k + K (mu_k - follow_k) for k = 1 .. H-1.
         """
         if self.compiled:
-            found = self._rollout(request.state, request.covariance, inputs, follow)
+            found = self.rollout(request.state, request.covariance, inputs, follow)
             return Prediction(found.A, found.B, found.c, request.state, found.covariances, found.inputs)
         belief, gain, stages, plan = self._belief(request.state, request.covariance), None, [], np.array(inputs)
         covariances, n = [_array(belief.covariance)], self.problem.state_dim

@@ -4,11 +4,11 @@ A question that does not fit the controller is misuse and raises. A state that i
 happens in flight: it is answered by a ``Status`` (``unanswered``).
 """
 
-import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from gpmpc.compiled import compile_for, compiled, direct
 from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
@@ -16,10 +16,13 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.status import Status
 
+NO_PLAN = np.empty((0, 0))
+SIGNATURE = "i8(f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])"
+BELIEF, TARGETS, WANTED, BEFORE = 1, 2, 4, 8  # what may not be finite
 
-@dataclass(frozen=True)
-class Request:
-    """One step's question, in float64.
+
+class Request(NamedTuple):
+    """One step's question, in contiguous float64 arrays.
 
     Attributes:
         state: Mean of the belief (n,).
@@ -29,6 +32,7 @@ class Request:
         last: The input before this step, u_{-1} (m,).
         shifted: The last plan, one step on, its last input repeated (H, m); the last input held where there is no
             plan of a solve that succeeded. Within the input bounds.
+        finite: Whether the belief can be worked with.
     """
 
     state: np.ndarray
@@ -37,6 +41,7 @@ class Request:
     wanted: np.ndarray
     last: np.ndarray
     shifted: np.ndarray
+    finite: bool
 
     @classmethod
     def read(
@@ -64,32 +69,29 @@ class Request:
         """
         n, m = problem.state_dim, problem.input_dim
         state, covariance = _array(belief.mean), _array(belief.covariance)
-        targets = np.asarray(reference.states, dtype=float)
+        targets = _array(reference.states)
         if state.shape != (n,) or targets.shape != (horizon + 1, n):
             raise ShapeError(
                 f"state and reference must have shapes ({n},) and ({horizon + 1}, {n}); "
                 f"got {state.shape} and {targets.shape}"
             )
-        wanted = np.zeros((horizon, m)) if reference.inputs is None else np.asarray(reference.inputs, dtype=float)
+        wanted = np.zeros((horizon, m)) if reference.inputs is None else _array(reference.inputs)
         if wanted.shape != (horizon, m):
             raise ShapeError(f"reference inputs must have shape ({horizon}, {m}); got {wanted.shape}")
-        for name, values in (("states", targets), ("inputs", wanted)):
-            if not _all_finite(values):
+        last, plan = initial_input if previous is None else _array(previous.input), NO_PLAN
+        if previous is not None and previous.status.solved:
+            plan = _array(previous.inputs)
+            plan = plan if plan.shape == (horizon, m) else NO_PLAN
+        last, shifted = _array(last), np.empty((horizon, m))
+        bounds = problem.input_lower, problem.input_upper
+        found = inspect(state, covariance, targets, wanted, last, plan, *bounds, shifted)
+        if found & BEFORE:
+            last = _array(initial_input)
+            found = inspect(state, covariance, targets, wanted, last, plan, *bounds, shifted)
+        for part, name, values in ((TARGETS, "states", targets), (WANTED, "inputs", wanted)):
+            if found & part:
                 raise DataError(f"reference {name} must be finite; got {values[~np.isfinite(values)][0]}")
-        last = np.asarray(initial_input if previous is None else previous.input, dtype=float)
-        if not _all_finite(last):
-            last = np.asarray(initial_input, dtype=float)
-        if previous is not None and previous.status.solved and np.shape(previous.inputs) == (horizon, m):
-            shifted = np.concatenate((previous.inputs[1:], previous.inputs[-1:]))
-        else:
-            shifted = np.tile(last, (horizon, 1))
-        shifted = shifted.clip(problem.input_lower, problem.input_upper)
-        return cls(state, covariance, targets[1:], wanted, last, shifted)
-
-    @property
-    def finite(self) -> bool:
-        """Whether the belief can be worked with."""
-        return _all_finite(self.state) and _all_finite(self.covariance)
+        return cls(state, covariance, targets[1:], wanted, last, shifted, not found & BELIEF)
 
     @property
     def held(self) -> np.ndarray:
@@ -132,6 +134,9 @@ def check_controller(
         SettingError: A horizon below 1, weights of another dimension than the model's, or an initial input of the
             wrong length.
     """
+    global inspect
+    compile_for(look_over, SIGNATURE)
+    inspect = direct(look_over)
     check_number("horizon", horizon, least=1, whole=True)
     check_numbers("initial_input", initial_input, inputs)
     if (problem.state_dim, problem.input_dim) != (states, inputs):
@@ -143,10 +148,36 @@ def check_controller(
 
 
 def _array(value: object) -> np.ndarray:
-    """A tensor or array as float64 in host memory."""
-    return np.asarray(value.numpy(force=True) if hasattr(value, "detach") else value, dtype=float)
+    """A tensor or array as contiguous float64 in host memory."""
+    if hasattr(value, "detach"):
+        try:
+            value = value.numpy()
+        except (RuntimeError, TypeError):  # on another device, or part of a graph
+            value = value.numpy(force=True)
+    return np.ascontiguousarray(value, dtype=np.float64)
 
 
-def _all_finite(values: np.ndarray) -> bool:
-    """Whether no entry is infinite or NaN; a sum of squares that is finite says so in half the time."""
-    return math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all())
+@compiled(locked=True)
+def look_over(state, covariance, targets, wanted, last, plan, lower, upper, shifted):
+    """Says which parts are not finite, a sum of ``BELIEF``, ``TARGETS``, ``WANTED``, ``BEFORE``; writes ``shifted``."""
+    H, m = shifted.shape
+    for k in range(H):
+        for j in range(m):
+            u = plan[min(k + 1, H - 1), j] if len(plan) > 0 else last[j]
+            shifted[k, j] = min(max(u, lower[j]), upper[j])
+    found = BELIEF if undefined(state) or undefined(covariance.ravel()) else 0
+    found += TARGETS if undefined(targets.ravel()) else 0
+    found += WANTED if undefined(wanted.ravel()) else 0
+    return found + (BEFORE if undefined(last) else 0)
+
+
+@compiled
+def undefined(values):
+    """Whether an entry is infinite or NaN."""
+    nothing = 0.0
+    for value in values:
+        nothing += value * 0.0
+    return nothing != 0.0
+
+
+inspect = look_over  # until it is compiled

@@ -1,84 +1,195 @@
-"""Problem: between the quadratic programs of a sequence stands arithmetic on few numbers, which calls cost more than.
+"""Problem: one quadratic program is a step towards the optimal plan; a sequence of them reaches it.
 
-What ``ConvexMPC`` does between two programs, compiled: how far a plan is from a KKT point, and the correction of the
-Gauss-Newton Hessian by what the Lagrangian's slope did over the last steps.
+Sequential quadratic programming (Nocedal and Wright, 2006, chapter 18): linearise along the plan, solve the program, go
+as far towards its solution as the true cost falls, and again, until the plan is a KKT point. The step length is found
+by backtracking on the cost along the true rollout, with an exact penalty for the state bounds, and the Gauss-Newton
+Hessian is corrected by damped BFGS updates for the curvature of the Lagrangian that it misses (section 18.3 there).
+
+Between the model's and the solver's arithmetic stands little, on few numbers. In Python it would cost more than both,
+most where other work has emptied the caches between two control steps; so the sequence is one compiled loop
+(``gpmpc.control.sequential_loop``). What it cannot compute it asks for, by yielding ``MODEL`` or ``PROGRAM``, and goes
+on when its caller has answered: the stages along a plan, where no compiled rollout gives them, and the solution of a
+program, where the solver is not ``DualActiveSet`` or ended otherwise than well.
 """
+
+from functools import cached_property
+from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import compile_for, direct
+from gpmpc.control import sequential_loop as loop
+from gpmpc.control.chance_constraints import ChanceConstraints
+from gpmpc.control.compiled_rollout import NO_MODEL, NOTHING
+from gpmpc.control.condensing import Condenser
+from gpmpc.control.controller import Decision, Timing
+from gpmpc.control.flat_arrays import Layout, flattened
+from gpmpc.control.prediction import Predictor
+from gpmpc.control.request import Request
+from gpmpc.exceptions import DataError
+from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
+from gpmpc.qp import record as layout
+from gpmpc.qp.soft_rows import SoftRows
+from gpmpc.qp.solution import Terms
+from gpmpc.status import Status
 
-MEMORY = 10  # pairs of a corrected Hessian
-SMALL = 1e-3  # share of an input's size
+Array = np.ndarray
+
+run = loop.programs  # until it is compiled
 
 
-@compiled
-def kkt_share(h, slope, G, z, plan, proposed, lower, upper, cost):
-    """How far a plan is from a KKT point, with multipliers z of the rows: 0 there, a share of 1 elsewhere.
+class Reached(NamedTuple):
+    """Where a sequence of programs ended.
 
-    The Lagrangian's gradient g = slope + G'z is projected onto the box (the middle of g, h (u - lower), h (u - upper))
-    and divided by the largest that the gradient of such a cost can be, sqrt(2 h cost) (Cauchy and Schwarz): the cosine
-    between the residuals and their change with an input (More, 1978, eq. (8.2)). Where the reference can be reached,
-    gradient and root of the cost vanish together and their ratio does not. So the cost is counted with what moving the
-    input by ``SMALL`` of its size adds to it, h (SMALL size)^2 / 2; the size is |u| or 1, whichever is more, but at
-    most upper - lower. Where there are rows, also how far they are from where the program wants them, relative to the
-    largest of them or 1.
+    Attributes:
+        status: ``SOLVED``, the status of a program that could not be solved, ``ITERATION_LIMIT``, or
+            ``NUMERICAL_TROUBLE`` where no step lowers the cost any more.
+        programs: How many.
+        timing: Where the time went.
+        program: The last one.
+        solution: Of the last one.
+        states: s_0 .. s_H under that solution, by the last stage models (H + 1, p).
+        covariances: Sigma_0 .. Sigma_H that these were made at (H + 1, n, n).
+    """
+
+    status: Status
+    programs: int
+    timing: Timing
+    program: QuadraticProgram
+    solution: QPSolution
+    states: Array
+    covariances: Array
+
+
+class SequentialPrograms:
+    """The sequence of programs of one controller.
 
     Args:
-        h: Diagonal of the Gauss-Newton Hessian (n,).
-        slope: Of the cost, at the plan (n,).
-        G: (rows, n).
-        z: (rows,).
-        plan: (n,).
-        proposed: The program's solution (n,).
-        lower: Of the stacked constraints; the first n are the box.
-        upper: Of the stacked constraints.
-        cost: At the plan, a sum of squares.
+        predictor: Of the form ``"trajectory"``.
+        condenser: Of its problem.
+        chance: Of its problem.
+        solver: Of the programs.
+        soft: Prices of the rows of G.
+        limit: Programs at most.
+        tolerance: Of ``convergence.kkt_share``, estimated from the slower of the last two rates of convergence.
     """
-    largest, n = 0.0, len(plan)
-    gradient = slope.copy()
-    moved, reach = 0.0, 1.0
-    for r in range(len(G)):
-        value, change = 0.0, 0.0
-        for j in range(n):
-            gradient[j] += G[r, j] * z[r]
-            value += G[r, j] * plan[j]
-            change += G[r, j] * (proposed[j] - plan[j])
-        moved, reach = max(moved, abs(change)), max(reach, abs(value))
-    for j in range(n):
-        size = min(max(1.0, abs(plan[j])), upper[j] - lower[j])
-        counted = cost + 0.5 * h[j] * (SMALL * size) ** 2 + 1e-300
-        left = max(h[j] * (plan[j] - upper[j]), min(gradient[j], h[j] * (plan[j] - lower[j])))
-        if left != 0.0:
-            largest = max(largest, abs(left) / np.sqrt(2.0 * h[j] * counted))
-    return max(largest, moved / reach)
 
+    def __init__(
+        self,
+        predictor: Predictor,
+        condenser: Condenser,
+        chance: ChanceConstraints,
+        solver: QPSolver,
+        soft: SoftRows | None,
+        limit: int,
+        tolerance: float,
+    ):
+        global run
+        compile_for(loop.programs, loop.SIGNATURE)
+        run = direct(loop.programs)
+        self._predictor, self._chance, self._solver, self._soft = predictor, chance, solver, soft
+        self._condenser, self._limits = condenser, (limit, tolerance)
+        problem, H, r = predictor.problem, predictor.horizon, len(chance.known[0])
+        n, m, rows = problem.state_dim, problem.input_dim, condenser.rate_rows + predictor.horizon * r
+        p, size = n * len(predictor.extended(problem.Q)), H * m
+        self._ours = isinstance(solver, DualActiveSet)
+        self._softness, self._work = (solver if self._ours else DualActiveSet()).workspace(rows, size, soft)
+        K = H if chance.constant is None else 1
+        stages = [(H, p, p), (H, p, m), (H, p), (H + 1, n, n), (H, m)]
+        self._along = Layout([*stages, (K, r, p), (H, r), (H, r)])
+        program = [(size, size), (size,), (rows, size), (size + rows,), (size + rows,)]
+        found = [(layout.record_size(size, size + rows),), (H + 1, p), (H + 1, n, n), (loop.OUTCOMES,)]
+        self._answer, self._inputs = Layout(program + found), slice(layout.HEADER, layout.HEADER + size)
 
-@compiled
-def corrected(P, steps, changes):
-    """P after one BFGS update for every step and change of slope (pairs, n), the oldest first.
+    @cached_property
+    def _with_rollout(self) -> tuple[Array, Array, Array]:
+        return self._told(self._predictor.rollout.known)
 
-    With Powell's damping, which keeps P positive definite (Nocedal and Wright, 2006, procedure 18.2).
-    """
-    n, P = len(P), P.copy()
-    moved, change = np.empty(n), np.empty(n)
-    for k in range(len(steps)):
-        curvature, found = 0.0, 0.0
-        for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += P[i, j] * steps[k, j]
-            moved[i] = total
-            curvature += steps[k, i] * total
-            found += steps[k, i] * changes[k, i]
-        share = 1.0
-        if found < 0.2 * curvature:
-            share = 0.8 * curvature / (curvature - found)
-            found = 0.2 * curvature
-        for i in range(n):
-            change[i] = share * changes[k, i] + (1.0 - share) * moved[i]
-        for i in range(n):
-            a, b = change[i] / found, moved[i] / curvature
-            for j in range(n):
-                P[i, j] += a * change[j] - b * moved[j]
-    return P
+    @cached_property
+    def _without_rollout(self) -> tuple[Array, Array, Array]:
+        return self._told(NO_MODEL)
+
+    def _told(self, rollout: tuple) -> tuple[Array, Array, Array]:
+        """What the loop knows of its controller: columns, what is flat, and its table."""
+        uncertain, feedback, gp, columns, (offset, difference), *_, noise = rollout
+        problem, (limit, tolerance) = self._predictor.problem, self._limits
+        (weight, terminal, R, penalized), of_inputs = self._condenser.known
+        *bounds, kappa, prices = self._chance.known
+        constant = np.empty((1, 0, 1)) if self._chance.constant is None else self._chance.constant
+        sides = problem.input_lower, problem.input_upper, problem.rate_lower, problem.rate_upper
+        settings = np.array([uncertain, feedback, difference, penalized, kappa, limit, tolerance], dtype=float)
+        weights = problem.Q, problem.terminal, *sides, weight, terminal, R, *of_inputs
+        return columns, *flattened([*gp, offset, noise, *weights, *bounds, prices, constant, settings])
+
+    def __call__(self, request: Request, previous: Decision | None, warm: QPSolution | None) -> Reached:
+        """Goes from the request's plan to an optimal one.
+
+        Args:
+            request: With a finite belief.
+            previous: The last decision, whose means the first rollout follows.
+            warm: The last solution; None starts from nothing.
+
+        Raises:
+            DataError: The first rollout left the finite numbers.
+            ProblemError: A program is malformed, numerically.
+        """
+        began, predictor = perf_counter(), self._predictor
+        compiled, follow = predictor.compiled, predictor.followed(request, previous)
+        columns, known, places = self._with_rollout if compiled else self._without_rollout
+        along, answer = np.empty(self._along.size), np.empty(self._answer.size)
+        start = predictor.state(request.state, request.covariance)
+        sequence = run(
+            compiled,
+            self._ours,
+            columns,
+            known,
+            places,
+            self._work,
+            (start, request.covariance, request.targets, request.wanted, request.last, request.shifted),
+            NOTHING if follow is None else np.ascontiguousarray(follow),
+            layout.NO_RECORD if warm is None or not self._ours else warm.record,
+            along,
+            self._along.table,
+            answer,
+            self._answer.table,
+        )
+        P, q, G, lower, upper, record, states, covariances, outcome = self._answer.parts(answer)
+        solution, first = None, True
+        for wish in sequence:
+            if wish == loop.MODEL:
+                self._linearise(request, along, follow, first)
+                follow, first = None, False
+            else:
+                solution = self._solve((P, q, G, lower, upper), warm if solution is None else solution)
+                record[:] = solution.record[: len(record)]
+        status, count, build, solve = outcome.tolist()
+        if self._ours:
+            terms = Terms(P, G, self._softness)
+            solution = QPSolution(record[self._inputs], terms, q, lower, upper, record, 0.0, solve)
+        timing = Timing(perf_counter() - began - build - solve, build, solve)
+        program = QuadraticProgram.unchecked(P, q, G, lower, upper)
+        return Reached(layout.STATUSES[int(status)], int(count), timing, program, solution, states, covariances)
+
+    def _linearise(self, request: Request, along: Array, follow: Array | None, first: bool) -> None:
+        """The stages along a plan, from the model itself."""
+        *stages, rows, low, high = self._along.parts(along)
+        try:
+            found = self._predictor.along(request, stages[-1], follow)
+        except DataError:  # the rollout left the finite numbers; from the second one on a shorter step may not
+            if first:
+                raise
+            along[: self._along.table[loop.PLAN, 0]] = np.nan
+            return
+        made = found.A, found.B, found.c, found.covariances, found.inputs
+        for place, part in zip(stages, made, strict=True):
+            place[:] = part
+        low[:], high[:] = self._chance.limits(found)
+        rows[:] = self._chance.rows(found)
+
+    def _solve(self, program: tuple[Array, ...], warm: QPSolution | None) -> QPSolution:
+        if self._ours:
+            return self._solver.solve_stacked(*program, warm, self._soft)
+        _, q, _, lower, _ = program
+        fits = warm is not None and len(warm.q) == len(q) and len(warm.lower) == len(lower)
+        return self._solver.solve(QuadraticProgram.from_stacked(*program), warm if fits else None)

@@ -14,7 +14,7 @@ The moments are summed over x~_i - x~, which all outputs share, and scaled by D_
 import numpy as np
 
 from gpmpc.compiled import borrowing, compiled
-from gpmpc.fused.exponential import exp_all
+from gpmpc.fused.exponential import exp, exp_all, widest
 from gpmpc.fused.point_rows import LINE, aligned_rows, combine, explain, multiply, project, summed
 
 JACOBIAN, HESSIAN = 1, 2  # how much is wanted: up to second derivatives of M, up to third
@@ -88,19 +88,45 @@ def expand_at(gp, x, u, memory, kept, place, M, J, J_u):
 
     ``gp`` holds the first four arrays of ``means_along``; ``memory`` has 2 R + 2 aligned rows.
     """
+    widest()
     points, inverse_squares, log_signal, beta = gp
-    rows, n, m = len(points), len(x), len(u)
+    (rows, padded), n, m = points.shape, len(x), len(u)
     U = rows - padded_inputs(m)
     difference, squares, weighted, sums = memory[:rows], memory[rows : 2 * rows], memory[2 * rows], memory[2 * rows + 1]
-    offsets(points, x, u, difference)
     for c in range(rows):
-        multiply(difference[c], difference[c], squares[c])
-    for a in range(len(beta)):
-        D, k = inverse_squares[a], kept[a, place]
-        correlate(log_signal[a], D, squares, sums, k)
-        multiply(k, beta[a], weighted)
-        M[a] = summed(weighted)
-        project(weighted, difference, sums)
+        at = x[c] if c < n else (u[c - U] if U <= c < U + m else 0.0)
+        source, offset, square = points[c], difference[c], squares[c]
+        for j in range(padded):
+            value = source[j] - at
+            offset[j] = value
+            square[j] = value * value
+    for a in range(len(beta)):  # written out: calls would take a fifth of the time
+        D, k, factors, start = inverse_squares[a], kept[a, place], beta[a], log_signal[a]
+        for c in range(0, rows, 3):
+            square0, square1, square2 = squares[c], squares[c + 1], squares[c + 2]
+            D0, D1, D2 = D[c] / -2, D[c + 1] / -2, D[c + 2] / -2
+            if c == 0:
+                for j in range(padded):
+                    k[j] = start + D0 * square0[j] + D1 * square1[j] + D2 * square2[j]
+            else:
+                for j in range(padded):
+                    k[j] = k[j] + D0 * square0[j] + D1 * square1[j] + D2 * square2[j]
+        total = 0.0
+        for j in range(padded):
+            value = exp(k[j])
+            k[j] = value
+            value *= factors[j]
+            weighted[j] = value
+            total += value
+        M[a] = total
+        for c in range(0, rows, 3):
+            offset0, offset1, offset2 = difference[c], difference[c + 1], difference[c + 2]
+            sum0 = sum1 = sum2 = 0.0
+            for j in range(padded):
+                sum0 += weighted[j] * offset0[j]
+                sum1 += weighted[j] * offset1[j]
+                sum2 += weighted[j] * offset2[j]
+            sums[c], sums[c + 1], sums[c + 2] = sum0, sum1, sum2
         for c in range(n):
             J[a, c] = D[c] * sums[c]
         for c in range(m):

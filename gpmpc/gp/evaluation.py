@@ -41,6 +41,11 @@ def evaluation(choice: Evaluation) -> Iterator[None]:
         _chosen.reset(token)
 
 
+def chosen_evaluation() -> Evaluation:
+    """What ``evaluation`` says here."""
+    return _chosen.get()
+
+
 def host_arrays(*tensors: Tensor) -> list[np.ndarray] | None:
     """The tensors as arrays that the compiled loops may answer for; None where torch has to."""
     choice = _chosen.get()

@@ -156,6 +156,10 @@ class DualActiveSet:
         terms = Terms(problem.P, problem.G, stack_softness(soft, n, m))
         return Prepared(self, terms, self._settings(n, n + m, soft is not None, float(next(_tags))))
 
+    def workspace(self, rows: int, variables: int, soft: SoftRows | None = None) -> tuple[Array, Array]:
+        """Softness and the memory that ``solve_lazy`` takes in kernels that call it themselves, holding the lock."""
+        return self._plan(rows, variables, soft)[:2]
+
     def _plan(self, m: int, n: int, soft: SoftRows | None) -> tuple[Array, Array, int, slice]:
         """For a shape of G, softness, workspace, the record's length, and where x is in it."""
         softness, settings = stack_softness(soft, n, m), self._settings(n, n + m, soft is not None)

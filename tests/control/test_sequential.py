@@ -1,4 +1,5 @@
 from dataclasses import replace
+from time import perf_counter
 
 import numpy as np
 import pytest
@@ -6,13 +7,16 @@ import torch
 
 from gpmpc.bench.optimality import Question, kkt_residual
 from gpmpc.bench.pendulums import pendulum_gp
+from gpmpc.control import sequential_loop
 from gpmpc.control.controller import Reference
+from gpmpc.control.convergence import kkt_share
 from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.sequential import kkt_share
-from gpmpc.control.tracking import TrackingProblem
+from gpmpc.control.sequential_loop import keeps_rates
+from gpmpc.control.tracking import StateBounds, TrackingProblem
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.propagation import Linearization
+from gpmpc.qp import DualActiveSet
 from gpmpc.status import Status
 from tests.control.systems import HOVER, linear_gaussian, quadrotor_gp
 
@@ -124,10 +128,83 @@ def test_plans_of_the_program_keep_their_rates_whatever_the_unit_of_the_inputs(s
     for _ in range(20):
         last = controller.control(Gaussian.certain(state), Reference(np.zeros((9, 2))), last)
         assert last.status is Status.SOLVED
-        assert controller._keeps_rates(last.inputs, before)
+        assert keeps_rates(last.inputs, before, problem.rate_lower, problem.rate_upper)
         off = last.inputs.copy()
         off[-1] += 3 * bound
-        assert not controller._keeps_rates(off, before)
+        assert not keeps_rates(off, before, problem.rate_lower, problem.rate_upper)
         bitten += int((np.abs(np.diff(last.inputs[:, 0])) > 0.999 * bound).sum())
         state, before = model.predict(torch.tensor(state), torch.tensor(last.input)).mean.numpy(), last.input
     assert bitten > 10
+
+
+class Told:
+    """A predictor whose compiled rollout the loop does not call by itself, and a solver likewise."""
+
+    compiled = False
+
+    def __init__(self, predictor):
+        self._predictor = predictor
+
+    def __getattr__(self, name):
+        return getattr(self._predictor, name)
+
+    def solve(self, problem, warm_start=None):
+        return DualActiveSet().solve(problem, warm_start)
+
+
+BOUNDS = StateBounds([-np.inf, -0.3] * 3, [np.inf, 0.3] * 3, l1=20.0, l2=5.0)
+
+
+@pytest.mark.parametrize("covariance", ["zero_order", "none"])
+@pytest.mark.parametrize(
+    "limits",
+    [{}, {"rate_lower": [-0.5, -0.05, -0.05], "rate_upper": [0.5, 0.05, 0.05]}, {"state_bounds": BOUNDS}],
+    ids=["box", "rates", "soft states"],
+)
+def test_what_the_loop_asks_for_and_what_it_computes_are_the_same(quadrotor, covariance, limits):
+    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="increments", **BOX, **limits)
+    arguments = quadrotor, Linearization(), problem, 5, HOVER, "trajectory", covariance
+    told = {} if "state_bounds" in limits else {"solver": Told(None)}  # whose prices need our own solver
+    alone, asking = (ConvexMPC(*arguments, **solver, iterations=60, tolerance=1e-7) for solver in ({}, told))
+    asking._sequence._predictor = Told(asking.predictor)
+    random, last, other, programs = np.random.default_rng(2), None, None, 0
+    for _ in range(8):
+        mean, std = 0.4 * random.uniform(-1, 1, 6), 0.01
+        belief = Gaussian(torch.tensor(mean), std**2 * torch.eye(6))
+        reference = Reference(np.tile(0.5 * random.uniform(-1, 1, 6), (6, 1)))
+        last, other = alone.control(belief, reference, last), asking.control(belief, reference, other)
+        assert last.status is other.status
+        assert last.iterations == other.iterations
+        for name in ("inputs", "means", "covariances"):
+            assert np.allclose(getattr(last, name), getattr(other, name), rtol=0, atol=1e-12, equal_nan=True)
+        programs += last.iterations * last.status.solved
+    assert programs > 16
+
+
+def test_the_order_in_memory_of_what_is_asked_changes_nothing(quadrotor):
+    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
+    controller = ConvexMPC(quadrotor, Linearization(), problem, 5, HOVER, iterations=30)
+    random = np.random.default_rng(3)
+    states, inputs = 0.3 * random.uniform(-1, 1, (6, 6)), HOVER + 0.1 * random.uniform(-1, 1, (5, 3))
+    S = torch.tensor(np.cov(random.normal(size=(6, 40)))) * 1e-3
+    plain = controller.control(Gaussian(torch.tensor(states[0]), S), Reference(states, inputs))
+    mean = torch.tensor(np.repeat(states[0], 2))[::2]
+    strided = Reference(np.asfortranarray(states), np.repeat(inputs, 2, axis=0)[::2])
+    other = controller.control(Gaussian(mean, S.mT), strided)
+    assert plain.status is Status.SOLVED
+    assert np.array_equal(plain.inputs, other.inputs)
+    assert np.array_equal(plain.covariances, other.covariances)
+
+
+def test_the_parts_of_the_time_are_within_what_the_step_took(quadrotor, reachable):
+    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
+    controller = ConvexMPC(quadrotor, Linearization(), problem, 5, HOVER, covariance="none", iterations=30)
+    began = perf_counter()
+    timing = controller.control(Gaussian.certain(np.zeros(6)), reachable).timing
+    assert timing.total <= perf_counter() - began
+    assert min(timing.model, timing.build, timing.solve) > 0
+
+
+def test_the_loop_is_kept_on_disk_by_its_name():
+    """By value it would carry all kernels that it calls, to be compiled by every process that loads it."""
+    assert getattr(sequential_loop, sequential_loop.programs.py_func.__name__) is sequential_loop.programs.py_func
