@@ -269,8 +269,8 @@ def slsqp(program: Program, shot: Shot, tolerance: float, limit: int) -> Outcome
             return shot, _trouble(step), iterations
         if step.size <= tolerance:
             return shot, Status.SOLVED if step.consistent else Status.INFEASIBLE, iterations
-        if iterations >= limit:
-            return shot, Status.ITERATION_LIMIT, iterations
+        if iterations >= limit:  # where bounds contradict each other SLSQP wanders until then
+            return shot, Status.ITERATION_LIMIT if step.consistent else Status.INFEASIBLE, iterations
         try:
             found, used = _round(program, shot, tolerance, limit - iterations)
         except FAILURES:
