@@ -14,6 +14,9 @@ itself, the processor time in it, which other processes on the machine blur less
 *Flat out*: steps of a millisecond of work each, without waiting. Reported: how much longer it takes, by the clock and
 in the loop's processor time (the writer's process has a core of its own only if one is free).
 
+A third way takes turns with the two: one plain copy of as many bytes into private memory of the ring's size. Where the
+machine itself holds up writes to memory (one copy in twenty by 0.2 ms on some virtual ones), it shows there as well.
+
 Also: what a step costs the writer's process, which is what a thread in the loop's process would take from the loop.
 """
 
@@ -33,7 +36,7 @@ import numpy as np
 from gpmpc.control.controller import Decision, Timing
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.recording import McapRecorder, Step, wire
-from gpmpc.recording.ring import FRAME
+from gpmpc.recording.ring import CAPACITY, FRAME
 from gpmpc.recording.writer import StepWriter
 from gpmpc.status import Status
 
@@ -84,6 +87,24 @@ def work(seconds_of_work: int) -> float:
     return total
 
 
+class PlainCopy:
+    """Copies as many numbers as a step has, to a place that moves on."""
+
+    def __init__(self, steps: list[Step]):
+        head, _, length = wire.pack(steps[0], len(STATES), len(INPUTS))
+        count = (len(head) + length) // 8
+        self._sources = [np.random.default_rng(k).standard_normal(count) for k in range(len(steps))]
+        self._numbers, self._at = np.zeros(CAPACITY // 8), 0
+
+    def record(self, step: Step) -> None:
+        """Copies."""
+        source = self._sources[step.k]
+        if self._at + len(source) > len(self._numbers):
+            self._at = 0
+        self._numbers[self._at : self._at + len(source)] = source
+        self._at += len(source)
+
+
 def calibrate(seconds: float) -> int:
     """How much ``work`` takes that long."""
     counts = 20_000
@@ -98,7 +119,7 @@ def _timed(count: int) -> float:
 
 
 def loop(
-    steps: list[Step], count: int, amount: int, recorder: McapRecorder | None, paced: bool
+    steps: list[Step], count: int, amount: int, recorder: McapRecorder | PlainCopy | None, paced: bool
 ) -> dict[str, np.ndarray]:
     """Times of work and of recording of every step [s]."""
     works, records, processor = np.zeros(count), np.zeros(count), np.zeros(count)
@@ -150,9 +171,10 @@ def measure(horizon: int, seconds: float, record_problems: bool, turns: int) -> 
     half, whole = calibrate(0.5 * PERIOD), calibrate(PERIOD)
     paced: dict[bool, list] = {False: [], True: []}
     flat: dict[bool, list] = {False: [], True: []}
-    closing = []
+    closing, copies = [], []
     with tempfile.TemporaryDirectory() as folder:
         for turn in range(turns):
+            copies.append(loop(steps, count, half, PlainCopy(steps), paced=True)["record"])
             for recording in (False, True):
                 for results, amount, is_paced in ((paced, half, True), (flat, whole, False)):
                     recorder = None
@@ -170,7 +192,7 @@ def measure(horizon: int, seconds: float, record_problems: bool, turns: int) -> 
                         recorder.close()
                         closing.append(perf_counter() - began)
         size = (Path(folder) / "0.mcap").stat().st_size / count
-    records = np.concatenate([run["record"] for run in paced[True]])
+    records, copied = np.concatenate([run["record"] for run in paced[True]]), np.concatenate(copies)
     processor = {key: np.concatenate([run["processor"] for run in runs]) for key, runs in paced.items()}
     works = {key: np.concatenate([run["work"] for run in runs]) for key, runs in paced.items()}
     totals = {key: np.min([run["total"] for run in runs], axis=0) for key, runs in flat.items()}
@@ -182,6 +204,9 @@ def measure(horizon: int, seconds: float, record_problems: bool, turns: int) -> 
         "record_mean_us": 1e6 * records.mean(),
         "record_median_us": 1e6 * np.median(records),
         "record_p99_us": 1e6 * np.quantile(records, 0.99),
+        "copy_mean_us": 1e6 * copied.mean(),
+        "copy_median_us": 1e6 * np.median(copied),
+        "copy_p99_us": 1e6 * np.quantile(copied, 0.99),
         "record_processor_mean_us": 1e6 * (processor[True].mean() - processor[False].mean()),
         "record_processor_median_us": 1e6 * (np.median(processor[True]) - np.median(processor[False])),
         "work_change_median_us": 1e6 * (np.median(works[True]) - np.median(works[False])),
@@ -211,7 +236,8 @@ def main() -> None:
                 f"H {horizon:3d}, problems {'kept' if record_problems else 'not kept':8s}: record() median "
                 f"{row['record_median_us']:5.1f} us, mean {row['record_mean_us']:5.1f} (processor time "
                 f"{row['record_processor_mean_us']:5.1f}, median {row['record_processor_median_us']:5.1f}), p99 "
-                f"{row['record_p99_us']:6.1f}; work "
+                f"{row['record_p99_us']:6.1f}; a plain copy {row['copy_median_us']:.1f}, "
+                f"mean {row['copy_mean_us']:.1f}, p99 {row['copy_p99_us']:.1f}; work "
                 f"{row['work_change_median_us']:+5.1f} us; flat out {100 * row['flat_out_slowdown']['wall']:+.1f} % "
                 f"(processor time {100 * row['flat_out_slowdown']['processor']:+.1f} %); the writer "
                 f"{row['writer_us_per_step']:.0f} us, {row['file_bytes_per_step'] / 1e3:.1f} kB a step; close "
