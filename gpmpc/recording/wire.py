@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpmpc.exceptions import ShapeError
+from gpmpc.qp.record import HEADER
 from gpmpc.recording.ring import FRAME
 from gpmpc.status import Status
 from gpmpc.step import Step
@@ -23,7 +24,6 @@ STATUSES = tuple(Status)
 
 # time, k, gp_size, gp_version, status, iterations, failed, H, n and m of the QP, length of its record, timing
 _HEAD = struct.Struct("<dqqqqqqqqqqddd")
-RECORD_HEADER = 7  # gpmpc.qp.record.HEADER, whose import would cost the writer's start a quarter of a second
 _float64 = np.dtype(np.float64)
 _NUMBERS = {status: number for number, status in enumerate(STATUSES)}
 
@@ -64,7 +64,7 @@ def pack(step: Step, states: int, inputs: int) -> tuple[bytes, list[Array], int]
     if solution is not None:
         (P, G, softness), q = solution.terms, solution.q
         variables, rows = len(q), len(G)
-        record = RECORD_HEADER + 3 * variables + 2 * rows  # without the factor
+        record = HEADER + 3 * variables + 2 * rows  # without the factor
         arrays += [q, solution.lower, solution.upper, softness, solution.record[:record]]
         large = [P, G]
     elif problem is not None:

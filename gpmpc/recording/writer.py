@@ -21,6 +21,7 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
+from gpmpc.qp.record import HEADER
 from gpmpc.qp.solution import QPSolution, Terms
 from gpmpc.recording import schemas, wire
 from gpmpc.recording.encoding import DoublesEncoder
@@ -158,7 +159,7 @@ class StepWriter:
         n, M = len(qp.q), len(qp.lower)
         arrays = {name: getattr(qp, name).tobytes() for name in ("P", "q", "G", "lower", "upper", "softness")}
         if len(qp.record):
-            x, multipliers = np.split(qp.record[wire.RECORD_HEADER : wire.RECORD_HEADER + n + M], [n])
+            x, multipliers = np.split(qp.record[HEADER : HEADER + n + M], [n])
             arrays |= {"x": x.tobytes(), "multipliers": multipliers.tobytes()}
         return self._qp(time=step.time, k=step.k, variables=n, rows=M - n, **arrays)
 
@@ -171,7 +172,7 @@ def _quality(qp: wire.PackedQP | None) -> tuple[int, tuple[float, float, float]]
     """Size of the active set, and the residuals; zero and NaN where there is no solution to judge."""
     if qp is None or not len(qp.record):
         return 0, (np.nan, np.nan, np.nan)
-    x = qp.record[wire.RECORD_HEADER : wire.RECORD_HEADER + len(qp.q)]
+    x = qp.record[HEADER : HEADER + len(qp.q)]
     solution = QPSolution(x, Terms(qp.P, qp.G, qp.softness), qp.q, qp.lower, qp.upper, qp.record, 0.0, 0.0)
     return int(np.count_nonzero(solution.active_set)), solution.residuals()
 

@@ -17,7 +17,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from gpmpc.exceptions import RecordingError, SettingError, ShapeError
 from gpmpc.qp import QuadraticProgram, SoftRows
-from gpmpc.recording import read_run, replay, wire
+from gpmpc.recording import read_run, replay
 from gpmpc.status import Status
 from tests.recording import runs
 
@@ -384,9 +384,3 @@ def test_two_processes_recording_into_one_tree_lose_nothing(tmp_path):
     files = sorted(tmp_path.rglob("*.mcap"))
     assert len(files) == 6
     assert all(read_run(file).finished and len(read_run(file).times) == 20 for file in files)
-
-
-def test_the_wire_knows_the_layout_of_a_solvers_record():
-    from gpmpc.qp import record
-
-    assert record.HEADER == wire.RECORD_HEADER
