@@ -15,7 +15,7 @@ from torch import Tensor
 from gpmpc.control.controller import Decision
 from gpmpc.control.prediction import Prediction, Predictor
 from gpmpc.control.request import Request
-from gpmpc.control.stage_models import StageModel, stage_model
+from gpmpc.control.stage_models import StageModel, disturbed, stage_model
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
@@ -51,7 +51,8 @@ def predict_many(
         return _along(predictor, requests, previous, states, covariances)
     about = np.stack([predictor.about(request) for request in requests])
     belief = _belief(predictor, states, covariances)
-    stage = _stage(predictor, belief, _tensor(predictor, about))
+    disturbances = _disturbances(predictor, requests)
+    stage = _stage(predictor, belief, _tensor(predictor, about), disturbances)
     now, after, starts = _array(belief.covariance), _array(stage.next.covariance), predictor.state(states, covariances)
     A, B, c = (_array(part) for part in stage[:3])
     V = [None] * len(requests) if stage.V is None else _array(stage.V)
@@ -79,13 +80,13 @@ def _along(
     if predictor.feedback:
         followed = [predictor.followed(request, before) for request, before in zip(requests, previous, strict=True)]
         follow = _tensor(predictor, np.stack(followed))
-    belief, stages = _belief(predictor, states, covariances), []
+    belief, stages, disturbances = _belief(predictor, states, covariances), [], _disturbances(predictor, requests)
     spreads = [belief.covariance]
     for k, input in enumerate(plan):
         if gain is not None:
             moved = input + (gain @ (belief.mean - follow[:, k])[..., None])[..., 0]
             plan[k] = input = moved.clamp(lower, upper)
-        stage = _stage(predictor, belief, input)
+        stage = _stage(predictor, belief, input, disturbances)
         if predictor.feedback and gain is None:
             gain = _gains(predictor, stage)
         belief = stage.next
@@ -100,8 +101,16 @@ def _along(
     return [Prediction(A, B, c, start, S, inputs) for A, B, c, S, inputs, start in zip(*parts, starts, strict=True)]
 
 
-def _stage(predictor: Predictor, belief: Gaussian, input: Tensor) -> StageModel:
-    return stage_model(predictor.covariance, predictor.propagator, predictor.model, belief, input)
+def _stage(predictor: Predictor, belief: Gaussian, input: Tensor, disturbances: Tensor | None) -> StageModel:
+    stage = stage_model(predictor.covariance, predictor.propagator, predictor.model, belief, input)
+    return stage if disturbances is None else disturbed(stage, disturbances)
+
+
+def _disturbances(predictor: Predictor, requests: Sequence[Request]) -> Tensor | None:
+    """Of all requests (T, n), where they are estimated."""
+    if not predictor.disturbance_gain:
+        return None
+    return _tensor(predictor, np.stack([request.disturbance for request in requests]))
 
 
 def _gains(predictor: Predictor, stage: StageModel) -> Tensor:

@@ -70,23 +70,27 @@ class CompiledRollout:
             noise,
         )
 
-    def __call__(self, start: Array, covariance: Array, plan: Array, follow: Array | None) -> Stages:
+    def __call__(
+        self, start: Array, covariance: Array, disturbance: Array, plan: Array, follow: Array | None
+    ) -> Stages:
         """The stages along a plan.
 
         Args:
             start: x_0 (n,).
             covariance: Of x_0 (n, n).
+            disturbance: Added to every mean (n,), or nothing (0,).
             plan: (H, m).
             follow: Means (H, n) that the rollout follows under the feedback; None follows none.
         """
         (H, m), n = plan.shape, len(start)
         found = Stages(np.empty((H, n, n)), np.empty((H, n, m)), np.empty((H, n)), np.zeros((H + 1, n, n)), plan.copy())
-        roll_out(self.known, start, covariance, NOTHING if follow is None else follow, tuple(found))
+        follow = NOTHING if follow is None else follow
+        roll_out(self.known, start, covariance, disturbance, follow, tuple(found))
         return found
 
 
 @compiled
-def roll_out(known, start, covariance, follow, out):
+def roll_out(known, start, covariance, disturbance, follow, out):
     """Writes the stages along the plan in ``out`` (the parts of ``Stages``), following ``follow`` if there is any."""
     uncertain, feedback, gp, columns, outer, weights, limits, noise = known
     points, _, log_signal, _ = gp
@@ -109,6 +113,8 @@ def roll_out(known, start, covariance, follow, out):
         expand_at(gp, x, u, memory, kept, k if uncertain else 0, M, A[k], B[k])
         for i in range(n):
             M[i] += offset[i]
+            if len(disturbance) > 0:
+                M[i] += disturbance[i]
             if adds_state:
                 M[i] += x[i]
                 A[k, i, i] += 1.0

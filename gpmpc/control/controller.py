@@ -76,6 +76,8 @@ class Decision:
         timing: Where the time went.
         problem: The quadratic program that was solved last, where there is one.
         solution: Its solution: active set, multipliers, residuals; a warm start for the next.
+        disturbance: What was added to the model's mean at every stage (n,), an estimate of its constant error; None
+            where nothing is estimated.
     """
 
     input: np.ndarray
@@ -87,6 +89,7 @@ class Decision:
     timing: Timing
     problem: QuadraticProgram | None = None
     solution: QPSolution | None = None
+    disturbance: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "input", np.array(self.input, dtype=float))  # no view of the plan

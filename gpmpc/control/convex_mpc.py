@@ -83,6 +83,8 @@ class ConvexMPC:
         feedback: Rolls plans out, and predicts the covariances of ``"zero_order"``, under an ancillary feedback,
             without which no long horizon with state bounds is feasible. ``"full"`` and ``"diagonal"`` predict their
             covariances without feedback.
+        disturbance_gain: L, how fast a constant error of the model is made up for: 0 leaves it, with an offset of the
+            state; 1 takes all of what the last step showed, its noise too. See ``gpmpc.control.prediction``.
 
     Attributes:
         soft: Prices of the rows of the program's G, None where all are hard.
@@ -104,6 +106,7 @@ class ConvexMPC:
         iterations: int = 1,
         tolerance: float = 1e-6,
         feedback: bool = True,
+        disturbance_gain: float = 0.0,
     ):
         self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
         check_number("iterations", iterations, least=1, whole=True)
@@ -112,7 +115,7 @@ class ConvexMPC:
             raise SettingError("iterations", f"form {form!r} is one quadratic program, so 1; got {iterations}")
         self.problem, self.horizon, self.iterations, self.tolerance = problem, horizon, iterations, tolerance
         self.solver = DualActiveSet() if solver is None else solver
-        self.predictor = Predictor(model, propagator, problem, horizon, form, covariance, feedback)
+        self.predictor = Predictor(model, propagator, problem, horizon, form, covariance, feedback, disturbance_gain)
         weights = self.predictor.extended(problem.Q), self.predictor.extended(problem.terminal)
         self._condenser = Condenser(problem, horizon, *weights)
         self._chance = ChanceConstraints(problem.state_bounds, problem.state_dim, horizon, covariance)
@@ -253,7 +256,8 @@ class ConvexMPC:
             return replace(request.unanswered(status, count, timing), problem=program, solution=solution)
         inputs = _inputs(request, solution).copy()
         means, covariances = self.predictor.moments(states, covariances)
-        return Decision(inputs[0], inputs, means, covariances, status, count, timing, program, solution)
+        disturbance = request.disturbance if self.predictor.disturbance_gain else None
+        return Decision(inputs[0], inputs, means, covariances, status, count, timing, program, solution, disturbance)
 
 
 def read_request(
@@ -268,7 +272,10 @@ def read_request(
     if reference.inputs is None and (predictor.form == "deviation" or problem.penalized == "deviations"):
         what = "form 'deviation'" if predictor.form == "deviation" else "penalized 'deviations'"
         raise ShapeError(f"{what} needs reference inputs ({H}, {problem.input_dim}); got none")
-    return Request.read(problem, H, initial_input, belief, reference, previous)
+    request = Request.read(problem, H, initial_input, belief, reference, previous)
+    if predictor.disturbance_gain and request.finite:
+        return request._replace(disturbance=predictor.disturbance(request, previous))
+    return request
 
 
 def _warm(previous: Decision | None) -> QPSolution | None:

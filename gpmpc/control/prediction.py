@@ -14,6 +14,12 @@ What s holds of the belief is its *covariance* mode. ``full``: s = [mu; vec S], 
 covariances are predicted beside the optimisation as if the inputs did not change them (Hewing, Kabzan and Zeilinger,
 2020; Zanelli, Frey, Messerer and Diehl, 2021). ``none``: s = mu, through the model's mean at a certain state.
 
+A constant error of the model leaves an offset between reference and state. ``increment`` has none: the error is in
+both of two steps, and not in their difference. The other forms may add an estimate of it to every mean, a
+*disturbance* (Pannocchia and Rawlings, 2003), which moves by a gain L towards what the last step showed:
+
+    d_k = (1 - L) d_{k-1} + L (mu_k - f(mu_{k-1}, u_{k-1}))
+
 Torch ends here: what comes out is NumPy float64.
 """
 
@@ -29,9 +35,9 @@ from gpmpc.control.compiled_rollout import CompiledRollout
 from gpmpc.control.condensing import respond
 from gpmpc.control.controller import Decision
 from gpmpc.control.request import Request
-from gpmpc.control.stage_models import is_first_order, stage_model
+from gpmpc.control.stage_models import disturbed, is_first_order, stage_model
 from gpmpc.control.tracking import TrackingProblem
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, check_number
 from gpmpc.fused.extended import roots
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
@@ -87,9 +93,10 @@ class Predictor:
         covariance: See the module's text.
         feedback: Rolls out, and predicts the covariances of ``zero_order``, under an ancillary feedback; see
             ``gpmpc.control.ancillary_feedback``.
+        disturbance_gain: L, from 0 (no disturbance is estimated) to 1 (it is what the last step showed).
 
     Raises:
-        SettingError: An unknown form or covariance mode.
+        SettingError: An unknown form or covariance mode, a gain out of range, or one with ``increment``.
     """
 
     def __init__(
@@ -101,6 +108,7 @@ class Predictor:
         form: Form,
         covariance: Covariance,
         feedback: bool,
+        disturbance_gain: float = 0.0,
     ):
         for key, value, possible in (("form", form, FORMS), ("covariance", covariance, COVARIANCES)):
             if value not in possible:
@@ -108,7 +116,12 @@ class Predictor:
         if not isinstance(feedback, bool):
             raise SettingError("feedback", f"must be true or false; got {feedback!r}")
         self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
+        check_number("disturbance_gain", disturbance_gain, least=0)
+        if disturbance_gain > (form != "increment"):
+            rule = "be 0 for form 'increment', which needs none" if form == "increment" else "lie between 0 and 1"
+            raise SettingError("disturbance_gain", f"must {rule}; got {disturbance_gain}")
         self.form, self.covariance, self.feedback = form, covariance, feedback
+        self.disturbance_gain = disturbance_gain
         at_points = covariance == "zero_order" and is_first_order(propagator, model)
         exact = isinstance(model, GPPosterior) and model.predicts in ("next_state", "difference")
         self._compiles = at_points or (covariance == "none" and exact)
@@ -196,7 +209,7 @@ class Predictor:
                 its bounds: u_k + K (mu_k - follow_k) for k = 1 .. H-1.
         """
         if self.compiled:
-            found = self.rollout(request.state, request.covariance, inputs, follow)
+            found = self.rollout(request.state, request.covariance, request.disturbance, inputs, follow)
             return Prediction(found.A, found.B, found.c, request.state, found.covariances, found.inputs)
         belief, gain, stages, plan = self._belief(request.state, request.covariance), None, [], np.array(inputs)
         covariances, n = [_array(belief.covariance)], self.problem.state_dim
@@ -204,7 +217,7 @@ class Predictor:
             if follow is not None and k:
                 moved = input + gain @ (_array(belief.mean) - follow[k])
                 input[:] = np.clip(moved, self.problem.input_lower, self.problem.input_upper)
-            A, B, c, belief, V = self._linearise(belief, self._tensor(input))
+            A, B, c, belief, V = self._linearise(belief, self._tensor(input), request.disturbance)
             if self.feedback and gain is None and (follow is not None or V is not None):
                 gain = self.gain(np.ascontiguousarray(A[:n, :n]), np.ascontiguousarray(B[:n]))
             if self.feedback and V is not None:
@@ -217,7 +230,7 @@ class Predictor:
     def held(self, request: Request, input: Array) -> Prediction:
         """The local model about the belief and an input (m,), for all stages."""
         belief = self._belief(request.state, request.covariance)
-        A, B, c, after, V = self._linearise(belief, self._tensor(input))
+        A, B, c, after, V = self._linearise(belief, self._tensor(input), request.disturbance)
         now = _array(belief.covariance)
         return self.hold(self.state(request.state, now), input, A, B, c, now, _array(after.covariance), V)
 
@@ -244,10 +257,25 @@ class Predictor:
             return previous.means[1:]
         return np.concatenate([request.state[None], request.targets[:-1]])
 
-    def _linearise(self, belief: Gaussian, input: torch.Tensor) -> tuple[Array, Array, Array, Gaussian, Array | None]:
+    def disturbance(self, request: Request, previous: Decision | None) -> Array:
+        """d_k (n,), from the estimate of the last decision and what came of its input; zero before the first step."""
+        if previous is None or not previous.status.solved:
+            return np.zeros(self.problem.state_dim)
+        before = np.zeros_like(request.state) if previous.disturbance is None else previous.disturbance
+        x, u = self._tensor(previous.means[0]), self._tensor(request.last)
+        if isinstance(self.model, GPPosterior):
+            predicted = _array(self.model.mean_with_jacobian(x, u)[0])
+        else:
+            predicted = _array(self.model.predict(x, u).mean)
+        return before + self.disturbance_gain * (request.state - predicted - before)
+
+    def _linearise(
+        self, belief: Gaussian, input: torch.Tensor, disturbance: Array
+    ) -> tuple[Array, Array, Array, Gaussian, Array | None]:
         """One ``StageModel``; compiled where a point is all that it needs."""
         if not self.compiled:
             stage = stage_model(self.covariance, self.propagator, self.model, belief, input)
+            stage = disturbed(stage, self._tensor(disturbance)) if len(disturbance) else stage
             A, B, c = (_array(part) for part in stage[:3])
             return A, B, c, stage.next, None if stage.V is None else _array(stage.V)
         x, u = _array(belief.mean), _array(input)
@@ -261,6 +289,8 @@ class Predictor:
                 V += _array(self.model.noise_covariance)
             S = self._tensor(A @ _array(belief.covariance) @ A.T + V)
         A, B = np.ascontiguousarray(A), np.ascontiguousarray(B)
+        if len(disturbance):
+            mean += disturbance
         return A, B, mean - A @ x - B @ u, Gaussian(self._tensor(mean), S), V
 
     def gain(self, A: Array, B: Array) -> Array:

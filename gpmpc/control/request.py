@@ -16,7 +16,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.status import Status
 
-NO_PLAN = np.empty((0, 0))
+NO_PLAN, UNDISTURBED = np.empty((0, 0)), np.empty(0)
 SIGNATURE = "i8(f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])"
 BELIEF, TARGETS, WANTED, BEFORE = 1, 2, 4, 8  # what may not be finite
 
@@ -33,6 +33,7 @@ class Request(NamedTuple):
         shifted: The last plan, one step on, its last input repeated (H, m); the last input held where there is no
             plan of a solve that succeeded. Within the input bounds.
         finite: Whether the belief can be worked with.
+        disturbance: Added to the model's mean at every stage (n,), or nothing (0,).
     """
 
     state: np.ndarray
@@ -42,6 +43,7 @@ class Request(NamedTuple):
     last: np.ndarray
     shifted: np.ndarray
     finite: bool
+    disturbance: np.ndarray = UNDISTURBED
 
     @classmethod
     def read(

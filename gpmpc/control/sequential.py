@@ -139,6 +139,7 @@ class SequentialPrograms:
         columns, known, places = self._with_rollout if compiled else self._without_rollout
         along, answer = np.empty(self._along.size), np.empty(self._answer.size)
         start = predictor.state(request.state, request.covariance)
+        told = request.targets, request.wanted, request.last, request.shifted
         sequence = run(
             compiled,
             self._ours,
@@ -146,7 +147,7 @@ class SequentialPrograms:
             known,
             places,
             self._work,
-            (start, request.covariance, request.targets, request.wanted, request.last, request.shifted),
+            (start, request.covariance, request.disturbance, *told),
             NOTHING if follow is None else np.ascontiguousarray(follow),
             layout.NO_RECORD if warm is None or not self._ours else warm.record,
             along,

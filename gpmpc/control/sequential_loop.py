@@ -43,7 +43,7 @@ ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: pos
 
 
 FLAT, VECTOR, MATRIX, TABLE = types.float64[::1], types.float64[::1], types.float64[:, ::1], types.int64[:, ::1]
-QUESTION = types.Tuple([VECTOR, MATRIX, MATRIX, MATRIX, VECTOR, MATRIX])
+QUESTION = types.Tuple([VECTOR, MATRIX, VECTOR, MATRIX, MATRIX, VECTOR, MATRIX])
 SIGNATURE = (
     *(types.boolean, types.boolean, types.float64[:, :, ::1], FLAT, TABLE, MATRIX),
     *(QUESTION, MATRIX, VECTOR, FLAT, TABLE, FLAT, TABLE),
@@ -60,7 +60,8 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
         known: What stays, flat.
         places: Its table.
         work: Workspace of ``solve_lazy``.
-        question: s_0, and covariance, targets, reference inputs, last input and shifted plan of a ``Request``.
+        question: s_0, and covariance, disturbance, targets, reference inputs, last input and shifted plan of a
+            ``Request``.
         follow: Means that the first rollout follows, or nothing.
         guess: Record of a solution to start from.
         along: The stages along the plan in it, flat.
@@ -69,7 +70,7 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
         parts: Its table.
     """
     model, condenser, chance, (rate_lower, rate_upper), constant, (limit, tolerance) = told(known, places, columns)
-    start, covariance, targets, wanted, last, shifted = question
+    start, covariance, disturbance, targets, wanted, last, shifted = question
     H, m = wanted.shape
     kept = np.empty_like(along)  # of the plan that was reached; ``along`` is of the one that is tried
     stages, rows, low, high = linearised(along, table)
@@ -90,7 +91,7 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
     if constant.shape[0] > 0:
         rows[:] = constant.reshape(rows.shape)
     if compiled:
-        roll_out(model, start, covariance, follow, stages)
+        roll_out(model, start, covariance, disturbance, follow, stages)
         tighten(chance, spread, low, high)
     else:
         yield MODEL
@@ -161,7 +162,7 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
             for i in range(size):
                 moved[i] = solution[i] if length == 1.0 else plan[i] + length * step[i]
             if compiled:
-                roll_out(model, start, covariance, NOTHING, stages)
+                roll_out(model, start, covariance, disturbance, NOTHING, stages)
                 tighten(chance, spread, low, high)
             else:
                 yield MODEL

@@ -44,6 +44,13 @@ def stage_model(
     return _MODES[covariance](propagator, model, belief, input)
 
 
+def disturbed(stage: StageModel, disturbance: Tensor) -> StageModel:
+    """The stage whose mean has a disturbance (*batch, n) added."""
+    rest = stage.c.shape[-1] - disturbance.shape[-1]  # entries of s that are no means
+    after = Gaussian(stage.next.mean + disturbance, stage.next.covariance)
+    return stage._replace(c=stage.c + torch.nn.functional.pad(disturbance, (0, rest)), next=after)
+
+
 def is_first_order(propagator: Propagator, model: DynamicsModel) -> bool:
     """Whether a stage of ``zero_order`` needs no more than mean, variance and the mean's derivatives at a point."""
     known = isinstance(model, GPPosterior) and model.predicts in ("next_state", "difference")

@@ -44,6 +44,7 @@ class StateFormMPC:
         form: As for ``ConvexMPC``.
         covariance: As for ``ConvexMPC``.
         feedback: As for ``ConvexMPC``.
+        disturbance_gain: As for ``ConvexMPC``.
         constraints: Of the states s_0 .. s_H (H + 1, p), whose first n columns are the means, and the inputs (H, m),
             two CVXPY variables: a list of constraints. Called once.
         solver: A CVXPY solver.
@@ -63,6 +64,7 @@ class StateFormMPC:
         form: Form = "trajectory",
         covariance: Covariance = "zero_order",
         feedback: bool = True,
+        disturbance_gain: float = 0.0,
         constraints: Callable[[Any, Any], list] | None = None,
         solver: str = "CLARABEL",
         options: dict | None = None,
@@ -70,7 +72,7 @@ class StateFormMPC:
         self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
         self.problem, self.horizon, self.solver = problem, horizon, solver
         self.options = TIGHT.get(solver, {}) if options is None else options
-        self.predictor = Predictor(model, propagator, problem, horizon, form, covariance, feedback)
+        self.predictor = Predictor(model, propagator, problem, horizon, form, covariance, feedback, disturbance_gain)
         self._chance = ChanceConstraints(problem.state_bounds, problem.state_dim, horizon, covariance)
         self._program = _Program(self.predictor, self._chance, constraints)
 
@@ -101,7 +103,8 @@ class StateFormMPC:
             return request.unanswered(status, iterations, timing)
         inputs = np.array(self._program.inputs.value)
         means, covariances = self.predictor.beliefs(prediction, inputs)
-        return Decision(inputs[0], inputs, means, covariances, status, iterations, timing)
+        disturbance = request.disturbance if self.predictor.disturbance_gain else None
+        return Decision(inputs[0], inputs, means, covariances, status, iterations, timing, disturbance=disturbance)
 
 
 class _Program:
