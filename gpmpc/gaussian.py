@@ -6,7 +6,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpmpc.exceptions import ShapeError
+from gpmpc.exceptions import SettingError, ShapeError
+
+
+def check_tensors(**given: Any) -> None:
+    """Raises unless everything given is a tensor.
+
+    Raises:
+        SettingError: Something else was given: an array, a list, a number.
+    """
+    for key, value in given.items():
+        if not isinstance(value, Tensor):
+            got = type(value).__name__
+            raise SettingError(key, f"must be a torch tensor; got {got} (torch.as_tensor(..., dtype=torch.float64))")
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,12 +31,14 @@ class Gaussian:
 
     Raises:
         ShapeError: The shapes do not belong together.
+        SettingError: One of the two is no tensor.
     """
 
     mean: Tensor
     covariance: Tensor
 
     def __post_init__(self) -> None:
+        check_tensors(mean=self.mean, covariance=self.covariance)
         expected = (*self.mean.shape, self.mean.shape[-1]) if self.mean.dim() else None
         if self.covariance.shape != expected:
             raise ShapeError(
@@ -34,9 +48,20 @@ class Gaussian:
 
     @classmethod
     def certain(cls, value: Any) -> "Gaussian":
-        """A belief without doubt, such as a measured state (*batch, n), from a tensor, an array or a list."""
-        mean = value if isinstance(value, Tensor) else torch.as_tensor(value)
+        """A belief without doubt, such as a measured state (*batch, n), from a tensor, an array or a list.
+
+        Tensors and arrays of floating point keep their type; everything else becomes float64.
+
+        Raises:
+            ShapeError: No vector of numbers was given.
+        """
+        try:
+            mean = torch.as_tensor(value, dtype=None if hasattr(value, "dtype") else torch.float64)
+        except (TypeError, ValueError) as error:
+            raise ShapeError(f"a state must be numbers (*batch, n); got {value!r}") from error
         mean = mean if mean.is_floating_point() else mean.to(torch.float64)
+        if not mean.dim():
+            raise ShapeError(f"a state must be numbers (*batch, n); got the single number {value!r}")
         return cls(mean, torch.zeros(*mean.shape, mean.shape[-1], dtype=mean.dtype, device=mean.device))
 
     @property

@@ -10,10 +10,16 @@ from scipy.special import betaincinv
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.gaussian import check_tensors
 
 
 def mean_squared_error(predicted: Tensor, observed: Tensor) -> float:
-    """Squared error summed over the outputs, averaged over the samples; both (N, n)."""
+    """Squared error summed over the outputs, averaged over the samples; both (N, n).
+
+    Raises:
+        ShapeError: The shapes differ.
+    """
+    _check_alike(predicted=predicted, observed=observed)
     return float((predicted - observed).square().sum(dim=-1).mean())
 
 
@@ -21,16 +27,33 @@ def negative_log_predictive_density(mean: Tensor, variance: Tensor, observed: Te
     """-log N(observed; mean, variance), averaged over samples and outputs; all (N, n). Lower is better.
 
     Quinonero-Candela et al. (2006), "Evaluating predictive uncertainty challenge".
+
+    Raises:
+        ShapeError: The shapes differ.
     """
+    _check_alike(mean=mean, variance=variance, observed=observed)
     return float(((2 * math.pi * variance).log() + (observed - mean).square() / variance).mean() / 2)
 
 
 def interval_coverage(mean: Tensor, variance: Tensor, observed: Tensor, level: float = 0.95) -> float:
-    """Part of the observations inside the central interval of the given level; all (N, n). Ideal is the level."""
+    """Part of the observations inside the central interval of the given level; all (N, n). Ideal is the level.
+
+    Raises:
+        ShapeError: The shapes differ.
+        SettingError: A level outside (0, 1).
+    """
+    _check_alike(mean=mean, variance=variance, observed=observed)
     if not 0 < level < 1:
         raise SettingError("level", f"must lie between 0 and 1; got {level}")
     half_width = torch.special.ndtri(torch.tensor((1 + level) / 2, dtype=variance.dtype)) * variance.sqrt()
     return float(((observed - mean).abs() <= half_width).double().mean())
+
+
+def _check_alike(**given: Tensor) -> None:
+    check_tensors(**given)
+    if len({value.shape for value in given.values()}) > 1:
+        got = ", ".join(f"{key} {tuple(value.shape)}" for key, value in given.items())
+        raise ShapeError(f"all must have one shape (N, n); got {got}")
 
 
 @dataclass(frozen=True)
@@ -55,13 +78,16 @@ def tracking_error(states: np.ndarray, references: np.ndarray, axes: Sequence[in
         axes: Which states to look at; x, y, z of the translational ones by default.
 
     Raises:
-        ShapeError: The two do not belong together.
+        ShapeError: The two do not belong together, or have no such axes.
     """
     if np.ndim(states) != 2 or np.shape(states) != np.shape(references) or len(states) < 2:
         raise ShapeError(
             f"states and references must both be (K + 1, n), K of 1 or more; got {np.shape(states)} and "
             f"{np.shape(references)}"
         )
+    n = np.shape(states)[1]
+    if not all(-n <= axis < n for axis in axes):
+        raise ShapeError(f"axes must be states from 0 to {n - 1}; got {tuple(axes)}")
     squares = np.square((np.asarray(states) - np.asarray(references))[1:, list(axes)]).mean(axis=0)
     return TrackingError(np.sqrt(squares), float(np.sqrt(squares.sum())))
 
@@ -107,13 +133,16 @@ def violation_rate(
 
     Raises:
         ShapeError: Bounds do not fit the values, or there is no row.
-        SettingError: A level outside (0, 1).
+        SettingError: A level outside (0, 1), or crossed bounds.
     """
     values, lower, upper = (np.asarray(a, dtype=float) for a in (values, lower, upper))
     if values.ndim != 2 or not len(values) or lower.shape != values.shape[1:] or upper.shape != values.shape[1:]:
         raise ShapeError(
             f"values must be (K, d) with bounds (d,), K of 1 or more; got {values.shape}, {lower.shape}, {upper.shape}"
         )
+    if (lower > upper).any():
+        j = int(np.argmax(lower > upper))
+        raise SettingError("lower, upper", f"must not cross; entry {j} has {lower[j]:g} above {upper[j]:g}")
     # A value that is no number keeps no bound.
     inside = (values >= lower - tolerance) & (values <= upper + tolerance)
     violations = int((~inside.all(axis=1)).sum())

@@ -27,7 +27,7 @@ from gpmpc.control.chance_constraints import ChanceConstraints
 from gpmpc.control.condensing import Condenser
 from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.prediction import Covariance, Form, Prediction, Predictor
-from gpmpc.control.request import Request, check_controller, check_dynamics
+from gpmpc.control.request import Request, check_controller, check_dynamics, check_method
 from gpmpc.control.sequential import Reached, SequentialPrograms
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import DataError, ProblemError, SettingError, ShapeError, check_number
@@ -115,6 +115,8 @@ class ConvexMPC:
             raise SettingError("iterations", f"form {form!r} is one quadratic program, so 1; got {iterations}")
         self.problem, self.horizon, self.iterations, self.tolerance = problem, horizon, iterations, tolerance
         self.solver = DualActiveSet() if solver is None else solver
+        check_method("propagator", propagator, "propagate", "Linearization()")
+        check_method("solver", self.solver, "solve", "DualActiveSet()")
         self.predictor = Predictor(model, propagator, problem, horizon, form, covariance, feedback, disturbance_gain)
         weights = self.predictor.extended(problem.Q), self.predictor.extended(problem.terminal)
         self._condenser = Condenser(problem, horizon, *weights)
@@ -269,10 +271,10 @@ def read_request(
         ShapeError: Belief or reference have other dimensions, or reference inputs are missing.
     """
     problem, H = predictor.problem, predictor.horizon
+    request = Request.read(problem, H, initial_input, belief, reference, previous)
     if reference.inputs is None and (predictor.form == "deviation" or problem.penalized == "deviations"):
         what = "form 'deviation'" if predictor.form == "deviation" else "penalized 'deviations'"
         raise ShapeError(f"{what} needs reference inputs ({H}, {problem.input_dim}); got none")
-    request = Request.read(problem, H, initial_input, belief, reference, previous)
     if predictor.disturbance_gain and request.finite:
         return request._replace(disturbance=predictor.disturbance(request, previous))
     return request

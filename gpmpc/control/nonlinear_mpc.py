@@ -17,7 +17,7 @@ import numpy as np
 
 from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.control.descent import FAILURES, Program, slsqp, sqp
-from gpmpc.control.request import Request, check_controller, check_dynamics
+from gpmpc.control.request import Request, check_controller, check_dynamics, check_method
 from gpmpc.control.shooting import Shooting, Shot
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError, ShapeError, check_number
@@ -64,6 +64,7 @@ class NonlinearGPMPC:
         tolerance: float = 1e-5,
         max_iterations: int = 100,
     ):
+        check_method("propagator", propagator, "propagate", "Linearization()")
         self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
         if optimizer not in METHODS:
             raise SettingError("optimizer", f"must be one of {', '.join(map(repr, METHODS))}; got {optimizer!r}")

@@ -69,6 +69,11 @@ class Request(NamedTuple):
             ShapeError: Belief or reference have other dimensions than the problem and the horizon.
             DataError: The reference is not finite.
         """
+        if not (isinstance(belief, Gaussian) and isinstance(reference, Reference)):
+            raise ShapeError(
+                "control takes a Gaussian (Gaussian.certain(x) for a measured state) and a Reference(states); "
+                f"got {type(belief).__name__} and {type(reference).__name__}"
+            )
         n, m = problem.state_dim, problem.input_dim
         state, covariance = _array(belief.mean), _array(belief.covariance)
         targets = _array(reference.states)
@@ -118,13 +123,26 @@ def check_dynamics(model: DynamicsModel) -> tuple[int, int]:
     """The numbers of states and inputs of a model that predicts the next state.
 
     Raises:
-        SettingError: It predicts something else.
+        SettingError: It is no model, or predicts something else.
     """
+    if not hasattr(model, "predict"):
+        raise SettingError("model", f"must be a DynamicsModel, such as GPPosterior; got {type(model).__name__}")
     if model.output_dim != model.state_dim:
         raise SettingError(
             "model", f"must predict the next state; got {model.state_dim} states and {model.output_dim} outputs"
         )
     return model.state_dim, model.input_dim
+
+
+def check_method(key: str, value: object, method: str, example: str) -> None:
+    """Raises unless a setting is an object (no class of them) with a method.
+
+    Raises:
+        SettingError: It is not.
+    """
+    if isinstance(value, type) or not hasattr(value, method):
+        got = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
+        raise SettingError(key, f"must be an object with the method {method!r}, such as {example}; got {got}")
 
 
 def check_controller(
@@ -139,6 +157,8 @@ def check_controller(
     global inspect
     compile_for(look_over, SIGNATURE)
     inspect = direct(look_over)
+    if not isinstance(problem, TrackingProblem):
+        raise SettingError("problem", f"must be TrackingProblem(...); got {type(problem).__name__}")
     check_number("horizon", horizon, least=1, whole=True)
     check_numbers("initial_input", initial_input, inputs)
     if (problem.state_dim, problem.input_dim) != (states, inputs):

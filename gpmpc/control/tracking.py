@@ -47,6 +47,11 @@ class StateBounds:
     l2: float | None = None
 
     def __post_init__(self) -> None:
+        for key in ("lower", "upper"):
+            if np.ndim(getattr(self, key)) != 1:
+                raise SettingError(
+                    key, f"must be a list of n numbers, infinite where unbounded; got {getattr(self, key)!r}"
+                )
         _set_bounds(self, "lower", "upper", len(self.lower))
         check_number("confidence", self.confidence)
         if not 0.5 < self.confidence < 1:
@@ -108,6 +113,8 @@ class TrackingProblem:
             raise SettingError("penalized", f"must be 'inputs', 'deviations' or 'increments'; got {self.penalized!r}")
         _set_bounds(self, "input_lower", "input_upper", self.input_dim)
         _set_bounds(self, "rate_lower", "rate_upper", self.input_dim)
+        if not isinstance(self.state_bounds, StateBounds | None):
+            raise SettingError("state_bounds", f"must be StateBounds(...); got {type(self.state_bounds).__name__}")
         if self.state_bounds is not None and len(self.state_bounds.lower) != self.state_dim:
             raise SettingError(
                 "state_bounds", f"must bound {self.state_dim} states; got {len(self.state_bounds.lower)}"
@@ -161,6 +168,12 @@ def _set_bounds(owner: Any, lower_key: str, upper_key: str, length: int) -> None
             raise SettingError(key, f"must be a list of {length} numbers; got {value!r}")
         object.__setattr__(owner, key, array)
         arrays.append(array)
+    unreachable = np.flatnonzero((arrays[0] == math.inf) | (arrays[1] == -math.inf))
+    if len(unreachable):
+        j = unreachable[0]
+        raise SettingError(
+            f"{lower_key}, {upper_key}", f"must leave room; entry {j} is from {arrays[0][j]:g} to {arrays[1][j]:g}"
+        )
     crossed = np.flatnonzero(arrays[0] > arrays[1])
     if len(crossed):
         j = crossed[0]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError
-from gpmpc.gaussian import Gaussian
+from gpmpc.gaussian import Gaussian, check_tensors
 
 
 class DynamicsModel(Protocol):
@@ -65,8 +65,9 @@ def check_query(model: Any, state: Tensor, input: Tensor) -> None:
 
     Raises:
         ShapeError: Another number of states or inputs.
-        SettingError: Another dtype or device.
+        SettingError: No tensor, or another dtype or device.
     """
+    check_tensors(state=state, input=input)
     if state.shape[-1:] != (model.state_dim,) or input.shape[-1:] != (model.input_dim,):
         got = [tensor.shape[-1] if tensor.dim() else "a scalar" for tensor in (state, input)]
         raise ShapeError(
@@ -82,3 +83,19 @@ def check_query(model: Any, state: Tensor, input: Tensor) -> None:
             raise SettingError(
                 name, f"must be {model.dtype} on {model.device} like the model; got {value.dtype} on {value.device}"
             )
+
+
+def check_destination(device: Any, dtype: Any) -> None:
+    """Raises unless a model can go to a device and a type; None stays where it is.
+
+    Raises:
+        SettingError: torch finds no such device here, or the type is neither float32 nor float64.
+    """
+    if device is not None:
+        try:
+            torch.empty(0, device=device)
+        except (AssertionError, RuntimeError, TypeError) as error:
+            reason = str(error).partition("\n")[0]
+            raise SettingError("device", f"must be one that torch finds here; got {device!r} ({reason})") from error
+    if dtype not in (None, torch.float32, torch.float64):
+        raise SettingError("dtype", f"must be torch.float32 or torch.float64; got {dtype!r}")

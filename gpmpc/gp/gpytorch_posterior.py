@@ -20,7 +20,7 @@ from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import batched_jacobian, check_query
+from gpmpc.gp.dynamics import batched_jacobian, check_destination, check_query
 from gpmpc.gp.kernel import PREDICTS
 from gpmpc.gp.model import exact_inference, members
 from gpmpc.gp.posterior import Predicts
@@ -98,7 +98,8 @@ class KernelPosterior:
         return torch.diag(torch.cat([part.noise for part in self.parts]))
 
     def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "KernelPosterior":
-        """The same on another device, or in another floating-point type."""
+        """The same on another device, or in another type: float32 or float64."""
+        check_destination(device, dtype)
         return replace(self, parts=tuple(part.to(device, dtype) for part in self.parts))
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:

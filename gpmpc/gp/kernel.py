@@ -2,7 +2,8 @@
 
 from torch import Tensor, float64, int32, isfinite, linalg, nonzero, zeros
 
-from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
+from gpmpc.gaussian import check_tensors
 
 PREDICTS = ("next_state", "difference", "value")
 MANY = 1000  # points: from here on kernel matrices are made and factorised one after another, in place
@@ -73,6 +74,7 @@ def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> 
         SettingError: A hyperparameter is not positive, or a dtype, a device or ``predicts`` is another one.
         DataError: An entry is not finite.
     """
+    check_tensors(**given)
     inputs, targets = given["inputs"], given["targets"]
     if inputs.dim() != 2 or targets.dim() != 2 or not len(inputs):
         raise ShapeError(
@@ -93,7 +95,8 @@ def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> 
             raise DataError(f"{name} must be finite; got {value[~isfinite(value)][0]}")
     if predicts not in PREDICTS:
         raise SettingError("predicts", f"must be one of {', '.join(map(repr, PREDICTS))}; got {predicts!r}")
-    if not 0 <= input_dim < d or (predicts != "value" and d != k + input_dim):
+    check_number("input_dim", input_dim, least=0, whole=True)
+    if input_dim >= d or (predicts != "value" and d != k + input_dim):
         raise ShapeError(
             f"inputs must have n + m columns, one state an output and {input_dim} controls; "
             f"got {d} columns and {k} outputs"

@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import ShapeError, UnsupportedModel
-from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import check_query
+from gpmpc.gaussian import Gaussian, check_tensors
+from gpmpc.gp.dynamics import check_destination, check_query
 from gpmpc.gp.evaluation import compiled_point, host_arrays
 from gpmpc.gp.kernel import check_posterior, factorised
 from gpmpc.gp.model import hyperparameters as trained
@@ -97,6 +97,7 @@ class GPPosterior:
                 positive definite.
             DataError: An entry is not finite.
         """
+        check_tensors(targets=targets)
         offset = torch.zeros_like(targets[:1].flatten()) if offset is None else offset
         given = {
             "inputs": inputs,
@@ -181,6 +182,10 @@ class GPPosterior:
     def __len__(self) -> int:
         return len(self.features)
 
+    def __repr__(self) -> str:
+        sizes = f"{len(self)} points, n={self.state_dim}, m={self.input_dim}, k={self.output_dim}"
+        return f"GPPosterior({sizes}, predicts={self.predicts!r}, {self.dtype} on {self.device})"
+
     @property
     def noise_covariance(self) -> Tensor:
         """Of the observations (k, k), diagonal."""
@@ -207,7 +212,8 @@ class GPPosterior:
         return bool((error <= torch.finfo(self.dtype).eps ** 0.75 * diagonal).all())
 
     def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "GPPosterior":
-        """The same on another device, or in another floating-point type."""
+        """The same on another device, or in another type: float32 or float64."""
+        check_destination(device, dtype)
         tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
         return replace(self, **{name: value.to(device=device, dtype=dtype) for name, value in tensors.items()})
 

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError
-from gpmpc.gaussian import Gaussian
+from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp.budget import Budget
-from gpmpc.gp.dynamics import batched_jacobian, check_query
+from gpmpc.gp.dynamics import batched_jacobian, check_destination, check_query
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.training import Trainer
 from gpmpc.gp.transitions import Transitions
@@ -31,11 +31,22 @@ class Affine:
         A: (n, n).
         B: (n, m).
         c: (n,).
+
+    Raises:
+        ShapeError: The shapes do not belong together.
+        SettingError: One of the three is no tensor.
     """
 
     A: Tensor
     B: Tensor
     c: Tensor
+
+    def __post_init__(self) -> None:
+        check_tensors(A=self.A, B=self.B, c=self.c)
+        shapes = [tuple(part.shape) for part in (self.A, self.B, self.c)]
+        n = len(self.A) if self.A.dim() else 0
+        if shapes[0] != (n, n) or self.B.dim() != 2 or len(self.B) != n or shapes[2] != (n,):
+            raise ShapeError(f"A, B and c must be (n, n), (n, m) and (n,); got {', '.join(map(str, shapes))}")
 
     def __call__(self, state: Tensor, input: Tensor) -> Tensor:
         """The nominal next state (*batch, n)."""
@@ -69,6 +80,7 @@ class ResidualModel:
 
     def __post_init__(self) -> None:
         gp = self.residual
+        check_tensors(B=self.B)
         if gp.predicts != "value":
             raise SettingError("residual", f"must be a GP with predicts='value'; got {gp.predicts!r}")
         if (len(self.states), len(self.inputs)) != (gp.state_dim, gp.input_dim):
@@ -92,9 +104,7 @@ class ResidualModel:
                 raise ShapeError(f"{name} must have shape {shape}; got {tuple(value.shape)}")
             if value.dtype != gp.dtype or value.device != gp.device:
                 raise SettingError(name, f"must be {gp.dtype} on {gp.device}; got {value.dtype} on {value.device}")
-        for key, chosen, count in (("states", self.states, self.state_dim), ("inputs", self.inputs, self.input_dim)):
-            if any(not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
-                raise SettingError(key, f"must be different indices from 0 to {count - 1}; got {list(chosen)}")
+        _check_chosen(self.states, self.state_dim, self.inputs, self.input_dim)
 
     @classmethod
     def train(
@@ -119,12 +129,20 @@ class ResidualModel:
             seed: Of the random starts.
 
         Raises:
+            ShapeError: ``nominal`` or B do not fit the transitions.
+            SettingError: An index is out of range, or the columns of B depend on each other.
             TrainingError: An output could not be trained.
         """
         n, m = transitions.state_dim, transitions.input_dim
         states = list(range(n)) if states is None else list(states)
         inputs = list(range(m)) if inputs is None else list(inputs)
         B = torch.eye(n, dtype=torch.float64) if B is None else B
+        check_tensors(B=B)
+        if B.dim() != 2 or len(B) != n:
+            raise ShapeError(f"B must be ({n}, k), a row a state; got {tuple(B.shape)}")
+        if int(torch.linalg.matrix_rank(B)) < B.shape[1]:
+            raise SettingError("B", "must have linearly independent columns: what acts alike cannot be told apart")
+        _check_chosen(states, n, inputs, m)
         features, targets = _learned(nominal, B, states, inputs, transitions)
         training = (trainer or Trainer()).fit(features, targets, len(inputs), "value", seed)
         return cls(nominal, training.posterior, B, states, inputs, m)
@@ -174,7 +192,7 @@ class ResidualModel:
         input = state[..., :0] if input is None else input
         check_query(self, state, input)
         d = self.residual.predict(*self.selected(state, input))
-        return self._combined(self.nominal(state, input), d)
+        return self._combined(_nominal(self.nominal, state, input), d)
 
     def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
         """``predict``, and its mean's derivatives by the state (*batch, n, n) and by the input (*batch, n, m)."""
@@ -185,7 +203,7 @@ class ResidualModel:
             nominal, A, G = self.nominal(state, input), self.nominal.A, self.nominal.B
             A, G = A.expand(*state.shape[:-1], *A.shape), G.expand(*state.shape[:-1], *G.shape)
         else:
-            (nominal,), (A, G) = batched_jacobian(lambda x, u: (self.nominal(x, u),), (state, input))
+            (nominal,), (A, G) = batched_jacobian(lambda x, u: (_nominal(self.nominal, x, u),), (state, input))
         A = A.index_add(-1, self._index(self.states), self.B @ by_state)
         G = G.index_add(-1, self._index(self.inputs), self.B @ by_input)
         return self._combined(nominal, d), A, G
@@ -196,6 +214,7 @@ class ResidualModel:
 
     def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "ResidualModel":
         """The same on another device or in another type; a nominal that is no ``Affine`` is taken as it is."""
+        check_destination(device, dtype)
         nominal = self.nominal
         if isinstance(nominal, Affine):
             nominal = Affine(*(part.to(device=device, dtype=dtype) for part in (nominal.A, nominal.B, nominal.c)))
@@ -230,6 +249,24 @@ class ResidualModel:
         return torch.tensor(list(chosen), dtype=torch.long, device=self.device)
 
 
+def _check_chosen(states: Sequence[int], n: int, inputs: Sequence[int], m: int) -> None:
+    for key, chosen, count in (("states", states, n), ("inputs", inputs, m)):
+        if any(not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
+            raise SettingError(key, f"must be different indices from 0 to {count - 1}; got {list(chosen)}")
+
+
+def _nominal(nominal: Callable[[Tensor, Tensor], Tensor], state: Tensor, input: Tensor) -> Tensor:
+    """f0 (*batch, n), held against the rule that a wrong number of states would otherwise be broadcast."""
+    value = nominal(state, input)
+    if not isinstance(value, Tensor):
+        raise SettingError("nominal", f"must give a torch tensor; got {type(value).__name__}")
+    if value.shape != state.shape:
+        raise ShapeError(
+            f"nominal must give next states of the states' shape {tuple(state.shape)}; got {tuple(value.shape)}"
+        )
+    return value
+
+
 def _learned(
     nominal: Callable[[Tensor, Tensor], Tensor],
     B: Tensor,
@@ -240,5 +277,5 @@ def _learned(
     """What d sees and is to be, of N transitions: the features, and the least-squares part of what f0 missed (N, k)."""
     to_B = {"device": B.device, "dtype": B.dtype}
     x, u, after = (t.to(**to_B) for t in (transitions.states, transitions.inputs, transitions.next_states))
-    targets = torch.linalg.lstsq(B, (after - nominal(x, u)).mT).solution.mT
+    targets = torch.linalg.lstsq(B, (after - _nominal(nominal, x, u)).mT).solution.mT
     return torch.cat([x[:, list(states)], u[:, list(inputs)]], dim=1), targets

@@ -98,11 +98,17 @@ class Trainer:
             check_number("subset", self.subset, least=1, whole=True)
         if self.likelihood not in ("closed_form", "gpytorch"):
             raise SettingError("likelihood", f"must be 'closed_form' or 'gpytorch'; got {self.likelihood!r}")
+        for key in ("scaling", "penalty"):
+            if not (callable(value := getattr(self, key)) or (key == "penalty" and value is None)):
+                example = "standardize" if key == "scaling" else "SoftLimits()"
+                raise SettingError(key, f"must be a function such as {example} of gpmpc.gp; got {value!r}")
         for key, least in (("tolerance", 0), ("lengthscale_limit", 1), ("signal_to_noise_limit", 1)):
             check_number(key, getattr(self, key), above=least)
 
     def __call__(self, transitions: Transitions, seed: int = 0, start: GPPosterior | None = None) -> Training:
         """Trains on transitions; see ``fit``."""
+        if not isinstance(transitions, Transitions):
+            raise SettingError("transitions", f"must be Transitions(...); got {type(transitions).__name__}")
         return self.fit(
             transitions.features, self.learned(transitions), transitions.input_dim, self.predicts, seed, start
         )
@@ -159,6 +165,7 @@ class Trainer:
 
         Raises:
             ShapeError: ``start`` has other dimensions.
+            SettingError: The seed is no whole number.
             DataError: The kernel matrices would not fit the memory that is available.
             TrainingError: Every start failed for an output, which is named.
         """
@@ -181,6 +188,7 @@ class Trainer:
         start: GPPosterior | None = None,
     ) -> "Problem":
         """What ``fit`` solves, one task an output, for those that solve the tasks themselves; arguments as there."""
+        check_number("seed", seed, least=0, whole=True)
         (size, d), outputs = features.shape, targets.shape[1]
         check_memory([(size, outputs)], self.likelihood)
         names = [f"x{i + 1}" for i in range(d - input_dim)] + [f"u{i + 1}" for i in range(input_dim)]

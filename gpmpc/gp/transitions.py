@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.exceptions import DataError, ShapeError
+from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.files import write_whole
 
 
@@ -41,7 +41,10 @@ class Transitions:
 
     def __post_init__(self) -> None:
         for name in ("states", "inputs", "next_states"):
-            value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            try:
+                value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            except (TypeError, ValueError) as error:
+                raise DataError(f"{name} must be numbers in rows and columns; {error}") from error
             if value.dim() != 2:
                 raise ShapeError(f"{name} must have two dimensions (rows, columns); got shape {tuple(value.shape)}")
             object.__setattr__(self, name, value)
@@ -66,6 +69,9 @@ class Transitions:
 
     def __len__(self) -> int:
         return len(self.states)
+
+    def __repr__(self) -> str:
+        return f"Transitions({len(self)} rows, n={self.state_dim}, m={self.input_dim})"
 
     @property
     def state_dim(self) -> int:
@@ -153,8 +159,12 @@ class Transitions:
                 the next row's states are the next states, and the last row only serves as such.
 
         Raises:
+            SettingError: One name was given where a list of them belongs.
             DataError: The file or a column is missing, or an entry is no finite number.
         """
+        for key, names in (("states", states), ("inputs", inputs), ("next_states", next_states)):
+            if isinstance(names, str):
+                raise SettingError(key, f"must be a list of column names; got the single name {names!r}")
         path = _existing(path)
         text = _text(path)
         header = text.partition("\n")[0]

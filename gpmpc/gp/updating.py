@@ -22,6 +22,7 @@ from torch import Tensor
 
 from gpmpc.compiled import compiled
 from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.gaussian import check_tensors
 from gpmpc.gp.kernel import kernel_matrix
 
 if TYPE_CHECKING:
@@ -122,6 +123,7 @@ def _remove(factor: np.ndarray, smaller: np.ndarray, kept: np.ndarray, dropped: 
 
 
 def _expected(posterior: "GPPosterior", features: Tensor, targets: Tensor) -> tuple[tuple, tuple]:
+    check_tensors(features=features, targets=targets)
     if features.dim() != 2 or targets.dim() != 2 or len(features) != len(targets) or not len(features):
         raise ShapeError(
             "features (p, d) and targets (p, k) need two dimensions and the same number of rows, one or more; "

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc.exceptions import SettingError, ShapeError, check_number
 
 
 class Dynamics(Protocol):
@@ -78,6 +78,10 @@ class Integrated:
         dynamics: The right-hand side f.
         time_step: Sampling time [s].
         substeps: Runge-Kutta steps a sampling time.
+
+    Raises:
+        SettingError: The time step is not positive, or there is no substep.
+        ShapeError: (at a step) The derivative has another number of entries than there are states.
     """
 
     dynamics: Dynamics
@@ -95,6 +99,8 @@ class Integrated:
         x = [x[i] for i in range(n)]
         for _ in range(self.substeps):
             k1 = f(x, u)
+            if hasattr(k1, "__len__") and len(k1) != n:
+                raise ShapeError(f"derivative must give {n} entries, one for each of state_names; got {len(k1)}")
             k2 = f([x[i] + h / 2 * k1[i] for i in range(n)], u)
             k3 = f([x[i] + h / 2 * k2[i] for i in range(n)], u)
             k4 = f([x[i] + h * k3[i] for i in range(n)], u)
@@ -103,7 +109,16 @@ class Integrated:
 
 
 def step(plant: Plant, state: np.ndarray, input: np.ndarray) -> np.ndarray:
-    """The next state (n,) of a plant from a state (n,) and an input (m,)."""
+    """The next state (n,) of a plant from a state (n,) and an input (m,).
+
+    Raises:
+        ShapeError: State or input are of another length.
+    """
+    shapes = ((len(plant.dynamics.state_names),), (len(plant.dynamics.input_names),))
+    if (np.shape(state), np.shape(input)) != shapes:
+        raise ShapeError(
+            f"state and input must have shapes {shapes[0]} and {shapes[1]}; got {np.shape(state)} and {np.shape(input)}"
+        )
     return np.array(plant.successor(state, input), dtype=float)
 
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import ShapeError
-from gpmpc.gaussian import Gaussian, square_root_differential
+from gpmpc.gaussian import Gaussian, check_tensors, square_root_differential
 from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.gp.evaluation import host_arrays
 from gpmpc.propagation.propagator import Propagator
@@ -153,6 +153,7 @@ def linearize_along(propagator: Propagator, model: DynamicsModel, belief: Gaussi
 
 
 def _steps(inputs: Tensor) -> tuple[Tensor, ...]:
+    check_tensors(inputs=inputs)
     if inputs.dim() < 2 or not inputs.shape[-2]:
         raise ShapeError(f"inputs must be (*batch, H, m) with H of 1 or more; got {tuple(inputs.shape)}")
     return inputs.unbind(-2)

@@ -7,7 +7,7 @@ import numpy as np
 from torch import Tensor
 
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
-from gpmpc.gaussian import Gaussian
+from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp.dynamics import DynamicsModel, check_query
 
 
@@ -53,7 +53,10 @@ def checked_input(model: DynamicsModel, belief: Gaussian, input: Tensor | None) 
 
     Values are looked at where that is free: in host memory, outside torch's transforms.
     """
+    if not isinstance(belief, Gaussian):
+        raise SettingError("belief", f"must be a Gaussian; got {type(belief).__name__}")
     input = belief.mean[..., :0] if input is None else input
+    check_tensors(input=input)
     if input.dim() == 1 and input.shape[-1] == model.input_dim:
         input = input.expand(*belief.mean.shape[:-1], model.input_dim)  # one control for all
     check_query(model, belief.mean, input)

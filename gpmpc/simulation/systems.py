@@ -94,7 +94,7 @@ class RunningPlant:
 
     Raises:
         ShapeError: State or noise do not fit the plant.
-        SettingError: The seed is no whole number.
+        SettingError: The seed is no whole number, or plant, noise or disturbances are of another kind.
         DataError: The state is not finite.
     """
 
@@ -107,6 +107,15 @@ class RunningPlant:
         seed: int = 0,
     ):
         check_number("seed", seed, least=0, whole=True)
+        if not hasattr(plant, "dynamics"):
+            got = type(plant).__name__
+            raise SettingError(
+                "system", f"must be a plant, such as Integrated(dynamics, 0.1), or a ModelLoop; got {got}"
+            )
+        if not isinstance(noise, Noise | None):
+            raise SettingError("noise", f"must be Noise(...); got {noise!r}")
+        if not isinstance(disturbances, Sequence):
+            raise SettingError("disturbances", f"must be a list of them; got {disturbances!r}")
         n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
         noise = noise or Noise()
         for key, length in (("process", n), ("measurement", n), ("input", m)):

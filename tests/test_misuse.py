@@ -1,0 +1,255 @@
+"""Whoever imports a module on its own and mixes up types or shapes is told the rule and what was got, at once."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc import metrics
+from gpmpc.control.controller import Reference
+from gpmpc.control.convex_mpc import ConvexMPC
+from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.control.tracking import StateBounds, TrackingProblem
+from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import Affine, GPPosterior, ResidualModel, Trainer, Transitions, train
+from gpmpc.plants import Integrated, step
+from gpmpc.propagation import Linearization, MomentMatching, rollout
+from gpmpc.qp import DualActiveSet
+from gpmpc.simulation import Gust, closed_loop
+
+F = torch.float64
+
+
+def data():
+    generator = torch.Generator().manual_seed(0)
+    x, u = torch.randn(12, 2, generator=generator, dtype=F), torch.randn(12, 1, generator=generator, dtype=F)
+    return Transitions(x, u, x + 0.1 * u)
+
+
+def posterior(**changed):
+    seen, ones = data(), torch.ones(2, dtype=F)
+    given = {
+        "inputs": seen.features,
+        "targets": seen.next_states,
+        "lengthscales": torch.ones(2, 3, dtype=F),
+        "signal_variance": ones,
+        "noise_variance": 1e-3 * ones,
+        "input_dim": 1,
+    }
+    return GPPosterior.from_hyperparameters(**given | changed)
+
+
+def belief():
+    return Gaussian(torch.zeros(2, dtype=F), 0.1 * torch.eye(2, dtype=F))
+
+
+class Oscillator:
+    state_names, input_names = ("position", "velocity"), ("force",)
+
+    def derivative(self, x, u):
+        return [x[1], u[0] - x[0]]
+
+
+class Short(Oscillator):
+    def derivative(self, x, u):
+        return [x[1]]
+
+
+def controller(kind=ConvexMPC, **changed):
+    given = {
+        "model": posterior(),
+        "propagator": Linearization(),
+        "problem": TrackingProblem(Q=[1.0, 1.0], R=[1.0]),
+        "horizon": 3,
+        "initial_input": [0.0],
+    }
+    return kind(**given | changed)
+
+
+@pytest.mark.parametrize("value", [[0.1, 0.2], (0.1, 0.2), np.array([0.1, 0.2])])
+def test_a_certain_belief_from_numbers_is_float64_to_the_last_digit(value):
+    assert torch.equal(Gaussian.certain(value).mean, torch.tensor([0.1, 0.2], dtype=F))
+
+
+@pytest.mark.parametrize("value", [1.0, "ab", [[0.0, 1.0], [2.0]], None])
+def test_a_certain_belief_of_no_vector_is_refused(value):
+    with pytest.raises(ShapeError, match=r"\(\*batch, n\); got"):
+        Gaussian.certain(value)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: Gaussian([0.0], [[1.0]]),
+        lambda: Gaussian(np.zeros(1), np.eye(1)),
+        lambda: posterior(inputs=data().features.tolist()),
+        lambda: posterior(targets=data().next_states.numpy()),
+        lambda: posterior(signal_variance=1.0),
+        lambda: posterior().predict([0.0, 0.0], [0.0]),
+        lambda: posterior().predict(np.zeros(2), np.zeros(1)),
+        lambda: posterior().predict(torch.zeros(2, dtype=F), 0.0),
+        lambda: posterior().condition_on_targets([[0.0] * 3], [[0.0] * 2]),
+        lambda: MomentMatching()(posterior(), belief(), [0.0]),
+        lambda: rollout(Linearization(), posterior(), belief(), [[0.0], [0.0]]),
+        lambda: Affine([[1.0]], [[1.0]], [0.0]),
+        lambda: ResidualModel.train(lambda x, u: x, data(), B=[[1.0], [0.0]]),
+        lambda: metrics.mean_squared_error(np.zeros((3, 2)), np.zeros((3, 2))),
+    ],
+)
+def test_what_is_no_tensor_is_named(call):
+    with pytest.raises(SettingError, match="must be a torch tensor; got (list|ndarray|float)"):
+        call()
+
+
+def test_a_mean_in_the_place_of_a_belief_is_refused():
+    with pytest.raises(SettingError, match="belief: must be a Gaussian; got Tensor"):
+        Linearization()(posterior(), torch.zeros(2, dtype=F), torch.zeros(1, dtype=F))
+
+
+@pytest.mark.parametrize("input_dim", [1.0, True, -1])
+def test_the_number_of_inputs_is_a_whole_number(input_dim):
+    with pytest.raises(SettingError, match="input_dim: must be a whole number, 0 or more; got"):
+        posterior(input_dim=input_dim)
+
+
+def residual():
+    return ResidualModel.train(lambda x, u: x, data(), trainer=Trainer(restarts=0))
+
+
+@pytest.mark.parametrize("model", [posterior, residual], ids=["posterior", "residual"])
+def test_a_model_goes_only_where_torch_can_take_it(model):
+    with pytest.raises(SettingError, match="device: must be one that torch finds here; got 'gpu'"):
+        model().to("gpu")
+    with pytest.raises(SettingError, match=r"dtype: must be torch.float32 or torch.float64; got torch.int64"):
+        model().to(dtype=torch.int64)
+    if not torch.cuda.is_available():
+        with pytest.raises(SettingError, match="device: must be one that torch finds here; got 'cuda'"):
+            model().to("cuda")
+
+
+def test_models_and_data_say_what_they_are_in_one_line():
+    assert repr(posterior()) == ("GPPosterior(12 points, n=2, m=1, k=2, predicts='next_state', torch.float64 on cpu)")
+    assert repr(data()) == "Transitions(12 rows, n=2, m=1)"
+
+
+@pytest.mark.parametrize(
+    ("call", "rule"),
+    [
+        (lambda: train(data(), scaling="standardize"), "scaling: must be a function such as standardize"),
+        (lambda: train(data(), penalty="soft"), "penalty: must be a function such as SoftLimits"),
+        (lambda: train(data(), seed=-1), "seed: must be a whole number, 0 or more; got -1"),
+        (lambda: train(data(), seed=1.5), "seed: must be a whole number, 0 or more; got 1.5"),
+        (lambda: train((1, 2)), r"transitions: must be Transitions\(...\); got tuple"),
+        (lambda: Transitions.from_csv("any.csv", "angle", []), "states: must be a list of column names; got .*'angle'"),
+        (lambda: TrackingProblem([1.0], [1.0], input_lower=[np.inf]), "must leave room; entry 0 is from inf to inf"),
+        (lambda: TrackingProblem([1.0], [1.0], state_bounds=(-1, 1)), r"must be StateBounds\(...\); got tuple"),
+        (lambda: StateBounds(None, [1.0]), "lower: must be a list of n numbers, infinite where unbounded; got None"),
+        (lambda: StateBounds([0.0], 1), "upper: must be a list of n numbers, infinite where unbounded; got 1"),
+        (lambda: controller(model="gp.npz"), "model: must be a DynamicsModel, such as GPPosterior; got str"),
+        (lambda: controller(problem={"Q": [1]}), r"problem: must be TrackingProblem\(...\); got dict"),
+        (
+            lambda: controller(propagator=Linearization),
+            "propagator: .*such as Linearization.*got the class Linearization",
+        ),
+        (lambda: controller(NonlinearGPMPC, propagator="linear"), "propagator: .*such as Linearization.*got 'linear'"),
+        (lambda: controller(solver=DualActiveSet), "solver: .*such as DualActiveSet.*got the class DualActiveSet"),
+        (lambda: metrics.violation_rate(np.zeros((3, 1)), [1], [-1]), "must not cross; entry 0 has 1 above -1"),
+    ],
+)
+def test_a_setting_of_another_kind_is_refused_where_it_is_given(call, rule):
+    with pytest.raises(SettingError, match=rule):
+        call()
+
+
+def test_a_whole_number_may_be_one_of_numpy():
+    assert controller(horizon=np.int64(2)).horizon == 2
+    reference = Reference(np.zeros((3, 2)))
+    asked = [controller(horizon=h).control(Gaussian.certain([1.0, 0.0]), reference).inputs for h in (2, np.int64(2))]
+    assert np.array_equal(*asked)
+
+
+@pytest.mark.parametrize("rows", [[[1.0], [2.0, 3.0]], [["a"]], None])
+def test_rows_that_are_no_table_of_numbers_are_refused(rows):
+    with pytest.raises(DataError, match="states must be numbers in rows and columns"):
+        Transitions(rows, [[0.0]], [[0.0]])
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "rule"),
+    [
+        ({"nominal": lambda x, u: x[..., :1]}, ShapeError, r"nominal must give .*\(12, 2\); got \(12, 1\)"),
+        ({"nominal": lambda x, u: x.numpy()}, SettingError, "nominal: must give a torch tensor; got ndarray"),
+        ({"B": torch.eye(3, dtype=F)}, ShapeError, r"B must be \(2, k\), a row a state; got \(3, 3\)"),
+        ({"B": torch.ones(2, 2, dtype=F)}, SettingError, "B: must have linearly independent columns"),
+        ({"states": [5]}, SettingError, r"states: must be different indices from 0 to 1; got \[5\]"),
+    ],
+)
+def test_a_nominal_model_that_does_not_fit_is_not_broadcast(settings, error, rule):
+    with pytest.raises(error, match=rule):
+        ResidualModel.train(**{"nominal": lambda x, u: x, "transitions": data()} | settings)
+
+
+def test_a_residual_model_refuses_a_nominal_of_another_size_when_it_predicts():
+    model = residual()
+    wrong = ResidualModel(lambda x, u: x[..., :1], model.residual, model.B, model.states, model.inputs, 1)
+    x, u = torch.zeros(2, dtype=F), torch.zeros(1, dtype=F)
+    for ask in (wrong.predict, wrong.predict_with_jacobian):
+        with pytest.raises(ShapeError, match="nominal must give next states"):
+            ask(x, u)
+
+
+def test_an_affine_model_checks_its_shapes():
+    with pytest.raises(ShapeError, match=r"A, B and c must be \(n, n\), \(n, m\) and \(n,\); got"):
+        Affine(torch.eye(2), torch.zeros(1, 2), torch.zeros(2))
+
+
+@pytest.mark.parametrize("kind", [ConvexMPC, NonlinearGPMPC])
+def test_a_controller_says_what_it_takes(kind):
+    asked, reference = controller(kind), np.zeros((4, 2))
+    for given in ((belief(), reference), (np.zeros(2), Reference(reference))):
+        with pytest.raises(ShapeError, match=r"control takes a Gaussian .* and a Reference\(states\); got"):
+            asked.control(*given)
+
+
+@pytest.mark.parametrize(
+    ("settings", "rule"),
+    [
+        ({"system": Oscillator()}, "system: must be a plant, such as Integrated.*; got Oscillator"),
+        ({"noise": 0.1}, r"noise: must be Noise\(...\); got 0.1"),
+        ({"disturbances": Gust({"velocity": 1.0})}, "disturbances: must be a list of them; got Gust"),
+    ],
+)
+def test_a_closed_loop_says_what_it_takes(settings, rule):
+    given = {
+        "system": Integrated(Oscillator(), 0.1),
+        "controller": controller(),
+        "references": np.zeros((9, 2)),
+        "initial": [0.0, 0.0],
+        "steps": 2,
+    }
+    with pytest.raises(SettingError, match=rule):
+        closed_loop(**given | settings)
+
+
+def test_a_step_of_other_lengths_is_refused():
+    plant = Integrated(Oscillator(), 0.1)
+    for state, input in ((np.zeros(3), np.zeros(1)), (np.zeros(2), 0.0)):
+        with pytest.raises(ShapeError, match=r"state and input must have shapes \(2,\) and \(1,\); got"):
+            step(plant, state, input)
+    with pytest.raises(ShapeError, match="derivative must give 2 entries, one for each of state_names; got 1"):
+        step(Integrated(Short(), 0.1), np.zeros(2), np.zeros(1))
+
+
+@pytest.mark.parametrize(
+    "measure", [metrics.negative_log_predictive_density, metrics.interval_coverage, metrics.mean_squared_error]
+)
+def test_predictions_of_another_shape_are_not_broadcast(measure):
+    tall, wide = torch.ones(3, 1, dtype=F), torch.ones(3, 2, dtype=F)
+    given = (tall, wide) if measure is metrics.mean_squared_error else (tall, tall, wide)
+    with pytest.raises(ShapeError, match=r"all must have one shape \(N, n\); got"):
+        measure(*given)
+
+
+def test_tracking_errors_of_axes_that_are_not_there_are_refused():
+    with pytest.raises(ShapeError, match=r"axes must be states from 0 to 1; got \(0, 2, 4\)"):
+        metrics.tracking_error(np.zeros((3, 2)), np.zeros((3, 2)))
