@@ -6,7 +6,6 @@ the way back from a worker process (its constructor's arguments are its ``args``
 """
 
 import math
-from numbers import Integral, Real
 from typing import Any
 
 
@@ -110,7 +109,7 @@ def check_number(
     Raises:
         SettingError: It is not.
     """
-    right_type = isinstance(value, Integral if whole else Real)  # NumPy's scalars, too
+    right_type = isinstance(value, int) if whole else isinstance(value, int | float)
     if (
         right_type
         and not isinstance(value, bool)

@@ -161,13 +161,6 @@ def test_a_setting_of_another_kind_is_refused_where_it_is_given(call, rule):
         call()
 
 
-def test_a_whole_number_may_be_one_of_numpy():
-    assert controller(horizon=np.int64(2)).horizon == 2
-    reference = Reference(np.zeros((3, 2)))
-    asked = [controller(horizon=h).control(Gaussian.certain([1.0, 0.0]), reference).inputs for h in (2, np.int64(2))]
-    assert np.array_equal(*asked)
-
-
 @pytest.mark.parametrize("rows", [[[1.0], [2.0, 3.0]], [["a"]], None])
 def test_rows_that_are_no_table_of_numbers_are_refused(rows):
     with pytest.raises(DataError, match="states must be numbers in rows and columns"):

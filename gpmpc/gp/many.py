@@ -35,6 +35,8 @@ def train_many(
 ) -> list[Training | TrainingError]:
     """Trains on many sets of transitions at once, on every core; as ``trainer(set, seed)`` one after another.
 
+    A script calls it below ``if __name__ == "__main__":``, since every worker process imports the script.
+
     Args:
         trainer: Its settings; picklable.
         sets: Of any sizes and dimensions.

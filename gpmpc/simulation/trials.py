@@ -46,6 +46,8 @@ def trials(
 ) -> list[Trial]:
     """Runs a trial with many seeds.
 
+    A script calls it below ``if __name__ == "__main__":``, since every worker process imports the script.
+
     Args:
         trial: From a seed to a result, such as a ``Rollout``; both can be pickled.
         seeds: The seeds; a number stands for 0 .. seeds - 1.
