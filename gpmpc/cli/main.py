@@ -173,7 +173,9 @@ def _one_line(error: Exception, config_name: str) -> str:
         return f"launcher: this one is not installed: pip install 'gpmpc[{extra}]'"
     if option:
         known = option[3].split()
-        return f"{option[1]}: no such option {option[2]!r}; available are {', '.join(known)}{_nearest(option[2], known)}"
+        return (
+            f"{option[1]}: no such option {option[2]!r}; available are {', '.join(known)}{_nearest(option[2], known)}"
+        )
     if isinstance(error, OverrideParseException):
         if "=" not in error.override:
             return f"{error.override!r}: a setting is written SETTING=VALUE"

@@ -67,7 +67,9 @@ class Noise:
             if values is not None:
                 values = values.tolist() if isinstance(values, np.ndarray) else values
                 if isinstance(values, str) or not hasattr(values, "__len__"):
-                    what = "must be a list of standard deviations, one for every " + ("input" if key == "input" else "state")
+                    what = "must be a list of standard deviations, one for every " + (
+                        "input" if key == "input" else "state"
+                    )
                     raise SettingError(f"noise.{key}", f"{what}; got {values!r}")
                 check_numbers(f"noise.{key}", values, len(values), least=0)
 
