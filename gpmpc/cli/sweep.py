@@ -88,7 +88,8 @@ def sweep(overrides: Sequence[str], conf: Path) -> None:
     finally:
         GlobalHydra.instance().clear()
     failed = [outcome for outcome in chain(outcomes, again) if "error" in outcome]
-    text = f"{len(jobs)} run{'' if len(jobs) == 1 else 's'}: {len(waiting) - len(failed)} flown, {len(finished)} finished before"
+    runs = "1 run" if len(jobs) == 1 else f"{len(jobs)} runs"
+    text = f"{runs}: {len(waiting) - len(failed)} flown, {len(finished)} finished before"
     console.print(f"{text}, {len(failed)} failed; in {config.folder}", soft_wrap=True, highlight=False, markup=False)
     for outcome in failed:
         print(f"gpmpc: failed: {outcome['folder']}: {outcome['error']}", file=sys.stderr)
