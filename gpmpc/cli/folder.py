@@ -11,9 +11,9 @@ def folder_of(settings: dict) -> Path:
     """The folder that ``folder`` names.
 
     Raises:
-        SettingError: It is no text.
+        SettingError: It is no text, or empty.
     """
-    if not isinstance(settings["folder"], str):
+    if not isinstance(settings["folder"], str) or not settings["folder"].strip():
         raise SettingError("folder", f"must be the path of a folder; got {settings['folder']!r}")
     return Path(settings["folder"])
 

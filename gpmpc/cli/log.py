@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from gpmpc.recording import Run
 
 FORMATS = (".csv", ".parquet")
+CUT = "unfinished or damaged; this is what is whole before the break"
 
 
 def log(arguments: list[str]) -> None:
@@ -46,7 +47,7 @@ def _info(given: argparse.Namespace) -> None:
     from gpmpc.recording import read_run
 
     run, console = read_run(given.file), Console()
-    state = "finished" if run.finished else "unfinished (gpmpc log recover makes it readable for other tools)"
+    state = "finished" if run.finished else f"{CUT} (gpmpc log recover makes it readable for other tools)"
     console.print(f"{given.file}: {state}", soft_wrap=True, highlight=False, markup=False)
     channels = Table("topic", "schema", "messages")
     for topic, (count, schema) in run.channels.items():
@@ -102,7 +103,8 @@ def _export(given: argparse.Namespace) -> None:
         raise SettingError("output", f"must end in {' or '.join(FORMATS)}; got {output.name!r}")
     run = read_run(given.file)
     _write(output, _csv(run) if output.suffix == ".csv" else _parquet(run))
-    print(f"written to {output}: {len(run.times)} rows, {len(run.columns)} columns")
+    note = "" if run.finished else f"; the recording is {CUT}"
+    print(f"written to {output}: {len(run.times)} rows, {len(run.columns)} columns{note}")
 
 
 def _layout(given: argparse.Namespace) -> None:

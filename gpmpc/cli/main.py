@@ -15,7 +15,7 @@ from pathlib import Path
 
 import hydra
 from hydra._internal.utils import get_args_parser
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
@@ -69,6 +69,7 @@ def main() -> None:
         known = [*COMMANDS, *PLAIN]
         _fail(f"unknown command {command!r}{_nearest(command, known)}; gpmpc --help lists the commands")
     task, config_name = COMMANDS[command]
+    _check_options(command, arguments[1:])
     sys.argv = [f"gpmpc {command}", *arguments[1:]]
     if command == "run" and (overrides := _swept(arguments[1:])) is not None:
         from gpmpc.cli.sweep import sweep
@@ -87,6 +88,16 @@ def config_folder() -> Path:
     package = Path(gpmpc.__file__).resolve().parent
     installed = package / "conf"
     return installed if installed.is_dir() else package.parent / "conf"
+
+
+def _check_options(command: str, arguments: list[str]) -> None:
+    """Answers an option that Hydra does not have in one line, where its parser would print all that it has."""
+    parser = get_args_parser()
+    parser.error = lambda message: _fail(f"{message}; gpmpc {command} --help lists the settings")
+    _, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        known = [option for action in parser._actions for option in action.option_strings]
+        _fail(f"unknown option {unknown[0]!r}{_nearest(unknown[0], known)}; gpmpc {command} --help lists the settings")
 
 
 def _swept(arguments: list[str]) -> list[str] | None:
@@ -161,7 +172,18 @@ def _one_line(error: Exception, config_name: str) -> str:
         extra = EXTRAS[option[2].removeprefix("launcher/")]
         return f"launcher: this one is not installed: pip install 'gpmpc[{extra}]'"
     if option:
-        return f"{option[1]}: no such option {option[2]!r}; available are {', '.join(option[3].split())}"
+        known = option[3].split()
+        return (
+            f"{option[1]}: no such option {option[2]!r}; available are {', '.join(known)}{_nearest(option[2], known)}"
+        )
+    if isinstance(error, OverrideParseException):
+        if "=" not in error.override:
+            return f"{error.override!r}: a setting is written SETTING=VALUE"
+        quoted = "in single quotes where the value holds brackets, braces, commas or spaces"
+        return f"{error.override!r}: cannot be read; a setting is written SETTING=VALUE, {quoted}"
+    unlocated = re.match(r"Error locating target '([^']+)'", text)
+    if unlocated:
+        return f"_target_: no such class or function {unlocated[1]!r}"
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key}: this setting has no default; give it as {error.full_key}=VALUE"
     ambiguous = re.match(r"Ambiguous value for argument '([^=]+)=([^']+)'", text)
@@ -169,7 +191,7 @@ def _one_line(error: Exception, config_name: str) -> str:
         listed = f"{ambiguous[1]}: a list is written in brackets, {ambiguous[1]}=[{ambiguous[2]}]"
         return f"{listed}; a sweep takes -m" if config_name == "run" else listed
     lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc" not in line]
-    return "; ".join(line.rstrip(":;") for line in lines) or type(error).__name__
+    return "; ".join(line.rstrip(".:;") for line in lines) or type(error).__name__
 
 
 def _settings(config_name: str) -> list[str]:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from gpmpc.cli.arguments import Parser
+from gpmpc.cli.log import CUT
 from gpmpc.exceptions import DataError, SettingError
 
 FORMATS = ("png", "pdf", "svg")
@@ -43,4 +44,5 @@ def plot(arguments: list[str]) -> None:
                 written.append(f"flight.{ending}")
     except OSError as error:
         raise SettingError("to", f"cannot write to {folder}: {error.strerror or error}") from error
-    print(f"written to {folder}: {', '.join(written)}")
+    note = "" if run.finished else f"; {len(run.times)} steps: the recording is {CUT}"
+    print(f"written to {folder}: {', '.join(written)}{note}")

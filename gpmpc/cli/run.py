@@ -14,7 +14,7 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc.exceptions import DataError, GpmpcError, RecordingError, SettingError, ShapeError
+from gpmpc.exceptions import DataError, GpmpcError, RecordingError, SettingError, ShapeError, check_number
 
 if TYPE_CHECKING:
     from gpmpc.experiments.run import Experiment
@@ -142,6 +142,9 @@ def experiment_of(config: DictConfig) -> "Experiment":
 
     config = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     checked_folder(config)
+    check_number("horizon", config.horizon, least=1, whole=True)
+    if not OmegaConf.is_list(config.disturbances):
+        raise SettingError("disturbances", f"must be a list; got {config.disturbances!r}")
     if config.recorder not in ("mcap", "none", None):
         raise SettingError("recorder", f"must be 'mcap' or 'none'; got {config.recorder!r}")
     for group in ("data", "trajectory", "subsystem", "plant", "model", "controller"):
@@ -188,7 +191,7 @@ def checked_folder(config: DictConfig) -> str:
     Raises:
         SettingError: It is no path.
     """
-    if not isinstance(config.folder, str):
+    if not isinstance(config.folder, str) or not config.folder.strip():
         raise SettingError("folder", f"must be the path of a folder; got {config.folder!r}")
     return config.folder
 

@@ -8,13 +8,17 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 
+SEARCH = "gpmpc.gp.hyperparameter_search"  # tells of single evaluations, where a bar says how far the work is
+
+
 def told_console() -> "Console":
-    """A console that the package's own log lines go to as well, each text once."""
+    """A console that the package's own log lines go to as well, each text once, without a search's evaluations."""
     from rich.console import Console
     from rich.logging import RichHandler
 
     console, told = Console(), set()
     handler = RichHandler(console=console, show_path=False, show_time=False, show_level=False)
+    handler.addFilter(lambda record: record.name != SEARCH)
     handler.addFilter(lambda record: not (record.getMessage() in told or told.add(record.getMessage())))
     log = logging.getLogger("gpmpc")
     log.setLevel(logging.INFO)

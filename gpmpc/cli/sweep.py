@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain
@@ -30,7 +30,7 @@ from hydra.core.plugins import Plugins
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, open_dict
 
-from gpmpc.cli.run import check_same, checked_folder, choices, fly_one, plain_settings
+from gpmpc.cli.run import check_same, checked_folder, choices, experiment_of, fly_one, plain_settings
 from gpmpc.cli.screen import progress_bar
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.experiments.run_folder import PLAN, Busy, RunFolder, folder_name
@@ -74,10 +74,10 @@ def sweep(overrides: Sequence[str], conf: Path) -> None:
     try:
         context, config = _composed(overrides, conf)
         jobs = _jobs(overrides, config)
-        _check(jobs, context, config)
         waiting, finished = [], []
         for job in jobs:
             (finished if job.folder.finished else waiting).append(job)
+        _check(waiting, context, config)
         with console.status(f"comparing the settings of {len(finished)} finished runs"):
             _check_finished(finished, context, config)
         _keep_plan(jobs, Path(config.folder))
@@ -88,7 +88,8 @@ def sweep(overrides: Sequence[str], conf: Path) -> None:
     finally:
         GlobalHydra.instance().clear()
     failed = [outcome for outcome in chain(outcomes, again) if "error" in outcome]
-    text = f"{len(jobs)} runs: {len(waiting) - len(failed)} flown, {len(finished)} finished before"
+    runs = "1 run" if len(jobs) == 1 else f"{len(jobs)} runs"
+    text = f"{runs}: {len(waiting) - len(failed)} flown, {len(finished)} finished before"
     console.print(f"{text}, {len(failed)} failed; in {config.folder}", soft_wrap=True, highlight=False, markup=False)
     for outcome in failed:
         print(f"gpmpc: failed: {outcome['folder']}: {outcome['error']}", file=sys.stderr)
@@ -127,6 +128,9 @@ def _composed(overrides: Sequence[str], conf: Path) -> tuple[HydraContext, DictC
 
 def _jobs(overrides: Sequence[str], config: DictConfig) -> list[Job]:
     parsed = OverridesParser.create().parse_overrides(list(overrides))
+    for override in parsed:
+        if override.is_sweep_override() and not list(override.sweep_iterator()):
+            raise SettingError(override.get_key_element(), "holds no value to sweep over")
     ((*combinations,),) = BasicSweeper.split_arguments(parsed, None)
     tree, jobs = Path(checked_folder(config)), {}
     for combination in combinations:
@@ -136,22 +140,27 @@ def _jobs(overrides: Sequence[str], config: DictConfig) -> list[Job]:
 
 
 def _check(jobs: Sequence[Job], context: HydraContext, config: DictConfig) -> None:
-    """Composes the settings once for every value that occurs: a mistake is found before anything is launched."""
+    """Makes the objects once for every value that occurs: a mistake is found before anything is launched."""
     seen: set[str] = set()
     for job in jobs:
         if not seen.issuperset(job.overrides):
-            context.config_loader.load_sweep_config(config, job.overrides)
+            experiment_of(_settings(job, context, config)[0])
             seen.update(job.overrides)
 
 
 def _check_finished(jobs: Sequence[Job], context: HydraContext, config: DictConfig) -> None:
     """Raises where a finished run is another one than is asked for now."""
     for job in jobs:
-        composed = context.config_loader.load_sweep_config(config, job.overrides)
-        options = composed.hydra.runtime.choices
-        with open_dict(composed):
-            del composed["hydra"]
-        check_same(job.folder, plain_settings(composed, options))
+        check_same(job.folder, plain_settings(*_settings(job, context, config)))
+
+
+def _settings(job: Job, context: HydraContext, config: DictConfig) -> tuple[DictConfig, Mapping[str, Any]]:
+    """A run's composed settings, and the chosen option by group."""
+    composed = context.config_loader.load_sweep_config(config, job.overrides)
+    options = composed.hydra.runtime.choices
+    with open_dict(composed):
+        del composed["hydra"]
+    return composed, options
 
 
 def _keep_plan(jobs: Sequence[Job], tree: Path) -> None:

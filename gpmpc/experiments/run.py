@@ -26,6 +26,7 @@ from gpmpc.metrics import ViolationRate, time_quantiles, tracking_error, violati
 from gpmpc.plants import Coupled, Map, Plant, Rotational, Translational
 from gpmpc.propagation import MomentMatching, Propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, Rollout, Step, closed_loop
+from gpmpc.simulation.systems import RunningPlant
 from gpmpc.trajectories import Trajectory, states_along
 
 NAMES = {"translational": Translational.state_names, "rotational": Rotational.state_names}
@@ -55,7 +56,8 @@ class Experiment:
         on_failure: What is applied where a solve fails.
 
     Raises:
-        SettingError: A number out of range, an unknown policy or loop.
+        SettingError: A number out of range, an unknown policy or loop, a disturbance that does not fit the plant.
+        ShapeError: Noise that does not fit the plant.
     """
 
     data: DataSource
@@ -95,6 +97,12 @@ class Experiment:
             raise SettingError("plant", "the rotational subsystem is flown at its own rate; a Map has none")
         if self.loop == "model" and not self.learns:
             raise SettingError("loop", "a model loop needs a controller that learns a model; this one knows the plant")
+        for disturbance in self.disturbances:
+            if not hasattr(disturbance, "acting"):
+                what = "must each name what it is, such as {_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}}"
+                raise SettingError("disturbances", f"{what}; got {disturbance!r}")
+        if self.loop == "plant":  # noise and disturbances that do not fit it are found out before the training
+            RunningPlant(self.plant, np.zeros(len(names)), self.disturbances, self.noise, self.seed)
 
     @property
     def learns(self) -> bool:

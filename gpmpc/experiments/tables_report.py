@@ -120,7 +120,9 @@ def differences(rows: Sequence[Row]) -> list[str]:
                 end, nearest = ("low", statistic.low) if statistic.position == "below" else ("high", statistic.high)
                 ratio = float(statistic.paper) / nearest
                 distance = (
-                    f"{100 * abs(ratio - 1):.2g} %" if 0.9 < ratio < 1.1 else f"a factor {max(ratio, 1 / ratio):.3g}"
+                    f"{100 * abs(ratio - 1):.2g} %"
+                    if 0.9 < ratio < 1.1
+                    else f"a factor {number(max(ratio, 1 / ratio))}"
                 )
                 lines.append(
                     f"{row.title}, {label}: the paper prints {_paper(statistic)}, "
@@ -148,7 +150,7 @@ def render(rows: Sequence[Row], note: str) -> Group:
         table.add_column("\nN", justify="right")
         for label in MEASURES.values():
             table.add_column(f"{label}\nours     paper")
-        table.add_column("time\n[s]", justify="right")
+        table.add_column("time\n\\[s]", justify="right")
         _in_sections(
             table, [row for row in rows if row.trajectory == trajectory], lambda row: row.subsystem, _two_lines
         )
@@ -165,8 +167,8 @@ def render(rows: Sequence[Row], note: str) -> Group:
 
 def title(trajectory: str) -> str:
     """The heading of a trajectory's table."""
-    number_in_paper = {"elliptical": "Table 1: ", "lorenz": "Table 2: "}.get(trajectory, "")
-    return f"{number_in_paper}{trajectory} trajectory"
+    in_paper = {"elliptical": "Table 1: elliptical", "lorenz": "Table 2: Lorenz"}
+    return f"{in_paper.get(trajectory, trajectory)} trajectory"
 
 
 def markdown(rows: Sequence[Row], meta: dict, note: str) -> str:

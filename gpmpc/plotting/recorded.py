@@ -116,6 +116,8 @@ def timing_figure(run: "Run") -> Figure:
         distribution.set_xscale("log")
         if total[-1] < 300 * total[0]:  # few decades: their names alone say little
             distribution.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        else:  # as many as fit beside each other
+            distribution.xaxis.set_major_locator(LogLocator(numticks=5))
         distribution.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         distribution.xaxis.set_minor_formatter(NullFormatter())
     median, most = (float(np.quantile(total, share)) for share in (0.5, 0.99))

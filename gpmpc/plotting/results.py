@@ -55,11 +55,11 @@ def error_over_size(panels: Sequence[Panel], label: str) -> Figure:
         for position, size in enumerate(sizes):  # the draws themselves: a box hides that there are two modes
             draws = list(panel.draws[size])
             aside = [0.18 * ((7 * i) % 11 / 5 - 1) for i in range(len(draws))]
-            axis.plot([position + a for a in aside], draws, ".", color="#1f4e79", alpha=0.55, markersize=4)
+            named = {} if position else {"label": "our draws, in boxes of their quartiles"}
+            axis.plot([position + a for a in aside], draws, ".", color="#1f4e79", alpha=0.55, markersize=4, **named)
         known = [(position, panel.paper[size]) for position, size in enumerate(sizes) if size in panel.paper]
         if known:
             axis.plot(*zip(*known, strict=True), "o", color="#c0392b", markersize=6, zorder=3, label="paper")
-            axis.legend(loc="upper right", frameon=False)
         axis.set_yscale("log")
         axis.yaxis.set_minor_locator(NullLocator())
         axis.yaxis.set_minor_formatter(NullFormatter())
@@ -69,6 +69,9 @@ def error_over_size(panels: Sequence[Panel], label: str) -> Figure:
         axis.spines[["top", "right"]].set_visible(False)
     for axis in axes[len(panels) :]:
         axis.set_visible(False)
+    named = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    if named:
+        figure.legend(named.values(), named, loc="outside upper center", ncols=2, frameon=False)
     figure.supxlabel("training points N")
     figure.supylabel(label)
     return figure

@@ -43,7 +43,7 @@ def over_variable(
         connected: Whether the medians are joined, as over numbers; over words nothing lies between them.
     """
     drawn = [line for line in lines if any(line.values)]
-    columns = max(1, int(60 / (max((len(line.label) for line in drawn), default=0) + 6)))
+    columns = max(1, 52 // (max((len(line.label) for line in drawn), default=0) + 8))  # 52 characters fill the width
     legend = -(-len(drawn) // columns) if len(drawn) > 1 else 0  # rows
     figure = Figure(figsize=(4.4, 3.2 + 0.22 * legend), layout="constrained")
     axis = figure.subplots()

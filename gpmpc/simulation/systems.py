@@ -66,7 +66,12 @@ class Noise:
             values = getattr(self, key)
             if values is not None:
                 values = values.tolist() if isinstance(values, np.ndarray) else values
-                check_numbers(f"noise.{key}", values, len(values) if hasattr(values, "__len__") else 1, least=0)
+                if isinstance(values, str) or not hasattr(values, "__len__"):
+                    what = "must be a list of standard deviations, one for every " + (
+                        "input" if key == "input" else "state"
+                    )
+                    raise SettingError(f"noise.{key}", f"{what}; got {values!r}")
+                check_numbers(f"noise.{key}", values, len(values), least=0)
 
 
 class Running(Protocol):

@@ -46,7 +46,12 @@ def test_info_shows_channels_counts_metadata_and_statuses(folder):
         "0 to 0.9 s",
     ):
         assert text in result.stdout
-    assert "unfinished" in gpmpc_log("info", "cut.mcap", cwd=folder).stdout
+    assert "cut.mcap: unfinished or damaged" in gpmpc_log("info", "cut.mcap", cwd=folder).stdout
+
+
+def test_a_table_of_an_unfinished_recording_says_that_it_is_one(folder):
+    assert "unfinished or damaged" in gpmpc_log("export", "cut.mcap", cwd=folder).stdout
+    assert "unfinished" not in gpmpc_log("export", "run.mcap", cwd=folder).stdout
 
 
 def test_recover_writes_a_finished_file_beside_the_broken_one(folder):

@@ -1,0 +1,19 @@
+"""Figures of a sweep."""
+
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from gpmpc.plotting.sweeps import Series, over_variable
+
+
+@pytest.mark.parametrize(
+    "label", ["horizon=1", "data.size=189", "controller=nonlinear", "propagation=mean_equivalence"]
+)
+@pytest.mark.parametrize("count", [2, 3, 6])
+def test_a_legend_stays_within_its_figure(label, count):
+    figure = over_variable("horizon", ["1", "5"], "RMSE [m]", [Series(label, [[1.0], [2.0]])] * count)
+    FigureCanvasAgg(figure).draw()
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert box.x0 >= 0
+    assert box.x1 <= figure.bbox.x1
