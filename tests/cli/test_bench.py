@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from tests.cli.command import gpmpc
+from tests.cli.command import forked, gpmpc
 
 SMALL = ["parts=[steps]", "states=[2]", "sizes=[6]", "horizons=[1]", "caches=[hot]", "seconds=0.01"]
 
@@ -15,7 +15,7 @@ def test_a_measurement_is_written_and_two_of_them_become_ratios(tmp_path):
     assert len(json.loads((folder / "bench.json").read_text())["rows"]) == 7
     assert "paper's form, H = 1" in done.stdout
     path = folder / "bench.json"
-    ratios = gpmpc("bench", f"compare=[{path},{path}]", cwd=tmp_path)
+    ratios = forked("bench", f"compare=[{path},{path}]", cwd=tmp_path)
     assert "step: new / old 1.00 in the median of 3 rows" in ratios.stdout
 
 
@@ -32,7 +32,7 @@ def test_a_measurement_is_written_and_two_of_them_become_ratios(tmp_path):
     ],
 )
 def test_a_mistake_is_one_clear_line_and_leaves_nothing_behind(setting, message, tmp_path):
-    done = gpmpc("bench", "parts=[steps]", setting, cwd=tmp_path)
+    done = forked("bench", "parts=[steps]", setting, cwd=tmp_path)
     assert done.returncode == 2
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.command import gpmpc
+from tests.cli.command import forked, gpmpc
 
 ROW = " ".join(str(i / 7) for i in range(15))
 RESULTS = Path("outputs/tables/nmpc-seed0/data.samples=12,model.restarts=0,sizes=[5],trajectory=elliptical")
@@ -25,7 +25,7 @@ def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
     usage = gpmpc("--help", cwd=tmp_path)
     assert usage.returncode == 0
     assert "tables" in usage.stdout
-    settings = gpmpc("tables", "--help", cwd=tmp_path)
+    settings = forked("tables", "--help", cwd=tmp_path)
     assert settings.returncode == 0
     for setting in ("draws", "sizes", "trajectory", "subsystem", "seed", "data"):
         assert setting in settings.stdout
@@ -70,12 +70,19 @@ def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_a_mistake_is_one_clear_line_and_leaves_nothing_behind(arguments, message, tmp_path):
-    result = gpmpc(*arguments, cwd=tmp_path)
+    result = forked(*arguments, cwd=tmp_path)
     assert result.returncode == 2
     assert result.stderr.startswith("gpmpc: ")
     assert message in result.stderr
     assert result.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("arguments", [["tables", "draws=0"], ["run", "--help"], ["table"]], ids=" ".join)
+def test_a_copy_of_a_process_answers_as_the_command_does(arguments, tmp_path):
+    copy, command = forked(*arguments, cwd=tmp_path), gpmpc(*arguments, cwd=tmp_path)
+    assert (copy.returncode, copy.stdout, copy.stderr) == (command.returncode, command.stdout, command.stderr)
+    assert copy.stdout or copy.stderr
 
 
 @pytest.mark.parametrize(
@@ -90,7 +97,7 @@ def test_a_mistake_is_one_clear_line_and_leaves_nothing_behind(arguments, messag
 )
 def test_a_broken_data_file_is_named_with_row_and_column(broken, message, tmp_path):
     folder = authors_folder(tmp_path / "data", broken=broken)
-    result = gpmpc("tables", "data=paper", f"data.folder={folder}", "data.samples=20", "sizes=[5]", cwd=tmp_path)
+    result = forked("tables", "data=paper", f"data.folder={folder}", "data.samples=20", "sizes=[5]", cwd=tmp_path)
     assert result.returncode == 2
     assert message in result.stderr
     assert result.stderr.count("\n") == 1
@@ -136,13 +143,13 @@ def test_a_run_writes_every_document_and_prints_the_tables(small_run):
 def test_the_same_command_again_computes_nothing_anew(small_run):
     cwd, arguments, _ = small_run
     before = json.loads((cwd / RESULTS / "tables.json").read_text())["draws"]
-    assert gpmpc(*arguments, cwd=cwd).returncode == 0
+    assert forked(*arguments, cwd=cwd).returncode == 0
     assert json.loads((cwd / RESULTS / "tables.json").read_text())["draws"] == before
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "taken").write_text("a file, not a folder")
-    result = gpmpc("tables", "draws=1", "sizes=[5]", "data.samples=12", "folder=taken", cwd=tmp_path)
+    result = forked("tables", "draws=1", "sizes=[5]", "data.samples=12", "folder=taken", cwd=tmp_path)
     assert result.returncode == 2
     assert "folder: cannot write to taken" in result.stderr
     assert result.stderr.count("\n") == 1

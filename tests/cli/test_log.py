@@ -2,8 +2,6 @@
 
 import csv
 import importlib.util
-import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,12 +12,11 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "recording"))
 import runs
 
 from gpmpc.recording import layout, read_run
+from tests.cli.command import forked
 
 
 def gpmpc_log(*arguments, cwd):
-    command = [sys.executable, "-c", "from gpmpc.cli import main; main()", "log", *arguments]
-    environment = os.environ | {"COLUMNS": "160"}
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, env=environment, timeout=100, check=False)
+    return forked("log", *arguments, cwd=cwd, COLUMNS="160")
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gpmpc.recording import read_run, replay
-from tests.cli.command import gpmpc, start
+from tests.cli.command import forked, gpmpc, start
 
 TINY = ["data.samples=25", "model.restarts=0", "steps=3", "horizon=1"]
 SWEPT = ["run", "-m", *TINY, "data.size=10,20", "seed=range(2)"]
@@ -72,7 +72,7 @@ def test_the_recording_holds_the_flight_and_its_decisions(single):
 def test_a_recorded_flight_is_drawn(single):
     cwd, _ = single
     (folder,) = (cwd / "tree").iterdir()
-    done = gpmpc("plot", str(folder), "--to", "figures", cwd=cwd)
+    done = forked("plot", str(folder), "--to", "figures", cwd=cwd)
     assert done.returncode == 0, done.stderr
     assert {"tracking.png", "inputs.png", "timing.png", "flight.gif"} <= {p.name for p in (cwd / "figures").iterdir()}
     assert (cwd / "figures" / "flight.gif").read_bytes().startswith(b"GIF89a")
@@ -81,7 +81,7 @@ def test_a_recorded_flight_is_drawn(single):
 
 def test_the_attitude_alone_is_flown_recorded_drawn_and_reported_in_radians(tmp_path):
     settings = ["subsystem=rotational", "trajectory=lorenz", *TINY, "steps=70", "horizon=3", "folder=tree"]
-    done = gpmpc("run", *settings, cwd=tmp_path)
+    done = forked("run", *settings, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "70 steps of lorenz attitude with convex" in done.stdout
     assert "RMSE [rad]" in done.stdout
@@ -91,9 +91,9 @@ def test_the_attitude_alone_is_flown_recorded_drawn_and_reported_in_radians(tmp_
     assert run.metadata["units"]["state.phi"] == "rad"
     assert run.times[1] == 0.05
     assert np.abs(run.states - run.references)[:, ::2].max() < 0.02 < np.ptp(run.references[:, 0])
-    assert gpmpc("plot", str(folder), "--to", "figures", cwd=tmp_path).returncode == 0
+    assert forked("plot", str(folder), "--to", "figures", cwd=tmp_path).returncode == 0
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"tracking.png", "inputs.png", "timing.png"}
-    assert gpmpc("report", "tree", cwd=tmp_path).returncode == 0
+    assert forked("report", "tree", cwd=tmp_path).returncode == 0
     assert "RMSE [rad]" in (tmp_path / "tree" / "report" / "report.md").read_text()
 
 
@@ -102,12 +102,12 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
     (folder,) = (cwd / "tree").iterdir()
     found = json.loads((folder / "metrics.json").read_text())
     arguments = ["run", *found["choices"], "folder=tree"]
-    again = gpmpc(*arguments, cwd=cwd)
+    again = forked(*arguments, cwd=cwd)
     assert again.returncode == 0, again.stderr
     assert "finished before" in again.stdout
     found["settings"]["controller"]["tolerance"] = 1
     (folder / "metrics.json").write_text(json.dumps(found))
-    other = gpmpc(*arguments, cwd=cwd)
+    other = forked(*arguments, cwd=cwd)
     assert other.returncode == 2
     assert "holds a finished run of other settings (controller.tolerance: 1 then, 1e-06 now)" in other.stderr
 
@@ -144,7 +144,7 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_a_mistake_is_one_clear_line_and_leaves_nothing_behind(arguments, message, tmp_path):
-    done = gpmpc("run", *arguments, cwd=tmp_path)
+    done = forked("run", *arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.count("\n") == 1
@@ -152,7 +152,7 @@ def test_a_mistake_is_one_clear_line_and_leaves_nothing_behind(arguments, messag
 
 
 def test_a_mistake_that_the_flight_finds_is_kept_with_its_traceback(tmp_path):
-    done = gpmpc("run", *TINY, "data.size=26", cwd=tmp_path)
+    done = forked("run", *TINY, "data.size=26", cwd=tmp_path)
     assert done.returncode == 2
     assert "data.size: must be at most 25, the rows of the data; got 26" in done.stderr
     assert done.stderr.count("\n") == 1
@@ -218,7 +218,7 @@ def test_a_killed_sweep_goes_on_and_ends_as_if_nothing_had_happened(sweep, tmp_p
 def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(sweep, tmp_path):
     tree = tmp_path / "tree"
     shutil.copytree(sweep[0], tree)
-    again = gpmpc(*SWEPT, "folder=tree", cwd=tmp_path)
+    again = forked(*SWEPT, "folder=tree", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert "4 runs: 0 flown, 4 finished before, 0 failed" in again.stdout
     path = sorted(tree.glob("*/metrics.json"))[2]
@@ -227,7 +227,7 @@ def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(swee
     found["settings"]["gone"] = 1
     path.write_text(json.dumps(found))
     (tree / path.parent.name.replace("seed=0", "seed=1") / "metrics.json").unlink()
-    refused = gpmpc(*SWEPT, "folder=tree", cwd=tmp_path)
+    refused = forked(*SWEPT, "folder=tree", cwd=tmp_path)
     assert refused.returncode == 2
     assert refused.stderr.count("\n") == 1
     assert f"folder: tree/{path.parent.name} holds a finished run of other settings" in refused.stderr
@@ -255,7 +255,7 @@ def test_failed_runs_are_named_and_stop_nothing(tmp_path):
     assert len(lines) == 2
     assert all("data.size=99" in line and "must be at most 25" in line for line in lines)
     assert len(results(tmp_path / "t")) == 22
-    told = gpmpc("report", "t", cwd=tmp_path)
+    told = forked("report", "t", cwd=tmp_path)
     assert told.returncode == 0, told.stderr
     assert "22 finished in 12 cells, 2 failed, 0 missing" in told.stdout
     assert told.stdout.count("failed: ") == 2

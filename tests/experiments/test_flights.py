@@ -24,6 +24,7 @@ from gpmpc.gp import SoftLimits, identity, train
 from gpmpc.plants import Integrated, Translational
 from gpmpc.propagation import MomentMatching
 from gpmpc.trajectories import Elliptical, Lorenz
+from tests.cli.command import forked
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 COLUMNS = ["x", "vx", "y", "vy", "z", "vz", "U1", "ux", "uy", "x+", "vx+", "y+", "vy+", "z+", "vz+"]
@@ -74,7 +75,7 @@ def test_a_run_goes_on_where_it_stopped(finished):
     lines = flights.read_text().splitlines()
     flights.write_text("\n".join(lines[:-3]) + '\n{"fingerprint": "cut sho')
     before = {json.loads(line)["fingerprint"] for line in lines}
-    again = gpmpc(*TINY, cwd=folder)
+    again = forked("figures", *TINY, cwd=folder)
     assert again.returncode == 0, again.stderr
     after = [line for line in flights.read_text().splitlines() if line.endswith("}")]
     assert {json.loads(line)["fingerprint"] for line in after} == before
@@ -93,7 +94,7 @@ def test_a_run_goes_on_where_it_stopped(finished):
     ],
 )
 def test_a_mistake_is_answered_in_one_line(tmp_path, arguments, message):
-    run = gpmpc(*arguments, cwd=tmp_path)
+    run = forked("figures", *arguments, cwd=tmp_path)
     assert run.returncode == 2
     assert message in run.stderr
     assert len(run.stderr.strip().splitlines()) == 1
@@ -132,7 +133,7 @@ def test_bounds_are_counted_over_all_steps_and_over_those_planned_at_a_bound(tmp
         "rows.convex.confidence=[0.9,0.99]",
         "state_bounds.lorenz.upper=[-1,null,4,null,null,null]",
     ]
-    run = gpmpc(*TINY, *bounded, cwd=tmp_path)
+    run = forked("figures", *TINY, *bounded, cwd=tmp_path)
     assert run.returncode == 0, run.stderr
     assert "State bounds that may be broken" in run.stdout
     assert (tmp_path / "out/confidence.png").exists()
