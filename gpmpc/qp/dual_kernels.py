@@ -237,7 +237,7 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
         for i in range(n):
             v[i] = -pull[i]
         solve_transposed(L, n, v)
-    k, age, tag, candidates = 0, 0.0, settings[workspace.TAG], members[SCRATCH]
+    k, age, tag, candidates = np.int64(0), 0.0, settings[workspace.TAG], members[SCRATCH]  # see ``settle``
     listed = members[LISTED]
     if guessed:
         names = warm[HEADER + n + M : HEADER + n + M + int(warm[WORKING])]
@@ -256,7 +256,7 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
         else:
             count = choose_guess(names, capacity, bounds, mu, candidates)
             k = take(
-                lazy, candidates, count, 0, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch[1]
+                lazy, candidates, count, k, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch[1]
             )
         k = settle(k, bounds, mu, slots, members, R, scratch)
     if lazy and not soft:
@@ -264,7 +264,7 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
         row_values(lazy, L, G, n, traits, y)
     else:
         evaluate(lazy, n, q, inverse, L, G, mu, k, members, traits, soft, slope, y)
-    iterations, rounds, status, worst = 0, 0, NUMERICAL_TROUBLE, np.inf
+    iterations, rounds, status, worst = np.int64(0), 0, NUMERICAL_TROUBLE, np.inf
     interrupted = guessed and warm[STATUS] == ITERATION_LIMIT
     sweeps = SWEEPS if interrupted else 0  # the dual objective climbs with single steps only, and so the end is sure
     count = list_violated(y, traits[SCALE], bounds, excess, listed)

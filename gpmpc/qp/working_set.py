@@ -171,7 +171,7 @@ def settle(k, bounds, mu, slots, members, R, scratch):
         for i in range(k):
             trial[i] = solved[i]
         backward_solve(R, k, trial)
-        worst, slot = 0.0, -1
+        worst, slot = 0.0, np.int64(-1)  # for a literal numba compiles what is called with it anew, and uses none of it
         for i in range(k):
             outside = max(trial[i] - slots[MOST, i], slots[LEAST, i] - trial[i])
             if outside > worst:
