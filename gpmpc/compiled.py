@@ -51,18 +51,20 @@ def compiled(
     if function is None:
         return partial(compiled, fastmath=fastmath, allocates=allocates, woven=woven, locked=locked)
     options = {"nogil": not locked, "fastmath": set(fastmath), "forceinline": woven}
-    if not allocates and _counting_is_optional():
+    if not allocates and _knows("_nrt"):  # not promised; kernels are slower without it
         options["_nrt"] = False
+    if _knows("no_cfunc_wrapper"):  # nothing in C calls a kernel; a way in for it is another tenth of compiling
+        options["no_cfunc_wrapper"] = True
     return _jit(function, options)
 
 
-def _counting_is_optional() -> bool:
-    """Whether this numba knows its own option ``_nrt``, which it does not promise; without it kernels are slower."""
+def _knows(option: str) -> bool:
+    """Whether this numba has an option that it does not document."""
     try:
         from numba.core.cpu import CPUTargetOptions
     except ImportError:
         return False
-    return hasattr(CPUTargetOptions, "_nrt")
+    return hasattr(CPUTargetOptions, option)
 
 
 def _jit(function: Callable, options: dict) -> Callable:
@@ -121,6 +123,20 @@ borrowing = partial(compiled, allocates=False)
 
 woven = partial(borrowing, woven=True)
 """Compiles such a function as a part of its callers."""
+
+
+@borrowing
+def copy(x, y):
+    """Writes a vector to one of its length. For ``y[:] = x`` numba compiles an error's words: a second a kernel."""
+    for i in range(len(y)):
+        y[i] = x[i]
+
+
+@borrowing
+def copy_matrix(X, Y):
+    """Writes a matrix to one of its shape."""
+    for r in range(len(Y)):
+        copy(X[r], Y[r])
 
 
 def compile_for(kernel: Callable, signature: str) -> None:

@@ -11,7 +11,7 @@ exists whatever A and B are. The bounds of the inputs hold for u_k, not for what
 
 import numpy as np
 
-from gpmpc.compiled import borrowing, compiled
+from gpmpc.compiled import borrowing, compiled, copy_matrix
 from gpmpc.control.small_matrices import add_product, add_transposed_product, solve_positive
 
 Array = np.ndarray
@@ -26,12 +26,14 @@ def lqr_gain(A, B, Q, R, terminal, horizon):
     M, cost, MA, MB = terminal.copy(), np.empty((n, n)), np.empty((n, n)), np.empty((n, m))
     K, W, MBA = np.zeros((m, n)), np.empty((m, m)), np.empty((m, n))
     for _ in range(horizon):
-        MA[:], MB[:], MBA[:], W[:], cost[:] = 0.0, 0.0, 0.0, R, Q
+        MA[:], MB[:], MBA[:] = 0.0, 0.0, 0.0
+        copy_matrix(R, W)
+        copy_matrix(Q, cost)
         add_product(M, A, MA)
         add_product(M, B, MB)
         add_transposed_product(MB, A, MBA)
         add_transposed_product(B, MB, W)
-        K[:] = MBA
+        copy_matrix(MBA, K)
         solve_positive(W, K)
         for j in range(m):
             for i in range(n):
@@ -53,7 +55,7 @@ def lqr_gain(A, B, Q, R, terminal, horizon):
 def spread(A, V, start, horizon):
     """Sigma_0 .. Sigma_H (H + 1, n, n) of Sigma+ = A Sigma A' + V."""
     covariances, scratch = np.empty((horizon + 1, A.shape[0], A.shape[1])), np.empty(len(A))
-    covariances[0] = start
+    copy_matrix(start, covariances[0])
     for k in range(horizon):
         step_spread(A, V, covariances[k], scratch, covariances[k + 1])
     return covariances

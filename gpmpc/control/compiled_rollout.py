@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import compiled, copy, copy_matrix
 from gpmpc.control.ancillary_feedback import lqr_gain, step_spread
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.fused.point import expand_at
@@ -119,16 +119,16 @@ def roll_out(known, start, covariance, disturbance, follow, out):
                 M[i] += x[i]
                 A[k, i, i] += 1.0
         if k == 0 and feedback and (uncertain or len(follow) > 0):
-            K[:] = lqr_gain(A[k], B[k], Q, R, terminal, H)
+            K = lqr_gain(A[k], B[k], Q, R, terminal, H)
         for i in range(n):
             c[k, i] = M[i]
             for j in range(n):
                 c[k, i] -= A[k, i, j] * x[j]
             for j in range(m):
                 c[k, i] -= B[k, i, j] * u[j]
-        x[:] = M
+        copy(M, x)
     if uncertain:
-        covariances[0] = covariance
+        copy_matrix(covariance, covariances[0])
         kept[:, H:] = 0.0
         explained = np.zeros((n, places))
         for a in range(n):

@@ -23,7 +23,7 @@ diag(Q, I_n kron Q) is never written out.
 
 import numpy as np
 
-from gpmpc.compiled import borrowing, compiled
+from gpmpc.compiled import borrowing, compiled, copy, copy_matrix
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.fused.point_rows import aligned_rows
 from gpmpc.qp.lanes import combine
@@ -155,7 +155,7 @@ def tracking_cost(known, states, inputs, targets, wanted, last):
     (H, n), m = targets.shape, len(R)
     total, error, v = 0.0, np.empty(states.shape[1]), np.empty(m)
     for k in range(H):
-        error[:] = states[k + 1]
+        copy(states[k + 1], error)
         for i in range(n):
             error[i] -= targets[k, i]
         weight = T if k == H - 1 else W
@@ -192,8 +192,8 @@ def condense(known, stages, start, targets, wanted, last, program):
     A, B, c, rows, low, high = stages
     P, q, G, lower, upper = program
     (H, m), r, first, given = wanted.shape, rows.shape[1], len(rate_rows), len(box_lower)
-    P[:] = hessian
-    G[:first] = rate_rows
+    copy_matrix(hessian, P)
+    copy_matrix(rate_rows, G[:first])
     G[first:] = 0.0
     _varying_curvature(A, B, W, T, rows, H, P, G[first:])
     q[:] = 0.0
@@ -215,7 +215,7 @@ def respond(A, B, c, start, inputs, states):
     """Writes s_0 .. s_H (H + 1, p) under inputs (H, m) to ``states``."""
     held = len(A) - 1
     p, m = B.shape[1], B.shape[2]
-    states[0, :] = start
+    copy(start, states[0])
     for k in range(len(inputs)):
         at = min(k, held)
         s, u = states[k], inputs[k]
@@ -277,7 +277,7 @@ def _varying_curvature(A, B, W, T, rows, H, P, G):
                 out[j] += row[j]
         for e in range(r):
             combine(gamma, p, rows[min(k, len(rows) - 1), e], 0, width, row)
-            G[k * r + e, :width] = row[:width]
+            copy(row, G[k * r + e, :width])
     _mirror(P)
 
 
@@ -336,7 +336,9 @@ def _held_curvature(A, B, W, T, same, rows, H, P, G):
 def _widened(W):
     """The blocks of a weight, symmetric, in rows of whole registers (p / n, n, n padded)."""
     wide = np.zeros((len(W), W.shape[1], (W.shape[1] + 7) // 8 * 8))
-    wide[:, :, : W.shape[1]] = W
+    for b in range(len(W)):
+        for i in range(W.shape[1]):
+            copy(W[b, i], wide[b, i, : W.shape[1]])
     return wide
 
 
@@ -377,7 +379,7 @@ def _slope(A, B, c, start, rows, targets, W, T, centre, R, q, values):
         at, row_at = min(k, held), min(k, held_rows)
         for e in range(r):
             values[k, e] = _dot(rows[row_at, e], free[k + 1])
-        error[:] = free[k + 1]
+        copy(free[k + 1], error)
         for i in range(n):
             error[i] -= targets[k, i]
         _weigh(T if k == H - 1 else W, error, slope)

@@ -52,6 +52,6 @@ def flattened(arrays: Sequence[Array]) -> tuple[Array, Array]:
 
 
 @compiled(woven=True)
-def part(flat, table, number):
-    """One of ``Layout.parts`` in compiled code, with two dimensions."""
-    return matrix(flat, table[number, 0], table[number, 1], table[number, 2])
+def part(flat, place):
+    """One of ``Layout.parts`` in compiled code, with two dimensions; ``place`` is its row of the table."""
+    return matrix(flat, place[0], place[1], place[2])  # with its number numba would compile this for each of them

@@ -9,9 +9,9 @@ import math
 import numpy as np
 from numba import types
 
-from gpmpc.compiled import borrowing, clock, compiled
+from gpmpc.compiled import borrowing, clock, compiled, copy, copy_matrix
 from gpmpc.control.chance_constraints import tighten, violation_price
-from gpmpc.control.compiled_rollout import NOTHING, roll_out
+from gpmpc.control.compiled_rollout import roll_out
 from gpmpc.control.condensing import condense, respond, tracking_cost
 from gpmpc.control.convergence import kkt_share
 from gpmpc.control.flat_arrays import part
@@ -74,11 +74,11 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
     H, m = wanted.shape
     kept = np.empty_like(along)  # of the plan that was reached; ``along`` is of the one that is tried
     stages, rows, low, high = linearised(along, table)
-    (A, B, c, covariances, _), E, low_here, high_here = linearised(kept, table)
+    (A, B, c, _, _), E, low_here, high_here = linearised(kept, table)
     A_tried, B_tried, c_tried, spread, trial = stages
-    P, q, G = part(answer, parts, P_OF), part(answer, parts, Q_OF)[0], part(answer, parts, G_OF)
-    lower, upper, record = part(answer, parts, LOWER)[0], part(answer, parts, UPPER)[0], part(answer, parts, RECORD)[0]
-    states, outcome = part(answer, parts, STATES), part(answer, parts, OUTCOME)[0]
+    P, q, G = part(answer, parts[P_OF]), part(answer, parts[Q_OF])[0], part(answer, parts[G_OF])
+    lower, upper, record = part(answer, parts[LOWER])[0], part(answer, parts[UPPER])[0], part(answer, parts[RECORD])[0]
+    states, outcome = part(answer, parts[STATES]), part(answer, parts[OUTCOME])[0]
     size, M, bounded, limited = len(q), len(lower), low.shape[1] > 0, len(condenser[1][1])
     program, warm, solved = (P, q, G, lower, upper), guess, np.empty_like(record)
     solution, z = record[HEADER : HEADER + size], record[HEADER + size + size : HEADER + size + M]
@@ -87,9 +87,10 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
     scratch, change = vectors[5], vectors[6]
     inputs, proposed, moved = plan.reshape(H, m), solution.reshape(H, m), trial.reshape(size)
     status, price, share, rate, taken = ITERATION_LIMIT, 0.0, np.inf, 1.0, False
-    outcome[:], spread[:], trial[:] = 0.0, 0.0, shifted
+    outcome[:], spread[:] = 0.0, 0.0
+    copy_matrix(shifted, trial)
     if constant.shape[0] > 0:
-        rows[:] = constant.reshape(rows.shape)
+        copy_matrix(constant, part(along, table[ROWS]))
     if compiled:
         roll_out(model, start, covariance, disturbance, follow, stages)
         tighten(chance, spread, low, high)
@@ -97,8 +98,8 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
         yield MODEL
     respond(A_tried, B_tried, c_tried, start, trial, states)
     cost = tracking_cost(condenser, states, trial, targets, wanted, last)
-    kept[:] = along
-    plan[:] = moved
+    copy(along, kept)
+    copy(moved, plan)
     for number in range(limit):
         now = clock()
         outcome[COUNT] = number + 1
@@ -114,7 +115,8 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
             if curvature > ROUND_OFF * cost:
                 if count == MEMORY:
                     for k in range(MEMORY - 1):
-                        pairs[:, k] = pairs[:, k + 1]
+                        for of in range(2):
+                            copy(pairs[of, k + 1], pairs[of, k])
                     count -= 1
                 pull(G, z, scratch)
                 for i in range(size):
@@ -134,7 +136,7 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
         if ended != SOLVED:
             status = ended
             break
-        solved[:] = record
+        copy(record, solved)
         warm = solved
         before_this = share
         share = kkt_share(diagonal, slope, G, z, plan, solution, lower, upper, cost)
@@ -162,7 +164,7 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
             for i in range(size):
                 moved[i] = solution[i] if length == 1.0 else plan[i] + length * step[i]
             if compiled:
-                roll_out(model, start, covariance, disturbance, NOTHING, stages)
+                roll_out(model, start, covariance, disturbance, follow[:0], stages)
                 tighten(chance, spread, low, high)
             else:
                 yield MODEL
@@ -184,10 +186,10 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
         for i in range(size):
             step[i] = moved[i] - plan[i]
             before[i] += slope[i]
-        kept[:] = along
-        plan[:] = moved
+        copy(along, kept)
+        copy(moved, plan)
     respond(A, B, c, start, proposed, states)
-    part(answer, parts, PREDICTED)[:] = covariances.reshape(-1, covariances.shape[2])
+    copy_matrix(part(kept, table[COVARIANCES]), part(answer, parts[PREDICTED]))
     outcome[STATUS] = status
 
 
@@ -199,58 +201,58 @@ programs = compiled(locked=True)(sequence)
 @compiled
 def told(known, places, columns):
     """What stays, as those take it who need it."""
-    settings = part(known, places, SETTINGS)[0]
+    settings = part(known, places[SETTINGS])[0]
     Q, R, n = (
-        part(known, places, FEEDBACK_Q),
-        part(known, places, INPUT_WEIGHT),
-        part(known, places, FEEDBACK_Q).shape[0],
+        part(known, places[FEEDBACK_Q]),
+        part(known, places[INPUT_WEIGHT]),
+        part(known, places[FEEDBACK_Q]).shape[0],
     )
-    weight, terminal = part(known, places, WEIGHT), part(known, places, TERMINAL)
+    weight, terminal = part(known, places[WEIGHT]), part(known, places[TERMINAL])
     model = (
         settings[UNCERTAIN] != 0.0,
         settings[FEEDBACK] != 0.0,
         (
-            part(known, places, POINTS),
-            part(known, places, SQUARES),
-            part(known, places, LOG_SIGNAL)[0],
-            part(known, places, BETA),
+            part(known, places[POINTS]),
+            part(known, places[SQUARES]),
+            part(known, places[LOG_SIGNAL])[0],
+            part(known, places[BETA]),
         ),
         columns,
-        (part(known, places, OFFSET)[0], settings[DIFFERENCE] != 0.0),
-        (Q, R, part(known, places, FEEDBACK_TERMINAL)),
-        (part(known, places, INPUT_LOWER)[0], part(known, places, INPUT_UPPER)[0]),
-        part(known, places, NOISE),
+        (part(known, places[OFFSET])[0], settings[DIFFERENCE] != 0.0),
+        (Q, R, part(known, places[FEEDBACK_TERMINAL])),
+        (part(known, places[INPUT_LOWER])[0], part(known, places[INPUT_UPPER])[0]),
+        part(known, places[NOISE]),
     )
     condenser = (
         (weight.reshape(-1, n, n), terminal.reshape(-1, n, n), R, int(settings[PENALIZED])),
         (
-            part(known, places, INPUT_HESSIAN),
-            part(known, places, RATE_ROWS),
-            part(known, places, BOX_LOWER)[0],
-            part(known, places, BOX_UPPER)[0],
+            part(known, places[INPUT_HESSIAN]),
+            part(known, places[RATE_ROWS]),
+            part(known, places[BOX_LOWER])[0],
+            part(known, places[BOX_UPPER])[0],
         ),
     )
     chance = (
-        part(known, places, BOUNDED)[0],
-        part(known, places, SIGN)[0],
-        part(known, places, BOUND)[0],
+        part(known, places[BOUNDED])[0],
+        part(known, places[SIGN])[0],
+        part(known, places[BOUND])[0],
         settings[KAPPA],
-        part(known, places, PRICES),
+        part(known, places[PRICES]),
     )
-    rates = part(known, places, RATE_LOWER)[0], part(known, places, RATE_UPPER)[0]
-    constant, stop = part(known, places, CONSTANT_ROWS), (int(settings[LIMIT]), settings[TOLERANCE])
+    rates = part(known, places[RATE_LOWER])[0], part(known, places[RATE_UPPER])[0]
+    constant, stop = part(known, places[CONSTANT_ROWS]), (int(settings[LIMIT]), settings[TOLERANCE])
     return model, condenser, chance, rates, constant, stop
 
 
 @compiled
 def linearised(flat, table):
     """The stages along a plan, the rows of their states (K, r, p), and the bounds of these (H, r)."""
-    c, plan, low = part(flat, table, C_OF), part(flat, table, PLAN), part(flat, table, LOW)
-    (H, p), m, n = c.shape, plan.shape[1], part(flat, table, COVARIANCES).shape[1]
-    A, B = part(flat, table, A_OF).reshape(H, p, p), part(flat, table, B_OF).reshape(H, p, m)
-    stages = A, B, c, part(flat, table, COVARIANCES).reshape(H + 1, n, n), plan
-    r, rows = low.shape[1], part(flat, table, ROWS)
-    return stages, rows.reshape(rows.shape[0] // r if r > 0 else 1, r, p), low, part(flat, table, HIGH)
+    c, plan, low = part(flat, table[C_OF]), part(flat, table[PLAN]), part(flat, table[LOW])
+    (H, p), m, n = c.shape, plan.shape[1], part(flat, table[COVARIANCES]).shape[1]
+    A, B = part(flat, table[A_OF]).reshape(H, p, p), part(flat, table[B_OF]).reshape(H, p, m)
+    stages = A, B, c, part(flat, table[COVARIANCES]).reshape(H + 1, n, n), plan
+    r, rows = low.shape[1], part(flat, table[ROWS])
+    return stages, rows.reshape(rows.shape[0] // r if r > 0 else 1, r, p), low, part(flat, table[HIGH])
 
 
 @borrowing

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from gpmpc.compiled import borrowing, compiled
+from gpmpc.compiled import borrowing, compiled, copy
 
 
 @compiled
@@ -35,24 +35,31 @@ def extended_models(means, covariances, inputs, next_means, next_covariances, de
     for h in range(H):
         root(covariances[h], S)
         r, U = root(next_covariances[h], S_next)
-        now[:n], after[:n] = means[h], next_means[h]
-        now[n:], after[n:] = S.reshape(n * n), S_next.reshape(n * n)
+        copy(means[h], now[:n])
+        copy(next_means[h], after[:n])
+        copy(S.reshape(n * n), now[n:])
+        copy(S_next.reshape(n * n), after[n:])
         for i in range(n):
-            A[h, i, :n], B[h, i] = mean_by_mean[h, i], mean_by_input[h, i]
+            copy(mean_by_mean[h, i], A[h, i, :n])
+            copy(mean_by_input[h, i], B[h, i])
             by_root(mean_by_covariance[h, i], S, A[h, i, n:])
             for j in range(n):
                 row = change[i * n + j]
-                row[:n], row[p:] = by_mean[h, i, j], by_input[h, i, j]
+                copy(by_mean[h, i, j], row[:n])
+                copy(by_input[h, i, j], row[p:])
                 by_root(by_covariance[h, i, j], S, row[n:p])
         turn(U.T.copy(), change, turned)
         turn(U.T.copy(), turned, change)
         for i in range(n):
             for j in range(n):
                 total = r[i] + r[j]
-                change[i * n + j] *= 1.0 / total if total > 0.0 else 0.0
+                for column in range(p + m):
+                    change[i * n + j, column] *= 1.0 / total if total > 0.0 else 0.0
         turn(U, change, turned)
         turn(U, turned, change)
-        A[h, n:], B[h, n:] = change[:, :p], change[:, p:]
+        for i in range(n * n):
+            copy(change[i, :p], A[h, n + i])
+            copy(change[i, p:], B[h, n + i])
         for i in range(p):
             c[h, i] = after[i]
             for j in range(p):

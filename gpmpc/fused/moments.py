@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy import ndarray
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import borrowing, compiled
 from gpmpc.fused.belief_algebra import (
     add_difference,
     condition,
@@ -113,10 +113,17 @@ def seen_from(points, mu, S, u):
     R, padded = (n + 2) // 3 * 3, points.shape[1]
     nu, control = aligned_rows(R, padded), aligned_rows(len(points) - R, padded)
     for c in range(R):
-        nu[c] = points[c] - (mu[c] if c < n else 0.0)
+        centre(points[c], mu[c] if c < n else 0.0, nu[c])
     for c in range(len(control)):
-        control[c] = points[R + c] - (u[c] if c < m else 0.0)
+        centre(points[R + c], u[c] if c < m else 0.0, control[c])
     return Belief(S, nu, control, m)
+
+
+@borrowing
+def centre(row, number, out):
+    """Writes row - number."""
+    for j in range(len(out)):
+        out[j] = row[j] - number
 
 
 @compiled
@@ -227,7 +234,8 @@ def evaluate_pair(belief, D_a, D_b, a, b, single, triangle, explained, n, order,
         transform(T_ab, single.z[a], left, n)
         add_products(rise, D_b / -2, left, single.moved[a], n)
     else:
-        rise += fall
+        for j in range(len(rise)):
+            rise[j] += fall[j]
     weights_a, weights_b = (single.q[a], single.q[b]) if a == b else (single.weighted[a], single.weighted[b])
     rows, columns = Side(single.z[a], rise, weights_a), Side(single.z[b], fall, weights_b)
     return pair_sums(a == b, order > VALUE, triangle, left, rows, columns, explained, strips, work[3:])
@@ -265,7 +273,8 @@ def differentiate_pair(belief, D_a, D_b, a, b, single, n, M, P_total, to, work, 
     for c in range(n):
         for d in range(n):
             x[c, d] += y[c, d] + H[c, d] + H[d, c]
-    vector[0] += vector[1]
+    for c in range(R):
+        vector[0, c] += vector[1, c]
     congruent(G_ab, x, n, y, H)
     transposed_times(G_ab, vector[0], n, vector[1])
     for c in range(n):
@@ -287,9 +296,12 @@ def differentiate_pair(belief, D_a, D_b, a, b, single, n, M, P_total, to, work, 
     for c in range(belief.inputs):
         to.dV_du[a, b, c] += controls[0, c] * D_a[R + c] + controls[1, c] * D_b[R + c]
     if not same:
-        to.dV_dmu[b, a] = dmu
-        to.dV_dS[b, a] = to.dV_dS[a, b]
-        to.dV_du[b, a] = to.dV_du[a, b]
+        for c in range(n):
+            to.dV_dmu[b, a, c] = dmu[c]
+            for d in range(n):
+                to.dV_dS[b, a, c, d] = to.dV_dS[a, b, c, d]
+        for c in range(belief.inputs):
+            to.dV_du[b, a, c] = to.dV_du[a, b, c]
 
 
 @compiled

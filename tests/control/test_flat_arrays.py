@@ -9,7 +9,7 @@ SHAPES = [(3,), (2, 3, 4), (0,), (1, 0, 5), (9, 8)]
 
 @njit
 def copy_of(flat, table, number):
-    return part(flat, table, number).copy()
+    return part(flat, table[number]).copy()
 
 
 @pytest.mark.parametrize("number", range(len(SHAPES)))
