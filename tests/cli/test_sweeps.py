@@ -218,7 +218,7 @@ def test_a_killed_sweep_goes_on_and_ends_as_if_nothing_had_happened(sweep, tmp_p
 def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(sweep, tmp_path):
     tree = tmp_path / "tree"
     shutil.copytree(sweep[0], tree)
-    again = forked(*SWEPT, "folder=tree", cwd=tmp_path)
+    again = gpmpc(*SWEPT, "folder=tree", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert "4 runs: 0 flown, 4 finished before, 0 failed" in again.stdout
     path = sorted(tree.glob("*/metrics.json"))[2]
@@ -227,7 +227,7 @@ def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(swee
     found["settings"]["gone"] = 1
     path.write_text(json.dumps(found))
     (tree / path.parent.name.replace("seed=0", "seed=1") / "metrics.json").unlink()
-    refused = forked(*SWEPT, "folder=tree", cwd=tmp_path)
+    refused = gpmpc(*SWEPT, "folder=tree", cwd=tmp_path)
     assert refused.returncode == 2
     assert refused.stderr.count("\n") == 1
     assert f"folder: tree/{path.parent.name} holds a finished run of other settings" in refused.stderr
