@@ -15,6 +15,7 @@ from gpmpc.qp.workspace import aligned, padded
 Array = NDArray[np.float64]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen in each solve
 def gram_system(terms: Terms) -> tuple[Array, Array]:
     """The array for ``gpmpc.qp.dual_kernels.solve_gram``, and the traits (5, M) of ``gpmpc.qp.working_set``."""
     P, G, softness = terms
