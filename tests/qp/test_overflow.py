@@ -56,12 +56,12 @@ def test_one_overflowing_entry_is_seen_wherever_it_stands(size, mode):
         assert solution.status is Status.NUMERICAL_TROUBLE
 
 
-def test_a_proper_problem_that_the_kernel_refuses_is_trouble_and_not_what_memory_held(monkeypatch):
-    """A row whose norm overflows; zeros in memory read as SOLVED."""
+def test_a_proper_problem_that_the_kernel_refuses_is_not_answered_by_what_memory_held(monkeypatch):
+    """A row whose norm overflows; zeros in memory read as SOLVED, with x = 0."""
     monkeypatch.setattr(np, "empty", np.zeros)
     rows = np.full((1, 3), 2e300)
     solution = solve_in("lazy", np.eye(3), np.ones(3), rows, np.full(4, -np.inf), np.array([*np.full(3, np.inf), -1.0]))
-    assert solution.status is Status.NUMERICAL_TROUBLE
+    assert solution.is_optimal(1e-9) or not solution.status.solved
 
 
 def test_soft_rows_do_not_hide_it():
