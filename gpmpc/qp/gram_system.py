@@ -37,4 +37,6 @@ def gram_system(terms: Terms) -> tuple[Array, Array]:
         end = start + rows * padded(columns)
         system[start:end].reshape(rows, padded(columns))[:, :columns] = block
         start = end
+    if not (np.isfinite(K).all() and np.isfinite(traits[0]).all()):
+        system[:] = np.nan  # else a row of infinite norm would count as kept: every solve is to fail, and to be rescued
     return system, traits
