@@ -19,6 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gpmpc.exceptions import SettingError, check_number
+from gpmpc.qp.problem import ABSENT
 
 Penalized = Literal["inputs", "deviations", "increments"]
 
@@ -166,6 +167,8 @@ def _set_bounds(owner: Any, lower_key: str, upper_key: str, length: int) -> None
             raise SettingError(key, f"must be a list of {length} numbers; got {value!r}") from None
         if array.shape != (length,) or np.isnan(array).any():
             raise SettingError(key, f"must be a list of {length} numbers; got {value!r}")
+        if (-np.sign(absent) * array >= ABSENT).any():
+            raise SettingError(key, f"no number keeps it: a bound of size {ABSENT:g} or more is none; got {value!r}")
         object.__setattr__(owner, key, array)
         arrays.append(array)
     unreachable = np.flatnonzero((arrays[0] == math.inf) | (arrays[1] == -math.inf))

@@ -89,6 +89,8 @@ def mean_hessian(model: DynamicsModel, state: Tensor, input: Tensor) -> Tensor:
     with torch.inference_mode(False), torch.enable_grad():
         x = state if state.requires_grad and again else state.detach().clone().requires_grad_()
         _, A, _ = model.predict_with_jacobian(x, input)
+        if not A.requires_grad:  # the model is linear in the state
+            return A.new_zeros(*A.shape, A.shape[-1])
         rows = [
             torch.autograd.grad(A[..., a, d].sum(), x, create_graph=again, retain_graph=True, materialize_grads=True)[0]
             for a in range(A.shape[-2])

@@ -131,6 +131,8 @@ class DualActiveSet:
             softness, work, size, where = self._plan(m, n, soft)
             record, warm = np.empty(size), _as_record(warm_start, n, n + m)
             status = solve_lazy(P, q, G, lower, upper, warm, work, record)
+            if status == layout.MISUSE:
+                _write_trouble(record, n, n + m)
         terms = new(Terms, (P, G, softness))
         if status != layout.SOLVED:
 
@@ -256,9 +258,17 @@ class Prepared:
 
         if status == layout.MISUSE:
             status = again(_as_record(warm_start, len(q), len(lower)), record)
+            if status == layout.MISUSE:
+                _write_trouble(record, len(q), len(lower))
         if status != layout.SOLVED:
             record = self._solver._settle(again, self.terms, q, lower, upper, record, began)
         return QPSolution(record[self._x], self.terms, q, lower, upper, record, 0.0, perf_counter() - began)
+
+
+def _write_trouble(record: Array, n: int, M: int) -> None:
+    """Fills the record of a kernel that refused a proper problem: rows that overflow, P at the edge of definiteness."""
+    record[:] = 0.0
+    record[layout.STATUS], record[layout.VARIABLES], record[layout.CONSTRAINTS] = layout.NUMERICAL_TROUBLE, n, M
 
 
 def _as_record(warm_start: WarmStart, n: int, M: int) -> Array:

@@ -161,3 +161,16 @@ def first_block(step, sense, k, mu, slots, members, r):
             if room < step:
                 step, blocking = max(room, 0.0), i
     return step, blocking
+
+
+@woven
+def write_ray(p, above, k, bounds, members, r, mu):
+    """Farkas' proof that constraint p contradicts the working ones, ``C' ray = 0`` and ``ray' bounds < 0``, into mu."""
+    sense = 1.0 if above else -1.0
+    mu[:] = 0.0
+    for i in range(k):
+        at = abs(members[NAME, i]) - 1
+        mu[at] = -sense * r[i]
+        if mu[at] * members[NAME, i] < 0.0 and bounds[LOWER, at] < bounds[UPPER, at]:
+            mu[at] = 0.0  # rounding: this bound cannot pull that way
+    mu[p] = sense

@@ -10,14 +10,19 @@ working set by Newton's method (one step is exact but for rounding), and handed 
 violated.
 """
 
-import math
-
 import numpy as np
 
 from gpmpc.compiled import borrowing, woven
 from gpmpc.qp import record, workspace
 from gpmpc.qp.cholesky import factorise
-from gpmpc.qp.dual_iteration import CONTRADICTION, keep_violated, list_violated, most_violated, step_to
+from gpmpc.qp.dual_iteration import (
+    CONTRADICTION,
+    keep_violated,
+    list_violated,
+    most_violated,
+    step_to,
+    write_ray,
+)
 from gpmpc.qp.evaluation import (
     UNDEFINED,
     add_pull,
@@ -28,11 +33,11 @@ from gpmpc.qp.evaluation import (
     refine,
     residuals,
     row_values,
+    worst_violation,
 )
 from gpmpc.qp.factor import multiply_at, pack, unpack
 from gpmpc.qp.hessian import solve_transposed
 from gpmpc.qp.lanes import (
-    any_nonzero,
     bounded,
     lanes,
     larger,
@@ -41,15 +46,12 @@ from gpmpc.qp.lanes import (
     negative,
     no_lanes,
     plus,
-    plus_product,
     put,
     scaled,
     some_lanes,
-    total,
 )
 from gpmpc.qp.working_set import (
     CAP,
-    END,
     HIGH_WATCH,
     LISTED,
     LOW_WATCH,
@@ -64,12 +66,14 @@ from gpmpc.qp.working_set import (
     admit,
     choose_guess,
     choose_violated,
+    clip_multipliers,
     ignore,
+    measure,
     settle,
     take,
     watch,
 )
-from gpmpc.qp.workspace import carve, matrix, most_working, padded, round_end
+from gpmpc.qp.workspace import carve, matrix, most_working, padded
 
 STATUS, ITERATIONS, VARIABLES, CONSTRAINTS = record.STATUS, record.ITERATIONS, record.VARIABLES, record.CONSTRAINTS
 WORKING, TAG, AGE, HEADER = record.WORKING, record.TAG, record.AGE, record.HEADER
@@ -138,19 +142,6 @@ def all_present(names, bounds, mu):
     return True
 
 
-@woven
-def write_ray(p, above, k, bounds, members, r, mu):
-    """Farkas' proof that constraint p contradicts the working ones, ``C' ray = 0`` and ``ray' bounds < 0``, into mu."""
-    sense = 1.0 if above else -1.0
-    mu[:] = 0.0
-    for i in range(k):
-        at = abs(members[NAME, i]) - 1
-        mu[at] = -sense * r[i]
-        if mu[at] * members[NAME, i] < 0.0 and bounds[LOWER, at] < bounds[UPPER, at]:
-            mu[at] = 0.0  # rounding: this bound cannot pull that way
-    mu[p] = sense
-
-
 @borrowing  # woven into ``optimise`` it would cost the solves that need no step a twentieth of a microsecond
 def climb(
     lazy, n, q, inverse, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch, y, now, seen, excess,
@@ -159,14 +150,15 @@ def climb(
     """Changes the working set until none of the constraints is violated; ``count`` are, and listed.
 
     Returns:
-        ``SOLVED``, ``INFEASIBLE`` or ``ITERATION_LIMIT``, the size of the working set, iterations and sweeps so far.
+        ``SOLVED``, ``INFEASIBLE`` or ``ITERATION_LIMIT``, the size of the working set, iterations and sweeps so far,
+        and whether a constraint was passed over because it contradicts others by what may be rounding.
     """
-    candidates, listed, fresh = members[SCRATCH], members[LISTED], True
+    candidates, listed, fresh, passed = members[SCRATCH], members[LISTED], True, False
     for p in range(len(mu)):
         seen[p] = mu[p]
     while count > 0:
         if iterations >= limit:
-            return ITERATION_LIMIT, k, iterations, sweeps
+            return ITERATION_LIMIT, k, iterations, sweeps, passed
         p = most_violated(excess, listed, count)
         value, several = y[p] if fresh else now[p], False
         if fresh and sweeps < SWEEPS and count_above(excess, SWEPT * excess[p], listed, count) > 1:
@@ -180,6 +172,7 @@ def climb(
             iterations += k - before
             k = settle(k, bounds, mu, slots, members, R, scratch)
         if not several:
+            before_step = mu[p]
             outcome, k, changes = step_to(
                 lazy, p, value, k, capacity, n, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch
             )
@@ -187,8 +180,11 @@ def climb(
             if outcome == CONTRADICTION:
                 if excess[p] * traits[SCALE, p] > NOISE * bounds[SLACK, p] / TOLERATED:
                     write_ray(p, value > bounds[UPPER, p], k, bounds, members, scratch[2], mu)
-                    return INFEASIBLE, k, iterations, sweeps
+                    return INFEASIBLE, k, iterations, sweeps, passed
+                mu[p], passed = before_step, True  # what it gained on the way belongs to no working set
                 ignore(p, bounds)
+                if not soft:  # else refinement has to do
+                    k = settle(k, bounds, mu, slots, members, R, scratch)
             if soft:
                 sweeps = SWEEPS  # caps may have changed what ``pull`` says
         fresh = several or soft or count == 1 or iterations >= limit
@@ -205,7 +201,8 @@ def climb(
                 follow_lazily(n, v, rows, L, mu, k, members, gradient, y)
                 row_values(lazy, L, G, n, traits, y)
             count = list_violated(y, traits[SCALE], bounds, excess, listed)
-    return SOLVED, k, iterations, sweeps
+    clip_multipliers(k, mu, slots, members)  # which rounding can take out of their ranges
+    return SOLVED, k, iterations, sweeps, passed
 
 
 @woven
@@ -269,15 +266,16 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
     sweeps = SWEEPS if interrupted else 0  # the dual objective climbs with single steps only, and so the end is sure
     count = list_violated(y, traits[SCALE], bounds, excess, listed)
     current, moved = not lazy or soft, False  # whether slope belongs to mu, and x is not what was last looked at
+    passed = False  # whether a constraint was passed over
     while True:
         if count > 0:
-            status, k, iterations, sweeps = climb(
+            status, k, iterations, sweeps, passed_over = climb(
                 lazy, n, q, inverse, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch, y, now, seen,
                 excess, gradient, slope, k, capacity, soft, limit, iterations, sweeps, count,
             )  # fmt: skip
             if status != SOLVED:
                 break
-            current, moved = False, True
+            current, moved, passed = False, True, passed or passed_over
             if not lazy:
                 row_values(lazy, L, G, n, traits, y)
         if not current:
@@ -297,6 +295,9 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
         count = list_violated(y, traits[SCALE], bounds, excess, listed)
         if count == 0:
             break
+    unsure = passed or rounds == ROUNDS  # of the violations that are left
+    if unsure and status == SOLVED and worst_violation(y, mu, traits, bounds) > tolerance:
+        status = NUMERICAL_TROUBLE
     out[STATUS], out[ITERATIONS], out[WORKING] = status, iterations, k
     out[VARIABLES], out[CONSTRAINTS], out[TAG], out[AGE] = n, M, NO_TAG, age + iterations
     factor = out[HEADER + n + 2 * M :]
@@ -347,33 +348,6 @@ def solve_lazy(P, q, G, lower, upper, warm, work, out):
     if not measure(G, n, traits):
         return MISUSE
     return optimise(True, P, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
-
-
-@woven
-def measure(G, n, traits):
-    """Writes the norms, scales and ends of the rows of G; False if G is not finite."""
-    norms, scales, ends = traits[NORM, n:], traits[SCALE, n:], traits[END, n:]
-    undefined, end = 0.0, 0
-    for p in range(len(G)):
-        row, near, far = G[p], no_lanes(), no_lanes()
-        head, tail = row[:end], row[end:]
-        for j in range(0, end, 8):
-            values = some_lanes(head, j)
-            near = plus_product(near, values, values)
-        for j in range(0, n - end, 8):
-            values = some_lanes(tail, j)
-            far = plus_product(far, values, values)
-        if any_nonzero(far):  # longer than the row before
-            end = n
-            while end > 0 and row[end - 1] == 0.0:
-                end -= 1
-            end = round_end(end, n)
-        norms[p], ends[p] = total(plus(near, 1.0, far)), end
-    for p in range(len(G)):
-        norm = math.sqrt(norms[p])
-        norms[p], scales[p] = norm, norm if norm > 0.0 else 1.0
-        undefined += norm * 0.0
-    return undefined == 0.0
 
 
 @woven

@@ -19,7 +19,7 @@ from gpmpc.qp.workspace import TOLERANCE, lazy_workspace
 Array = NDArray[np.float64]
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what is not finite does not convince
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite does not convince
 def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, settings: Array) -> Array:
     """The first convincing record; the one with the smallest residuals, as ``NUMERICAL_TROUBLE``, if none convinces."""
     lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)

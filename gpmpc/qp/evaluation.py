@@ -11,7 +11,21 @@ from gpmpc.compiled import woven
 from gpmpc.qp.factor import backward_solve, dot, forward_solve, four_dots, multiply, subtract_rows
 from gpmpc.qp.hessian import solve_lower, solve_transposed
 from gpmpc.qp.lanes import any_nonzero, combine, lanes, larger, largest, less, no_lanes, plus, put, some_lanes, total
-from gpmpc.qp.working_set import BOUND, END, LEAST, MOST, NAME, PLACE, SCRATCH, SOFTNESS, couple
+from gpmpc.qp.working_set import (
+    BOUND,
+    CAP,
+    END,
+    LEAST,
+    LOWER,
+    MOST,
+    NAME,
+    NORM,
+    PLACE,
+    SCRATCH,
+    SOFTNESS,
+    UPPER,
+    couple,
+)
 from gpmpc.qp.workspace import padded
 
 UNDEFINED = 1e300  # a residual that overflowed; less than infinity, so that refinement is tried
@@ -155,10 +169,23 @@ def residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, 
         active[i] = y[p] - traits[SOFTNESS, p] * mu[p] - b
         infeasibility = max(infeasibility, abs(active[i]) / max(1.0, abs(b)))
         gap += mu[p] * active[i]
-    gap, slope_along = abs(gap), abs(dot(q, y, n))
+    gap, slope_along = abs(gap - dot(gradient, y, n)), abs(dot(q, y, n))
     if not gap + slope_along < np.inf:
         return UNDEFINED
     return max(max(stationarity / size, infeasibility), gap / max(1.0, slope_along))
+
+
+@woven
+def worst_violation(y, mu, traits, bounds):
+    """The largest violation, beyond what multipliers pay for, scaled as ``Residuals.primal``."""
+    worst, size = 0.0, 1.0
+    for value in y:
+        size = max(size, abs(value))
+    for p in range(len(y)):
+        if abs(mu[p]) < traits[CAP, p]:
+            outside = max(y[p] - bounds[UPPER, p], bounds[LOWER, p] - y[p])
+            worst = max(worst, (outside - traits[SOFTNESS, p] * abs(mu[p])) / max(size, traits[NORM, p]))
+    return worst
 
 
 @woven

@@ -15,6 +15,7 @@ from gpmpc.qp.workspace import aligned, padded
 Array = NDArray[np.float64]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen in each solve
 def gram_system(terms: Terms) -> tuple[Array, Array]:
     """The array for ``gpmpc.qp.dual_kernels.solve_gram``, and the traits (5, M) of ``gpmpc.qp.working_set``."""
     P, G, softness = terms
@@ -36,4 +37,6 @@ def gram_system(terms: Terms) -> tuple[Array, Array]:
         end = start + rows * padded(columns)
         system[start:end].reshape(rows, padded(columns))[:, :columns] = block
         start = end
+    if not (np.isfinite(K).all() and np.isfinite(traits[0]).all()):
+        system[:] = np.nan  # else a row of infinite norm would count as kept: every solve is to fail, and to be rescued
     return system, traits

@@ -33,6 +33,8 @@ def as_float_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array
         array = np.require(value, np.float64, ["C", "A", "W"])
     except (TypeError, ValueError) as error:
         raise ProblemError(f"{name} must be an array of real numbers; got {value!r}") from error
+    if array.size and array.strides != np.empty(array.shape).strides:  # an axis of length 1 may have any, for NumPy
+        array = array.copy()
     if array.shape != shape:
         raise ProblemError(f"{name} must have shape {shape}; got {array.shape}")
     if np.isnan(array).any():

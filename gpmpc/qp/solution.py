@@ -31,10 +31,11 @@ class Residuals(NamedTuple):
 
     Attributes:
         primal: The largest violation of a hard constraint, or of a soft one beyond what its multiplier pays for;
-            scaled by max(1, |x|, |Gx|) (largest entries).
+            scaled by max(1, |x|, |Gx|, |g|) (largest entries), g its own row: round-off of a value grows with it.
         dual: The largest entry of P x + q + G'z + z_box, or multiplier of an absent bound or beyond its weight; scaled
             by max(1, |Px|, |q|, |G'z|) (largest entries).
-        gap: |primal - dual objective|, scaled by max(1, |x'Px|, |q'x|, |sum of multipliers times bounds|).
+        gap: |primal - dual objective|, what ``primal`` counts as violated left out,
+            scaled by max(1, |x'Px|, |q'x|, |sum of multipliers times bounds|).
     """
 
     primal: float
@@ -120,15 +121,16 @@ class QPSolution(NamedTuple):
 
         violation = self._violation(rows)
         beyond = np.maximum(0.0, violation - np.where(sizes >= caps, np.inf, softness * sizes))
-        primal = beyond.max() / max(1.0, _size(x), _size(rows))
+        own = np.concatenate([np.ones(len(x)), np.abs(G).max(axis=1, initial=0.0)])
+        primal = (beyond / np.maximum(max(1.0, _size(x), _size(rows)), own)).max()
 
         absent = (up & (self.upper >= ABSENT)) | (down & (self.lower <= -ABSENT))
         stray = np.where(absent, sizes, np.maximum(0.0, sizes - caps))
         dual = max(_size(slope + q + pull + self.z_box), _size(stray)) / max(1.0, _size(slope), _size(q), _size(pull))
 
         support = multipliers[up] @ self.upper[up] + multipliers[down] @ self.lower[down]
-        paying = softness > 0.0  # the squares of others may overflow
-        soft = self._price(violation) + 0.5 * np.sum(softness[paying] * multipliers[paying] ** 2)
+        paying, capped = softness > 0.0, (sizes >= caps) & np.isfinite(caps)  # the squares of others may overflow
+        soft = softness[paying] @ multipliers[paying] ** 2 + caps[capped] @ violation[capped]
         curvature, gain = x @ slope, q @ x
         gap = abs(curvature + gain + support + soft) / max(1.0, abs(curvature), abs(gain), abs(support))
         return Residuals(float(primal), float(dual), float(gap))
@@ -139,7 +141,9 @@ class QPSolution(NamedTuple):
 
     def _violation(self, rows: Array) -> Array:
         values = np.concatenate([self.x, rows])
-        return np.maximum(0.0, np.maximum(values - self.upper, self.lower - values))
+        above = np.where(self.upper < ABSENT, values - self.upper, 0.0)
+        below = np.where(self.lower > -ABSENT, self.lower - values, 0.0)
+        return np.maximum(0.0, np.maximum(above, below))
 
     def _price(self, violation: Array) -> float:
         softness, caps = self.terms.softness

@@ -18,11 +18,15 @@ A *row* represents a constraint in the metric of P^-1, K_pq = row_p . row_q or s
 p is K_p, known beforehand; in lazy mode, P = L'L, it is w_p = L^-T c_p, made when p enters, and as short as c_p.
 """
 
+import math
+
 import numpy as np
 
 from gpmpc.compiled import woven
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, multiply_at, remove_row
 from gpmpc.qp.hessian import make_row, make_rows
+from gpmpc.qp.lanes import any_nonzero, no_lanes, plus, plus_product, some_lanes, total
+from gpmpc.qp.workspace import round_end
 
 LOWER, UPPER, SLACK, LOW_WATCH, HIGH_WATCH = 0, 1, 2, 3, 4  # rows of ``bounds``
 BOUND, FREE_VALUE, LEAST, MOST = 0, 1, 2, 3  # rows of ``slots``
@@ -186,3 +190,38 @@ def settle(k, bounds, mu, slots, members, R, scratch):
     for i in range(k):
         mu[abs(members[NAME, i]) - 1] = trial[i]
     return k
+
+
+@woven
+def clip_multipliers(k, mu, slots, members):
+    """Puts the multipliers of the working set back into their ranges."""
+    for i in range(k):
+        p = abs(members[NAME, i]) - 1
+        mu[p] = min(max(mu[p], slots[LEAST, i]), slots[MOST, i])
+
+
+@woven
+def measure(G, n, traits):
+    """Writes the norms, scales and ends of the rows of G; False if G is not finite."""
+    norms, scales, ends = traits[NORM, n:], traits[SCALE, n:], traits[END, n:]
+    undefined, end = 0.0, 0
+    for p in range(len(G)):
+        row, near, far = G[p], no_lanes(), no_lanes()
+        head, tail = row[:end], row[end:]
+        for j in range(0, end, 8):
+            values = some_lanes(head, j)
+            near = plus_product(near, values, values)
+        for j in range(0, n - end, 8):
+            values = some_lanes(tail, j)
+            far = plus_product(far, values, values)
+        if any_nonzero(far):  # longer than the row before
+            end = n
+            while end > 0 and row[end - 1] == 0.0:
+                end -= 1
+            end = round_end(end, n)
+        norms[p], ends[p] = total(plus(near, 1.0, far)), end
+    for p in range(len(G)):
+        norm = math.sqrt(norms[p])
+        norms[p], scales[p] = norm, norm if norm > 0.0 else 1.0
+        undefined += norm * 0.0
+    return undefined == 0.0

@@ -26,6 +26,8 @@ def test_diagonals_and_matrices_mean_the_same():
         ({"terminal": [1.0]}, "terminal: must be a weight of 2 states; got 1"),
         ({"penalized": "rates"}, "penalized: must be 'inputs', 'deviations' or 'increments'; got 'rates'"),
         ({"input_lower": [2.0], "input_upper": [1.0]}, "must not cross; entry 0 has 2 above 1"),
+        ({"input_lower": [math.inf]}, "input_lower: no number keeps it"),
+        ({"rate_upper": [-1e20]}, "rate_upper: no number keeps it"),
         ({"rate_upper": [1.0, 2.0]}, "rate_upper: must be a list of 1 numbers"),
         ({"state_bounds": StateBounds([0.0], [1.0])}, "state_bounds: must bound 2 states; got 1"),
     ],
@@ -39,6 +41,8 @@ def test_a_problem_that_makes_no_sense_is_refused(arguments, message):
     ("arguments", "message"),
     [
         ({"lower": [2.0]}, "must not cross"),
+        ({"lower": [math.inf], "upper": [math.inf]}, "lower: no number keeps it"),
+        ({"lower": [-math.inf], "upper": [-math.inf]}, "upper: no number keeps it"),
         ({"confidence": 0.5}, r"eta must lie in \(0.5, 1\); got 0.5"),
         ({"confidence": 1.0}, r"eta must lie in \(0.5, 1\); got 1.0"),
         ({"kappa": -1.0}, "kappa: must be a number, 0 or more"),

@@ -6,7 +6,8 @@ import torch
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Affine, GPPosterior, ResidualModel
-from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented
+from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, differentiate
+from tests.control.systems import linear_gaussian
 
 DETERMINISTIC = {
     "mean equivalence": MeanEquivalence,
@@ -127,6 +128,19 @@ def test_the_hessian_by_torch_is_the_one_in_closed_form():
     closed, by_torch = (Linearization(hessian=True)(each, at, u) for each in (model, Opaque()))
     assert torch.allclose(closed.mean, by_torch.mean, atol=1e-12)
     assert torch.allclose(closed.covariance, by_torch.covariance, atol=1e-12)
+
+
+def test_a_model_of_ones_own_that_is_linear_has_no_second_order_terms():
+    """Its Jacobian is a constant, through which torch cannot differentiate."""
+    model, at, u = linear_gaussian(), belief(), torch.tensor([0.7])
+    first, second = (Linearization(hessian=hessian) for hessian in (False, True))
+    assert torch.equal(first(model, at, u).covariance, second(model, at, u).covariance)
+    for ours, theirs in zip(
+        vars(differentiate(first, model, at, u)[1]).values(),
+        vars(differentiate(second, model, at, u)[1]).values(),
+        strict=True,
+    ):
+        assert torch.equal(ours, theirs)
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gpmpc.compiled
-from gpmpc.qp import DualActiveSet
+from gpmpc.qp import DualActiveSet, QuadraticProgram
 from tests.qp.problems import feasible_problem, worst_residual
 
 ODD = {
@@ -45,6 +45,19 @@ def test_an_odd_array_is_read_as_what_it_is(odd, position, rng):
         if expected.status.solved:
             assert worst_residual(solution) < 1e-9
             np.testing.assert_allclose(solution.x, expected.x, atol=1e-9 * max(1.0, np.abs(expected.x).max()))
+
+
+def test_an_axis_of_length_one_may_have_any_stride():
+    """NumPy calls such arrays contiguous whatever their strides; the solve then ended in memory never written to."""
+    wide, rows = np.arange(1.0, 10.0).reshape(3, 3), np.array([[1.0, 2.0]])
+    one = QuadraticProgram(wide[:1, :1], [-3.0], rows.T, [-9.0, -9.0], [1.0, 1.0])
+    several = QuadraticProgram(np.eye(2), [-3.0, 0.0], np.ones((4, 2))[::2][:1], [-9.0], [1.0])
+    for problem, x in ((one, [0.5]), (several, [2.0, -1.0])):
+        for array in (problem.P, problem.G):
+            assert array.strides == np.empty(array.shape).strides
+        solution = DualActiveSet().solve_stacked(problem.P, problem.q, problem.G, problem.lower, problem.upper)
+        np.testing.assert_allclose(solution.x, x)
+        assert solution.iterations <= 3
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.int64, np.uint64, "datetime64[s]"])

@@ -1,0 +1,55 @@
+"""Rows that are all but dependent, bounds that contradict each other by a hair: ``SOLVED`` is to be true there too."""
+
+import numpy as np
+import pytest
+
+from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
+from gpmpc.status import Status
+
+
+def near_dependent_problem(rng, feasible=True):
+    """Rows that repeat a few others up to 2^-10 .. 2^-50, with bounds met by a point; or missed by a hair."""
+    n, m = int(rng.integers(2, 10)), int(rng.integers(4, 20))
+    root = rng.integers(-16, 17, (n, n)) / 8.0
+    base = rng.integers(-16, 17, (max(1, m // 4), n)) / 8.0
+    G = base[rng.integers(0, len(base), m)] * np.exp2(rng.integers(-3, 4, m))[:, None]
+    G += 2.0 ** -int(rng.integers(10, 50)) * rng.integers(-3, 4, (m, n)) * (rng.random((m, 1)) < 0.5)
+    P, q = root @ root.T + 10.0 ** rng.integers(-6, 3) * np.eye(n), rng.integers(-160, 161, n) / 16.0
+    values = np.vstack([np.eye(n), G]) @ (rng.integers(-32, 33, n) / 16.0)
+    lower, upper = values - rng.integers(0, 3, n + m), values + rng.integers(0, 3, n + m)
+    if not feasible:
+        G[1], lower[n], upper[n], upper[n + 1] = -G[0], -np.inf, values[n], np.inf
+        lower[n + 1] = -values[n] + 10.0 ** rng.uniform(-13, -5)
+    lower[rng.random(n + m) < 0.3] = -np.inf
+    return QuadraticProgram.from_stacked(P, q, G, lower, upper)
+
+
+@pytest.mark.parametrize("kind", ["hard", "linear", "quadratic"])
+@pytest.mark.parametrize("feasible", [True, False])
+@pytest.mark.parametrize("mode", ["gram", "lazy"])
+def test_what_is_called_solved_is_optimal_and_what_is_called_infeasible_is(mode, feasible, kind, rng):
+    solver, solved = DualActiveSet(), 0
+    for _ in range(250):
+        problem = near_dependent_problem(rng, feasible)
+        prices = 10.0 ** rng.uniform(-3, 10, len(problem.G))
+        soft = None if kind == "hard" else SoftRows(**{kind: prices})
+        if mode == "gram":
+            prepared = solver.prepare(problem.P, problem.G, soft)
+            solution = prepared.solve(problem.q, problem.lower, problem.upper)
+        else:
+            solution = solver.solve(problem, None, soft)
+        if solution.status is Status.SOLVED:
+            assert solution.is_optimal(1e-9), solution.residuals()
+            assert np.isfinite(solution.x).all()
+            solved += 1
+        elif feasible:
+            assert solution.status is not Status.INFEASIBLE
+    assert solved > (200 if feasible or kind != "hard" else 20)
+
+
+def test_a_multiplier_on_the_way_to_a_contradiction_is_taken_back(rng):
+    """It had grown to 2.6e10 before the row was found to contradict others by 1e-9, and was handed out."""
+    for _ in range(500):
+        solution = DualActiveSet().solve(near_dependent_problem(rng))
+        working = solution.active_set != 0
+        assert (solution.multipliers[~working] == 0.0).all() or not solution.status.solved
