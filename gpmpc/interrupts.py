@@ -1,4 +1,4 @@
-"""Problem: CasADi keeps a Ctrl-C during a solve to itself: IPOPT stops there, and whoever asked goes on with its iterate.
+"""Problem: CasADi keeps a Ctrl-C during a solve to itself: IPOPT stops, and whoever asked goes on with its iterate.
 
 A flight would be flown on with a failed solve, a measurement with a time that was cut short. So a solve is not
 interrupted: it ends, and then the interrupt is raised.

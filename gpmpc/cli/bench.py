@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 FIGURE_SIZE, FIGURE_HORIZON = 189, 10  # of the figure, where they were measured
 ASIDE = ("folder", "compare")  # settings that no figure depends on
-WIDTH = 26  # of a group's name beside a bar; some are sentences
+WIDTH = 36  # of a group's name beside a bar; some are sentences
 
 
 def bench(config: DictConfig) -> None:
