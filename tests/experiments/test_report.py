@@ -113,6 +113,37 @@ def test_a_run_that_cannot_be_read_is_named_and_the_others_are_reported(tree):
         assert str(old) in written[name]
 
 
+@pytest.mark.parametrize("planned", [True, False])
+def test_a_run_that_cannot_be_read_is_not_missing_and_no_command_flies_over_it(planned, tmp_path):
+    for controller in ("convex", "lqr"):
+        for seed in range(4):
+            if (controller, seed) != ("lqr", 3):
+                add(tmp_path, controller, seed, 0.1)
+    if planned:
+        plan(tmp_path, [chosen(controller, seed)[0] for controller in ("convex", "lqr") for seed in range(4)])
+    (tmp_path / folder_name(chosen("lqr", 1)[0]) / METRICS).write_text('{"choices": ')
+    found = report(tmp_path)
+    convex, lqr = found.cells
+    assert (convex.skipped, convex.missing) == ((), ())
+    assert (list(lqr.runs), lqr.skipped, lqr.missing) == (["0", "2"], ("1",), ("3",))
+    assert found.commands() == [f"gpmpc run -m controller=lqr seed=3 folder={tmp_path}"]
+    written = documents(found)
+    assert "6 finished in 2 cells, 0 failed, 1 missing, 1 skipped" in written["report.md"]
+    assert "2, 1 missing, 1 skipped" in written["report.md"]
+    assert "2<small>1 missing</small><small>1 skipped</small>" in written["report.html"]
+    assert list(csv.DictReader(io.StringIO(written["report.csv"])))[1]["skipped"] == "1"
+
+
+def test_a_folder_that_belongs_to_no_cell_fills_none(tmp_path):
+    for controller, seed in (("lqr", 0), ("lqr", 1), ("convex", 1)):
+        add(tmp_path, controller, seed, 0.1)
+    for name in ("elsewhere", "controller=convex,horizon=3,seed=0"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / METRICS).write_text("")
+    convex, _ = report(tmp_path).cells
+    assert (convex.missing, convex.skipped) == (("0",), ())
+
+
 def test_a_line_of_the_latex_table_never_begins_with_a_bracket(tmp_path):
     for steps in ("[1,2]", "[1]"):
         choices, settings = chosen("lqr", 0, steps=steps)
