@@ -171,6 +171,31 @@ def test_pairs_show_what_means_alone_do_not(tree):
         assert word in text
 
 
+def test_every_seed_is_an_average_over_the_same_and_what_is_left_out_is_named(tmp_path):
+    def fly(controller, horizon, seed):
+        choices = [f"controller={controller}", f"horizon={horizon}", f"seed={seed}"]
+        settings = SETTINGS | {"seed": seed, "horizon": horizon, "options": {"controller": controller}}
+        made_up_run(tmp_path, choices, settings, result=metrics_of(0.1 * horizon + 0.01 * (controller == "lqr")))
+
+    for seed in range(8):
+        for controller in ("lqr", "convex"):
+            for horizon in (1, 5):
+                if (controller, horizon, seed) != ("lqr", 5, 7):
+                    fly(controller, horizon, seed)
+        fly("convex", 10, seed)  # lqr has but one of them
+    fly("lqr", 10, 0)
+    found = report(tmp_path)
+    rmse = compare(found, "controller=lqr", "controller=convex")[0]
+    assert rmse.left_out == ("horizon=10", "seed=7")
+    assert rmse.pairs == 7
+    assert rmse.means == pytest.approx((0.31, 0.3))  # of the horizons 1 and 5 for every seed
+    assert "lacks runs of it: horizon=10; seed=7." in sentences(found, [rmse], "a", "b")[0]
+    assert compare(found, "horizon=1", "horizon=5")[0].left_out == ("seed=7",)
+    alone = compare(found, "controller=convex,horizon=1", "controller=convex,horizon=5")[0]
+    assert alone.left_out == ()
+    assert "Left out" not in sentences(found, [alone], "a", "b")[0]
+
+
 def test_errors_of_both_subsystems_keep_their_units_and_are_not_averaged_together(tmp_path):
     for seed in range(6):
         for subsystem, unit in (("translational", "m"), ("rotational", "rad")):
