@@ -2,6 +2,8 @@
 
 One measurement is one JSON document: where (machine, versions, commit), how (settings) and the rows, plain dictionaries
 that all have ``part``, ``what`` and ``median`` [ms]. Markdown and figures are made from it, and ratios of two of them.
+One that is incomplete has ``incomplete``, how many groups of every part there are and are measured; everything that is
+made from it says so.
 """
 
 import json
@@ -35,10 +37,37 @@ RESULTS = (
 )
 
 
-def write_json(rows: Sequence[Row], machine: Mapping, settings: Mapping, provenance: Mapping) -> str:
-    """The document itself."""
-    meta = {"machine": machine, "settings": settings, "provenance": provenance}
-    return json.dumps({"gpmpc bench": 1, **meta, "rows": rows}, indent=1, allow_nan=True) + "\n"
+def document(
+    rows: Sequence[Row],
+    groups: Mapping[str, tuple[int, int]],
+    sittings: Sequence[Mapping],
+    settings: Mapping,
+    provenance: Mapping,
+) -> dict:
+    """The document itself, as plain data.
+
+    Args:
+        rows: What was measured.
+        groups: Of every part: how many are measured, and how many there are.
+        sittings: Of ``gpmpc.bench.groups.Kept``, with their ``machine``; the document's own is that of the first one.
+        settings: How it was measured.
+        provenance: Who measured.
+    """
+    missing = any(measured < planned for measured, planned in groups.values())
+    return {
+        "gpmpc bench": 1,
+        **({"incomplete": {part: list(counts) for part, counts in groups.items()}} if missing else {}),
+        "machine": sittings[0]["machine"],
+        "settings": settings,
+        "provenance": provenance,
+        "sittings": list(sittings),
+        "rows": list(rows),
+    }
+
+
+def as_json(document: Mapping) -> str:
+    """The document as it is kept."""
+    return json.dumps(document, indent=1, allow_nan=True) + "\n"
 
 
 def read_json(path: str | Path) -> dict:
@@ -68,9 +97,24 @@ def described(machine: Mapping) -> str:
     )
 
 
-def markdown(rows: Sequence[Row], machine: Mapping) -> str:
+def missing(document: Mapping) -> str:
+    """How much of an incomplete measurement there is; empty where it is complete."""
+    if "incomplete" not in document:
+        return ""
+    counts = ", ".join(f"{part} {measured} of {there}" for part, (measured, there) in document["incomplete"].items())
+    return f"incomplete, groups measured: {counts}"
+
+
+def markdown(document: Mapping) -> str:
     """The document for people."""
-    sections = [f"# What it costs\n\n{described(machine)}.", TIMES]
+    rows, sittings = document["rows"], document["sittings"]
+    sections = [f"# What it costs\n\n{described(document['machine'])}."]
+    if lacking := missing(document):
+        sections.append(f"**{lacking.capitalize()}.**")
+    if len(sittings) > 1:
+        told = [f"{sitting['groups']} groups from {sitting['created']} on" for sitting in sittings]
+        sections.append(f"Measured in {len(sittings)} sittings: {', '.join(told)}.")
+    sections.append(TIMES)
     steps = [row for row in rows if row["part"] in ("linearisation", "step")]
     if steps:
         sections += ["## Control steps\n\nMilliseconds, median (99 %).", steps_markdown(steps)]
@@ -162,9 +206,12 @@ def compared(old: Mapping, new: Mapping) -> list[dict]:
 def compared_markdown(old: Mapping, new: Mapping) -> str:
     """The same as a document, the medians of the ratios of every part first."""
     rows = compared(old, new)
+    both = {"old": old, "new": new}
+    lacking = [f"{name} is {missing(one)}" for name, one in both.items() if missing(one)]
     if not rows:
-        raise DataError("the two measurements have no row in common")
-    lines = [f"old: {described(old['machine'])}", f"new: {described(new['machine'])}", ""]
+        raise DataError("; ".join(["the two measurements have no row in common", *lacking]))
+    lines = [f"{name}: {described(one['machine'])}" for name, one in both.items()]
+    lines += [*(f"{line}; rows that only one of the two has are left out" for line in lacking), ""]
     for part in dict.fromkeys(row["part"] for row in rows):
         ratios = np.array([row["ratio"] for row in rows if row["part"] == part])
         middle, low, high = np.quantile(ratios, [0.5, 0.05, 0.95])

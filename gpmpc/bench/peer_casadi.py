@@ -18,6 +18,7 @@ from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.casadi_ import casadi_function
+from gpmpc.interrupts import interrupts_after
 
 Array = np.ndarray
 
@@ -117,15 +118,16 @@ class CasadiIpopt:
                 "lam_x0": np.concatenate([_shifted(bounds_x, n), _shifted(bounds_u, m)]),
                 "lam_g0": _shifted(last.of_steps, n),
             }
-        found = self._solver(
-            x0=start,
-            p=np.concatenate([question.state, question.last, question.targets.ravel()]),
-            lbx=self._lower,
-            ubx=self._upper,
-            lbg=0.0,
-            ubg=0.0,
-            **multipliers,
-        )
+        with interrupts_after():
+            found = self._solver(
+                x0=start,
+                p=np.concatenate([question.state, question.last, question.targets.ravel()]),
+                lbx=self._lower,
+                ubx=self._upper,
+                lbg=0.0,
+                ubg=0.0,
+                **multipliers,
+            )
         x, of_bounds, of_steps = (np.array(found[key]).ravel() for key in ("x", "lam_x", "lam_g"))
         return Answer(x[H * n :].reshape(H, m), x[: H * n].reshape(H, n), of_bounds, of_steps)
 

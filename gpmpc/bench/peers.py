@@ -13,14 +13,17 @@ one another:
 * ``linearisation``: one prediction with derivatives, compiled and by automatic differentiation.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, lru_cache, partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
 import torch
 
 from gpmpc.bench import peer_daqp, peer_do_mpc
+from gpmpc.bench.groups import Group
 from gpmpc.bench.linearisations import linearisation_groups
 from gpmpc.bench.mean_alone import MeanAlone
 from gpmpc.bench.optimality import Question, kkt_residual
@@ -150,6 +153,9 @@ def one_program(gp: GPPosterior, problem: TrackingProblem, horizon: int) -> list
     return groups
 
 
+KINDS = {"one program": one_program, "converged": converged}  # of which there are two groups each
+
+
 @dataclass(frozen=True)
 class Comparison:
     """How much of a comparison.
@@ -172,35 +178,48 @@ class Comparison:
             check_number("horizons", horizon, least=1, whole=True)
         check_number("seconds", self.seconds, above=0, unit="[s]")
 
-    def __len__(self) -> int:
-        """Groups of contenders: two of either kind at every horizon, and the linearisations."""
-        return 4 * len(self.horizons) + 1
+    def groups(self) -> list[Group]:
+        """Of contenders: two of either kind at every horizon, and the linearisations.
+
+        A group's record is its rows. A row has ``part``, ``kind``, ``what``, ``H`` (None for ``linearisation``), the
+        summary of its ``Times`` [ms], and ``ratio``, the median over ours of the same turns. Plans have the common
+        residual, ``kkt`` (median) and ``kkt_worst``; converged ones ``tolerance``, and ``within``, the share of them
+        that is. Where ours is there twice, the first comes after a contender that has emptied the caches, the second
+        right after the first, and ``ratio_warm`` is the one over that. What is not installed has a ``note`` instead of
+        all that.
+        """
+        task, model = peers_problem(), cache(lambda: trained(TRAJECTORY))
+        asked = lru_cache(maxsize=1)(lambda horizon: questions_of_a_flight(model(), task, horizon, STEPS))
+
+        def measured(horizon: int, kind: str, number: int) -> list[dict]:
+            group = KINDS[kind](model(), task, horizon)[number]
+            patience = self.seconds, FEW if kind == "converged" and number else 2 * FEW
+            return _measured(kind, group, model(), task, horizon, asked(horizon), patience)
+
+        found = [
+            Group(f"H={horizon} {kind} {number + 1} of 2", partial(measured, horizon, kind, number))
+            for horizon in dict.fromkeys(self.horizons)
+            for kind in KINDS
+            for number in range(2)
+        ]
+        last = self.horizons[-1]
+        return [*found, Group("linearisations", lambda: _linearisations(model(), asked(last), self.seconds))]
+
+    def rows(self, records: Sequence[list[dict]]) -> list[dict]:
+        """Those of every group that is measured."""
+        return list(chain.from_iterable(records))
 
 
-def measure_peers(comparison: Comparison) -> Iterator[list[dict]]:
-    """Times of ours and theirs: yields the rows of every group of contenders, ``len(comparison)`` of them.
-
-    A row has ``part``, ``kind``, ``what``, ``H`` (None for ``linearisation``), the summary of its ``Times`` [ms],
-    and ``ratio``, the median over ours of the same turns. Plans have the common residual, ``kkt`` (median) and
-    ``kkt_worst``; converged ones ``tolerance``, and ``within``, the share of them that is. Where ours is there twice,
-    the first comes after a contender that has emptied the caches, the second right after the first, and ``ratio_warm``
-    is the one over that. What is not installed has a ``note`` instead of all that.
-    """
-    gp, task = trained(TRAJECTORY), peers_problem()
-    for horizon in comparison.horizons:
-        questions = questions_of_a_flight(gp, task, horizon, STEPS)
-        for kind, groups in (("one program", one_program), ("converged", converged)):
-            for number, group in enumerate(groups(gp, task, horizon)):
-                least = FEW if kind == "converged" and number else 2 * FEW
-                yield _measured(kind, group, gp, task, horizon, questions, (comparison.seconds, least))
+def _linearisations(gp: GPPosterior, questions: Sequence[Question], seconds: float) -> list[dict]:
+    """The rows of one prediction with derivatives, in the middle of a flight."""
     at = Gaussian(questions[len(questions) // 2].belief.mean, STD**2 * torch.eye(gp.state_dim, dtype=torch.float64))
     rows = []
     for group in linearisation_groups(gp, at, torch.tensor(HOVER, dtype=torch.float64), reverse_mode=True):
-        times = take_turns(group, comparison.seconds, least=FEW)
+        times = take_turns(group, seconds, least=FEW)
         ours = next(iter(times.values()))
         common = {"part": "peers", "kind": "linearisation", "H": None}
         rows += [common | {"what": name, **t.summary(), "ratio": t.over(ours)} for name, t in times.items()]
-    yield rows
+    return rows
 
 
 def _measured(

@@ -15,14 +15,15 @@ loaded at a first call is spent before.
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from dataclasses import field as default
-from itertools import product
+from functools import cache, partial
+from itertools import chain, product
 
 import numpy as np
 
 from gpmpc.bench.contenders import TRUTH, Contender
+from gpmpc.bench.groups import Group
 from gpmpc.bench.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
 from gpmpc.control.controller import Controller, Decision, Reference
 from gpmpc.control.tracking import TrackingProblem
@@ -72,52 +73,53 @@ class Field:
         return Contender(TRUTH.name, TRUTH.words, max(contender.horizon for contender in self.contenders))
 
     @property
-    def rounds(self) -> list[tuple[int, str, Contender]]:
-        """Seed, trajectory and contender of every flight, in their order: contenders take turns."""
+    def _flights(self) -> list[tuple[int, str, Contender]]:
+        """Seed, trajectory and contender, in their order: contenders take turns."""
         everyone = list(dict.fromkeys([self.truth, *self.contenders]))
-        return list(product(range(self.seeds), self.trajectories, everyone))
+        return list(product(range(self.seeds), dict.fromkeys(self.trajectories), everyone))
 
-    def __len__(self) -> int:
-        """Flights."""
-        return len(self.rounds)
+    def groups(self, models: Mapping[str, GPPosterior] | None = None) -> list[Group]:
+        """A flight each; ``lost`` says why one has no result.
 
+        Args:
+            models: What was learned, by trajectory; by default GPs of 189 transitions of a dithered flight.
+        """
+        model = cache(trained) if models is None else models.__getitem__
+        controller = cache(lambda trajectory, contender: contender.controller(model(trajectory)))
 
-def measure_quality(field: Field, models: Mapping[str, GPPosterior] | None = None) -> Iterator[list[dict]]:
-    """Flies all contenders and says what each one paid, in cost and in time.
-
-    Args:
-        field: Who flies.
-        models: What was learned, by trajectory; by default GPs of 189 transitions of a dithered flight.
-
-    Yields:
-        Nothing after every flight, ``len(field)`` times, and with the last one a row for every contender: ``what`` is
-        typed after ``gpmpc run``, with ``horizon=H``; ``median`` and ``p99`` of a decision [ms]; ``cost`` is the
-        geometric mean over the trajectories of its ratio to NMPC's on the same flights, ``cost ...`` by trajectory;
-        ``rmse ...`` [m]; ``failed`` counts solves; ``front`` says whether no other controller on a learned model is as
-        good, to 0.1 %, in less time or better in the same. Who lost a flight has none of these numbers, and ``lost``
-        says how.
-    """
-    if models is None:
-        models = {name: trained(name) for name in field.trajectories}
-    flown: dict[Contender, _Flown] = defaultdict(_Flown)
-    made: dict[tuple[str, Contender], Controller] = {}
-    rounds = field.rounds
-    for count, (seed, trajectory, contender) in enumerate(rounds, 1):
-        if flown[contender].lost is None:
+        def flown(seed: int, trajectory: str, contender: Contender) -> dict:
             try:
-                if (trajectory, contender) not in made:
-                    made[trajectory, contender] = contender.controller(models[trajectory])
-                flown[contender].add(*_flight(made[trajectory, contender], trajectory, field.steps, seed), trajectory)
+                return _paid(*_flight(controller(trajectory, contender), trajectory, self.steps, seed))
             except GpmpcError as error:
-                flown[contender].lost = f"{trajectory}, seed {seed}: {error}"
-        if count < len(rounds):
-            yield []
-    rows = [_row(contender, flown[contender], flown[field.truth], field.steps) for contender in field.contenders]
-    candidates = [row for row in rows if row["lost"] is None and row["family"] != TRUTH.name]
-    members = pareto_front([row["median"] for row in candidates], [row["cost"] for row in candidates], SAME)
-    for row, member in zip(candidates, members, strict=True):
-        row["front"] = member
-    yield rows
+                return {"lost": f"{trajectory}, seed {seed}: {error}"}
+
+        return [
+            Group(f"{name} seed {seed} H={who.horizon} {who.words}", partial(flown, seed, name, who))
+            for seed, name, who in self._flights
+        ]
+
+    def rows(self, records: Sequence[dict]) -> list[dict]:
+        """What each contender paid, in cost and in time; nothing before all have flown all flights.
+
+        Returns:
+            A row for every contender: ``what`` is typed after ``gpmpc run``, with ``horizon=H``; ``median`` and ``p99``
+            of a decision [ms]; ``cost`` is the geometric mean over the trajectories of its ratio to NMPC's on the same
+            flights, ``cost ...`` by trajectory; ``rmse ...`` [m]; ``failed`` counts solves; ``front`` says whether no
+            other controller on a learned model is as good, to 0.1 %, in less time or better in the same. Who lost a
+            flight has none of these numbers, and ``lost`` says how.
+        """
+        flights = self._flights
+        if len(records) < len(flights):
+            return []
+        flown: dict[Contender, dict[str, list[dict]]] = defaultdict(lambda: defaultdict(list))
+        for (_, trajectory, contender), record in zip(flights, records, strict=True):
+            flown[contender][trajectory].append(record)
+        rows = [_row(contender, flown[contender], flown[self.truth], self.steps) for contender in self.contenders]
+        candidates = [row for row in rows if row["lost"] is None and row["family"] != TRUTH.name]
+        members = pareto_front([row["median"] for row in candidates], [row["cost"] for row in candidates], SAME)
+        for row, member in zip(candidates, members, strict=True):
+            row["front"] = member
+        return rows
 
 
 def stage_cost(
@@ -155,25 +157,21 @@ def pareto_front(times: Sequence[float], costs: Sequence[float], least: float = 
     return members
 
 
-@dataclass
-class _Flown:
-    """What came of a contender's flights: costs by trajectory, seed by seed."""
+def _paid(rollout: Rollout, seconds: Sequence[float]) -> dict:
+    """What came of one flight.
 
-    costs: dict[str, list[float]] = default(default_factory=dict)
-    squares: dict[str, list[float]] = default(default_factory=dict)  # of the distance, a mean a flight [m^2]
-    seconds: list[float] = default(default_factory=list)
-    failed: int = 0
-    lost: str | None = None
-
-    def add(self, rollout: Rollout, seconds: Sequence[float], trajectory: str) -> None:
-        distance = np.linalg.norm((rollout.states - rollout.references)[:, ::2], axis=1)
-        if distance.max() > LOST:
-            raise GpmpcError(f"{LOST:g} m off its path after {int(np.argmax(distance > LOST))} steps")
-        cost = stage_cost(problem(), rollout.states, rollout.references, rollout.inputs, HOVER)
-        self.costs.setdefault(trajectory, []).append(cost)
-        self.squares.setdefault(trajectory, []).append(tracking_error(rollout.states, rollout.references).total ** 2)
-        self.seconds.extend(seconds)
-        self.failed += len(rollout.failures)
+    Raises:
+        GpmpcError: The vehicle has left its path.
+    """
+    distance = np.linalg.norm((rollout.states - rollout.references)[:, ::2], axis=1)
+    if distance.max() > LOST:
+        raise GpmpcError(f"{LOST:g} m off its path after {int(np.argmax(distance > LOST))} steps")
+    return {
+        "cost": stage_cost(problem(), rollout.states, rollout.references, rollout.inputs, HOVER),
+        "rmse": float(tracking_error(rollout.states, rollout.references).total),
+        "seconds": list(seconds),
+        "failed": len(rollout.failures),
+    }
 
 
 def _flight(controller: Controller, trajectory: str, steps: int, seed: int) -> tuple[Rollout, list[float]]:
@@ -204,15 +202,28 @@ class _Clocked:
         return decision
 
 
-def _row(contender: Contender, flown: _Flown, truth: _Flown, steps: int) -> dict:
+def _row(contender: Contender, flown: Mapping[str, list[dict]], truth: Mapping[str, list[dict]], steps: int) -> dict:
+    """Of records by trajectory."""
+    records = list(chain.from_iterable(flown.values()))
+    lost, astray = (
+        next((record["lost"] for record in chain.from_iterable(of.values()) if "lost" in record), None)
+        for of in (flown, truth)
+    )
+    lost = lost or (astray and f"nothing to compare with: NMPC on the true model, {astray}")
     row = {"part": "quality", "family": contender.family, "what": contender.words, "H": contender.horizon}
-    lost = flown.lost or (truth.lost and f"nothing to compare with: NMPC on the true model, {truth.lost}")
-    row |= {"flights": sum(map(len, flown.costs.values())), "steps": steps, "lost": lost, "front": False}
+    row |= {"flights": sum("lost" not in record for record in records), "steps": steps, "lost": lost, "front": False}
     if lost is not None:
         return row
-    costs = {name: sum(paid) / sum(truth.costs[name]) for name, paid in flown.costs.items()}
-    row |= {"median": 1e3 * float(np.median(flown.seconds)), "p99": 1e3 * float(np.quantile(flown.seconds, 0.99))}
+
+    def paid(of: Sequence[dict]) -> float:
+        return sum(record["cost"] for record in of)
+
+    costs = {name: paid(of) / paid(truth[name]) for name, of in flown.items()}
+    seconds = list(chain.from_iterable(record["seconds"] for record in records))
+    row |= {"median": 1e3 * float(np.median(seconds)), "p99": 1e3 * float(np.quantile(seconds, 0.99))}
     row |= {"cost": float(np.exp(np.mean(np.log(list(costs.values())))))}
     row |= {f"cost {name}": float(ratio) for name, ratio in costs.items()}
-    row |= {f"rmse {name}": float(np.sqrt(np.mean(squares))) for name, squares in flown.squares.items()}
-    return row | {"failed": flown.failed, "samples": len(flown.seconds)}
+    row |= {
+        f"rmse {name}": float(np.sqrt(np.mean([record["rmse"] ** 2 for record in of]))) for name, of in flown.items()
+    }
+    return row | {"failed": sum(record["failed"] for record in records), "samples": len(seconds)}

@@ -5,13 +5,15 @@ controller answers them in turns, warm-started from its own last answer, as in a
 ``solve`` are the medians of the decisions' own accounts (wall time); all other figures are processor time.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import cycle
+from functools import lru_cache, partial
+from itertools import chain, cycle, product
 
 import numpy as np
 import torch
 
+from gpmpc.bench.groups import Group
 from gpmpc.bench.pendulums import pendulum_gp, pendulum_plant, pendulum_references
 from gpmpc.bench.timing import Times, take_turns
 from gpmpc.control.controller import Controller, Decision, Reference, Timing
@@ -69,20 +71,27 @@ class Grid:
         check_number("seconds", self.seconds, above=0, unit="[s]")
         check_number("seed", self.seed, least=0, whole=True)
 
-    def __len__(self) -> int:
-        """Rounds of measurement: for every n and N one of the GPs alone, and one for every horizon."""
-        return len(self.states) * len(self.sizes) * (1 + len(self.horizons)) * len(self.caches)
+    def groups(self) -> list[Group]:
+        """For every n, N and cache one of the GPs alone, and one for every horizon."""
+        model = lru_cache(maxsize=1)(pendulum_gp)  # large ones are not kept until all are measured
 
+        def alone(n: int, size: int, cache: str) -> list[dict]:
+            return _linearisations(model(n, size, self.seed), cache, self)
 
-def measure_steps(grid: Grid) -> Iterator[list[dict]]:
-    """Measures round after round, ``len(grid)`` of them, and yields the rows of each."""
-    for n in grid.states:
-        for size in grid.sizes:
-            gp = pendulum_gp(n, size, grid.seed)
-            for cache in grid.caches:
-                yield _linearisations(gp, cache, grid)
-                for horizon in grid.horizons:
-                    yield _whole_steps(gp, horizon, cache, grid)
+        def stepping(n: int, size: int, cache: str, horizon: int) -> list[dict]:
+            return _whole_steps(model(n, size, self.seed), horizon, cache, self)
+
+        found = []
+        states, sizes, caches, horizons = map(dict.fromkeys, (self.states, self.sizes, self.caches, self.horizons))
+        for cell in product(states, sizes, caches):
+            name = "n={} N={} {}".format(*cell)
+            found.append(Group(f"{name} GPs alone", partial(alone, *cell)))
+            found += [Group(f"{name} H={horizon}", partial(stepping, *cell, horizon)) for horizon in horizons]
+        return found
+
+    def rows(self, records: Sequence[list[dict]]) -> list[dict]:
+        """Those of every group that is measured."""
+        return list(chain.from_iterable(records))
 
 
 def controllers(gp: GPPosterior, horizon: int) -> dict[str, Controller]:

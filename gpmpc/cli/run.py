@@ -228,19 +228,10 @@ def check_same(folder: "RunFolder", settings: dict[str, Any]) -> dict[str, Any]:
         SettingError: It was flown with other settings: those of a file have changed meanwhile.
         DataError: What is there is not what a run writes.
     """
+    from gpmpc.experiments.run_folder import difference
+
     result = folder.result()
-    differing = differences(result["settings"], settings)
-    if differing:
-        first = ", ".join(f"{key}: {then!r} then, {now!r} now" for key, then, now in differing[:3])
-        more = f", and {len(differing) - 3} more" if len(differing) > 3 else ""
-        reason = f"{folder.path} holds a finished run of other settings ({first}{more})"
+    if differs := difference(result["settings"], settings):
+        reason = f"{folder.path} holds a finished run of other settings ({differs})"
         raise SettingError("folder", f"{reason}; choose another folder, or remove that one to fly it again")
     return result
-
-
-def differences(then: Any, now: Any, key: str = "") -> list[tuple[str, Any, Any]]:
-    """Every leaf in which two settings differ."""
-    if isinstance(then, dict) and isinstance(now, dict):
-        keys = dict.fromkeys([*then, *now])
-        return [d for k in keys for d in differences(then.get(k), now.get(k), f"{key}.{k}" if key else k)]
-    return [] if then == now else [(key, then, now)]

@@ -19,6 +19,7 @@ from gpmpc.control.request import Request, check_controller
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
+from gpmpc.interrupts import interrupts_after
 from gpmpc.plants import Plant
 from gpmpc.status import Status
 
@@ -85,14 +86,15 @@ class NMPC:
         states = _rollout(self.plant, state, guess)
         unknowns = np.zeros(len(lower["x"]))
         unknowns[: H * (n + m)] = np.concatenate([states[1:].ravel(), guess.ravel()])
-        solution = self._solver(
-            x0=unknowns,
-            p=np.concatenate([state, request.last, request.targets.ravel(), request.wanted.ravel()]),
-            lbx=lower["x"],
-            ubx=upper["x"],
-            lbg=lower["g"],
-            ubg=upper["g"],
-        )
+        with interrupts_after():
+            solution = self._solver(
+                x0=unknowns,
+                p=np.concatenate([state, request.last, request.targets.ravel(), request.wanted.ravel()]),
+                lbx=lower["x"],
+                ubx=upper["x"],
+                lbg=lower["g"],
+                ubg=upper["g"],
+            )
         plan = np.array(solution["x"]).ravel()
         stats = self._solver.stats()
         means = np.vstack([state, plan[: H * n].reshape(H, n)])

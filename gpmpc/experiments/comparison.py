@@ -1,21 +1,23 @@
 """Problem: two groups of runs differ in their means, and it has to be said whether that is more than luck.
 
 Runs of one seed share their training rows and their noise, so they are compared in pairs: what else was varied is
-averaged within a seed first, and a seed counts once. Two paired tests are stated. The signed-rank test (Wilcoxon, 1945)
-decides: it asks only that the differences are spread symmetrically. Student's t-test beside it asks for normal ones.
-With fewer than six pairs nothing can make the first one significant at 5 %. Where the seed decides nothing (all rows,
-one start, no noise) its runs are copies of one, and no test may count them: a difference that never varies is
-undecided.
+averaged within a seed first, and a seed counts once. So that every seed is an average over the same, seeds and other
+settings of which one of the groups lacks runs are left out, and named. Two paired tests are stated. The signed-rank
+test (Wilcoxon, 1945) decides: it asks only that the differences are spread symmetrically. Student's t-test beside it
+asks for normal ones. With fewer than six pairs nothing can make the first one significant at 5 %. Where the seed
+decides nothing (all rows, one start, no noise) its runs are copies of one, and no test may count them: a difference
+that never varies is undecided.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.experiments.report import MEASURES, Cell, Report
+from gpmpc.experiments.report import MEASURES, SEED, Cell, Report, in_order
 
 LEVEL = 0.05
 FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
@@ -36,6 +38,7 @@ class Comparison:
             every pair differs in the same direction.
         standardised: Mean over standard deviation of the differences (Cohen's d_z).
         pairs: Their number, n.
+        left_out: Seeds and other settings that do not count, since A or B lacks runs of them.
     """
 
     measure: str
@@ -47,6 +50,7 @@ class Comparison:
     rank_biserial: float
     standardised: float
     pairs: int
+    left_out: tuple[str, ...] = ()
 
     @property
     def copies(self) -> bool:
@@ -84,13 +88,11 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
     comparisons = []
     for measure in report.measures():
         first, second = (_by_pair(report, group, measure) for group in groups)
-        common: dict[str, list[tuple[float, float]]] = {}
-        for (rest, seed), value in first.items():
-            if (rest, seed) in second:
-                common.setdefault(seed, []).append((value, second[rest, seed]))
-        if len(common) >= 2:
-            pairs = np.array([np.mean(values, axis=0) for values in common.values()])
-            comparisons.append(_tested(measure, pairs))
+        settings, seeds, left_out = _complete(first, second)
+        if len(seeds) >= 2:
+            values = np.array([[[side[rest, seed] for side in (first, second)] for rest in settings] for seed in seeds])
+            names = [name for name in report.variables if name not in groups[0]]
+            comparisons.append(replace(_tested(measure, values.mean(axis=1)), left_out=_named(left_out, names)))
     if not comparisons:
         raise DataError(f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common")
     return comparisons
@@ -120,6 +122,31 @@ def _by_pair(report: Report, group: Mapping[str, str], measure: str) -> dict[tup
             if value is not None:
                 found[rest, seed] = float(value)
     return found
+
+
+def _complete(first: Mapping[tuple, float], second: Mapping[tuple, float]) -> tuple[list, list, list]:
+    """Other settings and seeds of which both groups have every combination, and those that were left out for that.
+
+    Of what lacks a run, that is left out which lacks the largest share.
+    """
+    settings, seeds = (list(dict.fromkeys(key[i] for key in [*first, *second])) for i in (0, 1))
+    both = np.array([[(rest, seed) in first and (rest, seed) in second for seed in seeds] for rest in settings])
+    left_out = []
+    while not both.all():
+        lacking = (~both).mean(axis=1), (~both).mean(axis=0)
+        axis = int(lacking[1].max() >= lacking[0].max())
+        place = int(lacking[axis].argmax())
+        left_out.append((axis, (settings, seeds)[axis].pop(place)))
+        both = np.delete(both, place, axis)
+    return settings, seeds, left_out
+
+
+def _named(left_out: Sequence[tuple[int, Any]], names: Sequence[str]) -> tuple[str, ...]:
+    """In words, settings before seeds."""
+    settings = [value for axis, value in left_out if axis == 0]
+    seeds = sorted((value for axis, value in left_out if axis == 1), key=in_order)
+    told = [", ".join(f"{name}={v}" for name, v in zip(names, value, strict=True)) for value in settings]
+    return (*told, *(f"{SEED}={value}" for value in seeds))
 
 
 def _cells(report: Report, group: Mapping[str, str]) -> list[Cell]:
@@ -154,7 +181,12 @@ def _tested(measure: str, pairs: np.ndarray) -> Comparison:
 def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str) -> list[str]:
     """A line a measure, with everything that a reader needs to doubt it."""
     lines = [f"A: {a}; B: {b}; pairs are seeds, what else was varied is averaged within a seed."]
+    everywhere = set.intersection(*(set(c.left_out) for c in comparisons))
+    if everywhere:
+        told = "; ".join(name for name in comparisons[0].left_out if name in everywhere)
+        lines[0] += f" Left out, since A or B lacks runs of it: {told}."
     for c in comparisons:
+        others = "; ".join(name for name in c.left_out if name not in everywhere)
         low, high = c.interval
         tests = (
             ""
@@ -166,6 +198,6 @@ def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str)
         )
         lines.append(
             f"{report.label(c.measure)}: {c.verdict}. Mean {c.means[0]:.4g} against {c.means[1]:.4g}, difference "
-            f"{c.difference:.3g}{tests}; n = {c.pairs}"
+            f"{c.difference:.3g}{tests}; n = {c.pairs}" + (f"; left out as well: {others}" if others else "")
         )
     return lines

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gpmpc.exceptions import DataError
-from gpmpc.experiments.run_folder import ERROR, METRICS, PLAN
+from gpmpc.experiments.run_folder import ERROR, METRICS, PLAN, folder_name
 
 SEED = "seed"
 LARGEST_PRODUCT = 100_000  # combinations that are looked through for missing ones where there is no plan
@@ -66,6 +66,19 @@ class RunRecord:
 
 
 @dataclass(frozen=True)
+class Unread:
+    """A run that cannot be read.
+
+    Attributes:
+        folder: Where it is.
+        reason: Why it cannot, in one line.
+    """
+
+    folder: Path
+    reason: str
+
+
+@dataclass(frozen=True)
 class Cell:
     """All runs of one combination.
 
@@ -74,12 +87,14 @@ class Cell:
         runs: Those that finished, by seed.
         failed: Those that failed, by seed.
         missing: Seeds asked for of which there is nothing.
+        skipped: Seeds of which there is something that cannot be read.
     """
 
     values: tuple[str, ...]
     runs: Mapping[str, RunRecord]
     failed: Mapping[str, RunRecord]
     missing: tuple[str, ...]
+    skipped: tuple[str, ...] = ()
 
     def numbers(self, measure: str) -> list[float]:
         """One measure of all runs that have it, by seed."""
@@ -115,20 +130,23 @@ class Report:
         return MEASURES[measure].label.format(unit=" or ".join(sorted(units)) or "m")
 
     def commands(self) -> list[str]:
-        """What would fill the cells in which runs are missing or failed, one a cell."""
+        """What would fill the cells in which runs are missing or failed, one a cell.
+
+        Those that were skipped are not among them: a run is not flown over what lies in its folder.
+        """
         commands = []
         for cell in self.cells:
             seeds = sorted([*cell.missing, *cell.failed], key=in_order)
             if seeds:
                 chosen = [*self.constants.items(), *zip(self.variables, cell.values, strict=True)]
-                settings = [f"{key}={value}" if value else key for key, value in chosen if value != "default"]
+                settings = _spelled({key: value for key, value in chosen if value != "default"})
                 sweep = [f"{SEED}={','.join(seeds)}", f"folder={self.tree}"]
                 commands.append(shlex.join(["gpmpc", "run", "-m", *settings, *sweep]))
         return commands
 
 
-def read_runs(tree: str | Path) -> tuple[list[RunRecord], tuple[str, ...]]:
-    """Every run below a folder, finished or failed, and what could not be read, with the reason.
+def read_runs(tree: str | Path) -> tuple[list[RunRecord], list[Unread]]:
+    """Every run below a folder, finished or failed, and what could not be read.
 
     Raises:
         DataError: There is no such folder, or no run in it that can be read.
@@ -142,10 +160,10 @@ def read_runs(tree: str | Path) -> tuple[list[RunRecord], tuple[str, ...]]:
         try:
             found.append(_read(path))
         except DataError as error:
-            skipped.append(str(error))
+            skipped.append(Unread(path.parent, str(error)))
     if not found:
-        raise DataError(skipped[0] if skipped else f"{tree}: holds no run, finished or failed")
-    return found, tuple(skipped)
+        raise DataError(skipped[0].reason if skipped else f"{tree}: holds no run, finished or failed")
+    return found, skipped
 
 
 def report(tree: str | Path) -> Report:
@@ -176,20 +194,30 @@ def report(tree: str | Path) -> Report:
         axes = [values[key] for key in (*varied, SEED)]
         if np.prod([len(axis) for axis in axes], dtype=float) <= LARGEST_PRODUCT:
             expected = {(tuple(combination[:-1]), combination[-1]) for combination in product(*axes)}
+    named = {folder_name(_spelled(choices)): choices for choices in asked}
+    unread = [_choices(each.folder, named) for each in skipped]
+    unread = [_filled(choices, keys, runs[0].settings) for choices in unread if choices and set(choices) <= set(keys)]
+    there = {
+        (tuple(choices[key] for key in varied), choices[SEED])
+        for choices in unread
+        if all(choices[key] == value for key, value in constants.items())
+    }
     missing: dict[tuple[str, ...], list[str]] = {}
-    for key, seed in expected:
+    unreadable: dict[tuple[str, ...], list[str]] = {}
+    for key, seed in sorted(expected, key=lambda each: in_order(each[1])):
         done, failed = cells.setdefault(key, ({}, {}))
         if seed not in done and seed not in failed:
-            missing.setdefault(key, []).append(seed)
+            (unreadable if (key, seed) in there else missing).setdefault(key, []).append(seed)
     in_rows = sorted(cells, key=lambda values: [in_order(value) for value in values])
     return Report(
         tree,
         varied,
         {key: value for key, value in constants.items() if value != "default"},
         tuple(
-            Cell(key, *map(_by_seed, cells[key]), tuple(sorted(missing.get(key, []), key=in_order))) for key in in_rows
+            Cell(key, *map(_by_seed, cells[key]), *(tuple(seeds.get(key, ())) for seeds in (missing, unreadable)))
+            for key in in_rows
         ),
-        skipped,
+        tuple(each.reason for each in skipped),
     )
 
 
@@ -231,6 +259,18 @@ def _planned(tree: Path) -> list[dict[str, str]]:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DataError(f"{path}: is not what a sweep writes: {type(error).__name__}: {error}") from error
     return [{key: value for key, _, value in (choice.partition("=") for choice in plan)} for plan in planned]
+
+
+def _choices(folder: Path, planned: Mapping[str, Mapping[str, str]]) -> Mapping[str, str]:
+    """What was asked for of a run that cannot be read, by its folder's name; empty where that does not tell."""
+    if folder.name in planned:
+        return planned[folder.name]
+    choices = {key: value for key, _, value in (choice.partition("=") for choice in folder.name.split(","))}
+    return choices if folder_name(_spelled(choices)) == folder.name else {}
+
+
+def _spelled(choices: Mapping[str, str]) -> list[str]:
+    return [f"{key}={value}" if value else key for key, value in choices.items()]
 
 
 def _filled(choices: Mapping[str, str], keys: Sequence[str], settings: Mapping[str, Any]) -> dict[str, str]:

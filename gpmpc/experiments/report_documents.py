@@ -69,7 +69,7 @@ def documents(report: Report, comparison: Sequence[str] = ()) -> dict[str, str |
 
 def title(report: Report) -> str:
     """How much there is of it."""
-    finished, failed, missing = (sum(map(len, group)) for group in zip(*map(_counts, report.cells), strict=True))
+    finished, failed, missing, _ = (sum(map(len, group)) for group in zip(*map(_counts, report.cells), strict=True))
     text = f"{finished} finished in {len(report.cells)} cells, {failed} failed, {missing} missing"
     return f"{text}, {len(report.skipped)} skipped" if report.skipped else text
 
@@ -113,7 +113,7 @@ def comma_separated(report: Report) -> str:
     writer = csv.writer(buffer, lineterminator="\n")
     parts = ("mean", "q25", "median", "q75")
     measured = [f"{name}_{part} [{_unit(report, name)}]" for name in report.measures() for part in parts]
-    writer.writerow([*report.variables, "finished", "failed", "missing", *measured])
+    writer.writerow([*report.variables, "finished", "failed", "missing", "skipped", *measured])
     for cell in report.cells:
         numbers = [value for name in report.measures() for value in spread(cell.numbers(name)) or [""] * 4]
         writer.writerow([*cell.values, *(len(group) for group in _counts(cell)), *numbers])
@@ -242,12 +242,13 @@ def _named(report: Report, cell: Cell) -> Sequence[str]:
 
 
 def _counts(cell: Cell) -> tuple:
-    return cell.runs, cell.failed, cell.missing
+    return cell.runs, cell.failed, cell.missing, cell.skipped
 
 
 def _seeds(cell: Cell, separator: str = ", ") -> str:
     """How many finished, and where not all did, how many did not."""
-    notes = [f"{len(group)} {word}" for group, word in ((cell.failed, "failed"), (cell.missing, "missing")) if group]
+    named = {"failed": cell.failed, "missing": cell.missing, "skipped": cell.skipped}
+    notes = [f"{len(group)} {word}" for word, group in named.items() if group]
     return separator.join([str(len(cell.runs)), *notes])
 
 

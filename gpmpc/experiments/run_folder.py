@@ -137,3 +137,17 @@ def folder_name(choices: Sequence[str]) -> str:
         return name
     text = json.dumps(sorted(choices))
     return f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
+
+
+def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """In what two settings differ, in words: the first three of their leaves; empty where in nothing."""
+    differing = _differing(then, now)
+    first = ", ".join(f"{key}: {a!r} then, {b!r} now" for key, a, b in differing[:3])
+    return first + (f", and {len(differing) - 3} more" if len(differing) > 3 else "")
+
+
+def _differing(then: Any, now: Any, key: str = "") -> list[tuple[str, Any, Any]]:
+    if isinstance(then, Mapping) and isinstance(now, Mapping):
+        keys = dict.fromkeys([*then, *now])
+        return [d for k in keys for d in _differing(then.get(k), now.get(k), f"{key}.{k}" if key else k)]
+    return [] if then == now else [(key, then, now)]

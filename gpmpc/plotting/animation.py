@@ -70,8 +70,8 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
     )
     height.set_xlabel("time [s]")
     height.set_ylabel("height -z [m]")
-    flown = np.concatenate([run.states[:, [x, y]], run.references[:, [x, y]]])
-    low, high = flown.min(axis=0), flown.max(axis=0)
+    drawn = np.concatenate([run.states[:, [x, y]], run.references[:, [x, y]], _planned(run, x, y)])
+    low, high = drawn.min(axis=0), drawn.max(axis=0)
     span = 0.56 * max((high - low).max(), 1.0)
     above.set_xlim((low + high)[0] / 2 - span, (low + high)[0] / 2 + span)
     above.set_ylim((low + high)[1] / 2 - span, (low + high)[1] / 2 + span)
@@ -131,6 +131,12 @@ def _middle(run: "Run", k: int, x: int, y: int) -> np.ndarray:
     plan = run.plan_means[k][:, [x, y]]
     plan = plan[np.isfinite(plan).all(axis=1)]
     return (plan.min(axis=0) + plan.max(axis=0)) / 2 if len(plan) else run.states[k, [x, y]]
+
+
+def _planned(run: "Run", x: int, y: int) -> np.ndarray:
+    """Positions of all plans that solves ended with (k, 2): the last ones lead on from where the flight ends."""
+    positions = run.plan_means[~run.failed][:, :, [x, y]].reshape(-1, 2)
+    return positions[np.isfinite(positions).all(axis=1)]
 
 
 def _view(run: "Run", x: int, y: int) -> float:

@@ -49,5 +49,6 @@ def speed(rows: Sequence[Mapping], size: int, horizon: int) -> Figure:
         axes[0, column].set_title(f"n = {n}, m = {n // 2}")
     for axis in axes[:, 0]:
         axis.set_ylabel("ms a control step")
-    axes[0, 0].legend(frameon=False, fontsize=8)
+    named = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*named, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return figure

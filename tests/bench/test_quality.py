@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from gpmpc.bench.contenders import FAMILIES, TRUTH, Contender, contenders
 from gpmpc.bench.quadrotor import OUTER
-from gpmpc.bench.quality import Field, measure_quality, pareto_front, stage_cost
+from gpmpc.bench.quality import Field, pareto_front, stage_cost
 from gpmpc.cli.run import experiment_of
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
@@ -105,10 +106,11 @@ def rows():
     truth, astray = Contender(TRUTH.name, TRUTH.words, 2), Contender("astray", NEVER, 2)
     short = replace(CHEAP, horizon=1)
     field = Field([truth, CHEAP, short, astray], steps=12, seeds=2, trajectories=["elliptical"])
-    rounds = list(measure_quality(field, {"elliptical": model()}))
-    assert len(rounds) == len(field) == 8
-    assert not any(rounds[:-1])
-    return rounds[-1]
+    groups = field.groups({"elliptical": model()})
+    assert len({group.name for group in groups}) == len(groups) == 8
+    records = [json.loads(json.dumps(group.measure())) for group in groups]  # as they are kept
+    assert field.rows(records[:-1]) == []
+    return field.rows(records)
 
 
 def test_a_flight_gives_rows_of_finite_numbers_in_the_order_of_the_contenders(rows):

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from gpmpc.bench.pendulums import Pendulums, pendulum_gp, pendulum_plant, pendulum_references
-from gpmpc.bench.steps import Answering, Grid, controllers, measure_steps, recorded_questions
+from gpmpc.bench.steps import Answering, Grid, controllers, recorded_questions
 from gpmpc.exceptions import SettingError
 from gpmpc.plants.plant import step
 
@@ -33,9 +33,11 @@ def test_springs_pull_neighbours_together():
 
 def test_every_cell_has_a_row_for_everything_that_is_compared():
     grid = Grid([2], [5, 8], [1, 3], caches=["hot"], seconds=0.01)
-    rounds = list(measure_steps(grid))
-    assert len(rounds) == len(grid) == 6
-    rows = [row for found in rounds for row in found]
+    groups = grid.groups()
+    assert len({group.name for group in groups}) == len(groups) == 6
+    records = [group.measure() for group in groups]
+    rows = grid.rows(records)
+    assert grid.rows(records[:2]) == rows[:7]
     steps = {(row["what"], row["N"], row["H"]) for row in rows if row["part"] == "step"}
     assert steps == {(w, N, H) for w in ("paper's form", "zero order", "mean only") for N in (5, 8) for H in (1, 3)}
     assert len(rows) == 12 + 2 * 4
@@ -43,6 +45,10 @@ def test_every_cell_has_a_row_for_everything_that_is_compared():
         assert 0 < row["median"] <= row["p95"] <= row["p99"] <= row["max"]
         assert row["samples"] >= 10
         assert row.get("unsolved", 0) == 0
+
+
+def test_what_is_asked_for_twice_is_measured_once():
+    assert len(Grid([2, 2], [5, 8, 5], [1, 1], caches=["hot", "hot"]).groups()) == 4
 
 
 def test_an_answer_is_what_the_controller_decides_from_its_last_one():

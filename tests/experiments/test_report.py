@@ -113,6 +113,37 @@ def test_a_run_that_cannot_be_read_is_named_and_the_others_are_reported(tree):
         assert str(old) in written[name]
 
 
+@pytest.mark.parametrize("planned", [True, False])
+def test_a_run_that_cannot_be_read_is_not_missing_and_no_command_flies_over_it(planned, tmp_path):
+    for controller in ("convex", "lqr"):
+        for seed in range(4):
+            if (controller, seed) != ("lqr", 3):
+                add(tmp_path, controller, seed, 0.1)
+    if planned:
+        plan(tmp_path, [chosen(controller, seed)[0] for controller in ("convex", "lqr") for seed in range(4)])
+    (tmp_path / folder_name(chosen("lqr", 1)[0]) / METRICS).write_text('{"choices": ')
+    found = report(tmp_path)
+    convex, lqr = found.cells
+    assert (convex.skipped, convex.missing) == ((), ())
+    assert (list(lqr.runs), lqr.skipped, lqr.missing) == (["0", "2"], ("1",), ("3",))
+    assert found.commands() == [f"gpmpc run -m controller=lqr seed=3 folder={tmp_path}"]
+    written = documents(found)
+    assert "6 finished in 2 cells, 0 failed, 1 missing, 1 skipped" in written["report.md"]
+    assert "2, 1 missing, 1 skipped" in written["report.md"]
+    assert "2<small>1 missing</small><small>1 skipped</small>" in written["report.html"]
+    assert list(csv.DictReader(io.StringIO(written["report.csv"])))[1]["skipped"] == "1"
+
+
+def test_a_folder_that_belongs_to_no_cell_fills_none(tmp_path):
+    for controller, seed in (("lqr", 0), ("lqr", 1), ("convex", 1)):
+        add(tmp_path, controller, seed, 0.1)
+    for name in ("elsewhere", "controller=convex,horizon=3,seed=0"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / METRICS).write_text("")
+    convex, _ = report(tmp_path).cells
+    assert (convex.missing, convex.skipped) == (("0",), ())
+
+
 def test_a_line_of_the_latex_table_never_begins_with_a_bracket(tmp_path):
     for steps in ("[1,2]", "[1]"):
         choices, settings = chosen("lqr", 0, steps=steps)
@@ -138,6 +169,31 @@ def test_pairs_show_what_means_alone_do_not(tree):
     text = sentences(report(tree), [rmse], "controller=lqr", "controller=convex")[1]
     for word in ("Wilcoxon signed-rank p = 0.0312", "t-test", "rank-biserial", "n = 6"):
         assert word in text
+
+
+def test_every_seed_is_an_average_over_the_same_and_what_is_left_out_is_named(tmp_path):
+    def fly(controller, horizon, seed):
+        choices = [f"controller={controller}", f"horizon={horizon}", f"seed={seed}"]
+        settings = SETTINGS | {"seed": seed, "horizon": horizon, "options": {"controller": controller}}
+        made_up_run(tmp_path, choices, settings, result=metrics_of(0.1 * horizon + 0.01 * (controller == "lqr")))
+
+    for seed in range(8):
+        for controller in ("lqr", "convex"):
+            for horizon in (1, 5):
+                if (controller, horizon, seed) != ("lqr", 5, 7):
+                    fly(controller, horizon, seed)
+        fly("convex", 10, seed)  # lqr has but one of them
+    fly("lqr", 10, 0)
+    found = report(tmp_path)
+    rmse = compare(found, "controller=lqr", "controller=convex")[0]
+    assert rmse.left_out == ("horizon=10", "seed=7")
+    assert rmse.pairs == 7
+    assert rmse.means == pytest.approx((0.31, 0.3))  # of the horizons 1 and 5 for every seed
+    assert "lacks runs of it: horizon=10; seed=7." in sentences(found, [rmse], "a", "b")[0]
+    assert compare(found, "horizon=1", "horizon=5")[0].left_out == ("seed=7",)
+    alone = compare(found, "controller=convex,horizon=1", "controller=convex,horizon=5")[0]
+    assert alone.left_out == ()
+    assert "Left out" not in sentences(found, [alone], "a", "b")[0]
 
 
 def test_errors_of_both_subsystems_keep_their_units_and_are_not_averaged_together(tmp_path):

@@ -1,0 +1,83 @@
+"""A Ctrl-C that CasADi would keep to itself reaches the command, and the solve that it met has ended."""
+
+import os
+import signal
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.control.controller import Reference
+from gpmpc.control.nmpc import NMPC
+from gpmpc.control.tracking import TrackingProblem
+from gpmpc.gaussian import Gaussian
+from gpmpc.interrupts import interrupts_after
+from gpmpc.plants import Integrated, Translational
+
+
+def swallow():
+    """What a library does that goes on in its own way."""
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        return False
+    return True
+
+
+def test_an_interrupt_waits_for_the_end_of_the_block():
+    went_on = False
+    with pytest.raises(KeyboardInterrupt), interrupts_after():
+        went_on = swallow()
+    assert went_on
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_one_does_not_wait():
+    with pytest.raises(KeyboardInterrupt), interrupts_after():
+        assert [swallow(), swallow()] == [True, False]
+
+
+def test_without_an_interrupt_and_in_another_thread_nothing_happens():
+    with interrupts_after():
+        pass
+    done = []
+
+    def other():
+        with interrupts_after():
+            done.append(True)
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    thread.join()
+    assert done == [True]
+
+
+def test_an_error_inside_is_that_error():
+    with pytest.raises(ZeroDivisionError), interrupts_after():
+        1 / 0  # noqa: B018
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ipopt_ends_a_solve_that_an_interrupt_meets_and_nmpc_passes_it_on():
+    plant = Integrated(Translational(), time_step=1.0, substeps=1)
+    controller = NMPC(plant, TrackingProblem([1.0] * 6, [1.0] * 3), 5, [7.26, 0.0, 0.0])
+    solver, statuses = controller._solver, []
+
+    class Met:
+        """Solves until the signal has come, which is in the middle of one."""
+
+        def __call__(self, **arguments):
+            sent = threading.Event()
+            timer = threading.Timer(0.05, lambda: (os.kill(os.getpid(), signal.SIGINT), sent.set()))
+            timer.start()
+            while not sent.is_set():
+                found = solver(**arguments)
+                statuses.append(solver.stats()["return_status"])
+            timer.join()
+            return found
+
+    controller._solver = Met()
+    with pytest.raises(KeyboardInterrupt):
+        controller.control(Gaussian.certain(torch.zeros(6)), Reference(np.full((6, 6), 0.5)))
+    assert set(statuses) == {"Solve_Succeeded"}
