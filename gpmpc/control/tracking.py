@@ -171,12 +171,6 @@ def _set_bounds(owner: Any, lower_key: str, upper_key: str, length: int) -> None
             raise SettingError(key, f"no number keeps it: a bound of size {ABSENT:g} or more is none; got {value!r}")
         object.__setattr__(owner, key, array)
         arrays.append(array)
-    unreachable = np.flatnonzero((arrays[0] == math.inf) | (arrays[1] == -math.inf))
-    if len(unreachable):
-        j = unreachable[0]
-        raise SettingError(
-            f"{lower_key}, {upper_key}", f"must leave room; entry {j} is from {arrays[0][j]:g} to {arrays[1][j]:g}"
-        )
     crossed = np.flatnonzero(arrays[0] > arrays[1])
     if len(crossed):
         j = crossed[0]
