@@ -55,10 +55,12 @@ class Gaussian:
         Raises:
             ShapeError: No vector of numbers was given.
         """
-        try:
-            mean = torch.as_tensor(value, dtype=None if hasattr(value, "dtype") else torch.float64)
-        except (TypeError, ValueError) as error:
-            raise ShapeError(f"a state must be numbers (*batch, n); got {value!r}") from error
+        mean = value
+        if not isinstance(value, Tensor):
+            try:
+                mean = torch.as_tensor(value, dtype=None if hasattr(value, "dtype") else torch.float64)
+            except (TypeError, ValueError) as error:
+                raise ShapeError(f"a state must be numbers (*batch, n); got {value!r}") from error
         mean = mean if mean.is_floating_point() else mean.to(torch.float64)
         if not mean.dim():
             raise ShapeError(f"a state must be numbers (*batch, n); got the single number {value!r}")

@@ -122,9 +122,9 @@ class Predictor:
             raise SettingError("disturbance_gain", f"must {rule}; got {disturbance_gain}")
         self.form, self.covariance, self.feedback = form, covariance, feedback
         self.disturbance_gain = disturbance_gain
-        at_points = covariance == "zero_order" and is_first_order(propagator, model)
+        at_points = covariance == "none" or (covariance == "zero_order" and is_first_order(propagator))
         exact = isinstance(model, GPPosterior) and model.predicts in ("next_state", "difference")
-        self._compiles = at_points or (covariance == "none" and exact)
+        self._compiles = exact and at_points
 
     @property
     def compiled(self) -> bool:

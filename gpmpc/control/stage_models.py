@@ -51,10 +51,9 @@ def disturbed(stage: StageModel, disturbance: Tensor) -> StageModel:
     return stage._replace(c=stage.c + torch.nn.functional.pad(disturbance, (0, rest)), next=after)
 
 
-def is_first_order(propagator: Propagator, model: DynamicsModel) -> bool:
-    """Whether a stage of ``zero_order`` needs no more than mean, variance and the mean's derivatives at a point."""
-    known = isinstance(model, GPPosterior) and model.predicts in ("next_state", "difference")
-    return known and type(propagator) is Linearization and not propagator.hessian
+def is_first_order(propagator: Propagator) -> bool:
+    """Whether a stage of ``zero_order`` needs no more than mean, covariance and the mean's derivatives at a point."""
+    return type(propagator) is Linearization and not propagator.hessian
 
 
 def _full(propagator: Propagator, model: DynamicsModel, belief: Gaussian, input: Tensor) -> StageModel:
@@ -84,7 +83,7 @@ def _diagonal(propagator: Propagator, model: DynamicsModel, belief: Gaussian, in
 
 
 def _zero_order(propagator: Propagator, model: DynamicsModel, belief: Gaussian, input: Tensor) -> StageModel:
-    if is_first_order(propagator, model):
+    if is_first_order(propagator):
         at_mean, A, B = model.predict_with_jacobian(belief.mean, input)
         mean, V = at_mean.mean, at_mean.covariance
         V = V + model.noise_covariance if propagator.observation_noise else V
