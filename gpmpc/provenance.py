@@ -47,7 +47,8 @@ def git_commit() -> dict | None:
 
 
 def _git(root: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(root), *arguments]
+    # Without the lock that refreshes the index: a run that is killed would leave it, and git would refuse to commit.
+    command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
 
