@@ -207,10 +207,10 @@ def test_what_cannot_be_saved_says_what_to_do(tmp_path):
     model = ResidualModel(lambda x, u: x, model.residual, model.B, model.states, model.inputs, model.input_dim)
     with pytest.raises(UnsupportedModel, match="only an Affine nominal model .* got function. Save the part"):
         model.save(tmp_path / "model.npz")
-    with pytest.raises(SettingError, match="features: must be one of float64, float32 to be saved; got torch.bfloat16"):
-        posterior().to(dtype=torch.bfloat16).save(tmp_path / "gp.npz")
     gp = posterior()
     parts = {f.name: getattr(gp, f.name) for f in fields(gp)}
+    with pytest.raises(SettingError, match="features: must be one of float64, float32 to be saved; got torch.bfloat16"):
+        GPPosterior(**parts | {"features": gp.features.to(torch.bfloat16)}).save(tmp_path / "gp.npz")
     with pytest.raises(DataError, match=r"gp\.npz: weights must be finite; got nan"):
         GPPosterior(**parts | {"weights": gp.weights * torch.nan}).save(tmp_path / "gp.npz")
 
