@@ -1,6 +1,6 @@
 """What a control step costs beside one moment-matched Jacobian, and beside nonlinear GP-MPC on the same questions.
 
-    .venv/bin/python benchmarks/controllers.py [--steps 14] [--horizons 1 10]
+    .venv/bin/python benchmarks/controllers.py [--steps 14] [--horizons 1 10 20 50] [--rivals 1 10]
 
 One process, one thread, process CPU time, GPs on 189 transitions. Questions are recorded on a flight with the plant in
 the loop, with the plans that the one controller made, and then put to each controller in turns, warm-started from its
@@ -46,15 +46,18 @@ def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=14, help="of the rivals; ten times as many of the convex ones")
-    parser.add_argument("--horizons", type=int, nargs="+", default=[1, 10])
+    parser.add_argument("--horizons", type=int, nargs="+", default=[1, 10, 20, 50])
+    parser.add_argument("--rivals", type=int, nargs="*", default=[1, 10], help="horizons at which they fly as well")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     results = []
     for trajectory in TRAJECTORIES:
         gp = trained(trajectory)
         for horizon in arguments.horizons:
-            for controllers, steps in zip(ways(gp, horizon), (10 * arguments.steps, arguments.steps), strict=True):
-                results.append(measured(gp, controllers, trajectory, horizon, steps))
+            convex, rivals = ways(gp, horizon)
+            results.append(measured(gp, convex, trajectory, horizon, 10 * arguments.steps))
+            if horizon in arguments.rivals:
+                results.append(measured(gp, rivals, trajectory, horizon, arguments.steps))
     path = Path("outputs/benchmarks/controllers.json")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
