@@ -25,3 +25,9 @@ def write_whole(path: str | Path, content: bytes | str) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def remove_partial(folder: Path) -> None:
+    """Removes what processes that were killed have left of ``write_whole``, where nobody else is writing now."""
+    for left in folder.glob(".*.partial"):
+        left.unlink(missing_ok=True)

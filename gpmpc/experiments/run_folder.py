@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from gpmpc.exceptions import DataError, GpmpcError
-from gpmpc.files import write_whole
+from gpmpc.files import remove_partial, write_whole
 from gpmpc.provenance import provenance
 
 METRICS, ERROR, CONFIG, RECORDING = "metrics.json", "error.json", "config.yaml", "run.mcap"
@@ -59,7 +59,7 @@ class RunFolder:
 
     @contextmanager
     def claimed(self, wait: bool = True) -> Iterator[None]:
-        """Keeps other processes from working on this run meanwhile; makes the folder.
+        """Keeps other processes from working on this run meanwhile; makes the folder, clears it of half-written files.
 
         Args:
             wait: Until another process is done with it.
@@ -71,6 +71,7 @@ class RunFolder:
         folder = os.open(self.path, os.O_RDONLY)
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            remove_partial(self.path)
             yield
         except BlockingIOError as error:
             raise Busy(f"{self.path}: another process works on this run") from error
