@@ -8,6 +8,7 @@ from gpmpc import metrics
 from gpmpc.control.controller import Reference
 from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.control.state_form import StateFormMPC
 from gpmpc.control.tracking import StateBounds, TrackingProblem
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
@@ -149,6 +150,10 @@ def test_models_and_data_say_what_they_are_in_one_line():
         (lambda: controller(problem={"Q": [1]}), r"problem: must be TrackingProblem\(...\); got dict"),
         (
             lambda: controller(propagator=Linearization),
+            "propagator: .*such as Linearization.*got the class Linearization",
+        ),
+        (
+            lambda: controller(StateFormMPC, propagator=Linearization),
             "propagator: .*such as Linearization.*got the class Linearization",
         ),
         (lambda: controller(NonlinearGPMPC, propagator="linear"), "propagator: .*such as Linearization.*got 'linear'"),

@@ -115,7 +115,6 @@ class ConvexMPC:
             raise SettingError("iterations", f"form {form!r} is one quadratic program, so 1; got {iterations}")
         self.problem, self.horizon, self.iterations, self.tolerance = problem, horizon, iterations, tolerance
         self.solver = DualActiveSet() if solver is None else solver
-        check_method("propagator", propagator, "propagate", "Linearization()")
         check_method("solver", self.solver, "solve", "DualActiveSet()")
         self.predictor = Predictor(model, propagator, problem, horizon, form, covariance, feedback, disturbance_gain)
         weights = self.predictor.extended(problem.Q), self.predictor.extended(problem.terminal)

@@ -34,7 +34,7 @@ from gpmpc.control.ancillary_feedback import lqr_gain, spread
 from gpmpc.control.compiled_rollout import CompiledRollout
 from gpmpc.control.condensing import respond
 from gpmpc.control.controller import Decision
-from gpmpc.control.request import Request
+from gpmpc.control.request import Request, check_method
 from gpmpc.control.stage_models import disturbed, is_first_order, stage_model
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError, check_number
@@ -96,7 +96,7 @@ class Predictor:
         disturbance_gain: L, from 0 (no disturbance is estimated) to 1 (it is what the last step showed).
 
     Raises:
-        SettingError: An unknown form or covariance mode, a gain out of range, or one with ``increment``.
+        SettingError: An unknown form or covariance mode, no propagator, a gain out of range, or one with ``increment``.
     """
 
     def __init__(
@@ -116,6 +116,7 @@ class Predictor:
         if not isinstance(feedback, bool):
             raise SettingError("feedback", f"must be true or false; got {feedback!r}")
         self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
+        check_method("propagator", propagator, "propagate", "Linearization()")
         check_number("disturbance_gain", disturbance_gain, least=0)
         if disturbance_gain > (form != "increment"):
             rule = "be 0 for form 'increment', which needs none" if form == "increment" else "lie between 0 and 1"
