@@ -105,3 +105,18 @@ def test_a_bad_measurement_is_said_so_and_misuse_is_refused():
         controller.control(Gaussian.certain(np.zeros(2)), Reference(np.zeros((3, 2))))
     with pytest.raises(SettingError, match="must weigh 2 states and 1 inputs; got 2 and 2"):
         LQR(double_integrator(), TrackingProblem(Q, [1.0, 1.0]), 3, [0.2])
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_where_rates_and_box_contradict_each_other_no_input_leaves_the_box(side, rng):
+    """The input before was far outside, and the rates alone would keep the next ones there."""
+    problem = TrackingProblem(
+        Q, R, input_lower=[-0.5], input_upper=[0.4], rate_lower=[-0.1], rate_upper=[0.1], penalized="increments"
+    )
+    controller = LQR(double_integrator(), problem, 5, [side * 3.0])
+    for _ in range(20):
+        decision = controller.control(Gaussian.certain(rng.normal(size=2)), Reference(rng.normal(size=(6, 2))), None)
+        assert decision.inputs.min() >= -0.5
+        assert decision.inputs.max() <= 0.4
+        assert decision.input[0] == (0.4 if side > 0 else -0.5)
+        assert np.abs(np.diff(decision.inputs[:, 0])).max() <= 0.1 + 1e-12

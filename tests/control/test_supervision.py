@@ -112,3 +112,15 @@ def test_before_the_first_plan_the_reference_input_is_applied_within_the_bounds_
     told = planner.previous[0]
     assert told.input[0] == 2
     assert not told.status.solved
+
+
+@pytest.mark.parametrize("on_failure", ["previous_plan", "hold"])
+def test_before_the_first_plan_each_step_applies_its_own_reference_input(on_failure):
+    """What was applied for want of a plan is no plan, and is not gone on along."""
+    planner, last, applied = Planner(0, 1, 2), None, []
+    for k in range(4):
+        reference = Reference(np.zeros((5, 1)), 100.0 + k + np.arange(4.0)[:, None])
+        last = command(planner, STATE, reference, last, on_failure, k)
+        applied.append(last.input[0])
+    assert applied == [100, 101, 102, 30]
+    assert last.plan.status.solved

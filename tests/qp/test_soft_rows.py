@@ -144,3 +144,19 @@ def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(solve, kind,
         np.testing.assert_allclose(last.x, cold.x, atol=1e-9)
         at_caps += int((np.abs(last.z) == soft.linear).sum())
     assert (at_caps > 0) == (kind != "quadratic")
+
+
+@DUAL
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("price", [0.5, 40.0])
+def test_a_multiplier_beyond_what_its_row_may_pay_is_a_dual_residual(solve, side, price):
+    """min 1/2 x^2 with the row |x| >= 100 at the price w a unit: x = w. At any other x the multiplier is no price."""
+    bounds = ([100.0], [np.inf]) if side > 0 else ([-np.inf], [-100.0])
+    solution = solve(QuadraticProgram(np.eye(1), [0.0], [[1.0]], *bounds), SoftRows(linear=[price]))
+    assert solution.x[0] == pytest.approx(side * price)
+    assert solution.is_optimal()
+    solution.x[:] *= 1.5  # still stationary, P x + G'z = 0, and the violation is still paid for
+    solution.z[:] *= 1.5
+    assert solution.residuals().primal == 0
+    assert solution.residuals().dual == pytest.approx(0.5 * price / max(1.0, 1.5 * price))
+    assert not solution.is_optimal(0.1)
