@@ -83,3 +83,36 @@ def test_a_step_jumps_at_its_time():
 def test_misuse_is_refused_with_the_rule(build, message):
     with pytest.raises(SettingError, match=message):
         build()
+
+
+def test_lorenz_by_default_is_the_papers_with_its_second_axis_turned():
+    """(0.7 X, -0.7 Y, Z) from (-1.79, -3.13, 12.74), Cao, Lai and Alam (2017), (27)."""
+    assert np.allclose(Lorenz()(np.array(0.0)), [0.7 * -1.79, -0.7 * -3.13, 12.74], rtol=1e-14)
+
+
+@pytest.mark.parametrize("samples", [1, 2, 4])
+def test_lorenz_passes_the_ends_of_the_accepted_steps_whatever_the_samples_between_them(samples):
+    """Of K samples a step, every K-th is the end of one: the same points of the same integration."""
+    ends = Lorenz(samples_per_step=samples, duration=40.0)(samples * np.arange(10.0))
+    assert np.allclose(ends, Lorenz(samples_per_step=4, duration=40.0)(4.0 * np.arange(10)), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("samples_per_step", 0), ("samples_per_step", 1.5), ("relative_tolerance", 0.0), ("sampling_time", -1.0),
+        ("duration", 0.0), ("sigma", np.nan), ("rho", "a"), ("beta", np.inf), ("start", (1.0, 2.0)), ("scale", (1, 2)),
+    ],
+)  # fmt: skip
+def test_a_setting_of_lorenz_that_makes_no_sense_is_refused_by_name(setting, value):
+    with pytest.raises(SettingError, match=setting):
+        Lorenz(**{setting: value})
+
+
+@pytest.mark.parametrize("time", [-0.1, 20.1])
+def test_lorenz_is_defined_from_its_start_to_its_duration_both_included(time):
+    trajectory = Lorenz(duration=20.0)
+    assert np.isfinite(trajectory(np.array([0.0, 20.0]))).all()
+    for call in (trajectory, trajectory.velocity):
+        with pytest.raises(SettingError, match="duration: this Lorenz trajectory is defined from 0 to 20 s"):
+            call(np.array([1.0, time]))

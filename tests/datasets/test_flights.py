@@ -96,3 +96,9 @@ def test_an_integrated_plant_can_be_flown():
 def test_no_samples_are_refused():
     with pytest.raises(SettingError, match="data.samples: must be a whole number, 1 or more; got 0"):
         NMPCData(NMPC_DATA.translational, NMPC_DATA.rotational, samples=0)
+
+
+@pytest.mark.parametrize("horizon", [0, -1, 1.5, None])
+def test_a_horizon_is_a_positive_whole_number(horizon):
+    with pytest.raises(SettingError, match="data.horizon: must be a whole number, 1 or more"):
+        NMPCData(NMPC_DATA.translational, NMPC_DATA.rotational, horizon=horizon)
