@@ -90,3 +90,50 @@ def test_the_quantiles_of_times_are_in_order():
 def test_arrays_that_do_not_belong_together_are_refused(call, error, message):
     with pytest.raises(error, match=message):
         call()
+
+
+def test_a_bound_is_kept_up_to_the_tolerance_on_either_side():
+    lower, upper = np.array([-1.0, -np.inf]), np.array([1.0, 2.0])
+    for sign, entry, bound in ((-1, 0, -1.0), (1, 0, 1.0), (1, 1, 2.0)):
+        values = np.zeros((4, 2))
+        values[:, entry] = bound + sign * np.array([-0.5, 0.0, 0.9e-6, 1.1e-6])
+        rate = violation_rate(values, lower, upper, tolerance=1e-6)
+        assert (rate.violations, rate.steps) == (1, 4)
+        assert rate.worst == pytest.approx(1.1e-6)
+    assert violation_rate(np.full((3, 2), 0.5), lower, upper).worst == 0
+
+
+def test_the_interval_of_a_violation_rate_is_the_binomial_one_at_the_level():
+    values = np.array([0.0] * 37 + [2.0] * 3)[:, None]
+    for level in (0.5, 0.95):
+        rate = violation_rate(values, [-1.0], [1.0], level)
+        exact = stats.binomtest(3, 40).proportion_ci(level, method="exact")
+        assert (rate.low, rate.high) == pytest.approx((exact.low, exact.high))
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: violation_rate(np.zeros((3, 2)), [0, 1], [1, 0]), SettingError, "entry 1 has 1 above 0"),
+        (lambda: violation_rate(np.zeros((0, 2)), [0, 0], [1, 1]), ShapeError, "K of 1 or more"),
+        (lambda: violation_rate(np.zeros((3, 2)), [0, 0], [1]), ShapeError, r"got \(3, 2\), \(2,\), \(1,\)"),
+        (lambda: tracking_error(np.zeros((3, 6)), np.zeros((3, 6)), [6]), ShapeError, r"from 0 to 5; got \(6,\)"),
+        (lambda: tracking_error(np.zeros((3, 6)), np.zeros((3, 6)), [-7]), ShapeError, r"from 0 to 5; got \(-7,\)"),
+        (lambda: tracking_error(np.zeros((1, 6)), np.zeros((1, 6))), ShapeError, "K of 1 or more"),
+        (lambda: binomial_interval(0, 0), SettingError, "got 0 of 0"),
+        (lambda: binomial_interval(-1, 3), SettingError, "got -1 of 3"),
+        (lambda: binomial_interval(1, 3, 0.0), SettingError, "level: must lie between 0 and 1; got 0"),
+        (lambda: binomial_interval(1, 3, 1.0), SettingError, "level: must lie between 0 and 1; got 1"),
+        (lambda: mean_squared_error(torch.zeros(2, 1), torch.zeros(2, 2)), ShapeError, r"predicted \(2, 1\)"),
+        (lambda: interval_coverage(*[torch.ones(1, 1)] * 3, 0), SettingError, "must lie between 0 and 1; got 0"),
+    ],
+)
+def test_what_has_no_answer_is_refused_with_the_rule(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_axes_may_be_counted_from_the_end():
+    states = np.arange(18.0).reshape(3, 6)
+    last = tracking_error(states, np.zeros((3, 6)), [-1, 0])
+    assert np.array_equal(last.axes, tracking_error(states, np.zeros((3, 6)), [5, 0]).axes)

@@ -68,7 +68,10 @@ class LQR:
         modelled = time.perf_counter()
         if not all(np.isfinite(part).all() for part in (A, B, c)):
             return request.unanswered(Status.NUMERICAL_TROUBLE)
-        gains = _tracking_gains(A, B, c, self.problem, request)
+        with np.errstate(over="ignore", invalid="ignore"):
+            gains = _tracking_gains(A, B, c, self.problem, request)
+        if not gains:
+            return request.unanswered(Status.NUMERICAL_TROUBLE)
         n, p, x, last = self.problem.state_dim, self.problem, request.state, request.last
         states, inputs = [x], []
         for i, K in enumerate(gains):
@@ -103,7 +106,7 @@ class LQR:
 def _tracking_gains(
     A: np.ndarray, B: np.ndarray, c: np.ndarray, problem: TrackingProblem, request: Request
 ) -> list[np.ndarray]:
-    """K_0 .. K_{H-1} (m, n + m + 1); see the module's text."""
+    """K_0 .. K_{H-1} (m, n + m + 1), none where the cost to go grows beyond all numbers; see the module's text."""
     H, n, m = B.shape
     R, gains = problem.R, []
     E = np.hstack([np.eye(n), np.zeros((n, m + 1))])
@@ -117,8 +120,11 @@ def _tracking_gains(
             V[:, n : n + m] = -np.eye(m)
         elif problem.penalized == "deviations":
             V[:, -1] = -request.wanted[i]
+        weight, pull = R + G.T @ cost_to_go @ G, R @ V + G.T @ cost_to_go @ F
+        if not (np.isfinite(weight).all() and np.isfinite(pull).all()):
+            return []
         # Least squares: an input without weight or effect is left at zero.
-        K = np.linalg.lstsq(R + G.T @ cost_to_go @ G, R @ V + G.T @ cost_to_go @ F, rcond=1e-14)[0]
+        K = np.linalg.lstsq(weight, pull, rcond=1e-14)[0]
         gains.append(K)
         moved, paid = F - G @ K, V - K
         cost_to_go = moved.T @ cost_to_go @ moved + paid.T @ R @ paid

@@ -120,3 +120,34 @@ def test_where_rates_and_box_contradict_each_other_no_input_leaves_the_box(side,
         assert decision.inputs.max() <= 0.4
         assert decision.input[0] == (0.4 if side > 0 else -0.5)
         assert np.abs(np.diff(decision.inputs[:, 0])).max() <= 0.1 + 1e-12
+
+
+class Watched(LinearGaussian):
+    """Keeps where it was linearised; its Jacobian by the state may be damaged."""
+
+    def __init__(self, *arguments, factor=1.0):
+        super().__init__(*arguments)
+        self.factor = factor
+
+    def predict_with_jacobian(self, state, input=None):
+        self.seen = state.numpy(), input.numpy()
+        moved, dynamics, effect = super().predict_with_jacobian(state, input)
+        return moved, self.factor * dynamics, effect
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["reference inputs", "no reference inputs"])
+def test_the_local_models_are_taken_at_the_state_and_then_along_the_reference(known, rng):
+    model, H = Watched(A.tolist(), B.tolist()), 4
+    states, wanted, state = rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1)), rng.normal(size=2)
+    reference = Reference(states, wanted if known else None)
+    LQR(model, TrackingProblem(Q, R), H, [0.3]).control(Gaussian.certain(state), reference)
+    assert np.array_equal(model.seen[0], np.vstack([state, states[1:-1]]))
+    assert np.array_equal(model.seen[1], wanted if known else np.full((H, 1), 0.3))
+
+
+@pytest.mark.parametrize("factor", [np.nan, np.inf, 1e250])
+def test_a_model_that_is_not_finite_or_grows_beyond_all_numbers_is_numerical_trouble(factor):
+    controller = LQR(Watched(A.tolist(), B.tolist(), factor=factor), TrackingProblem(Q, R), 4, [0.2])
+    decision = controller.control(Gaussian.certain(np.ones(2)), Reference(np.zeros((5, 2))))
+    assert decision.status is Status.NUMERICAL_TROUBLE
+    assert np.array_equal(decision.inputs, np.full((4, 1), 0.2))
