@@ -1,0 +1,121 @@
+"""What is drawn in space: the vehicle, its reference and its plan stand where the states say, turned as they say."""
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from scipy.spatial.transform import Rotation
+
+from gpmpc.control.controller import Decision, Timing
+from gpmpc.plants import Coupled
+from gpmpc.recording import McapRecorder, Step
+from gpmpc.status import Status
+
+H = 3
+
+
+def record(path, states, outcomes, rng, **settings):
+    """A step a second, of the statuses and of whether they count as failed; the steps."""
+    n, steps = len(states), []
+    with McapRecorder(path, states, ("u",), time_step=1.0, **settings) as recorder:
+        for k, (status, failed) in enumerate(outcomes):
+            decision = Decision(
+                np.zeros(1), np.zeros((H, 1)), rng.uniform(-3, 3, (H + 1, n)), np.tile(0.01 * np.eye(n), (H + 1, 1, 1)),
+                status, 1, Timing(0.0, 0.0, 0.0),
+            )  # fmt: skip
+            reference, state = rng.uniform(-3, 3, (2, n))
+            step = Step(
+                float(k), k, reference, state, state, np.zeros(1), decision, np.zeros(n), np.eye(n), failed=failed
+            )
+            recorder.record(step)
+            steps.append(step)
+    return steps
+
+
+def decoded(path, topic):
+    with path.open("rb") as file:
+        messages = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(topics=[topic])
+        return [proto for _, _, _, proto in messages]
+
+
+def place(vector):
+    return [vector.x, vector.y, vector.z]
+
+
+def turn(quaternion):
+    return Rotation.from_quat([quaternion.x, quaternion.y, quaternion.z, quaternion.w]).as_matrix()
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    path, rng = tmp_path_factory.mktemp("run") / "run.mcap", np.random.default_rng(4)
+    outcomes = [(Status.SOLVED, False)] * 5 + [(Status.INFEASIBLE, True), (Status.ITERATION_LIMIT, False)]
+    return path, record(path, Coupled.state_names, outcomes, rng)
+
+
+def of(state):
+    """Position and rotation matrix Rz(psi) Ry(theta) Rx(phi) of a state of the whole quadrotor."""
+    return state[[0, 2, 4]], Rotation.from_euler("ZYX", state[[10, 8, 6]]).as_matrix()
+
+
+def test_the_vehicle_its_reference_and_its_plan_stand_and_turn_as_the_states_say(flown):
+    path, steps = flown
+    for topic, states in (
+        ("/pose", [[step.state] for step in steps]),
+        ("/reference", [[step.reference] for step in steps]),
+        ("/plan/path", [step.decision.means for step in steps]),
+    ):
+        messages = decoded(path, topic)
+        assert len(messages) == len(steps)
+        for message, expected in zip(messages, states, strict=True):
+            poses = message.poses if topic == "/plan/path" else [message.pose]
+            assert message.frame_id == "world"
+            for pose, state in zip(poses, expected, strict=True):
+                position, rotation = of(state)
+                np.testing.assert_allclose(place(pose.position), position)
+                np.testing.assert_allclose(turn(pose.orientation), rotation, atol=1e-12)
+
+
+def test_the_line_of_the_plan_passes_the_predicted_positions(flown):
+    path, steps = flown
+    for message, step in zip(decoded(path, "/plan/tube"), steps, strict=True):
+        [line] = message.entities[0].lines
+        np.testing.assert_allclose([place(point) for point in line.points], step.decision.means[:, [0, 2, 4]])
+
+
+def test_the_frames_lead_from_the_display_to_the_vehicle(flown):
+    path, steps = flown
+    for message, step in zip(decoded(path, "/tf"), steps, strict=True):
+        position, rotation = of(step.state)
+        assert (message.parent_frame_id, message.child_frame_id) == ("world", "vehicle")
+        np.testing.assert_allclose(place(message.translation), position)
+        np.testing.assert_allclose(turn(message.rotation), rotation, atol=1e-12)
+    for message in decoded(path, "/tf/display"):
+        assert (message.parent_frame_id, message.child_frame_id) == ("display", "world")
+        np.testing.assert_allclose(turn(message.rotation), np.diag([1.0, -1.0, -1.0]), atol=1e-15)  # z points down
+        assert place(message.translation) == [0, 0, 0]
+
+
+def test_every_solve_that_failed_is_logged_the_louder_the_more_it_mattered(flown):
+    path, _ = flown
+    failed, limited = decoded(path, "/log")
+    assert (failed.level, limited.level) == (failed.ERROR, limited.WARNING)
+    assert failed.message.startswith("step 5: INFEASIBLE: ")
+    assert limited.message == f"step 6: ITERATION_LIMIT: {Status.ITERATION_LIMIT.advice}"
+    assert failed.message == f"step 5: INFEASIBLE: {Status.INFEASIBLE.advice}; the policy for failures chose the input"
+
+
+def test_an_axis_that_no_state_names_is_zero_and_an_attitude_that_is_not_whole_is_none(tmp_path, rng):
+    path = tmp_path / "run.mcap"
+    steps = record(path, ("z", "x", "phi"), [(Status.SOLVED, False)] * 3, rng, z_down=False, frame="hall")
+    for message, step in zip(decoded(path, "/pose"), steps, strict=True):
+        assert message.frame_id == "hall"
+        assert place(message.pose.position) == [step.state[1], 0, step.state[0]]
+        np.testing.assert_array_equal(turn(message.pose.orientation), np.eye(3))
+    for message in decoded(path, "/tf/display"):
+        np.testing.assert_array_equal(turn(message.rotation), np.eye(3))
+    for message in decoded(path, "/plan/tube"):
+        for sphere in message.entities[0].spheres:  # 0.01 in x and z, nothing in y
+            assert sorted(place(sphere.size)) == pytest.approx([0, 0.4, 0.4])
+            along = turn(sphere.pose.orientation) @ np.diag(place(sphere.size)) @ turn(sphere.pose.orientation).T
+            np.testing.assert_allclose(along, np.diag([0.4, 0, 0.4]), atol=1e-12)
