@@ -186,3 +186,59 @@ def test_reference_inputs_of_another_number_are_refused():
         controller.control(Gaussian.certain(np.zeros(6)), Reference(np.zeros((4, 6)), np.zeros((3, 2))))
     with pytest.raises(SettingError, match="first_guess: must be 'hold' or 'shift'; got 'warm'"):
         NMPC(Map(Rotational()), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3, first_guess="warm")
+
+
+@pytest.mark.parametrize("prices", [{"l1": 0.3}, {"l2": 2.0}, {"l1": 0.3, "l2": 2.0}], ids=str)
+def test_a_soft_state_bound_costs_what_it_says_on_either_side(prices):
+    """One step of x+ = x + u: minimise (x - r)^2 + u^2 + l1 v + l2 v^2 on a grid finer than the answer."""
+
+    class Shifted:
+        state_names, input_names = ("x",), ("u",)
+
+        def derivative(self, x, u):
+            return [x[0] + u[0]]
+
+    limits = StateBounds([-0.5], [0.2], **prices)
+    controller = NMPC(Map(Shifted()), TrackingProblem([1.0], [1.0], state_bounds=limits), 1, [0.0])
+    x = np.linspace(-3, 3, 600_001)
+    outside = np.maximum(0, np.maximum(x - 0.2, -0.5 - x))
+    for start, target in ((0.0, 2.0), (0.1, -3.0), (0.4, 0.1), (-2.0, -0.9)):
+        price = prices.get("l1", 0.0) * outside + prices.get("l2", 0.0) * outside**2
+        best = x[np.argmin((x - target) ** 2 + (x - start) ** 2 + price)]
+        decision = controller.control(Gaussian.certain(np.array([start])), Reference(np.full((2, 1), target)))
+        assert decision.status is Status.SOLVED
+        assert decision.means[1, 0] == pytest.approx(best, abs=2e-5)
+
+
+def test_bounds_that_contradict_each_other_are_not_called_solved():
+    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    limits = StateBounds([1.0, -np.inf], [np.inf, np.inf])
+    problem = TrackingProblem([1.0, 0.0], [1.0], input_lower=[-0.1], input_upper=[0.1], state_bounds=limits)
+    decision = NMPC(plant, problem, 3, [0.0]).control(Gaussian.certain(np.zeros(2)), Reference(np.zeros((4, 2))))
+    assert not decision.status.solved
+
+
+@pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
+def test_the_last_state_has_its_own_weight_and_inputs_are_weighed_as_asked(penalized, rng):
+    """No small change of the plan is cheaper by the problem's own words."""
+    plant, H = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1), 4
+    Q, T, R = np.array([[2.0, 0.3], [0.3, 1.0]]), np.diag([9.0, 0.1]), np.array([[0.4]])
+    controller = NMPC(plant, TrackingProblem(Q, R, penalized, T), H, [0.7])
+    state, reference = rng.normal(size=2), Reference(rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1)))
+    decision = controller.control(Gaussian.certain(state), reference)
+
+    def cost(inputs):
+        x, total, last = state, 0.0, np.array([0.7])
+        for k, u in enumerate(inputs):
+            x = step(plant, x, u)
+            error, weight = x - reference.states[k + 1], T if k == H - 1 else Q
+            v = {"inputs": u, "deviations": u - reference.inputs[k], "increments": u - last}[penalized]
+            total, last = total + error @ weight @ error + v @ R @ v, u
+        return total
+
+    best = cost(decision.inputs)
+    for k in range(H):
+        for change in (-1e-4, 1e-4):
+            changed = decision.inputs.copy()
+            changed[k] += change
+            assert cost(changed) > best
