@@ -438,3 +438,15 @@ def test_the_compiled_rollout_is_the_one_stage_by_stage(covariance, feedback, ob
     assert np.allclose(found.inputs, expected.inputs, atol=1e-9)
     assert np.allclose(found.means, expected.means, atol=1e-10)
     assert np.allclose(found.covariances, expected.covariances, atol=1e-12)
+
+
+@pytest.mark.parametrize("evaluated", ["auto", "torch"])
+@pytest.mark.parametrize(("form", "covariance"), [pair for pair in PAIRS if pair[1] != "none"])
+def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_request(form, covariance, evaluated):
+    state, found = Gaussian.certain(np.array([0.3, 0.0, -0.2, 0.1, 0.2, 0.0])), []
+    for noise in (False, True):
+        how = Linearization(observation_noise=noise)
+        controller = ConvexMPC(gp(), how, quadrotor_problem(), 3, HOVER, form, covariance, feedback=False)
+        with evaluation(evaluated):
+            found.append(controller.control(state, at_origin(3)).covariances[1])
+    assert np.allclose(found[1] - found[0], gp().noise_covariance, atol=1e-6)  # of 1e-4; the plans differ a little
