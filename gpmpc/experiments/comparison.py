@@ -1,4 +1,4 @@
-"""Problem: two groups of runs differ in their means, and it has to be said whether that is more than luck.
+"""Problem: two groups of runs differ, and it has to be said whether that is more than luck.
 
 Runs of one seed share their training rows and their noise, so they are compared in pairs: what else was varied is
 averaged within a seed first, and a seed counts once. So that every seed is an average over the same, seeds and other
@@ -6,7 +6,8 @@ settings of which one of the groups lacks runs are left out, and named. Two pair
 test (Wilcoxon, 1945) decides: it asks only that the differences are spread symmetrically. Student's t-test beside it
 asks for normal ones. With fewer than six pairs nothing can make the first one significant at 5 %. Where the seed
 decides nothing (all rows, one start, no noise) its runs are copies of one, and no test may count them: a difference
-that never varies is undecided.
+that never varies is undecided. Wall times are not compared: one group is flown after the other, and what the machine
+did meanwhile is no property of either.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +30,8 @@ class Comparison:
 
     Attributes:
         measure: Name of the measure.
-        means: Of A and of B.
+        medians: Of A and of B, over the pairs.
+        means: The same.
         difference: Mean of A - B over the pairs.
         interval: Of that mean, 95 %, by Student's t.
         wilcoxon: Two-sided p-value of the signed-rank test.
@@ -42,6 +44,7 @@ class Comparison:
     """
 
     measure: str
+    medians: tuple[float, float]
     means: tuple[float, float]
     difference: float
     interval: tuple[float, float]
@@ -82,11 +85,11 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         DataError: The groups have no two seeds in common.
     """
     groups = [_group(report, key, text) for key, text in (("A", a), ("B", b))]
-    units = {run.result["unit"] for group in groups for cell in _cells(report, group) for run in cell.runs.values()}
+    units = {run.unit for group in groups for cell in _cells(report, group) for run in cell.runs.values()}
     if len(units) > 1:
         raise SettingError("compare", "errors in m and in rad have no common mean; add subsystem=... to both groups")
     comparisons = []
-    for measure in report.measures():
+    for measure in (name for name in report.measures() if not MEASURES[name].wall_time):
         first, second = (_by_pair(report, group, measure) for group in groups)
         settings, seeds, left_out = _complete(first, second)
         if len(seeds) >= 2:
@@ -118,9 +121,8 @@ def _by_pair(report: Report, group: Mapping[str, str], measure: str) -> dict[tup
     for cell in _cells(report, group):
         rest = tuple(v for name, v in zip(report.variables, cell.values, strict=True) if name not in group)
         for seed, run in cell.runs.items():
-            value = MEASURES[measure].of(run.result)
-            if value is not None:
-                found[rest, seed] = float(value)
+            if (value := run.numbers[measure]) is not None:
+                found[rest, seed] = value
     return found
 
 
@@ -167,6 +169,7 @@ def _tested(measure: str, pairs: np.ndarray) -> Comparison:
     signed = float((ranks * np.sign(differences[differences != 0])).sum())
     return Comparison(
         measure=measure,
+        medians=tuple(np.median(pairs, axis=0).tolist()),
         means=(float(pairs[:, 0].mean()), float(pairs[:, 1].mean())),
         difference=mean,
         interval=(mean - half, mean + half),
@@ -180,7 +183,9 @@ def _tested(measure: str, pairs: np.ndarray) -> Comparison:
 
 def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str) -> list[str]:
     """A line a measure, with everything that a reader needs to doubt it."""
-    lines = [f"A: {a}; B: {b}; pairs are seeds, what else was varied is averaged within a seed."]
+    lines = [
+        f"A: {a}; B: {b}; pairs are seeds, what else was varied is averaged within a seed. Times are not compared."
+    ]
     everywhere = set.intersection(*(set(c.left_out) for c in comparisons))
     if everywhere:
         told = "; ".join(name for name in comparisons[0].left_out if name in everywhere)
@@ -197,7 +202,7 @@ def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str)
             )
         )
         lines.append(
-            f"{report.label(c.measure)}: {c.verdict}. Mean {c.means[0]:.4g} against {c.means[1]:.4g}, difference "
-            f"{c.difference:.3g}{tests}; n = {c.pairs}" + (f"; left out as well: {others}" if others else "")
+            f"{report.label(c.measure)}: {c.verdict}. Median {c.medians[0]:.4g} against {c.medians[1]:.4g}, mean "
+            f"difference {c.difference:.3g}{tests}; n = {c.pairs}" + (f"; left out as well: {others}" if others else "")
         )
     return lines

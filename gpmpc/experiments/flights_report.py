@@ -14,6 +14,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from gpmpc.experiments.escapes import in_csv
 from gpmpc.experiments.tables_report import markdown_table, number
 from gpmpc.metrics import binomial_interval, time_quantiles
 from gpmpc.plotting import Curve, over_settings, png, tracking
@@ -215,7 +216,7 @@ def render(rows: Sequence[Summary], note: str) -> Group:
         for column in columns:
             table.add_column(header[column], overflow="fold", no_wrap=column > 1)
         for line in lines:
-            table.add_row(*(line[column] for column in columns))
+            table.add_row(*(Text(line[column]) for column in columns))
         parts.append(table)
     return Group(*parts, Text(f"{legend(rows)}\n{note}"))
 
@@ -255,7 +256,7 @@ def comma_separated(rows: Sequence[Summary]) -> str:
     writer.writerow(plain + more)
     for row in rows:
         axes = row.rmse or ("", "", "")
-        line = [getattr(row, key) for key in plain]
+        line = [in_csv(getattr(row, key)) for key in plain]
         line += [*axes, row.total, *row.spread, row.excess, row.failed, *row.milliseconds, row.seconds]
         writer.writerow([*line, *(row.violations or ("", "")), *(row.at_bound or ("", "")), row.paid])
     return buffer.getvalue()
