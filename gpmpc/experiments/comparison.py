@@ -31,7 +31,8 @@ class Comparison:
     Attributes:
         measure: Name of the measure.
         medians: Of A and of B, over the pairs.
-        means: The same.
+        quartiles: Of A - B over the pairs: first, median, third.
+        means: Of A and of B.
         difference: Mean of A - B over the pairs.
         interval: Of that mean, 95 %, by Student's t.
         wilcoxon: Two-sided p-value of the signed-rank test.
@@ -45,6 +46,7 @@ class Comparison:
 
     measure: str
     medians: tuple[float, float]
+    quartiles: tuple[float, float, float]
     means: tuple[float, float]
     difference: float
     interval: tuple[float, float]
@@ -170,6 +172,7 @@ def _tested(measure: str, pairs: np.ndarray) -> Comparison:
     return Comparison(
         measure=measure,
         medians=tuple(np.median(pairs, axis=0).tolist()),
+        quartiles=tuple(np.quantile(differences, [0.25, 0.5, 0.75]).tolist()),
         means=(float(pairs[:, 0].mean()), float(pairs[:, 1].mean())),
         difference=mean,
         interval=(mean - half, mean + half),
@@ -192,17 +195,15 @@ def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str)
         lines[0] += f" Left out, since A or B lacks runs of it: {told}."
     for c in comparisons:
         others = "; ".join(name for name in c.left_out if name not in everywhere)
-        low, high = c.interval
+        low, median, high = c.quartiles
         tests = (
-            ""
-            if low == high
-            else (
-                f" (95 %: {low:.3g} to {high:.3g}); Wilcoxon signed-rank p = {c.wilcoxon:.3g}, paired t-test p = "
-                f"{c.t_test:.3g}; rank-biserial {c.rank_biserial:.2f}, d_z {c.standardised:.2f}"
-            )
+            f"; Wilcoxon signed-rank p = {c.wilcoxon:.3g}, rank-biserial {c.rank_biserial:.2f}; mean difference "
+            f"{c.difference:.3g} (95 %: {c.interval[0]:.3g} to {c.interval[1]:.3g}), paired t-test p = {c.t_test:.3g}, "
+            f"d_z {c.standardised:.2f}"
         )
         lines.append(
-            f"{report.label(c.measure)}: {c.verdict}. Median {c.medians[0]:.4g} against {c.medians[1]:.4g}, mean "
-            f"difference {c.difference:.3g}{tests}; n = {c.pairs}" + (f"; left out as well: {others}" if others else "")
+            f"{report.label(c.measure)}: {c.verdict}. Medians {c.medians[0]:.4g} and {c.medians[1]:.4g}; differences "
+            f"{median:.3g} [{low:.3g}, {high:.3g}]{tests if c.interval[0] != c.interval[1] else ''}; n = {c.pairs}"
+            + (f"; left out as well: {others}" if others else "")
         )
     return lines

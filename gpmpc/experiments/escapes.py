@@ -29,7 +29,7 @@ def in_plain_text(text: object) -> str:
 def in_markdown(text: str) -> str:
     """Neither HTML, nor a link, emphasis, formula or the end of a table's cell."""
     text = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    return re.sub(r"[\\`*|~$]|(?<!\w)_|_(?!\w)|(?<=\])[(\[:]", r"\\\g<0>", text)
+    return re.sub(r"[\\`*|~$]|(?<!\w)_|_(?!\w)|(?<=\])[(\[]", r"\\\g<0>", text)
 
 
 def in_latex(text: str) -> str:

@@ -188,7 +188,8 @@ def page(report: Report, drawn: dict[str, bytes], comparison: Sequence[str] = ()
         lines = "".join(f"<li>{escape(line)}</li>" for line in comparison)
         parts += ["<h2>Comparison</h2>", f"<ul>{lines}</ul>"]
     for kind, runs in notes(report).items():
-        items = "".join(f"<li><code>{escape(f)}</code> <span class=bad>{escape(why)}</span></li>" for f, why in runs)
+        lines = ((f"<code>{escape(f)}</code> " if f else "", escape(why)) for f, why in runs)
+        items = "".join(f"<li>{folder}<span class=bad>{why}</span></li>" for folder, why in lines)
         parts += [f"<h2>{kind}</h2>", f"<ul>{items}</ul>"]
     if report.commands():
         commands = escape("\n".join(report.commands()))
