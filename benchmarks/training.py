@@ -22,7 +22,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from gpmpc.cli.main import config_folder
+from gpmpc.cli.configuration import config_folder
 from gpmpc.experiments.tables import Tables
 from gpmpc.gp import Trainer
 from gpmpc.provenance import provenance

@@ -1,11 +1,14 @@
 """Problem: independent jobs should use every core, without one thread pool inside another and without orphans.
 
 Jobs run in freshly started processes (spawn: it is safe with threads and the same on every system), one thread each. On
-Ctrl-C, which reaches the whole process group, the parent alone answers: what is running is ended, nothing hangs.
+Ctrl-C, which reaches the whole process group, the parent alone answers: what is running is ended, nothing hangs. Where
+the parent itself is killed, its workers end by themselves.
 """
 
 import os
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -16,6 +19,7 @@ J = TypeVar("J")
 R = TypeVar("R")
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+LOOK = 0.5  # between two looks at whether the parent lives [s]
 
 
 def in_processes(function: Callable[[J], R], jobs: Sequence[J], workers: int | None = None) -> Iterator[tuple[int, R]]:
@@ -32,9 +36,11 @@ def in_processes(function: Callable[[J], R], jobs: Sequence[J], workers: int | N
     if not jobs:
         return
     workers, before = min(workers or cores(), len(jobs)), set(active_children())
-    with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), _quiet_on_interrupt) as pool:
+    mine = {"initializer": end_with, "initargs": (os.getpid(),)}
+    with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), **mine) as pool:
         try:  # around the start as well: leaving the pool waits for what was begun
-            running = {pool.submit(function, job): index for index, job in enumerate(jobs)}
+            with deaf_children():
+                running = {pool.submit(function, job): index for index, job in enumerate(jobs)}
             for done in as_completed(running):
                 yield running[done], done.result()
         except BaseException:  # a failed job, Ctrl-C, or a caller that wants no more
@@ -49,8 +55,31 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _quiet_on_interrupt() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def end_with(parent: int) -> None:
+    """Ends this process soon after its parent, whatever ended that.
+
+    An orphan would compute what nobody reads, or wait for jobs that do not come, and hold the terminal's pipe open.
+
+    Args:
+        parent: The parent's process id, which the parent itself states: it may be gone before this is called.
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(LOOK)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def deaf_children() -> Iterator[None]:
+    """Processes started inside do not hear Ctrl-C, from their first moment on; this one hears it at the end."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

@@ -1,5 +1,48 @@
-"""The command ``gpmpc``: thin entries over the package; the only importer of hydra."""
+"""The command ``gpmpc``: thin entries over the package; the only importer of hydra.
 
-from gpmpc.cli.main import main
+What stands here is there before any library: Ctrl-C ends the command with one line from its first moment on.
+"""
 
-__all__ = ["main"]
+import _thread
+import signal
+import sys
+from contextlib import suppress
+from types import FrameType
+
+
+def main() -> None:
+    """Runs the command line."""
+    interrupts = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        interrupts.append(number)
+        raise KeyboardInterrupt
+
+    def interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
+        """Raises once more what came inside a finaliser, where Python would print a traceback and go on."""
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            _thread.interrupt_main()
+        else:
+            sys.__unraisablehook__(lost)
+
+    ignored = signal.getsignal(signal.SIGINT) is not signal.default_int_handler  # as under nohup
+    if not ignored:
+        signal.signal(signal.SIGINT, interrupt)
+    sys.unraisablehook = interrupt_again
+    try:
+        from gpmpc.cli.streams import usable_streams
+
+        with usable_streams():
+            from gpmpc.cli.command import main as command
+
+            command()
+    except BaseException as error:  # whatever a library made of the interrupt
+        if not interrupts:
+            raise
+        advice = f"; {error}" if isinstance(error, KeyboardInterrupt) and error.args else ""
+        with suppress(OSError):
+            print(f"\ninterrupted{advice}", file=sys.stderr)
+        sys.exit(130)
+    finally:
+        if not ignored:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends what is still being tidied up, without a traceback

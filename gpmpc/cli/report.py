@@ -27,7 +27,7 @@ def report(arguments: list[str]) -> None:
 
     from gpmpc.experiments.comparison import compare, sentences
     from gpmpc.experiments.report import report as put_together
-    from gpmpc.experiments.report_documents import documents, render
+    from gpmpc.experiments.report_documents import documents, notes, render
     from gpmpc.files import write_whole
 
     found = put_together(given.tree)
@@ -47,11 +47,9 @@ def report(arguments: list[str]) -> None:
 
     for line in lines:
         say(line)
-    for cell in found.cells:
-        for run in cell.failed.values():
-            say(f"failed: {run.folder.name}: {run.error}")
-    for line in found.skipped:
-        say(f"skipped: {line}")
+    for kind, runs in notes(found).items():
+        for name, reason in runs:
+            say(f"{kind.lower()}: {f'{name}: ' * bool(name)}{reason}")
     for command in found.commands():
         say(f"to fill: {command}")
     say(f"written to {folder}: {', '.join(sorted(written))}")

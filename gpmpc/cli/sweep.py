@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import sys
+from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from hydra._internal.callbacks import Callbacks
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
+from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
@@ -35,7 +37,7 @@ from gpmpc.cli.screen import progress_bar
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.experiments.run_folder import PLAN, Busy, RunFolder, folder_name
 from gpmpc.files import write_whole
-from gpmpc.parallel import THREADS
+from gpmpc.parallel import THREADS, end_with
 
 LOOK = 0.5  # between two looks at the folders [s]
 
@@ -54,13 +56,13 @@ class Job:
         return self.folder.finished or self.folder.failed_at not in (None, self.failed_before)
 
 
-def sweep(overrides: Sequence[str], conf: Path) -> None:
+def sweep(given: Namespace, conf: Path) -> None:
     """Runs every combination of the choices that is not finished; the command line after ``gpmpc run -m``.
 
     Exits with 1 where runs failed, and names them, and where the launcher broke down.
 
     Args:
-        overrides: The settings, some with several values.
+        given: Hydra's options, and as ``overrides`` the settings, some with several values.
         conf: Folder of the configuration.
 
     Raises:
@@ -72,8 +74,8 @@ def sweep(overrides: Sequence[str], conf: Path) -> None:
         os.environ[name] = "1"
     console = Console()
     try:
-        context, config = _composed(overrides, conf)
-        jobs = _jobs(overrides, config)
+        context, config = _composed(given, conf)
+        jobs = _jobs(given.overrides, config)
         waiting, finished = [], []
         for job in jobs:
             (finished if job.folder.finished else waiting).append(job)
@@ -117,11 +119,18 @@ def _outcome(config: DictConfig, wait: bool) -> dict[str, Any]:
     return {key: outcome[key] for key in ("folder", "error") if key in outcome}
 
 
-def _composed(overrides: Sequence[str], conf: Path) -> tuple[HydraContext, DictConfig]:
+def _composed(given: Namespace, conf: Path) -> tuple[HydraContext, DictConfig]:
     """What ``hydra.main`` makes before it sweeps."""
     version.setbase("1.3")
-    hydra = Hydra.create_main_hydra2("run", create_config_search_path(str(conf)))
-    config = hydra.compose_config("run", list(overrides), run_mode=RunMode.MULTIRUN, with_log_configuration=False)
+    folders = create_config_search_path(given.config_path or str(conf))
+    if given.config_dir is not None:
+        if not Path(given.config_dir).is_dir():
+            raise SettingError("--config-dir", f"{given.config_dir}: no such folder")
+        own = f"file://{Path(given.config_dir).absolute()}"
+        folders.prepend(provider="command-line", path=own, anchor=SearchPathQuery(provider="schema"))
+    hydra = Hydra.create_main_hydra2("run", folders)
+    name, overrides = given.config_name or "run", list(given.overrides)
+    config = hydra.compose_config(name, overrides, run_mode=RunMode.MULTIRUN, with_log_configuration=False)
     config.hydra.mode = RunMode.MULTIRUN
     return HydraContext(config_loader=hydra.config_loader, callbacks=Callbacks(config)), config
 
@@ -181,6 +190,8 @@ def _launch(jobs: Sequence[Job], wait: bool, context: HydraContext, config: Dict
     launcher = Plugins.instance().instantiate_launcher(
         hydra_context=context, task_function=fly_after_others if wait else fly, config=config
     )
+    if isinstance(workers := getattr(launcher, "joblib", None), dict):  # of the joblib launcher: joblib's own arguments
+        workers |= {"initializer": end_with, "initargs": (os.getpid(),)}
     try:
         returns = launcher.launch([job.overrides for job in jobs], initial_job_idx=0)
         return [each.return_value for each in returns]

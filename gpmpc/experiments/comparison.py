@@ -1,4 +1,4 @@
-"""Problem: two groups of runs differ in their means, and it has to be said whether that is more than luck.
+"""Problem: two groups of runs differ, and it has to be said whether that is more than luck.
 
 Runs of one seed share their training rows and their noise, so they are compared in pairs: what else was varied is
 averaged within a seed first, and a seed counts once. So that every seed is an average over the same, seeds and other
@@ -6,7 +6,8 @@ settings of which one of the groups lacks runs are left out, and named. Two pair
 test (Wilcoxon, 1945) decides: it asks only that the differences are spread symmetrically. Student's t-test beside it
 asks for normal ones. With fewer than six pairs nothing can make the first one significant at 5 %. Where the seed
 decides nothing (all rows, one start, no noise) its runs are copies of one, and no test may count them: a difference
-that never varies is undecided.
+that never varies is undecided. Wall times are not compared: one group is flown after the other, and what the machine
+did meanwhile is no property of either.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,6 +30,8 @@ class Comparison:
 
     Attributes:
         measure: Name of the measure.
+        medians: Of A and of B, over the pairs.
+        quartiles: Of A - B over the pairs: first, median, third.
         means: Of A and of B.
         difference: Mean of A - B over the pairs.
         interval: Of that mean, 95 %, by Student's t.
@@ -42,6 +45,8 @@ class Comparison:
     """
 
     measure: str
+    medians: tuple[float, float]
+    quartiles: tuple[float, float, float]
     means: tuple[float, float]
     difference: float
     interval: tuple[float, float]
@@ -82,11 +87,11 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         DataError: The groups have no two seeds in common.
     """
     groups = [_group(report, key, text) for key, text in (("A", a), ("B", b))]
-    units = {run.result["unit"] for group in groups for cell in _cells(report, group) for run in cell.runs.values()}
+    units = {run.unit for group in groups for cell in _cells(report, group) for run in cell.runs.values()}
     if len(units) > 1:
         raise SettingError("compare", "errors in m and in rad have no common mean; add subsystem=... to both groups")
     comparisons = []
-    for measure in report.measures():
+    for measure in (name for name in report.measures() if not MEASURES[name].wall_time):
         first, second = (_by_pair(report, group, measure) for group in groups)
         settings, seeds, left_out = _complete(first, second)
         if len(seeds) >= 2:
@@ -118,9 +123,8 @@ def _by_pair(report: Report, group: Mapping[str, str], measure: str) -> dict[tup
     for cell in _cells(report, group):
         rest = tuple(v for name, v in zip(report.variables, cell.values, strict=True) if name not in group)
         for seed, run in cell.runs.items():
-            value = MEASURES[measure].of(run.result)
-            if value is not None:
-                found[rest, seed] = float(value)
+            if (value := run.numbers[measure]) is not None:
+                found[rest, seed] = value
     return found
 
 
@@ -167,6 +171,8 @@ def _tested(measure: str, pairs: np.ndarray) -> Comparison:
     signed = float((ranks * np.sign(differences[differences != 0])).sum())
     return Comparison(
         measure=measure,
+        medians=tuple(np.median(pairs, axis=0).tolist()),
+        quartiles=tuple(np.quantile(differences, [0.25, 0.5, 0.75]).tolist()),
         means=(float(pairs[:, 0].mean()), float(pairs[:, 1].mean())),
         difference=mean,
         interval=(mean - half, mean + half),
@@ -180,24 +186,24 @@ def _tested(measure: str, pairs: np.ndarray) -> Comparison:
 
 def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str) -> list[str]:
     """A line a measure, with everything that a reader needs to doubt it."""
-    lines = [f"A: {a}; B: {b}; pairs are seeds, what else was varied is averaged within a seed."]
+    lines = [
+        f"A: {a}; B: {b}; pairs are seeds, what else was varied is averaged within a seed. Times are not compared."
+    ]
     everywhere = set.intersection(*(set(c.left_out) for c in comparisons))
     if everywhere:
         told = "; ".join(name for name in comparisons[0].left_out if name in everywhere)
         lines[0] += f" Left out, since A or B lacks runs of it: {told}."
     for c in comparisons:
         others = "; ".join(name for name in c.left_out if name not in everywhere)
-        low, high = c.interval
+        low, median, high = c.quartiles
         tests = (
-            ""
-            if low == high
-            else (
-                f" (95 %: {low:.3g} to {high:.3g}); Wilcoxon signed-rank p = {c.wilcoxon:.3g}, paired t-test p = "
-                f"{c.t_test:.3g}; rank-biserial {c.rank_biserial:.2f}, d_z {c.standardised:.2f}"
-            )
+            f"; Wilcoxon signed-rank p = {c.wilcoxon:.3g}, rank-biserial {c.rank_biserial:.2f}; mean difference "
+            f"{c.difference:.3g} (95 %: {c.interval[0]:.3g} to {c.interval[1]:.3g}), paired t-test p = {c.t_test:.3g}, "
+            f"d_z {c.standardised:.2f}"
         )
         lines.append(
-            f"{report.label(c.measure)}: {c.verdict}. Mean {c.means[0]:.4g} against {c.means[1]:.4g}, difference "
-            f"{c.difference:.3g}{tests}; n = {c.pairs}" + (f"; left out as well: {others}" if others else "")
+            f"{report.label(c.measure)}: {c.verdict}. Medians {c.medians[0]:.4g} and {c.medians[1]:.4g}; differences "
+            f"{median:.3g} [{low:.3g}, {high:.3g}]{tests if c.interval[0] != c.interval[1] else ''}; n = {c.pairs}"
+            + (f"; left out as well: {others}" if others else "")
         )
     return lines

@@ -4,6 +4,7 @@ A ``Row`` says which controller, with which settings; a ``Task``, what it flies;
 ``Flight``, and ``fly`` flies it.
 """
 
+import inspect
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,6 +34,8 @@ from gpmpc.simulation.loop import window
 PROPAGATIONS = {"moment_matching": MomentMatching, "linearization": Linearization}
 CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "convex": ConvexMPC}
 LOOPS = ("model", "plant")
+SUBSYSTEMS = ("translational", "rotational")
+PRICES = ("l1", "l2")  # of unkept state bounds, among a row's settings
 ALL = 0  # ``size`` of a row that learns from all samples
 AT_BOUND = 1e-6  # [m, m/s] distance of a plan to a bound that is none
 
@@ -88,6 +91,13 @@ class Row:
                 raise SettingError(key, f"must be one of {', '.join(possible)}; got {getattr(self, key)!r}")
         if self.loop == "model" and self.controller == "nmpc":
             raise SettingError("controller", "nmpc knows the true plant and needs it in the loop; got loop model")
+        taken = {*inspect.signature(CONTROLLERS[self.controller]).parameters, *PRICES}
+        for key in self.settings:
+            if key not in taken:
+                raise SettingError(f"settings.{key}", f"controller {self.controller} takes no such setting")
+        for subsystem in self.subsystems:
+            if subsystem not in SUBSYSTEMS:
+                raise SettingError("subsystems", f"must be among {', '.join(SUBSYSTEMS)}; got {subsystem!r}")
         for key, least in (("horizon", 1), ("size", 0)):
             for value in _several(getattr(self, key)):
                 check_number(key, value, least=least, whole=True)
@@ -142,16 +152,26 @@ class Task:
     steps: int
 
 
+def problem_of(
+    row: Row,
+    lower: Sequence[float],
+    upper: Sequence[float],
+    state_lower: Sequence[float] | None,
+    state_upper: Sequence[float] | None,
+) -> TrackingProblem:
+    """The tracking problem of a row between bounds of the inputs and states, as ``Task`` has them."""
+    bounds = {"input_lower": lower, "input_upper": upper} if row.bounded else {}
+    limits = None
+    if state_lower is not None:
+        prices = {key: row.settings[key] for key in PRICES if key in row.settings}
+        limits = StateBounds(state_lower, state_upper, confidence=row.confidence, **prices)
+    return TrackingProblem(row.Q, row.R, row.penalized, state_bounds=limits, **bounds)
+
+
 def controller_of(row: Row, task: Task) -> Controller:
     """The controller of a row, for one flight."""
-    bounds, limits = {}, None
-    if row.bounded:
-        bounds = {"input_lower": task.lower, "input_upper": task.upper}
-    settings = dict(row.settings)
-    if task.state_lower is not None:
-        prices = {key: settings.pop(key) for key in ("l1", "l2") if key in settings}
-        limits = StateBounds(task.state_lower, task.state_upper, confidence=row.confidence, **prices)
-    problem = TrackingProblem(row.Q, row.R, row.penalized, state_bounds=limits, **bounds)
+    problem = problem_of(row, task.lower, task.upper, task.state_lower, task.state_upper)
+    settings = {key: value for key, value in row.settings.items() if key not in PRICES}
     known = task.reference.inputs
     at_first = np.array([task.plant.dynamics.mass * GRAVITY, 0.0, 0.0]) if known is None else known[0]
     at_first = np.clip(at_first, problem.input_lower, problem.input_upper)

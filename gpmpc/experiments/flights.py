@@ -29,11 +29,11 @@ import gpmpc
 from gpmpc.control.controller import Reference
 from gpmpc.datasets import DataSource
 from gpmpc.exceptions import DataError, SettingError, check_number
-from gpmpc.experiments.flight import Flight, Row, Task, fly
+from gpmpc.experiments.flight import Flight, Row, Task, fly, problem_of
 from gpmpc.experiments.tables import FitStore, Subsystem, digest
 from gpmpc.gp import Scaling, Transitions
 from gpmpc.parallel import in_processes
-from gpmpc.plants import Plant
+from gpmpc.plants import Plant, Translational
 from gpmpc.trajectories import Trajectory, states_along
 
 SOURCES = ("gaussian.py", "metrics.py", "control/*.py", "gp/*.py", "propagation/*.py", "fused/*.py", "qp/*.py")
@@ -62,7 +62,8 @@ class Flights:
         workers: Processes; None takes one a core.
 
     Raises:
-        SettingError: A number out of range, no rows, or rows that name data that are not there.
+        SettingError: A number out of range, nothing to fly, rows that name data that are not there, or bounds that a
+            row needs and that are not there or do not fit it.
     """
 
     rows: Mapping[str, Row]
@@ -93,6 +94,24 @@ class Flights:
         for name, row in self.rows.items():
             if row.data not in self.data:
                 raise SettingError(f"rows.{name}.data", f"must be one of {', '.join(self.data)}; got {row.data!r}")
+        if tuple(self.plant.dynamics.state_names) != Translational.state_names:
+            names = ", ".join(self.plant.dynamics.state_names)
+            raise SettingError("plant", f"must have the states of the translational subsystem; got {names}")
+        for _, row, trajectory, subsystem in self._flown():
+            problem_of(row, *self._bounds(row, trajectory, subsystem))
+        if not self._flown():
+            chosen = ", ".join(self.subsystems) or "none"
+            raise SettingError("subsystem", f"no row flies it in the chosen loops; got {chosen}")
+
+    def _flown(self) -> list[tuple[str, Row, str, str]]:
+        """Name, row, trajectory and subsystem of everything that is flown, each once a trial."""
+        return [
+            (name, row, trajectory, subsystem)
+            for name, template in self.rows.items()
+            for trajectory, row in itertools.product(self.trajectories, template.variants())
+            for subsystem in (row.subsystems if row.loop == "model" else ("translational",))
+            if subsystem in self.subsystems
+        ]
 
     def flights(self, folder: Path, progress: Callable[[str], None] = lambda _: None) -> list[Flight]:
         """Every flight of the experiment, its GPs trained; trained ones are kept in ``folder``.
@@ -101,14 +120,14 @@ class Flights:
             DataError: The data cannot be read, or are fewer than are asked for.
             TrainingError: GPs could not be trained.
         """
-        flights = []
-        for name, template in self.rows.items():
-            for trajectory, row in itertools.product(self.trajectories, template.variants()):
-                for subsystem in row.subsystems if row.loop == "model" else ("translational",):
-                    progress(f"{name}, {trajectory} {subsystem}")
-                    task = self._task(row, trajectory, subsystem, folder)
-                    trials = 1 if row.loop == "model" else row.trials or self.trials
-                    flights += [self._flight(name, row, trajectory, subsystem, t, task) for t in range(trials)]
+        flown, flights = self._flown(), []
+        for _, row, trajectory, subsystem in flown:  # what the data do not hold is found out before any training
+            self._data(row, trajectory, subsystem)
+        for name, row, trajectory, subsystem in flown:
+            progress(f"{name}, {trajectory} {subsystem}")
+            task = self._task(row, trajectory, subsystem, folder)
+            trials = 1 if row.loop == "model" else row.trials or self.trials
+            flights += [self._flight(name, row, trajectory, subsystem, t, task) for t in range(trials)]
         return flights
 
     def _flight(self, name: str, row: Row, trajectory: str, subsystem: str, trial: int, task: Task) -> Flight:
@@ -122,40 +141,55 @@ class Flights:
         content += [np.ascontiguousarray(array).tobytes() for array in arrays if array is not None]
         return Flight(name, row, trajectory, subsystem, trial, seed, task, digest(_source(), *content))
 
+    def _bounds(self, row: Row, trajectory: str, subsystem: str) -> tuple[Sequence[float] | None, ...]:
+        """Lower and upper bounds of the inputs, then of the states, None where there are none."""
+        of_inputs = self.bounds.get(row.loop) or {}
+        if row.loop == "model":
+            of_inputs = of_inputs.get(subsystem) or of_inputs.get(trajectory) or {}
+        of_states = None
+        if row.confidence is not None:
+            of_states = (self.state_bounds or {}).get(trajectory) or {}
+        found = []
+        for key, box in (("bounds", of_inputs), ("state_bounds", of_states)):
+            if box is not None and not {"lower", "upper"} <= set(box):
+                what = f"must hold lower and upper of the {row.loop} on {trajectory}, {subsystem}; got {box or 'none'}"
+                raise SettingError(key, what)
+            found += [None, None] if box is None else [box["lower"], box["upper"]]
+        lower, upper, state_lower, state_upper = found
+        if of_states is not None:
+            state_lower, state_upper = _infinite(state_lower, -np.inf), _infinite(state_upper, np.inf)
+        return lower, upper, state_lower, state_upper
+
+    def _data(self, row: Row, trajectory: str, subsystem: str) -> tuple[Transitions | None, list[int]]:
+        """The transitions of a row, None for a controller that knows the plant, and those that its GP learns from."""
+        size = row.size or self.samples
+        if row.controller == "nmpc":
+            return None, []
+        if row.loop == "plant":
+            data = self._transitions(row.data, trajectory, subsystem, max(size, self.samples))
+            return data, _subset(len(data), size, self.seed)
+        data = self._transitions(row.data, trajectory, subsystem, max(self.samples, self.steps + row.horizon))
+        return data, _subset(self.samples, size, self.seed)
+
     def _task(self, row: Row, trajectory: str, subsystem: str, folder: Path) -> Task:
         n_ahead = self.steps + row.horizon
-        state_bounds = self.state_bounds.get(trajectory) if row.confidence is not None else None
-        shared = {
-            "state_lower": None if state_bounds is None else _infinite(state_bounds["lower"], -np.inf),
-            "state_upper": None if state_bounds is None else _infinite(state_bounds["upper"], np.inf),
-            "plant": self.plant,
-            "noise": self.noise,
-            "steps": self.steps,
-        }
-        size = row.size or self.samples
+        lower, upper, state_lower, state_upper = self._bounds(row, trajectory, subsystem)
+        shared = {"lower": lower, "upper": upper, "state_lower": state_lower, "state_upper": state_upper}
+        shared |= {"plant": self.plant, "noise": self.noise, "steps": self.steps}
+        data, chosen = self._data(row, trajectory, subsystem)
         if row.loop == "plant":
-            box = self.bounds["plant"]
-            data = None
-            if row.controller != "nmpc":
-                data = self._transitions(row.data, trajectory, subsystem, max(size, self.samples))
-                data = data[_subset(len(data), size, self.seed)]
             times = self.plant.time_step * np.arange(n_ahead + 1)
             reference = Reference(states_along(self.trajectories[trajectory], times))
             unscaled = Scaling(torch.zeros(6), torch.ones(6))
-            posterior = None if data is None else self._trained(row.loop, data, folder)
-            return Task(posterior, reference, unscaled, box["lower"], box["upper"], **shared)
-        data = self._transitions(row.data, trajectory, subsystem, max(self.samples, n_ahead))
+            posterior = None if data is None else self._trained(row.loop, data[chosen], folder)
+            return Task(posterior, reference, unscaled, **shared)
         part, n, m = self.subsystems[subsystem], data.state_dim, data.input_dim
         # States and next states share one scaling, so that a prediction can be fed back in.
         visited = torch.cat([data.states, data.next_states[-1:]])
         states, inputs = part.scaling(visited, part.columns[:n]), part.scaling(data.inputs, part.columns[n : n + m])
         learned = Transitions(states.scale(data.states), inputs.scale(data.inputs), states.scale(data.next_states))
         reference = Reference(states.scale(visited)[: n_ahead + 1].numpy(), learned.inputs[:n_ahead].numpy())
-        chosen = _subset(self.samples, size, self.seed)
-        box = self.bounds["model"].get(subsystem) or self.bounds["model"][trajectory]
-        return Task(
-            self._trained(row.loop, learned[chosen], folder), reference, states, box["lower"], box["upper"], **shared
-        )
+        return Task(self._trained(row.loop, learned[chosen], folder), reference, states, **shared)
 
     def _transitions(self, name: str, trajectory: str, subsystem: str, count: int) -> Transitions:
         source = self.data[name]

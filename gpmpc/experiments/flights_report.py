@@ -14,6 +14,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from gpmpc.experiments.escapes import in_csv
 from gpmpc.experiments.tables_report import markdown_table, number
 from gpmpc.metrics import binomial_interval, time_quantiles
 from gpmpc.plotting import Curve, over_settings, png, tracking
@@ -185,7 +186,7 @@ def timing(rows: Sequence[Summary]) -> list[list[str]]:
     for trajectory, by_name in ours.items():
         convex = [row for row in by_name.values() if row.controller == "convex"]
         for row in by_name.values():
-            if row.controller == "nonlinear" and convex:
+            if row.controller == "nonlinear" and convex and ("nonlinear", trajectory) in paper_seconds():
                 paper = paper_seconds()[("nonlinear", trajectory)] / paper_seconds()[("convex", trajectory)]
                 ratio = row.seconds / convex[0].seconds
                 lines.append([f"ratio: {row.name} / {convex[0].name}", trajectory, f"{ratio:.2f}", f"{paper:.2f}", ""])
@@ -215,7 +216,7 @@ def render(rows: Sequence[Summary], note: str) -> Group:
         for column in columns:
             table.add_column(header[column], overflow="fold", no_wrap=column > 1)
         for line in lines:
-            table.add_row(*(line[column] for column in columns))
+            table.add_row(*(Text(line[column]) for column in columns))
         parts.append(table)
     return Group(*parts, Text(f"{legend(rows)}\n{note}"))
 
@@ -255,7 +256,7 @@ def comma_separated(rows: Sequence[Summary]) -> str:
     writer.writerow(plain + more)
     for row in rows:
         axes = row.rmse or ("", "", "")
-        line = [getattr(row, key) for key in plain]
+        line = [in_csv(getattr(row, key)) for key in plain]
         line += [*axes, row.total, *row.spread, row.excess, row.failed, *row.milliseconds, row.seconds]
         writer.writerow([*line, *(row.violations or ("", "")), *(row.at_bound or ("", "")), row.paid])
     return buffer.getvalue()
@@ -280,12 +281,13 @@ def pictures(rows: Sequence[Summary], records: Sequence[dict]) -> dict[str, byte
                     shown.append((labels, [_curve(r, "states", range(0, 6, 2)) for r in there]))
             if shown:
                 found[f"{figure}{suffix}.png"] = png(tracking(shown))
+        flying = [r for r in chosen if r["subsystem"] == "translational"]
         inputs = [
             (
                 tuple(f"{trajectory}: {label}" for label in INPUTS),
-                [_curve(r, "inputs", range(3)) for r in chosen if r["trajectory"] == trajectory and _flies(r)],
+                [_curve(r, "inputs", range(3)) for r in flying if r["trajectory"] == trajectory],
             )
-            for trajectory in dict.fromkeys(r["trajectory"] for r in chosen)
+            for trajectory in dict.fromkeys(r["trajectory"] for r in flying)
         ]
         if inputs:
             found[f"figure4{suffix}.png"] = png(tracking(inputs))
@@ -294,10 +296,6 @@ def pictures(rows: Sequence[Summary], records: Sequence[dict]) -> dict[str, byte
         ("confidence.png", _over_confidence(rows), "allowed rate 1 - eta", {"diagonal": True}),
     )
     return found | {name: png(over_settings(panels, at, **how)) for name, panels, at, how in curves if panels}
-
-
-def _flies(record: dict) -> bool:
-    return record["subsystem"] == "translational"
 
 
 def _curve(record: dict, key: str, columns: Sequence[int]) -> Curve:

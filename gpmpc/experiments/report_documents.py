@@ -3,23 +3,27 @@
 import base64
 import csv
 import io
+import re
 from collections.abc import Sequence
 from html import escape
 from itertools import groupby, zip_longest
-from statistics import mean, quantiles
 from typing import NamedTuple
 
+import numpy as np
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
+from gpmpc.experiments.escapes import in_csv, in_figure, in_latex, in_markdown, in_plain_text
 from gpmpc.experiments.report import MEASURES, Cell, Report, in_order
-from gpmpc.experiments.tables_report import number
+from gpmpc.experiments.run_folder import LONGEST_NAME
+from gpmpc.experiments.tables_report import markdown_table, number
 from gpmpc.plotting import Series, over_variable, png
 
 DRAWN = ("rmse", "failed", "decision")  # a figure each
 SHOWN = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
 MOST_LINES = 8  # in a figure; what is varied besides is pooled
-LATEX = str.maketrans({c: f"\\{c}" for c in "&%$#_{}"} | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"})
+LEGEND = "Median [first to third quartile] over the seeds"
 STYLE = """
 :root { color-scheme: light; }
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-width: 75rem; margin: 2rem auto;
@@ -40,19 +44,14 @@ pre { padding: .6rem; } .bad { color: #b03a2e; } li { overflow-wrap: anywhere; }
 class Spread(NamedTuple):
     """Of one measure over the runs of a cell."""
 
-    mean: float
     low: float
     median: float
     high: float
 
 
 def spread(values: Sequence[float]) -> Spread | None:
-    """Mean and quartiles; None where there is nothing."""
-    if not values:
-        return None
-    if len(values) == 1:
-        return Spread(*[values[0]] * 4)
-    return Spread(mean(values), *quantiles(values, n=4, method="inclusive"))
+    """Median and quartiles; None where there is nothing."""
+    return Spread(*np.quantile(values, [0.25, 0.5, 0.75]).tolist()) if values else None
 
 
 def documents(report: Report, comparison: Sequence[str] = ()) -> dict[str, str | bytes]:
@@ -69,39 +68,49 @@ def documents(report: Report, comparison: Sequence[str] = ()) -> dict[str, str |
 
 def title(report: Report) -> str:
     """How much there is of it."""
-    finished, failed, missing, _ = (sum(map(len, group)) for group in zip(*map(_counts, report.cells), strict=True))
+    finished, lost, failed, missing, _ = (
+        sum(map(len, group)) for group in zip(*map(_counts, report.cells), strict=True)
+    )
     text = f"{finished} finished in {len(report.cells)} cells, {failed} failed, {missing} missing"
-    return f"{text}, {len(report.skipped)} skipped" if report.skipped else text
+    text += f", {len(report.skipped)} skipped" if report.skipped else ""
+    return text + (f"; of those finished, {lost} lost" if lost else "")
 
 
 def render(report: Report) -> Table:
-    """The table for a terminal: mean, and the quartiles below it; what is zero everywhere is left out."""
+    """The table for a terminal: median, and the quartiles below it; what is zero everywhere is left out."""
     shown = [name for name in SHOWN if name in _telling(report)]
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title(report), title_justify="left")
+    table = Table(
+        box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title=Text(title(report), style="italic"), title_justify="left"
+    )
     for name in report.variables or ("runs",):
-        table.add_column(name.replace(".", ".\n"), justify="right", overflow="fold")
-    table.add_column("seeds", justify="right", no_wrap=True)
-    for name in shown:
-        table.add_column(f"{SHOWN[name]}\n\\[{_unit(report, name)}]", justify="right", no_wrap=True)
-    for cell in report.cells:
-        texts = [_text(cell, name, "\n").replace("[", "\\[") for name in shown]
-        table.add_row(*_named(report, cell), _seeds(cell, "\n"), *texts)
+        table.add_column(Text(name.replace(".", ".\n")), justify="right", overflow="fold")
+    for head in ("seeds", *(f"{SHOWN[name]}\n[{_unit(report, name)}]" for name in shown)):
+        table.add_column(Text(head), justify="right", no_wrap=True)
+    for row in _rows(report, shown, "\n"):
+        table.add_row(*map(Text, row))
     return table
+
+
+def notes(report: Report) -> dict[str, list[tuple[str, str]]]:
+    """What has to be known of single runs, by kind: their folders and the reasons."""
+    each = {
+        "Failed": [(run.folder.name, run.error or "") for cell in report.cells for run in cell.failed.values()],
+        "Lost": [(run.folder.name, run.lost or "") for cell in report.cells for run in cell.lost],
+        "Skipped": [("", line) for line in report.skipped],
+    }
+    return {kind: [(in_plain_text(folder), reason) for folder, reason in runs] for kind, runs in each.items() if runs}
 
 
 def markdown(report: Report, drawn: Sequence[str] = (), comparison: Sequence[str] = ()) -> str:
     """The table as Markdown, with what failed, what is missing and how to get it."""
-    rows = [_header(report), ["---"] * len(_header(report)), *_rows(report, report.measures())]
-    out = [f"# {report.tree.name}", "", f"{title(report)}.{_constants(report)}", ""]
-    out += ["| " + " | ".join(text.replace("|", "\\|") for text in row) + " |" for row in rows]
-    out += ["", "Mean [first to third quartile] over the seeds.", ""]
+    out = [f"# {in_markdown(_name(report))}", "", in_markdown(f"{title(report)}.{_constants(report)}"), ""]
+    out += markdown_table(_header(report), _rows(report, report.measures()))
+    out += ["", f"{LEGEND}.", ""]
     out += [line for name in drawn for line in (f"![{name}]({name})", "")]
     if comparison:
-        out += ["## Comparison", "", *(f"- {line}" for line in comparison), ""]
-    if any(cell.failed for cell in report.cells):
-        out += ["## Failed", "", *(f"- `{folder}`: {error}" for folder, error in _failures(report)), ""]
-    if report.skipped:
-        out += ["## Skipped", "", *(f"- {line}" for line in report.skipped), ""]
+        out += ["## Comparison", "", *(f"- {in_markdown(line)}" for line in comparison), ""]
+    for kind, runs in notes(report).items():
+        out += [f"## {kind}", "", *(f"- {in_markdown(f'{folder}: ' * bool(folder) + why)}" for folder, why in runs), ""]
     if report.commands():
         out += ["## To fill the gaps", "", "```", *report.commands(), "```", ""]
     return "\n".join(out)
@@ -111,12 +120,13 @@ def comma_separated(report: Report) -> str:
     """One line a cell."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    parts = ("mean", "q25", "median", "q75")
+    parts = ("q25", "median", "q75")
     measured = [f"{name}_{part} [{_unit(report, name)}]" for name in report.measures() for part in parts]
-    writer.writerow([*report.variables, "finished", "failed", "missing", "skipped", *measured])
+    counted = ["finished", "lost", "failed", "missing", "skipped"]
+    writer.writerow(map(in_csv, [*report.variables, *counted, *measured]))
     for cell in report.cells:
-        numbers = [value for name in report.measures() for value in spread(cell.numbers(name)) or [""] * 4]
-        writer.writerow([*cell.values, *(len(group) for group in _counts(cell)), *numbers])
+        numbers = [value for name in report.measures() for value in spread(cell.numbers(name)) or [""] * len(parts)]
+        writer.writerow(map(in_csv, [*cell.values, *map(len, _counts(cell)), *numbers]))
     return buffer.getvalue()
 
 
@@ -125,7 +135,7 @@ def latex(report: Report) -> str:
     shown = _telling(report)
     names = [*(report.variables or ("runs",)), "seeds", *(report.label(name) for name in shown)]
     names = [name.replace(", ", "\n").replace(" [", "\n[") for name in names]
-    out = ["% needs \\usepackage{booktabs}; mean, and below it the quartiles over the seeds"]
+    out = ["% needs \\usepackage{booktabs}; median, and below it the quartiles over the seeds"]
     out += [f"\\begin{{tabular}}{{{'r' * len(names)}}}", "\\toprule", *_latex_lines(names), "\\midrule"]
     for row in _rows(report, shown, "\n"):
         out += _latex_lines(row)
@@ -136,9 +146,9 @@ def _latex_lines(row: Sequence[str]) -> list[str]:
     """A row whose cells may have several lines."""
     out = []
     for i, texts in enumerate(zip_longest(*(text.split("\n") for text in row), fillvalue="")):
-        marked = [text.translate(LATEX).replace("—", "--") for text in texts]
+        marked = map(in_latex, texts)
         line = " & ".join(f"\\footnotesize {text}" if i and text else text for text in marked)
-        out.append(("{}" if line.startswith("[") else "") + line + " \\\\")  # the line before would take a bracket
+        out.append(("{}" if line.startswith(("[", "*")) else "") + line + " \\\\")  # the line before would take these
     return out
 
 
@@ -155,10 +165,12 @@ def figures(report: Report) -> dict[str, bytes]:
                 values: dict[str, list[float]] = {position: [] for position in positions}
                 for cell in cells:
                     values[cell.values[index]] += cell.numbers(name)
-                series.append(Series(label, list(values.values())))
-            logarithmic = MEASURES[name].logarithmic
-            figure = over_variable(variable, positions, report.label(name), series, logarithmic, connected=numbers)
-            drawn[f"{name}-over-{variable.replace('/', '-')}.png"] = png(figure, dpi=150)
+                series.append(Series(in_figure(label), list(values.values())))
+            names = map(in_figure, (variable, *positions, report.label(name)))
+            title, *ticks, label = names
+            figure = over_variable(title, ticks, label, series, MEASURES[name].logarithmic, connected=numbers)
+            file = re.sub(r"[^\w.+-]", "-", f"{name}-over-{variable}"[:LONGEST_NAME], flags=re.ASCII)
+            drawn[f"{file}.png" if f"{file}.png" not in drawn else f"{file}-{index}.png"] = png(figure, dpi=150)
     return drawn
 
 
@@ -167,25 +179,23 @@ def page(report: Report, drawn: dict[str, bytes], comparison: Sequence[str] = ()
     row = "".join(f"<th>{escape(name)}</th>" for name in _header(report))
     rows = _rows(report, report.measures(), "\n")
     body = "\n".join("<tr>" + "".join(f"<td>{_html(text)}</td>" for text in row) + "</tr>" for row in rows)
-    parts = [f"<h1>{escape(report.tree.name)}</h1>", f"<p>{escape(title(report))}.{escape(_constants(report))}</p>"]
+    parts = [f"<h1>{escape(_name(report))}</h1>", f"<p>{escape(title(report))}.{escape(_constants(report))}</p>"]
     for _, names in groupby(drawn, lambda name: name.partition("-over-")[2]):
         parts.append(f'<div class="figures">{"".join(_image(name, drawn[name]) for name in names)}</div>')
     parts.append(f'<div class="wide"><table><thead><tr>{row}</tr></thead><tbody>\n{body}\n</tbody></table></div>')
-    parts.append("<p>Mean [first to third quartile] over the seeds. Figures: medians, quartiles, all runs.</p>")
+    parts.append(f"<p>{LEGEND}. Figures: the same, and every run a dot.</p>")
     if comparison:
         lines = "".join(f"<li>{escape(line)}</li>" for line in comparison)
         parts += ["<h2>Comparison</h2>", f"<ul>{lines}</ul>"]
-    if failures := _failures(report):
-        items = "".join(f"<li><code>{escape(f)}</code> <span class=bad>{escape(e)}</span></li>" for f, e in failures)
-        parts += ["<h2>Failed</h2>", f"<ul>{items}</ul>"]
-    if report.skipped:
-        items = "".join(f"<li>{escape(line)}</li>" for line in report.skipped)
-        parts += ["<h2>Skipped</h2>", f"<ul>{items}</ul>"]
+    for kind, runs in notes(report).items():
+        lines = ((f"<code>{escape(f)}</code> " if f else "", escape(why)) for f, why in runs)
+        items = "".join(f"<li>{folder}<span class=bad>{why}</span></li>" for folder, why in lines)
+        parts += [f"<h2>{kind}</h2>", f"<ul>{items}</ul>"]
     if report.commands():
         commands = escape("\n".join(report.commands()))
         parts += ["<h2>To fill the gaps</h2>", f"<pre>{commands}</pre>"]
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-    head += f"<title>{escape(report.tree.name)}</title><style>{STYLE}</style>"
+    head += f"<title>{escape(_name(report))}</title><style>{STYLE}</style>"
     return f"<!doctype html>\n<html lang=en><head>{head}</head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
 
 
@@ -241,15 +251,18 @@ def _named(report: Report, cell: Cell) -> Sequence[str]:
     return cell.values if report.variables else ("all",)
 
 
+def _name(report: Report) -> str:
+    return in_plain_text(report.tree.resolve().name)
+
+
 def _counts(cell: Cell) -> tuple:
-    return cell.runs, cell.failed, cell.missing, cell.skipped
+    return cell.runs, cell.lost, cell.failed, cell.missing, cell.skipped
 
 
 def _seeds(cell: Cell, separator: str = ", ") -> str:
-    """How many finished, and where not all did, how many did not."""
-    named = {"failed": cell.failed, "missing": cell.missing, "skipped": cell.skipped}
-    notes = [f"{len(group)} {word}" for word, group in named.items() if group]
-    return separator.join([str(len(cell.runs)), *notes])
+    """How many finished, how many of these were lost, and where not all did, how many did not."""
+    named = {"lost": cell.lost, "failed": cell.failed, "missing": cell.missing, "skipped": cell.skipped}
+    return separator.join([str(len(cell.runs)), *(f"{len(group)} {word}" for word, group in named.items() if group)])
 
 
 def _text(cell: Cell, measure: str, separator: str = " ") -> str:
@@ -257,14 +270,10 @@ def _text(cell: Cell, measure: str, separator: str = " ") -> str:
     if found is None:
         return "—"
     if found.low == found.high:
-        return number(found.mean)
-    return f"{number(found.mean)}{separator}[{number(found.low)}, {number(found.high)}]"
+        return number(found.median)
+    return f"{number(found.median)}{separator}[{number(found.low)}, {number(found.high)}]"
 
 
 def _constants(report: Report) -> str:
     text = ", ".join(f"{key}={value}" for key, value in report.constants.items())
     return f" All of them: {text}." if text else ""
-
-
-def _failures(report: Report) -> list[tuple[str, str]]:
-    return [(run.folder.name, run.error or "") for cell in report.cells for run in cell.failed.values()]

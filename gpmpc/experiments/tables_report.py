@@ -15,6 +15,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from gpmpc.experiments.escapes import in_csv, in_latex, in_markdown
 from gpmpc.plotting import Panel, error_over_size, png
 
 MEASURES = {"training_mse": "training MSE", "test_mse": "test MSE", "average_variance": "average variance"}
@@ -146,7 +147,7 @@ def render(rows: Sequence[Row], note: str) -> Group:
     """The tables for a terminal of 80 columns."""
     parts = []
     for trajectory in dict.fromkeys(row.trajectory for row in rows):
-        table = Table(title=f"\n{title(trajectory)}", **STYLE)
+        table = Table(title=Text(f"\n{title(trajectory)}", style="bold"), **STYLE)
         table.add_column("\nN", justify="right")
         for label in MEASURES.values():
             table.add_column(f"{label}\nours     paper")
@@ -206,7 +207,7 @@ def comma_separated(rows: Sequence[Row]) -> str:
     writer.writerow(header)
     for row in rows:
         done = len(next(iter(row.statistics.values())).values) if row.statistics else 0
-        line = [row.trajectory, row.subsystem, row.size, done, row.failed, row.seconds]
+        line = [in_csv(row.trajectory), row.subsystem, row.size, done, row.failed, row.seconds]
         for name in [*MEASURES, *CALIBRATION]:
             s = row.statistics.get(name)
             line += [s.median, s.low, s.high] if s else ["", "", ""]
@@ -241,8 +242,8 @@ def latex(rows: Sequence[Row]) -> str:
             first = "" if row.subsystem == previous else row.subsystem
             out += [" & ".join([first, str(row.size), *cells, _seconds(row)]) + " \\\\"]
             previous = row.subsystem
-        out += ["\\bottomrule", "\\end{tabular}", f"% {title(trajectory)}; $\\in$, $<$, $>$: the paper's figure is in,"]
-        out += ["% below or above our range", ""]
+        out += ["\\bottomrule", "\\end{tabular}", f"% {in_latex(title(trajectory))}; $\\in$, $<$, $>$: the"]
+        out += ["% paper's figure is in, below or above our range", ""]
     return "\n".join(out)
 
 
@@ -338,5 +339,5 @@ def _latex(value: float | Decimal) -> str:
 
 def markdown_table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
     """Header and lines as a Markdown table."""
-    rows = [header, ["---"] * len(header), *lines]
-    return ["| " + " | ".join(row) + " |" for row in rows]
+    head, *rows = (f"| {' | '.join(map(in_markdown, row))} |" for row in [header, *lines])
+    return [head, f"|{' --- |' * len(header)}", *rows]

@@ -8,7 +8,15 @@ import tempfile
 from pathlib import Path
 
 PATH = str(Path(sys.executable).with_name("gpmpc"))
-IMPORTED = ["torch", "gpytorch", "cvxpy", "matplotlib.pyplot", "gpmpc.bench.quality", "gpmpc.cli", "gpmpc.recording"]
+IMPORTED = [
+    "torch",
+    "gpytorch",
+    "cvxpy",
+    "matplotlib.pyplot",
+    "gpmpc.bench.quality",
+    "gpmpc.cli.command",
+    "gpmpc.recording",
+]
 IMPORTED += ["gpmpc.cli.sweep", "gpmpc.experiments.flights_report", "gpmpc.experiments.tables_report"]
 IMPORTED += ["gpmpc.experiments.report_documents", "gpmpc.experiments.run", "gpmpc.plotting.recorded"]
 SECONDS = 300  # a command may take

@@ -5,13 +5,14 @@ standard error; ``HYDRA_FULL_ERROR=1`` shows where it came from. Heavy libraries
 and completion stay quick.
 """
 
+import argparse
 import difflib
 import os
 import re
 import sys
 from collections.abc import Callable, Iterable
 from functools import partial
-from pathlib import Path
+from typing import Any, NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser
@@ -21,15 +22,19 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 import gpmpc
 from gpmpc.cli.bench import bench
+from gpmpc.cli.completion import complete
+from gpmpc.cli.configuration import config_folder, find_modules_here
 from gpmpc.cli.figures import figures
 from gpmpc.cli.log import log
 from gpmpc.cli.plot import plot
 from gpmpc.cli.report import report
 from gpmpc.cli.run import run
+from gpmpc.cli.streams import tell
 from gpmpc.cli.tables import tables
 from gpmpc.exceptions import GpmpcError
 
 EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher
+HELP = ("-h", "--help", "help")
 SHOW_TRACEBACK = bool(os.environ.get("HYDRA_FULL_ERROR"))
 USAGE = f"""gpmpc {gpmpc.__version__}: Gaussian process model predictive control
 
@@ -49,76 +54,68 @@ commands:
             a layout to look at it in Foxglove (layout)
 
 gpmpc COMMAND --help lists a command's settings, --cfg job prints them resolved.
+eval "$(gpmpc -sc install=bash)" completes commands and settings at TAB; zsh takes the same, fish has its own.
 """
 
 
 def main() -> None:
     """Runs the subcommand that the command line names."""
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # let Hydra raise, so that the message can be ours
     arguments = sys.argv[1:]
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
+    if arguments and arguments[0] in HELP:
+        arguments = [arguments[1], "--help"] if len(arguments) > 1 else []
+    if not arguments:
         print(USAGE)
         return
-    if arguments[0] in ("-V", "--version"):
+    command = arguments[0]
+    if {"-V", "--version"} & {command, *arguments[1:]}:
         print(gpmpc.__version__)
         return
-    command = arguments[0]
+    if {"-sc", "--shell-completion"} & set(arguments):
+        _guarded("run", complete, arguments, {name: config_name for name, (_, config_name) in COMMANDS.items()}, PLAIN)
+        return
     if command in PLAIN:
-        _run_plain(PLAIN[command], arguments[1:])
+        _guarded("", PLAIN[command], arguments[1:])
         return
     if command not in COMMANDS:
         known = [*COMMANDS, *PLAIN]
         _fail(f"unknown command {command!r}{_nearest(command, known)}; gpmpc --help lists the commands")
     task, config_name = COMMANDS[command]
-    _check_options(command, arguments[1:])
+    given = _options(command, arguments[1:])
+    _guarded(config_name, find_modules_here)
     sys.argv = [f"gpmpc {command}", *arguments[1:]]
-    if command == "run" and (overrides := _swept(arguments[1:])) is not None:
+    # Guarded inside as well, where Hydra would add a line of its own to a task's error.
+    entry = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)(
+        partial(_guarded, config_name, task)
+    )
+    swept = given.multirun and not (given.help or given.hydra_help or given.cfg or given.info)
+    if swept:
         from gpmpc.cli.sweep import sweep
 
-        _run(lambda: sweep(overrides, config_folder()), config_name)
-        return
-    # Guarded inside as well, where Hydra would add a line of its own to a task's error.
-    guarded = partial(_guarded, config_name, task)
-    _run(
-        hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)(guarded), config_name
-    )
+        entry = partial(sweep, given, config_folder())
+    try:
+        _guarded(config_name, entry)
+    except KeyboardInterrupt:
+        resumed = swept or command != "run"
+        raise KeyboardInterrupt(*["the same command goes on where it stopped"] * resumed) from None
 
 
-def config_folder() -> Path:
-    """The configuration: beside the package's modules in a wheel, beside the package in a checkout."""
-    package = Path(gpmpc.__file__).resolve().parent
-    installed = package / "conf"
-    return installed if installed.is_dir() else package.parent / "conf"
-
-
-def _check_options(command: str, arguments: list[str]) -> None:
-    """Answers an option that Hydra does not have in one line, where its parser would print all that it has."""
+def _options(command: str, arguments: list[str]) -> argparse.Namespace:
+    """The options given; one that does not exist is answered in one line, where Hydra would print all that do."""
     parser = get_args_parser()
     parser.error = lambda message: _fail(f"{message}; gpmpc {command} --help lists the settings")
-    _, unknown = parser.parse_known_args(arguments)
+    given, unknown = parser.parse_known_args(arguments)
+    if given.experimental_rerun:
+        unknown = ["--experimental-rerun"]  # it runs whatever a file holds
     if unknown:
         known = [option for action in parser._actions for option in action.option_strings]
         _fail(f"unknown option {unknown[0]!r}{_nearest(unknown[0], known)}; gpmpc {command} --help lists the settings")
+    if given.multirun and command != "run":
+        _fail("-m: only gpmpc run sweeps")
+    return given
 
 
-def _swept(arguments: list[str]) -> list[str] | None:
-    """The settings of a sweep; None where another thing is asked for."""
-    given, unknown = get_args_parser().parse_known_args(arguments)
-    asked = given.multirun and not (given.help or given.hydra_help or given.cfg or given.info)
-    return given.overrides if asked and not unknown else None
-
-
-def _run(entry: Callable[[], None], config_name: str) -> None:
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # let Hydra raise, so that the message can be ours
-    try:
-        _guarded(config_name, entry)
-    except BrokenPipeError:
-        _end_of_pipe()
-    except KeyboardInterrupt:
-        print("\ninterrupted; the same command goes on where it stopped", file=sys.stderr)
-        sys.exit(130)
-
-
-def _guarded(config_name: str, function: Callable, *arguments: DictConfig) -> None:
+def _guarded(config_name: str, function: Callable, *arguments: Any) -> None:
     """Calls a function; a user's mistake ends with one line, or with its traceback for who asks."""
     try:
         function(*arguments)
@@ -126,33 +123,19 @@ def _guarded(config_name: str, function: Callable, *arguments: DictConfig) -> No
         if SHOW_TRACEBACK:
             raise
         _fail(_one_line(error, config_name))
-    except (TypeError, ValueError, ArithmeticError) as error:  # a value that no check foresaw
+    except OSError as error:
         if SHOW_TRACEBACK:
+            raise
+        _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except (TypeError, ValueError, ArithmeticError) as error:  # a value that no check foresaw
+        if SHOW_TRACEBACK or not config_name:
             raise
         reason = " ".join(str(error).split()) or type(error).__name__
         _fail(f"{reason}; is a setting of the wrong kind? HYDRA_FULL_ERROR=1 shows where")
 
 
-def _run_plain(task: Callable[[list[str]], None], arguments: list[str]) -> None:
-    """Runs a command that works on files and has no settings to compose."""
-    try:
-        task(arguments)
-    except GpmpcError as error:
-        if SHOW_TRACEBACK:
-            raise
-        _fail(" ".join(str(error).split()))
-    except BrokenPipeError:
-        _end_of_pipe()
-
-
-def _end_of_pipe() -> None:
-    """The reader of a pipe, such as head, has seen enough."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    sys.exit(1)
-
-
-def _fail(message: str) -> None:
-    print(f"gpmpc: {message}", file=sys.stderr)
+def _fail(message: str) -> NoReturn:
+    tell(f"gpmpc: {message}")
     sys.exit(2)
 
 
