@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.files import write_whole
 
 
@@ -87,6 +87,19 @@ class Transitions:
     def features(self) -> Tensor:
         """x~ = (x, u), (N, n + m)."""
         return torch.cat([self.states, self.inputs], dim=1)
+
+    def targets(self, predicts: str) -> Tensor:
+        """What GPs that predict ``"next_state"`` or ``"difference"`` learn of them (N, n).
+
+        Raises:
+            UnsupportedModel: They predict values, which transitions do not hold.
+        """
+        if predicts == "value":
+            raise UnsupportedModel(
+                "transitions hold no targets of GPs with predicts='value': use condition_on_targets of a posterior, "
+                "fit(features, targets, ...) of a trainer"
+            )
+        return self.next_states - self.states if predicts == "difference" else self.next_states
 
     def __getitem__(self, rows: slice | Sequence[int]) -> "Transitions":
         """The transitions of some rows, in the order given."""
@@ -192,6 +205,16 @@ class Transitions:
         if next_states:
             return _with_path(path, table[:, :n], table[:, n : n + m], table[:, n + m :])
         return _with_path(path, table[:-1, :n], table[:-1, n:], table[1:, :n])
+
+
+def check_transitions(transitions: Any) -> None:
+    """Raises unless these are transitions.
+
+    Raises:
+        SettingError: Something else was given.
+    """
+    if not isinstance(transitions, Transitions):
+        raise SettingError("transitions", f"must be Transitions(...); got {type(transitions).__name__}")
 
 
 def _existing(path: str | Path) -> Path:

@@ -142,7 +142,7 @@ def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(
     [
         ({"subset": 0}, "subset: must be a whole number, 1 or more; got 0"),
         ({"restarts": -1}, "restarts: must be a whole number, 0 or more; got -1"),
-        ({"predicts": "delta"}, "'next_state' or 'difference'; got 'delta'"),
+        ({"predicts": "delta"}, "'next_state', 'difference', 'value'; got 'delta'"),
         ({"likelihood": "exact"}, "'closed_form' or 'gpytorch'; got 'exact'"),
         ({"signal_to_noise_limit": 1.0}, "signal_to_noise_limit: must be a number above 1; got 1.0"),
         ({"tolerance": 0.0}, "tolerance: must be a number above 0; got 0.0"),
