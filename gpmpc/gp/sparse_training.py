@@ -3,7 +3,8 @@
 The hyperparameters start where exact training on a random subset ends; the inducing points start greedily, each where
 the outputs' conditional variances given those before it, in units of their noise, add up to the most (Burt, Rasmussen
 and van der Wilk, 2020, section 4: this is the step that closes most of the bound's gap tr(Kxx - Qxx) / sn2). What they
-leave unexplained, on average, is added to the noise. Then L-BFGS climbs the collapsed bound over all of it. One evaluation costs O(N M^2) an output.
+leave unexplained, on average, is added to the noise. Then L-BFGS climbs the collapsed bound over all of it. One
+evaluation costs O(N M^2) an output.
 """
 
 import logging
@@ -138,7 +139,9 @@ class SparseTrainer:
         if self.iterations:  # of none L-BFGS-B makes one
             limits = {"maxiter": self.iterations, "maxfun": 3 * self.iterations + 1}
             options = {"ftol": self.tolerance, "gtol": 1e-6, **limits}
-            minimize(bound, start, jac=True, method="L-BFGS-B", bounds=bound.box, callback=bound.report, options=options)
+            minimize(
+                bound, start, jac=True, method="L-BFGS-B", bounds=bound.box, callback=bound.report, options=options
+            )
         initial, objective = bound.values(start), bound.values(bound.best)
         if not np.isfinite(objective).all():
             failed = [a for a, value in enumerate(objective) if not np.isfinite(value)]
@@ -155,7 +158,7 @@ class SparseTrainer:
         return SparseTraining(posterior, theta, objective, initial, bound.evaluations, time.perf_counter() - begin)
 
     def _with_unexplained(self, theta: np.ndarray, Z: Tensor, x: Tensor, y: Tensor) -> np.ndarray:
-        """theta with a noise that also accounts for what the inducing points leave unexplained of the signal.
+        """Adds to the noise what the inducing points leave unexplained of the signal, on average.
 
         Else the bound is so low where the search begins that its first step leaves for a model of noise alone.
         """
@@ -180,8 +183,8 @@ class SparseTrainer:
         if failed:
             raise TrainingError(
                 failed,
-                f"{self.inducing} inducing points learned nothing but noise of output {', '.join(map(str, failed))}, where "
-                f"exact GPs of {self.subset} points learned more: raise inducing",
+                f"{self.inducing} inducing points learned nothing but noise of output {', '.join(map(str, failed))}, "
+                f"where exact GPs of {self.subset} points learned more: raise inducing",
             )
         if nothing:
             log.warning("sparse training: nothing but noise was found in output %s", ", ".join(map(str, nothing)))
@@ -202,7 +205,7 @@ def hyperparameters(theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def noise_alone(targets: Tensor) -> np.ndarray:
-    """The least negative log evidence (k,) of targets (N, k) as independent noise; minus infinity where all are zero."""
+    """The least negative log evidence (k,) of targets (N, k) as noise alone; minus infinity where all are zero."""
     return (len(targets) / 2 * (2 * math.pi * math.e * targets.square().mean(0)).log()).numpy()
 
 
