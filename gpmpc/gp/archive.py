@@ -13,8 +13,10 @@ import hashlib
 import io
 import json
 import math
+import os
 import zipfile
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from gpmpc.exceptions import DataError, SettingError
 
 HEADER = "header.json"
 EXPANSION = 20  # times its size is what a compressed file may hold: measured numbers shrink to a half, or a tenth
+LONGEST = 2**20  # bytes of a header
 READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -71,16 +74,17 @@ def pack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> bytes:
 
 def read_header(path: Path) -> Any:
     """What ``header.json`` says; None where there is none."""
-    with zipfile.ZipFile(path) as archive:
-        _check_sizes(archive, path.stat().st_size)
-        return json.loads(archive.read(HEADER)) if HEADER in archive.namelist() else None
+    with _opened(path) as (archive, _):
+        if HEADER not in archive.namelist():
+            return None
+        if archive.getinfo(HEADER).file_size > LONGEST:
+            raise ValueError(f"{HEADER} is longer than {LONGEST} bytes")
+        return json.loads(archive.read(HEADER))
 
 
 def read_arrays(path: Path, names: Collection[str] | None = None) -> Iterator[tuple[str, np.ndarray]]:
     """Names and read-only arrays of real numbers, one after another; all of them, or those of the given names."""
-    size = path.stat().st_size
-    with zipfile.ZipFile(path) as archive:
-        _check_sizes(archive, size)
+    with _opened(path) as (archive, size):
         left = EXPANSION * size // 8  # numbers
         for info in archive.infolist():
             name = info.filename.removesuffix(".npy")
@@ -92,7 +96,7 @@ def read_arrays(path: Path, names: Collection[str] | None = None) -> Iterator[tu
 
 def check_whole(path: Path, header: dict[str, Any]) -> None:
     """Raises where header and arrays are not those that were written together; files without a checksum pass."""
-    with zipfile.ZipFile(path) as archive:
+    with _opened(path) as (archive, _):
         if "checksum" in header and header["checksum"] != _checksum(header, archive):
             raise ValueError("the checksum of its parts differs from the one in its header")
 
@@ -109,13 +113,26 @@ def _checksum(header: dict[str, Any], archive: zipfile.ZipFile) -> str:
     return hashlib.sha256(json.dumps([said, parts], sort_keys=True).encode()).hexdigest()
 
 
-def _check_sizes(archive: zipfile.ZipFile, size: int) -> None:
-    for info in archive.infolist():
-        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ValueError(f"{info.filename} is compressed in a way that is not read; write it uncompressed")
-    declared = sum(info.file_size for info in archive.infolist())
-    if declared > EXPANSION * size:
-        raise ValueError(f"declares {declared} bytes, more than a file of {size} bytes can hold")
+class _File(io.FileIO):
+    """Sets aside no more memory for a read than the file has left, whatever a damaged number asks for."""
+
+    def read(self, count: int | None = -1) -> bytes:
+        left = max(os.fstat(self.fileno()).st_size - self.tell(), 0)
+        return super().read(left if count is None or count < 0 else min(count, left))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, int]]:
+    """The archive and its size, after what it declares was held against that."""
+    size = path.stat().st_size
+    with _File(path) as file, zipfile.ZipFile(file) as archive:
+        for info in archive.infolist():
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"{info.filename} is compressed in a way that is not read; write it uncompressed")
+        declared = sum(info.file_size for info in archive.infolist())
+        if declared > EXPANSION * size:
+            raise ValueError(f"declares {declared} bytes, more than a file of {size} bytes can hold")
+        yield archive, size
 
 
 def _array(name: str, data: bytes, most: int) -> np.ndarray:

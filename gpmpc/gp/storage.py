@@ -44,6 +44,7 @@ def save_posterior(posterior: GPPosterior, path: str | Path) -> None:
         SettingError: It is in another floating-point type.
         DataError: The folder does not exist, or the posterior is inconsistent and could not be read again.
     """
+    path = new_file(path)
     _write(path, "GPPosterior", *_parts(path, posterior))
 
 
@@ -68,6 +69,7 @@ def save_residual_model(model: ResidualModel, path: str | Path) -> None:
         SettingError: A tensor is neither float64 nor float32.
         DataError: The folder does not exist.
     """
+    path = new_file(path)
     if not isinstance(model.nominal, Affine):
         raise UnsupportedModel(
             f"only an Affine nominal model is numbers and can be saved; got {type(model.nominal).__name__}. Save the "
@@ -107,7 +109,7 @@ def load_residual_model(path: str | Path) -> ResidualModel:
     return model
 
 
-def _parts(path: str | Path, posterior: GPPosterior) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def _parts(path: Path, posterior: GPPosterior) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """What goes into the header and what into arrays, after a look at whether it could be read again."""
     if type(posterior) is not GPPosterior:
         raise UnsupportedModel(f"only a GPPosterior can be saved; got {type(posterior).__name__}")
@@ -119,7 +121,7 @@ def _parts(path: str | Path, posterior: GPPosterior) -> tuple[dict[str, Any], di
         "points": len(posterior),
     }
     tensors = {f.name: v for f in fields(posterior) if isinstance(v := getattr(posterior, f.name), Tensor)}
-    _posterior(Path(path), header, tensors)
+    _posterior(path, header, tensors)
     return header, tensors
 
 
@@ -175,8 +177,7 @@ def _entry(path: Path, header: dict, name: str, kind: type) -> Any:
     return value
 
 
-def _write(path: str | Path, kind: str, header: dict, tensors: dict[str, Tensor]) -> None:
-    path = new_file(path)
+def _write(path: Path, kind: str, header: dict, tensors: dict[str, Tensor]) -> None:
     tensors = {name: value.detach() for name, value in tensors.items()}
     for name, value in tensors.items():
         if value.dtype not in DTYPES:
