@@ -41,11 +41,7 @@ class GPyTorchSlsqp:
     def __init__(self, gp: GPPosterior, problem: TrackingProblem, horizon: int, tolerance: float):
         if problem.penalized != "increments" or problem.state_bounds is not None or problem.rate_limited:
             raise SettingError("problem", "must weigh increments, and bound nothing but inputs")
-        self._model, self._offset, self._adds_state = (
-            gpytorch_model(gp).requires_grad_(False),
-            gp.offset,
-            gp.predicts == "difference",
-        )
+        self._model, self._adds_state = gpytorch_model(gp).requires_grad_(False), gp.predicts == "difference"
         self._horizon, self._tolerance = horizon, tolerance
         self._Q, self._R, self._terminal = map(torch.from_numpy, (problem.Q, problem.R, problem.terminal))
         self._bounds = list(zip(problem.input_lower, problem.input_upper, strict=True)) * horizon
@@ -72,7 +68,7 @@ class GPyTorchSlsqp:
         increments = torch.diff(inputs, dim=0, prepend=last[None])
         total = (increments @ self._R * increments).sum()
         for k, target in enumerate(targets):
-            moved = self._model(torch.cat([x, inputs[k]])[None]).mean[:, 0] + self._offset
+            moved = self._model(torch.cat([x, inputs[k]])[None]).mean[:, 0]
             x = x + moved if self._adds_state else moved
             total = total + (x - target) @ (self._terminal if k + 1 == len(targets) else self._Q) @ (x - target)
         return total

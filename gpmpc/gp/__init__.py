@@ -9,7 +9,7 @@ from gpmpc.gp.many import train_many
 from gpmpc.gp.penalties import SoftLimits
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.residual import Affine, ResidualModel
-from gpmpc.gp.scaling import Scaling, identity, min_max, standardize
+from gpmpc.gp.scaling import Scaling, centre, identity, min_max, standardize
 from gpmpc.gp.sparse import sparse_posterior
 from gpmpc.gp.sparse_training import SparseTrainer, SparseTraining
 from gpmpc.gp.training import Trainer, Training, train
@@ -29,6 +29,7 @@ __all__ = [
     "Trainer",
     "Training",
     "Transitions",
+    "centre",
     "evaluation",
     "fit",
     "identity",

@@ -15,6 +15,8 @@ times slower at the sizes of model predictive control; a test keeps the two equa
 import numpy as np
 from scipy.linalg import blas, lapack
 
+from gpmpc.gp.kernel import centred
+
 
 class LogEvidence:
     """The negative log marginal likelihood of one output over theta = (log l (d), log sf, log(sf / sn)).
@@ -25,7 +27,7 @@ class LogEvidence:
     """
 
     def __init__(self, features: np.ndarray, targets: np.ndarray):
-        self.x = np.ascontiguousarray(features)
+        self.x = np.ascontiguousarray(centred(features))
         self.y = np.ascontiguousarray(targets)
 
     def __call__(self, theta: np.ndarray) -> tuple[float, np.ndarray]:

@@ -15,6 +15,8 @@ all in LAPACK's blocked, threaded routines, the rest is O(N^2 d).
 import numpy as np
 from scipy.linalg import lapack
 
+from gpmpc.gp.kernel import centred
+
 BLOCK = 256  # columns at a time: a block and its mirror image fit the cache
 
 
@@ -29,7 +31,7 @@ class InPlaceEvidence:
     """
 
     def __init__(self, features: np.ndarray, targets: np.ndarray):
-        self.x, self.y = np.ascontiguousarray(features), np.ascontiguousarray(targets)
+        self.x, self.y = np.ascontiguousarray(centred(features)), np.ascontiguousarray(targets)
         self.square = np.empty((len(targets), len(targets)), order="F")
 
     def __call__(self, theta: np.ndarray) -> tuple[float, np.ndarray]:

@@ -24,6 +24,7 @@ from scipy.optimize import minimize
 
 from gpmpc.gp.evidence import LogEvidence
 from gpmpc.gp.evidence_in_place import InPlaceEvidence
+from gpmpc.gp.kernel import centred
 from gpmpc.gp.model import BatchExactGP, GPyTorchEvidence
 from gpmpc.gp.penalties import Penalty
 from gpmpc.gp.posterior import IGNORED
@@ -38,7 +39,7 @@ EXPLORATION = 16  # L-BFGS iterations from every start, before ...
 FINALISTS = 2  # ... this many of the best go on to convergence
 ITERATIONS = 1000  # of the search to convergence, at most
 LONGER = 1.0  # mean of log l over log std(x~) at the random starts: smooth dynamics prefer long length-scales
-CONSTANT = 1e-8  # a column that moves by less than this part of its magnitude is constant
+CONSTANT = 3e-9  # of its magnitude: a column that moves by no more holds a solver's residue (1e-9); 1e8 +- 0.5 moves
 FAILED = 1e12  # objective where the kernel matrix is not positive definite: finite, so that a line search steps back
 IN_PLACE = 400  # from as many points on one matrix for everything is the faster way as well
 TOLD = 5.0  # seconds between two lines of the log
@@ -55,6 +56,8 @@ class Task:
         first: theta of the first start (d + 2,); None takes l = std(x~), sf = std(y), sn = std(y) / 10.
         perturbations: Standard normal (restarts + 1, d + 2); the first row is not used.
         rows: The subset that the search begins with; None for all points from the start.
+        spread: Of the inputs (d,), see ``spread``.
+        constant: Which inputs are (d,).
     """
 
     name: str
@@ -63,6 +66,8 @@ class Task:
     first: np.ndarray | None
     perturbations: np.ndarray
     rows: np.ndarray | None
+    spread: np.ndarray
+    constant: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ def find_hyperparameters(task: Task, trainer: "Trainer") -> Found:
     """Searches for one output with a trainer's settings; ``objective`` is ``FAILED`` or more where no start led on."""
     begin = time.perf_counter()
     inputs, targets = task.inputs, task.targets
-    log_inputs, log_output = np.log(spread(inputs)), np.log(spread(targets[:, None])[0])
+    log_inputs, log_output = np.log(task.spread), np.log(spread(targets[:, None])[0])
     centre = np.append(log_inputs, [log_output, 0.0])
     reach = np.append(
         np.full(inputs.shape[1], np.log(trainer.lengthscale_limit)),
@@ -107,8 +112,7 @@ def find_hyperparameters(task: Task, trainer: "Trainer") -> Found:
         theta, value = search(theta, ITERATIONS)
         evaluations += search.evaluations
     # Nothing can be learned about an input that never moved, and nothing is: it drops out of the kernel.
-    constant = np.ptp(inputs, axis=0) <= CONSTANT * np.abs(inputs).max(axis=0)
-    theta[:-2][constant] = log_inputs[constant] + np.log(IGNORED)
+    theta[:-2][task.constant] = log_inputs[task.constant] + np.log(IGNORED)
     return Found(theta, value, [end[1] for end in ends], evaluations, time.perf_counter() - begin)
 
 
@@ -143,10 +147,15 @@ class _Search:
 
 def spread(columns: np.ndarray) -> np.ndarray:
     """The standard deviation (d,) of columns (N, d); of a constant column its magnitude, or 1 where that is 0."""
-    magnitude = np.abs(columns).max(axis=0)
-    magnitude = np.where(magnitude > 0, magnitude, 1.0)
-    relative = (columns / magnitude).std(axis=0, ddof=1) if len(columns) > 1 else np.zeros_like(magnitude)
-    return magnitude * np.where(relative > CONSTANT, relative, 1.0)
+    away = columns - columns[0]
+    reach, magnitude, constant = np.abs(away).max(axis=0), np.abs(columns).max(axis=0), constant_columns(columns)
+    unit = np.where(constant, np.where(magnitude > 0, magnitude, 1.0), reach)
+    return unit * np.where(constant, 1.0, (away / unit).std(axis=0, ddof=min(1, len(columns) - 1)))
+
+
+def constant_columns(columns: np.ndarray) -> np.ndarray:
+    """Which columns (d,) of (N, d) do not move by more than round-off."""
+    return np.ptp(columns, axis=0) <= CONSTANT * np.abs(columns).max(axis=0)
 
 
 def _objective(
@@ -156,7 +165,7 @@ def _objective(
     if likelihood == "closed_form":
         evidence = (LogEvidence if len(targets) < IN_PLACE else InPlaceEvidence)(inputs, targets)
     else:
-        batch = GPyTorchEvidence(BatchExactGP(torch.from_numpy(inputs), torch.from_numpy(targets)[:, None]))
+        batch = GPyTorchEvidence(BatchExactGP(torch.from_numpy(centred(inputs)), torch.from_numpy(targets)[:, None]))
 
         def evidence(theta: np.ndarray) -> tuple[float, np.ndarray]:
             values, gradients = batch(theta[None])

@@ -1,5 +1,7 @@
 """Problem: the SE-ARD kernel between two sets of points, its noisy matrix factorised, and what may go into it."""
 
+from typing import Any
+
 from torch import Tensor, float64, int32, isfinite, linalg, nonzero, zeros
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
@@ -25,6 +27,16 @@ def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_v
     for ours, theirs, scale in zip(points.T, others.T, lengthscales.T, strict=True):
         total.addcmul_((ours[:, None] - theirs).square(), scale[:, None, None] ** -2)
     return signal_variance[:, None, None] * (total / -2).exp()
+
+
+def centred(points: Any) -> Any:
+    """Points (N, d), NumPy's or torch's, moved to mean zero: elsewhere distances from a matrix product cancel.
+
+    A stationary kernel does not see it. The first point is subtracted first, which is exact between near numbers: so a
+    shift of all points changes no bit of the result.
+    """
+    away = points - points[0]
+    return away - away.mean(0)
 
 
 def factorised(inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor) -> Tensor:
@@ -69,20 +81,22 @@ def _factorised_in_place(
 def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> None:
     """Raises unless the arguments of ``GPPosterior.from_hyperparameters`` belong together; its docstring has the rules.
 
+    The features come first, under any name; before training there are only they and the targets.
+
     Raises:
         ShapeError: The shapes do not belong together, or there is no row.
         SettingError: A hyperparameter is not positive, or a dtype, a device or ``predicts`` is another one.
         DataError: An entry is not finite.
     """
     check_tensors(**given)
-    inputs, targets = given["inputs"], given["targets"]
-    if inputs.dim() != 2 or targets.dim() != 2 or not len(inputs):
+    (first, inputs), targets = next(iter(given.items())), given["targets"]
+    if inputs.dim() != 2 or targets.dim() != 2 or not len(inputs) or not targets.shape[1]:
         raise ShapeError(
-            "inputs (N, d) and targets (N, k) need two dimensions and a row; "
+            f"{first} (N, d) and targets (N, k) need two dimensions, a column and a row; "
             f"got {tuple(inputs.shape)} and {tuple(targets.shape)}"
         )
     (size, d), k = inputs.shape, targets.shape[1]
-    shapes = {"inputs": (size, d), "targets": (size, k), "lengthscales": (k, d)}
+    shapes = {first: (size, d), "targets": (size, k), "lengthscales": (k, d)}
     for name, value in given.items():
         shape = shapes.get(name, (k,))
         if tuple(value.shape) != shape:
@@ -90,7 +104,7 @@ def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> 
         if value.dtype != float64:
             raise SettingError(name, f"must be float64 (convert after: posterior.to(dtype=...)); got {value.dtype}")
         if value.device != inputs.device:
-            raise SettingError(name, f"must be on the device of inputs, {inputs.device}; got {value.device}")
+            raise SettingError(name, f"must be on the device of {first}, {inputs.device}; got {value.device}")
         if not bool(isfinite(value).all()):
             raise DataError(f"{name} must be finite; got {value[~isfinite(value)][0]}")
     if predicts not in PREDICTS:
@@ -98,9 +112,9 @@ def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> 
     check_number("input_dim", input_dim, least=0, whole=True)
     if input_dim >= d or (predicts != "value" and d != k + input_dim):
         raise ShapeError(
-            f"inputs must have n + m columns, one state an output and {input_dim} controls; "
+            f"{first} must have n + m columns, one state an output and {input_dim} controls; "
             f"got {d} columns and {k} outputs"
         )
     for name in ("lengthscales", "signal_variance", "noise_variance"):
-        if not bool((given[name] > 0).all()):
+        if name in given and not bool((given[name] > 0).all()):
             raise SettingError(name, f"must be positive; got {given[name].tolist()}")

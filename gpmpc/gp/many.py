@@ -19,7 +19,7 @@ import numpy as np
 from gpmpc.exceptions import ShapeError, TrainingError, check_number
 from gpmpc.gp.hyperparameter_search import Found, find_hyperparameters
 from gpmpc.gp.training import Trainer, Training, check_memory, needed_memory
-from gpmpc.gp.transitions import Transitions
+from gpmpc.gp.transitions import Transitions, check_transitions
 from gpmpc.memory import GIB, available_memory
 from gpmpc.parallel import cores, in_processes
 
@@ -60,8 +60,10 @@ def train_many(
         check_number("seeds", seed, least=0, whole=True)
     if len(seeds) != len(sets):
         raise ShapeError(f"one seed a set is needed, or one for all; got {len(seeds)} for {len(sets)} sets")
+    for one in sets:
+        check_transitions(one)
     problems = [
-        trainer.problem(one.features, trainer.learned(one), one.input_dim, trainer.predicts, seed)
+        trainer.problem(one.features, one.targets(trainer.predicts), one.input_dim, trainer.predicts, seed)
         for one, seed in zip(sets, seeds, strict=True)
     ]
     places = [(s, a) for s, problem in enumerate(problems) for a in range(len(problem.tasks))]

@@ -79,8 +79,10 @@ class BatchExactGP(gpytorch.models.ExactGP):
 
 
 def gpytorch_model(posterior: "GPPosterior") -> BatchExactGP:
-    """The GPyTorch model that a posterior could have come from; its targets lack the offset, its prior mean is zero."""
-    model = BatchExactGP(posterior.features, posterior.targets - posterior.offset)
+    """The GPyTorch model that a posterior could have come from; its prior mean is no parameter of a training."""
+    model = BatchExactGP(posterior.features, posterior.targets)
+    model.mean_module = gpytorch.means.ConstantMean(batch_shape=posterior.offset.shape).requires_grad_(False)
+    model.mean_module.constant.copy_(posterior.offset)
     deviation, noise = posterior.signal_variance.log() / 2, posterior.noise_variance.log() / 2
     theta = torch.cat([posterior.lengthscales.log(), torch.stack([deviation, deviation - noise], 1)], 1)
     model.set_hyperparameters(theta)

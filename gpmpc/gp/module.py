@@ -10,6 +10,7 @@ sf2 - |L^-1 k|^2, which loses fewer digits than k' (K + sn2 I)^-1 k. With ``onnx
 import torch
 from torch import Tensor
 
+from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gp.posterior import GPPosterior
 
 
@@ -18,10 +19,16 @@ class PosteriorModule(torch.nn.Module):
 
     Args:
         posterior: The model; its type and device are the module's.
+
+    Raises:
+        UnsupportedModel: It is no ``GPPosterior``.
     """
 
     def __init__(self, posterior: GPPosterior):
         super().__init__()
+        if not isinstance(posterior, GPPosterior):
+            got = type(posterior).__name__
+            raise UnsupportedModel(f"PosteriorModule takes a GPPosterior, such as a model's .residual; got {got}")
         eye = torch.eye(len(posterior), dtype=posterior.dtype, device=posterior.device)
         buffers = {
             "features": posterior.features,

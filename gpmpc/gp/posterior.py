@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from gpmpc.exceptions import ShapeError, UnsupportedModel
+from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp.dynamics import check_destination, check_query
 from gpmpc.gp.evaluation import compiled_point, host_arrays
 from gpmpc.gp.kernel import check_posterior, factorised
 from gpmpc.gp.model import hyperparameters as trained
 from gpmpc.gp.scaling import Scaling
-from gpmpc.gp.transitions import Transitions
+from gpmpc.gp.transitions import Transitions, check_transitions
 from gpmpc.gp.updating import extended, without
 
 if TYPE_CHECKING:
@@ -331,18 +331,14 @@ class GPPosterior:
             ShapeError: The transitions have other dimensions.
             UnsupportedModel: The GPs learned values, which transitions do not hold.
         """
-        if self.predicts == "value":
-            raise UnsupportedModel(
-                "transitions hold no targets of a GP with predicts='value': use condition_on_targets"
-            )
+        check_transitions(transitions)
+        targets = transitions.targets(self.predicts)
         if (transitions.state_dim, transitions.input_dim) != (self.state_dim, self.input_dim):
             raise ShapeError(
                 f"the model has {self.state_dim} states and {self.input_dim} inputs; "
                 f"got transitions with {transitions.state_dim} and {transitions.input_dim}"
             )
-        if self.predicts == "difference":
-            return transitions.next_states - transitions.states
-        return transitions.next_states
+        return targets
 
     def explained(self, k: Tensor) -> Tensor:
         """|L_a^-1 k_a|^2 (*batch, k) of k (*batch, k, N): how much of the variance the data explain.

@@ -20,7 +20,7 @@ from gpmpc.gp.budget import Budget
 from gpmpc.gp.dynamics import batched_jacobian, check_destination, check_query
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.training import Trainer
-from gpmpc.gp.transitions import Transitions
+from gpmpc.gp.transitions import Transitions, check_transitions
 
 
 @dataclass(frozen=True)
@@ -125,14 +125,20 @@ class ResidualModel:
             B: Where d acts (n, k); on every state by default.
             states: Which states d sees; all by default.
             inputs: Which inputs d sees; all by default.
-            trainer: How the GPs are trained.
+            trainer: How the GPs are trained; what they learn is no difference, so it must not ask for one.
             seed: Of the random starts.
 
         Raises:
             ShapeError: ``nominal`` or B do not fit the transitions.
-            SettingError: An index is out of range, or the columns of B depend on each other.
+            SettingError: An index is out of range, the columns of B depend on each other, or the trainer learns
+                differences.
             TrainingError: An output could not be trained.
         """
+        check_transitions(transitions)
+        trainer = Trainer() if trainer is None else trainer
+        if getattr(trainer, "predicts", "difference") == "difference":
+            rule = "must be a Trainer or SparseTrainer with predicts='value' (or the default), which a residual is"
+            raise SettingError("trainer", f"{rule}; got {trainer!r}")
         n, m = transitions.state_dim, transitions.input_dim
         states = list(range(n)) if states is None else list(states)
         inputs = list(range(m)) if inputs is None else list(inputs)
@@ -144,7 +150,7 @@ class ResidualModel:
             raise SettingError("B", "must have linearly independent columns: what acts alike cannot be told apart")
         _check_chosen(states, n, inputs, m)
         features, targets = _learned(nominal, B, states, inputs, transitions)
-        training = (trainer or Trainer()).fit(features, targets, len(inputs), "value", seed)
+        training = trainer.fit(features, targets, len(inputs), "value", seed)
         return cls(nominal, training.posterior, B, states, inputs, m)
 
     def condition_on(self, transitions: Transitions, budget: Budget | None = None) -> "ResidualModel":
@@ -251,7 +257,8 @@ class ResidualModel:
 
 def _check_chosen(states: Sequence[int], n: int, inputs: Sequence[int], m: int) -> None:
     for key, chosen, count in (("states", states, n), ("inputs", inputs, m)):
-        if any(not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
+        whole = all(isinstance(i, int) and not isinstance(i, bool) for i in chosen)
+        if not whole or any(not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
             raise SettingError(key, f"must be different indices from 0 to {count - 1}; got {list(chosen)}")
 
 

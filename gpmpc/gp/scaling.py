@@ -1,7 +1,7 @@
 """Problem: columns of very different ranges have to be brought to one scale before a GP is trained, and back after.
 
-A ``Scaling`` is one affine map a column, scaled = (value - offset) / factor. The three in use: none at all, zero mean
-and unit standard deviation, and a range onto an interval (the paper's rotational data: [0.1, 0.9]).
+A ``Scaling`` is one affine map a column, scaled = (value - offset) / factor. The four in use: none at all, zero mean,
+zero mean and unit standard deviation, and a range onto an interval (the paper's rotational data: [0.1, 0.9]).
 """
 
 import logging
@@ -48,6 +48,11 @@ class Scaling:
 def identity(columns: Tensor, names: Sequence[str] = ()) -> Scaling:
     """Leaves columns (N, d) as they are."""
     return Scaling(torch.zeros_like(columns[0]), torch.ones_like(columns[0]))
+
+
+def centre(columns: Tensor, names: Sequence[str] = ()) -> Scaling:
+    """Maps columns (N, d) to mean zero and keeps their units."""
+    return Scaling(columns[0] + (columns - columns[0]).mean(dim=0), torch.ones_like(columns[0]))
 
 
 def standardize(columns: Tensor, names: Sequence[str], resolution: float = 0.0) -> Scaling:

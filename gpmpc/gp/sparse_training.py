@@ -2,11 +2,13 @@
 
 The hyperparameters start where exact training on a random subset ends; the inducing points start greedily, each where
 the outputs' conditional variances given those before it, in units of their noise, add up to the most (Burt, Rasmussen
-and van der Wilk, 2020, section 4: this is the step that closes most of the bound's gap tr(Kxx - Qxx) / sn2). Then
-L-BFGS climbs the collapsed bound over both. One evaluation costs O(N M^2) an output.
+and van der Wilk, 2020, section 4: this is the step that closes most of the bound's gap tr(Kxx - Qxx) / sn2). What they
+leave unexplained, on average, is added to the noise. Then L-BFGS climbs the collapsed bound over all of it. One
+evaluation costs O(N M^2) an output.
 """
 
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,14 +19,14 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, TrainingError, check_number
-from gpmpc.gp.collapsed_bound import JITTER, Method, collapsed_bound_with_gradient
+from gpmpc.gp.collapsed_bound import JITTER, Method, collapsed_bound_with_gradient, data_sums, inducing_factor
 from gpmpc.gp.hyperparameter_search import FAILED, spread
 from gpmpc.gp.kernel import kernel_matrix
 from gpmpc.gp.posterior import GPPosterior, Predicts
-from gpmpc.gp.scaling import Scaling, identity
+from gpmpc.gp.scaling import Scaling, centre, identity
 from gpmpc.gp.sparse import sparse_posterior
-from gpmpc.gp.training import Trainer
-from gpmpc.gp.transitions import Transitions
+from gpmpc.gp.training import Trainer, log_hyperparameters, training_data
+from gpmpc.gp.transitions import Transitions, check_transitions
 
 log = logging.getLogger(__name__)
 EVERY = 10  # iterations between two lines of the log
@@ -63,8 +65,8 @@ class SparseTrainer:
         method: ``"sgpr"`` (Titsias, 2009) never overfits and may overestimate the noise; ``"fitc"`` (Snelson and
             Ghahramani, 2006) has a noise of its own at every point and may underestimate it (Bauer, van der Wilk and
             Rasmussen, 2016).
-        predicts: What the GPs learn: the next state, or the difference to it.
-        scaling: How features and targets are scaled for training, such as ``standardize``.
+        predicts: What the GPs learn, as in ``Trainer``.
+        scaling: How features and targets are scaled for training, as in ``Trainer``.
         iterations: Of L-BFGS, at most.
         learn_locations: Whether the inducing points move; else only the hyperparameters are fitted.
         subset: How many random transitions the first, exact, training sees.
@@ -80,7 +82,7 @@ class SparseTrainer:
     inducing: int = 100
     method: Method = "sgpr"
     predicts: Predicts = "next_state"
-    scaling: Callable[[Tensor, Sequence[str]], Scaling] = identity
+    scaling: Callable[[Tensor, Sequence[str]], Scaling] = centre
     iterations: int = 100
     learn_locations: bool = True
     subset: int = 200
@@ -102,26 +104,29 @@ class SparseTrainer:
         """Trains on transitions; ``seed`` is that of the subset and of its random starts.
 
         Raises:
-            TrainingError: No start of the subset's training succeeded for an output, which is named.
+            TrainingError: No start of the subset's training succeeded for an output, which is named; or the inducing
+                points learned nothing but noise of it where the subset's training learned more.
         """
-        learned = transitions.next_states
-        if self.predicts == "difference":
-            learned = learned - transitions.states
-        return self.fit(transitions.features, learned, transitions.input_dim, self.predicts, seed)
+        check_transitions(transitions)
+        return self.fit(transitions.features, transitions.targets(self.predicts), transitions.input_dim, seed=seed)
 
     def fit(
-        self, features: Tensor, targets: Tensor, input_dim: int, predicts: Predicts, seed: int = 0
+        self, features: Tensor, targets: Tensor, input_dim: int, predicts: Predicts | None = None, seed: int = 0
     ) -> SparseTraining:
         """Trains on features x~ = (x, u) (N, n + m) and any targets (N, k)."""
         begin = time.perf_counter()
+        predicts = self.predicts if predicts is None else predicts
+        features, targets = training_data(features, targets, input_dim, predicts)
         n = features.shape[1] - input_dim
         names = [f"x{i + 1}" for i in range(n)] + [f"u{i + 1}" for i in range(input_dim)]
-        feature_scaling = self.scaling(features, names)
+        # A stationary kernel sees differences only; those from one of the points are exact, wherever the data lie.
+        feature_scaling = Scaling(features[0], self.scaling(features, names).factor)
         target_scaling = self.scaling(targets, [f"y{a + 1}" for a in range(targets.shape[1])])
         x, y = feature_scaling.scale(features), target_scaling.scale(targets)
 
         chosen = np.random.default_rng(seed).permutation(len(x))[: self.subset]
-        theta = self._exact().fit(x[chosen], y[chosen], input_dim, "value", seed).theta
+        exact = self._exact().fit(features[chosen], y[chosen], input_dim, "value", seed)
+        theta = log_hyperparameters(exact.posterior, feature_scaling, identity(y))
         Z = greedy_points(x, *hyperparameters(torch.from_numpy(theta)), count=self.inducing)
         log.info(
             "sparse training: %d inducing points chosen among %d after %.1f s",
@@ -129,27 +134,20 @@ class SparseTrainer:
             len(x),
             time.perf_counter() - begin,
         )
-        bound = _Bound(self, x, y, len(Z))
-        start = bound.vector(theta, Z)
-        outcome = minimize(
-            bound,
-            start,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=bound.box,
-            callback=bound.report,
-            options={
-                "ftol": self.tolerance,
-                "gtol": 1e-6,
-                "maxiter": self.iterations,
-                "maxfun": 3 * self.iterations + 1,
-            },
-        )
-        initial, objective = bound.values(start), bound.values(outcome.x)
+        bound = _Bound(self, x, y, torch.from_numpy(spread(features.numpy())) / feature_scaling.factor, len(Z))
+        start = bound.best = bound.vector(self._with_unexplained(theta, Z, x, y), Z)
+        if self.iterations:  # of none L-BFGS-B makes one
+            limits = {"maxiter": self.iterations, "maxfun": 3 * self.iterations + 1}
+            options = {"ftol": self.tolerance, "gtol": 1e-6, **limits}
+            minimize(
+                bound, start, jac=True, method="L-BFGS-B", bounds=bound.box, callback=bound.report, options=options
+            )
+        initial, objective = bound.values(start), bound.values(bound.best)
         if not np.isfinite(objective).all():
             failed = [a for a, value in enumerate(objective) if not np.isfinite(value)]
             raise TrainingError(failed, "the inducing points' kernel matrix is not positive definite: raise jitter")
-        theta, Z = bound.parts(torch.from_numpy(outcome.x))
+        self._check_learned(noise_alone(y) - objective, noise_alone(y[chosen]) - exact.objective, x.shape[1] + 2)
+        theta, Z = bound.parts(torch.from_numpy(bound.best))
         lengthscales, sf2, sn2 = hyperparameters(theta)
         posterior = sparse_posterior(
             Z, x, y, lengthscales, sf2, sn2, input_dim, predicts, method=self.method, jitter=self.jitter
@@ -159,9 +157,42 @@ class SparseTrainer:
         theta[:, -2] += target_scaling.factor.log().numpy()
         return SparseTraining(posterior, theta, objective, initial, bound.evaluations, time.perf_counter() - begin)
 
+    def _with_unexplained(self, theta: np.ndarray, Z: Tensor, x: Tensor, y: Tensor) -> np.ndarray:
+        """Adds to the noise what the inducing points leave unexplained of the signal, on average.
+
+        Else the bound is so low where the search begins that its first step leaves for a model of noise alone.
+        """
+        if self.method == "fitc":  # has that noise of its own
+            return theta
+        lengthscales, sf2, sn2 = hyperparameters(torch.from_numpy(theta))
+        Lz = inducing_factor(Z, lengthscales, sf2, self.jitter)
+        explained = data_sums(Lz, Z, x, y, lengthscales, sf2, sn2, self.method).gram.diagonal(dim1=-2, dim2=-1).sum(-1)
+        sn2 = sn2 + (sf2 - explained * sn2 / len(x)).clamp_min(0)
+        return np.column_stack([theta[:, :-1], (sf2 / sn2).log().numpy() / 2])
+
+    def _check_learned(self, gains: np.ndarray, exact_gains: np.ndarray, parameters: int) -> None:
+        """Raises, or warns in the log, where the GPs are no better than noise alone.
+
+        Args:
+            gains: Log evidence over that of noise alone (k,).
+            exact_gains: The same of the exact GPs of the subset.
+            parameters: Of an output; a gain below their number is none (Akaike, 1974).
+        """
+        nothing = [a for a, gain in enumerate(gains) if -np.inf < gain < parameters]
+        failed = [a for a in nothing if exact_gains[a] > parameters]
+        if failed:
+            raise TrainingError(
+                failed,
+                f"{self.inducing} inducing points learned nothing but noise of output {', '.join(map(str, failed))}, "
+                f"where exact GPs of {self.subset} points learned more: raise inducing",
+            )
+        if nothing:
+            log.warning("sparse training: nothing but noise was found in output %s", ", ".join(map(str, nothing)))
+
     def _exact(self) -> Trainer:
         return Trainer(
             predicts=self.predicts,
+            scaling=identity,
             restarts=self.restarts,
             tolerance=self.tolerance,
             signal_to_noise_limit=self.signal_to_noise_limit,
@@ -171,6 +202,11 @@ class SparseTrainer:
 def hyperparameters(theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Length-scales (k, d), sf2 (k,) and sn2 (k,) of rows (log l, log sf, log(sf / sn))."""
     return theta[:, :-2].exp(), (2 * theta[:, -2]).exp(), (2 * (theta[:, -2] - theta[:, -1])).exp()
+
+
+def noise_alone(targets: Tensor) -> np.ndarray:
+    """The least negative log evidence (k,) of targets (N, k) as noise alone; minus infinity where all are zero."""
+    return (len(targets) / 2 * (2 * math.pi * math.e * targets.square().mean(0)).log()).numpy()
 
 
 def greedy_points(
@@ -202,10 +238,9 @@ def greedy_points(
 class _Bound:
     """Minus the collapsed bound of all outputs over one vector: their theta, and Z in units of the features' spread."""
 
-    def __init__(self, trainer: SparseTrainer, features: Tensor, targets: Tensor, count: int):
-        self.trainer, self.x, self.y, self.count = trainer, features, targets, count
-        self.unit = torch.from_numpy(spread(features.numpy()))
-        self.evaluations, self.iteration, self._last = 0, 0, np.nan
+    def __init__(self, trainer: SparseTrainer, features: Tensor, targets: Tensor, unit: Tensor, count: int):
+        self.trainer, self.x, self.y, self.unit, self.count = trainer, features, targets, unit, count
+        self.evaluations, self.iteration, self._last, self._least = 0, 0, np.nan, np.inf
         outputs, d = targets.shape[1], features.shape[1]
         log_inputs, log_outputs = self.unit.log().numpy(), np.log(spread(targets.numpy()))
         reach = np.append(np.full(d, np.log(1e4)), [np.log(1e6), np.log(trainer.signal_to_noise_limit)])
@@ -256,6 +291,8 @@ class _Bound:
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             return FAILED, np.zeros_like(vector)
         self._last = value
+        if value < self._least:
+            self.best, self._least = vector.copy(), value
         return value, gradient
 
     def values(self, vector: np.ndarray) -> np.ndarray:

@@ -1,8 +1,7 @@
 """Problem: a trained model has to outlive its process, and a damaged or foreign file must never pass for one.
 
-A model is one uncompressed ``.npz`` file: a zip archive of plain arrays, each with its checksum, and of
-``header.json``, which says what they are and what wrote them. There is no pickle in it, so reading it runs no code of
-others, and ``numpy.load`` opens it where gpmpc is not installed.
+A model is one uncompressed ``.npz`` file of plain arrays and a header (``gpmpc.gp.archive``), which says what they are
+and what wrote them; ``numpy.load`` opens it where gpmpc is not installed.
 
 The Cholesky factor is stored too (its lower triangle): factorising again would give other last digits, and the factor
 of a posterior that was updated or made sparse does not follow from its hyperparameters at all. The header also keeps
@@ -10,10 +9,8 @@ the order in which a tensor's dimensions lie in memory, because BLAS rounds diff
 predicts what was saved, bit by bit.
 """
 
-import io
-import json
+import math
 import mmap
-import zipfile
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -24,13 +21,13 @@ from torch import Tensor
 
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, UnsupportedModel
 from gpmpc.files import write_whole
+from gpmpc.gp.archive import HEADER, check_whole, existing_file, new_file, pack, read_arrays, read_header
 from gpmpc.gp.kernel import PREDICTS
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.residual import Affine, ResidualModel
 from gpmpc.provenance import now, versions
 
 FORMAT, VERSION = "gpmpc model", 1
-HEADER = "header.json"
 DTYPES = {torch.float64: "float64", torch.float32: "float32"}
 POSITIVE = ("lengthscales", "signal_variance", "noise_variance")
 
@@ -47,6 +44,7 @@ def save_posterior(posterior: GPPosterior, path: str | Path) -> None:
         SettingError: It is in another floating-point type.
         DataError: The folder does not exist, or the posterior is inconsistent and could not be read again.
     """
+    path = new_file(path)
     _write(path, "GPPosterior", *_parts(path, posterior))
 
 
@@ -56,9 +54,11 @@ def load_posterior(path: str | Path) -> GPPosterior:
     Raises:
         DataError: The file is missing, damaged, of another kind or of a newer format.
     """
-    path = Path(path)
+    path = existing_file(path, "a saved GPPosterior")
     header, tensors = _read(path, "GPPosterior")
-    return _posterior(path, header, tensors)
+    posterior = _posterior(path, header, tensors)
+    _check_whole(path, header, "GPPosterior")
+    return posterior
 
 
 def save_residual_model(model: ResidualModel, path: str | Path) -> None:
@@ -69,6 +69,7 @@ def save_residual_model(model: ResidualModel, path: str | Path) -> None:
         SettingError: A tensor is neither float64 nor float32.
         DataError: The folder does not exist.
     """
+    path = new_file(path)
     if not isinstance(model.nominal, Affine):
         raise UnsupportedModel(
             f"only an Affine nominal model is numbers and can be saved; got {type(model.nominal).__name__}. Save the "
@@ -91,7 +92,7 @@ def load_residual_model(path: str | Path) -> ResidualModel:
     Raises:
         DataError: The file is missing, damaged, of another kind or of a newer format.
     """
-    path = Path(path)
+    path = existing_file(path, "a saved ResidualModel")
     header, tensors = _read(path, "ResidualModel")
     residual = {name.partition("/")[2]: value for name, value in tensors.items() if name.startswith("residual/")}
     gp = _posterior(path, _entry(path, header, "residual", dict), residual)
@@ -101,12 +102,14 @@ def load_residual_model(path: str | Path) -> ResidualModel:
     B, *nominal = _checked(path, tensors, shapes, gp.dtype).values()
     states, inputs = (_entry(path, header, name, list) for name in ("states", "inputs"))
     try:
-        return ResidualModel(Affine(*nominal), gp, B, states, inputs, m)
+        model = ResidualModel(Affine(*nominal), gp, B, states, inputs, m)
     except (GpmpcError, TypeError) as error:
         raise DataError(f"{path}: not a consistent residual model ({error})") from error
+    _check_whole(path, header, "ResidualModel")
+    return model
 
 
-def _parts(path: str | Path, posterior: GPPosterior) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def _parts(path: Path, posterior: GPPosterior) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """What goes into the header and what into arrays, after a look at whether it could be read again."""
     if type(posterior) is not GPPosterior:
         raise UnsupportedModel(f"only a GPPosterior can be saved; got {type(posterior).__name__}")
@@ -118,7 +121,7 @@ def _parts(path: str | Path, posterior: GPPosterior) -> tuple[dict[str, Any], di
         "points": len(posterior),
     }
     tensors = {f.name: v for f in fields(posterior) if isinstance(v := getattr(posterior, f.name), Tensor)}
-    _posterior(Path(path), header, tensors)
+    _posterior(path, header, tensors)
     return header, tensors
 
 
@@ -174,10 +177,7 @@ def _entry(path: Path, header: dict, name: str, kind: type) -> Any:
     return value
 
 
-def _write(path: str | Path, kind: str, header: dict, tensors: dict[str, Tensor]) -> None:
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise DataError(f"{path}: the folder {path.parent} does not exist")
+def _write(path: Path, kind: str, header: dict, tensors: dict[str, Tensor]) -> None:
     tensors = {name: value.detach() for name, value in tensors.items()}
     for name, value in tensors.items():
         if value.dtype not in DTYPES:
@@ -192,31 +192,19 @@ def _write(path: str | Path, kind: str, header: dict, tensors: dict[str, Tensor]
         "versions": versions(("gpmpc", "torch", "gpytorch", "numpy")),
         "created": now(),
     }
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr(zipfile.ZipInfo(HEADER), json.dumps(header, indent=2))
-        for name, value in tensors.items():
-            array = io.BytesIO()
-            np.lib.format.write_array(array, _packed(name, value).cpu().contiguous().numpy(), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), array.getvalue())
-    write_whole(path, content.getvalue())
+    arrays = {name: _packed(name, value).cpu().contiguous().numpy() for name, value in tensors.items()}
+    write_whole(path, pack(header, arrays))
 
 
 def _read(path: Path, kind: str) -> tuple[dict, dict[str, Tensor]]:
     """Header and tensors of a file of the given kind."""
-    if not path.is_file():
-        raise DataError(f"{path}: no such file; expected a saved {kind}")
-    # A damaged archive makes zipfile, json and numpy raise whatever they come upon first: struct.error, EOFError,
-    # MemoryError, NotImplementedError, ... All say the same about the file.
     try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-            header = json.loads(archive.read(HEADER)) if HEADER in names else None  # read() compares the checksum
+        header = read_header(path)
     except Exception as error:
         raise DataError(f"{path}: damaged, or not a file of this package; expected a saved {kind} ({error})") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise DataError(f"{path}: a file of something else; expected a saved {kind}")
-    if _entry(path, header, "format_version", int) > VERSION:
+    if not 1 <= _entry(path, header, "format_version", int) <= VERSION:
         raise DataError(
             f"{path}: written in format {header['format_version']} by gpmpc "
             f"{_entry(path, header, 'versions', dict).get('gpmpc')}; this version reads up to {VERSION}: update gpmpc"
@@ -226,12 +214,18 @@ def _read(path: Path, kind: str) -> tuple[dict, dict[str, Tensor]]:
     if header.get("kernel") != "SE-ARD":
         raise DataError(f"{path}: has the kernel {header.get('kernel')!r}; expected 'SE-ARD'")
     try:
-        with zipfile.ZipFile(path) as archive:
-            names = [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
-            tensors = {name: _restored(name, archive, header["memory_order"][name]) for name in names}
+        tensors = {name: _restored(name, array, header["memory_order"][name]) for name, array in read_arrays(path)}
     except Exception as error:
         raise DataError(f"{path}: damaged; expected a saved {kind} ({error})") from error
     return header, tensors
+
+
+def _check_whole(path: Path, header: dict, kind: str) -> None:
+    """After all that can say more exactly what is wrong."""
+    try:
+        check_whole(path, header)
+    except Exception as error:
+        raise DataError(f"{path}: damaged; expected a saved {kind} ({error})") from error
 
 
 def _order(value: Tensor) -> list[int]:
@@ -247,24 +241,29 @@ def _packed(name: str, value: Tensor) -> Tensor:
     return value[..., rows, columns]
 
 
-def _restored(name: str, archive: zipfile.ZipFile, order: list[int]) -> Tensor:
-    """The tensor of an archive's ``.npy`` file, lying in memory as it did when it was saved.
+def _restored(name: str, stored: np.ndarray, order: list[int]) -> Tensor:
+    """The tensor of an array, lying in memory as it did when it was saved.
 
     The zeros above the diagonal of a factor are pages that nobody writes, which take no memory.
     """
-    with archive.open(f"{name}.npy") as file:
-        stored = torch.from_numpy(np.lib.format.read_array(file, allow_pickle=False))
-        file.read()  # the checksum is compared at the end
+    dtype = torch.from_numpy(np.empty(0, stored.dtype)).dtype
     triangular = name.endswith("cholesky")
-    size = round((2 * stored.shape[-1] + 0.25) ** 0.5 - 0.5) if triangular else 0
-    shape = (len(stored), size, size) if triangular else tuple(stored.shape)
+    size = math.isqrt(2 * stored.shape[-1]) if triangular else 0
+    shape = (len(stored), size, size) if triangular else stored.shape
+    if sorted(order) != list(range(len(shape))) or (
+        triangular and stored.shape != (len(stored), size * (size + 1) // 2)
+    ):
+        raise ValueError(f"{name} of shape {stored.shape} cannot lie in the order {order}")
     inverse = sorted(range(len(shape)), key=order.__getitem__)
     if not triangular:
-        return torch.empty([shape[d] for d in order], dtype=stored.dtype).permute(inverse).copy_(stored)
-    pages = mmap.mmap(-1, len(stored) * size * size * stored.element_size(), access=mmap.ACCESS_COPY)
-    tensor = torch.frombuffer(pages, dtype=stored.dtype, count=len(stored) * size * size)
+        tensor = torch.empty([shape[d] for d in order], dtype=dtype).permute(inverse)
+        tensor.numpy()[...] = stored
+        return tensor
+    pages = mmap.mmap(-1, len(stored) * size * size * stored.itemsize, access=mmap.ACCESS_COPY)
+    tensor = torch.frombuffer(pages, dtype=dtype, count=len(stored) * size * size)
     tensor = tensor.view([shape[d] for d in order]).permute(inverse)
+    lower = tensor.numpy()
     for row in range(size):
         start = row * (row + 1) // 2
-        tensor[:, row, : row + 1] = stored[:, start : start + row + 1]
+        lower[:, row, : row + 1] = stored[:, start : start + row + 1]
     return tensor

@@ -17,12 +17,14 @@ import numpy as np
 import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError, UnsupportedModel, check_number
-from gpmpc.gp.hyperparameter_search import FAILED, Found, Task, find_hyperparameters
+from gpmpc.gaussian import check_tensors
+from gpmpc.gp.hyperparameter_search import FAILED, Found, Task, constant_columns, find_hyperparameters, spread
+from gpmpc.gp.kernel import PREDICTS, check_posterior
 from gpmpc.gp.model import BatchExactGP, gpytorch_model
 from gpmpc.gp.penalties import Penalty
 from gpmpc.gp.posterior import GPPosterior, Predicts
-from gpmpc.gp.scaling import Scaling, identity
-from gpmpc.gp.transitions import Transitions
+from gpmpc.gp.scaling import Scaling, centre
+from gpmpc.gp.transitions import Transitions, check_transitions
 from gpmpc.memory import GIB, available_memory
 
 log = logging.getLogger(__name__)
@@ -62,9 +64,10 @@ class Trainer:
     """Fits one SE-ARD GP per output to observed transitions.
 
     Attributes:
-        predicts: What the GPs learn: the next state, or the difference to it.
-        scaling: How features and targets are scaled for training, such as ``standardize``; what comes out is in the
-            units of the data all the same. Without it the prior mean is zero in those units.
+        predicts: What the GPs learn: the next state, the difference to it, or any values, which ``fit`` takes.
+        scaling: How features and targets are scaled for training; what comes out is in the units of the data all the
+            same. The prior mean is what it maps to zero: the targets' mean by default and with ``standardize``, zero
+            with ``identity``.
         penalty: Added to every output's negative log marginal likelihood; none by default.
         restarts: Random starts besides the first, which has l = std(x~), sf = std(y), sn = std(y) / 10.
         subset: Of more points than this a random subset of as many is searched first, from all starts; the search over
@@ -81,7 +84,7 @@ class Trainer:
     """
 
     predicts: Predicts = "next_state"
-    scaling: Callable[[torch.Tensor, Sequence[str]], Scaling] = identity
+    scaling: Callable[[torch.Tensor, Sequence[str]], Scaling] = centre
     penalty: Penalty | None = None
     restarts: int = 3
     subset: int | None = 1000
@@ -91,8 +94,8 @@ class Trainer:
     signal_to_noise_limit: float = 1e4
 
     def __post_init__(self) -> None:
-        if self.predicts not in ("next_state", "difference"):
-            raise SettingError("predicts", f"must be 'next_state' or 'difference'; got {self.predicts!r}")
+        if self.predicts not in PREDICTS:
+            raise SettingError("predicts", f"must be one of {', '.join(map(repr, PREDICTS))}; got {self.predicts!r}")
         check_number("restarts", self.restarts, least=0, whole=True)
         if self.subset is not None:
             check_number("subset", self.subset, least=1, whole=True)
@@ -107,17 +110,9 @@ class Trainer:
 
     def __call__(self, transitions: Transitions, seed: int = 0, start: GPPosterior | None = None) -> Training:
         """Trains on transitions; see ``fit``."""
-        if not isinstance(transitions, Transitions):
-            raise SettingError("transitions", f"must be Transitions(...); got {type(transitions).__name__}")
-        return self.fit(
-            transitions.features, self.learned(transitions), transitions.input_dim, self.predicts, seed, start
-        )
-
-    def learned(self, transitions: Transitions) -> torch.Tensor:
-        """What the GPs are told of transitions (N, n): next states, or differences."""
-        if self.predicts == "difference":
-            return transitions.next_states - transitions.states
-        return transitions.next_states
+        check_transitions(transitions)
+        targets = transitions.targets(self.predicts)
+        return self.fit(transitions.features, targets, transitions.input_dim, seed=seed, start=start)
 
     def refit(self, posterior: GPPosterior, transitions: Transitions | None = None, seed: int = 0) -> Training:
         """Trains on the points a posterior holds, and on new ones, from its hyperparameters on.
@@ -130,18 +125,19 @@ class Trainer:
             seed: Of the random starts.
 
         Raises:
-            UnsupportedModel: The posterior stands on a sparse model's pseudo-observations.
+            UnsupportedModel: It is no ``GPPosterior``, or stands on a sparse model's pseudo-observations.
             ShapeError: The transitions have other dimensions.
             TrainingError: Every start failed for an output, which is named.
         """
+        _check_start("posterior", posterior)
         if not posterior.exact:
             raise UnsupportedModel(
                 "the posterior holds a sparse model's pseudo-observations, no data: train again with SparseTrainer"
             )
         features, targets = (t.to("cpu", torch.float64) for t in (posterior.features, posterior.targets))
         if transitions is not None:
-            features = torch.cat([features, transitions.features])
-            targets = torch.cat([targets, posterior.learned(transitions)])
+            learned = posterior.learned(transitions)
+            features, targets = torch.cat([features, transitions.features]), torch.cat([targets, learned])
         return self.fit(features, targets, posterior.input_dim, posterior.predicts, seed, start=posterior)
 
     def fit(
@@ -149,7 +145,7 @@ class Trainer:
         features: torch.Tensor,
         targets: torch.Tensor,
         input_dim: int,
-        predicts: Predicts,
+        predicts: Predicts | None = None,
         seed: int = 0,
         start: GPPosterior | None = None,
     ) -> Training:
@@ -159,14 +155,15 @@ class Trainer:
             features: x~ = (x, u) (N, n + m).
             targets: (N, k).
             input_dim: m.
-            predicts: What the targets mean.
+            predicts: What the targets mean; by default what the trainer's setting says.
             seed: Of the random starts.
             start: Its hyperparameters are the first start instead; the random ones stay where they are.
 
         Raises:
-            ShapeError: ``start`` has other dimensions.
-            SettingError: The seed is no whole number.
-            DataError: The kernel matrices would not fit the memory that is available.
+            ShapeError: Features and targets do not belong together, or ``start`` has other dimensions.
+            SettingError: They are no float64 tensors in host memory, or the seed is no whole number.
+            UnsupportedModel: ``start`` is no ``GPPosterior``.
+            DataError: An entry is not finite, or the kernel matrices would not fit the memory that is available.
             TrainingError: Every start failed for an output, which is named.
         """
         begin = time.perf_counter()
@@ -183,12 +180,14 @@ class Trainer:
         features: torch.Tensor,
         targets: torch.Tensor,
         input_dim: int,
-        predicts: Predicts,
+        predicts: Predicts | None = None,
         seed: int = 0,
         start: GPPosterior | None = None,
     ) -> "Problem":
         """What ``fit`` solves, one task an output, for those that solve the tasks themselves; arguments as there."""
         check_number("seed", seed, least=0, whole=True)
+        predicts = self.predicts if predicts is None else predicts
+        features, targets = training_data(features, targets, input_dim, predicts)
         (size, d), outputs = features.shape, targets.shape[1]
         check_memory([(size, outputs)], self.likelihood)
         names = [f"x{i + 1}" for i in range(d - input_dim)] + [f"u{i + 1}" for i in range(input_dim)]
@@ -197,6 +196,7 @@ class Trainer:
         x, y = feature_scaling.scale(features).numpy(), target_scaling.scale(targets).numpy()
         first: list[np.ndarray | None] = [None] * outputs
         if start is not None:
+            _check_start("start", start)
             first = list(log_hyperparameters(start, feature_scaling, target_scaling))
         rng = np.random.default_rng(seed)
         perturbations = rng.normal(size=(outputs, self.restarts + 1, d + 2))
@@ -204,8 +204,11 @@ class Trainer:
         known = start is not None and not self.restarts  # where to begin: a subset tells no more
         if self.subset is not None and size > self.subset and not known:
             rows = np.sort(rng.permutation(size)[: self.subset])
+        columns = features.numpy()
+        of_inputs = (rows, spread(columns) / feature_scaling.factor.numpy(), constant_columns(columns))
         tasks = [
-            Task(f"output {a + 1} of {outputs}", x, y[:, a], first[a], perturbations[a], rows) for a in range(outputs)
+            Task(f"output {a + 1} of {outputs}", x, y[:, a], first[a], perturbations[a], *of_inputs)
+            for a in range(outputs)
         ]
         return Problem(features, targets, feature_scaling, target_scaling, input_dim, predicts, tasks)
 
@@ -278,6 +281,30 @@ class Problem:
 def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
     """``Trainer(**settings)(transitions, seed)``: fits one GP per output in one call."""
     return Trainer(**settings)(transitions, seed)
+
+
+def training_data(
+    features: torch.Tensor, targets: torch.Tensor, input_dim: int, predicts: str
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Features and targets as training takes them, apart from any graph, after a look at both.
+
+    Raises:
+        ShapeError: They do not belong together, or there is no row.
+        SettingError: They are no float64 tensors in host memory, or ``predicts`` is unknown.
+        DataError: An entry is not finite.
+    """
+    given = {"features": features, "targets": targets}
+    check_tensors(**given)
+    for name, value in given.items():
+        if value.device.type != "cpu":
+            raise SettingError(name, f"must be in host memory for training ({name}.cpu()); got {value.device}")
+    check_posterior(given, input_dim, predicts)
+    return features.detach(), targets.detach()
+
+
+def _check_start(key: str, posterior: Any) -> None:
+    if not isinstance(posterior, GPPosterior):
+        raise UnsupportedModel(f"{key} must be a GPPosterior; got {type(posterior).__name__}")
 
 
 def log_hyperparameters(posterior: GPPosterior, features: Scaling, targets: Scaling) -> np.ndarray:

@@ -7,8 +7,7 @@ what is wrong with a file is said with its name, row and column.
 
 import csv
 import io
-import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, UnsupportedModel, check_number
 from gpmpc.files import write_whole
+from gpmpc.gp.archive import check_whole, existing_file, new_file, pack, read_arrays, read_header
+
+FORMAT, VERSION = "gpmpc transitions", 1
+NAMES = ("states", "inputs", "next_states")
+EXPECTED = "a file of transitions"
 
 
 @dataclass(frozen=True)
@@ -40,9 +44,9 @@ class Transitions:
     next_states: Tensor
 
     def __post_init__(self) -> None:
-        for name in ("states", "inputs", "next_states"):
+        for name in NAMES:
             try:
-                value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+                value = _real(getattr(self, name))
             except (TypeError, ValueError) as error:
                 raise DataError(f"{name} must be numbers in rows and columns; {error}") from error
             if value.dim() != 2:
@@ -60,7 +64,7 @@ class Transitions:
             )
         if len(self.states) == 0:
             raise DataError("transitions need at least one row; got none")
-        for name in ("states", "inputs", "next_states"):
+        for name in NAMES:
             bad = torch.nonzero(~torch.isfinite(getattr(self, name)))
             if len(bad):
                 row, column = bad[0].tolist()
@@ -88,36 +92,49 @@ class Transitions:
         """x~ = (x, u), (N, n + m)."""
         return torch.cat([self.states, self.inputs], dim=1)
 
+    def targets(self, predicts: str) -> Tensor:
+        """What GPs that predict ``"next_state"`` or ``"difference"`` learn of them (N, n).
+
+        Raises:
+            UnsupportedModel: They predict values, which transitions do not hold.
+        """
+        if predicts == "value":
+            raise UnsupportedModel(
+                "transitions hold no targets of GPs with predicts='value': use condition_on_targets of a posterior, "
+                "fit(features, targets, ...) of a trainer"
+            )
+        return self.next_states - self.states if predicts == "difference" else self.next_states
+
     def __getitem__(self, rows: slice | Sequence[int]) -> "Transitions":
         """The transitions of some rows, in the order given."""
         return Transitions(self.states[rows], self.inputs[rows], self.next_states[rows])
 
     def save(self, path: str | Path) -> None:
         """Writes an uncompressed ``.npz`` (no pickle), in one piece or not at all."""
-        buffer = io.BytesIO()
-        np.savez(buffer, states=self.states.numpy(), inputs=self.inputs.numpy(), next_states=self.next_states.numpy())
-        write_whole(path, buffer.getvalue())
+        arrays = {name: getattr(self, name).numpy(force=True) for name in NAMES}
+        write_whole(new_file(path), pack({"format": FORMAT, "format_version": VERSION}, arrays))
 
     @classmethod
     def load(cls, path: str | Path) -> "Transitions":
-        """Reads what ``save`` wrote.
+        """Reads what ``save`` wrote, or NumPy's ``savez`` of arrays with the same names.
 
         Raises:
             DataError: The file is missing, damaged, or not such a file.
         """
-        path = _existing(path)
-        names = ("states", "inputs", "next_states")
+        path = existing_file(path, EXPECTED)
         try:
-            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                missing = [name for name in names if name not in file]
-                if missing:
-                    raise DataError(f"{path}: array {missing[0]!r} is missing; expected {', '.join(names)}")
-                arrays = [file[name] for name in names]
-        except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-            if isinstance(error, DataError):
-                raise
+            header = read_header(path)
+            if header is not None:
+                if (header["format"], header["format_version"]) != (FORMAT, VERSION):
+                    raise ValueError(f"it holds a {header['format']}, format {header['format_version']}")
+                check_whole(path, header)
+            arrays = dict(read_arrays(path, NAMES))
+        except Exception as error:
             raise DataError(f"{path}: not a readable .npz file of transitions ({error})") from error
-        return _with_path(path, *arrays)
+        missing = [name for name in NAMES if name not in arrays]
+        if missing:
+            raise DataError(f"{path}: array {missing[0]!r} is missing; expected {', '.join(NAMES)}")
+        return _with_path(path, *(arrays[name] for name in NAMES))
 
     @classmethod
     def from_text(cls, path: str | Path, state_dim: int = 6, input_dim: int = 3) -> "Transitions":
@@ -126,7 +143,9 @@ class Transitions:
         Raises:
             DataError: The file is missing, a row has another number of columns, or an entry is no finite number.
         """
-        path = _existing(path)
+        check_number("state_dim", state_dim, least=1, whole=True)
+        check_number("input_dim", input_dim, least=0, whole=True)
+        path = existing_file(path, EXPECTED)
         columns = 2 * state_dim + input_dim
         rows = []
         for line, text in enumerate(_text(path).splitlines(), start=1):
@@ -163,14 +182,16 @@ class Transitions:
             DataError: The file or a column is missing, or an entry is no finite number.
         """
         for key, names in (("states", states), ("inputs", inputs), ("next_states", next_states)):
-            if isinstance(names, str):
-                raise SettingError(key, f"must be a list of column names; got the single name {names!r}")
-        path = _existing(path)
+            if isinstance(names, str) or not (isinstance(names, Iterable) or (key == "next_states" and names is None)):
+                single = "the single name " if isinstance(names, str) else ""
+                raise SettingError(key, f"must be a list of column names; got {single}{names!r}")
+        path = existing_file(path, EXPECTED)
         text = _text(path)
         header = text.partition("\n")[0]
         delimiter = max(",;\t", key=header.count)
         reader = csv.reader(io.StringIO(text), delimiter=delimiter)
-        names = [name.strip() for name in next(reader, [])]
+        lines = _lines(path, reader)
+        names = [name.strip() for name in next(lines, [])]
         wanted = [*states, *inputs, *(next_states or ())]
         for name in wanted:
             if names.count(name) != 1:
@@ -178,7 +199,7 @@ class Transitions:
                 raise DataError(f"{path}: column {name!r} {problem}; the header has {', '.join(names) or 'no columns'}")
         positions = [names.index(name) for name in wanted]
         rows = []
-        for fields in _lines(path, reader):
+        for fields in lines:
             line = reader.line_num
             if not fields:
                 continue
@@ -194,11 +215,26 @@ class Transitions:
         return _with_path(path, table[:-1, :n], table[:-1, n:], table[1:, :n])
 
 
-def _existing(path: str | Path) -> Path:
-    path = Path(path)
-    if not path.is_file():
-        raise DataError(f"{path}: no such file; expected a file of transitions")
-    return path
+def check_transitions(transitions: Any) -> None:
+    """Raises unless these are transitions.
+
+    Raises:
+        SettingError: Something else was given.
+    """
+    if not isinstance(transitions, Transitions):
+        raise SettingError("transitions", f"must be Transitions(...); got {type(transitions).__name__}")
+
+
+def _real(values: Any) -> Tensor:
+    """Numbers as float64; what only could be taken for numbers (truth values, text, dates, complex ones) raises."""
+    if not isinstance(values, Tensor):
+        values = np.asarray(values)
+        if values.dtype.kind not in "fiu":
+            raise TypeError(f"got {values.dtype}")
+        values = torch.from_numpy(np.array(values, dtype=np.float64))
+    if values.dtype == torch.bool or values.is_complex():
+        raise TypeError(f"got {values.dtype}")
+    return values.to(torch.float64)
 
 
 def _text(path: Path) -> str:
@@ -219,14 +255,14 @@ def _number(path: Path, row: int, column: int | str, field: str) -> float:
     try:
         value = float(field)
     except ValueError:
-        value = None
-    if value is None or not np.isfinite(value):
+        value = np.nan
+    if not np.isfinite(value) or "_" in field:  # Python takes 1_0 for 10
         raise DataError(f"{path}: row {row}, column {column} is {field.strip()!r}; expected a finite number")
     return value
 
 
 def _with_path(path: Path, states: np.ndarray, inputs: np.ndarray, next_states: np.ndarray) -> Transitions:
     try:
-        return Transitions(*(torch.from_numpy(np.array(a, dtype=float)) for a in (states, inputs, next_states)))
-    except (DataError, ShapeError, ValueError, TypeError) as error:
+        return Transitions(states, inputs, next_states)
+    except GpmpcError as error:
         raise DataError(f"{path}: {error}") from error

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gp.module import PosteriorModule
-from tests.gp.small_models import posterior
+from tests.gp.small_models import posterior, residual_model
 
 
 @pytest.mark.parametrize("predicts", ["next_state", "difference", "value"])
@@ -40,3 +41,9 @@ def test_an_autonomous_model_takes_an_input_of_no_columns():
     program = torch.export.export(PosteriorModule(gp), (torch.zeros(2), torch.zeros(0)))
     state = torch.randn(2)
     assert torch.allclose(program.module()(state, torch.zeros(0))[0], gp.predict(state).mean, atol=1e-12)
+
+
+@pytest.mark.parametrize("model", [residual_model(), "gp.npz"], ids=["residual", "name"])
+def test_another_model_is_refused_with_the_way_out(model):
+    with pytest.raises(UnsupportedModel, match=r"takes a GPPosterior, such as a model's .residual; got"):
+        PosteriorModule(model)

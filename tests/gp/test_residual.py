@@ -136,9 +136,21 @@ def test_a_residual_model_can_be_moved_to_single_precision():
     assert torch.allclose(single.predict(x.float(), u.float()).mean.double(), model().predict(x, u).mean, atol=1e-4)
 
 
+def test_a_trainer_of_differences_is_no_trainer_of_residuals():
+    for trainer in (Trainer(predicts="difference"), SparseTrainer(predicts="difference"), 3):
+        with pytest.raises(SettingError, match="trainer: must be a Trainer or SparseTrainer with predicts='value'"):
+            ResidualModel.train(AFFINE, transitions(15), trainer=trainer)
+    with pytest.raises(SettingError, match=r"transitions: must be Transitions\(...\); got str"):
+        ResidualModel.train(AFFINE, "data.npz")
+    known = ResidualModel.train(AFFINE, transitions(15), trainer=Trainer(predicts="value", restarts=0))
+    assert known.residual.predicts == "value"
+
+
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
+        ({"states": [2.0, 0]}, SettingError, r"states: must be different indices from 0 to 2; got \[2.0, 0\]"),
+        ({"inputs": [True]}, SettingError, r"inputs: must be different indices from 0 to 1; got \[True\]"),
         ({"states": [2]}, ShapeError, "sees 2 states and 1 inputs; got 1 and 1 selected"),
         ({"states": [2, 3]}, SettingError, r"states: must be different indices from 0 to 2; got \[2, 3\]"),
         ({"inputs": [2]}, SettingError, r"inputs: must be different indices from 0 to 1; got \[2\]"),

@@ -2,10 +2,11 @@
 
 import logging
 
+import numpy as np
 import pytest
 import torch
 
-from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
+from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Budget, GPPosterior, SparseTrainer, Trainer, Transitions, sparse_posterior, standardize
 from gpmpc.gp.collapsed_bound import collapsed_bound, collapsed_bound_with_gradient
@@ -180,7 +181,7 @@ def test_fewer_points_than_inducing_points_are_all_taken():
         ({"inducing": 0}, "inducing: must be a whole number, 1 or more; got 0"),
         ({"method": "dtc"}, "'sgpr' or 'fitc'; got 'dtc'"),
         ({"jitter": -1.0}, "jitter: must be a number, 0 or more; got -1.0"),
-        ({"predicts": "value"}, "'next_state' or 'difference'; got 'value'"),
+        ({"predicts": "delta"}, "'next_state', 'difference', 'value'; got 'delta'"),
         ({"iterations": 1.5}, "iterations: must be a whole number, 0 or more; got 1.5"),
     ],
 )
@@ -226,3 +227,77 @@ def test_training_on_a_mirrored_feature_is_the_mirrored_training(inducing, bend)
     margin = 0.1 * (x.max() - x.min())
     assert x.min() - margin - 1e-9 <= ours.min()
     assert ours.max() <= x.max() + margin + 1e-9
+
+
+def sines(rows, d, noise, seed):
+    generator = torch.Generator().manual_seed(seed)
+    x = 4 * torch.rand(rows, d, generator=generator) - 2
+    y = torch.sin(1.5 * x).sum(1, keepdim=True)
+    return x, y + noise * torch.randn(rows, 1, generator=generator)
+
+
+def explained(gp, x, y):
+    return 1 - float((gp.predict(x).mean - y).square().sum() / (y - y.mean(0)).square().sum())
+
+
+@pytest.mark.parametrize(
+    ("d", "rows", "noise", "least"),
+    [(8, 2000, 0.1, 0.7), (12, 500, 0.01, 0.65), (4, 1000, 0.01, 0.98), (4, 500, 0.5, 0.8), (2, 500, 1e-3, 0.999)],
+)
+def test_by_default_more_is_learned_than_noise(d, rows, noise, least):
+    x, y = sines(rows, d, noise, seed=0)
+    assert explained(SparseTrainer(inducing=50).fit(x, y, 0, "value").posterior, x, y) > least
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("noise", [0.01, 0.1])
+@pytest.mark.parametrize("d", [4, 8, 12])
+def test_by_default_more_is_learned_than_noise_whatever_the_seed(d, noise, seed):
+    x, y = sines(2000, d, noise, seed)
+    assert explained(SparseTrainer(inducing=50).fit(x, y, 0, "value", seed).posterior, x, y) > 0.6
+
+
+@pytest.mark.parametrize("settings", [{}, {"method": "fitc"}, {"learn_locations": False}, {"scaling": standardize}])
+def test_no_iterations_leave_everything_where_it_began(settings):
+    x, y = sines(300, 3, 0.1, seed=1)
+    training = SparseTrainer(inducing=20, iterations=0, **settings).fit(x, y, 0, "value")
+    assert np.array_equal(training.objective, training.initial)
+    away = (training.posterior.features[:, None] - x).abs().sum(-1)
+    assert float(away.min(dim=1).values.max()) < 1e-12
+
+
+def test_the_best_point_of_a_search_is_kept(monkeypatch):
+    def astray(objective, start, bounds, **_):
+        values = [objective(np.clip(start + step, *bounds.T))[0] for step in (0.0, 1e-3, 3.0)]
+        assert values[-1] > values[0]
+
+    monkeypatch.setattr("gpmpc.gp.sparse_training.minimize", astray)
+    training = SparseTrainer(inducing=20).fit(*sines(300, 3, 0.1, seed=1), 0, "value")
+    assert (training.objective <= training.initial).all()
+
+
+def test_points_that_learn_nothing_where_there_is_something_are_refused():
+    x, _ = sines(500, 2, 0.0, seed=0)
+    y = torch.sin(2 * x).prod(1, keepdim=True)
+    with pytest.raises(
+        TrainingError, match="1 inducing points learned nothing but noise of output 1, where exact"
+    ) as e:
+        SparseTrainer(inducing=1).fit(x, torch.cat([x[:, :1], y], dim=1), 0, "value")
+    assert e.value.outputs == [1]
+
+
+def test_where_there_is_nothing_but_noise_the_log_says_so(caplog):
+    x, _ = sines(300, 2, 0.0, seed=0)
+    with caplog.at_level(logging.WARNING, "gpmpc"):
+        gp = SparseTrainer(inducing=20).fit(x, 3 + torch.randn(300, 2), 0, "value").posterior
+    assert "nothing but noise was found in output" in caplog.text
+    assert torch.allclose(gp.noise_variance, torch.ones(2), atol=0.2)
+
+
+def test_an_output_at_rest_is_learned_without_complaint(caplog):
+    x, y = sines(300, 2, 0.1, seed=0)
+    with caplog.at_level(logging.WARNING, "gpmpc"):
+        gp = SparseTrainer(inducing=20).fit(x, torch.cat([y, torch.full_like(y, 7.0)], dim=1), 0, "value").posterior
+    assert torch.allclose(gp.predict(x).mean[:, 1], torch.tensor(7.0), atol=1e-6)
+    assert not caplog.text

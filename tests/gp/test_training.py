@@ -1,10 +1,12 @@
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 from scipy.optimize import approx_fprime
 
-from gpmpc.exceptions import DataError, SettingError, TrainingError
-from gpmpc.gp import SoftLimits, Trainer, Transitions, train
+from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError, UnsupportedModel
+from gpmpc.gp import GPPosterior, SoftLimits, SparseTrainer, Trainer, Transitions, train, train_many
 from gpmpc.gp.hyperparameter_search import spread
 
 
@@ -142,7 +144,7 @@ def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(
     [
         ({"subset": 0}, "subset: must be a whole number, 1 or more; got 0"),
         ({"restarts": -1}, "restarts: must be a whole number, 0 or more; got -1"),
-        ({"predicts": "delta"}, "'next_state' or 'difference'; got 'delta'"),
+        ({"predicts": "delta"}, "'next_state', 'difference', 'value'; got 'delta'"),
         ({"likelihood": "exact"}, "'closed_form' or 'gpytorch'; got 'exact'"),
         ({"signal_to_noise_limit": 1.0}, "signal_to_noise_limit: must be a number above 1; got 1.0"),
         ({"tolerance": 0.0}, "tolerance: must be a number above 0; got 0.0"),
@@ -165,3 +167,75 @@ def test_misuse_is_refused_with_the_rule(setting, message):
 def test_limits_that_are_none_are_refused(arguments, message):
     with pytest.raises(SettingError, match=message):
         SoftLimits(*arguments)
+
+
+def test_values_of_any_kind_are_learned_from_features_and_targets():
+    x = torch.linspace(-2, 2, 30)[:, None]
+    for trainer in (Trainer(predicts="value", restarts=0), SparseTrainer(predicts="value", inducing=20, restarts=0)):
+        gp = trainer.fit(x, torch.sin(x), 0).posterior
+        assert gp.predicts == "value"
+        assert torch.allclose(gp.predict(x).mean, torch.sin(x), atol=1e-2)
+        with pytest.raises(UnsupportedModel, match="transitions hold no targets of GPs with predicts='value'"):
+            trainer(pendulum(5))
+
+
+def two_columns(rows=6):
+    return torch.rand(rows, 2), torch.rand(rows, 1)
+
+
+TABLES = [
+    ({"features": [[1.0, 2.0]]}, SettingError, "features: must be a torch tensor; got list"),
+    ({"features": np.ones((6, 2))}, SettingError, "features: must be a torch tensor; got ndarray"),
+    ({"targets": np.ones((6, 1))}, SettingError, "targets: must be a torch tensor; got ndarray"),
+    ({"targets": torch.ones(5, 1)}, ShapeError, r"targets must have shape \(6, 1\); got \(5, 1\)"),
+    ({"targets": torch.ones(6)}, ShapeError, "need two dimensions, a column and a row"),
+    ({"targets": torch.ones(6, 0)}, ShapeError, "need two dimensions, a column and a row"),
+    ({"features": torch.ones(0, 2), "targets": torch.ones(0, 1)}, ShapeError, "a row; got"),
+    ({"features": torch.full((6, 2), torch.nan)}, DataError, "features must be finite; got nan"),
+    ({"targets": torch.full((6, 1), torch.inf)}, DataError, "targets must be finite; got inf"),
+    ({"features": torch.ones(6, 2).float()}, SettingError, "features: must be float64"),
+    ({"targets": torch.ones(6, 1, dtype=torch.int64)}, SettingError, "targets: must be float64"),
+    ({"features": torch.ones(6, 2, device="meta")}, SettingError, "features: must be in host memory for training"),
+    ({"input_dim": 2}, ShapeError, "2 controls"),
+    ({"input_dim": -1}, SettingError, "input_dim: must be a whole number"),
+    ({"input_dim": 1.0}, SettingError, "input_dim: must be a whole number"),
+    ({"predicts": "delta"}, SettingError, "predicts: must be one of"),
+    ({"predicts": "next_state", "input_dim": 0}, ShapeError, "one state an output"),
+]
+
+
+@pytest.mark.parametrize(("change", "error", "message"), TABLES, ids=lambda value: str(value)[:40])
+@pytest.mark.parametrize("trainer", [Trainer(), SparseTrainer()], ids=["exact", "sparse"])
+def test_tables_that_cannot_be_learned_from_are_refused_with_the_rule(trainer, change, error, message):
+    features, targets = two_columns()
+    good = {"features": features, "targets": targets, "input_dim": 1, "predicts": "next_state"}
+    with pytest.raises(error, match=message):
+        trainer.fit(**good | change)
+
+
+def test_tables_of_a_graph_are_learned_apart_from_it():
+    features, targets = two_columns()
+    gp = Trainer(restarts=0).fit(features.requires_grad_(), targets, 1, "value").posterior
+    assert not gp.weights.requires_grad
+
+
+def test_a_refit_and_a_start_need_a_posterior_and_transitions_that_fit_it():
+    trainer, gp = Trainer(restarts=0), train(pendulum(8), restarts=0).posterior
+    other = Transitions(torch.zeros(3, 3), torch.zeros(3, 1), torch.zeros(3, 3))
+    with pytest.raises(ShapeError, match="the model has 2 states and 1 inputs; got transitions with 3 and 1"):
+        trainer.refit(gp, other)
+    with pytest.raises(SettingError, match=r"transitions: must be Transitions\(...\); got Tensor"):
+        trainer.refit(gp, other.states)
+    with pytest.raises(UnsupportedModel, match="posterior must be a GPPosterior; got str"):
+        trainer.refit("gp.npz")
+    with pytest.raises(UnsupportedModel, match="start must be a GPPosterior; got Training"):
+        trainer(pendulum(8), start=train(pendulum(8), restarts=0))
+    with pytest.raises(ShapeError, match="the posterior to start from must have 4 features and 3 outputs; got 3 and 2"):
+        trainer(other, start=gp)
+    values = GPPosterior(**vars(gp) | {"predicts": "value"})
+    with pytest.raises(UnsupportedModel, match="transitions hold no targets"):
+        trainer.refit(values, pendulum(8))
+    assert trainer.refit(values).posterior.predicts == "value"
+    for learner in (SparseTrainer(), partial(train_many, trainer)):
+        with pytest.raises(SettingError, match=r"transitions: must be Transitions\(...\); got int"):
+            learner([1] if isinstance(learner, partial) else 1)

@@ -1,0 +1,223 @@
+"""Where data lie must not matter: a shift of features and targets, however large, shifts what is learned, no more.
+
+All numbers are multiples of 2^-20, so that float64 holds them exactly at offsets of 1e8, where it resolves 1.5e-8.
+"""
+
+import casadi
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import (
+    GPPosterior,
+    SparseTrainer,
+    Trainer,
+    Transitions,
+    evaluation,
+    identity,
+    min_max,
+    sparse_posterior,
+    standardize,
+)
+from gpmpc.gp.casadi_ import casadi_function
+from gpmpc.gp.collapsed_bound import collapsed_bound
+from gpmpc.gp.evidence import LogEvidence
+from gpmpc.gp.evidence_in_place import InPlaceEvidence
+from gpmpc.gp.hyperparameter_search import constant_columns, spread
+from gpmpc.gp.model import BatchExactGP, GPyTorchEvidence
+from gpmpc.gp.module import PosteriorModule
+from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, linearize
+from gpmpc.propagation.sensitivity import differentiate
+
+FEATURES = [-1e5, 1e8, torch.tensor([-1e8, 1e7, 13.75])]
+TARGETS = [-1e8, torch.tensor([1e8, 0.0])]
+
+
+def on_grid(values):
+    return (values * 2**20).round() / 2**20
+
+
+def data(rows=30, noise=1e-3, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    x = 4 * torch.rand(rows, 3, generator=generator) - 2
+    y = torch.stack([torch.sin(x[:, 0]) + 0.3 * x[:, 1], x[:, 1] * x[:, 2]], dim=1)
+    return on_grid(x), on_grid(y + noise * torch.randn(y.shape, generator=generator))
+
+
+TRAINERS = {
+    "exact": Trainer(restarts=0),
+    "exact, standardized": Trainer(restarts=0, scaling=standardize),
+    "exact, on an interval": Trainer(restarts=0, scaling=min_max),
+    "GPyTorch": Trainer(restarts=0, likelihood="gpytorch"),
+    "sparse": SparseTrainer(inducing=15, restarts=0, iterations=15),
+    "fitc": SparseTrainer(inducing=15, restarts=0, iterations=15, method="fitc"),
+}
+
+
+def assert_same_training(trainer, x, y, by, targets_by=0.0):
+    here, there = trainer.fit(x, y, 1, "value"), trainer.fit(x + by, y + targets_by, 1, "value")
+    assert np.abs(here.objective - there.objective).max() < 0.01
+    at = on_grid(data(20, seed=1)[0])
+    (ours, *slopes), (theirs, *their_slopes) = (
+        training.posterior.predict_with_jacobian(points[:, :2], points[:, 2:])
+        for training, points in ((here, at), (there, at + by))
+    )
+    assert torch.allclose(theirs.mean - targets_by, ours.mean, rtol=0, atol=1e-3)
+    assert torch.allclose(theirs.variance, ours.variance, rtol=1e-2, atol=1e-7)
+    for slope, their_slope in zip(slopes, their_slopes, strict=True):
+        assert torch.allclose(slope, their_slope, rtol=0, atol=1e-2)
+
+
+@pytest.mark.parametrize("by", FEATURES, ids=str)
+@pytest.mark.parametrize("name", TRAINERS)
+def test_training_does_not_see_where_the_features_lie(name, by):
+    assert_same_training(TRAINERS[name], *data(), by)
+
+
+@pytest.mark.parametrize("by", FEATURES, ids=str)
+def test_training_in_place_does_not_see_where_the_features_lie(by, monkeypatch):
+    monkeypatch.setattr("gpmpc.gp.hyperparameter_search.IN_PLACE", 1)
+    assert_same_training(Trainer(restarts=0), *data(), by)
+
+
+@pytest.mark.parametrize("by", FEATURES, ids=str)
+def test_with_a_prior_mean_of_zero_training_does_not_see_where_the_features_lie_either(by):
+    assert_same_training(Trainer(restarts=0, scaling=identity), *data(), by)
+
+
+@pytest.mark.parametrize("by", TARGETS, ids=str)
+@pytest.mark.parametrize("name", TRAINERS)
+def test_training_does_not_see_where_the_targets_lie(name, by):
+    assert_same_training(TRAINERS[name], *data(noise=0.01), 1e8, by)
+
+
+@pytest.mark.parametrize("by", FEATURES, ids=str)
+def test_every_evidence_is_that_of_the_shifted_features(by):
+    x, y = data(60)
+    theta = np.array([0.2, 0.5, 0.1, 0.3, np.log(1e3)])
+    shifted = x + by
+    for kind in (LogEvidence, InPlaceEvidence):
+        value, gradient = kind(x.numpy(), y[:, 0].numpy())(theta)
+        there, slopes = kind(shifted.numpy(), y[:, 0].numpy())(theta)
+        assert there == pytest.approx(value, rel=1e-10)
+        assert np.allclose(slopes, gradient, rtol=1e-7)
+    here, there = (GPyTorchEvidence(BatchExactGP(p, y[:, :1]))(theta[None])[0] for p in (x, shifted))
+    assert there == pytest.approx(here, abs=0.01)  # GPyTorch divides by the length-scales first: round-off remains
+    kernel = [torch.tensor(theta[None, :3]).exp(), torch.ones(1), torch.full((1,), 1e-4)]
+    bounds = [collapsed_bound(p[:20], p, y[:, :1], *kernel) for p in (x, shifted)]
+    assert torch.allclose(*bounds, rtol=1e-10)
+
+
+def test_a_column_around_a_large_value_moves_and_one_at_rest_does_not():
+    x = data()[0].numpy()
+    assert np.array_equal(spread(x + 1e8), spread(x))
+    assert not constant_columns(x + 1e8).any()
+    rest = 0.5 + 1e-10 * x
+    assert constant_columns(rest).all()
+    assert np.allclose(spread(rest), np.abs(rest).max(axis=0))
+
+
+def posterior(by=0.0, targets_by=0.0, sparse=False, predicts="next_state"):
+    x, y = data(25)
+    kernel = {
+        "lengthscales": torch.tensor([[1.5, 2.5, 2.0], [1.0, 1.5, 3.0]]),
+        "signal_variance": torch.tensor([1.0, 2.0]),
+        "noise_variance": torch.tensor([1e-4, 1e-3]),
+        "input_dim": 1,
+        "predicts": predicts,
+        "offset": torch.full((2,), 0.25) + targets_by,
+    }
+    if sparse:
+        return sparse_posterior(x[:10] + by, x + by, y + targets_by, **kernel)
+    return GPPosterior.from_hyperparameters(x + by, y + targets_by, **kernel)
+
+
+def query(by=0.0):
+    at = on_grid(data(6, seed=3)[0]) + by
+    return at[:, :2], at[:, 2:]
+
+
+def everything(gp, by):
+    """What a model says at shifted points: a list of tensors."""
+    x, u = query(by)
+    said = [*(part for part in gp.mean_with_jacobian(x, u)), gp.mean_hessian(x, u)]
+    belief, *slopes = gp.predict_with_jacobian(x, u)
+    said += [belief.mean, belief.covariance, *slopes, gp.sample(x, u, generator=torch.Generator().manual_seed(0))]
+    module = PosteriorModule(gp)(x, u)
+    said += [*module, *torch.export.export(PosteriorModule(gp), (x, u)).module()(x, u)]
+    said += [
+        torch.from_numpy(np.array(part)).mT for part in casadi_function(gp).map(6)(casadi.DM(x.numpy().T), u.numpy().T)
+    ]
+    return said
+
+
+@pytest.mark.parametrize("by", FEATURES[1:], ids=str)
+@pytest.mark.parametrize("choice", ["compiled", "torch"])
+@pytest.mark.parametrize("sparse", [False, True], ids=["exact", "sparse"])
+def test_predictions_and_exports_are_those_of_the_shifted_model(by, choice, sparse):
+    with evaluation(choice):
+        here, there = everything(posterior(sparse=sparse), 0.0), everything(posterior(by, sparse=sparse), by)
+    for ours, theirs in zip(here, there, strict=True):
+        assert torch.allclose(ours, theirs, rtol=1e-7, atol=1e-8 if sparse else 1e-10)
+
+
+PROPAGATORS = [
+    (MomentMatching(), 1e-10),
+    (MomentMatching(diagonal=True, observation_noise=True), 1e-10),
+    (Linearization(), 1e-10),
+    (Linearization(hessian=True), 1e-10),
+    (MeanEquivalence(), 1e-10),
+    (Unscented(), 3e-7),  # its points, and the samples, are states: float64 resolves 1.5e-8 of them at 1e8
+    (MonteCarlo(300), 3e-7),
+]
+
+
+@pytest.mark.parametrize("choice", ["auto", "torch"])
+@pytest.mark.parametrize(("propagator", "atol"), PROPAGATORS, ids=lambda value: type(value).__name__)
+def test_propagations_are_those_of_the_shifted_model(propagator, atol, choice):
+    by = torch.tensor([1e8, -3e6, 1e7])
+    covariance = torch.tensor([[0.09, 0.02], [0.02, 0.04]])
+    said = []
+    for shift in (torch.zeros(3), by):
+        x, u = query(shift)
+        with evaluation(choice):
+            moved = propagator.propagate(posterior(shift), Gaussian(x[0], covariance), u[0])
+            derivatives = differentiate(propagator, posterior(shift), Gaussian(x[0], covariance), u[0])[1]
+        said.append([moved.belief.mean, moved.belief.covariance, moved.cross_covariance, *vars(derivatives).values()])
+    for ours, theirs in zip(*said, strict=True):
+        assert torch.allclose(ours, theirs, rtol=1e-6, atol=atol)
+
+
+@pytest.mark.parametrize("predicts", ["next_state", "difference"])
+def test_the_local_model_of_a_shifted_state_is_shifted(predicts):
+    by, covariance = torch.tensor([1e8, -3e6, 1e7]), torch.tensor([[0.09, 0.02], [0.02, 0.04]])
+    targets_by = by[:2] if predicts == "next_state" else 0.0
+    said = []
+    for shift, of_targets in ((torch.zeros(3), 0.0), (by, targets_by)):
+        x, u = query(shift)
+        gp, belief = posterior(shift, of_targets, predicts=predicts), Gaussian(x[0], covariance)
+        moved = MomentMatching()(gp, belief, u[0])
+        local = linearize(MomentMatching(), gp, belief, u[0])
+        said.append([moved.mean - shift[:2], moved.covariance, local.A, local.B])
+    for ours, theirs in zip(*said, strict=True):
+        assert torch.allclose(ours, theirs, rtol=1e-6, atol=1e-7)
+
+
+def test_points_come_and_go_around_a_large_value_as_around_zero():
+    x, y = data(28)
+    new = slice(25, 28)
+    here = posterior().condition_on_targets(x[new], y[new]).drop([0, 7])
+    there = posterior(1e8, -1e8).condition_on_targets(x[new] + 1e8, y[new] - 1e8).drop([0, 7])
+    (a, u), (b, v) = query(), query(1e8)
+    assert torch.allclose(here.predict(a, u).mean, there.predict(b, v).mean + 1e8, rtol=0, atol=1e-6)
+    assert torch.allclose(here.predict(a, u).variance, there.predict(b, v).variance, atol=1e-9)
+
+
+def test_what_flies_around_a_large_value_is_learned_by_default():
+    x, y = data(60)
+    far = torch.tensor([1e8, -3e6])
+    held_out, expected = data(40, noise=0.0, seed=5)
+    gp = Trainer()(Transitions(x[:, :2] + far, x[:, 2:], y + far)).posterior
+    error = gp.predict(held_out[:, :2] + far, held_out[:, 2:]).mean - far - expected
+    assert float(error.square().mean().sqrt()) < 0.05
