@@ -101,7 +101,7 @@ def _export(given: argparse.Namespace) -> None:
     from gpmpc.recording import read_run
 
     output: Path = given.output or _beside(given.file, ".csv")
-    if output.suffix not in FORMATS:
+    if given.output and output.suffix not in FORMATS:
         raise SettingError("output", f"must end in {' or '.join(FORMATS)}; got {output.name!r}")
     run = read_run(given.file)
     _write(output, _csv(run) if output.suffix == ".csv" else _parquet(run))
@@ -113,7 +113,7 @@ def _layout(given: argparse.Namespace) -> None:
     from gpmpc.recording import layout, read_run
 
     output: Path = given.output or _beside(given.file, ".layout.json")
-    if output.suffix != ".json":
+    if given.output and output.suffix != ".json":
         raise SettingError("output", f"must end in .json; got {output.name!r}")
     _write(output, layout(read_run(given.file)))
     print(f"written to {output}: open {given.file} in Foxglove or Lichtblick, then import it as a layout")
