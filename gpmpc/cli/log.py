@@ -93,7 +93,7 @@ def _recover(given: argparse.Namespace) -> None:
 
     output = given.output or _beside(given.file, ".recovered.mcap")
     found = recover(given.file, output)
-    note = "; the file was finished, nothing was missing" if found.finished else ""
+    note = "; the recording was finished, nothing was missing" if found.finished else ""
     print(f"written to {output}: {found.messages} messages over {found.seconds:g} s{note}")
 
 

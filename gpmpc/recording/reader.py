@@ -104,7 +104,8 @@ class Run:
     def columns(self) -> dict[str, Array]:
         """The run as a table: a column (K,) per scalar field of ``gpmpc.Step``, in its order."""
         table: dict[str, Array] = {"time": self.times, "k": self.steps}
-        std = np.sqrt(np.diagonal(self.belief_covariances, axis1=1, axis2=2))
+        with np.errstate(invalid="ignore"):  # NaN says it
+            std = np.sqrt(np.diagonal(self.belief_covariances, axis1=1, axis2=2))
         groups = {"reference": self.references, "state": self.states, "measured": self.measured, "input": self.inputs}
         groups |= {"innovation": self.innovations, "belief_std": std}
         for group, values in groups.items():
@@ -206,6 +207,8 @@ def read_run(path: str | Path) -> Run:
             counts[record.channel_id] += 1
             topic = channels[record.channel_id].topic
             if topic in messages:
+                if decoder is None and "run" not in metadata:  # another tool has moved them behind the messages
+                    metadata |= {more.name: more.metadata for more in whole_records(path) if isinstance(more, Metadata)}
                 decoder = decoder or _Decoder(path, metadata)
                 messages[topic].append(decoder.decode(topic, record))
         elif isinstance(record, Schema):
@@ -238,7 +241,7 @@ class _Decoder:
 
     Args:
         path: The file.
-        metadata: Its records so far.
+        metadata: Its records.
 
     Raises:
         RecordingError: They do not tell of a run.

@@ -25,7 +25,7 @@ class Recovery:
     Attributes:
         messages: Number of messages.
         seconds: Time between the first and the last of them [s].
-        finished: The file had been closed; nothing was missing.
+        finished: The run had been recorded to its end; nothing was missing.
     """
 
     messages: int
@@ -48,18 +48,19 @@ def recover(path: str | Path, output: str | Path) -> Recovery:
         if output.exists() and path.exists() and output.samefile(path):
             raise RecordingError(f"{output}: a file cannot be recovered into itself; name another output")
         with whole_file(output) as file:
-            found = _copy(path, file)
+            messages, seconds = _copy(path, file)
             file.flush()
             try:
-                read_run(file.name)
+                run = read_run(file.name)
             except RecordingError as error:
                 raise RecordingError(str(error).replace(file.name, str(path), 1)) from error
     except OSError as error:
         raise RecordingError(f"{output}: cannot be written: {error.strerror or error}") from error
-    return found
+    return Recovery(messages, seconds, run.finished)
 
 
-def _copy(path: Path, file: BinaryIO) -> Recovery:
+def _copy(path: Path, file: BinaryIO) -> tuple[int, float]:
+    """Number of the messages, and the time between the first and the last of them [s]."""
     writer = Writer(file, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile="", library="gpmpc")
     schemas: dict[int, int] = {0: 0}
@@ -86,4 +87,4 @@ def _copy(path: Path, file: BinaryIO) -> Recovery:
     if not finished:
         writer.add_metadata(RECOVERED, {"messages": str(count)})
     writer.finish()
-    return Recovery(count, (times[1] - times[0]) / 1e9 if times else 0.0, finished)
+    return count, (times[1] - times[0]) / 1e9 if times else 0.0

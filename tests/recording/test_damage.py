@@ -213,3 +213,13 @@ def test_a_frame_that_does_not_say_its_size_is_read(recorded, tmp_path):
             found[i] = damage.chunk(data, compressed=silent.compress(data))
     path.write_bytes(damage.sealed(found))
     assert read_run(path).finished
+
+
+def test_metadata_and_configuration_may_stand_behind_the_messages(recorded, tmp_path):
+    path, found = tmp_path / "other.mcap", damage.section(recorded[0].read_bytes())
+    behind = [record for record in found if record[0] in (damage.METADATA, damage.ATTACHMENT)]
+    path.write_bytes(damage.sealed([record for record in found if record not in behind] + behind))
+    run, expected = read_run(path), read_run(recorded[0])
+    assert run.finished
+    assert (run.metadata, run.config) == (expected.metadata, expected.config)
+    np.testing.assert_array_equal(run.states, expected.states)
