@@ -1,19 +1,23 @@
 """Problem: a file that looks finished has to be finished, whenever the process or the machine dies."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 
-def write_whole(path: str | Path, content: bytes | str) -> None:
-    """Writes a file in one piece or not at all: to a neighbour first, flushed to the disk, then renamed over it.
+@contextmanager
+def whole_file(path: str | Path) -> Iterator[BinaryIO]:
+    """A file to write in one piece or not at all: a neighbour, flushed to the disk and renamed if no error came.
 
-    When it returns, both the content and the name are on the disk.
+    Behind the block both the content and the name are on the disk.
     """
     path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.parent / f".{path.name}.{os.getpid()}.partial"
     try:
         with partial.open("wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
@@ -25,6 +29,12 @@ def write_whole(path: str | Path, content: bytes | str) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def write_whole(path: str | Path, content: bytes | str) -> None:
+    """Writes a ``whole_file``."""
+    with whole_file(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
 
 
 def remove_partial(folder: Path) -> None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from gpmpc.recording import Run
 
 FORMATS = (".csv", ".parquet")
-CUT = "unfinished or damaged; this is what is whole before the break"
+CUT = "unfinished or damaged; this is what could be read"
 
 
 def log(arguments: list[str]) -> None:
@@ -45,9 +45,11 @@ def _info(given: argparse.Namespace) -> None:
     from rich.table import Table
 
     from gpmpc.recording import read_run
+    from gpmpc.recording.reader import RECOVERED
 
     run, console = read_run(given.file), Console()
-    state = "finished" if run.finished else f"{CUT} (gpmpc log recover makes it readable for other tools)"
+    hint = "" if RECOVERED in run.metadata else " (gpmpc log recover makes it readable for other tools)"
+    state = "finished" if run.finished else f"{CUT}{hint}"
     console.print(f"{given.file}: {state}", soft_wrap=True, highlight=False, markup=False)
     channels = Table("topic", "schema", "messages")
     for topic, (count, schema) in run.channels.items():
@@ -89,17 +91,17 @@ def _facts(run: "Run") -> dict[str, str]:
 def _recover(given: argparse.Namespace) -> None:
     from gpmpc.recording import recover
 
-    output = given.output or given.file.with_suffix(".recovered.mcap")
+    output = given.output or _beside(given.file, ".recovered.mcap")
     found = recover(given.file, output)
-    note = "; the file was finished, nothing was missing" if found.finished else ""
+    note = "; the recording was finished, nothing was missing" if found.finished else ""
     print(f"written to {output}: {found.messages} messages over {found.seconds:g} s{note}")
 
 
 def _export(given: argparse.Namespace) -> None:
     from gpmpc.recording import read_run
 
-    output: Path = given.output or given.file.with_suffix(".csv")
-    if output.suffix not in FORMATS:
+    output: Path = given.output or _beside(given.file, ".csv")
+    if given.output and output.suffix not in FORMATS:
         raise SettingError("output", f"must end in {' or '.join(FORMATS)}; got {output.name!r}")
     run = read_run(given.file)
     _write(output, _csv(run) if output.suffix == ".csv" else _parquet(run))
@@ -110,11 +112,15 @@ def _export(given: argparse.Namespace) -> None:
 def _layout(given: argparse.Namespace) -> None:
     from gpmpc.recording import layout, read_run
 
-    output: Path = given.output or given.file.with_suffix(".layout.json")
-    if output.suffix != ".json":
+    output: Path = given.output or _beside(given.file, ".layout.json")
+    if given.output and output.suffix != ".json":
         raise SettingError("output", f"must end in .json; got {output.name!r}")
     _write(output, layout(read_run(given.file)))
     print(f"written to {output}: open {given.file} in Foxglove or Lichtblick, then import it as a layout")
+
+
+def _beside(file: Path, ending: str) -> Path:
+    return file.parent / f"{file.stem}{ending}"  # of a folder too, which the reader refuses
 
 
 def _write(output: Path, content: str | bytes) -> None:

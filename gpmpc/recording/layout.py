@@ -39,7 +39,9 @@ def layout(run: Run) -> str:
     panels["RosOut!log"] = {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/log"}
     left, share = "RosOut!log", 25
     if "/pose" in run.channels:
-        panels["3D!scene"] = _scene(run.metadata["frames"]["positions"], "Position" in groups, "Attitude" in groups)
+        panels["3D!scene"] = _scene(
+            run.metadata.get("frames", {}).get("positions", "world"), "Position" in groups, "Attitude" in groups
+        )
         left, share = _split("column", "3D!scene", left, 78), 50
     whole = {
         "configById": panels,

@@ -1,20 +1,27 @@
 """Problem: a recorded run has to come back as arrays, and any of its decisions has to be repeatable.
 
-``read_run`` reads finished files and unfinished ones alike (all that is whole, see ``recovery``). ``replay`` solves a
-step's quadratic program again: its minimiser is unique, so any exact solver finds the recorded plan.
+``read_run`` reads finished files and unfinished ones alike (all that is whole, see ``records``). A message whose
+checksum is right may still come from another program, so the sizes of its arrays are checked. A plan belongs to the
+step of its number, wherever it stands. ``replay`` solves a step's quadratic program again: its minimiser is unique, so
+any exact solver finds the recorded plan.
 """
 
+import math
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Channel, Footer, Message, Metadata, Schema
 
-from gpmpc.exceptions import RecordingError
+from gpmpc.exceptions import GpmpcError, RecordingError, SettingError
 from gpmpc.recording import schemas
-from gpmpc.recording.recovery import whole_records
+from gpmpc.recording.records import room, whole_records
 from gpmpc.recording.writer import CONFIG, PLAN, QP, STEP
 from gpmpc.status import Status
 
@@ -24,6 +31,7 @@ if TYPE_CHECKING:
     from gpmpc.qp import QPSolution, QPSolver
 
 Array = np.ndarray
+RECOVERED = "recovered"  # metadata of a file that holds what was left of another
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +40,7 @@ class Run:
 
     Attributes:
         path: The file.
-        finished: It was closed; otherwise these are the steps that were saved.
+        finished: The run was recorded to its end, and every checksum is right; otherwise this is what was saved of it.
         state_names: n names.
         input_names: m names.
         steps: Numbers k of the steps (K,).
@@ -96,7 +104,8 @@ class Run:
     def columns(self) -> dict[str, Array]:
         """The run as a table: a column (K,) per scalar field of ``gpmpc.Step``, in its order."""
         table: dict[str, Array] = {"time": self.times, "k": self.steps}
-        std = np.sqrt(np.diagonal(self.belief_covariances, axis1=1, axis2=2))
+        with np.errstate(invalid="ignore"):  # NaN says it
+            std = np.sqrt(np.diagonal(self.belief_covariances, axis1=1, axis2=2))
         groups = {"reference": self.references, "state": self.states, "measured": self.measured, "input": self.inputs}
         groups |= {"innovation": self.innovations, "belief_std": std}
         for group, values in groups.items():
@@ -157,20 +166,23 @@ def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
         solver: ``DualActiveSet()`` if omitted, which also takes soft rows.
 
     Raises:
-        RecordingError: The step or its problem is not in the recording.
+        RecordingError: The step or its problem is not in the recording, or it is no convex program.
     """
     from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
 
     recorded = run.problems.get(k)
     if recorded is None:
         raise RecordingError(f"{run.path}: holds no quadratic program of step {k}; it holds {len(run.problems)} others")
-    problem = QuadraticProgram.from_stacked(recorded.P, recorded.q, recorded.G, recorded.lower, recorded.upper)
     solver = solver if solver is not None else DualActiveSet()
     inverse, caps = recorded.softness[:, len(recorded.q) :]
-    if not inverse.any() and np.isinf(caps).all():
-        return solver.solve(problem)
-    with np.errstate(divide="ignore"):
-        return solver.solve(problem, soft=SoftRows(quadratic=1 / inverse, linear=caps))
+    try:
+        problem = QuadraticProgram.from_stacked(recorded.P, recorded.q, recorded.G, recorded.lower, recorded.upper)
+        if not inverse.any() and np.isinf(caps).all():
+            return solver.solve(problem)
+        with np.errstate(divide="ignore"):
+            return solver.solve(problem, soft=SoftRows(quadratic=1 / inverse, linear=caps))
+    except GpmpcError as error:
+        raise RecordingError(f"{run.path}: step {k}: {error}") from error
 
 
 def read_run(path: str | Path) -> Run:
@@ -186,50 +198,106 @@ def read_run(path: str | Path) -> Run:
     metadata: dict[str, dict[str, str]] = {}
     names: dict[int, str] = {}
     channels: dict[int, Channel] = {}
-    counts: dict[int, int] = {}
-    data: dict[str, list[bytes]] = {STEP: [], PLAN: [], QP: []}
+    counts: Counter[int] = Counter()
+    messages: dict[str, list] = {STEP: [], PLAN: [], QP: []}
+    decoder: _Decoder | None = None
     config, finished = "", False
     for record in whole_records(path):
         if isinstance(record, Message):
             counts[record.channel_id] += 1
             topic = channels[record.channel_id].topic
-            if topic in data:
-                data[topic].append(record.data)
+            if topic in messages:
+                if decoder is None and "run" not in metadata:  # another tool has moved them behind the messages
+                    metadata |= {more.name: more.metadata for more in whole_records(path) if isinstance(more, Metadata)}
+                decoder = decoder or _Decoder(path, metadata)
+                messages[topic].append(decoder.decode(topic, record))
         elif isinstance(record, Schema):
             names[record.id] = record.name
         elif isinstance(record, Channel):
             channels[record.id] = record
-            counts.setdefault(record.id, 0)
         elif isinstance(record, Metadata):
-            metadata[record.name] = record.metadata
+            metadata.setdefault(record.name, record.metadata)
         elif isinstance(record, Attachment) and record.name == CONFIG:
-            config = record.data.decode()
+            config = record.data.decode(errors="replace")
         finished = finished or isinstance(record, Footer)
-    about = metadata.get("run", {})
-    if "state_names" not in about:
-        raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
-    states, inputs = tuple(about["state_names"].split()), tuple(about["input_names"].split())
-    classes = schemas.message_classes(states, inputs, schemas.READ)
-    steps = [classes[schemas.STEP].FromString(content) for content in data[STEP]]
-    plans = [classes[schemas.PLAN].FromString(content) for content in data[PLAN][: len(steps)]]
-    problems = [classes[schemas.QP].FromString(content) for content in data[QP]]
+    decoder = decoder or _Decoder(path, metadata)
+    states, inputs = decoder.states, decoder.inputs
     return Run(
         path=path,
-        finished=finished,
+        finished=finished and RECOVERED not in metadata,
         state_names=states,
         input_names=inputs,
-        **_steps(steps, states, inputs),
-        **_plans(plans, len(steps), states, inputs),
+        **_steps(messages[STEP], states, inputs),
+        **_plans(path, messages[PLAN], messages[STEP], states, inputs),
         channels={channel.topic: (counts[i], names.get(channel.schema_id, "")) for i, channel in channels.items()},
         metadata=metadata,
         config=config,
-        problems={message.k: _problem(message) for message in problems},
+        problems=dict(messages[QP]),
     )
 
 
+class _Decoder:
+    """Turns messages into what they say, if it fits the names of states and inputs.
+
+    Args:
+        path: The file.
+        metadata: Its records.
+
+    Raises:
+        RecordingError: They do not tell of a run.
+    """
+
+    def __init__(self, path: Path, metadata: dict[str, dict[str, str]]):
+        self._path, about = path, metadata.get("run", {})
+        if not {"state_names", "input_names"} <= about.keys():
+            raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
+        try:
+            self.states = schemas.check_names("state_names", about["state_names"].split())
+            self.inputs = schemas.check_names("input_names", about["input_names"].split())
+            classes = schemas.message_classes(self.states, self.inputs, schemas.READ)
+        except SettingError as error:
+            raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
+        self._classes = {STEP: classes[schemas.STEP], PLAN: classes[schemas.PLAN], QP: classes[schemas.QP]}
+
+    def decode(self, topic: str, record: Message) -> Any:
+        """The message; of a quadratic program its step's number k and itself.
+
+        Raises:
+            RecordingError: It does not parse, or its arrays do not belong together.
+        """
+        n = len(self.states)
+        try:
+            message = self._classes[topic].FromString(record.data)
+            if topic == QP:
+                return message.k, _problem(message)
+            if topic == STEP:
+                _numbers(message, "belief_covariance", n, n)
+                if not 0 <= message.status < len(Status):
+                    raise ValueError(f"status {message.status} is unknown")
+            elif not message.stages:
+                raise ValueError("it has no stage")
+            else:
+                _numbers(message, "covariances", len(message.stages), n, n)
+        except (DecodeError, ValueError) as error:
+            raise RecordingError(f"{self._path}: message {record.sequence} of {topic} is damaged: {error}") from error
+        return message
+
+
+def _numbers(message: Any, field: str, *shape: int) -> Array:
+    """A field's numbers.
+
+    Raises:
+        ValueError: There are more or fewer.
+    """
+    data = getattr(message, field)
+    if min(shape) < 0 or len(data) != 8 * math.prod(shape):
+        raise ValueError(f"{field} must be {shape}; got {len(data)} bytes")
+    return np.frombuffer(data).reshape(shape)
+
+
 def _table(messages: list, fields: tuple[str, ...]) -> Array:
-    rows = [[getattr(message, field) for field in fields] for message in messages]
-    return np.array(rows, dtype=float).reshape(len(messages), len(fields))
+    numbers = attrgetter(*fields)
+    return np.array([numbers(message) for message in messages], dtype=float).reshape(len(messages), len(fields))
 
 
 def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Any]:
@@ -259,26 +327,42 @@ def _bounds(steps: list, inputs: tuple[str, ...]) -> Array:
     return np.concatenate([_table([steps[0].input_lower], inputs), _table([steps[0].input_upper], inputs)])
 
 
-def _plans(plans: list, steps: int, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Array]:
-    H, n = max((len(plan.stages) - 1 for plan in plans), default=0), len(states)
+def _numbered(messages: list) -> Iterator[tuple[int, int]]:
+    """Of every message its step's number k and, where a number comes again, the how many'th time it is."""
+    seen: Counter[int] = Counter()
+    for message in messages:
+        seen[message.k] += 1
+        yield message.k, seen[message.k]
+
+
+def _plans(path: Path, plans: list, steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Array]:
+    H, n, m = max((len(plan.stages) - 1 for plan in plans), default=0), len(states), len(inputs)
+    if (needed := 8 * len(steps) * (H + 1) * (n * n + 2 * n + m)) > room(path):
+        raise RecordingError(f"{path}: a plan of {H} stages would make arrays of {needed / 1e6:.0f} MB with the others")
     arrays = {
-        "plan_inputs": np.full((steps, H, len(inputs)), np.nan),
-        "plan_means": np.full((steps, H + 1, n), np.nan),
-        "plan_stds": np.full((steps, H + 1, n), np.nan),
-        "plan_covariances": np.full((steps, H + 1, n, n), np.nan),
+        "plan_inputs": np.full((len(steps), H, m), np.nan),
+        "plan_means": np.full((len(steps), H + 1, n), np.nan),
+        "plan_stds": np.full((len(steps), H + 1, n), np.nan),
+        "plan_covariances": np.full((len(steps), H + 1, n, n), np.nan),
     }
-    for k, plan in enumerate(plans):
+    rows = {key: row for row, key in enumerate(_numbered(steps))}
+    for key, plan in zip(_numbered(plans), plans, strict=True):
+        if (row := rows.get(key)) is None:
+            continue  # the step is lost
         stages = list(plan.stages)
         length = len(stages)
-        arrays["plan_means"][k, :length] = _table([stage.mean for stage in stages], states)
-        arrays["plan_stds"][k, :length] = _table([stage.std for stage in stages], states)
-        arrays["plan_inputs"][k, : length - 1] = _table([stage.input for stage in stages[:-1]], inputs)
-        arrays["plan_covariances"][k, :length] = np.frombuffer(plan.covariances).reshape(length, n, n)
+        arrays["plan_means"][row, :length] = _table([stage.mean for stage in stages], states)
+        arrays["plan_stds"][row, :length] = _table([stage.std for stage in stages], states)
+        arrays["plan_inputs"][row, : length - 1] = _table([stage.input for stage in stages[:-1]], inputs)
+        arrays["plan_covariances"][row, :length] = _numbers(plan, "covariances", length, n, n)
     return arrays
 
 
 def _problem(message: Any) -> RecordedProblem:
-    n, rows = message.variables, message.rows
-    shapes = {"P": (n, n), "q": (n,), "G": (rows, n), "lower": (n + rows,), "upper": (n + rows,)}
-    shapes |= {"softness": (2, n + rows), "x": (-1,), "multipliers": (-1,)}
-    return RecordedProblem(**{name: np.frombuffer(getattr(message, name)).reshape(s) for name, s in shapes.items()})
+    n, M = message.variables, message.variables + message.rows
+    shapes = {"P": (n, n), "q": (n,), "G": (message.rows, n), "lower": (M,), "upper": (M,), "softness": (2, M)}
+    if message.x or message.multipliers:
+        shapes |= {"x": (n,), "multipliers": (M,)}
+    else:
+        shapes |= {"x": (0,), "multipliers": (0,)}
+    return RecordedProblem(**{name: _numbers(message, name, *shape) for name, shape in shapes.items()})

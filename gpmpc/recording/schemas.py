@@ -37,6 +37,7 @@ TIMING = ("model", "build", "solve", "total")
 RESIDUALS = ("primal", "dual", "gap")
 READ = {"doubles": "bytes"}
 WRITTEN = READ | dict.fromkeys(("State", "Input", "Timing", "Residuals"), "bytes") | {"Stages": "list of bytes"}
+LARGEST = 1000  # states or inputs; a covariance of more would not fit into a step
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
@@ -47,8 +48,8 @@ def check_names(kind: str, names: Sequence[str]) -> tuple[str, ...]:
         SettingError: They cannot.
     """
     names = tuple(names)
-    if not names:
-        raise SettingError(kind, "must be one name or more; got none")
+    if not 1 <= len(names) <= LARGEST:
+        raise SettingError(kind, f"must be 1 to {LARGEST} names; got {len(names)}")
     for name in names:
         if not isinstance(name, str) or not _NAME.fullmatch(name):
             raise SettingError(kind, f"a name must be letters, digits and _, a letter first; got {name!r}")
@@ -66,6 +67,9 @@ def message_classes(
         state_names: Names of the n states.
         input_names: Names of the m inputs.
         twin: Kinds of fields in place of those that a file declares, with the same wire format: ``READ``, ``WRITTEN``.
+
+    Raises:
+        SettingError: Two names are one to protobuf.
     """
     file = FileDescriptorProto(name="gpmpc/recording.proto", package="gpmpc", syntax="proto3")
     status = file.enum_type.add(name="Status")
@@ -108,7 +112,10 @@ def message_classes(
     arrays = dict.fromkeys(("P", "q", "G", "lower", "upper", "softness", "x", "multipliers"), "doubles")
     add("QuadraticProgram", {"time": "double", "k": "int64", "variables": "int64", "rows": "int64"} | arrays)
     pool = DescriptorPool()
-    pool.Add(file)
+    try:
+        pool.Add(file)
+    except TypeError as error:  # two names that are one to protobuf, such as x_1 and x1
+        raise SettingError("state_names", f"and input_names cannot be fields of a message: {error}") from error
     return {
         name: GetMessageClass(pool.FindMessageTypeByName(name))
         for name in (STEP, PLAN, QP, STATE, INPUT, TIMINGS, RESIDUES, STAGE)

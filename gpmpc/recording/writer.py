@@ -45,7 +45,7 @@ class StepWriter:
         self._file, self._setup = file, setup
         self._states, self._inputs = setup["state_names"], setup["input_names"]
         self._steps = 0
-        self._writer = Writer(file, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD)
+        self._writer = Writer(file, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD, enable_data_crcs=True)
         self._writer.start(profile="", library="gpmpc")
         for name in ("run", "units", "frames"):
             self._writer.add_metadata(name, setup[name])

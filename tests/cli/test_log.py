@@ -2,15 +2,19 @@
 
 import csv
 import importlib.util
+import os
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "recording"))
 import runs
 
+from gpmpc.cli.log import log
+from gpmpc.exceptions import GpmpcError
 from gpmpc.recording import layout, read_run
 from tests.cli.command import forked
 
@@ -55,7 +59,9 @@ def test_recover_writes_a_finished_file_beside_the_broken_one(folder):
     result = gpmpc_log("recover", "cut.mcap", cwd=folder)
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith("written to cut.recovered.mcap: ")
-    assert read_run(folder / "cut.recovered.mcap").finished
+    assert len(read_run(folder / "cut.recovered.mcap").times) == 10
+    shown = gpmpc_log("info", "cut.recovered.mcap", cwd=folder).stdout
+    assert "cut.recovered.mcap: unfinished or damaged; this is what could be read\n" in shown
 
 
 def test_export_writes_a_row_per_step_with_exact_numbers(folder):
@@ -86,11 +92,61 @@ def test_layout_writes_what_foxglove_imports(folder):
     assert (folder / "run.layout.json").read_text() == layout(read_run(folder / "run.mcap"))
 
 
+def foreign(folder):
+    """Files and other things that are no recordings, by name."""
+    (folder / "empty.mcap").touch()
+    (folder / "picture.mcap").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
+    (folder / "folder.mcap").mkdir()
+    os.mkfifo(folder / "pipe.mcap")
+    with (folder / "other.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/step", "json", writer.register_schema("step", "jsonschema", b"{}"))
+        writer.add_message(channel, 0, b"{}", 0)
+        writer.finish()
+    data = (folder / "run.mcap").read_bytes()
+    (folder / "nameless.mcap").write_bytes(data.replace(b"state_names", b"\xff" * 11))
+    (folder / "renamed.mcap").write_bytes(data.replace(b"x vx y vy z vz", b"x vx y vy z 1z"))
+    return {
+        "empty.mcap": "is empty",
+        "picture.mcap": "is not an MCAP file",
+        "folder.mcap": "is not a file",
+        "pipe.mcap": "is not a file",
+        "other.mcap": "is not the recording of a run",
+        "nameless.mcap": "is not the recording of a run",
+        "renamed.mcap": "a name must be letters, digits and _, a letter first; got '1z'",
+        ".": "is not a file",
+        "/dev/zero": "is not a file",
+        "n" * 300: "File name too long",
+    }
+
+
+def test_what_is_no_recording_is_refused_in_one_line_that_names_it(folder, tmp_path, monkeypatch):
+    (tmp_path / "run.mcap").write_bytes((folder / "run.mcap").read_bytes())
+    reasons = foreign(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.chdir(tmp_path)
+    for name, reason in reasons.items():
+        for command in ("info", "recover", "export", "layout"):
+            with pytest.raises(GpmpcError) as caught:
+                log([command, name])
+            assert str(caught.value).startswith(name)
+            assert reason in str(caught.value)
+            assert "\n" not in str(caught.value)
+        assert sorted(tmp_path.iterdir()) == before
+    result = gpmpc_log("info", "other.mcap", cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stderr.startswith("gpmpc: other.mcap: is not the recording of a run")
+    assert result.stderr.count("\n") == 1
+
+
 MISTAKES = [
     (["info", "missing.mcap"], "missing.mcap: cannot be read: No such file or directory"),
     (["info", "notes.mcap"], "notes.mcap: is not an MCAP file"),
     (["recover", "notes.mcap"], "notes.mcap: is not an MCAP file"),
     (["recover", "run.mcap", "run.mcap"], "run.mcap: a file cannot be recovered into itself"),
+    (["recover", "run.mcap", "."], ".: cannot be written: "),
+    (["recover", "run.mcap", "nowhere/run.mcap"], "nowhere/run.mcap: cannot be written: No such file"),
     (["export", "run.mcap", "run.xlsx"], "output: must end in .csv or .parquet; got 'run.xlsx'"),
     (["export", "run.mcap", "nowhere/run.csv"], "output: cannot write to nowhere/run.csv: No such file"),
     (["layout", "run.mcap", "run.yaml"], "output: must end in .json; got 'run.yaml'"),

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from gpmpc.exceptions import RecordingError, SettingError, ShapeError
-from gpmpc.qp import QuadraticProgram, SoftRows
+from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
 from gpmpc.recording import read_run, replay
 from gpmpc.status import Status
 from tests.recording import runs
@@ -56,7 +56,7 @@ def test_every_number_comes_back_as_it_was(recorded):
     assert run.iterations.tolist() == [step.decision.iterations for step in steps]
     assert run.gp_sizes.tolist() == [step.gp_size for step in steps]
     assert run.gp_versions.tolist() == [step.gp_version for step in steps]
-    np.testing.assert_allclose(run.timings[:, -1], 0.006)
+    np.testing.assert_allclose(run.timings, np.tile([0.001, 0.002, 0.003, 0.006], (30, 1)))
 
 
 def test_the_quality_of_every_solution_is_recorded(recorded):
@@ -67,6 +67,40 @@ def test_the_quality_of_every_solution_is_recorded(recorded):
         residuals = solution.residuals()
         np.testing.assert_allclose(run.residuals[k], residuals, atol=1e-15)
         assert run.active_set_sizes[k] == np.count_nonzero(solution.active_set)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 8])
+def test_the_whole_active_set_is_recorded_however_many_constraints_work(tmp_path, rows):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    step = runs.make_step(0, rng)
+    G, wide = rng.standard_normal((rows, 6)), np.full(rows, 100.0)
+    program = QuadraticProgram(np.eye(6), np.full(6, 9.0), G, -wide, wide, -np.ones(6), np.ones(6))
+    solution = DualActiveSet().solve(program)
+    assert np.count_nonzero(solution.active_set) == 6  # the whole box
+    with runs.recorder(path) as recorder:
+        recorder.record(replace(step, decision=replace(step.decision, problem=program, solution=solution)))
+    run = read_run(path)
+    assert run.active_set_sizes.tolist() == [6]
+    np.testing.assert_allclose(run.residuals[0], solution.residuals(), atol=1e-15)
+    np.testing.assert_array_equal(run.problems[0].multipliers, solution.multipliers)
+    np.testing.assert_array_equal(run.problems[0].x, solution.x)
+
+
+def test_a_program_without_solution_is_recorded_hard_and_without_one(tmp_path):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    step = runs.make_step(0, rng)
+    program = step.decision.problem
+    with runs.recorder(path) as recorder:
+        recorder.record(replace(step, decision=replace(step.decision, solution=None)))
+    run = read_run(path)
+    recorded = run.problems[0]
+    for name in ("P", "q", "G"):
+        np.testing.assert_array_equal(getattr(recorded, name), getattr(program, name))
+    np.testing.assert_array_equal(recorded.lower, program.lower)
+    np.testing.assert_array_equal(recorded.upper, program.upper)
+    assert (len(recorded.x), len(recorded.multipliers), run.active_set_sizes[0]) == (0, 0, 0)
+    assert np.isnan(run.residuals).all()
+    np.testing.assert_allclose(replay(run, 0).x, step.decision.solution.x, rtol=0, atol=1e-9)
 
 
 def test_a_replayed_step_gives_the_same_answer(recorded):

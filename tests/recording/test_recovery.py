@@ -60,7 +60,7 @@ def check_recovered(path, output):
     assert metadata["run"]["seed"] == "7"
     assert metadata["units"]["time"] == "s"
     run = read_run(output)
-    assert run.finished
+    assert not run.finished  # the file is; its run came to no end
     np.testing.assert_array_equal(run.times, read_run(path).times)
     return run
 
@@ -151,9 +151,12 @@ def test_a_damaged_chunk_ends_what_is_recovered(finished, tmp_path):
 
 def test_a_finished_file_is_copied_with_nothing_lost(finished, tmp_path):
     output = tmp_path / "copy.mcap"
-    assert recover(finished, output).finished
+    found = recover(finished, output)
+    assert found.finished
+    assert found.seconds == pytest.approx(1.9)
     before, after = read_run(finished), read_run(output)
     np.testing.assert_array_equal(before.plan_means, after.plan_means)
+    assert after.finished
     assert before.metadata == after.metadata
     assert before.channels == after.channels
 
@@ -183,5 +186,7 @@ def test_a_file_of_others_is_no_run(tmp_path):
         writer = Writer(file)
         writer.start()
         writer.finish()
-    with pytest.raises(RecordingError, match="is not the recording of a run"):
-        read_run(path)
+    for use in (read_run, lambda path: recover(path, tmp_path / "recovered.mcap")):
+        with pytest.raises(RecordingError, match=r"other\.mcap: is not the recording of a run"):
+            use(path)
+    assert [left.name for left in tmp_path.iterdir()] == ["other.mcap"]

@@ -1,0 +1,225 @@
+"""A damaged recording is refused in one line that names it, or read as unfinished, or holds what was recorded."""
+
+import contextlib
+import json
+import struct
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+
+from gpmpc.exceptions import RecordingError
+from gpmpc.recording import read_run, recover
+from tests.recording import damage, runs
+
+STUDY = Path(__file__).with_name("study.py")
+BARE = 50  # what a process that reads recordings takes at least [MB]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    return path, runs.record_run(path, steps=20, config=20 * "seed: 7\n", start_time_ns=10**18)
+
+
+def check_study(path, seed, count):
+    command = [sys.executable, str(STUDY), str(path), str(seed), str(count)]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    assert len(lines) == count
+    edits = {kind.__name__ for kind in damage.EDITS}
+    for line in lines:
+        found = line["outcomes"]
+        believed = {"other"} if line["damage"] in edits else set()
+        assert set(found.values()) <= {"error", "same", "unfinished", "done"} | believed, line
+        assert found.get("recovered") != "error", line  # what recover writes can always be read
+        assert line["megabytes"] + BARE < 300, line
+        assert line["seconds"] < 5, line
+    assert {line["damage"] for line in lines} == edits | {kind.__name__ for kind in damage.DAMAGES}
+    assert {line["outcomes"]["read"] for line in lines} == {"error", "same", "unfinished", "other"}
+
+
+def test_a_damaged_recording_is_never_believed_and_does_no_harm(recorded):
+    check_study(recorded[0], 0, 2 * (2 * len(damage.DAMAGES) + len(damage.EDITS)))
+
+
+@pytest.mark.slow
+def test_three_thousand_damaged_recordings_are_never_believed_and_do_no_harm(recorded):
+    check_study(recorded[0], 1, 3000)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_flipped_bit_of_the_configuration_or_the_metadata_passes_unseen(recorded, tmp_path, seed):
+    data, rng, path = recorded[0].read_bytes(), np.random.default_rng(seed), tmp_path / "flipped.mcap"
+    for _ in range(100):
+        path.write_bytes(damage.flip_text(data, rng))
+        with contextlib.suppress(RecordingError):  # the names of states and inputs are among them
+            assert not read_run(path).finished
+
+
+CHANGES = {
+    "lost": lambda found, i: found[:i] + found[i + 1 :],
+    "repeated": lambda found, i: [*found[: i + 1], *found[i:]],
+    "of an unknown kind": lambda found, i: [*found[:i], (found[i][0] | 0x80, found[i][1]), *found[i + 1 :]],
+}
+
+
+@pytest.mark.parametrize("data_checksum", [True, False])
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_file_of_which_a_record_is_lost_or_repeated_is_not_finished(recorded, tmp_path, change, data_checksum):
+    path, found = tmp_path / "changed.mcap", list(damage.records(recorded[0].read_bytes()[len(damage.MAGIC) :]))
+    if not data_checksum:  # then the numbers of messages, chunks, metadata and attachments in the index have to do
+        found = [(kind, bytes(4) if kind == damage.DATA_END else content) for kind, content in found]
+    read_again = 0
+    for i, (kind, _) in enumerate(found):
+        if kind in (damage.CHUNK, damage.METADATA, damage.ATTACHMENT):
+            path.write_bytes(damage.MAGIC + damage.joined(CHANGES[change](found, i)) + damage.MAGIC)
+            with contextlib.suppress(RecordingError):  # the metadata about the run are among them
+                assert not read_run(path).finished, (i, kind)
+                read_again += 1
+    assert read_again > 3
+    path.write_bytes(damage.MAGIC + damage.joined(found) + damage.MAGIC)
+    assert read_run(path).finished
+
+
+def with_messages(data, change):
+    """The file with other messages, in one chunk, its checksums right."""
+    found = damage.section(data)
+    records = [record for kind, content in found if kind == damage.CHUNK for record in damage.inside(content)]
+    messages = [content for kind, content in records if kind == damage.MESSAGE]
+    records = [record for record in records if record[0] != damage.MESSAGE]
+    records += [(damage.MESSAGE, content) for content in change(messages)]
+    chunk = damage.chunk(damage.joined(records))
+    return damage.sealed([record for record in found if record[0] not in (damage.CHUNK, 7)] + [chunk])
+
+
+def channel(message):
+    return struct.unpack_from("<H", message)[0]
+
+
+def test_a_plan_belongs_to_the_step_of_its_number_wherever_it_stands(recorded, tmp_path):
+    path, steps = recorded[0], recorded[1]
+    changed, rng = tmp_path / "changed.mcap", np.random.default_rng(0)
+    for lost in (0, 7, 19):
+
+        def change(messages, lost=lost):
+            plans = [message for message in messages if channel(message) == 2]
+            left = [message for message in messages if message is not plans[lost]]
+            return [left[i] for i in rng.permutation(len(left))]
+
+        changed.write_bytes(with_messages(path.read_bytes(), change))
+        run = read_run(changed)
+        assert run.finished
+        assert sorted(run.steps) == list(range(20))
+        for row, k in enumerate(run.steps):
+            plan = steps[k].decision
+            np.testing.assert_array_equal(run.states[row], steps[k].state)
+            np.testing.assert_array_equal(run.plan_means[row], plan.means if k != lost else np.full((6, 6), np.nan))
+            np.testing.assert_array_equal(run.plan_inputs[row], plan.inputs if k != lost else np.full((5, 3), np.nan))
+
+
+def test_a_plan_whose_step_is_lost_is_left_out(recorded, tmp_path):
+    path, steps = recorded[0], recorded[1]
+    changed = tmp_path / "changed.mcap"
+
+    def change(messages):
+        first = next(message for message in messages if channel(message) == 1)
+        return [message for message in messages if message is not first]
+
+    changed.write_bytes(with_messages(path.read_bytes(), change))
+    run = read_run(changed)
+    assert run.steps.tolist() == list(range(1, 20))
+    np.testing.assert_array_equal(run.plan_means, [step.decision.means for step in steps[1:]])
+
+
+def test_numbers_that_come_again_keep_their_own_plans(tmp_path):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    steps = [runs.make_step(k, rng) for k in (0, 1, 2, 0, 1)]  # two flights in one file
+    with runs.recorder(path) as recorder:
+        for step in steps:
+            recorder.record(step)
+    np.testing.assert_array_equal(read_run(path).plan_means, [step.decision.means for step in steps])
+
+
+def test_a_shorter_plan_ends_in_nothing(tmp_path):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    steps = [runs.make_step(k, rng, horizon=horizon) for k, horizon in enumerate((3, 5, 1))]
+    with runs.recorder(path) as recorder:
+        for step in steps:
+            recorder.record(step)
+    run = read_run(path)
+    assert run.plan_means.shape == (3, 6, 6)
+    assert run.plan_inputs.shape == (3, 5, 3)
+    for row, step in enumerate(steps):
+        H = len(step.decision.inputs)
+        np.testing.assert_array_equal(run.plan_means[row, : H + 1], step.decision.means)
+        np.testing.assert_array_equal(run.plan_inputs[row, :H], step.decision.inputs)
+        assert np.isnan(run.plan_means[row, H + 1 :]).all()
+        assert np.isnan(run.plan_covariances[row, H + 1 :]).all()
+        assert np.isnan(run.plan_inputs[row, H:]).all()
+
+
+def test_a_damaged_configuration_is_left_out_and_the_steps_are_not(recorded, tmp_path):
+    path = tmp_path / "flipped.mcap"
+    path.write_bytes(recorded[0].read_bytes().replace(b"seed: 7", b"seed: 8", 1))
+    run = read_run(path)
+    assert not run.finished
+    assert run.config == ""
+    assert len(run.times) == 20
+    recover(path, tmp_path / "recovered.mcap")
+    again = read_run(tmp_path / "recovered.mcap")
+    assert (again.finished, again.config, len(again.times)) == (False, "", 20)
+
+
+def test_a_recording_of_the_largest_steps_is_read(tmp_path):
+    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    step = runs.make_step(0, rng, qp=False)
+    H = 21_000  # of a plan of zeros: 7.4 MB, half of what is shared with the writer, and more as messages
+    zeros = replace(
+        step.decision, inputs=np.zeros((H, 3)), means=np.zeros((H + 1, 6)), covariances=np.zeros((H + 1, 6, 6))
+    )
+    with runs.recorder(path) as recorder:
+        recorder.record(replace(step, decision=zeros))
+    run = read_run(path)
+    assert run.finished
+    assert run.plan_means.shape == (1, H + 1, 6)
+    assert not run.plan_means.any()
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
+def test_a_file_that_another_tool_compressed_is_read(recorded, tmp_path, compression):
+    path, found = tmp_path / "other.mcap", damage.section(recorded[0].read_bytes())
+    chunks = [(kind, damage.inside(content) if kind == damage.CHUNK else content) for kind, content in found]
+    rewritten = [
+        damage.chunk(damage.joined(content), compression) if kind == damage.CHUNK else (kind, content)
+        for kind, content in chunks
+    ]
+    path.write_bytes(damage.sealed(rewritten))
+    run = read_run(path)
+    assert run.finished
+    np.testing.assert_array_equal(run.states, read_run(recorded[0]).states)
+
+
+def test_a_frame_that_does_not_say_its_size_is_read(recorded, tmp_path):
+    path, found = tmp_path / "other.mcap", damage.section(recorded[0].read_bytes())
+    silent = zstandard.ZstdCompressor(write_content_size=False)
+    for i, (kind, content) in enumerate(found):
+        if kind == damage.CHUNK:
+            data = damage.joined(damage.inside(content))
+            found[i] = damage.chunk(data, compressed=silent.compress(data))
+    path.write_bytes(damage.sealed(found))
+    assert read_run(path).finished
+
+
+def test_metadata_and_configuration_may_stand_behind_the_messages(recorded, tmp_path):
+    path, found = tmp_path / "other.mcap", damage.section(recorded[0].read_bytes())
+    behind = [record for record in found if record[0] in (damage.METADATA, damage.ATTACHMENT)]
+    path.write_bytes(damage.sealed([record for record in found if record not in behind] + behind))
+    run, expected = read_run(path), read_run(recorded[0])
+    assert run.finished
+    assert (run.metadata, run.config) == (expected.metadata, expected.config)
+    np.testing.assert_array_equal(run.states, expected.states)
