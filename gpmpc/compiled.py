@@ -2,7 +2,8 @@
 
 numba keeps the machine code beside the source, or in the user's cache folder when the installation is read-only. When
 neither can be written it refuses to cache; the kernels are then compiled anew in each process. Sums may be reordered
-(that is what makes them vectorise); infinities and NaN keep their meaning.
+(that is what makes them vectorise); infinities and NaN keep their meaning. A kernel's results are the same to the last
+bit whether it was compiled in this process or loaded, and whatever else was.
 
 A kernel contains what it calls and the constants that it reads, wherever they are written; numba looks at the kernel's
 own file only. So what is kept here is valid for one state of all modules of the package that the kernel's module
@@ -21,6 +22,12 @@ import numba
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
+
+try:  # not promised
+    from numba.core.codegen import JITCodeLibrary
+    from numba.core.compiler import Compiler
+except ImportError:
+    JITCodeLibrary = Compiler = None
 
 _compiling = Lock()
 
@@ -55,6 +62,8 @@ def compiled(
         options["_nrt"] = False
     if _knows("no_cfunc_wrapper"):  # nothing in C calls a kernel; a way in for it is another tenth of compiling
         options["no_cfunc_wrapper"] = True
+    if Compiler is not None:
+        options["pipeline_class"] = _Compiler
     return _jit(function, options)
 
 
@@ -65,6 +74,35 @@ def _knows(option: str) -> bool:
     except ImportError:
         return False
     return hasattr(CPUTargetOptions, option)
+
+
+class _Code(JITCodeLibrary or object):
+    """A kernel's machine code, with copies of all that it calls.
+
+    numba makes such copies, but lets the linker take any other of the same name for them: that of the function compiled
+    by itself, or of another kernel that was loaded earlier. They are optimised, and so rounded, each in its own way,
+    and a kernel's last digits then depend on what else has been compiled or loaded. Here they are the kernel's own.
+    """
+
+    def _finalize_final_module(self):
+        for_callers = self._final_module  # in which copies have to remain mergeable
+        self._final_module = for_callers.clone()
+        self._final_module.name = for_callers.name
+        for function in self._final_module.functions:
+            if function.linkage.name == "linkonce_odr":
+                function.linkage = "internal"
+        super()._finalize_final_module()
+        self._final_module = for_callers
+
+
+class _Compiler(Compiler or object):
+    """numba's compiler, for ``_Code``."""
+
+    def define_pipelines(self):
+        if self.state.library is None:
+            self.state.library = _Code(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+            self.state.library.enable_object_caching()  # as numba does where it makes a library of its own
+        return super().define_pipelines()
 
 
 def _jit(function: Callable, options: dict) -> Callable:

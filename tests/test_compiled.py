@@ -64,6 +64,45 @@ def test_machine_code_is_used_again_until_a_file_that_went_into_it_changes(packa
     assert run(package) == (6.0, True)
 
 
+OWN = """
+import math
+import os
+from gpmpc.compiled import compiled
+FACTOR = float(os.environ["FACTOR"])
+@compiled
+def callee(x):  # too long to be put into its caller
+    y = 0.0
+{lines}
+    return FACTOR * x + 0.0 * y
+@compiled
+def first(x):
+    return callee(x)
+@compiled
+def second(x):
+    return callee(x) + callee(2.0 * x)
+""".format(lines="\n".join(f"    y += math.cos(x + {i}.0) * math.sin(y)" for i in range(40)))
+
+
+def test_a_kernel_runs_its_own_copy_of_what_it_calls_whatever_was_loaded_or_compiled_before(tmp_path):
+    """Copies of one function differ by rounding; here by a factor, so that it is seen on any machine."""
+    (tmp_path / "own.py").write_text(OWN)
+
+    def run(factor, code):
+        script = f"from own import *\nprint({code})"
+        result = subprocess.run(
+            [sys.executable, "-B", "-c", script], capture_output=True, text=True, check=True,
+            env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}", "FACTOR": factor},
+        )  # fmt: skip
+        return [float(number) for number in result.stdout.split()]
+
+    assert run("2", "first(1.0)") == [2.0]
+    for cached in tmp_path.rglob("own.callee*"):
+        cached.unlink()
+    assert run("5", "second(1.0)") == [15.0]
+    assert run("7", "first(1.0), second(1.0), first(1.0)") == [2.0, 15.0, 2.0]
+    assert run("7", "second(1.0), first(1.0)") == [15.0, 2.0]
+
+
 def test_where_nothing_can_be_kept_kernels_are_compiled_all_the_same(package):
     (package / "__pycache__").write_text("in the way of the cache beside the source")
     nowhere = str(package / "other.py")  # a file: no folder can be made below it

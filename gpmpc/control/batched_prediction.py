@@ -58,7 +58,7 @@ def predict_many(
     V = [None] * len(requests) if stage.V is None else _array(stage.V)
     held = [predictor.hold(starts[t], about[t], A[t], B[t], c[t], now[t], after[t], V[t]) for t in range(len(requests))]
     if predictor.form == "increment":
-        solved = [t for t, before in enumerate(previous) if before is not None and before.status.solved]
+        solved = [t for t, before in enumerate(previous) if before is not None and before.applicable]
         if solved:
             before = predictor.state(*(np.stack([getattr(previous[t], key)[0] for t in solved]) for key in BELIEF))
             for t, s in zip(solved, before, strict=True):

@@ -71,13 +71,15 @@ class Decision:
         inputs: The planned inputs (H, m); the first row is ``input``.
         means: Predicted means of the states (H + 1, n), from the current state on.
         covariances: Their covariances (H + 1, n, n); zero where the controller does not predict them.
-        status: How the solve ended. Inputs of a solve that did not succeed are a failed iterate: do not apply them.
+        status: How the solve ended.
         iterations: Iterations of the solver.
         timing: Where the time went.
         problem: The quadratic program that was solved last, where there is one.
         solution: Its solution: active set, multipliers, residuals; a warm start for the next.
         disturbance: What was added to the model's mean at every stage (n,), an estimate of its constant error; None
             where nothing is estimated.
+        suboptimal: The solve stopped short of its tolerance, at a limit say, with a plan that keeps its bounds and that
+            steps towards the optimum led to (Scokaert, Mayne and Rawlings, 1999).
     """
 
     input: np.ndarray
@@ -90,9 +92,15 @@ class Decision:
     problem: QuadraticProgram | None = None
     solution: QPSolution | None = None
     disturbance: np.ndarray | None = None
+    suboptimal: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "input", np.array(self.input, dtype=float))  # no view of the plan
+
+    @property
+    def applicable(self) -> bool:
+        """Whether the plan may be applied, and started from; the inputs of another decision are a failed iterate."""
+        return self.status.solved or self.suboptimal
 
 
 class Controller(Protocol):

@@ -5,6 +5,7 @@ import numpy as np
 from gpmpc.compiled import compiled
 
 SMALL = 1e-3  # share of an input's size
+FEASIBLE = 1e-3  # hard bounds may be missed by so much, in their units, by a plan that a next step would mend
 
 
 @compiled

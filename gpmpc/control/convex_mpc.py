@@ -26,6 +26,7 @@ from gpmpc.control.batched_prediction import bytes_per_request, predict_many
 from gpmpc.control.chance_constraints import ChanceConstraints
 from gpmpc.control.condensing import Condenser
 from gpmpc.control.controller import Decision, Reference, Timing
+from gpmpc.control.convergence import FEASIBLE
 from gpmpc.control.prediction import Covariance, Form, Prediction, Predictor
 from gpmpc.control.request import Request, check_controller, check_dynamics, check_method
 from gpmpc.control.sequential import Reached, SequentialPrograms
@@ -153,12 +154,13 @@ class ConvexMPC:
         """Decides the input for one step; see ``Controller.control``.
 
         A belief that is not finite is answered with ``INVALID_MEASUREMENT``. ``iterations`` of the decision counts
-        quadratic programs; with more than one allowed, ``ITERATION_LIMIT`` says that the tolerance was not reached.
+        quadratic programs; with more than one allowed, ``ITERATION_LIMIT`` says that the tolerance was not reached, and
+        the plan is the best that was: ``suboptimal``.
 
         Args:
             belief: What is known of the state.
             reference: Over the horizon, with inputs where the form or the weights ask for them.
-            previous: The last decision; one that was not solved is ignored.
+            previous: The last decision; one that is not applicable is ignored.
 
         Raises:
             ShapeError: Belief or reference have other dimensions, or reference inputs are missing.
@@ -221,9 +223,10 @@ class ConvexMPC:
             timing = Timing(modelled + perf_counter() - began, 0.0, 0.0)
             return request.unanswered(Status.NUMERICAL_TROUBLE, timing=timing)
         timing = Timing(modelled, built - began, perf_counter() - built)
-        program, states = QuadraticProgram.unchecked(*stacked[:5]), prediction.states(_inputs(request, solution))
-        reached = Reached(solution.status, 1, timing, program, solution, states, prediction.covariances)
-        return self._decide(request, reached)
+        inputs = solution.x.reshape(request.shifted.shape)
+        program, states = QuadraticProgram.unchecked(*stacked[:5]), prediction.states(inputs)
+        ended = solution.status, _improves(solution, request.shifted.ravel()), 1
+        return self._decide(request, Reached(*ended, timing, program, solution, inputs, states, prediction.covariances))
 
     def _stack(self, prediction: Prediction, request: Request) -> _Stacked:
         A, B, rows = prediction.A, prediction.B, self._chance.rows(prediction)
@@ -252,13 +255,14 @@ class ConvexMPC:
         return self.solver.solve(QuadraticProgram.from_stacked(P, q, G, lower, upper), warm)
 
     def _decide(self, request: Request, reached: Reached) -> Decision:
-        status, count, timing, program, solution, states, covariances = reached
-        if not status.solved:
+        status, suboptimal, count, timing, program, solution, inputs, states, covariances = reached
+        if not (status.solved or suboptimal):
             return replace(request.unanswered(status, count, timing), problem=program, solution=solution)
-        inputs = _inputs(request, solution).copy()
-        means, covariances = self.predictor.moments(states, covariances)
+        inputs = inputs.copy()
+        predicted = self.predictor.moments(states, covariances)
         disturbance = request.disturbance if self.predictor.disturbance_gain else None
-        return Decision(inputs[0], inputs, means, covariances, status, count, timing, program, solution, disturbance)
+        found = program, solution, disturbance, suboptimal
+        return Decision(inputs[0], inputs, *predicted, status, count, timing, *found)
 
 
 def read_request(
@@ -280,9 +284,20 @@ def read_request(
 
 
 def _warm(previous: Decision | None) -> QPSolution | None:
-    return previous.solution if previous is not None and previous.status.solved else None
+    return previous.solution if previous is not None and previous.applicable else None
 
 
-def _inputs(request: Request, solution: QPSolution) -> Array:
-    """The plan (H, m) that solves a program, a view."""
-    return solution.x.reshape(request.shifted.shape)
+def _improves(solution: QPSolution, plan: Array) -> bool:
+    """Whether a solver that stopped at a limit got to a feasible point, and no worse one than a plan (H m,)."""
+    if solution.status not in (Status.ITERATION_LIMIT, Status.TIME_LIMIT) or not np.isfinite(solution.x).all():
+        return False
+    other = solution._replace(x=plan)
+    if not _missed(solution) <= FEASIBLE:
+        return False
+    return solution.objective <= other.objective or _missed(other) > FEASIBLE
+
+
+def _missed(solution: QPSolution) -> float:
+    """The largest violation of a hard row."""
+    softness, caps = solution.terms.softness
+    return float(solution.violation()[(softness == 0.0) & np.isinf(caps)].max(initial=0.0))

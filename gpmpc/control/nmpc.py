@@ -15,6 +15,7 @@ import casadi
 import numpy as np
 
 from gpmpc.control.controller import Decision, Reference, Timing
+from gpmpc.control.convergence import FEASIBLE
 from gpmpc.control.request import Request, check_controller
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError, check_number
@@ -99,14 +100,19 @@ class NMPC:
         stats = self._solver.stats()
         means = np.vstack([state, plan[: H * n].reshape(H, n)])
         inputs = plan[H * n : H * (n + m)].reshape(H, m)
+        status = IPOPT_STATUS.get(stats["return_status"], Status.NUMERICAL_TROUBLE)
+        values = {"x": plan, "g": np.array(solution["g"]).ravel()}
+        missed = np.max([np.maximum(lower[key] - at, at - upper[key]).max() for key, at in values.items()])
+        suboptimal = status not in (Status.SOLVED, Status.INFEASIBLE) and bool(missed <= FEASIBLE)
         return Decision(
             input=inputs[0],
             inputs=inputs,
             means=means,
             covariances=np.zeros((H + 1, n, n)),
-            status=IPOPT_STATUS.get(stats["return_status"], Status.NUMERICAL_TROUBLE),
+            status=status,
             iterations=stats["iter_count"],
             timing=Timing(0.0, 0.0, time.perf_counter() - start),
+            suboptimal=suboptimal,
         )
 
 

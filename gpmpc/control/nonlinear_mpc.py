@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 from gpmpc.control.controller import Decision, Reference, Timing
+from gpmpc.control.convergence import FEASIBLE
 from gpmpc.control.descent import FAILURES, Program, slsqp, sqp
 from gpmpc.control.request import Request, check_controller, check_dynamics, check_method
 from gpmpc.control.shooting import Shooting, Shot
@@ -106,7 +107,8 @@ class NonlinearGPMPC:
         """Solves the problem from a belief along a reference; see ``Controller.control``.
 
         Where there is no usable state, or no plan that the model could follow, the decision holds the shifted last plan
-        with a status that says so.
+        with a status that says so. Where the method stopped early, its last iterate is ``suboptimal`` if it keeps the
+        bounds.
 
         Raises:
             ShapeError: The belief or the reference does not belong to this controller.
@@ -122,6 +124,10 @@ class NonlinearGPMPC:
             shot, status, iterations = METHODS[self.optimizer](program, start, self.tolerance, self.max_iterations)
         except FAILURES:
             return request.unanswered(Status.NUMERICAL_TROUBLE)
+        suboptimal = False
+        if iterations and status not in (Status.SOLVED, Status.INFEASIBLE):
+            shot = min((shot, start), key=lambda shot: _rank(program, shot))  # SLSQP may stop at a worse one
+            suboptimal = program.violation(shot) <= FEASIBLE
         inputs = shot.plan.reshape(self.horizon, -1)
         return Decision(
             input=inputs[0],
@@ -131,6 +137,7 @@ class NonlinearGPMPC:
             status=status,
             iterations=iterations,
             timing=Timing(program.model_seconds, built, time.perf_counter() - began - built - program.model_seconds),
+            suboptimal=suboptimal,
         )
 
     @staticmethod
@@ -149,6 +156,9 @@ class NonlinearGPMPC:
                 plans.append(plan)
         if len(plans) == 1:
             return program(plans[0])
-        shots = [program(plan) for plan in plans]
-        # Violations that one step mends anyway are not worth a far worse plan.
-        return min(shots, key=lambda shot: (program.violation(shot) > 1e-3, program.objective(shot)))
+        return min((program(plan) for plan in plans), key=lambda shot: _rank(program, shot))
+
+
+def _rank(program: Program, shot: Shot) -> tuple[bool, float]:
+    """Smaller for the better of two plans. Violations that one step mends are not worth a far worse plan."""
+    return program.violation(shot) > FEASIBLE, program.objective(shot)

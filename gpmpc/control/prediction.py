@@ -184,7 +184,7 @@ class Predictor:
         if self.form == "trajectory":
             return self.along(request, request.shifted, self.followed(request, previous))
         prediction = self.held(request, self.about(request))
-        if self.form == "deviation" or previous is None or not previous.status.solved:
+        if self.form == "deviation" or previous is None or not previous.applicable:
             return prediction  # no step before: the increment that the local model itself predicts
         return self.incremented(request, prediction, self.state(previous.means[0], previous.covariances[0]))
 
@@ -254,13 +254,13 @@ class Predictor:
         """
         if not self.feedback:
             return None
-        if previous is not None and previous.status.solved and len(previous.means) == self.horizon + 1:
+        if previous is not None and previous.applicable and len(previous.means) == self.horizon + 1:
             return previous.means[1:]
         return np.concatenate([request.state[None], request.targets[:-1]])
 
     def disturbance(self, request: Request, previous: Decision | None) -> Array:
         """d_k (n,), from the estimate of the last decision and what came of its input; zero before the first step."""
-        if previous is None or not previous.status.solved:
+        if previous is None or not previous.applicable:
             return np.zeros(self.problem.state_dim)
         before = np.zeros_like(request.state) if previous.disturbance is None else previous.disturbance
         x, u = self._tensor(previous.means[0]), self._tensor(request.last)

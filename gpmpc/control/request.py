@@ -31,7 +31,7 @@ class Request(NamedTuple):
         wanted: Reference inputs u*_0 .. u*_{H-1} (H, m); zero where there are none.
         last: The input before this step, u_{-1} (m,).
         shifted: The last plan, one step on, its last input repeated (H, m); the last input held where there is no
-            plan of a solve that succeeded. Within the input bounds.
+            plan that may be applied. Within the input bounds.
         finite: Whether the belief can be worked with.
         disturbance: Added to the model's mean at every stage (n,), or nothing (0,).
     """
@@ -63,7 +63,7 @@ class Request(NamedTuple):
             initial_input: Taken as the last input where there is no previous decision (m,).
             belief: Of the state.
             reference: Over the horizon.
-            previous: The last decision. Of one that was not solved only ``input`` counts: what was applied.
+            previous: The last decision. Of one that is not applicable only ``input`` counts: what was applied.
 
         Raises:
             ShapeError: Belief or reference have other dimensions than the problem and the horizon.
@@ -86,7 +86,7 @@ class Request(NamedTuple):
         if wanted.shape != (horizon, m):
             raise ShapeError(f"reference inputs must have shape ({horizon}, {m}); got {wanted.shape}")
         last, plan = initial_input if previous is None else _array(previous.input), NO_PLAN
-        if previous is not None and previous.status.solved:
+        if previous is not None and previous.applicable:
             plan = _array(previous.inputs)
             plan = plan if plan.shape == (horizon, m) else NO_PLAN
         last, shifted = _array(last), np.empty((horizon, m))

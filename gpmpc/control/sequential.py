@@ -45,19 +45,23 @@ class Reached(NamedTuple):
     Attributes:
         status: ``SOLVED``, the status of a program that could not be solved, ``ITERATION_LIMIT``, or
             ``NUMERICAL_TROUBLE`` where no step lowers the cost any more.
+        suboptimal: Whether it is not ``SOLVED``, and the plan may be applied all the same.
         programs: How many.
         timing: Where the time went.
         program: The last one.
         solution: Of the last one.
-        states: s_0 .. s_H under that solution, by the last stage models (H + 1, p).
+        inputs: The plan (H, m): that solution, or the last one on the way to it that had a lower cost.
+        states: s_0 .. s_H under it, by the last stage models (H + 1, p).
         covariances: Sigma_0 .. Sigma_H that these were made at (H + 1, n, n).
     """
 
     status: Status
+    suboptimal: bool
     programs: int
     timing: Timing
     program: QuadraticProgram
     solution: QPSolution
+    inputs: Array
     states: Array
     covariances: Array
 
@@ -99,7 +103,7 @@ class SequentialPrograms:
         stages = [(H, p, p), (H, p, m), (H, p), (H + 1, n, n), (H, m)]
         self._along = Layout([*stages, (K, r, p), (H, r), (H, r)])
         program = [(size, size), (size,), (rows, size), (size + rows,), (size + rows,)]
-        found = [(layout.record_size(size, size + rows),), (H + 1, p), (H + 1, n, n), (loop.OUTCOMES,)]
+        found = [(layout.record_size(size, size + rows),), (size,), (H + 1, p), (H + 1, n, n), (loop.OUTCOMES,)]
         self._answer, self._inputs = Layout(program + found), slice(layout.HEADER, layout.HEADER + size)
 
     @cached_property
@@ -155,7 +159,7 @@ class SequentialPrograms:
             answer,
             self._answer.table,
         )
-        P, q, G, lower, upper, record, states, covariances, outcome = self._answer.parts(answer)
+        P, q, G, lower, upper, record, plan, states, covariances, outcome = self._answer.parts(answer)
         solution, first = None, True
         for wish in sequence:
             if wish == loop.MODEL:
@@ -164,13 +168,14 @@ class SequentialPrograms:
             else:
                 solution = self._solve((P, q, G, lower, upper), warm if solution is None else solution)
                 record[:] = solution.record[: len(record)]
-        status, count, build, solve = outcome.tolist()
+        status, suboptimal, count, build, solve = outcome.tolist()
         if self._ours:
             terms = Terms(P, G, self._softness)
             solution = QPSolution(record[self._inputs], terms, q, lower, upper, record, 0.0, solve)
         timing = Timing(perf_counter() - began - build - solve, build, solve)
-        program = QuadraticProgram.unchecked(P, q, G, lower, upper)
-        return Reached(layout.STATUSES[int(status)], int(count), timing, program, solution, states, covariances)
+        program, inputs = QuadraticProgram.unchecked(P, q, G, lower, upper), plan.reshape(request.shifted.shape)
+        ended = layout.STATUSES[int(status)], bool(suboptimal), int(count)
+        return Reached(*ended, timing, program, solution, inputs, states, covariances)
 
     def _linearise(self, request: Request, along: Array, follow: Array | None, first: bool) -> None:
         """The stages along a plan, from the model itself."""

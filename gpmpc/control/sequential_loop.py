@@ -13,7 +13,7 @@ from gpmpc.compiled import borrowing, clock, compiled, copy, copy_matrix
 from gpmpc.control.chance_constraints import tighten, violation_price
 from gpmpc.control.compiled_rollout import roll_out
 from gpmpc.control.condensing import condense, respond, tracking_cost
-from gpmpc.control.convergence import kkt_share
+from gpmpc.control.convergence import FEASIBLE, kkt_share
 from gpmpc.control.flat_arrays import part
 from gpmpc.control.quasi_newton import MEMORY, correct
 from gpmpc.qp import record as layout
@@ -33,9 +33,9 @@ UNCERTAIN, FEEDBACK, DIFFERENCE, PENALIZED, KAPPA, LIMIT, TOLERANCE = range(7)  
 # The stages along a plan, the rows of their states and the bounds of these:
 A_OF, B_OF, C_OF, COVARIANCES, PLAN, ROWS, LOW, HIGH = range(8)
 
-# What comes out: the last program and its solution, the states and covariances that it predicts, the outcome.
-P_OF, Q_OF, G_OF, LOWER, UPPER, RECORD, STATES, PREDICTED, OUTCOME = range(9)
-STATUS, COUNT, BUILD, SOLVE, OUTCOMES = range(5)  # BUILD and SOLVE are times [s]
+# What comes out: the last program and its solution, the plan, the states and covariances that it leads to, the outcome.
+P_OF, Q_OF, G_OF, LOWER, UPPER, RECORD, REACHED, STATES, PREDICTED, OUTCOME = range(10)
+STATUS, SUBOPTIMAL, COUNT, BUILD, SOLVE, OUTCOMES = range(6)  # BUILD and SOLVE are times [s]
 
 SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 SHORTEST_STEP = 2.0**-12
@@ -82,9 +82,9 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
     size, M, bounded, limited = len(q), len(lower), low.shape[1] > 0, len(condenser[1][1])
     program, warm, solved = (P, q, G, lower, upper), guess, np.empty_like(record)
     solution, z = record[HEADER : HEADER + size], record[HEADER + size + size : HEADER + size + M]
-    vectors, pairs, count = np.empty((7, size)), np.empty((2, MEMORY, size)), 0
-    plan, slope, diagonal, step, before = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
-    scratch, change = vectors[5], vectors[6]
+    vectors, pairs, count = np.empty((6, size)), np.empty((2, MEMORY, size)), 0
+    slope, diagonal, step, before = vectors[0], vectors[1], vectors[2], vectors[3]
+    scratch, change, plan = vectors[4], vectors[5], part(answer, parts[REACHED])[0]
     inputs, proposed, moved = plan.reshape(H, m), solution.reshape(H, m), trial.reshape(size)
     status, price, share, rate, taken = ITERATION_LIMIT, 0.0, np.inf, 1.0, False
     outcome[:], spread[:] = 0.0, 0.0
@@ -188,9 +188,15 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
             before[i] += slope[i]
         copy(along, kept)
         copy(moved, plan)
-    respond(A, B, c, start, proposed, states)
+    if status == SOLVED:
+        copy(solution, plan)
+    respond(A, B, c, start, inputs, states)
     copy_matrix(part(kept, table[COVARIANCES]), part(answer, parts[PREDICTED]))
-    outcome[STATUS] = status
+    missed = 0.0  # of hard bounds, by the last plan that the line search took
+    if bounded:
+        missed = violation_price(chance, E, states, low_here, high_here, 1.0)
+        missed -= violation_price(chance, E, states, low_here, high_here, 0.0)
+    outcome[STATUS], outcome[SUBOPTIMAL] = status, status != SOLVED and taken and missed <= FEASIBLE
 
 
 # numba keeps a generator on disk with its Python function, by name where that name still means it: otherwise by value,

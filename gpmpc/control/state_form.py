@@ -18,6 +18,7 @@ import numpy as np
 
 from gpmpc.control.chance_constraints import ChanceConstraints
 from gpmpc.control.controller import Decision, Reference, Timing
+from gpmpc.control.convergence import FEASIBLE
 from gpmpc.control.convex_mpc import read_request
 from gpmpc.control.prediction import Covariance, Form, Prediction, Predictor
 from gpmpc.control.request import Request, check_controller, check_dynamics
@@ -99,12 +100,14 @@ class StateFormMPC:
             status = Status.NUMERICAL_TROUBLE
         timing = Timing(modelled - began, built - modelled, perf_counter() - built)
         iterations = (program.solver_stats.num_iters or 0) if program.solver_stats else 0
-        if not status.solved:
+        suboptimal = status is Status.ITERATION_LIMIT and self._program.feasible
+        if not (status.solved or suboptimal):
             return request.unanswered(status, iterations, timing)
         inputs = np.array(self._program.inputs.value)
         means, covariances = self.predictor.beliefs(prediction, inputs)
         disturbance = request.disturbance if self.predictor.disturbance_gain else None
-        return Decision(inputs[0], inputs, means, covariances, status, iterations, timing, disturbance=disturbance)
+        found = means, covariances, status, iterations, timing
+        return Decision(inputs[0], inputs, *found, disturbance=disturbance, suboptimal=suboptimal)
 
 
 class _Program:
@@ -151,6 +154,14 @@ class _Program:
         self.problem = cvxpy.Problem(cvxpy.Minimize(cost), rules)
         if not self.problem.is_dcp(dpp=True):
             raise SettingError("constraints", "must be convex, and parametrised as CVXPY's rules (DPP) ask")
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the last iterate keeps all constraints."""
+        values = [variable.value for variable in self.problem.variables()]
+        if not all(value is not None and np.isfinite(value).all() for value in values):
+            return False
+        return all(np.max(rule.violation()) <= FEASIBLE for rule in self.problem.constraints)
 
     def set(self, prediction: Prediction, request: Request, chance: ChanceConstraints) -> None:
         """Gives all parameters their values of this step."""

@@ -212,6 +212,7 @@ def metrics(experiment: Experiment, flight: Flight) -> dict[str, Any]:
         "rmse": {name: float(value) for name, value in zip(names, error.axes, strict=True)} | {"total": error.total},
         "violations": {name: _violations(rate) for name, rate in violations.items()},
         "failures": dict(Counter(status.name for _, status in rollout.failures)),
+        "suboptimal": dict(Counter(rollout.statuses[k].name for k in rollout.suboptimal)),
         "iterations": {"mean": float(rollout.iterations.mean()), "largest": int(rollout.iterations.max())},
         "training": None
         if training is None

@@ -27,6 +27,9 @@ def summary(result: Mapping[str, Any]) -> Table:
         table.add_row(f"bounds of {name}", text)
     failures = ", ".join(f"{status} {count}" for status, count in result["failures"].items())
     table.add_row("failed solves", failures or "none")
+    if result.get("suboptimal"):
+        stopped = ", ".join(f"{status} {count}" for status, count in result["suboptimal"].items())
+        table.add_row("stopped early", f"{stopped}: plans that were not optimal yet, applied")
     total = times["total"]
     stages = ", ".join(f"{stage} {1e3 * times[stage]['median']:.3g}" for stage in ("model", "build", "solve"))
     decision = f"median {1e3 * total['median']:.3g}  ({stages}), 99 % below {1e3 * total['p99']:.3g}"

@@ -58,12 +58,13 @@ class Rollout:
         measured: What the controller was told of x[0] .. x[K-1] (K, n).
         inputs: What acted, u[0] .. u[K-1] (K, m).
         references: r[0] .. r[K] (K + 1, n); the last one is r[K-1] once more where no r[K] was given.
-        predicted_means: What the controller expected of x[1] .. x[K] (K, n); NaN where it had not solved.
+        predicted_means: What the controller expected of x[1] .. x[K] (K, n); NaN where its plan was not applied.
         predicted_covariances: The same (K, n, n).
         statuses: How every solve ended, K.
         iterations: Of the solver (K,).
         timings: Where the wall time of every decision went, K.
         time_step: Of one step [s].
+        suboptimal: The steps at which a plan was applied whose solve had stopped short of its tolerance.
     """
 
     states: np.ndarray
@@ -77,6 +78,7 @@ class Rollout:
     iterations: np.ndarray
     timings: tuple[Timing, ...]
     time_step: float  # [s]
+    suboptimal: tuple[int, ...] = ()
 
     @property
     def times(self) -> np.ndarray:
@@ -90,8 +92,9 @@ class Rollout:
 
     @property
     def failures(self) -> tuple[tuple[int, Status], ...]:
-        """Every step whose solve failed, with how."""
-        return tuple((k, status) for k, status in enumerate(self.statuses) if not status.solved)
+        """Every step at which the policy chose the input, with how the solve failed."""
+        applied = set(self.suboptimal)
+        return tuple((k, s) for k, s in enumerate(self.statuses) if not s.solved and k not in applied)
 
 
 def closed_loop(
@@ -172,9 +175,10 @@ class Kept(NamedTuple):
     covariance: np.ndarray
     measured: np.ndarray
     input: np.ndarray
-    expected: np.ndarray  # mean of the next state; NaN where nothing was solved
+    expected: np.ndarray  # mean of the next state; NaN where no plan was applied
     expected_covariance: np.ndarray
     status: Status
+    failed: bool
     iterations: int
     timing: Timing
 
@@ -186,10 +190,10 @@ def kept(step: Step) -> Kept:
     iterations, timing = 0, Timing(0.0, 0.0, 0.0)
     if decision is not None:
         iterations, timing = decision.iterations, decision.timing
-        if decision.status.solved:
+        if not step.command.failed:
             expected, covariance = np.array(decision.means[1]), np.array(decision.covariances[1])
     taken = (step.state, step.covariance, step.measured, step.input, expected, covariance)
-    return Kept(*taken, step.command.status, iterations, timing)
+    return Kept(*taken, step.command.status, step.command.failed, iterations, timing)
 
 
 def rollout(
@@ -217,6 +221,7 @@ def rollout(
         iterations=np.array([step.iterations for step in steps]),
         timings=tuple(step.timing for step in steps),
         time_step=time_step,
+        suboptimal=tuple(k for k, step in enumerate(steps) if not (step.failed or step.status.solved)),
     )
 
 

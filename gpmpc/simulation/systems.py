@@ -159,7 +159,14 @@ class RunningPlant:
         return input
 
     def act(self, time: float, input: np.ndarray) -> tuple[Plant, np.ndarray]:
-        """The first half of ``apply``: the plant that is there at this time, and the input that acts on it (m,)."""
+        """The first half of ``apply``: the plant that is there at this time, and the input that acts on it (m,).
+
+        Raises:
+            ShapeError: The plant has another number of inputs.
+        """
+        m = len(self.plant.dynamics.input_names)
+        if np.shape(input) != (m,):
+            raise ShapeError(f"the plant takes inputs of shape ({m},); got {np.shape(input)}")
         return self._acting(time), self._noisy("input", input)
 
     def arrive(self, state: np.ndarray, input: np.ndarray) -> None:

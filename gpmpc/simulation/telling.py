@@ -13,7 +13,6 @@ from gpmpc import step as recorded
 from gpmpc.control.controller import Decision, Timing
 from gpmpc.simulation.cascade_loop import CascadeStep
 from gpmpc.simulation.loop import Step
-from gpmpc.status import Status
 
 
 def tell(recorder: Any, gp_size: int = 0) -> Callable[[Step], None]:
@@ -41,10 +40,10 @@ def tell(recorder: Any, gp_size: int = 0) -> Callable[[Step], None]:
                 innovation=nothing if expected is None else step.measured - expected,
                 belief_covariance=step.covariance,
                 gp_size=gp_size,
-                failed=not step.command.status.solved,
+                failed=step.command.failed,
             )
         )
-        expected = decision.means[1] if decision is not None and decision.status.solved else None
+        expected = None if step.command.failed else decision.means[1]
 
     return on_step
 
@@ -71,14 +70,14 @@ def tell_cascade(outer: Any, inner: Any, gp_sizes: tuple[int, int] = (0, 0)) -> 
 
 
 def _unasked(step: Step) -> Decision:
-    """A decision that says nothing: the controller was not asked, since nothing was measured."""
+    """A decision that says nothing: the controller was not asked, or what it said has another shape."""
     H, n, m = step.reference.horizon, len(step.state), len(step.input)
     return Decision(
         input=step.input,
         inputs=np.full((H, m), np.nan),
         means=np.full((H + 1, n), np.nan),
         covariances=np.full((H + 1, n, n), np.nan),
-        status=Status.INVALID_MEASUREMENT,
+        status=step.command.status,
         iterations=0,
         timing=Timing(0.0, 0.0, 0.0),
     )
