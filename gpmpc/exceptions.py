@@ -79,7 +79,10 @@ class Diverged(GpmpcError, ArithmeticError):
 
     Attributes:
         step: The time step (from 0) that it did so in.
+        flown: The ``Rollout`` of a closed loop up to there; None where that was its first step.
     """
+
+    flown: Any = None
 
     def __init__(self, step: int, message: str):
         super().__init__(step, message)

@@ -80,6 +80,14 @@ def tracking_error(states: np.ndarray, references: np.ndarray, axes: Sequence[in
     Raises:
         ShapeError: The two do not belong together, or have no such axes.
     """
+    states, references = _looked_at(states, references, axes)
+    with np.errstate(over="ignore"):
+        squares = np.square(states - references)[1:].mean(axis=0)
+        return TrackingError(np.sqrt(squares), float(np.sqrt(squares.sum())))
+
+
+def _looked_at(states: np.ndarray, references: np.ndarray, axes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Some axes of both (K + 1, j)."""
     if np.ndim(states) != 2 or np.shape(states) != np.shape(references) or len(states) < 2:
         raise ShapeError(
             f"states and references must both be (K + 1, n), K of 1 or more; got {np.shape(states)} and "
@@ -88,8 +96,51 @@ def tracking_error(states: np.ndarray, references: np.ndarray, axes: Sequence[in
     n = np.shape(states)[1]
     if not all(-n <= axis < n for axis in axes):
         raise ShapeError(f"axes must be states from 0 to {n - 1}; got {tuple(axes)}")
-    squares = np.square((np.asarray(states) - np.asarray(references))[1:, list(axes)]).mean(axis=0)
-    return TrackingError(np.sqrt(squares), float(np.sqrt(squares.sum())))
+    return np.asarray(states)[:, list(axes)], np.asarray(references)[:, list(axes)]
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Where a flight was lost.
+
+    Attributes:
+        step: The first step k whose state is too far off.
+        distance: How far it is from its reference.
+        limit: How far it may be.
+    """
+
+    step: int
+    distance: float
+    limit: float
+
+
+def find_loss(
+    states: np.ndarray, references: np.ndarray, least: float = 0.0, axes: Sequence[int] = (0, 2, 4)
+) -> Loss | None:
+    """Where a flight is farther from its reference than the reference ever goes from where the flight began.
+
+    There the system would have been nearer had it never moved: it no longer follows. That holds for any system and any
+    units; a reference that hardly moves needs ``least``.
+
+    Args:
+        states: x[0] .. x[K] (K + 1, n).
+        references: r[0] .. r[K] (K + 1, n).
+        least: No flight is lost that is nearer than this.
+        axes: Which states to look at, all in one unit; x, y, z of the translational ones by default.
+
+    Returns:
+        The first such step; None where there is none.
+
+    Raises:
+        ShapeError: The two do not belong together, or have no such axes.
+    """
+    states, references = _looked_at(states, references, axes)
+    with np.errstate(over="ignore", invalid="ignore"):
+        limit = max(least, float(np.linalg.norm(references - states[0], axis=1).max()))
+        distances = np.linalg.norm(states - references, axis=1)
+    beyond = ~(distances <= limit)  # what is no number is nowhere near
+    k = int(np.argmax(beyond))
+    return Loss(k, float(distances[k]), limit) if beyond[k] else None
 
 
 @dataclass(frozen=True)

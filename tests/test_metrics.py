@@ -8,6 +8,7 @@ from scipy import stats
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.metrics import (
     binomial_interval,
+    find_loss,
     interval_coverage,
     mean_squared_error,
     negative_log_predictive_density,
@@ -51,6 +52,34 @@ def test_the_tracking_error_is_that_of_the_axes_and_of_the_distance_without_the_
     assert tracking_error(states, references, axes=[1]).total == pytest.approx(7.0)
 
 
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+@pytest.mark.parametrize("shift", [0.0, -3.0])
+def test_a_flight_is_lost_where_it_would_have_been_nearer_had_it_never_moved(scale, shift):
+    references = np.outer(np.arange(6.0), [3, 0, 4]) + shift  # 25 from its start in the end
+    away = references + np.outer([0, 10, 24, 26, 200, 1], [0, 1, 0])
+    loss = find_loss(scale * away, scale * references, axes=range(3))
+    assert (loss.step, loss.distance, loss.limit) == (3, pytest.approx(26 * scale), pytest.approx(25 * scale))
+    staying = np.tile(references[:1], (6, 1))
+    for near in (references, staying, references + np.outer([0, 24, 24, 24, 24, 24], [0, 1, 0])):
+        assert find_loss(scale * near, scale * references, axes=range(3)) is None
+
+
+def test_what_hovers_is_lost_beyond_the_least_distance_and_what_is_no_number_is_lost_anyway():
+    references = np.zeros((4, 6))
+    drifting = np.outer(np.arange(4.0), [1, 50, 0, 50, 0, 50])  # velocities are not looked at
+    assert find_loss(drifting, references, least=3.0) is None
+    assert find_loss(drifting, references, least=1.5).step == 2
+    drifting[1, 0] = np.nan
+    assert find_loss(drifting, references, least=1.5).step == 1
+    assert find_loss(np.outer([0, 1, 1e300, 1e308], np.ones(6)), references, least=2.0).step == 2
+
+
+def test_coming_back_from_a_distant_start_is_no_loss():
+    approaching = np.outer([9.0, 5.0, -2.0, 0.5], np.ones(6))
+    assert find_loss(approaching, np.zeros((4, 6))) is None
+    assert find_loss(-approaching * [[1], [1], [5], [1]], np.zeros((4, 6))).step == 2
+
+
 def test_a_violation_is_a_step_with_any_entry_outside():
     values = np.array([[0.0, 0.0], [1.5, -3.0], [1.0 + 1e-12, 0.0], [np.nan, 0.0], [0.0, 5.0]])
     rate = violation_rate(values, [-1.0, -2.0], [1.0, np.inf])
@@ -80,6 +109,7 @@ def test_the_quantiles_of_times_are_in_order():
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
+        (lambda: find_loss(np.zeros((3, 6)), np.zeros((2, 6))), ShapeError, "states and references must both be"),
         (lambda: tracking_error(np.zeros((3, 6)), np.zeros((2, 6))), ShapeError, r"got \(3, 6\) and \(2, 6\)"),
         (lambda: violation_rate(np.zeros((3, 2)), [0], [1]), ShapeError, r"bounds \(d,\).*got \(3, 2\), \(1,\)"),
         (lambda: binomial_interval(3, 2), SettingError, "successes: must lie between 0 and trials"),

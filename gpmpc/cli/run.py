@@ -26,6 +26,7 @@ UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s") | {
 UNITS |= dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys("pqr", "rad/s")
 UNITS |= dict.fromkeys(("U1", "U2", "U3", "U4"), "N")
 MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
+LOST = 3  # exit code of a run that is finished, and whose flight was lost
 PATIENCE = 10.0  # with the writer of a recording whose run was killed a moment ago [s]
 
 
@@ -33,10 +34,11 @@ def run(config: DictConfig) -> None:
     """The task behind ``conf/run.yaml``: flies, prints what came of it, and says where it is kept."""
     from rich.console import Console
 
+    from gpmpc.compiling import tell_of_compiling
     from gpmpc.experiments.run_summary import summary
 
     console = Console()
-    with console.status("flying"):
+    with console.status("flying"), tell_of_compiling():
         experiment_of(config)  # what a user can get wrong is found out before anything is written
         outcome = fly_one(config)
     if "error" in outcome:
@@ -45,6 +47,8 @@ def run(config: DictConfig) -> None:
     console.print(summary(outcome["result"]))
     state = "finished before" if outcome["skipped"] else "written to"
     console.print(f"{state}: {outcome['folder']}", soft_wrap=True, highlight=False, markup=False)
+    if outcome["result"].get("lost"):
+        sys.exit(LOST)
 
 
 def fly_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
@@ -96,14 +100,17 @@ def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, abou
     with ExitStack() as stack:
 
         def prepared(controller: Any, training: Any) -> Callable:
-            recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller.problem))
+            recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller, training))
             return tell(recorder, 0 if training is None else len(training.posterior))
 
         flight = fly(experiment, prepared)
     return metrics(experiment, flight)
 
 
-def _recorder(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict, problem: Any) -> Any:
+def _recorder(
+    experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict, controller: Any, training: Any
+) -> Any:
+    from gpmpc.experiments.run import unplanned_noise
     from gpmpc.experiments.run_folder import RECORDING
     from gpmpc.recording import McapRecorder
 
@@ -119,8 +126,12 @@ def _recorder(experiment: "Experiment", folder: "RunFolder", config: DictConfig,
                     name: unit for name, unit in UNITS.items() if name in dynamics.state_names + dynamics.input_names
                 },
                 config=OmegaConf.to_yaml(config, resolve=True),
-                metadata={"seed": experiment.seed, "command": about["provenance"]["command"]},
-                input_bounds=[problem.input_lower, problem.input_upper],
+                metadata={
+                    "seed": experiment.seed,
+                    "command": about["provenance"]["command"],
+                    "noise_std": " ".join(map(str, unplanned_noise(experiment, controller, training).tolist())),
+                },
+                input_bounds=[controller.problem.input_lower, controller.problem.input_upper],
             )
         except RecordingError as error:
             # The folder is ours, so only the orphaned writer of a killed run can still hold the file.

@@ -34,6 +34,7 @@ from omegaconf import DictConfig, open_dict
 
 from gpmpc.cli.run import check_same, checked_folder, choices, experiment_of, fly_one, plain_settings
 from gpmpc.cli.screen import progress_bar
+from gpmpc.compiling import tell_of_compiling
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.experiments.run_folder import PLAN, Busy, RunFolder, folder_name
 from gpmpc.files import write_whole
@@ -79,7 +80,8 @@ def sweep(given: Namespace, conf: Path) -> None:
         waiting, finished = [], []
         for job in jobs:
             (finished if job.folder.finished else waiting).append(job)
-        _check(waiting, context, config)
+        with tell_of_compiling():
+            _check(waiting, context, config)
         with console.status(f"comparing the settings of {len(finished)} finished runs"):
             _check_finished(finished, context, config)
         _keep_plan(jobs, Path(config.folder))
@@ -109,6 +111,7 @@ def fly_after_others(config: DictConfig) -> dict[str, Any]:
     return _outcome(config, wait=True)
 
 
+@tell_of_compiling()
 def _outcome(config: DictConfig, wait: bool) -> dict[str, Any]:
     try:
         outcome = fly_one(config, wait)

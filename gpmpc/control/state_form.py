@@ -94,7 +94,7 @@ class StateFormMPC:
         built = perf_counter()
         program = self._program.problem
         try:
-            program.solve(solver=self.solver, **self.options)
+            program.solve(solver=self.solver, **{"warm_start": False} | self.options)
             status = STATUSES.get(program.status, Status.NUMERICAL_TROUBLE)
         except cvxpy.error.SolverError:
             status = Status.NUMERICAL_TROUBLE

@@ -15,21 +15,20 @@ from typing import Any
 import numpy as np
 import torch
 
+from gpmpc.compiling import tell_of_compiling
 from gpmpc.control.controller import Controller, Reference
 from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.control.nmpc import NMPC
 from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.control.tracking import StateBounds, TrackingProblem
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
-from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Scaling
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.metrics import tracking_error, violation_rate
 from gpmpc.plants import Plant
 from gpmpc.plants.quadrotor import GRAVITY
 from gpmpc.propagation import Linearization, MomentMatching
-from gpmpc.simulation import ModelLoop, Noise, Rollout, closed_loop
-from gpmpc.simulation.loop import window
+from gpmpc.simulation import ModelLoop, Noise, Rollout, closed_loop, rehearse
 
 PROPAGATIONS = {"moment_matching": MomentMatching, "linearization": Linearization}
 CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "convex": ConvexMPC}
@@ -181,6 +180,7 @@ def controller_of(row: Row, task: Task) -> Controller:
     return CONTROLLERS[row.controller](model, propagator, problem, row.horizon, at_first, **settings)
 
 
+@tell_of_compiling()
 def fly(flight: Flight) -> dict:
     """Flies one flight, in a worker process."""
     torch.set_num_threads(1)
@@ -196,9 +196,7 @@ def fly(flight: Flight) -> dict:
         else:
             system, noise = task.plant, Noise(process=[task.noise] * 6)
         start = task.reference.states[0]
-        first = window(task.reference, 0, row.horizon)
-        for _ in range(2):  # what is compiled or loaded at a first call is no part of the times
-            controller.control(Gaussian.certain(start), first)
+        rehearse(system, controller, task.reference, start)
         rollout = closed_loop(
             system, controller, task.reference, start, task.steps,
             noise=noise, on_failure="previous_plan", seed=flight.seed,

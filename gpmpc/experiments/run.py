@@ -20,17 +20,18 @@ import numpy as np
 from gpmpc.control.controller import Controller, Reference
 from gpmpc.control.supervision import OnFailure, check_policy
 from gpmpc.datasets import DataSource, rotational_states_along
-from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
 from gpmpc.gp import Training, Transitions
-from gpmpc.metrics import ViolationRate, time_quantiles, tracking_error, violation_rate
+from gpmpc.metrics import ViolationRate, find_loss, time_quantiles, tracking_error, violation_rate
 from gpmpc.plants import Coupled, Map, Plant, Rotational, Translational
 from gpmpc.propagation import MomentMatching, Propagator
-from gpmpc.simulation import Disturbance, ModelLoop, Noise, Rollout, Step, closed_loop
+from gpmpc.simulation import Disturbance, ModelLoop, Noise, Rollout, Step, closed_loop, rehearse
 from gpmpc.simulation.systems import RunningPlant
 from gpmpc.trajectories import Trajectory, states_along
 
 NAMES = {"translational": Translational.state_names, "rotational": Rotational.state_names}
 UNITS = {"translational": "m", "rotational": "rad"}  # of the positions and angles that errors are stated in
+NEAR = {"m": 10.0, "rad": np.pi / 2}  # no flight is lost that is nearer; a vehicle on its side no longer carries itself
 STAGES = ("model", "build", "solve", "total")  # of a decision's time
 
 
@@ -118,11 +119,13 @@ class Flight:
         rollout: Every step, as arrays.
         controller: What steered.
         training: What was learned; None where the controller knows the plant.
+        diverged: Where and why the system left the finite numbers, and the rollout ends; None where it did not.
     """
 
     rollout: Rollout
     controller: Controller
     training: Training | None
+    diverged: Diverged | None = None
 
 
 def fly(
@@ -140,7 +143,7 @@ def fly(
         DataError: The data cannot be read.
         TrainingError: An output could not be trained.
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
-        Diverged: The system left the finite numbers.
+        Diverged: The system left the finite numbers in its first step.
     """
     plant, training = experiment.plant, None
     if experiment.learns:
@@ -154,19 +157,26 @@ def fly(
         system = ModelLoop(training.posterior, propagator, time_step=plant.time_step)
     states = references(experiment, experiment.steps + controller.horizon + 1)
     resting = np.asarray(controller.initial_input)  # falls back on it where the very first solve fails
+    reference = Reference(states, np.tile(resting, (len(states) - 1, 1)))
+    rehearse(system, controller, reference, states[0])
     on_step = None if prepared is None else prepared(controller, training)
-    rollout = closed_loop(
-        system,
-        controller,
-        Reference(states, np.tile(resting, (len(states) - 1, 1))),
-        states[0],
-        experiment.steps,
-        noise=experiment.noise,
-        disturbances=experiment.disturbances,
-        on_failure=experiment.on_failure,
-        seed=experiment.seed,
-        on_step=on_step,
-    )
+    try:
+        rollout = closed_loop(
+            system,
+            controller,
+            reference,
+            states[0],
+            experiment.steps,
+            noise=experiment.noise,
+            disturbances=experiment.disturbances,
+            on_failure=experiment.on_failure,
+            seed=experiment.seed,
+            on_step=on_step,
+        )
+    except Diverged as error:
+        if error.flown is None:
+            raise
+        return Flight(error.flown, controller, training, error)
     return Flight(rollout, controller, training)
 
 
@@ -197,19 +207,27 @@ def training_rows(experiment: Experiment) -> Transitions:
 
 
 def metrics(experiment: Experiment, flight: Flight) -> dict[str, Any]:
-    """What came of a flight, as plain data; everything that differs between equal runs is under ``times``."""
+    """What came of a flight, as plain data; everything that differs between equal runs is under ``times``.
+
+    ``lost`` says since when and why a flight no longer follows its reference (``find_loss``, or it diverged). One that
+    diverged has no RMSE: None.
+    """
     rollout, problem = flight.rollout, flight.controller.problem
     names = experiment.plant.dynamics.state_names[::2]
     error = tracking_error(rollout.states, rollout.references)
+    rmse = {name: float(value) for name, value in zip(names, error.axes, strict=True)} | {"total": error.total}
+    if flight.diverged is not None or not np.isfinite(error.total):
+        rmse = dict.fromkeys(rmse)
     violations = {"inputs": violation_rate(rollout.inputs, problem.input_lower, problem.input_upper)}
     if problem.state_bounds is not None:
         bounds = problem.state_bounds
         violations["states"] = violation_rate(rollout.states[1:], bounds.lower, bounds.upper)
     training = flight.training
     return {
-        "steps": experiment.steps,
+        "steps": len(rollout.inputs),
         "unit": UNITS[experiment.subsystem],
-        "rmse": {name: float(value) for name, value in zip(names, error.axes, strict=True)} | {"total": error.total},
+        "rmse": rmse,
+        "lost": _lost(experiment, flight),
         "violations": {name: _violations(rate) for name, rate in violations.items()},
         "failures": dict(Counter(status.name for _, status in rollout.failures)),
         "suboptimal": dict(Counter(rollout.statuses[k].name for k in rollout.suboptimal)),
@@ -224,6 +242,34 @@ def metrics(experiment: Experiment, flight: Flight) -> dict[str, Any]:
         "times": {"training": None if training is None else training.seconds}
         | {stage: asdict(time_quantiles(np.array([getattr(t, stage) for t in rollout.timings]))) for stage in STAGES},
     }
+
+
+def unplanned_noise(experiment: Experiment, controller: Controller, training: Training | None) -> np.ndarray:
+    """Standard deviations (n,) of the noise of a next state that the covariances of a plan do not hold.
+
+    It is what the model has learned of it; a controller that knows the plant knows its noise as well.
+    """
+    n = len(experiment.plant.dynamics.state_names)
+    if getattr(getattr(controller, "propagator", None), "observation_noise", False) or experiment.loop == "model":
+        return np.zeros(n)
+    if training is not None:
+        return training.posterior.noise_covariance.diagonal().sqrt().numpy()
+    noise = experiment.noise and experiment.noise.process
+    return np.zeros(n) if noise is None else np.array(noise, dtype=float)
+
+
+def _lost(experiment: Experiment, flight: Flight) -> dict[str, Any] | None:
+    """Step, time [s] and reason of a flight's loss; None where it was not lost."""
+    unit, steps, reasons = UNITS[experiment.subsystem], [], []
+    if loss := find_loss(flight.rollout.states, flight.rollout.references, NEAR[unit]):
+        steps.append(loss.step)
+        reasons.append(f"{loss.distance:.3g} {unit} from its reference, more than {loss.limit:.3g} {unit}")
+    if flight.diverged is not None:
+        steps.append(flight.diverged.step)
+        reasons.append(str(flight.diverged))
+    if not steps:
+        return None
+    return {"step": steps[0], "time": round(steps[0] * flight.rollout.time_step, 9), "reason": "; ".join(reasons)}
 
 
 def _violations(rate: ViolationRate) -> dict[str, Any]:

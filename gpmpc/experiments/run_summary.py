@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rich import box
+from rich.markup import escape
 from rich.table import Table
 
 
@@ -17,10 +18,12 @@ def summary(result: Mapping[str, Any]) -> Table:
     table.add_row("flight", f"{result['steps']} steps of {flown} with {options['controller']}")
     if training:
         table.add_row("training", f"{training['size']} rows, {times['training']:.2f} s")
+    if lost := result.get("lost"):
+        table.add_row("[red]lost", f"[red]from step {lost['step']} ({lost['time']:g} s) on: {escape(lost['reason'])}")
     rmse = dict(result["rmse"])
     total = rmse.pop("total")
-    axes = ", ".join(f"{name} {value:.3g}" for name, value in rmse.items())
-    table.add_row(rf"RMSE \[{result['unit']}]", f"{total:.3g}  ({axes})")
+    axes = ", ".join(f"{name} {value:.3g}" for name, value in rmse.items() if value is not None)
+    table.add_row(rf"RMSE \[{result['unit']}]", "none: it diverged" if total is None else f"{total:.3g}  ({axes})")
     for name, rate in result["violations"].items():
         low, high = 100 * rate["low"], 100 * rate["high"]
         text = f"{rate['violations']} of {rate['steps']} steps outside (95 %: {low:.2g} to {high:.2g} %)"

@@ -30,11 +30,25 @@ def positions_of(run: "Run") -> list[int]:
 
 
 def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Means and standard deviations (K, j) that were predicted one step before; NaN where nothing was."""
+    """Means and standard deviations (K, j) that were predicted one step before; NaN where nothing was.
+
+    What is predicted is the state itself: the noise that the plan leaves out belongs to it.
+    """
     mean, std = np.full((2, len(run.times), len(states)), np.nan)
     if run.plan_means.shape[1] > 1:
-        mean[1:], std[1:] = run.plan_means[:-1, 1, states], run.plan_stds[:-1, 1, states]
+        mean[1:] = run.plan_means[:-1, 1, states]
+        std[1:] = np.hypot(run.plan_stds[:-1, 1, states], _noise(run)[states])
     return mean, std
+
+
+def _noise(run: "Run") -> np.ndarray:
+    """Standard deviations of a next state's noise (n,); zero where the recording does not say."""
+    n = len(run.state_names)
+    try:
+        noise = np.array(run.metadata["run"]["noise_std"].split(), dtype=float)
+    except (KeyError, ValueError):
+        return np.zeros(n)
+    return noise if noise.shape == (n,) and np.isfinite(noise).all() else np.zeros(n)
 
 
 def tracking_figure(run: "Run") -> Figure:

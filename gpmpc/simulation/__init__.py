@@ -3,7 +3,7 @@
 from gpmpc.simulation.batched_loop import closed_loops
 from gpmpc.simulation.cascade_loop import CascadeRollout, cascade_loop
 from gpmpc.simulation.disturbances import Disturbance, Dropout, Gust, Replaced
-from gpmpc.simulation.loop import Rollout, Step, closed_loop
+from gpmpc.simulation.loop import Rollout, Step, closed_loop, rehearse
 from gpmpc.simulation.systems import ModelLoop, Noise
 from gpmpc.simulation.telling import tell, tell_cascade
 from gpmpc.simulation.trials import Trial, trials
@@ -22,6 +22,7 @@ __all__ = [
     "cascade_loop",
     "closed_loop",
     "closed_loops",
+    "rehearse",
     "tell",
     "tell_cascade",
     "trials",

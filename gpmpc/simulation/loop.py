@@ -7,6 +7,7 @@ after the step and outside of everything that is timed.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from gpmpc.control.controller import Controller, Reference, Timing
 from gpmpc.control.supervision import Command, OnFailure, check_policy, command
-from gpmpc.exceptions import ShapeError, check_number
+from gpmpc.exceptions import Diverged, GpmpcError, ShapeError, check_number
 from gpmpc.plants import Plant
 from gpmpc.simulation.disturbances import Disturbance
 from gpmpc.simulation.systems import ModelLoop, Noise, Running, RunningModel, RunningPlant
@@ -131,7 +132,7 @@ def closed_loop(
         ShapeError: Too few references for the steps and the horizon, or a state of the wrong length.
         SettingError: An unknown policy, negative noise, or noise in a model loop.
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
-        Diverged: The system left the finite numbers.
+        Diverged: The system left the finite numbers; ``flown`` holds the steps before.
     """
     check_number("steps", steps, least=1, whole=True)
     check_policy(on_failure)
@@ -143,12 +144,26 @@ def closed_loop(
     taken, last = [], None
     for k in range(steps):
         ahead = window(references, k, controller.horizon)
-        step = one_step(running, controller, ahead, last, on_failure, k, round(k * system.time_step, 9))
+        try:
+            step = one_step(running, controller, ahead, last, on_failure, k, round(k * system.time_step, 9))
+        except Diverged as error:
+            if taken:
+                error.flown = rollout(taken, references, system.time_step, running.mean, running.covariance)
+            raise
         taken.append(kept(step))
         last = step.command
         if on_step is not None:
             on_step(step)
     return rollout(taken, references, system.time_step, running.mean, running.covariance)
+
+
+def rehearse(system: Plant | ModelLoop, controller: Controller, references: Reference, initial: Any) -> None:
+    """Flies the first two steps, without noise, and forgets them: a flight's times then hold no compiling and loading.
+
+    Two, since the second one starts from a plan. What fails here fails again in the flight, and is told there.
+    """
+    with suppress(GpmpcError):
+        closed_loop(system, controller, references, initial, 2, on_failure="previous_plan")
 
 
 def one_step(

@@ -1,23 +1,32 @@
 """A flight follows from its experiment alone."""
 
+import json
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hydra import compose, initialize_config_dir
 
+from gpmpc.cli.run import experiment_of
+from gpmpc.control.controller import Decision, Timing
 from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.control.nmpc import NMPC
 from gpmpc.control.tracking import TrackingProblem
 from gpmpc.datasets import Excitation, ExcitedData
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import Diverged, SettingError
+from gpmpc.experiments import run
 from gpmpc.experiments.run import Experiment, fly, metrics, training_rows
 from gpmpc.experiments.run_folder import Busy, RunFolder, folder_name
 from gpmpc.gp import Trainer
 from gpmpc.plants import Coupled, Integrated, Map, Rotational, Translational
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise
-from gpmpc.trajectories import Elliptical, Lorenz
+from gpmpc.status import Status
+from gpmpc.trajectories import Elliptical, Hover, Lorenz, Step
 
+CONF = Path(__file__).resolve().parents[2] / "conf"
 PLANT = Integrated(Translational(), time_step=1.0, substeps=1)
 PROBLEM = TrackingProblem(
     [10, 1] * 3, [0.1, 1, 1], penalized="increments", input_lower=[0, -0.7, -0.7], input_upper=[20, 0.7, 0.7]
@@ -26,6 +35,25 @@ HOVER = [7.26, 0, 0]
 EXCITED = Excitation(PLANT, [1] * 6, [1] * 3, HOVER, [0.3, 0.03, 0.03], [0.01] * 6)
 CONVEX = partial(ConvexMPC, propagator=Linearization(), problem=PROBLEM, horizon=2, initial_input=HOVER)
 ON_THE_PLANT = partial(NMPC, problem=PROBLEM, horizon=2, initial_input=HOVER)
+
+
+class Blind:
+    """Applies a law of the state, whatever it is asked for; a call takes the seconds that ``seconds`` gives."""
+
+    horizon, problem, initial_input = 1, PROBLEM, HOVER
+
+    def __init__(self, plant, law, seconds=lambda: 0.0):
+        self.law, self.seconds = law, seconds
+
+    def control(self, belief, reference, previous=None):
+        inputs = np.array([self.law(belief.mean.numpy())], dtype=float)
+        timing = Timing(self.seconds(), 0.0, 0.0)
+        return Decision(inputs[0], inputs, np.zeros((2, 6)), np.zeros((2, 6, 6)), Status.SOLVED, 1, timing)
+
+
+def blind(law, **changes):
+    seconds = changes.pop("seconds", lambda: 0.0)
+    return experiment(data=None, controller=partial(Blind, law=law, seconds=seconds), **{"steps": 30} | changes)
 
 
 def experiment(**changes):
@@ -103,6 +131,115 @@ def test_the_rotational_subsystem_follows_the_attitudes_of_the_trajectory_at_its
     assert set(found["rmse"]) == {"phi", "theta", "psi", "total"}
     assert found["unit"] == "rad"
     assert found["rmse"]["total"] < 0.005
+
+
+@pytest.mark.parametrize("trajectory", [Elliptical(), Lorenz(), Hover((0, 0, -5)), Step((0, 0, 0), (1, 1, -1), 3.0)])
+@pytest.mark.parametrize("law", [lambda x: [0, 0, 0], lambda x: [100, 0, 0], lambda x: [7.26, 0.6, 0]])
+def test_a_flight_that_no_longer_follows_is_lost_and_says_since_when(trajectory, law):
+    lost = blind(law, trajectory=trajectory)
+    flight = fly(lost)
+    found = metrics(lost, flight)["lost"]
+    away = np.linalg.norm((flight.rollout.states - flight.rollout.references)[:, ::2], axis=1)
+    assert found["time"] == found["step"]
+    assert 10 < away[found["step"]] <= away.max()
+    assert away[: found["step"]].max() < away[found["step"]]
+    assert f"{away[found['step']]:.3g} m from its reference" in found["reason"]
+
+
+@pytest.mark.parametrize("trajectory", [Elliptical(), Lorenz(), Hover((0, 0, -5))])
+def test_an_offset_and_a_short_flight_are_no_loss(trajectory):
+    heavy = Integrated(Translational(mass=0.888), time_step=1.0, substeps=1)
+    problem = replace(PROBLEM, Q=[1] * 6, R=[1] * 3)
+    sagging = experiment(
+        trajectory=trajectory, data=None, controller=lambda plant: ON_THE_PLANT(PLANT, problem=problem), plant=heavy,
+        steps=20,
+    )  # fmt: skip
+    found = metrics(sagging, fly(sagging))
+    assert found["rmse"]["z"] > 3
+    assert found["lost"] is None
+    for steps in (1, 2):
+        assert numbers(experiment(trajectory=trajectory, steps=steps))["lost"] is None
+
+
+def growing(rate):
+    """Thrust that is never quite infinite."""
+    return lambda x: [min(rate * float(abs(x[4])), 1.7e308), 0, 0]
+
+
+@pytest.mark.parametrize("growth", [1e60, 1e120])
+def test_a_flight_that_diverges_ends_in_metrics_that_can_be_written_and_say_so(growth):
+    told = []
+    diverging = blind(growing(growth), trajectory=Hover((0, 0, -5)))
+    flight = fly(diverging, lambda controller, training: told.append)
+    found = metrics(diverging, flight)
+    json.dumps(found, allow_nan=False)
+    assert found["lost"]["step"] == 1
+    assert "the plant's state is not finite any more" in found["lost"]["reason"]
+    assert set(found["rmse"].values()) == {None}
+    assert found["steps"] == flight.diverged.step == len(told) < 30
+    assert found["violations"]["inputs"]["steps"] == found["steps"]
+    with pytest.raises(Diverged):  # nothing was flown
+        fly(blind(growing(1e308), trajectory=Hover((0, 0, -5))))
+
+
+def test_what_the_first_calls_take_is_no_part_of_the_times():
+    slow = iter([40.0, 20.0])
+    measured = blind(lambda x: HOVER, steps=5, seconds=lambda: next(slow, 0.001))
+    assert metrics(measured, fly(measured))["times"]["total"]["largest"] == 0.001
+
+
+def composed():
+    """Settings of flights with every controller, propagation and solver there is."""
+    names = {group: sorted(path.stem for path in (CONF / group).glob("*.yaml")) for group in CHOSEN}
+    return [f"{group}={name}" for group, found in names.items() for name in found] + MORE
+
+
+CHOSEN = ("controller", "propagation", "solver")
+MORE = ["loop=model", "controller.iterations=5", "controller.disturbance_gain=0.3", "subsystem=rotational"]
+
+
+@pytest.fixture(scope="module")
+def learned():
+    """Rows and what was learned from them, by subsystem; trained once."""
+    kept = {}
+
+    def of(settings):
+        if settings.subsystem not in kept:
+            rows = training_rows(settings)
+            kept[settings.subsystem] = rows, settings.train(rows, seed=0)
+        rows, training = kept[settings.subsystem]
+
+        class Kept:
+            note = ""
+
+            def transitions(self, *_):
+                return rows
+
+        return replace(settings, data=Kept(), train=lambda *_, **__: training)
+
+    return of
+
+
+@pytest.mark.parametrize("choice", composed())
+def test_the_rehearsal_changes_no_bit(choice, learned, monkeypatch):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        tiny = ["data.samples=20", "model.restarts=0", "steps=4", "horizon=3"]
+        noise = [] if choice == "loop=model" else [f"noise.process={[1e-3] * 6}", f"noise.measurement={[1e-3] * 6}"]
+        settings = learned(experiment_of(compose("run", overrides=[choice, *tiny, *noise])))
+    rehearsed = fly(settings).rollout
+    monkeypatch.setattr(run, "rehearse", lambda *_: None)
+    at_once = fly(settings).rollout
+    for name in (
+        "states",
+        "covariances",
+        "measured",
+        "inputs",
+        "predicted_means",
+        "predicted_covariances",
+        "iterations",
+    ):
+        assert np.array_equal(getattr(rehearsed, name), getattr(at_once, name), equal_nan=True), name
+    assert rehearsed.statuses == at_once.statuses
 
 
 def test_more_rows_than_there_are_are_refused():

@@ -212,6 +212,12 @@ def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
     with pytest.raises(Diverged, match="step 1: the plant's state is not finite any more") as caught:
         fly(plant=Integrated(Exploding(), substeps=1), initial=np.array([0.0, 1.0]))
     assert caught.value.step == 1
+    flown = caught.value.flown
+    assert flown.states[:, 1] == pytest.approx([1.0, 1e60], rel=1e300)  # what was flown before is kept
+    assert len(flown.inputs) == 1
+    with pytest.raises(Diverged) as caught:
+        fly(plant=Integrated(Exploding(), substeps=1), initial=np.array([0.0, 1e300]))
+    assert caught.value.flown is None
 
 
 @pytest.mark.parametrize(
