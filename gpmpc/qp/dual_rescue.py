@@ -18,6 +18,7 @@ from scipy.linalg import qr, solve_triangular
 
 from gpmpc.qp import record as layout
 from gpmpc.qp.farkas import proves_infeasibility, zero_row_size
+from gpmpc.qp.problem import ABSENT
 from gpmpc.qp.solution import Terms
 
 Array = NDArray[np.float64]
@@ -45,6 +46,7 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, li
     result = record.copy()
     result[layout.TAG] = layout.NO_TAG
     try:
+        lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
         solve = _Solve(terms, q, lower, upper)
         result[layout.STATUS] = solve.run(_names(record, len(q), len(lower)), limit, late)
         solve.write(result)
@@ -99,6 +101,8 @@ class _Solve:
         n, M, k = self.n, len(self.E), len(self.members)
         multipliers = self.mu.sum(axis=0) * self.E if self.ray is None else self.ray
         x = self.x.sum(axis=0) * self.D
+        if not (np.isfinite(x).all() and np.isfinite(multipliers).all()):
+            raise OverflowError
         record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
         record[layout.HEADER + n + M :][:k] = [side * (p + 1) for p, side in zip(self.members, self.sides, strict=True)]
         record[[layout.WORKING, layout.VARIABLES, layout.CONSTRAINTS]] = k, n, M
