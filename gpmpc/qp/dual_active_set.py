@@ -26,12 +26,13 @@ from gpmpc.exceptions import ProblemError
 from gpmpc.qp import record as layout
 from gpmpc.qp.dual_kernels import GRAM_SIGNATURE, LAZY_SIGNATURE, solve_gram, solve_lazy
 from gpmpc.qp.dual_rescue import rescue
+from gpmpc.qp.farkas import proves_infeasibility
 from gpmpc.qp.gram_system import gram_system
 from gpmpc.qp.problem import QuadraticProgram
 from gpmpc.qp.soft_rows import SoftRows, stack_softness
 from gpmpc.qp.solution import QPSolution, Terms
 from gpmpc.qp.solver import WarmStart
-from gpmpc.qp.workspace import gram_workspace, lazy_workspace
+from gpmpc.qp.workspace import SHARE, gram_workspace, lazy_workspace
 
 Array = NDArray[np.float64]
 
@@ -176,25 +177,30 @@ class DualActiveSet:
 
     def _settings(self, n: int, M: int, soft: bool, tag: float = layout.NO_TAG) -> Array:
         limit = self._limit(M) if self.time_limit is None else min(self._limit(M), ITERATIONS_PER_LOOK)
-        return np.array([limit, self.tolerance, soft, n, M, tag], dtype=float)
+        return np.array([limit, self.tolerance, soft, n, M, tag, 1.0])
 
     def _settle(self, again: Callable, terms: Terms, q: Array, lower: Array, upper: Array, record: Array, began: float):
         """Decides on a solve that did not end as ``SOLVED``: go on, believe it, or try again; returns the record."""
-        done = record[layout.ITERATIONS]
+        done, limit = record[layout.ITERATIONS], self._limit(len(lower))
+
+        def late() -> bool:
+            return self.time_limit is not None and perf_counter() - began > self.time_limit
+
         while record[layout.STATUS] == layout.ITERATION_LIMIT and self.time_limit is not None:
-            late = perf_counter() - began > self.time_limit
-            if late or done >= self._limit(len(lower)):
-                record[layout.STATUS] = layout.TIME_LIMIT if late else layout.ITERATION_LIMIT
+            if late() or done >= limit:
+                record[layout.STATUS] = layout.TIME_LIMIT if late() else layout.ITERATION_LIMIT
                 break
             guess, record = record, np.empty_like(record)
             again(guess, record)
             done += record[layout.ITERATIONS]
         record[layout.ITERATIONS] = done
-        stopped = record[layout.STATUS] == layout.ITERATION_LIMIT and self.iteration_limit is not None
-        if stopped or record[layout.STATUS] in (layout.SOLVED, layout.TIME_LIMIT):
+        status = record[layout.STATUS]
+        stopped = status == layout.ITERATION_LIMIT and self.iteration_limit is not None
+        if stopped or status in (layout.SOLVED, layout.TIME_LIMIT):
             return record
-        settings = np.array([self._limit(len(lower)), self.tolerance, True, len(q), len(lower), layout.NO_TAG])
-        return rescue(terms, q, lower, upper, record, settings)
+        if status == layout.INFEASIBLE and proves_infeasibility(_multipliers(record, len(q), len(lower)), terms.G, lower, upper):
+            return record
+        return rescue(terms, q, lower, upper, record, limit, late)
 
 
 class Prepared:
@@ -213,7 +219,7 @@ class Prepared:
         run_gram = direct(solve_gram)
         began = perf_counter()
         self.terms, self._solver, self._settings = terms, solver, settings
-        self._system, self._traits = gram_system(terms)
+        self._system, self._traits, settings[SHARE] = gram_system(terms)
         self._work = gram_workspace(settings, self._traits)
         n, M = len(terms.P), sum(terms.G.shape)
         self._size = layout.record_size(n, M) + layout.factor_size(n, M)
@@ -263,6 +269,10 @@ class Prepared:
         if status != layout.SOLVED:
             record = self._solver._settle(again, self.terms, q, lower, upper, record, began)
         return QPSolution(record[self._x], self.terms, q, lower, upper, record, 0.0, perf_counter() - began)
+
+
+def _multipliers(record: Array, n: int, M: int) -> Array:
+    return record[layout.HEADER + n : layout.HEADER + n + M]
 
 
 def _write_trouble(record: Array, n: int, M: int) -> None:

@@ -97,7 +97,7 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
     couple(lazy, row, k, size, rows, members, solved)
     forward_solve(R, k, solved)
     while True:
-        admit(k, p, above, place, traits, free, bounds, slots, members)
+        admit(k, p, above, place, diagonal, traits, free, bounds, slots, members)
         for i in range(k):
             r[i] = solved[i]
         backward_solve(R, k, r)

@@ -10,6 +10,8 @@ working set by Newton's method (one step is exact but for rounding), and handed 
 violated.
 """
 
+import math
+
 import numpy as np
 
 from gpmpc.compiled import borrowing, woven
@@ -52,16 +54,17 @@ from gpmpc.qp.lanes import (
 )
 from gpmpc.qp.working_set import (
     CAP,
+    FLOOR,
     HIGH_WATCH,
     LISTED,
     LOW_WATCH,
     LOWER,
     NAME,
-    NORM,
     PLACE,
     SCALE,
     SCRATCH,
-    SLACK,
+    SOFTNESS,
+    TOLERATED,
     UPPER,
     admit,
     choose_guess,
@@ -70,6 +73,7 @@ from gpmpc.qp.working_set import (
     ignore,
     measure,
     settle,
+    smallest_share,
     take,
     watch,
 )
@@ -84,30 +88,32 @@ GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8
 LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 
 ABSENT = 1e20  # a bound of this size or more is none
-TOLERATED = 1e-10  # a violation below this share of the size of a constraint is none
-NOISE = 1e-7  # share of the size of a constraint below which a contradiction is taken for rounding
+NEGLIGIBLE = 1e-22  # share of the length of q below which x, and a violation of a bound of zero, is none
+NOISE = 1e-13  # violation that a constraint which depends on others may be left with: see ``worst_violation``
+HOPELESS = 1e-10  # violation of such a constraint that is taken for a contradiction
 SWEEPS = 4  # times that all badly violated constraints are taken at once
 SWEPT = 0.5  # those violated by more than this share of the worst
 ROUNDS = 10  # returns from the residuals to the iteration
 REFINEMENTS = 3
-FINE = 1e-11  # scaled residual at which refinement stops
+FINE = 1e-11  # residual at which refinement stops
+DOUBT = 1e-7  # times the shares that cancellation left of the pivots: the largest residual of a solution
 OLD = 1000  # changes after which a factor is computed anew
 
 
 @woven
-def read_bounds(lower, upper, norms, bounds):
+def read_bounds(lower, upper, scales, least, bounds):
     """Copies the bounds, with absent ones infinite; True if any are crossed or undefined."""
     crossed = no_lanes()
     for p in range(0, len(lower), 8):
         low, high = some_lanes(lower, p), some_lanes(upper, p)
-        size = larger(larger(lanes(norms, p), bounded(low, ABSENT, 0.0)), bounded(high, ABSENT, 0.0))
         low, high = bounded(low, ABSENT, np.inf), bounded(high, ABSENT, np.inf)
         crossed = plus(crossed, 1.0, negative(less(high, 1.0, low)))
+        floor = scaled(least, lanes(scales, p))
         put(bounds[LOWER], p, low)
         put(bounds[UPPER], p, high)
-        put(bounds[SLACK], p, scaled(TOLERATED, size))
-        put(bounds[LOW_WATCH], p, less(low, TOLERATED, size))
-        put(bounds[HIGH_WATCH], p, plus(high, TOLERATED, size))
+        put(bounds[FLOOR], p, floor)
+        put(bounds[LOW_WATCH], p, less(less(low, TOLERATED, larger(no_lanes(), low)), 1.0, floor))
+        put(bounds[HIGH_WATCH], p, plus(plus(high, TOLERATED, larger(no_lanes(), high)), 1.0, floor))
     return largest(crossed) > 0.0
 
 
@@ -178,7 +184,7 @@ def climb(
             )
             iterations += changes
             if outcome == CONTRADICTION:
-                if excess[p] * traits[SCALE, p] > NOISE * bounds[SLACK, p] / TOLERATED:
+                if excess[p] * traits[SCALE, p] > HOPELESS * max(abs(value), bounds[FLOOR, p] / NEGLIGIBLE):
                     write_ray(p, value > bounds[UPPER, p], k, bounds, members, scratch[2], mu)
                     return INFEASIBLE, k, iterations, sweeps, passed
                 mu[p], passed = before_step, True  # what it gained on the way belongs to no working set
@@ -212,9 +218,9 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
     limit, tolerance = int(settings[workspace.LIMIT]), settings[workspace.TOLERANCE]
     soft = settings[workspace.SOFT] != 0.0
     capacity = most_working(n, M, soft)
-    bounds, slots, scratch, y = vectors[:5], vectors[5:9], vectors[9:13], vectors[13, :M]
-    seen, excess, gradient, active = vectors[14], vectors[15], vectors[16], vectors[17]
-    v, slope, pulled, now, q = vectors[18], vectors[19], vectors[20], vectors[21], vectors[22]
+    bounds, slots, scratch, y = vectors[:5], vectors[5:10], vectors[10:14], vectors[14, :M]
+    seen, excess, gradient, active = vectors[15], vectors[16], vectors[17], vectors[18]
+    v, slope, pulled, now, q = vectors[19], vectors[20], vectors[21], vectors[22], vectors[23]
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     for i in range(n):
         q[i] = linear[i]
@@ -222,7 +228,10 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
         mu[p] = 0.0
     for i in range(capacity + 2):
         members[PLACE, i] = i
-    if read_bounds(lower, upper, traits[NORM], bounds):
+    least = 0.0
+    for i in range(n):
+        least = max(least, NEGLIGIBLE * abs(q[i]) * traits[SCALE, i])
+    if read_bounds(lower, upper, traits[SCALE], least, bounds):
         return MISUSE
     guessed = len(warm) > HEADER and warm[VARIABLES] == n and warm[CONSTRAINTS] == M and 0 <= warm[WORKING] <= M
     pull = q
@@ -248,7 +257,8 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
             multiply_at(rows, candidates, k, pull, n, gradient)
             for i in range(k):
                 p = candidates[i]
-                admit(i, p, names[i] > 0.0, p, traits, -gradient[i], bounds, slots, members)
+                diagonal = rows[p, p] + traits[SOFTNESS, p]
+                admit(i, p, names[i] > 0.0, p, diagonal, traits, -gradient[i], bounds, slots, members)
                 ignore(p, bounds)
         else:
             count = choose_guess(names, capacity, bounds, mu, candidates)
@@ -278,17 +288,21 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
             current, moved, passed = False, True, passed or passed_over
             if not lazy:
                 row_values(lazy, L, G, n, traits, y)
+        for i in range(k):  # bounds of variables hold exactly
+            p = abs(members[NAME, i]) - 1
+            if p < n:
+                y[p] = slots[BOUND, i]
         if not current:
             add_pull(G, n, q, mu, k, members, traits, soft, slope)
-        best = np.inf
+        best, share = np.inf, min(settings[workspace.SHARE], math.sqrt(smallest_share(k, slots, R)))
         for attempt in range(REFINEMENTS + 1):
-            worst = residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, active)
-            if worst <= FINE or attempt == REFINEMENTS or not worst < 0.5 * best:
+            worst = residuals(lazy, P, G, n, traits, mu, k, slots, members, y, slope, least, gradient, active)
+            if worst <= min(FINE, DOUBT * share) or attempt == REFINEMENTS or not worst < 0.5 * best:
                 break
             best, moved = worst, True
             refine(lazy, k, n, rows, L, G, slots, members, traits, R, mu, y, gradient, active, scratch[0], scratch[2])
             add_pull(G, n, q, mu, k, members, traits, soft, slope)
-        status = SOLVED if worst <= tolerance else NUMERICAL_TROUBLE
+        status = SOLVED if worst <= min(tolerance, DOUBT * share) else NUMERICAL_TROUBLE
         rounds += 1
         if not moved or rounds == ROUNDS or worst >= UNDEFINED:
             break
@@ -296,7 +310,7 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
         if count == 0:
             break
     unsure = passed or rounds == ROUNDS  # of the violations that are left
-    if unsure and status == SOLVED and worst_violation(y, mu, traits, bounds) > tolerance:
+    if unsure and status == SOLVED and worst_violation(n, y, mu, slope, traits, bounds, least) > NOISE:
         status = NUMERICAL_TROUBLE
     out[STATUS], out[ITERATIONS], out[WORKING] = status, iterations, k
     out[VARIABLES], out[CONSTRAINTS], out[TAG], out[AGE] = n, M, NO_TAG, age + iterations
@@ -345,8 +359,11 @@ def solve_lazy(P, q, G, lower, upper, warm, work, out):
     L, rows = matrix(rest, 0, n, padded(n)), matrix(rest, n * padded(n), len(R) + 1, n)  # nearer without gaps
     if not factorise(P, L):
         return MISUSE
-    if not measure(G, n, traits):
+    if not measure(P, G, n, traits):
         return MISUSE
+    settings[workspace.SHARE] = 1.0
+    for i in range(n):
+        settings[workspace.SHARE] = min(settings[workspace.SHARE], 1.0 / (L[i, i] * L[i, i] * P[i, i]))
     return optimise(True, P, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
 
 

@@ -5,12 +5,27 @@ and may later move y by the rows of K whose multipliers changed; lazy mode, P = 
 transposed G in Gram mode, which adds its rows faster than it multiplies those of G.
 """
 
+import math
+
 import numpy as np
 
 from gpmpc.compiled import woven
 from gpmpc.qp.factor import backward_solve, dot, forward_solve, four_dots, multiply, subtract_rows
 from gpmpc.qp.hessian import solve_lower, solve_transposed
-from gpmpc.qp.lanes import any_nonzero, combine, lanes, larger, largest, less, no_lanes, plus, put, some_lanes, total
+from gpmpc.qp.lanes import (
+    any_nonzero,
+    combine,
+    lanes,
+    larger,
+    largest,
+    less,
+    no_lanes,
+    plus,
+    product,
+    put,
+    some_lanes,
+    total,
+)
 from gpmpc.qp.working_set import (
     BOUND,
     CAP,
@@ -19,8 +34,8 @@ from gpmpc.qp.working_set import (
     LOWER,
     MOST,
     NAME,
-    NORM,
     PLACE,
+    SCALE,
     SCRATCH,
     SOFTNESS,
     UPPER,
@@ -28,6 +43,7 @@ from gpmpc.qp.working_set import (
 )
 from gpmpc.qp.workspace import padded
 
+TINY = 1e-300
 UNDEFINED = 1e300  # a residual that overflowed; less than infinity, so that refinement is tried
 
 
@@ -142,13 +158,15 @@ def follow_listed(lazy, n, v, rows, L, G, mu, k, members, traits, seen, weights,
 
 
 @woven
-def residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, active):
-    """The largest scaled residual of (x, mu), x = y[:n]: stationarity, violation of the working set, duality gap.
+def residuals(lazy, P, G, n, traits, mu, k, slots, members, y, slope, least, gradient, active):
+    """The largest residual of stationarity and of the working constraints, as a share of x = y[:n], y = C x.
 
-    ``UNDEFINED`` where a number that it is made of is not finite: comparisons alone would pass over NaN.
+    The length of x is that in the metric of P, at least ``least``, and its largest entry, so that neither the units of
+    the data nor a cost of another size hide an error of x; that of a row is also measured by its bound and its own
+    terms. ``UNDEFINED`` where a number that it is made of is not finite: comparisons alone would pass over NaN.
 
-    Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where y = C x and slope = q + C' mu. The
-    vectors gradient, slope and q are padded, the latter two with zeros.
+    Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where slope = q + C' mu. The vectors
+    gradient and slope are padded with zeros.
     """
     if lazy:
         multiply(P, n, y, n, gradient)
@@ -156,35 +174,40 @@ def residuals(lazy, P, q, n, traits, mu, k, slots, members, y, slope, gradient, 
             gradient[i] = 0.0
     else:
         combine(P, n, y, 0, n, gradient)
-    sizes, rest, undefined = no_lanes(), no_lanes(), no_lanes()
+    size = math.sqrt(max(dot(gradient, y, n), least * least))
+    lengths, entries, shifts, undefined, scales = no_lanes(), no_lanes(), no_lanes(), no_lanes(), traits[SCALE]
     for i in range(0, n, 8):
-        pull, slopes = lanes(gradient, i), lanes(slope, i)
-        sizes = larger(larger(sizes, pull), lanes(q, i))
-        pull = plus(pull, 1.0, slopes)
+        pull, scale = plus(lanes(gradient, i), 1.0, lanes(slope, i)), lanes(scales, i)
         put(gradient, i, pull)
-        rest, undefined = larger(rest, pull), plus(undefined, 0.0, pull)
-    size, stationarity, infeasibility, gap = max(1.0, largest(sizes)), largest(rest), 0.0, total(undefined)
+        length = product(pull, scale)
+        lengths, shifts = larger(lengths, length), larger(shifts, product(length, scale))
+        entries, undefined = larger(entries, some_lanes(y[:n], i)), plus(undefined, 0.0, pull)
+    worst, undefined_sum = largest(lengths) / max(size, TINY), total(undefined)
+    worst = max(worst, largest(shifts) / max(largest(entries), least, TINY))
     for i in range(k):
         p, b = abs(members[NAME, i]) - 1, slots[BOUND, i]
         active[i] = y[p] - traits[SOFTNESS, p] * mu[p] - b
-        infeasibility = max(infeasibility, abs(active[i]) / max(1.0, abs(b)))
-        gap += mu[p] * active[i]
-    gap, slope_along = abs(gap - dot(gradient, y, n)), abs(dot(q, y, n))
-    if not gap + slope_along < np.inf:
-        return UNDEFINED
-    return max(max(stationarity / size, infeasibility), gap / max(1.0, slope_along))
+        rest, length = abs(active[i]), size * scales[p]
+        undefined_sum += 0.0 * rest
+        if rest > 1e-15 * length:  # then by the row's own terms too
+            own = max(abs(b), 1e-6 * length)
+            if p >= n and rest > 1e-9 * own:
+                row = G[p - n]
+                for j in range(int(traits[END, p])):
+                    own = max(own, abs(row[j] * y[j]))
+            worst = max(worst, max(rest / length, 1e-2 * rest / own))
+    return worst if worst + undefined_sum + size < np.inf else UNDEFINED
 
 
 @woven
-def worst_violation(y, mu, traits, bounds):
-    """The largest violation, beyond what multipliers pay for, scaled as ``Residuals.primal``."""
-    worst, size = 0.0, 1.0
-    for value in y:
-        size = max(size, abs(value))
+def worst_violation(n, y, mu, slope, traits, bounds, least):
+    """The largest violation beyond what multipliers pay for, as a share of its bound or, a hundredth, of x."""
+    worst, size = 0.0, math.sqrt(max(abs(dot(slope, y, n)), least * least))
     for p in range(len(y)):
         if abs(mu[p]) < traits[CAP, p]:
-            outside = max(y[p] - bounds[UPPER, p], bounds[LOWER, p] - y[p])
-            worst = max(worst, (outside - traits[SOFTNESS, p] * abs(mu[p])) / max(size, traits[NORM, p]))
+            above, below, paid = y[p] - bounds[UPPER, p], bounds[LOWER, p] - y[p], traits[SOFTNESS, p] * abs(mu[p])
+            bound = bounds[UPPER if above > below else LOWER, p]
+            worst = max(worst, (max(above, below) - paid) / max(0.01 * size * traits[SCALE, p], abs(bound)))
     return worst
 
 

@@ -16,18 +16,20 @@ Array = NDArray[np.float64]
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen in each solve
-def gram_system(terms: Terms) -> tuple[Array, Array]:
-    """The array for ``gpmpc.qp.dual_kernels.solve_gram``, and the traits (5, M) of ``gpmpc.qp.working_set``."""
+def gram_system(terms: Terms) -> tuple[Array, Array, float]:
+    """The array for ``gpmpc.qp.dual_kernels.solve_gram``, the traits (4, M) of ``gpmpc.qp.working_set``,
+    and the smallest pivot of P's factor as a share of P_ii."""
     P, G, softness = terms
     C = np.vstack([np.eye(len(P)), G])
-    responses = cho_solve(cho_factor(P, lower=True), C.T)  # P^-1 C'
+    factor = cho_factor(P, lower=True)
+    responses = cho_solve(factor, C.T)  # P^-1 C'
     K = C @ responses
     K = 0.5 * (K + K.T)
     diagonal = np.diagonal(K)
     scales = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     ends = ((C != 0) * np.arange(1, len(P) + 1)).max(axis=1)
     ends[len(P) :] = np.maximum.accumulate(ends[len(P) :])  # so that the last of several rows has the largest
-    traits = np.vstack([np.linalg.norm(C, axis=1), scales, softness, ends])
+    traits = np.vstack([scales, softness, ends])
     n = len(P)
     blocks = K, K[:n, :n], P, G.T, G
     system = aligned(1, sum(len(block) * padded(block.shape[1]) for block in blocks))[0]
@@ -37,6 +39,6 @@ def gram_system(terms: Terms) -> tuple[Array, Array]:
         end = start + rows * padded(columns)
         system[start:end].reshape(rows, padded(columns))[:, :columns] = block
         start = end
-    if not (np.isfinite(K).all() and np.isfinite(traits[0]).all()):
+    if not np.isfinite(K).all():
         system[:] = np.nan  # else a row of infinite norm would count as kept: every solve is to fail, and to be rescued
-    return system, traits
+    return system, traits, float((np.diagonal(factor[0]) ** 2 / np.diagonal(P)).min())

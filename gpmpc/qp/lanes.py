@@ -140,6 +140,12 @@ def plus_product(typing_context, values, ones, others):
     return LANES(LANES, LANES, LANES), generate
 
 
+@woven
+def product(values, others):
+    """``values others``, entry by entry."""
+    return plus_product(no_lanes(), values, others)
+
+
 @intrinsic
 def bounded(typing_context, values, limit, beyond):
     """The entries below ``limit`` in size; ``beyond``, with the entry's sign, in place of the others. NaN stays."""

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import record as layout
+from gpmpc.qp.farkas import zero_row_size
 from gpmpc.qp.problem import ABSENT, QuadraticProgram
 from gpmpc.status import Status
 
@@ -29,13 +30,17 @@ class Terms(NamedTuple):
 class Residuals(NamedTuple):
     """How far a point is from the conditions of optimality; all three are zero at the minimiser.
 
+    Each is relative to the numbers that it is a sum of, so that neither units nor data of another size hide it. Where
+    these cancel, zero is what is small beside x, or very small beside the free minimiser's size, in the metric of P's
+    diagonal (1e-6 and 1e-12 of them).
+
     Attributes:
-        primal: The largest violation of a hard constraint, or of a soft one beyond what its multiplier pays for;
-            scaled by max(1, |x|, |Gx|, |g|) (largest entries), g its own row: round-off of a value grows with it.
-        dual: The largest entry of P x + q + G'z + z_box, or multiplier of an absent bound or beyond its weight; scaled
-            by max(1, |Px|, |q|, |G'z|) (largest entries).
-        gap: |primal - dual objective|, what ``primal`` counts as violated left out,
-            scaled by max(1, |x'Px|, |q'x|, |sum of multipliers times bounds|).
+        primal: The largest violation of a hard constraint, or of a soft one beyond what its multiplier pays for; relative
+            to the violated bound or the constraint's own terms |c|'|x|.
+        dual: The largest entry of P x + q + G'z + z_box, multipliers of absent bounds or beyond their weights counted as
+            wrong; relative to the entry's own terms.
+        gap: |primal - dual objective|, what ``primal`` counts as violated left out; relative to x'Px, |q'x|, or the sum of
+            |multiplier times bound|.
     """
 
     primal: float
@@ -117,23 +122,33 @@ class QPSolution(NamedTuple):
         P, G, (softness, caps) = self.terms
         x, q, multipliers = self.x, self.q, self.multipliers
         sizes, up, down = np.abs(multipliers), multipliers > 0, multipliers < 0
-        rows, slope, pull = G @ x, P @ x, G.T @ self.z
+        rows, slope, n = G @ x, P @ x, len(x)
+        units = np.sqrt(np.diagonal(P))
+        free = (np.abs(q) / units).max()
+        zero = max(1e-6 * (units * np.abs(x)).max(), 1e-12 * free)
 
         violation = self._violation(rows)
         beyond = np.maximum(0.0, violation - np.where(sizes >= caps, np.inf, softness * sizes))
-        own = np.concatenate([np.ones(len(x)), np.abs(G).max(axis=1, initial=0.0)])
-        primal = (beyond / np.maximum(max(1.0, _size(x), _size(rows)), own)).max()
+        bound = np.abs(np.where(np.concatenate([x, rows]) > self.upper, self.upper, self.lower))
+        own = np.concatenate([np.maximum(np.abs(x), zero / units), np.abs(G) @ np.maximum(np.abs(x), zero / units)])
+        own[n:][~G.any(axis=1)] = zero_row_size(self.lower, self.upper)
+        primal = _largest_ratio(beyond, np.maximum(own, bound))
 
         absent = (up & (self.upper >= ABSENT)) | (down & (self.lower <= -ABSENT))
         stray = np.where(absent, sizes, np.maximum(0.0, sizes - caps))
-        dual = max(_size(slope + q + pull + self.z_box), _size(stray)) / max(1.0, _size(slope), _size(q), _size(pull))
+        rest = np.abs(slope + q + G.T @ self.z + self.z_box) + stray[:n] + np.abs(G).T @ stray[n:]
+        paid = sizes - stray
+        own = np.abs(P) @ np.abs(x) + np.abs(q) + paid[:n] + np.abs(G).T @ paid[n:]
+        dual = _largest_ratio(rest, np.maximum(own, zero * units))
 
-        support = multipliers[up] @ self.upper[up] + multipliers[down] @ self.lower[down]
+        support = multipliers[up] * self.upper[up], multipliers[down] * self.lower[down]
         paying, capped = softness > 0.0, (sizes >= caps) & np.isfinite(caps)  # the squares of others may overflow
         soft = softness[paying] @ multipliers[paying] ** 2 + caps[capped] @ violation[capped]
         curvature, gain = x @ slope, q @ x
-        gap = abs(curvature + gain + support + soft) / max(1.0, abs(curvature), abs(gain), abs(support))
-        return Residuals(float(primal), float(dual), float(gap))
+        gap = abs(curvature + gain + sum(map(np.sum, support)) + soft)
+        own = sum(np.abs(part).sum() for part in support)
+        gap = _largest_ratio(gap, max(abs(curvature), abs(gain), own, zero * free))
+        return Residuals(primal, dual, gap)
 
     def is_optimal(self, eps: float = 1e-9) -> bool:
         """Whether the residuals, whatever the status says, are all at most ``eps``."""
@@ -151,8 +166,9 @@ class QPSolution(NamedTuple):
         return float(0.5 * np.sum(violation[soft] ** 2 / softness[soft]) + np.sum(caps[linear] * violation[linear]))
 
 
-def _size(vector: Array) -> float:
-    return float(np.abs(vector).max(initial=0.0))
+def _largest_ratio(rest: ArrayLike, own: ArrayLike) -> float:
+    """The largest of ``rest / own``, zero where both are."""
+    return float(np.max(np.divide(rest, own, out=np.zeros(np.shape(rest)), where=np.not_equal(rest, 0.0))))
 
 
 def hard_terms(problem: QuadraticProgram) -> Terms:

@@ -2,15 +2,17 @@
 
 Everything lives in a few arrays that the kernels hand around, a column per constraint or per *slot* of the working set:
 
-* ``bounds`` (5, M): the bounds, how much violation counts as none, and the band outside which ``most_violated`` reports
-  a constraint (infinitely wide for a working one).
-* ``slots`` (4, capacity + 1): the bound b that holds, the constraint's value at the unconstrained minimiser, and the
-  range of its multiplier: [0, cap] at an upper bound, [-cap, 0] at a lower one, [-cap, cap] for an equality. The cap is
-  infinite unless the row is soft with a linear weight; a constraint that leaves at its cap stays violated.
+* ``bounds`` (5, M): the bounds, how much violation of a bound of zero counts as none, and the band outside which
+  ``most_violated`` reports a constraint (infinitely wide for a working one).
+* ``slots`` (5, capacity + 1): the bound b that holds, the constraint's value at the unconstrained minimiser, the range
+  of its multiplier: [0, cap] at an upper bound, [-cap, 0] at a lower one, [-cap, cap] for an equality, and its entry of
+  the diagonal of K + softness. The cap is infinite unless the row is soft with a linear weight; a constraint that leaves
+  at its cap stays violated.
 * ``members`` (4, capacity + 2) integers: the signed number +-(p + 1) of the constraint in each slot, where its row is,
   scratch for lists of candidates, and the list of violated constraints.
-* ``traits`` (5, M): norm, what a violation is divided by in the choice of the most violated, softness 1/rho and cap
-  (``gpmpc.qp.soft_rows``), and the number of leading entries of c_p that may not be zero.
+* ``traits`` (4, M): the length of c_p in the metric of P^-1, by which violations are measured (Gram mode) or that in the
+  metric of P's diagonal (lazy mode), softness 1/rho and cap (``gpmpc.qp.soft_rows``), and the number of leading entries
+  of c_p that may not be zero.
 * ``mu`` (M): multipliers; zero outside the working set except at a cap.
 * ``R``: the Cholesky factor of K_WW + softness (``gpmpc.qp.factor``).
 
@@ -25,14 +27,15 @@ import numpy as np
 from gpmpc.compiled import woven
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, multiply_at, remove_row
 from gpmpc.qp.hessian import make_row, make_rows
-from gpmpc.qp.lanes import any_nonzero, no_lanes, plus, plus_product, some_lanes, total
+from gpmpc.qp.lanes import any_nonzero, no_lanes, plus, plus_product, product, some_lanes, total
 from gpmpc.qp.workspace import round_end
 
-LOWER, UPPER, SLACK, LOW_WATCH, HIGH_WATCH = 0, 1, 2, 3, 4  # rows of ``bounds``
-BOUND, FREE_VALUE, LEAST, MOST = 0, 1, 2, 3  # rows of ``slots``
+LOWER, UPPER, FLOOR, LOW_WATCH, HIGH_WATCH = 0, 1, 2, 3, 4  # rows of ``bounds``
+BOUND, FREE_VALUE, LEAST, MOST, DIAGONAL = 0, 1, 2, 3, 4  # rows of ``slots``
 NAME, PLACE, SCRATCH, LISTED = 0, 1, 2, 3  # rows of ``members``
-NORM, SCALE, SOFTNESS, CAP, END = 0, 1, 2, 3, 4  # rows of ``traits``
+SCALE, SOFTNESS, CAP, END = 0, 1, 2, 3  # rows of ``traits``
 
+TOLERATED = 1e-13  # a violation below this share of the bound is none, whatever the constraint's other bound is
 GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
 
 
@@ -42,12 +45,13 @@ def watch(p, mu, bounds):
 
     With mu_p = 0 it must stay within its bounds; at a cap it must stay outside the bound that it violates.
     """
-    slack = bounds[SLACK, p]
-    bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = bounds[LOWER, p] - slack, bounds[UPPER, p] + slack
+    low, high, floor = bounds[LOWER, p], bounds[UPPER, p], bounds[FLOOR, p]
+    below, above = TOLERATED * abs(low) + floor, TOLERATED * abs(high) + floor
+    bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = low - below, high + above
     if mu[p] > 0.0:
-        bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = bounds[UPPER, p] - slack, np.inf
+        bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = high - above, np.inf
     elif mu[p] < 0.0:
-        bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = -np.inf, bounds[LOWER, p] + slack
+        bounds[LOW_WATCH, p], bounds[HIGH_WATCH, p] = -np.inf, low + below
 
 
 @woven
@@ -77,11 +81,11 @@ def couple(lazy, row, k, size, rows, members, product):
 
 
 @woven
-def admit(k, p, above, place, traits, free, bounds, slots, members):
+def admit(k, p, above, place, diagonal, traits, free, bounds, slots, members):
     """Writes constraint p into slot k, at its upper bound (``above``) or its lower one."""
     members[NAME, k], members[PLACE, k] = (p + 1 if above else -(p + 1)), place
     slots[BOUND, k] = bounds[UPPER, p] if above else bounds[LOWER, p]
-    slots[FREE_VALUE, k] = free
+    slots[FREE_VALUE, k], slots[DIAGONAL, k] = free, diagonal
     cap, equality = traits[CAP, p], bounds[LOWER, p] == bounds[UPPER, p]
     slots[LEAST, k] = -cap if equality or not above else 0.0
     slots[MOST, k] = cap if equality or above else 0.0
@@ -97,7 +101,7 @@ def evict(k, slot, slots, members, R, solved, scratch):
     place = members[PLACE, slot]
     for i in range(slot, k - 1):
         members[NAME, i], members[PLACE, i] = members[NAME, i + 1], members[PLACE, i + 1]
-        for field in range(4):
+        for field in range(5):
             slots[field, i] = slots[field, i + 1]
     members[PLACE, k - 1] = place
 
@@ -153,7 +157,8 @@ def take(lazy, candidates, count, k, n, q, v, rows, L, G, traits, bounds, mu, sl
         pivot = diagonal - dot(solved, solved, k)
         if pivot > GUESSED_PIVOT * diagonal:
             members[PLACE, first + i] = members[PLACE, k]
-            admit(k, p, candidates[i] > 0, place, traits, free_value(lazy, row, v, q, n), bounds, slots, members)
+            free = free_value(lazy, row, v, q, n)
+            admit(k, p, candidates[i] > 0, place, diagonal, traits, free, bounds, slots, members)
             append_row(R, k, solved, pivot)
             k += 1
         else:
@@ -201,18 +206,29 @@ def clip_multipliers(k, mu, slots, members):
 
 
 @woven
-def measure(G, n, traits):
-    """Writes the norms, scales and ends of the rows of G; False if G is not finite."""
-    norms, scales, ends = traits[NORM, n:], traits[SCALE, n:], traits[END, n:]
+def smallest_share(k, slots, R):
+    """The smallest pivot of the factor, as a share of its diagonal entry: what cancellation left of it."""
+    share = 1.0
+    for i in range(k):
+        share = min(share, 1.0 / (R[i, i] * R[i, i] * slots[DIAGONAL, i]))
+    return share
+
+
+@woven
+def measure(P, G, n, traits):
+    """Writes the scales and ends of the constraints, lengths in the metric of P's diagonal; False if not finite."""
+    units, norms, ends = traits[SCALE, :n], traits[SCALE, n:], traits[END, n:]
+    for i in range(n):
+        units[i] = 1.0 / math.sqrt(P[i, i])
     undefined, end = 0.0, 0
     for p in range(len(G)):
         row, near, far = G[p], no_lanes(), no_lanes()
-        head, tail = row[:end], row[end:]
+        head, tail, rest = row[:end], row[end:], units[end:]
         for j in range(0, end, 8):
-            values = some_lanes(head, j)
+            values = product(some_lanes(head, j), some_lanes(units, j))
             near = plus_product(near, values, values)
         for j in range(0, n - end, 8):
-            values = some_lanes(tail, j)
+            values = product(some_lanes(tail, j), some_lanes(rest, j))
             far = plus_product(far, values, values)
         if any_nonzero(far):  # longer than the row before
             end = n
@@ -222,6 +238,6 @@ def measure(G, n, traits):
         norms[p], ends[p] = total(plus(near, 1.0, far)), end
     for p in range(len(G)):
         norm = math.sqrt(norms[p])
-        norms[p], scales[p] = norm, norm if norm > 0.0 else 1.0
+        norms[p] = norm if norm > 0.0 else 1.0
         undefined += norm * 0.0
     return undefined == 0.0

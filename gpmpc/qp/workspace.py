@@ -4,8 +4,8 @@ To ask the system for it costs as much as a small solve, so each prepared proble
 it, since a solve keeps the interpreter's lock. It is one matrix, whose rows have an entry per constraint; to slice it
 costs nothing. Its first rows stay the same from solve to solve, the others are otherwise undefined:
 
-    iteration limit, tolerance, whether rows are soft, n, M, tag
-    traits (5 rows, see ``gpmpc.qp.working_set``; lazy mode fills in norms, scales and ends of the rows of G)
+    iteration limit, tolerance, whether rows are soft, n, M, tag, smallest share of a pivot of P's factor in P_ii
+    traits (4 rows, see ``gpmpc.qp.working_set``; lazy mode fills in the scales, and the ends of the rows of G)
     vectors, members (integers), R, and in lazy mode L and rows
 """
 
@@ -19,22 +19,22 @@ from gpmpc.compiled import woven
 
 Array = NDArray[np.float64]
 
-LIMIT, TOLERANCE, SOFT, VARIABLES, CONSTRAINTS, TAG, SETTINGS = 0, 1, 2, 3, 4, 5, 6
-TRAITS, VECTORS, MEMBERS = 5, 23, 4  # rows of each
+LIMIT, TOLERANCE, SOFT, VARIABLES, CONSTRAINTS, TAG, SHARE, SETTINGS = 0, 1, 2, 3, 4, 5, 6, 7
+TRAITS, VECTORS, MEMBERS = 4, 24, 4  # rows of each
 END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
 
 
 def gram_workspace(settings: Array, traits: Array) -> Array:
-    """Memory for solves in Gram mode with these settings (6,) and traits (5, M)."""
+    """Memory for solves in Gram mode with these settings (7,) and traits (4, M)."""
     return _workspace(settings, traits, 0)
 
 
 def lazy_workspace(settings: Array, softness: Array) -> Array:
-    """Memory for solves in lazy mode with these settings (6,) and softness (2, M)."""
+    """Memory for solves in lazy mode with these settings (7,) and softness (2, M)."""
     n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
     box = np.arange(M) < n
     ends = np.minimum(n, (np.arange(M) // END_STEP + 1) * END_STEP)
-    traits = np.vstack([box, box, softness, box * ends])
+    traits = np.vstack([box, softness, box * ends])
     return _workspace(settings, traits, n * (padded(n) + most_working(n, M, bool(settings[SOFT])) + 2))
 
 
