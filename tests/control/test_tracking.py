@@ -60,3 +60,38 @@ def test_kappa_is_the_quantile_of_the_confidence_unless_given():
     assert StateBounds([0.0], [1.0], 0.95, kappa=2.0).kappa == 2.0
     assert not StateBounds([0.0], [math.inf]).soft
     assert StateBounds([0.0], [math.inf], l2=1.0).soft
+
+
+@pytest.mark.parametrize(
+    ("bounds", "limited"),
+    [
+        ({}, False),
+        ({"rate_lower": [-1.0, -1.0], "rate_upper": [1.0, 1.0]}, True),
+        ({"rate_lower": [-math.inf, -1.0]}, True),
+        ({"rate_upper": [2.0, math.inf]}, True),
+        ({"rate_lower": [-math.inf] * 2, "rate_upper": [math.inf] * 2}, False),
+        ({"input_lower": [-1.0, -1.0]}, False),
+    ],
+)
+def test_one_bound_on_one_increment_is_a_rate_limit(bounds, limited):
+    assert TrackingProblem([1.0], [1.0, 1.0], **bounds).rate_limited is limited
+
+
+def test_without_bounds_everything_is_free_and_bounds_may_touch():
+    free = TrackingProblem([1.0], [1.0, 1.0])
+    for key, value in (("input_lower", -math.inf), ("input_upper", math.inf), ("rate_lower", -math.inf)):
+        assert np.array_equal(getattr(free, key), [value, value])
+    assert np.array_equal(free.rate_upper, [math.inf, math.inf])
+    assert TrackingProblem([1.0], [1.0], input_lower=[0.3], input_upper=[0.3]).input_lower[0] == 0.3
+    assert StateBounds([0.3], [0.3]).upper[0] == 0.3
+
+
+@pytest.mark.parametrize("skew", [1e-13, 1e-6])
+def test_a_weight_may_be_skew_by_round_off_and_no_more(skew):
+    for scale in (1e-6, 1.0, 1e6):
+        weight = scale * np.array([[1.0, 0.5], [0.5 * (1 + skew), 1.0]])
+        if skew < 1e-12:
+            assert TrackingProblem(weight, [1.0]).state_dim == 2
+        else:
+            with pytest.raises(SettingError, match="Q: must be symmetric"):
+                TrackingProblem(weight, [1.0])

@@ -282,3 +282,32 @@ def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row
     (record,) = experiment.run(FitStore(tmp_path / "fits.jsonl"), experiment.fits(), lambda record: None)
     for name, printed in paper_figures()["elliptical", "rotational", 189].items():
         assert record[name] == pytest.approx(float(printed), rel=1e-3)
+
+
+@pytest.mark.parametrize("subsystem", SUBSYSTEMS)
+def test_the_measures_of_a_fit_are_those_of_its_predictions_in_the_units_of_the_data(finished, subsystem):
+    """Worked out anew from the posterior of all rows, by torch's own normal distribution."""
+    experiment, _, records = finished
+    full = next(r for r in records if (r["subsystem"], r["size"]) == (subsystem, 25))
+    cell = next(fit.cell for fit in experiment.fits() if fit.cell.subsystem == subsystem)
+    gp = train(cell.data, seed=full["seed"], penalty=SoftLimits(), restarts=0).posterior
+    plain = gp.predict(cell.data.states, cell.data.inputs)
+    raw, factor = Wave().transitions("hover", Hover(), subsystem).next_states, cell.scaling.factor
+    predicted = torch.distributions.Normal(
+        cell.scaling.restore(plain.mean), (plain.variance + gp.noise_variance).sqrt() * factor
+    )
+    assert full["plain_test_mse"] == pytest.approx(float((predicted.mean - raw).square().sum(1).mean()), rel=1e-5)
+    assert full["plain_training_mse"] == full["plain_test_mse"]
+    assert full["nlpd"] == pytest.approx(-float(predicted.log_prob(raw).mean()), abs=1e-5)
+    inside = (predicted.cdf(raw) - 0.5).abs() <= 0.475
+    assert full["coverage_95"] == pytest.approx(float(inside.double().mean()))
+    means, fed, projected = predict_all(gp, cell.data, 0.1)
+    errors = cell.scaling.restore(means) - raw
+    assert full["test_mse"] == pytest.approx(float(errors.square().sum(1).mean()), rel=1e-5)
+    assert full["average_variance"] == pytest.approx(float(fed[:, [0, 2, 4]].mean()), rel=1e-5)
+    assert full["largest_projection"] == pytest.approx(projected, abs=1e-12)
+    small = [r for r in records if (r["subsystem"], r["size"]) == (subsystem, 5)]
+    for record in small:  # 5 rows of 25 are not held out; of 6 states each
+        inside, held_out = 150 * record["coverage_95"], 120 * record["held_out_coverage_95"]
+        assert held_out == pytest.approx(round(held_out))
+        assert -1e-9 <= inside - held_out <= 30 + 1e-9

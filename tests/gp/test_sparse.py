@@ -214,21 +214,6 @@ def test_the_bound_itself_refuses_a_method_that_it_does_not_know():
             bound(z, z, z[:, :1], torch.ones_like(z), one, one, "foo")
 
 
-@pytest.mark.parametrize(("inducing", "bend"), [(3, lambda x: x**3 / 4), (5, lambda x: torch.sin(3 * x))])
-def test_training_on_a_mirrored_feature_is_the_mirrored_training(inducing, bend):
-    """Points may leave the data by a tenth of its range, on either side alike."""
-    generator = torch.Generator().manual_seed(0)
-    x = 4 * torch.rand(120, 1, generator=generator) - 2
-    y = bend(x) + 0.1 * torch.randn(x.shape, generator=generator)
-    trained, mirrored = (SparseTrainer(inducing, iterations=60).fit(side * x, y, 0, "value") for side in (1.0, -1.0))
-    assert mirrored.objective == pytest.approx(trained.objective, abs=1e-3)
-    ours, theirs = (training.posterior.features[:, 0].sort().values for training in (trained, mirrored))
-    assert torch.allclose(ours, -theirs.flip(0), atol=1e-2)
-    margin = 0.1 * (x.max() - x.min())
-    assert x.min() - margin - 1e-9 <= ours.min()
-    assert ours.max() <= x.max() + margin + 1e-9
-
-
 def sines(rows, d, noise, seed):
     generator = torch.Generator().manual_seed(seed)
     x = 4 * torch.rand(rows, d, generator=generator) - 2

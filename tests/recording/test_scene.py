@@ -14,13 +14,19 @@ from gpmpc.status import Status
 H = 3
 
 
+def spreads(n, rng):
+    """Covariances (H + 1, n, n): of variances 0.01 for few states, of any directions for many."""
+    roots = 0.1 * (np.tile(np.eye(n), (H + 1, 1, 1)) if n < 6 else rng.normal(size=(H + 1, n, n)))
+    return roots @ roots.mT
+
+
 def record(path, states, outcomes, rng, **settings):
     """A step a second, of the statuses and of whether they count as failed; the steps."""
     n, steps = len(states), []
     with McapRecorder(path, states, ("u",), time_step=1.0, **settings) as recorder:
         for k, (status, failed) in enumerate(outcomes):
             decision = Decision(
-                np.zeros(1), np.zeros((H, 1)), rng.uniform(-3, 3, (H + 1, n)), np.tile(0.01 * np.eye(n), (H + 1, 1, 1)),
+                np.zeros(1), np.zeros((H, 1)), rng.uniform(-3, 3, (H + 1, n)), spreads(n, rng),
                 status, 1, Timing(0.0, 0.0, 0.0),
             )  # fmt: skip
             reference, state = rng.uniform(-3, 3, (2, n))
@@ -83,6 +89,17 @@ def test_the_line_of_the_plan_passes_the_predicted_positions(flown):
         np.testing.assert_allclose([place(point) for point in line.points], step.decision.means[:, [0, 2, 4]])
 
 
+def test_the_tube_has_an_ellipsoid_of_two_standard_deviations_at_every_stage(flown):
+    path, steps = flown
+    for message, step in zip(decoded(path, "/plan/tube"), steps, strict=True):
+        spheres = message.entities[0].spheres
+        np.testing.assert_allclose([place(s.pose.position) for s in spheres], step.decision.means[:, [0, 2, 4]])
+        for sphere, covariance in zip(spheres, step.decision.covariances, strict=True):
+            directions, radii = turn(sphere.pose.orientation), np.array(place(sphere.size)) / 2
+            covariance = covariance[np.ix_([0, 2, 4], [0, 2, 4])]
+            np.testing.assert_allclose(directions @ np.diag(radii**2) @ directions.T, 4 * covariance, atol=1e-12)
+
+
 def test_the_frames_lead_from_the_display_to_the_vehicle(flown):
     path, steps = flown
     for message, step in zip(decoded(path, "/tf"), steps, strict=True):
@@ -115,6 +132,7 @@ def test_an_axis_that_no_state_names_is_zero_and_an_attitude_that_is_not_whole_i
     for message in decoded(path, "/tf/display"):
         np.testing.assert_array_equal(turn(message.rotation), np.eye(3))
     for message in decoded(path, "/plan/tube"):
+        assert len(message.entities[0].spheres) == H + 1
         for sphere in message.entities[0].spheres:  # 0.01 in x and z, nothing in y
             assert sorted(place(sphere.size)) == pytest.approx([0, 0.4, 0.4])
             along = turn(sphere.pose.orientation) @ np.diag(place(sphere.size)) @ turn(sphere.pose.orientation).T

@@ -1,0 +1,26 @@
+"""A measure that is zero in every run takes no column where there is little room, and one where it is not."""
+
+import pytest
+
+from gpmpc.experiments.report import report
+from gpmpc.experiments.report_documents import documents, render
+from tests.experiments.made_up import made_up_run, metrics_of
+
+SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
+
+
+@pytest.mark.parametrize("failing", [0, 2])
+def test_failed_solves_have_a_column_if_any_run_has_some(failing, tmp_path):
+    for seed in range(4):
+        for controller in ("convex", "lqr"):
+            settings = SETTINGS | {"seed": seed, "options": {"controller": controller}}
+            some = failing if (controller, seed) == ("lqr", 3) else 0
+            choices = [f"controller={controller}", f"seed={seed}"]
+            made_up_run(tmp_path, choices, settings, result=metrics_of(0.1, failing=some))
+    found = report(tmp_path)
+    header = " ".join(str(column.header) for column in render(found).columns)
+    for words in (header, documents(found)["report.tex"]):
+        assert ("failed" in words) == bool(failing)
+        assert "RMSE" in words
+        assert "outside" not in words
+    assert "outside" in documents(found)["report.csv"]  # which has room for everything
