@@ -3,9 +3,10 @@
 What stands here is there before any library: Ctrl-C ends the command with one line from its first moment on.
 """
 
-import _thread
+import os
 import signal
 import sys
+import threading
 from contextlib import suppress
 from types import FrameType
 
@@ -19,9 +20,9 @@ def main() -> None:
         raise KeyboardInterrupt
 
     def interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
-        """Raises once more what came inside a finaliser, where Python would print a traceback and go on."""
+        """Interrupts once more what was interrupted inside a finaliser: Python would print a traceback and go on."""
         if issubclass(lost.exc_type, KeyboardInterrupt):
-            _thread.interrupt_main()
+            threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
         else:
             sys.__unraisablehook__(lost)
 

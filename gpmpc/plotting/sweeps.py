@@ -83,7 +83,7 @@ def _draw(axis: Axes, lines: Sequence[Series], count: int, linestyle: str) -> No
         places, quartiles = np.array([p for p, _ in known]), np.array([q for _, q in known])
         low, middle, high = quartiles.T
         style = {"color": colour, "marker": "o", "markersize": 4, "linestyle": linestyle}
-        axis.errorbar(places, middle, [middle - low, high - middle], label=line.label, **style)
+        axis.errorbar(places, middle, np.array([middle - low, high - middle]), label=line.label, **style)
         for p, group in enumerate(line.values):
             aside = [0.25 * width * ((7 * j) % 11 / 5 - 1) for j in range(len(group))]
             axis.plot([p + offset + a for a in aside], group, ".", color=colour, alpha=0.45, markersize=5, mew=0)

@@ -11,6 +11,7 @@ from gpmpc.plants import Integrated, Translational
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
 
+SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
 PLANT = Integrated(Translational(), time_step=1.0, substeps=1)
 
 
@@ -50,3 +51,12 @@ def made_up_run(tree, choices, settings, result=None, error=None):
 def plan(tree, runs):
     tree.mkdir(parents=True, exist_ok=True)
     (tree / f"{PLAN}0.json").write_text(json.dumps({"runs": runs}))
+
+
+def chosen(controller, seed, **more):
+    settings = SETTINGS | {"seed": seed, "options": {"controller": controller}}
+    return sorted([f"controller={controller}", f"seed={seed}", *(f"{k}={v}" for k, v in more.items())]), settings
+
+
+def add(tree, controller, seed, error, **how):
+    made_up_run(tree, *chosen(controller, seed), result=metrics_of(error, **how))

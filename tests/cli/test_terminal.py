@@ -1,0 +1,242 @@
+"""What surrounds a command: pipes, full disks, folders that are gone, Ctrl-C, TAB, and where help is looked for."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gpmpc.cli.streams import Output
+from tests.cli.command import PATH, SECONDS, forked
+
+TINY = ["data.samples=25", "model.restarts=0", "steps=2", "horizon=1", "recorder=none"]
+
+
+def shell(line, cwd, **environment):
+    """A line of the shell, in which $GPMPC is the command."""
+    return subprocess.run(
+        ["bash", "-o", "pipefail", "-c", line], cwd=cwd, capture_output=True, timeout=SECONDS, check=False,
+        encoding="utf-8", errors="replace", env=os.environ | {"GPMPC": PATH} | environment,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("command", ["--help", "run --info searchpath", "log --help"])
+def test_a_standard_output_that_takes_nothing_ends_the_command_in_one_line(command, tmp_path):
+    full = shell(f"$GPMPC {command} > /dev/full", tmp_path)
+    assert (full.returncode, full.stderr) == (
+        1,
+        "gpmpc: cannot write to the standard output: No space left on device\n",
+    )
+    pipe = shell(f"$GPMPC {command} | true", tmp_path)
+    assert (pipe.returncode, pipe.stderr) in ((1, ""), (0, ""))  # all may have been written before true ended
+
+
+def test_closed_streams_and_those_of_other_letters_do_no_harm(tmp_path):
+    assert shell("$GPMPC run --cfg job >&-", tmp_path).returncode == 0
+    assert shell("$GPMPC run nope=1 2>&-", tmp_path).returncode == 2
+    for code in ("ascii", "latin-1", "utf-8"):
+        done = shell("$GPMPC report $'n\\xc3\\xb6\\xe2\\x82\\xac\\xff'", tmp_path, PYTHONIOENCODING=code)
+        assert (done.returncode, done.stderr.count("\n"), "no such folder" in done.stderr) == (2, 1, True)
+
+
+def test_what_cannot_be_written_is_no_error_that_a_command_could_take_for_one_of_a_file():
+    with open("/dev/full", "w") as full:
+        output = Output(full)
+        output.write("text")
+        with pytest.raises(SystemExit):
+            output.flush()
+        assert output.broken
+        output.flush()  # what is left goes nowhere, and nothing is raised twice
+
+
+@pytest.mark.parametrize("command", ["run", "run -m seed=1,2", "report here"])
+def test_a_working_folder_that_is_gone_is_one_line(command, tmp_path):
+    done = shell(f"mkdir gone; cd gone; rmdir ../gone; exec $GPMPC {command} 2>&1 >/dev/null", tmp_path)
+    assert done.returncode == 2
+    assert done.stdout.count("\n") == 1
+    assert "gone" in done.stdout or "here: no such folder" in done.stdout
+
+
+INTERRUPT = "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(5)"
+BREAKS = {
+    "at once": INTERRUPT,
+    "inside a library that makes an error of its own of it": f"""
+try:
+    {INTERRUPT}
+except KeyboardInterrupt:
+    raise ImportError("multiarray failed to import")
+""",
+    "inside a finaliser": f"""
+class Library:
+    def __del__(self):
+        {INTERRUPT}
+Library()
+import time
+time.sleep(5)
+""",
+}
+
+
+@pytest.mark.parametrize("broken", BREAKS)
+@pytest.mark.parametrize(
+    ("command", "library"), [("run", "hydra"), ("plot nothing", "matplotlib"), ("report nothing", "rich")]
+)
+def test_ctrl_c_while_libraries_are_imported_is_one_line(command, library, broken, tmp_path):
+    (tmp_path / f"{library}.py").write_text(BREAKS[broken])
+    done = shell(f"exec $GPMPC {command}", tmp_path, PYTHONPATH=str(tmp_path))
+    assert (done.returncode, done.stderr) == (130, "\ninterrupted\n")
+
+
+def test_who_ignores_ctrl_c_is_not_interrupted(tmp_path):
+    (tmp_path / "rich.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGINT); os._exit(7)")
+    done = shell("trap '' INT; $GPMPC report nothing", tmp_path, PYTHONPATH=str(tmp_path))
+    assert done.returncode == 7
+
+
+@pytest.mark.parametrize("command", ["run", "report"])
+def test_help_is_found_before_and_behind_a_command(command, tmp_path):
+    answers = [forked(*words, cwd=tmp_path) for words in (["help", command], [command, "--help"])]
+    assert {(each.returncode, each.stdout, each.stderr) for each in answers} == {(0, answers[0].stdout, "")}
+    assert f"gpmpc {command}" in answers[0].stdout
+
+
+def test_the_version_is_that_of_gpmpc_wherever_it_is_asked_for(tmp_path):
+    versions = {forked(*words, cwd=tmp_path).stdout for words in (["--version"], ["run", "--version"], ["plot", "-V"])}
+    assert len(versions) == 1
+    assert not any("Hydra" in version for version in versions)
+
+
+def test_help_and_tab_list_only_choices_that_the_command_has(tmp_path):
+    for command, has, lacks in (("run", "controller", "study"), ("figures", "study", "launcher")):
+        listed = forked(command, "--help", cwd=tmp_path).stdout.partition("Choices:")[2].partition("Every setting")[0]
+        assert f"\n{has}: " in listed
+        assert f"\n{lacks}: " not in listed
+        offered = forked("-sc", "query=bash", cwd=tmp_path, COMP_LINE=f"gpmpc {command} ").stdout.split()
+        assert f"{has}=" in offered
+        assert f"{lacks}=" not in offered
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("gpmpc ", {"run", "tables", "figures", "bench", "report", "plot", "log"}),
+        ("gpmpc run trajectory=l", {"trajectory=lorenz"}),
+        ("gpmpc run -m steps=3 controller=c", {"controller=convex"}),
+        ("gpmpc figures study=h", {"study=horizon"}),
+        ("gpmpc run 'seed=range(", set()),
+        ("gpmpc run --nonsense x", set()),
+        ("gpmpc plot ", set()),
+        ("", {"run"}),
+    ],
+)
+def test_tab_completes_commands_and_settings_and_never_complains(line, offered, tmp_path):
+    done = forked("-sc", "query=bash", cwd=tmp_path, COMP_LINE=line)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert offered <= set(done.stdout.split())
+    assert offered or not done.stdout.strip()
+
+
+def test_bash_completes_at_tab(tmp_path):
+    ask = (
+        'eval "$($GPMPC -sc install=bash)"; COMP_LINE="gpmpc run trajectory=l"; COMP_POINT=${#COMP_LINE}; COMP_CWORD=2'
+    )
+    path = os.pathsep.join([os.path.dirname(PATH), os.environ["PATH"]])
+    done = shell(f'{ask}; hydra_bash_completion; echo "${{COMPREPLY[@]}}"', tmp_path, PATH=path)
+    assert (done.stdout.strip(), done.stderr) == ("trajectory=lorenz", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-sc"], "-sc: takes one of install=SHELL, uninstall=SHELL and query=SHELL"),
+        (["-sc", "install=nosh"], "No completion plugin for 'nosh'"),
+        (["help", "rnu"], "unknown command 'rnu' (did you mean 'run'?)"),
+        (["tables", "-m", "draws=1,2"], "-m: only gpmpc run sweeps"),
+        (["run", "--experimental-rerun", "x"], "unknown option '--experimental-rerun'"),
+        (["run", "-m", "--config-dir", "nowhere"], "--config-dir: nowhere: no such folder"),
+        (["run", "-m", "--config-name", "nothing"], "Cannot find primary config 'nothing'"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_mistake_is_one_clear_line(arguments, message, tmp_path):
+    done = forked(*arguments, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert message in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("sweep", [[], ["-m"]], ids=["one run", "sweep"])
+def test_settings_and_classes_of_the_users_own_folder_are_found(sweep, tmp_path):
+    (tmp_path / "own" / "controller").mkdir(parents=True)
+    (tmp_path / "own" / "controller" / "mine.yaml").write_text("defaults: [convex]\ntolerance: 0.5\n")
+    (tmp_path / "own" / "ours.yaml").write_text("defaults: [run, _self_]\nseed: 5\n")
+    (tmp_path / "vehicle.py").write_text("from gpmpc.plants import Translational\nclass Mine(Translational): pass\n")
+    found = ["--config-dir", "own", "--config-name", "ours", "controller=mine", "plant.dynamics._target_=vehicle.Mine"]
+    done = forked("run", *sweep, *found, *TINY, "folder=tree", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (path,) = (tmp_path / "tree").glob("*/config.yaml")
+    for text in ("tolerance: 0.5", "seed: 5", "vehicle.Mine"):
+        assert text in path.read_text()
+
+
+POOL = """
+import os, sys, time
+from gpmpc.parallel import in_processes
+def job(name):
+    open(name, "w").close()
+    time.sleep(120)
+if __name__ == "__main__":
+    list(in_processes(job, ["a", "b", "c"], 2))
+"""
+
+
+@pytest.mark.parametrize("ended_by", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
+def test_workers_end_with_a_parent_that_is_killed_and_let_its_pipe_go(ended_by, tmp_path):
+    (tmp_path / "pool.py").write_text(POOL)
+    _kill_and_wait_for_the_pipe([sys.executable, "pool.py"], tmp_path, "b", ended_by)
+
+
+def test_a_killed_joblib_sweep_leaves_no_worker(tmp_path):
+    command = [PATH, "run", "-m", *TINY, "steps=1000000", "seed=1,2", "launcher=joblib", "hydra.launcher.n_jobs=2"]
+    _kill_and_wait_for_the_pipe([*command, "folder=tree"], tmp_path, "tree/*/config.yaml", signal.SIGKILL)
+
+
+def _kill_and_wait_for_the_pipe(command, cwd, begun, ended_by):
+    path = os.pathsep.join(filter(None, sys.path))
+    parent = subprocess.Popen(
+        command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+        env=os.environ | {"PYTHONPATH": path},
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + SECONDS
+        while not list(cwd.glob(begun)) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert parent.poll() is None
+        parent.send_signal(ended_by)
+        killed = time.monotonic()
+        parent.stdout.read()  # ends when the last process that holds it has ended
+        assert time.monotonic() - killed < 20
+    finally:
+        os.killpg(parent.pid, signal.SIGKILL)
+        parent.wait()
+        parent.stdout.close()
+
+
+def test_ctrl_c_in_a_terminal_reaches_no_worker_while_it_starts(tmp_path):
+    """Workers that are still importing would print their tracebacks between the lines of the parent."""
+    (tmp_path / "pool.py").write_text(POOL.replace("import os", "import time; time.sleep(0.5)\nimport os", 1))
+    parent = subprocess.Popen(
+        [sys.executable, "pool.py"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}, start_new_session=True,
+    )  # fmt: skip
+    children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")
+    deadline = time.monotonic() + SECONDS
+    while len(children.read_text().split()) < 3 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(parent.pid, signal.SIGINT)
+    told, _ = parent.communicate(timeout=SECONDS)
+    assert told.count("Traceback") == 1  # of the script itself, which is no command of ours
+    assert told.strip().endswith("KeyboardInterrupt")
