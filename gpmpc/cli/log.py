@@ -48,22 +48,26 @@ def _info(given: argparse.Namespace) -> None:
     from gpmpc.recording.reader import RECOVERED
 
     run, console = read_run(given.file), Console()
+
+    def plain(text: str) -> str:  # nothing that a terminal, or rich, would obey
+        return escape("".join(sign if sign.isprintable() or sign == "\n" else "\ufffd" for sign in text))
+
     hint = "" if RECOVERED in run.metadata else " (gpmpc log recover makes it readable for other tools)"
     state = "finished" if run.finished else f"{CUT}{hint}"
     console.print(f"{given.file}: {state}", soft_wrap=True, highlight=False, markup=False)
     channels = Table("topic", "schema", "messages")
     for topic, (count, schema) in run.channels.items():
-        channels.add_row(escape(topic), escape(schema), str(count))
+        channels.add_row(plain(topic), plain(schema), str(count))
     console.print(channels)
     facts = Table(show_header=False)
     for name, value in _facts(run).items():
-        facts.add_row(name, escape(value))
+        facts.add_row(name, plain(value))
     console.print(facts)
     metadata = Table("metadata", "key", "value")
     for name, pairs in run.metadata.items():
         if name != "units":
             for key, value in pairs.items():
-                metadata.add_row(*map(escape, (name, key, value)))
+                metadata.add_row(*map(plain, (name, key, value)))
     console.print(metadata)
 
 

@@ -140,6 +140,14 @@ def test_what_is_no_recording_is_refused_in_one_line_that_names_it(folder, tmp_p
     assert result.stderr.count("\n") == 1
 
 
+def test_info_prints_nothing_that_a_terminal_would_obey(tmp_path):
+    runs.record_run(tmp_path / "run.mcap", steps=1, metadata={"note": "\x1b[31m\x07\x1b]0;title"})
+    result = gpmpc_log("info", "run.mcap", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "]0;title" in result.stdout
+    assert not {"\x1b", "\x07"} & set(result.stdout)
+
+
 MISTAKES = [
     (["info", "missing.mcap"], "missing.mcap: cannot be read: No such file or directory"),
     (["info", "notes.mcap"], "notes.mcap: is not an MCAP file"),
