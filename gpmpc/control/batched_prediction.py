@@ -74,7 +74,8 @@ def _along(
     covariances: Array,
 ) -> list[Prediction]:
     """``Predictor.along`` for the shifted plans of all requests."""
-    lower, upper = (_tensor(predictor, side) for side in (predictor.problem.input_lower, predictor.problem.input_upper))
+    sides = ("input_lower", "input_upper", "rate_lower", "rate_upper")
+    lower, upper, *rates = (_tensor(predictor, getattr(predictor.problem, side)) for side in sides)
     plan = list(_tensor(predictor, np.stack([request.shifted for request in requests])).unbind(1))
     follow, gain = None, None
     if predictor.feedback:
@@ -85,6 +86,7 @@ def _along(
     for k, input in enumerate(plan):
         if gain is not None:
             moved = input + (gain @ (belief.mean - follow[:, k])[..., None])[..., 0]
+            moved = moved.clamp(plan[k - 1] + rates[0], plan[k - 1] + rates[1])
             plan[k] = input = moved.clamp(lower, upper)
         stage = _stage(predictor, belief, input, disturbances)
         if predictor.feedback and gain is None:

@@ -21,7 +21,7 @@ Array = np.ndarray
 NOTHING = np.empty((0, 0))
 NO_MODEL = (  # in the place of what is known of one
     *(False, False, (NOTHING, NOTHING, NOTHING[0:0].ravel(), NOTHING), NOTHING[None], (NOTHING.ravel(), False)),
-    *((NOTHING, NOTHING, NOTHING), (NOTHING.ravel(), NOTHING.ravel()), NOTHING),
+    *((NOTHING, NOTHING, NOTHING), (NOTHING.ravel(),) * 4, NOTHING),
 )
 
 
@@ -66,7 +66,7 @@ class CompiledRollout:
             packed.columns if uncertain else NOTHING[None],
             (model.offset.numpy(), model.predicts == "difference"),
             (problem.Q, problem.R, problem.terminal),
-            (problem.input_lower, problem.input_upper),
+            (problem.input_lower, problem.input_upper, problem.rate_lower, problem.rate_upper),
             noise,
         )
 
@@ -96,7 +96,7 @@ def roll_out(known, start, covariance, disturbance, follow, out):
     points, _, log_signal, _ = gp
     offset, adds_state = outer
     Q, R, terminal = weights
-    lower, upper = limits
+    lower, upper, rate_lower, rate_upper = limits
     A, B, c, covariances, plan = out
     (H, m), n, padded = plan.shape, len(start), points.shape[1]
     memory = aligned_rows(2 * len(points) + 2, padded)
@@ -109,6 +109,7 @@ def roll_out(known, start, covariance, disturbance, follow, out):
             for j in range(m):
                 for i in range(n):
                     u[j] += K[j, i] * (x[i] - follow[k, i])
+                u[j] = min(max(u[j], plan[k - 1, j] + rate_lower[j]), plan[k - 1, j] + rate_upper[j])
                 u[j] = min(max(u[j], lower[j]), upper[j])
         expand_at(gp, x, u, memory, kept, k if uncertain else 0, M, A[k], B[k])
         for i in range(n):

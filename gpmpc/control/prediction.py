@@ -207,7 +207,7 @@ class Predictor:
             request: Where it starts.
             inputs: The plan (H, m).
             follow: Means (H, n) that the rollout is to follow by the ancillary feedback, which changes the plan within
-                its bounds: u_k + K (mu_k - follow_k) for k = 1 .. H-1.
+                box and rates: u_k + K (mu_k - follow_k) for k = 1 .. H-1.
         """
         if self.compiled:
             found = self.rollout(request.state, request.covariance, request.disturbance, inputs, follow)
@@ -216,8 +216,9 @@ class Predictor:
         covariances, n = [_array(belief.covariance)], self.problem.state_dim
         for k, input in enumerate(plan):
             if follow is not None and k:
-                moved = input + gain @ (_array(belief.mean) - follow[k])
-                input[:] = np.clip(moved, self.problem.input_lower, self.problem.input_upper)
+                moved, problem = input + gain @ (_array(belief.mean) - follow[k]), self.problem
+                moved = np.clip(moved, plan[k - 1] + problem.rate_lower, plan[k - 1] + problem.rate_upper)
+                input[:] = np.clip(moved, problem.input_lower, problem.input_upper)
             A, B, c, belief, V = self._linearise(belief, self._tensor(input), request.disturbance)
             if self.feedback and gain is None and (follow is not None or V is not None):
                 gain = self.gain(np.ascontiguousarray(A[:n, :n]), np.ascontiguousarray(B[:n]))

@@ -116,13 +116,15 @@ class SequentialPrograms:
 
     def _told(self, rollout: tuple) -> tuple[Array, Array, Array]:
         """What the loop knows of its controller: columns, what is flat, and its table."""
-        uncertain, feedback, gp, columns, (offset, difference), *_, noise = rollout
+        uncertain, _, gp, columns, (offset, difference), *_, noise = rollout
         problem, (limit, tolerance) = self._predictor.problem, self._limits
         (weight, terminal, R, penalized), of_inputs = self._condenser.known
         *bounds, kappa, prices = self._chance.known
         constant = np.empty((1, 0, 1)) if self._chance.constant is None else self._chance.constant
         sides = problem.input_lower, problem.input_upper, problem.rate_lower, problem.rate_upper
-        settings = np.array([uncertain, feedback, difference, penalized, kappa, limit, tolerance], dtype=float)
+        settings = np.array(
+            [uncertain, self._predictor.feedback, difference, penalized, kappa, limit, tolerance], dtype=float
+        )
         weights = problem.Q, problem.terminal, *sides, weight, terminal, R, *of_inputs
         return columns, *flattened([*gp, offset, noise, *weights, *bounds, prices, constant, settings])
 
@@ -162,9 +164,11 @@ class SequentialPrograms:
         P, q, G, lower, upper, record, plan, states, covariances, outcome = self._answer.parts(answer)
         solution, first = None, True
         for wish in sequence:
-            if wish == loop.MODEL:
+            if wish != loop.PROGRAM:
+                if not first:
+                    follow = states[:-1, : len(request.state)] if wish == loop.GUIDED else None
                 self._linearise(request, along, follow, first)
-                follow, first = None, False
+                first = False
             else:
                 solution = self._solve((P, q, G, lower, upper), warm if solution is None else solution)
                 record[:] = solution.record[: len(record)]

@@ -19,7 +19,7 @@ from gpmpc.control.quasi_newton import MEMORY, correct
 from gpmpc.qp import record as layout
 from gpmpc.qp.dual_kernels import solve_lazy
 
-MODEL, PROGRAM = 1, 2  # what is asked for
+MODEL, GUIDED, PROGRAM = 1, 2, 3  # what is asked for
 SOLVED, ITERATION_LIMIT, NUMERICAL_TROUBLE = layout.SOLVED, layout.ITERATION_LIMIT, layout.NUMERICAL_TROUBLE
 HEADER, RECORD_STATUS = layout.HEADER, layout.STATUS
 
@@ -52,6 +52,8 @@ SIGNATURE = (
 
 def sequence(compiled, ours, columns, known, places, work, question, follow, guess, along, table, answer, parts):
     """The loop, a generator: yields ``MODEL`` to have the stages along the plan, or ``PROGRAM`` for the record.
+
+    ``GUIDED`` asks for them, too: along a rollout that follows the states in the answer by the ancillary feedback.
 
     Args:
         compiled: Whether the rollout is.
@@ -159,13 +161,18 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
             step[i] = solution[i] - plan[i]
             promised += slope[i] * step[i]
         whole = limited > 0 and not keeps_rates(inputs, last, rate_lower, rate_upper)  # left in one step
-        length, lower_cost = 1.0, False
+        # The whole step is tried first along a rollout that follows the states which the program predicts: where the
+        # open loop is unstable, the inputs alone lead elsewhere, and only steps of no use would lower the cost.
+        respond(A, B, c, start, proposed, states)
+        guided, length, lower_cost = model[1] and not whole, 1.0, False
         while length >= SHORTEST_STEP and not lower_cost:
             for i in range(size):
                 moved[i] = solution[i] if length == 1.0 else plan[i] + length * step[i]
             if compiled:
-                roll_out(model, start, covariance, disturbance, follow[:0], stages)
+                roll_out(model, start, covariance, disturbance, states[: H if guided else 0], stages)
                 tighten(chance, spread, low, high)
+            elif guided:
+                yield GUIDED
             else:
                 yield MODEL
             respond(A_tried, B_tried, c_tried, start, trial, states)
@@ -177,7 +184,8 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
                 break
             allowed = SUFFICIENT_DECREASE * length * promised + ROUND_OFF * abs(cost + violated)
             lower_cost = whole or merit <= cost + violated + allowed
-            length /= 2.0
+            length /= 1.0 if guided else 2.0
+            guided = False
         if not lower_cost:  # share^2 of the cost is what an input could gain
             status = SOLVED if share**2 <= ROUND_OFF else NUMERICAL_TROUBLE
             break
@@ -214,6 +222,7 @@ def told(known, places, columns):
         part(known, places[FEEDBACK_Q]).shape[0],
     )
     weight, terminal = part(known, places[WEIGHT]), part(known, places[TERMINAL])
+    rates = part(known, places[RATE_LOWER])[0], part(known, places[RATE_UPPER])[0]
     model = (
         settings[UNCERTAIN] != 0.0,
         settings[FEEDBACK] != 0.0,
@@ -226,7 +235,7 @@ def told(known, places, columns):
         columns,
         (part(known, places[OFFSET])[0], settings[DIFFERENCE] != 0.0),
         (Q, R, part(known, places[FEEDBACK_TERMINAL])),
-        (part(known, places[INPUT_LOWER])[0], part(known, places[INPUT_UPPER])[0]),
+        (part(known, places[INPUT_LOWER])[0], part(known, places[INPUT_UPPER])[0], *rates),
         part(known, places[NOISE]),
     )
     condenser = (
@@ -245,7 +254,6 @@ def told(known, places, columns):
         settings[KAPPA],
         part(known, places[PRICES]),
     )
-    rates = part(known, places[RATE_LOWER])[0], part(known, places[RATE_UPPER])[0]
     constant, stop = part(known, places[CONSTANT_ROWS]), (int(settings[LIMIT]), settings[TOLERANCE])
     return model, condenser, chance, rates, constant, stop
 

@@ -10,6 +10,7 @@ by another road: an independent check, and the place to try a constraint of one'
     StateFormMPC(..., constraints=lambda states, inputs: [states[1:, 0] + states[1:, 2] <= 5.0])
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from time import perf_counter
 from typing import Any
@@ -94,7 +95,9 @@ class StateFormMPC:
         built = perf_counter()
         program = self._program.problem
         try:
-            program.solve(solver=self.solver, **{"warm_start": False} | self.options)
+            with warnings.catch_warnings():  # that a solution is inaccurate is said by its status
+                warnings.simplefilter("ignore")
+                program.solve(solver=self.solver, **{"warm_start": False} | self.options)
             status = STATUSES.get(program.status, Status.NUMERICAL_TROUBLE)
         except cvxpy.error.SolverError:
             status = Status.NUMERICAL_TROUBLE

@@ -309,10 +309,13 @@ def test_a_model_that_breaks_down_is_numerical_trouble():
     assert np.isfinite(decision.inputs).all()
 
 
-def test_a_failed_plan_is_no_warm_start():
+def test_a_failed_plan_is_no_warm_start_and_one_that_stopped_at_a_limit_is():
     problem = TrackingProblem(Q, R)
     impatient = NonlinearGPMPC(pendulum_posterior(), Linearization(), problem, 4, [0.0], "sqp", 1e-7, 1)
-    failed = impatient.control(belief((2.0, -2.0)), swing(4))
+    stopped = impatient.control(belief((2.0, -2.0)), swing(4))
+    request = Request.read(problem, 4, np.zeros(1), belief(), swing(4), stopped)
+    assert np.array_equal(request.shifted, stopped.inputs[[1, 2, 3, 3]])
+    failed = replace(stopped, suboptimal=False)
     request = Request.read(problem, 4, np.zeros(1), belief(), swing(4), failed)
     assert np.array_equal(request.shifted, request.held)
 
