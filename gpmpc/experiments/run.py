@@ -22,7 +22,7 @@ from gpmpc.control.supervision import OnFailure, check_policy
 from gpmpc.datasets import DataSource, rotational_states_along
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
 from gpmpc.gp import Training, Transitions
-from gpmpc.metrics import ViolationRate, find_loss, time_quantiles, tracking_error, violation_rate
+from gpmpc.metrics import NEAR, ViolationRate, find_loss, time_quantiles, tracking_error, violation_rate
 from gpmpc.plants import Coupled, Map, Plant, Rotational, Translational
 from gpmpc.propagation import MomentMatching, Propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, Rollout, Step, closed_loop, rehearse
@@ -31,7 +31,6 @@ from gpmpc.trajectories import Trajectory, states_along
 
 NAMES = {"translational": Translational.state_names, "rotational": Rotational.state_names}
 UNITS = {"translational": "m", "rotational": "rad"}  # of the positions and angles that errors are stated in
-NEAR = {"m": 10.0, "rad": np.pi / 2}  # no flight is lost that is nearer; a vehicle on its side no longer carries itself
 STAGES = ("model", "build", "solve", "total")  # of a decision's time
 
 
@@ -265,7 +264,7 @@ def _lost(experiment: Experiment, flight: Flight) -> dict[str, Any] | None:
         reasons.append(f"{loss.distance:.3g} {unit} from its reference, more than {loss.limit:.3g} {unit}")
     if flight.diverged is not None:
         steps.append(flight.diverged.step)
-        reasons.append(str(flight.diverged))
+        reasons.append(" ".join(str(flight.diverged).split()))
     if not steps:
         return None
     return {"step": steps[0], "time": round(steps[0] * flight.rollout.time_step, 9), "reason": "; ".join(reasons)}
