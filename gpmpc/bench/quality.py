@@ -30,10 +30,11 @@ from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.metrics import NEAR, find_loss, tracking_error
+from gpmpc.metrics import tracking_error
 from gpmpc.simulation import Rollout, closed_loop, rehearse
 from gpmpc.trajectories import states_along
 
+LOST = 5.0  # [m] from the reference, some hundred times what is usual: nothing to compare costs with
 SAME = 1e-3  # difference of two costs below which the seeds' noise hides it: it buys no time
 
 
@@ -161,8 +162,9 @@ def _paid(rollout: Rollout, seconds: Sequence[float]) -> dict:
     Raises:
         GpmpcError: The vehicle has left its path.
     """
-    if loss := find_loss(rollout.states, rollout.references, NEAR["m"]):
-        raise GpmpcError(f"{loss.distance:.3g} m off its path after {loss.step} steps")
+    distance = np.linalg.norm((rollout.states - rollout.references)[:, ::2], axis=1)
+    if distance.max() > LOST:
+        raise GpmpcError(f"{LOST:g} m off its path after {int(np.argmax(distance > LOST))} steps")
     return {
         "cost": stage_cost(problem(), rollout.states, rollout.references, rollout.inputs, HOVER),
         "rmse": float(tracking_error(rollout.states, rollout.references).total),

@@ -50,7 +50,8 @@ class Experiment:
         steps: Of the flight.
         seed: Of all random numbers.
         loop: What stands at the other end: the plant, or the learned model rolled on itself.
-        propagator: How a model loop carries its belief on; the controller's own, or moment matching, by default.
+        propagator: The controller's own, if it has one. A model loop carries its belief on with it, or by moment
+            matching.
         noise: On the plant.
         disturbances: Of the plant.
         on_failure: What is applied where a solve fails.
@@ -242,13 +243,13 @@ def metrics(experiment: Experiment, flight: Flight) -> dict[str, Any]:
     }
 
 
-def unplanned_noise(experiment: Experiment, controller: Controller, training: Training | None) -> np.ndarray:
+def unplanned_noise(experiment: Experiment, training: Training | None) -> np.ndarray:
     """Standard deviations (n,) of the noise of a next state that the covariances of a plan do not hold.
 
     It is what the model has learned of it; a controller that knows the plant knows its noise as well.
     """
     n = len(experiment.plant.dynamics.state_names)
-    if getattr(getattr(controller, "propagator", None), "observation_noise", False) or experiment.loop == "model":
+    if getattr(experiment.propagator, "observation_noise", False) or experiment.loop == "model":
         return np.zeros(n)
     if training is not None:
         return training.posterior.noise_covariance.diagonal().sqrt().numpy()
