@@ -31,11 +31,10 @@ from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.metrics import tracking_error
-from gpmpc.simulation import Rollout, closed_loop
-from gpmpc.simulation.loop import window
+from gpmpc.simulation import Rollout, closed_loop, rehearse
 from gpmpc.trajectories import states_along
 
-LOST = 5.0  # [m] from the reference, some hundred times what is usual: the vehicle has left its path
+LOST = 5.0  # [m] from the reference, some hundred times what is usual: nothing to compare costs with
 SAME = 1e-3  # difference of two costs below which the seeds' noise hides it: it buys no time
 
 
@@ -179,9 +178,7 @@ def _flight(controller: Controller, trajectory: str, steps: int, seed: int) -> t
     states = states_along(TRAJECTORIES[trajectory], OUTER.time_step * np.arange(steps + controller.horizon + 1))
     reference = Reference(states, np.tile(HOVER, (len(states) - 1, 1)))  # as gpmpc run hands it over
     clocked = _Clocked(controller)
-    warm = None
-    for k in range(2):  # a cold decision and a warm-started one: what they compile and load is not counted
-        warm = controller.control(Gaussian.certain(states[k]), window(reference, k, controller.horizon), warm)
+    rehearse(OUTER, controller, reference, states[0])
     rollout = closed_loop(
         OUTER, clocked, reference, states[0], steps, noise=NOISE, seed=seed, on_failure="previous_plan"
     )

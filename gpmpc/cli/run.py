@@ -100,7 +100,7 @@ def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, abou
     with ExitStack() as stack:
 
         def prepared(controller: Any, training: Any) -> Callable:
-            recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller, training))
+            recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller.problem, training))
             return tell(recorder, 0 if training is None else len(training.posterior))
 
         flight = fly(experiment, prepared)
@@ -108,7 +108,7 @@ def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, abou
 
 
 def _recorder(
-    experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict, controller: Any, training: Any
+    experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict, problem: Any, training: Any
 ) -> Any:
     from gpmpc.experiments.run import unplanned_noise
     from gpmpc.experiments.run_folder import RECORDING
@@ -129,9 +129,9 @@ def _recorder(
                 metadata={
                     "seed": experiment.seed,
                     "command": about["provenance"]["command"],
-                    "noise_std": " ".join(map(str, unplanned_noise(experiment, controller, training).tolist())),
+                    "noise_std": " ".join(map(str, unplanned_noise(experiment, training).tolist())),
                 },
-                input_bounds=[controller.problem.input_lower, controller.problem.input_upper],
+                input_bounds=[problem.input_lower, problem.input_upper],
             )
         except RecordingError as error:
             # The folder is ours, so only the orphaned writer of a killed run can still hold the file.

@@ -22,7 +22,7 @@ from gpmpc.control.supervision import OnFailure, check_policy
 from gpmpc.datasets import DataSource, rotational_states_along
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
 from gpmpc.gp import Training, Transitions
-from gpmpc.metrics import ViolationRate, find_loss, time_quantiles, tracking_error, violation_rate
+from gpmpc.metrics import NEAR, ViolationRate, find_loss, time_quantiles, tracking_error, violation_rate
 from gpmpc.plants import Coupled, Map, Plant, Rotational, Translational
 from gpmpc.propagation import MomentMatching, Propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, Rollout, Step, closed_loop, rehearse
@@ -31,7 +31,6 @@ from gpmpc.trajectories import Trajectory, states_along
 
 NAMES = {"translational": Translational.state_names, "rotational": Rotational.state_names}
 UNITS = {"translational": "m", "rotational": "rad"}  # of the positions and angles that errors are stated in
-NEAR = {"m": 10.0, "rad": np.pi / 2}  # no flight is lost that is nearer; a vehicle on its side no longer carries itself
 STAGES = ("model", "build", "solve", "total")  # of a decision's time
 
 
@@ -51,7 +50,8 @@ class Experiment:
         steps: Of the flight.
         seed: Of all random numbers.
         loop: What stands at the other end: the plant, or the learned model rolled on itself.
-        propagator: How a model loop carries its belief on; the controller's own, or moment matching, by default.
+        propagator: The controller's own, if it has one. A model loop carries its belief on with it, or by moment
+            matching.
         noise: On the plant.
         disturbances: Of the plant.
         on_failure: What is applied where a solve fails.
@@ -244,13 +244,13 @@ def metrics(experiment: Experiment, flight: Flight) -> dict[str, Any]:
     }
 
 
-def unplanned_noise(experiment: Experiment, controller: Controller, training: Training | None) -> np.ndarray:
+def unplanned_noise(experiment: Experiment, training: Training | None) -> np.ndarray:
     """Standard deviations (n,) of the noise of a next state that the covariances of a plan do not hold.
 
     It is what the model has learned of it; a controller that knows the plant knows its noise as well.
     """
     n = len(experiment.plant.dynamics.state_names)
-    if getattr(getattr(controller, "propagator", None), "observation_noise", False) or experiment.loop == "model":
+    if getattr(experiment.propagator, "observation_noise", False) or experiment.loop == "model":
         return np.zeros(n)
     if training is not None:
         return training.posterior.noise_covariance.diagonal().sqrt().numpy()
@@ -266,7 +266,7 @@ def _lost(experiment: Experiment, flight: Flight) -> dict[str, Any] | None:
         reasons.append(f"{loss.distance:.3g} {unit} from its reference, more than {loss.limit:.3g} {unit}")
     if flight.diverged is not None:
         steps.append(flight.diverged.step)
-        reasons.append(str(flight.diverged))
+        reasons.append(" ".join(str(flight.diverged).split()))
     if not steps:
         return None
     return {"step": steps[0], "time": round(steps[0] * flight.rollout.time_step, 9), "reason": "; ".join(reasons)}

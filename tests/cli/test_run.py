@@ -1,0 +1,88 @@
+"""What one flight tells: that it was lost, that it waits for a compiler, and how well it foresaw itself."""
+
+import json
+
+import numpy as np
+import pytest
+
+from gpmpc.plotting.recorded import expected
+from gpmpc.recording import read_run
+from tests.cli.command import forked, gpmpc
+
+TINY = ["data.samples=25", "model.restarts=0", "horizon=2", "folder=tree"]
+NOISY = f"noise.process={[0.01] * 6}".replace(" ", "")
+GYROSCOPE = "plant.dynamics.gyroscopic"  # so strong a one that Runge and Kutta's step is unstable
+
+
+@pytest.mark.parametrize(
+    ("choices", "reason"),
+    [
+        (["plant.dynamics.mass=100", "trajectory=hover"], "m from its reference"),
+        (["subsystem=rotational", f"{GYROSCOPE}=[1e4,1e4]", "controller=lqr"], "state is not finite any more"),
+    ],
+    ids=["falls", "diverges"],
+)
+def test_a_lost_flight_is_finished_and_readable_and_has_an_exit_code_of_its_own(choices, reason, tmp_path):
+    done = forked("run", *TINY, *choices, "steps=9", cwd=tmp_path)
+    assert done.returncode == 3, done.stderr
+    assert "lost " in done.stdout
+    assert done.stderr == ""
+    (folder,) = (tmp_path / "tree").iterdir()
+    found = json.loads((folder / "metrics.json").read_text(), parse_constant=pytest.fail)
+    assert reason in found["lost"]["reason"]
+    run = read_run(folder / "run.mcap")
+    assert run.finished
+    assert len(run.times) == found["steps"]
+    assert run.times[found["lost"]["step"]] == found["lost"]["time"]
+    again = forked("run", *TINY, *choices, "steps=9", cwd=tmp_path)
+    assert again.returncode == 3
+    assert "finished before" in again.stdout
+    assert forked("plot", str(folder), cwd=tmp_path).returncode == 0
+    assert forked("report", "tree", cwd=tmp_path).returncode == 0
+
+
+def test_who_is_not_lost_is_not_called_so(tmp_path):
+    done = forked("run", "model.restarts=0", "plant.dynamics.mass=0.888", "steps=9", "folder=tree", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "lost" not in done.stdout
+    (path,) = tmp_path.glob("tree/*/metrics.json")
+    assert json.loads(path.read_text())["lost"] is None
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "controller"),
+    [("elliptical", "convex"), ("lorenz", "convex"), ("lorenz", "nmpc")],
+)
+def test_the_band_of_the_figure_holds_as_many_positions_as_two_deviations_promise(trajectory, controller, tmp_path):
+    choices = [f"trajectory={trajectory}", f"controller={controller}", "model.restarts=0", "horizon=2", NOISY]
+    assert forked("run", *choices, "steps=150", "folder=tree", cwd=tmp_path).returncode == 0
+    run = read_run(next(tmp_path.glob("tree/*/run.mcap")))
+    mean, std = expected(run, [0, 2, 4])
+    inside = np.abs(run.states[:, ::2] - mean)[1:] <= 2 * std[1:]
+    # 447 draws of 95.45 % and four standard errors; the learned noise is uncertain by a twentieth.
+    assert 0.90 < inside.mean() < 0.99
+
+
+def test_noise_that_the_plan_holds_already_is_not_counted_twice(tmp_path):
+    stds = []
+    for propagation in ([], ["propagation=linearization", "propagation.observation_noise=true"]):
+        assert forked("run", *TINY, *propagation, "steps=2", cwd=tmp_path).returncode in (0, 3)
+    for path in sorted(tmp_path.glob("tree/*/run.mcap")):
+        stds.append(expected(read_run(path), [0, 2, 4])[1][1:])
+    assert np.allclose(stds[0], stds[1], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_compiling_is_told_on_a_pipe_and_in_no_decision(tmp_path):
+    cold, warm = (
+        gpmpc("run", f"seed={seed}", "steps=20", cwd=tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+        for seed in range(2)
+    )
+    first, *lines = cold.stdout.splitlines()
+    assert "compiling numerical kernels" in first
+    assert any(line.startswith("compiled in ") for line in lines)
+    assert "compil" not in warm.stdout
+    for path in tmp_path.glob("outputs/run/*/metrics.json"):
+        times = json.loads(path.read_text())["times"]
+        assert times["total"]["largest"] < 1
+        assert times["training"] < 10
