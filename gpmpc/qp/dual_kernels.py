@@ -362,11 +362,12 @@ def solve_lazy(P, q, G, lower, upper, warm, work, out):
     L, rows = matrix(rest, 0, n, padded(n)), matrix(rest, n * padded(n), len(R) + 1, n)  # nearer without gaps
     if not factorise(P, L):
         return MISUSE
-    if not measure(P, G, n, traits):
+    if not measure(P, G, n, traits, vectors[0]):
         return MISUSE
-    settings[workspace.SHARE] = 1.0
+    loss = 1.0
     for i in range(n):
-        settings[workspace.SHARE] = min(settings[workspace.SHARE], 1.0 / (L[i, i] * L[i, i] * P[i, i]))
+        loss = max(loss, L[i, i] * L[i, i] * P[i, i])
+    settings[workspace.SHARE] = 1.0 / loss
     return optimise(True, P, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
 
 

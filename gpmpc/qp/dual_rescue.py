@@ -6,7 +6,9 @@ working set has a QR factor computed anew at each change, and x and the multipli
 method corrects by residuals without rounding error (iterative refinement, Higham, Accuracy and Stability of Numerical
 Algorithms, 2002, chapter 12). A solve takes milliseconds. With P = L L' and A_W = [L^-1 C_W'; sqrt(softness_W)]:
 
-    a = -A_W dmu - [L^-1 r1; 0],   A_W' a = -r2,   L' dx = a    for the residuals r1 of stationarity and r2 of C_W x = b_W
+    a = -A_W dmu - [L^-1 r1; 0],   A_W' a = -r2,   L' dx = a
+
+for the residuals r1 of stationarity and r2 of the working set.
 """
 
 from collections.abc import Callable

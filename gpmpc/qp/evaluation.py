@@ -163,7 +163,8 @@ def residuals(lazy, P, G, n, traits, mu, k, slots, members, y, slope, least, gra
 
     The length of x is that in the metric of P, at least ``least``, so that neither the units of the data nor a cost of
     another size hide an error of x. A hundredth of the error is also measured by the largest entry of x, and that of a
-    row by its bound or its own terms. ``UNDEFINED`` where a number that it is made of is not finite: comparisons alone would pass over NaN.
+    row by its bound or its own terms. ``UNDEFINED`` where a number that it is made of is not finite: comparisons alone
+    would pass over NaN.
 
     Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where slope = q + C' mu. The vectors
     gradient and slope are padded with zeros.
