@@ -11,7 +11,8 @@ It has the same multipliers. The cost of tracking, which no input changes, is go
 its duality gap against a cost of 6e5 stopped 1e-3 away from inputs of 0.1.
 
 The compiled problem is kept per shape and per pattern of absent bounds and equalities, one set per thread. The duals
-come back signed as this package signs them, and the answer is ``SOLVED`` only if its own residuals say so.
+come back signed as this package signs them. The answer is ``SOLVED`` only if its own residuals say so, ``INFEASIBLE``
+only with Farkas' proof.
 """
 
 import threading
@@ -25,6 +26,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_triangular
 
 from gpmpc.exceptions import ProblemError
+from gpmpc.qp import record as layout
+from gpmpc.qp.primal_active_set import farkas_ray
 from gpmpc.qp.problem import ABSENT, QuadraticProgram
 from gpmpc.qp.solution import QPSolution, make_solution
 from gpmpc.qp.solver import WarmStart
@@ -42,7 +45,7 @@ STATUSES = {
     "user_limit": Status.ITERATION_LIMIT,
 }
 TIGHT = {"CLARABEL": {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-14, "tol_feas": 1e-12}}
-"""Options that make a solver as accurate as this package promises; others are passed by the caller."""
+"""Options that are tried first, before the solver's own; what is not reached is judged by its residuals."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ class CvxpySolver:
 
     Args:
         name: An installed CVXPY solver ("CLARABEL", "OSQP", "SCS", "HIGHS", ...).
-        options: The solver's own options, by its own names; for Clarabel tight tolerances if omitted.
+        options: The solver's own options, by its own names; if omitted, Clarabel is first asked for tight tolerances.
         tolerance: Largest scaled KKT residual of a solution called ``SOLVED``.
 
     Raises:
@@ -72,8 +75,6 @@ class CvxpySolver:
 
     def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
         """The minimiser; a warm start's x is offered to solvers that take one. See ``gpmpc.qp.solver.QPSolver``."""
-        import cvxpy
-
         began = perf_counter()
         lower, upper = problem.lower, problem.upper
         n, M = len(problem.q), len(lower)
@@ -89,33 +90,38 @@ class CvxpySolver:
         if warm:
             form.y.value = factor @ (warm_start.x - free)
         built = perf_counter()
-        options = TIGHT.get(self.name, {}) if self.options is None else self.options
-        try:
-            with warnings.catch_warnings():  # an inaccurate solution is judged by its residuals below
-                warnings.simplefilter("ignore")
-                form.problem.solve(solver=self.name, warm_start=warm, **options)
-            claim = form.problem.status
-        except cvxpy.error.SolverError:
-            claim = "solver_error"
-        x, multipliers = np.zeros(n), np.zeros(M)
-        if claim in ("optimal", "optimal_inaccurate", "user_limit") and form.y.value is not None:
-            x = free + back @ form.y.value
-            for side in form.sides:
-                if side.constraint.dual_value is not None:
-                    multipliers[side.members] += side.sign * np.ravel(side.constraint.dual_value)
-        status = STATUSES.get(claim, Status.NUMERICAL_TROUBLE)
-        if status is Status.SOLVED and not make_solution(problem, status, x, multipliers).is_optimal(self.tolerance):
-            status = Status.NUMERICAL_TROUBLE
-        return make_solution(
-            problem,
-            status,
-            x,
-            multipliers,
-            active_set=_working(multipliers),
-            iterations=(form.problem.solver_stats.num_iters or 0) if form.problem.solver_stats else 0,
-            build_seconds=built - began,
-            solve_seconds=perf_counter() - built,
-        )
+        solutions = []
+        for options in (TIGHT.get(self.name, {}), {}) if self.options is None else (self.options,):
+            claim = _solve_form(form, self.name, warm, options)
+            status, x, multipliers = STATUSES.get(claim, Status.NUMERICAL_TROUBLE), np.zeros(n), np.zeros(M)
+            if status is Status.INFEASIBLE:
+                ray = farkas_ray(problem)
+                status, multipliers = (Status.NUMERICAL_TROUBLE, multipliers) if ray is None else (status, ray)
+            elif claim in STATUSES and form.y.value is not None:
+                x = np.clip(free + back @ form.y.value, problem.lb, problem.ub)
+                for side in form.sides:
+                    if side.constraint.dual_value is not None:
+                        multipliers[side.members] += side.sign * np.ravel(side.constraint.dual_value)
+            statistics = form.problem.solver_stats
+            solution = make_solution(
+                problem,
+                status,
+                x,
+                multipliers,
+                active_set=_working(multipliers),
+                iterations=(statistics.num_iters or 0) if statistics else 0,
+                build_seconds=built - began,
+                solve_seconds=perf_counter() - built,
+            )
+            if status is Status.INFEASIBLE:
+                return solution
+            solutions.append((float(np.nan_to_num(max(solution.residuals()), nan=np.inf)), solution))
+            if status is Status.SOLVED and solutions[-1][0] <= self.tolerance:
+                return solution
+        residual, solution = min(solutions, key=lambda pair: pair[0])
+        if solution.status is Status.SOLVED and residual > self.tolerance:
+            solution.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
+        return solution
 
     def _form(self, n: int, lower: Array, upper: Array) -> "_Form":
         """The compiled problem for this pattern of bounds, from the thread's own store."""
@@ -128,6 +134,19 @@ class CvxpySolver:
                 del forms[next(iter(forms))]
             forms[key] = _formulate(n, equal, below, above)
         return forms[key]
+
+
+def _solve_form(form: "_Form", name: str, warm: bool, options: dict) -> str:
+    """Hands the problem to the solver; returns what CVXPY says of it."""
+    import cvxpy
+
+    try:
+        with warnings.catch_warnings():  # an inaccurate solution is judged by its residuals
+            warnings.simplefilter("ignore")
+            form.problem.solve(solver=name, warm_start=warm, **options)
+    except cvxpy.error.SolverError:
+        return "solver_error"
+    return form.problem.status
 
 
 class _Side(NamedTuple):

@@ -198,7 +198,9 @@ class DualActiveSet:
         stopped = status == layout.ITERATION_LIMIT and self.iteration_limit is not None
         if stopped or status in (layout.SOLVED, layout.TIME_LIMIT):
             return record
-        if status == layout.INFEASIBLE and proves_infeasibility(_multipliers(record, len(q), len(lower)), terms.G, lower, upper):
+        if status == layout.INFEASIBLE and proves_infeasibility(
+            _multipliers(record, len(q), len(lower)), terms.G, lower, upper
+        ):
             return record
         return rescue(terms, q, lower, upper, record, limit, late)
 

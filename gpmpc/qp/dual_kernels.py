@@ -53,6 +53,7 @@ from gpmpc.qp.lanes import (
     some_lanes,
 )
 from gpmpc.qp.working_set import (
+    BOUND,
     CAP,
     FLOOR,
     HIGH_WATCH,
@@ -88,15 +89,15 @@ GRAM_SIGNATURE = "i8(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8
 LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 
 ABSENT = 1e20  # a bound of this size or more is none
-NEGLIGIBLE = 1e-22  # share of the length of q below which x, and a violation of a bound of zero, is none
+NEGLIGIBLE = 1e-26  # share of the length of q below which x, and a violation of a bound of zero, is none
 NOISE = 1e-13  # violation that a constraint which depends on others may be left with: see ``worst_violation``
 HOPELESS = 1e-10  # violation of such a constraint that is taken for a contradiction
 SWEEPS = 4  # times that all badly violated constraints are taken at once
 SWEPT = 0.5  # those violated by more than this share of the worst
 ROUNDS = 10  # returns from the residuals to the iteration
 REFINEMENTS = 3
-FINE = 1e-11  # residual at which refinement stops
-DOUBT = 1e-7  # times the shares that cancellation left of the pivots: the largest residual of a solution
+FINE = 2e-10  # residual at which refinement stops
+DOUBT = 3e-7  # times the shares that cancellation left of the pivots: the largest residual of a solution
 OLD = 1000  # changes after which a factor is computed anew
 
 
@@ -222,15 +223,15 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
     seen, excess, gradient, active = vectors[15], vectors[16], vectors[17], vectors[18]
     v, slope, pulled, now, q = vectors[19], vectors[20], vectors[21], vectors[22], vectors[23]
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
+    least = 0.0
     for i in range(n):
         q[i] = linear[i]
+        least = max(least, abs(linear[i]) * traits[SCALE, i])
+    least *= NEGLIGIBLE
     for p in range(M):
         mu[p] = 0.0
     for i in range(capacity + 2):
         members[PLACE, i] = i
-    least = 0.0
-    for i in range(n):
-        least = max(least, NEGLIGIBLE * abs(q[i]) * traits[SCALE, i])
     if read_bounds(lower, upper, traits[SCALE], least, bounds):
         return MISUSE
     guessed = len(warm) > HEADER and warm[VARIABLES] == n and warm[CONSTRAINTS] == M and 0 <= warm[WORKING] <= M
@@ -294,7 +295,9 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
                 y[p] = slots[BOUND, i]
         if not current:
             add_pull(G, n, q, mu, k, members, traits, soft, slope)
-        best, share = np.inf, min(settings[workspace.SHARE], math.sqrt(smallest_share(k, slots, R)))
+        best, share = np.inf, settings[workspace.SHARE]
+        if k > 0:
+            share = min(share, math.sqrt(smallest_share(k, slots, R)))
         for attempt in range(REFINEMENTS + 1):
             worst = residuals(lazy, P, G, n, traits, mu, k, slots, members, y, slope, least, gradient, active)
             if worst <= min(FINE, DOUBT * share) or attempt == REFINEMENTS or not worst < 0.5 * best:
@@ -359,11 +362,12 @@ def solve_lazy(P, q, G, lower, upper, warm, work, out):
     L, rows = matrix(rest, 0, n, padded(n)), matrix(rest, n * padded(n), len(R) + 1, n)  # nearer without gaps
     if not factorise(P, L):
         return MISUSE
-    if not measure(P, G, n, traits):
+    if not measure(P, G, n, traits, vectors[0]):
         return MISUSE
-    settings[workspace.SHARE] = 1.0
+    loss = 1.0
     for i in range(n):
-        settings[workspace.SHARE] = min(settings[workspace.SHARE], 1.0 / (L[i, i] * L[i, i] * P[i, i]))
+        loss = max(loss, L[i, i] * L[i, i] * P[i, i])
+    settings[workspace.SHARE] = 1.0 / loss
     return optimise(True, P, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
 
 

@@ -6,7 +6,9 @@ working set has a QR factor computed anew at each change, and x and the multipli
 method corrects by residuals without rounding error (iterative refinement, Higham, Accuracy and Stability of Numerical
 Algorithms, 2002, chapter 12). A solve takes milliseconds. With P = L L' and A_W = [L^-1 C_W'; sqrt(softness_W)]:
 
-    a = -A_W dmu - [L^-1 r1; 0],   A_W' a = -r2,   L' dx = a    for the residuals r1 of stationarity and r2 of C_W x = b_W
+    a = -A_W dmu - [L^-1 r1; 0],   A_W' a = -r2,   L' dx = a
+
+for the residuals r1 of stationarity and r2 of the working set.
 """
 
 from collections.abc import Callable
@@ -23,7 +25,7 @@ from gpmpc.qp.solution import Terms
 
 Array = NDArray[np.float64]
 
-NEGLIGIBLE = 1e-22  # violation, as a share of the terms that it is a sum of, that doubled digits cannot tell from none
+NEGLIGIBLE = 1e-26  # violation, as a share of the terms that it is a sum of, that doubled digits cannot tell from none
 ROUNDING = 1e-14  # share of these terms by which a row may contradict others that it depends on: the data's rounding
 DEPENDENT = 1e-14  # distance from the span of the others, as a share of the row, within which a row depends on them
 CONVERGED = 1e-12  # last correction of x, as a share of its size
@@ -61,7 +63,7 @@ class _Solve:
     def __init__(self, terms: Terms, q: Array, lower: Array, upper: Array):
         n, M = len(q), len(lower)
         D = _power_of_two(np.sqrt(np.diagonal(terms.P)))
-        E = np.concatenate([1.0 / D, _power_of_two(np.linalg.norm(terms.G * D, axis=1))])
+        E = np.concatenate([1.0 / D, _power_of_two(np.abs(terms.G * D).max(axis=1, initial=0.0))])
         self.D, self.E, self.n = D, E, n
         self.P, self.q, self.C = terms.P * np.outer(D, D), q * D, np.vstack([np.eye(n), terms.G * D * E[n:, None]])
         self.lower, self.upper = lower * E, upper * E
@@ -188,6 +190,8 @@ class _Solve:
             if not np.isfinite(size):
                 return False
             if np.abs(dx).max() <= CONVERGED * size:
+                box = [i for i, p in enumerate(W) if p < n]  # bounds of variables hold exactly
+                x[0, np.array(W, dtype=int)[box]], x[1, np.array(W, dtype=int)[box]] = b[box], 0.0
                 return True
         return False
 

@@ -161,9 +161,10 @@ def follow_listed(lazy, n, v, rows, L, G, mu, k, members, traits, seen, weights,
 def residuals(lazy, P, G, n, traits, mu, k, slots, members, y, slope, least, gradient, active):
     """The largest residual of stationarity and of the working constraints, as a share of x = y[:n], y = C x.
 
-    The length of x is that in the metric of P, at least ``least``, and its largest entry, so that neither the units of
-    the data nor a cost of another size hide an error of x; that of a row is also measured by its bound and its own
-    terms. ``UNDEFINED`` where a number that it is made of is not finite: comparisons alone would pass over NaN.
+    The length of x is that in the metric of P, at least ``least``, so that neither the units of the data nor a cost of
+    another size hide an error of x. A hundredth of the error is also measured by the largest entry of x, and that of a
+    row by its bound or its own terms. ``UNDEFINED`` where a number that it is made of is not finite: comparisons alone
+    would pass over NaN.
 
     Fills ``gradient = P x + slope`` and ``active = y_W - softness mu_W - b``, where slope = q + C' mu. The vectors
     gradient and slope are padded with zeros.
@@ -174,7 +175,7 @@ def residuals(lazy, P, G, n, traits, mu, k, slots, members, y, slope, least, gra
             gradient[i] = 0.0
     else:
         combine(P, n, y, 0, n, gradient)
-    size = math.sqrt(max(dot(gradient, y, n), least * least))
+    size = math.sqrt(max(dot(gradient, y, n), least * least, TINY))
     lengths, entries, shifts, undefined, scales = no_lanes(), no_lanes(), no_lanes(), no_lanes(), traits[SCALE]
     for i in range(0, n, 8):
         pull, scale = plus(lanes(gradient, i), 1.0, lanes(slope, i)), lanes(scales, i)
@@ -182,8 +183,8 @@ def residuals(lazy, P, G, n, traits, mu, k, slots, members, y, slope, least, gra
         length = product(pull, scale)
         lengths, shifts = larger(lengths, length), larger(shifts, product(length, scale))
         entries, undefined = larger(entries, some_lanes(y[:n], i)), plus(undefined, 0.0, pull)
-    worst, undefined_sum = largest(lengths) / max(size, TINY), total(undefined)
-    worst = max(worst, largest(shifts) / max(largest(entries), least, TINY))
+    worst, undefined_sum = largest(lengths) / size, total(undefined)
+    worst = max(worst, 0.01 * largest(shifts) / max(largest(entries), TINY))
     for i in range(k):
         p, b = abs(members[NAME, i]) - 1, slots[BOUND, i]
         active[i] = y[p] - traits[SOFTNESS, p] * mu[p] - b

@@ -17,8 +17,12 @@ Array = NDArray[np.float64]
 
 @np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen in each solve
 def gram_system(terms: Terms) -> tuple[Array, Array, float]:
-    """The array for ``gpmpc.qp.dual_kernels.solve_gram``, the traits (4, M) of ``gpmpc.qp.working_set``,
-    and the smallest pivot of P's factor as a share of P_ii."""
+    """Lays out what does not change from solve to solve.
+
+    Returns:
+        The array for ``gpmpc.qp.dual_kernels.solve_gram``, the traits (4, M) of ``gpmpc.qp.working_set``, and the
+        smallest pivot of P's factor as a share of P_ii.
+    """
     P, G, softness = terms
     C = np.vstack([np.eye(len(P)), G])
     factor = cho_factor(P, lower=True)

@@ -96,12 +96,7 @@ class PrimalActiveSet:
         x, ray = _phase_1(rows, start)
         if ray is not None:
             multipliers = _stack(rows, np.arange(len(rows.h)), ray, M)
-            proven = proves_infeasibility(
-                multipliers,
-                problem.G,
-                np.where(lower <= -ABSENT, -np.inf, lower),
-                np.where(upper >= ABSENT, np.inf, upper),
-            )
+            proven = proves_infeasibility(multipliers, problem.G, lower, upper)
             return finish(Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE, x, multipliers, nothing, 0)
         limit = self.iteration_limit or 200 + 20 * len(rows.h)
         working = list(np.flatnonzero(rows.equality | _close_to_guess(rows, x, guess)))
@@ -184,6 +179,17 @@ def _phase_1(rows: _Rows, start: Array) -> tuple[Array, Array | None]:
     ray = weights[: len(rows.h)].copy()
     ray[rows.equality] -= weights[len(rows.h) :]
     return start, ray
+
+
+def farkas_ray(problem: QuadraticProgram) -> Array | None:
+    """Farkas' proof (M,) that no point is feasible, from phase 1; None if it finds none."""
+    lower, upper = problem.lower, problem.upper
+    rows = _one_sided(problem, lower, upper)
+    _, weights = _phase_1(rows, np.zeros(len(problem.q)))
+    if weights is None:
+        return None
+    ray = _stack(rows, np.arange(len(rows.h)), weights, len(lower))
+    return ray if proves_infeasibility(ray, problem.G, lower, upper) else None
 
 
 def _close_to_guess(rows: _Rows, x: Array, guess: Array) -> NDArray[np.bool_]:

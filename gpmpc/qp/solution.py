@@ -35,12 +35,12 @@ class Residuals(NamedTuple):
     diagonal (1e-6 and 1e-12 of them).
 
     Attributes:
-        primal: The largest violation of a hard constraint, or of a soft one beyond what its multiplier pays for; relative
-            to the violated bound or the constraint's own terms |c|'|x|.
-        dual: The largest entry of P x + q + G'z + z_box, multipliers of absent bounds or beyond their weights counted as
-            wrong; relative to the entry's own terms.
-        gap: |primal - dual objective|, what ``primal`` counts as violated left out; relative to x'Px, |q'x|, or the sum of
-            |multiplier times bound|.
+        primal: The largest violation of a hard constraint, or of a soft one beyond what its multiplier pays for;
+            relative to the violated bound or the constraint's own terms |c|'|x|.
+        dual: The largest entry of P x + q + G'z + z_box, multipliers of absent bounds or beyond their weights counted
+            as wrong; relative to the entry's own terms.
+        gap: |primal - dual objective|, what ``primal`` counts as violated left out; relative to x'Px, |q'x|, or the sum
+            of |multiplier times bound|.
     """
 
     primal: float

@@ -6,13 +6,13 @@ Everything lives in a few arrays that the kernels hand around, a column per cons
   ``most_violated`` reports a constraint (infinitely wide for a working one).
 * ``slots`` (5, capacity + 1): the bound b that holds, the constraint's value at the unconstrained minimiser, the range
   of its multiplier: [0, cap] at an upper bound, [-cap, 0] at a lower one, [-cap, cap] for an equality, and its entry of
-  the diagonal of K + softness. The cap is infinite unless the row is soft with a linear weight; a constraint that leaves
-  at its cap stays violated.
+  the diagonal of K + softness. The cap is infinite unless the row is soft with a linear weight; a constraint that
+  leaves at its cap stays violated.
 * ``members`` (4, capacity + 2) integers: the signed number +-(p + 1) of the constraint in each slot, where its row is,
   scratch for lists of candidates, and the list of violated constraints.
-* ``traits`` (4, M): the length of c_p in the metric of P^-1, by which violations are measured (Gram mode) or that in the
-  metric of P's diagonal (lazy mode), softness 1/rho and cap (``gpmpc.qp.soft_rows``), and the number of leading entries
-  of c_p that may not be zero.
+* ``traits`` (4, M): the length of c_p by which violations are measured, in the metric of P^-1 (Gram mode) or of the
+  inverse of P's diagonal (lazy mode), softness 1/rho and cap (``gpmpc.qp.soft_rows``), and the number of leading
+  entries of c_p that may not be zero.
 * ``mu`` (M): multipliers; zero outside the working set except at a cap.
 * ``R``: the Cholesky factor of K_WW + softness (``gpmpc.qp.factor``).
 
@@ -27,7 +27,7 @@ import numpy as np
 from gpmpc.compiled import woven
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, multiply_at, remove_row
 from gpmpc.qp.hessian import make_row, make_rows
-from gpmpc.qp.lanes import any_nonzero, no_lanes, plus, plus_product, product, some_lanes, total
+from gpmpc.qp.lanes import any_nonzero, lanes, no_lanes, plus, plus_product, product, some_lanes, total
 from gpmpc.qp.workspace import round_end
 
 LOWER, UPPER, FLOOR, LOW_WATCH, HIGH_WATCH = 0, 1, 2, 3, 4  # rows of ``bounds``
@@ -208,27 +208,32 @@ def clip_multipliers(k, mu, slots, members):
 @woven
 def smallest_share(k, slots, R):
     """The smallest pivot of the factor, as a share of its diagonal entry: what cancellation left of it."""
-    share = 1.0
+    loss = 1.0
     for i in range(k):
-        share = min(share, 1.0 / (R[i, i] * R[i, i] * slots[DIAGONAL, i]))
-    return share
+        loss = max(loss, R[i, i] * R[i, i] * slots[DIAGONAL, i])
+    return 1.0 / loss
 
 
 @woven
-def measure(P, G, n, traits):
-    """Writes the scales and ends of the constraints, lengths in the metric of P's diagonal; False if not finite."""
-    units, norms, ends = traits[SCALE, :n], traits[SCALE, n:], traits[END, n:]
+def measure(P, G, n, traits, units):
+    """Writes the scales and ends of the constraints, lengths in the metric of P's diagonal; False if not finite.
+
+    ``units`` is scratch, an entry per variable and a lane more.
+    """
+    norms, ends = traits[SCALE, n:], traits[END, n:]
     for i in range(n):
-        units[i] = 1.0 / math.sqrt(P[i, i])
+        traits[SCALE, i] = units[i] = 1.0 / math.sqrt(P[i, i])
+    for i in range(n, n + 8):
+        units[i] = 0.0
     undefined, end = 0.0, 0
     for p in range(len(G)):
         row, near, far = G[p], no_lanes(), no_lanes()
         head, tail, rest = row[:end], row[end:], units[end:]
         for j in range(0, end, 8):
-            values = product(some_lanes(head, j), some_lanes(units, j))
+            values = product(some_lanes(head, j), lanes(units, j))
             near = plus_product(near, values, values)
         for j in range(0, n - end, 8):
-            values = product(some_lanes(tail, j), some_lanes(rest, j))
+            values = product(some_lanes(tail, j), lanes(rest, j))
             far = plus_product(far, values, values)
         if any_nonzero(far):  # longer than the row before
             end = n

@@ -59,7 +59,10 @@ def nearly_infeasible(rng):
     P, q, G, lower, upper = base(rng)
     n, size = len(q), magnitude(rng, -3, 3)
     gap = rng.choice([-1.0, 1.0]) * magnitude(rng, -12, -3) * size
-    lower[:], upper[:] = np.where(rng.random(len(lower)) < 0.7, -np.inf, lower), np.where(rng.random(len(upper)) < 0.7, np.inf, upper)
+    lower[:], upper[:] = (
+        np.where(rng.random(len(lower)) < 0.7, -np.inf, lower),
+        np.where(rng.random(len(upper)) < 0.7, np.inf, upper),
+    )
     a = rng.standard_normal(n)
     kind = rng.integers(0, 3)
     if kind == 0:
@@ -116,7 +119,13 @@ def small_direction(rng):
     P, q = np.eye(n), rng.standard_normal(n) * float(rng.random() < 0.5)
     upper = b if rng.random() < 0.7 else np.full(n, np.inf)
     order = rng.permutation(n)
-    return program(P, q, G[order], np.concatenate([np.full(n, -np.inf), b[order]]), np.concatenate([np.full(n, np.inf), upper[order]]))
+    return program(
+        P,
+        q,
+        G[order],
+        np.concatenate([np.full(n, -np.inf), b[order]]),
+        np.concatenate([np.full(n, np.inf), upper[order]]),
+    )
 
 
 def scaled(rng):
