@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from gpmpc.control.controller import Reference
 from gpmpc.control.lqr import LQR, lqr_gain
@@ -151,3 +152,10 @@ def test_a_model_that_is_not_finite_or_grows_beyond_all_numbers_is_numerical_tro
     decision = controller.control(Gaussian.certain(np.ones(2)), Reference(np.zeros((5, 2))))
     assert decision.status is Status.NUMERICAL_TROUBLE
     assert np.array_equal(decision.inputs, np.full((4, 1), 0.2))
+
+
+def test_a_state_that_is_part_of_a_graph_is_answered_like_any_other():
+    controller, reference = LQR(double_integrator(), TrackingProblem(Q, R), 3, [0.2]), Reference(np.zeros((4, 2)))
+    state = torch.tensor([0.3, -0.2], requires_grad=True)
+    ours = controller.control(Gaussian(2 * state, torch.zeros(2, 2)), reference)
+    assert np.array_equal(ours.inputs, controller.control(Gaussian.certain([0.6, -0.4]), reference).inputs)

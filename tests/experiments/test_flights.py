@@ -18,7 +18,7 @@ from gpmpc.datasets import PaperData
 from gpmpc.exceptions import SettingError
 from gpmpc.experiments.flight import Row, fly
 from gpmpc.experiments.flights import Flights
-from gpmpc.experiments.flights_report import paper_seconds, summarise
+from gpmpc.experiments.flights_report import LOOPS, paper_seconds, summarise
 from gpmpc.experiments.tables import FitStore, Subsystem
 from gpmpc.gp import SoftLimits, identity, train
 from gpmpc.plants import Integrated, Translational
@@ -200,3 +200,15 @@ def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
     assert decision.status.solved
     assert decision.iterations <= 1
     assert np.allclose(decision.inputs, inputs[:1], atol=1e-3)
+
+
+def test_the_page_has_a_table_a_loop_with_a_line_for_every_row_of_the_csv_file(finished):
+    folder, _ = finished
+    rows = list(csv.DictReader((folder / "out/figures.csv").read_text().splitlines()))
+    _, *sections = (folder / "out/figures.md").read_text().split("\n## ")
+    lines = {section.split("\n")[0]: [line for line in section.splitlines() if line[:1] == "|"] for section in sections}
+    for loop, title in LOOPS.items():
+        flown = [row for row in rows if row["loop"] == loop]
+        assert len(lines[title]) == 2 + len(flown) > 2
+        for line, row in zip(lines[title][2:], flown, strict=True):
+            assert line.split("|")[1].strip().startswith(row["name"].split("_")[0])

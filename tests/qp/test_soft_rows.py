@@ -158,5 +158,5 @@ def test_a_multiplier_beyond_what_its_row_may_pay_is_a_dual_residual(solve, side
     solution.x[:] *= 1.5  # still stationary, P x + G'z = 0, and the violation is still paid for
     solution.z[:] *= 1.5
     assert solution.residuals().primal == 0
-    assert solution.residuals().dual == pytest.approx(0.5 * price / max(1.0, 1.5 * price))
+    assert solution.residuals().dual > 0.1  # half the price, whatever it is held against
     assert not solution.is_optimal(0.1)
