@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children, get_context, resource_tracker
 from typing import TypeVar
 
 J = TypeVar("J")
@@ -74,7 +74,11 @@ def end_with(parent: int) -> None:
 
 @contextmanager
 def deaf_children() -> Iterator[None]:
-    """Processes started inside do not hear Ctrl-C, from their first moment on; this one hears it at the end."""
+    """Processes started inside do not hear Ctrl-C, from their first moment on.
+
+    This one hears it at the end of the block, or at once where it has another thread.
+    """
+    resource_tracker.ensure_running()  # whenever it starts, it unblocks what is blocked here
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -13,7 +13,7 @@ import os
 import sys
 from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -38,7 +38,7 @@ from gpmpc.compiling import tell_of_compiling
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.experiments.run_folder import PLAN, Busy, RunFolder, folder_name
 from gpmpc.files import write_whole
-from gpmpc.parallel import THREADS, end_with
+from gpmpc.parallel import THREADS, deaf_children, end_with
 
 LOOK = 0.5  # between two looks at the folders [s]
 
@@ -193,10 +193,16 @@ def _launch(jobs: Sequence[Job], wait: bool, context: HydraContext, config: Dict
     launcher = Plugins.instance().instantiate_launcher(
         hydra_context=context, task_function=fly_after_others if wait else fly, config=config
     )
-    if isinstance(workers := getattr(launcher, "joblib", None), dict):  # of the joblib launcher: joblib's own arguments
+    workers, quiet = getattr(launcher, "joblib", None), nullcontext()  # the joblib launcher has joblib's own arguments
+    if workers is not None:
         workers |= {"initializer": end_with, "initargs": (os.getpid(),)}
+        from joblib.externals.loky.backend import resource_tracker
+
+        resource_tracker.ensure_running()  # as in ``deaf_children``
+        quiet = deaf_children()  # the thread of the progress bar still hears Ctrl-C
     try:
-        returns = launcher.launch([job.overrides for job in jobs], initial_job_idx=0)
+        with quiet:
+            returns = launcher.launch([job.overrides for job in jobs], initial_job_idx=0)
         return [each.return_value for each in returns]
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__

@@ -91,13 +91,43 @@ def test_a_run_goes_on_where_it_stopped(finished):
         (["trials=0"], "trials: must be a whole number, 1 or more; got 0"),
         (["noise=-1"], "noise: must be a number, 0 or more; got -1"),
         (["data=paper", "data.folder=nowhere"], "nowhere: no such folder"),
+        (["subsystem=rotational", "loop=plant"], "subsystem: no row flies it in the chosen loops; got rotational"),
+        (["trajectory=hover", "loop=model"], "bounds: must hold lower and upper of the model on hover, translational"),
+        (["study=confidence", "trajectory=hover"], "state_bounds: must hold lower and upper of the plant on hover"),
+        (
+            ["bounds.plant=null"],
+            "bounds: must hold lower and upper of the plant on elliptical, translational; got none",
+        ),
+        (["bounds.plant.lower=[5,5]"], "input_lower: must be a list of 3 numbers; got [5, 5]"),
+        (
+            ["rows.ours_convex.subsystems=[rolling]"],
+            "subsystems: must be among translational, rotational; got 'rolling'",
+        ),
+        (["+rows.convex.settings.foo=1"], "settings.foo: controller convex takes no such setting"),
+        (["samples=15", "steps=3", "+rows.ours_convex.size=16"], "size: must be at most 15, the transitions at hand"),
+        (["plant=coupled"], "plant: must have the states of the translational subsystem"),
     ],
 )
-def test_a_mistake_is_answered_in_one_line(tmp_path, arguments, message):
+def test_a_mistake_is_answered_in_one_line_before_anything_is_trained(tmp_path, arguments, message):
     run = forked("figures", *arguments, cwd=tmp_path)
     assert run.returncode == 2
     assert message in run.stderr
     assert len(run.stderr.strip().splitlines()) == 1
+    assert not list(tmp_path.rglob("models"))
+
+
+@pytest.mark.parametrize("subsystem", ["translational", "rotational"])
+def test_one_subsystem_alone_is_flown_and_drawn(subsystem, tmp_path):
+    left_out = [f"rows.{name}=null" for name in ("authors_nonlinear", "timed_nonlinear", "timed_slsqp", "timed_convex")]
+    run = forked("figures", *TINY, f"subsystem={subsystem}", "loop=model", *left_out, cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    rows = list(csv.DictReader((tmp_path / "out/figures.csv").read_text().splitlines()))
+    assert {(row["name"], row["subsystem"]) for row in rows} == {
+        ("convex GPMPC, as the authors", subsystem),
+        ("convex GPMPC, ours", subsystem),
+    }
+    assert (tmp_path / "out/figure3.png").exists()
+    assert (tmp_path / "out/figure4.png").exists() == (subsystem == "translational")
 
 
 @pytest.mark.parametrize(
