@@ -37,7 +37,7 @@ class DataError(GpmpcError, ValueError):
 
 
 class TrainingError(GpmpcError, RuntimeError):
-    """Every start of the hyperparameter optimisation failed for at least one output.
+    """For at least one output every start of the search failed, or sparse GPs learned nothing where exact ones do.
 
     Attributes:
         outputs: Indices of the outputs (from 0) that could not be trained.

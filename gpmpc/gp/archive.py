@@ -15,7 +15,7 @@ import json
 import math
 import os
 import zipfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -59,11 +59,11 @@ def new_file(path: str | Path) -> Path:
     return path
 
 
-def pack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> bytes:
-    """The content of a file that holds a header and arrays, uncompressed."""
+def pack(header: dict[str, Any], arrays: Iterable[tuple[str, np.ndarray]]) -> bytes:
+    """The content of a file that holds a header and named arrays, uncompressed."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
-        for name, value in arrays.items():
+        for name, value in arrays:
             array = io.BytesIO()
             np.lib.format.write_array(array, value, allow_pickle=False)
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), array.getvalue())

@@ -24,7 +24,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc.exceptions import SettingError, UnsupportedModel, check_number
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.transitions import Transitions
 
@@ -60,8 +60,13 @@ class Budget:
 
         Raises:
             ShapeError: The transitions have other dimensions.
+            UnsupportedModel: Of another model.
         """
-        return self.condition(posterior, transitions.features, posterior.learned(transitions))
+        if not isinstance(posterior, GPPosterior):
+            got = type(posterior).__name__
+            raise UnsupportedModel(f"a budget is for a GPPosterior (ResidualModel.condition_on takes one); got {got}")
+        targets = posterior.learned(transitions)
+        return self.condition(posterior, transitions.features, targets)
 
     def condition(self, posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
         """The same for points x~ (p, n + m) and what the GPs learn of them (p, k)."""

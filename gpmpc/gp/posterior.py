@@ -309,7 +309,8 @@ class GPPosterior:
             UnsupportedModel: The GPs learned values, which transitions do not hold: ``condition_on_targets``.
             SettingError: The larger kernel matrix is not positive definite in this dtype.
         """
-        return extended(self, transitions.features, self.learned(transitions))
+        targets = self.learned(transitions)
+        return extended(self, transitions.features, targets)
 
     def condition_on_targets(self, features: Tensor, targets: Tensor) -> "GPPosterior":
         """The posterior that has seen more points: x~ = (x, u) (p, n + m) and what the GPs learn of them (p, k)."""

@@ -81,8 +81,8 @@ class ResidualModel:
     def __post_init__(self) -> None:
         gp = self.residual
         check_tensors(B=self.B)
-        if gp.predicts != "value":
-            raise SettingError("residual", f"must be a GP with predicts='value'; got {gp.predicts!r}")
+        if getattr(gp, "predicts", None) != "value":
+            raise SettingError("residual", f"must be a GP with predicts='value'; got {getattr(gp, 'predicts', gp)!r}")
         if (len(self.states), len(self.inputs)) != (gp.state_dim, gp.input_dim):
             raise ShapeError(
                 f"the residual sees {gp.state_dim} states and {gp.input_dim} inputs; "

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.gaussian import check_tensors
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +30,7 @@ class Scaling:
     factor: Tensor
 
     def __post_init__(self) -> None:
+        check_tensors(offset=self.offset, factor=self.factor)
         if self.offset.shape != self.factor.shape or self.offset.dim() != 1:
             raise ShapeError(
                 f"offset and factor must both be (d,); got {tuple(self.offset.shape)} and {tuple(self.factor.shape)}"

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.gaussian import check_tensors
 from gpmpc.gp.collapsed_bound import JITTER, Method, check_method, data_sums, inducing_factor
 from gpmpc.gp.posterior import GPPosterior, Predicts
 
@@ -65,6 +66,7 @@ def sparse_posterior(
     if jitter is not None:
         check_number("jitter", jitter, least=0)
     check_method(method)
+    check_tensors(inducing=inducing, features=features, targets=targets)
     offset = torch.zeros_like(targets[0]) if offset is None else offset
     if inducing.dim() != 2 or inducing.shape[1:] != features.shape[1:] or not len(inducing):
         raise ShapeError(f"inducing must be (M, {features.shape[-1]}), M > 0; got {tuple(inducing.shape)}")

@@ -11,7 +11,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -98,7 +98,7 @@ class SparseTrainer:
         check_number("jitter", self.jitter, least=0)
         if self.method not in ("sgpr", "fitc"):
             raise SettingError("method", f"must be 'sgpr' or 'fitc'; got {self.method!r}")
-        self._exact()  # which checks the others
+        replace(self._exact(), scaling=self.scaling)  # which checks the others
 
     def __call__(self, transitions: Transitions, seed: int = 0) -> SparseTraining:
         """Trains on transitions; ``seed`` is that of the subset and of its random starts.
@@ -115,6 +115,7 @@ class SparseTrainer:
     ) -> SparseTraining:
         """Trains on features x~ = (x, u) (N, n + m) and any targets (N, k)."""
         begin = time.perf_counter()
+        check_number("seed", seed, least=0, whole=True)
         predicts = self.predicts if predicts is None else predicts
         features, targets = training_data(features, targets, input_dim, predicts)
         n = features.shape[1] - input_dim

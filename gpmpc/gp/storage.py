@@ -192,7 +192,7 @@ def _write(path: Path, kind: str, header: dict, tensors: dict[str, Tensor]) -> N
         "versions": versions(("gpmpc", "torch", "gpytorch", "numpy")),
         "created": now(),
     }
-    arrays = {name: _packed(name, value).cpu().contiguous().numpy() for name, value in tensors.items()}
+    arrays = ((name, _packed(name, value).cpu().contiguous().numpy()) for name, value in tensors.items())
     write_whole(path, pack(header, arrays))
 
 

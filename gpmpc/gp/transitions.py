@@ -111,7 +111,7 @@ class Transitions:
 
     def save(self, path: str | Path) -> None:
         """Writes an uncompressed ``.npz`` (no pickle), in one piece or not at all."""
-        arrays = {name: getattr(self, name).numpy(force=True) for name in NAMES}
+        arrays = ((name, getattr(self, name).numpy(force=True)) for name in NAMES)
         write_whole(new_file(path), pack({"format": FORMAT, "format_version": VERSION}, arrays))
 
     @classmethod

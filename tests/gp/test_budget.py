@@ -3,9 +3,10 @@ import logging
 import pytest
 import torch
 
-from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gp import Budget, GPPosterior, Transitions
 from gpmpc.gp.budget import information, least_informative
+from tests.gp.small_models import residual_model
 
 
 def transitions(rows, seed=0):
@@ -112,3 +113,10 @@ def test_misuse_is_refused_with_the_rule():
         Budget(5, "random")
     with pytest.raises(ShapeError, match="2 states and 1 inputs; got transitions with 1 and 1"):
         Budget(5)(posterior(transitions(3)), Transitions(torch.zeros(1, 1), torch.zeros(1, 1), torch.zeros(1, 1)))
+
+
+def test_a_budget_of_another_model_says_what_takes_one():
+    with pytest.raises(UnsupportedModel, match="ResidualModel.condition_on takes one.; got ResidualModel"):
+        Budget(3)(residual_model(), transitions(2))
+    with pytest.raises(SettingError, match=r"transitions: must be Transitions\(...\); got Tensor"):
+        Budget(3)(posterior(transitions(5)), torch.zeros(2, 3))

@@ -30,7 +30,7 @@ from gpmpc.gp.module import PosteriorModule
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, linearize
 from gpmpc.propagation.sensitivity import differentiate
 
-FEATURES = [-1e5, 1e8, torch.tensor([-1e8, 1e7, 13.75])]
+FEATURES = [1e8, torch.tensor([-1e8, 1e7, 13.75])]
 TARGETS = [-1e8, torch.tensor([1e8, 0.0])]
 
 
@@ -152,7 +152,7 @@ def everything(gp, by):
     return said
 
 
-@pytest.mark.parametrize("by", FEATURES[1:], ids=str)
+@pytest.mark.parametrize("by", FEATURES, ids=str)
 @pytest.mark.parametrize("choice", ["compiled", "torch"])
 @pytest.mark.parametrize("sparse", [False, True], ids=["exact", "sparse"])
 def test_predictions_and_exports_are_those_of_the_shifted_model(by, choice, sparse):

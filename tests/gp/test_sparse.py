@@ -182,6 +182,7 @@ def test_fewer_points_than_inducing_points_are_all_taken():
         ({"method": "dtc"}, "'sgpr' or 'fitc'; got 'dtc'"),
         ({"jitter": -1.0}, "jitter: must be a number, 0 or more; got -1.0"),
         ({"predicts": "delta"}, "'next_state', 'difference', 'value'; got 'delta'"),
+        ({"scaling": "standardize"}, "scaling: must be a function such as standardize"),
         ({"iterations": 1.5}, "iterations: must be a whole number, 0 or more; got 1.5"),
     ],
 )
@@ -194,6 +195,7 @@ def test_misuse_of_the_trainer_is_refused_with_the_rule(setting, message):
     ("change", "error", "message"),
     [
         ({"inducing": torch.zeros(4, 2)}, ShapeError, r"inducing must be \(M, 3\), M > 0; got \(4, 2\)"),
+        ({"features": [[0.0] * 3] * 10}, SettingError, "features: must be a torch tensor; got list"),
         ({"targets": torch.zeros(9, 2)}, ShapeError, "same number of rows; got 10 and 9"),
         ({"method": "dtc"}, SettingError, "'sgpr' or 'fitc'; got 'dtc'"),
         ({"features": torch.full((10, 3), torch.nan)}, DataError, "inputs must be finite; got nan"),
@@ -227,7 +229,7 @@ def explained(gp, x, y):
 
 @pytest.mark.parametrize(
     ("d", "rows", "noise", "least"),
-    [(8, 2000, 0.1, 0.7), (12, 500, 0.01, 0.65), (4, 1000, 0.01, 0.98), (4, 500, 0.5, 0.8), (2, 500, 1e-3, 0.999)],
+    [(8, 2000, 0.1, 0.7), (4, 1000, 0.01, 0.98), (4, 500, 0.5, 0.8), (2, 500, 1e-3, 0.999)],
 )
 def test_by_default_more_is_learned_than_noise(d, rows, noise, least):
     x, y = sines(rows, d, noise, seed=0)

@@ -6,7 +6,17 @@ import torch
 from scipy.optimize import approx_fprime
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError, UnsupportedModel
-from gpmpc.gp import GPPosterior, SoftLimits, SparseTrainer, Trainer, Transitions, train, train_many
+from gpmpc.gp import (
+    GPPosterior,
+    SoftLimits,
+    SparseTrainer,
+    Trainer,
+    Transitions,
+    identity,
+    standardize,
+    train,
+    train_many,
+)
 from gpmpc.gp.hyperparameter_search import spread
 
 
@@ -92,6 +102,16 @@ def test_the_spread_of_a_constant_column_is_its_magnitude_or_one():
     columns = np.column_stack([[1.0, 2.0, 3.0], [-4.0] * 3, [0.0] * 3, [0.5, 0.5 + 1e-12, 0.5]])
     assert np.allclose(spread(columns), [1, 4, 1, 0.5])
     assert np.allclose(spread(np.array([[2.0, 0.0]])), [2, 1])
+
+
+def test_the_prior_mean_is_what_the_scaling_maps_to_zero():
+    data = pendulum(12)
+    means = data.next_states.mean(0)
+    for scaling, mean in ((None, means), (standardize, means), (identity, torch.zeros(2))):
+        gp = train(data, restarts=0, **({} if scaling is None else {"scaling": scaling})).posterior
+        assert torch.allclose(gp.offset, mean, atol=1e-14)
+        far = gp.predict(torch.full((2,), 1e6), torch.full((1,), 1e6)).mean
+        assert torch.allclose(far, mean, atol=1e-14)
 
 
 def test_one_row_can_be_trained_on():
