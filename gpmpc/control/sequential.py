@@ -1,9 +1,11 @@
 """Problem: one quadratic program is a step towards the optimal plan; a sequence of them reaches it.
 
 Sequential quadratic programming (Nocedal and Wright, 2006, chapter 18): linearise along the plan, solve the program, go
-as far towards its solution as the true cost falls, and again, until the plan is a KKT point. The step length is found
-by backtracking on the cost along the true rollout, with an exact penalty for the state bounds, and the Gauss-Newton
-Hessian is corrected by damped BFGS updates for the curvature of the Lagrangian that it misses (section 18.3 there).
+as far towards its solution as the true cost falls, and again, until the plan is a KKT point. The whole step is tried
+first, rolled out under the ancillary feedback towards the states that the program predicts: over a horizon that is
+unstable in the open loop its inputs alone would lead elsewhere. Then the step length is found by backtracking on the
+cost along the true rollout, with an exact penalty for the state bounds; the Gauss-Newton Hessian is corrected by damped
+BFGS updates for the curvature of the Lagrangian that it misses (section 18.3 there).
 
 Between the model's and the solver's arithmetic stands little, on few numbers. In Python it would cost more than both,
 most where other work has emptied the caches between two control steps; so the sequence is one compiled loop

@@ -1,5 +1,7 @@
 """The nonlinear problem against finite differences, autograd, quadratic programs and random search."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
