@@ -62,7 +62,7 @@ def test_the_recording_holds_the_flight_and_its_decisions(single):
     assert np.isnan(run.measured[2]).all()
     assert np.isnan(run.innovations[0]).all()
     assert np.allclose(run.innovations[1], run.measured[1] - run.plan_means[0, 1], atol=1e-14)
-    assert run.input_bounds.tolist() == [[0.0, -0.7, -0.7], [20.0, 0.7, 0.7]]
+    assert run.input_bounds.tolist() == [[0.0, -0.7, -0.7], [100.0, 0.7, 0.7]]
     assert np.allclose(replay(run, 1).x, run.problems[1].x, atol=1e-9)
     assert run.metadata["run"]["seed"] == "7"
     errors = np.square((run.states - run.references)[1:, ::2])  # x[K] is in the metrics, not in the recording
@@ -231,7 +231,7 @@ def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(swee
     assert refused.returncode == 2
     assert refused.stderr.count("\n") == 1
     assert f"folder: tree/{path.parent.name} holds a finished run of other settings" in refused.stderr
-    assert "controller.problem.Q: [7.0, 1.0, 10.0, 1.0, 10.0, 1.0] then, [10.0, 1.0" in refused.stderr
+    assert "controller.problem.Q: [7.0, 1.0, 1.0, 1.0, 1.0, 1.0] then, [1.0, 1.0" in refused.stderr
     assert "gone: 1 then, None now" in refused.stderr
     assert "choose another folder, or remove that one to fly it again" in refused.stderr
     assert json.loads(path.read_text()) == found  # nothing was overwritten, nothing else flown
