@@ -200,3 +200,11 @@ def test_misuse_is_refused_with_the_rule():
         Recording(torch.zeros(3, 2), torch.zeros(3, 1))
     with pytest.raises(DataError, match="inputs of a recording must be finite"):
         Recording(torch.zeros(3, 2), torch.full((2, 1), torch.nan))
+
+
+def test_a_table_without_a_choice_has_every_step_and_with_one_that_alone():
+    everything, table = example().markdown(), example().rows()
+    assert everything.count("\n") == 1 + len(table)
+    for choice, steps in ((None, [1, 2]), ([1], [1]), ([2], [2]), ([1, 2], [1, 2]), ([3], [])):
+        lines = example().markdown(choice).splitlines()[2:]
+        assert [int(line.split("|")[1]) for line in lines] == [step for step in steps for _ in example().names]

@@ -1,0 +1,30 @@
+"""A recovered file says that it was recovered, and of how many messages; a copy of a finished one says nothing."""
+
+import pytest
+from mcap.reader import make_reader
+
+from gpmpc.recording import read_run, recover
+from tests.recording import runs
+
+
+def metadata(path):
+    with path.open("rb") as file:
+        return {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+
+
+@pytest.mark.parametrize("cut", [0, 200, 40_000])
+def test_a_recovered_file_tells_so_and_counts_what_it_holds(cut, tmp_path):
+    path, output = tmp_path / "run.mcap", tmp_path / "recovered.mcap"
+    steps = runs.record_run(path, steps=20)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) - cut])
+    found = recover(path, output)
+    assert found.finished == (cut == 0)
+    about = metadata(output)
+    assert ("recovered" in about) == (cut > 0)
+    if cut:
+        assert about["recovered"]["messages"] == str(found.messages)
+    run = read_run(output)
+    assert run.steps.tolist() == list(range(len(run.steps)))
+    assert (len(run.steps) == len(steps)) == (cut < 1000)
+    assert found.seconds == pytest.approx(runs.TIME_STEP * (len(run.steps) - 1), abs=0.6)
