@@ -80,6 +80,7 @@ def flights(cascade: Cascade, trajectory: str, case: str, arguments: argparse.Na
     references = states_along(TRAJECTORIES[trajectory], np.arange(arguments.steps + 2.0))
     start = np.concatenate([references[0], np.zeros(6)])
     squares, lost, failures, outer, inner, worst = [], 0, 0, [], [], 0.0
+    cascade_loop(PLANT, cascade, references, start, 2, on_failure="previous_plan")  # compiles and loads
     for seed in range(arguments.seeds):
         try:
             flight = cascade_loop(

@@ -1,0 +1,43 @@
+"""Who waits for a compiler is told, and nobody else."""
+
+import re
+import time
+
+import numba
+import pytest
+
+from gpmpc.compiling import tell_of_compiling
+
+
+def test_compiling_is_told_once_with_its_time_and_a_call_of_what_is_compiled_is_not(capsys):
+    @numba.njit
+    def inner(x):
+        return x + 1
+
+    @numba.njit
+    def outer(x):
+        return 2 * inner(x)
+
+    began = time.perf_counter()
+    with tell_of_compiling():
+        assert outer(1.0) == 4
+        assert outer(1) == 4
+    taken = time.perf_counter() - began
+    first, last = capsys.readouterr().out.splitlines()
+    assert "compiling" in first
+    told = float(re.fullmatch(r"compiled in ([\d.]+) s", last)[1])
+    assert 0 <= told <= taken + 0.05
+    with tell_of_compiling():
+        outer(2.0)
+    assert capsys.readouterr().out == ""
+
+
+def test_an_error_meanwhile_is_passed_on(capsys):
+    @numba.njit
+    def kernel(x):
+        return x
+
+    with pytest.raises(KeyError), tell_of_compiling():
+        raise KeyError
+    kernel(1.0)
+    assert capsys.readouterr().out == ""  # nobody listens any more
