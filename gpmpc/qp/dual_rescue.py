@@ -12,7 +12,6 @@ for the residuals r1 of stationarity and r2 of the working set.
 """
 
 from collections.abc import Callable
-from math import fsum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +93,8 @@ class _Solve:
             if not self._step_to(p, side, sense, violation, rounding):
                 if self._prove(p, sense):
                     return layout.INFEASIBLE
-                if violation > rounding:
+                terms = [self._terms_of(w, s) for w, s in zip(self.members, self.sides, strict=True)]
+                if violation > rounding + ROUNDING * np.abs(self.r) @ np.array(terms):
                     return layout.NUMERICAL_TROUBLE
                 passed.add(p)
 
@@ -299,14 +299,22 @@ def _add(parts: Array, where, change: Array) -> None:
 
 
 def _sum_products(products: list[tuple[Array, Array]], constant: Array) -> Array:
-    """``constant + sum A @ v``, rounded once (products split by Dekker, 1971)."""
+    """``constant + sum A @ v`` as if in doubled precision (Ogita, Rump and Oishi, 2005)."""
     terms = [constant[:, None]]
     for A, v in products:
         product = A * v
         A_high, v_high = _leading_half(A), _leading_half(v)
         A_low, v_low = A - A_high, v - v_high
         terms += [product, ((A_high * v_high - product) + A_high * v_low + A_low * v_high) + A_low * v_low]
-    return np.array([fsum(row) for row in np.concatenate(terms, axis=1).tolist()])
+    total, rest = np.concatenate(terms, axis=1), np.zeros(len(constant))
+    while total.shape[1] > 1:
+        if total.shape[1] % 2:
+            total = np.column_stack([total, np.zeros(len(constant))])
+        a, b = total[:, ::2], total[:, 1::2]
+        total = a + b
+        part = total - a
+        rest += ((a - (total - part)) + (b - part)).sum(axis=1)
+    return total[:, 0] + rest
 
 
 def _leading_half(a: Array) -> Array:

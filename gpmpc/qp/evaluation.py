@@ -30,6 +30,7 @@ from gpmpc.qp.working_set import (
     BOUND,
     CAP,
     END,
+    FLOOR,
     LEAST,
     LOWER,
     MOST,
@@ -208,7 +209,8 @@ def worst_violation(n, y, mu, slope, traits, bounds, least):
         if abs(mu[p]) < traits[CAP, p]:
             above, below, paid = y[p] - bounds[UPPER, p], bounds[LOWER, p] - y[p], traits[SOFTNESS, p] * abs(mu[p])
             bound = bounds[UPPER if above > below else LOWER, p]
-            worst = max(worst, (max(above, below) - paid) / max(0.01 * size * traits[SCALE, p], abs(bound)))
+            rest = max(above, below) - paid - bounds[FLOOR, p]
+            worst = max(worst, rest / max(0.01 * size * traits[SCALE, p], abs(bound)))
     return worst
 
 
