@@ -215,7 +215,7 @@ class _Solve:
         """The size of the numbers whose rounding a violation may be; a zero row has those of the other rows only."""
         if self.C[p].any():
             return max(abs(self._bound(p, side)), np.abs(self.C[p]) @ np.abs(self.x[0]))
-        return zero_row_size(*self.bounds)
+        return zero_row_size(self.G, *self.bounds)
 
     def _step_to(self, p: int, side: int, sense: int, violation: float, rounding: float) -> bool:
         """Moves multipliers until constraint p is satisfied.

@@ -131,7 +131,7 @@ class QPSolution(NamedTuple):
         beyond = np.maximum(0.0, violation - np.where(sizes >= caps, np.inf, softness * sizes))
         bound = np.abs(np.where(np.concatenate([x, rows]) > self.upper, self.upper, self.lower))
         own = np.concatenate([np.maximum(np.abs(x), zero / units), np.abs(G) @ np.maximum(np.abs(x), zero / units)])
-        own[n:][~G.any(axis=1)] = zero_row_size(self.lower, self.upper)
+        own[n:][~G.any(axis=1)] = zero_row_size(G, self.lower, self.upper)
         primal = _largest_ratio(beyond, np.maximum(own, bound))
 
         absent = (up & (self.upper >= ABSENT)) | (down & (self.lower <= -ABSENT))
