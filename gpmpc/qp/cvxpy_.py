@@ -115,7 +115,8 @@ class CvxpySolver:
             )
             if status is Status.INFEASIBLE:
                 return solution
-            solutions.append((float(np.nan_to_num(max(solution.residuals()), nan=np.inf)), solution))
+            residual = max(solution.residuals(zero=1.0))  # an interior point does not reach zero
+            solutions.append((float(np.nan_to_num(residual, nan=np.inf)), solution))
             if status is Status.SOLVED and solutions[-1][0] <= self.tolerance:
                 return solution
         residual, solution = min(solutions, key=lambda pair: pair[0])

@@ -8,9 +8,9 @@ multipliers of the right sign. ``DualActiveSet`` is the method of Goldfarb and I
 * P and G stay: ``prepared = solver.prepare(P, G)`` once, then ``prepared.solve(q, lower, upper, last_solution)``.
 * P and G change: ``solver.solve(problem, last_solution)``, or ``solver.solve_stacked(...)`` without building a problem.
 
-An answer that its own residuals do not bear out, and an infeasibility without Farkas' proof, are tried again from
-nothing in lazy mode, on the equilibrated problem, and by the primal method; what still fails is reported as
-``Status.NUMERICAL_TROUBLE``.
+An answer that its own residuals do not bear out, one whose factors lost too many digits to say, and an infeasibility
+without Farkas' proof are tried again with a new factor, then with doubled digits (``gpmpc.qp.dual_rescue``); what still
+fails is reported as ``Status.NUMERICAL_TROUBLE``.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ class DualActiveSet:
     """The dual active-set method; an object holds settings only and may serve many threads.
 
     Args:
-        tolerance: Largest scaled KKT residual of a solution called ``SOLVED``.
+        tolerance: Largest residual of a solution called ``SOLVED``, as a share of its size.
         iteration_limit: Changes of the working set before ``ITERATION_LIMIT``; ample if omitted.
         time_limit: Seconds before ``TIME_LIMIT``; none if omitted.
 

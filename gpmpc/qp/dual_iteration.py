@@ -36,7 +36,7 @@ from gpmpc.qp.working_set import (
 
 REACHED, CONTRADICTION = 0, 1
 DEPENDENT = 1e-12  # d below this share of K_pp: the constraint depends on the working ones
-ROUNDING = 1e-14  # share of the bounds of a contradiction by which it may be their rounding
+ROUNDING = 1e-15  # share of the bounds of a contradiction by which it may be their rounding
 DOUBTFUL = 1e-4  # d below this share of K_pp is computed again without cancellation (lazy mode)
 
 
