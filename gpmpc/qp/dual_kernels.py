@@ -90,7 +90,7 @@ LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1],
 
 ABSENT = 1e20  # a bound of this size or more is none
 NEGLIGIBLE = 1e-26  # share of the length of q below which x, and a violation of a bound of zero, is none
-NOISE = 1e-13  # violation that a constraint which depends on others may be left with: see ``worst_violation``
+NOISE = 2e-14  # violation that a constraint which depends on others may be left with: see ``worst_violation``
 HOPELESS = 1e-7  # violation of such a constraint that is taken for a contradiction
 SWEEPS = 4  # times that all badly violated constraints are taken at once
 SWEPT = 0.5  # those violated by more than this share of the worst
