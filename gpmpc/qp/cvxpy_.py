@@ -27,7 +27,8 @@ from scipy.linalg import cho_solve, solve_triangular
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import record as layout
-from gpmpc.qp.primal_active_set import farkas_ray
+from gpmpc.qp.dual_rescue import rescue
+from gpmpc.qp.primal_active_set import LAST_CHANGES, farkas_ray
 from gpmpc.qp.problem import ABSENT, QuadraticProgram
 from gpmpc.qp.solution import QPSolution, make_solution
 from gpmpc.qp.solver import WarmStart
@@ -115,12 +116,17 @@ class CvxpySolver:
             )
             if status is Status.INFEASIBLE:
                 return solution
-            solutions.append((float(np.nan_to_num(max(solution.residuals()), nan=np.inf)), solution))
+            residual = max(solution.residuals(zero=1.0))  # an interior point does not reach zero
+            solutions.append((float(np.nan_to_num(residual, nan=np.inf)), solution))
             if status is Status.SOLVED and solutions[-1][0] <= self.tolerance:
                 return solution
         residual, solution = min(solutions, key=lambda pair: pair[0])
         if solution.status is Status.SOLVED and residual > self.tolerance:
             solution.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
+            if self.options is None:  # its working set may be right all the same
+                solution.record[:] = rescue(
+                    solution.terms, problem.q, lower, upper, solution.record, LAST_CHANGES, lambda: False
+                )
         return solution
 
     def _form(self, n: int, lower: Array, upper: Array) -> "_Form":

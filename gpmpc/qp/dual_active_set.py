@@ -8,9 +8,9 @@ multipliers of the right sign. ``DualActiveSet`` is the method of Goldfarb and I
 * P and G stay: ``prepared = solver.prepare(P, G)`` once, then ``prepared.solve(q, lower, upper, last_solution)``.
 * P and G change: ``solver.solve(problem, last_solution)``, or ``solver.solve_stacked(...)`` without building a problem.
 
-An answer that its own residuals do not bear out, and an infeasibility without Farkas' proof, are tried again from
-nothing in lazy mode, on the equilibrated problem, and by the primal method; what still fails is reported as
-``Status.NUMERICAL_TROUBLE``.
+An answer that its own residuals do not bear out, one whose factors lost too many digits to say, and an infeasibility
+without Farkas' proof are tried again with a new factor, then with doubled digits (``gpmpc.qp.dual_rescue``); what still
+fails is reported as ``Status.NUMERICAL_TROUBLE``.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ class DualActiveSet:
     """The dual active-set method; an object holds settings only and may serve many threads.
 
     Args:
-        tolerance: Largest scaled KKT residual of a solution called ``SOLVED``.
+        tolerance: Largest residual of a solution called ``SOLVED``, as a share of its size.
         iteration_limit: Changes of the working set before ``ITERATION_LIMIT``; ample if omitted.
         time_limit: Seconds before ``TIME_LIMIT``; none if omitted.
 
@@ -194,13 +194,15 @@ class DualActiveSet:
             again(guess, record)
             done += record[layout.ITERATIONS]
         record[layout.ITERATIONS] = done
-        status = record[layout.STATUS]
-        stopped = status == layout.ITERATION_LIMIT and self.iteration_limit is not None
-        if stopped or status in (layout.SOLVED, layout.TIME_LIMIT):
+        stopped = record[layout.STATUS] == layout.ITERATION_LIMIT and self.iteration_limit is not None
+        if stopped or _is_certain(record, terms.G, lower, upper):
             return record
-        if status == layout.INFEASIBLE and proves_infeasibility(
-            _multipliers(record, len(q), len(lower)), terms.G, lower, upper
-        ):
+        guess, record = record, np.empty_like(record)
+        guess[layout.TAG] = layout.NO_TAG  # the factor is made anew
+        if again(guess, record) == layout.MISUSE:
+            record = guess
+        record[layout.ITERATIONS] += done
+        if _is_certain(record, terms.G, lower, upper):
             return record
         return rescue(terms, q, lower, upper, record, limit, late)
 
@@ -273,8 +275,12 @@ class Prepared:
         return QPSolution(record[self._x], self.terms, q, lower, upper, record, 0.0, perf_counter() - began)
 
 
-def _multipliers(record: Array, n: int, M: int) -> Array:
-    return record[layout.HEADER + n : layout.HEADER + n + M]
+def _is_certain(record: Array, G: Array, lower: Array, upper: Array) -> bool:
+    """Whether a record needs no second look; an infeasibility needs Farkas' proof."""
+    if record[layout.STATUS] == layout.INFEASIBLE:
+        start = layout.HEADER + G.shape[1]
+        return proves_infeasibility(record[start : start + len(lower)], G, lower, upper)
+    return record[layout.STATUS] in (layout.SOLVED, layout.TIME_LIMIT)
 
 
 def _write_trouble(record: Array, n: int, M: int) -> None:

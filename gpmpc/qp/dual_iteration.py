@@ -13,7 +13,9 @@ import numpy as np
 from gpmpc.compiled import woven
 from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, subtract_rows
 from gpmpc.qp.working_set import (
+    BOUND,
     END,
+    FLOOR,
     HIGH_WATCH,
     LEAST,
     LOW_WATCH,
@@ -34,16 +36,20 @@ from gpmpc.qp.working_set import (
 
 REACHED, CONTRADICTION = 0, 1
 DEPENDENT = 1e-12  # d below this share of K_pp: the constraint depends on the working ones
+ROUNDING = 1e-15  # share of the bounds of a contradiction by which it may be their rounding
 DOUBTFUL = 1e-4  # d below this share of K_pp is computed again without cancellation (lazy mode)
 
 
 @woven
-def list_violated(y, scales, bounds, excess, listed):
-    """Lists the constraints outside their watch, and by how much in units of ``scales``; returns how many there are."""
+def list_violated(y, margin, scales, bounds, excess, listed):
+    """Lists the constraints outside their watch by more than ``margin``, and by how much more, in units of ``scales``.
+
+    Returns how many there are.
+    """
     lo, hi = bounds[LOW_WATCH], bounds[HIGH_WATCH]
     violated = 0
     for p in range(len(y)):
-        excess[p] = max(y[p] - hi[p], lo[p] - y[p])
+        excess[p] = max(y[p] - hi[p], lo[p] - y[p]) - margin * scales[p]
         violated += excess[p] > 0.0
     if violated > 0:
         count = 0
@@ -56,12 +62,12 @@ def list_violated(y, scales, bounds, excess, listed):
 
 
 @woven
-def keep_violated(now, scales, bounds, excess, listed, count):
+def keep_violated(now, margin, scales, bounds, excess, listed, count):
     """The same for the listed constraints, which stay listed if they are still outside their watch."""
     kept = 0
     for i in range(count):
         p = listed[i]
-        excess[p] = max(now[p] - bounds[HIGH_WATCH, p], bounds[LOW_WATCH, p] - now[p]) / scales[p]
+        excess[p] = max(now[p] - bounds[HIGH_WATCH, p], bounds[LOW_WATCH, p] - now[p]) / scales[p] - margin
         if excess[p] > 0.0:
             listed[kept] = p
             kept += 1
@@ -114,6 +120,8 @@ def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu
             step = own_room
         step, blocking = first_block(step, sense, k, mu, slots, members, r)
         if step == np.inf:
+            for i in range(k):
+                bounds[FLOOR, p] += ROUNDING * abs(r[i] * slots[BOUND, i])
             return CONTRADICTION, k, changes
         for i in range(k):
             mu[abs(members[NAME, i]) - 1] -= sense * step * r[i]

@@ -90,13 +90,14 @@ LAZY_SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1],
 
 ABSENT = 1e20  # a bound of this size or more is none
 NEGLIGIBLE = 1e-26  # share of the length of q below which x, and a violation of a bound of zero, is none
-NOISE = 1e-13  # violation that a constraint which depends on others may be left with: see ``worst_violation``
-HOPELESS = 1e-10  # violation of such a constraint that is taken for a contradiction
+NOISE = 2e-14  # violation that a constraint which depends on others may be left with: see ``worst_violation``
+HOPELESS = 1e-7  # violation of such a constraint that is taken for a contradiction
 SWEEPS = 4  # times that all badly violated constraints are taken at once
 SWEPT = 0.5  # those violated by more than this share of the worst
+LATER = 1e-11  # violation, as a share of the length of q, that waits for the refined x
 ROUNDS = 10  # returns from the residuals to the iteration
 REFINEMENTS = 3
-FINE = 2e-10  # residual at which refinement stops
+FINE, FINEST = 2e-10, 1e-15  # residuals at which refinement stops
 DOUBT = 3e-7  # times the shares that cancellation left of the pivots: the largest residual of a solution
 OLD = 1000  # changes after which a factor is computed anew
 
@@ -152,7 +153,7 @@ def all_present(names, bounds, mu):
 @borrowing  # woven into ``optimise`` it would cost the solves that need no step a twentieth of a microsecond
 def climb(
     lazy, n, q, inverse, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch, y, now, seen, excess,
-    gradient, slope, k, capacity, soft, limit, iterations, sweeps, count,
+    gradient, slope, k, capacity, soft, limit, iterations, sweeps, count, margin, least,
 ):  # fmt: skip
     """Changes the working set until none of the constraints is violated; ``count`` are, and listed.
 
@@ -185,7 +186,7 @@ def climb(
             )
             iterations += changes
             if outcome == CONTRADICTION:
-                if excess[p] * traits[SCALE, p] > HOPELESS * max(abs(value), bounds[FLOOR, p] / NEGLIGIBLE):
+                if excess[p] * traits[SCALE, p] > HOPELESS * max(abs(value), least / NEGLIGIBLE * traits[SCALE, p]):
                     write_ray(p, value > bounds[UPPER, p], k, bounds, members, scratch[2], mu)
                     return INFEASIBLE, k, iterations, sweeps, passed
                 mu[p], passed = before_step, True  # what it gained on the way belongs to no working set
@@ -197,7 +198,7 @@ def climb(
         fresh = several or soft or count == 1 or iterations >= limit
         if not fresh:  # first satisfy those that were seen to be violated, then look at all
             follow_listed(lazy, n, v, rows, L, G, mu, k, members, traits, seen, gradient, y, listed, count, now)
-            count = keep_violated(now, traits[SCALE], bounds, excess, listed, count)
+            count = keep_violated(now, margin, traits[SCALE], bounds, excess, listed, count)
             fresh = count == 0
         if fresh:
             if not lazy:
@@ -207,7 +208,7 @@ def climb(
             else:
                 follow_lazily(n, v, rows, L, mu, k, members, gradient, y)
                 row_values(lazy, L, G, n, traits, y)
-            count = list_violated(y, traits[SCALE], bounds, excess, listed)
+            count = list_violated(y, margin, traits[SCALE], bounds, excess, listed)
     clip_multipliers(k, mu, slots, members)  # which rounding can take out of their ranges
     return SOLVED, k, iterations, sweeps, passed
 
@@ -272,17 +273,18 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
         row_values(lazy, L, G, n, traits, y)
     else:
         evaluate(lazy, n, q, inverse, L, G, mu, k, members, traits, soft, slope, y)
+    margin, fine = LATER / NEGLIGIBLE * least, FINE
     iterations, rounds, status, worst = np.int64(0), 0, NUMERICAL_TROUBLE, np.inf
     interrupted = guessed and warm[STATUS] == ITERATION_LIMIT
     sweeps = SWEEPS if interrupted else 0  # the dual objective climbs with single steps only, and so the end is sure
-    count = list_violated(y, traits[SCALE], bounds, excess, listed)
+    count = list_violated(y, margin, traits[SCALE], bounds, excess, listed)
     current, moved = not lazy or soft, False  # whether slope belongs to mu, and x is not what was last looked at
     passed = False  # whether a constraint was passed over
     while True:
         if count > 0:
             status, k, iterations, sweeps, passed_over = climb(
                 lazy, n, q, inverse, pull, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch, y, now, seen,
-                excess, gradient, slope, k, capacity, soft, limit, iterations, sweeps, count,
+                excess, gradient, slope, k, capacity, soft, limit, iterations, sweeps, count, margin, least,
             )  # fmt: skip
             if status != SOLVED:
                 break
@@ -295,23 +297,28 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
                 y[p] = slots[BOUND, i]
         if not current:
             add_pull(G, n, q, mu, k, members, traits, soft, slope)
+        if passed:
+            fine = FINEST
         best, share = np.inf, settings[workspace.SHARE]
         if k > 0:
             share = min(share, math.sqrt(smallest_share(k, slots, R)))
         for attempt in range(REFINEMENTS + 1):
             worst = residuals(lazy, P, G, n, traits, mu, k, slots, members, y, slope, least, gradient, active)
-            if worst <= min(FINE, DOUBT * share) or attempt == REFINEMENTS or not worst < 0.5 * best:
+            if worst <= min(fine, DOUBT * share) or attempt == REFINEMENTS or not worst < 0.5 * best:
                 break
             best, moved = worst, True
             refine(lazy, k, n, rows, L, G, slots, members, traits, R, mu, y, gradient, active, scratch[0], scratch[2])
             add_pull(G, n, q, mu, k, members, traits, soft, slope)
         status = SOLVED if worst <= min(tolerance, DOUBT * share) else NUMERICAL_TROUBLE
         rounds += 1
-        if not moved or rounds == ROUNDS or worst >= UNDEFINED:
+        if (not moved and margin == 0.0) or rounds == ROUNDS or worst >= UNDEFINED:
             break
-        count = list_violated(y, traits[SCALE], bounds, excess, listed)
+        margin = 0.0
+        count = list_violated(y, margin, traits[SCALE], bounds, excess, listed)
         if count == 0:
             break
+        if fine > FINEST:  # a small violation is believed of the best x only
+            fine, count, moved = FINEST, 0, True
     unsure = passed or rounds == ROUNDS  # of the violations that are left
     if unsure and status == SOLVED and worst_violation(n, y, mu, slope, traits, bounds, least) > NOISE:
         status = NUMERICAL_TROUBLE

@@ -12,7 +12,6 @@ for the residuals r1 of stationarity and r2 of the working set.
 """
 
 from collections.abc import Callable
-from math import fsum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,9 +48,11 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, li
     result[layout.TAG] = layout.NO_TAG
     try:
         lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
-        solve = _Solve(terms, q, lower, upper)
-        result[layout.STATUS] = solve.run(_names(record, len(q), len(lower)), limit, late)
+        solve = _Solve(terms, q, lower, upper, late)
+        result[layout.STATUS] = solve.run(_names(record, len(q), len(lower)), limit)
         solve.write(result)
+    except TimeoutError:
+        result[layout.STATUS] = layout.TIME_LIMIT
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):  # not finite, or not positive definite once scaled
         result[layout.STATUS] = layout.NUMERICAL_TROUBLE
     return result
@@ -60,7 +61,7 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, li
 class _Solve:
     """One program, scaled, and the state of the iteration: the working set, x, and the multipliers."""
 
-    def __init__(self, terms: Terms, q: Array, lower: Array, upper: Array):
+    def __init__(self, terms: Terms, q: Array, lower: Array, upper: Array, late: Callable):
         n, M = len(q), len(lower)
         D = _power_of_two(np.sqrt(np.diagonal(terms.P)))
         E = np.concatenate([1.0 / D, _power_of_two(np.abs(terms.G * D).max(axis=1, initial=0.0))])
@@ -68,7 +69,7 @@ class _Solve:
         self.P, self.q, self.C = terms.P * np.outer(D, D), q * D, np.vstack([np.eye(n), terms.G * D * E[n:, None]])
         self.lower, self.upper = lower * E, upper * E
         self.softness, self.caps = terms.softness[0] * E * E, terms.softness[1] / E
-        self.G, self.bounds = terms.G, (lower, upper)
+        self.G, self.bounds, self.late = terms.G, (lower, upper), late
         self.L = np.linalg.cholesky(self.P)
         self.columns = solve_triangular(self.L, self.C.T, lower=True)  # L^-1 C'
         self.norms = np.sqrt((self.columns**2).sum(axis=0) + self.softness)
@@ -78,7 +79,7 @@ class _Solve:
         self.x, self.mu = np.zeros((2, n)), np.zeros((2, M))
         self.iterations, self.ray = 0, None
 
-    def run(self, names: Array, limit: int, late: Callable) -> int:
+    def run(self, names: Array, limit: int) -> int:
         """Changes the working set until no constraint is violated; returns the status."""
         self._guess(names)
         passed: set[int] = set()
@@ -88,13 +89,14 @@ class _Solve:
             p, side, sense, violation = self._most_violated(passed)
             if p < 0:
                 return layout.SOLVED
-            if self.iterations >= limit or late():
-                return layout.ITERATION_LIMIT if self.iterations >= limit else layout.TIME_LIMIT
+            if self.iterations >= limit:
+                return layout.ITERATION_LIMIT
             rounding = ROUNDING * self._terms_of(p, side)
             if not self._step_to(p, side, sense, violation, rounding):
                 if self._prove(p, sense):
                     return layout.INFEASIBLE
-                if violation > rounding:
+                terms = [self._terms_of(w, s) for w, s in zip(self.members, self.sides, strict=True)]
+                if violation > rounding + ROUNDING * np.abs(self.r) @ np.array(terms):
                     return layout.NUMERICAL_TROUBLE
                 passed.add(p)
 
@@ -120,15 +122,18 @@ class _Solve:
 
     def _guess(self, names: Array) -> None:
         """Starts with the named bounds, except those that depend on others."""
-        for name in names:
-            p, side = int(abs(name)) - 1, int(np.sign(name))
-            if p not in self.members and np.isfinite(self._bound(p, side)):
-                self._factorise()
-                if self._distance(p)[1] > 1e6 * self.dependent * self.norms[p]:
-                    self.members.append(p)
-                    self.sides.append(side)
+        guess = {int(abs(name)) - 1: int(np.sign(name)) for name in names}
+        some = [p for p, side in guess.items() if np.isfinite(self._bound(p, side)) and self.norms[p] > 0.0]
+        if some:
+            A = np.vstack([self.columns[:, some], np.diag(np.sqrt(self.softness[some]))]) / self.norms[some]
+            R, order = qr(A, mode="r", pivoting=True)
+            good = np.abs(np.diagonal(R)) > 1e6 * self.dependent
+            self.members = [some[i] for i in order[: len(good)][good]]
+            self.sides = [guess[p] for p in self.members]
 
     def _factorise(self) -> None:
+        if self.late():
+            raise TimeoutError
         A = np.vstack([self.columns[:, self.members], np.diag(np.sqrt(self.softness[self.members]))])
         self.Q, self.R = qr(A, mode="economic")
 
@@ -215,7 +220,7 @@ class _Solve:
         """The size of the numbers whose rounding a violation may be; a zero row has those of the other rows only."""
         if self.C[p].any():
             return max(abs(self._bound(p, side)), np.abs(self.C[p]) @ np.abs(self.x[0]))
-        return zero_row_size(*self.bounds)
+        return zero_row_size(self.G, *self.bounds)
 
     def _step_to(self, p: int, side: int, sense: int, violation: float, rounding: float) -> bool:
         """Moves multipliers until constraint p is satisfied.
@@ -299,14 +304,22 @@ def _add(parts: Array, where, change: Array) -> None:
 
 
 def _sum_products(products: list[tuple[Array, Array]], constant: Array) -> Array:
-    """``constant + sum A @ v``, rounded once (products split by Dekker, 1971)."""
+    """``constant + sum A @ v`` as if in doubled precision (Ogita, Rump and Oishi, 2005)."""
     terms = [constant[:, None]]
     for A, v in products:
         product = A * v
         A_high, v_high = _leading_half(A), _leading_half(v)
         A_low, v_low = A - A_high, v - v_high
         terms += [product, ((A_high * v_high - product) + A_high * v_low + A_low * v_high) + A_low * v_low]
-    return np.array([fsum(row) for row in np.concatenate(terms, axis=1).tolist()])
+    total, rest = np.concatenate(terms, axis=1), np.zeros(len(constant))
+    while total.shape[1] > 1:
+        if total.shape[1] % 2:
+            total = np.column_stack([total, np.zeros(len(constant))])
+        a, b = total[:, ::2], total[:, 1::2]
+        total = a + b
+        part = total - a
+        rest += ((a - (total - part)) + (b - part)).sum(axis=1)
+    return total[:, 0] + rest
 
 
 def _leading_half(a: Array) -> Array:

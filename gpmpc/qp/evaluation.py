@@ -30,6 +30,7 @@ from gpmpc.qp.working_set import (
     BOUND,
     CAP,
     END,
+    FLOOR,
     LEAST,
     LOWER,
     MOST,
@@ -202,13 +203,14 @@ def residuals(lazy, P, G, n, traits, mu, k, slots, members, y, slope, least, gra
 
 @woven
 def worst_violation(n, y, mu, slope, traits, bounds, least):
-    """The largest violation beyond what multipliers pay for, as a share of its bound or, a hundredth, of x."""
+    """The largest violation beyond what multipliers pay for, as a share of its bound or, a thousandth, of x."""
     worst, size = 0.0, math.sqrt(max(abs(dot(slope, y, n)), least * least))
     for p in range(len(y)):
         if abs(mu[p]) < traits[CAP, p]:
             above, below, paid = y[p] - bounds[UPPER, p], bounds[LOWER, p] - y[p], traits[SOFTNESS, p] * abs(mu[p])
             bound = bounds[UPPER if above > below else LOWER, p]
-            worst = max(worst, (max(above, below) - paid) / max(0.01 * size * traits[SCALE, p], abs(bound)))
+            rest = max(above, below) - paid - bounds[FLOOR, p]
+            worst = max(worst, rest / max(1e-3 * size * traits[SCALE, p], abs(bound)))
     return worst
 
 

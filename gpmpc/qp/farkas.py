@@ -29,11 +29,12 @@ def proves_infeasibility(ray: Array, G: Array, lower: Array, upper: Array) -> bo
     products = repaired[used] * bounds[used]
     if (np.abs(bounds[used]) >= ABSENT).any() or not np.isfinite(products).all():
         return False
-    sizes = np.abs(products).sum() + np.abs(ray[n:])[~G.any(axis=1)].sum() * zero_row_size(lower, upper)
+    sizes = np.abs(products).sum() + np.abs(ray[n:])[~G.any(axis=1)].sum() * zero_row_size(G, lower, upper)
     return bool(products.sum() < -ROUNDING * sizes)
 
 
-def zero_row_size(lower: Array, upper: Array) -> float:
-    """The size of the numbers that cancelled in a zero row, which does not say: that of the bounds, one at most."""
-    sizes = np.abs(np.concatenate([lower, upper]))
+def zero_row_size(G: Array, lower: Array, upper: Array) -> float:
+    """The size of the numbers that cancelled in a zero row, which does not say: that of other bounds, one at most."""
+    others = np.append(np.ones(G.shape[1], dtype=bool), G.any(axis=1))
+    sizes = np.abs(np.concatenate([lower[others], upper[others]]))
     return float(min(1.0, sizes[sizes < ABSENT].max(initial=0.0) or 1.0))

@@ -28,6 +28,8 @@ from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 from scipy.optimize import linprog
 
 from gpmpc.exceptions import ProblemError
+from gpmpc.qp import record as layout
+from gpmpc.qp.dual_rescue import rescue
 from gpmpc.qp.farkas import proves_infeasibility
 from gpmpc.qp.problem import ABSENT, QuadraticProgram
 from gpmpc.qp.solution import QPSolution, make_solution
@@ -40,6 +42,7 @@ RANK = 1e-11  # share of the largest pivot of the QR below which a working row d
 STILL = 1e-13  # share of the size of x below which a direction is zero
 FULL_STEPS = 2  # unhindered steps on one working set after which what is left of d is rounding
 INSIDE = 1e-9  # share of the size of a row by which phase 1 may miss it
+LAST_CHANGES = 20  # of the working set, when its last digits are found
 ZERO_STEPS = 20  # steps of length zero in a row after which Bland's rule breaks a possible cycle
 
 
@@ -84,13 +87,14 @@ class PrimalActiveSet:
         start, guess = _read_warm_start(warm_start, n, M)
 
         def finish(status, x, multipliers, active, iterations):
-            solution = make_solution(
-                problem, status, x, multipliers, active_set=active, iterations=iterations,
-                solve_seconds=perf_counter() - began,
-            )  # fmt: skip
-            if status is Status.SOLVED and not solution.is_optimal(self.tolerance):
-                return finish(Status.NUMERICAL_TROUBLE, x, multipliers, active, iterations)
-            return solution
+            solution = make_solution(problem, status, x, multipliers, active_set=active, iterations=iterations)
+            if status in (Status.SOLVED, Status.NUMERICAL_TROUBLE):  # checked, and its last digits found
+                solution.record[:] = rescue(
+                    solution.terms, problem.q, lower, upper, solution.record, LAST_CHANGES, lambda: False
+                )
+                if solution.status is not Status.INFEASIBLE and not solution.is_optimal(self.tolerance):
+                    solution.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
+            return solution._replace(solve_seconds=perf_counter() - began)
 
         nothing = np.zeros(M)
         x, ray = _phase_1(rows, start)

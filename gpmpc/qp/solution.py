@@ -31,8 +31,8 @@ class Residuals(NamedTuple):
     """How far a point is from the conditions of optimality; all three are zero at the minimiser.
 
     Each is relative to the numbers that it is a sum of, so that neither units nor data of another size hide it. Where
-    these cancel, zero is what is small beside x, or very small beside the free minimiser's size, in the metric of P's
-    diagonal (1e-6 and 1e-12 of them).
+    these cancel, zero is what is small beside x, or very small beside the free minimiser, in the metric of P's diagonal
+    (1e-4 and 1e-12 of them).
 
     Attributes:
         primal: The largest violation of a hard constraint, or of a soft one beyond what its multiplier pays for;
@@ -117,21 +117,25 @@ class QPSolution(NamedTuple):
         return self._violation(self.terms.G @ self.x)
 
     @np.errstate(all="ignore")  # the multipliers of a failed solve may be anything
-    def residuals(self) -> Residuals:
-        """How far x and the multipliers are from the conditions of optimality; NaN where that cannot be said."""
+    def residuals(self, zero: float = 1e-12) -> Residuals:
+        """How far x and the multipliers are from the conditions of optimality; NaN where that cannot be said.
+
+        Args:
+            zero: What counts as no x at all, as a share of the free minimiser.
+        """
         P, G, (softness, caps) = self.terms
         x, q, multipliers = self.x, self.q, self.multipliers
         sizes, up, down = np.abs(multipliers), multipliers > 0, multipliers < 0
         rows, slope, n = G @ x, P @ x, len(x)
         units = np.sqrt(np.diagonal(P))
         free = (np.abs(q) / units).max()
-        zero = max(1e-6 * (units * np.abs(x)).max(), 1e-12 * free)
+        zero = max(1e-4 * (units * np.abs(x)).max(), zero * free)
 
         violation = self._violation(rows)
         beyond = np.maximum(0.0, violation - np.where(sizes >= caps, np.inf, softness * sizes))
         bound = np.abs(np.where(np.concatenate([x, rows]) > self.upper, self.upper, self.lower))
         own = np.concatenate([np.maximum(np.abs(x), zero / units), np.abs(G) @ np.maximum(np.abs(x), zero / units)])
-        own[n:][~G.any(axis=1)] = zero_row_size(self.lower, self.upper)
+        own[n:][~G.any(axis=1)] = zero_row_size(G, self.lower, self.upper)
         primal = _largest_ratio(beyond, np.maximum(own, bound))
 
         absent = (up & (self.upper >= ABSENT)) | (down & (self.lower <= -ABSENT))

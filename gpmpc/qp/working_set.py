@@ -35,7 +35,7 @@ BOUND, FREE_VALUE, LEAST, MOST, DIAGONAL = 0, 1, 2, 3, 4  # rows of ``slots``
 NAME, PLACE, SCRATCH, LISTED = 0, 1, 2, 3  # rows of ``members``
 SCALE, SOFTNESS, CAP, END = 0, 1, 2, 3  # rows of ``traits``
 
-TOLERATED = 1e-13  # a violation below this share of the bound is none, whatever the constraint's other bound is
+TOLERATED = 2e-14  # a violation below this share of the bound is none, whatever the constraint's other bound is
 GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
 
 

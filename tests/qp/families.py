@@ -55,7 +55,7 @@ def huge_bounds(rng):
 
 
 def nearly_infeasible(rng):
-    """Two rows, or three, or a row and the box, that contradict each other by 1e-3 to 1e-12, or miss that by as much."""
+    """Two rows, three, or a row and the box that contradict each other by 1e-3 to 1e-12, or miss that by as much."""
     P, q, G, lower, upper = base(rng)
     n, size = len(q), magnitude(rng, -3, 3)
     gap = rng.choice([-1.0, 1.0]) * magnitude(rng, -12, -3) * size

@@ -5,11 +5,13 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from time import perf_counter
 
+import daqp
 import numpy as np
 import pytest
 
-from gpmpc.qp import DualActiveSet, PrimalActiveSet
+from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
 from gpmpc.status import Status
 from tests.qp.problems import feasible_problem, integer_problem
 
@@ -139,3 +141,48 @@ def test_no_disagreement_on_twenty_thousand_more_integer_problems():
     for _ in range(20000):
         problem = integer_problem(rng, True if rng.random() < 0.5 else None)
         assert DualActiveSet().solve(problem).status is primal.solve(problem).status
+
+
+def crowded_vertex(rng):
+    """More rows than variables through one vertex, the solution; some are repeated or sums of others."""
+    n = int(rng.integers(18, 40))
+    m = int(rng.integers(n, 4 * n))
+    root, G, vertex = rng.standard_normal((n, n)), rng.standard_normal((m, n)), rng.standard_normal(n)
+    if rng.random() < 0.3:
+        root, G, vertex = (np.round(2.0 * part) for part in (root, G, vertex))
+    G[m // 2 :] = G[: m - m // 2] + G[rng.integers(0, m // 2, m - m // 2)] * (rng.random() < 0.5)
+    P = root @ root.T / n + 10.0 ** rng.uniform(-3, 0) * np.eye(n)
+    q = -P @ vertex - G.T @ (rng.uniform(0, 1, m) * (rng.random(m) < rng.uniform(0.3, 1.0)))
+    return QuadraticProgram((P + P.T) / 2, q, G, h_upper=G @ vertex), vertex
+
+
+@pytest.mark.parametrize("mode", ["gram", "lazy"])
+def test_vertices_where_many_rows_meet_are_found_without_cycling(mode, rng):
+    solver = DualActiveSet()
+    for _ in range(30):
+        problem, vertex = crowded_vertex(rng)
+        prepared = solver.prepare(problem.P, problem.G)
+        solution = prepared.solve(problem.q, problem.lower, problem.upper) if mode == "gram" else solver.solve(problem)
+        assert solution.status is Status.SOLVED
+        x, _, flag, _ = daqp.solve(
+            problem.P.copy(), problem.q.copy(), problem.G.copy(), np.minimum(problem.upper, 1e30),
+            np.maximum(problem.lower, -1e30), np.zeros(len(problem.lower), dtype=np.int32), primal_tol=1e-10,
+        )  # fmt: skip
+        assert flag == 1
+        np.testing.assert_allclose(solution.x, x, atol=1e-7 * np.abs(vertex).max())
+
+
+def test_a_second_look_keeps_the_time_limit(rng):
+    """A program that one float does not decide, large enough for the doubled digits to take seconds."""
+    problem = feasible_problem(rng, 60, 120)
+    G = np.vstack([problem.G, problem.G + 1e-9 * rng.standard_normal(problem.G.shape)])
+    low, high = (
+        np.concatenate([h, h + 1e-9 * rng.standard_normal(len(h))]) for h in (problem.h_lower, problem.h_upper)
+    )
+    low[120:130] = high[120:130]
+    problem = QuadraticProgram(problem.P, problem.q, G, low, np.maximum(low, high), problem.lb, problem.ub)
+    for limit in (1e-3, 1e-2):
+        began = perf_counter()
+        solution = DualActiveSet(time_limit=limit).solve(problem)
+        assert perf_counter() - began < limit + 0.5  # one step of the iteration
+        assert solution.status in (Status.TIME_LIMIT, Status.SOLVED, Status.INFEASIBLE)
