@@ -26,7 +26,8 @@ Array = NDArray[np.float64]
 
 NEGLIGIBLE = 1e-26  # violation, as a share of the terms that it is a sum of, that doubled digits cannot tell from none
 ROUNDING = 1e-14  # share of these terms by which a row may contradict others that it depends on: the data's rounding
-DEPENDENT = 1e-14  # distance from the span of the others, as a share of the row, within which a row depends on them
+DEPENDENT = (1e-14, 1e-12, 1e-10)  # distance from the span of the others, as a share of the row, that counts as none:
+# where rows that differ by rounding only are taken for independent ones, x does not converge; then by the next one
 CONVERGED = 1e-12  # last correction of x, as a share of its size
 CORRECTIONS = 12
 
@@ -48,8 +49,11 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, li
     result[layout.TAG] = layout.NO_TAG
     try:
         lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
-        solve = _Solve(terms, q, lower, upper, late)
-        result[layout.STATUS] = solve.run(_names(record, len(q), len(lower)), limit)
+        for dependent in DEPENDENT:
+            solve = _Solve(terms, q, lower, upper, dependent, late)
+            result[layout.STATUS] = solve.run(_names(record, len(q), len(lower)), limit)
+            if result[layout.STATUS] != layout.NUMERICAL_TROUBLE:
+                break
         solve.write(result)
     except TimeoutError:
         result[layout.STATUS] = layout.TIME_LIMIT
@@ -61,7 +65,7 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, li
 class _Solve:
     """One program, scaled, and the state of the iteration: the working set, x, and the multipliers."""
 
-    def __init__(self, terms: Terms, q: Array, lower: Array, upper: Array, late: Callable):
+    def __init__(self, terms: Terms, q: Array, lower: Array, upper: Array, dependent: float, late: Callable):
         n, M = len(q), len(lower)
         D = _power_of_two(np.sqrt(np.diagonal(terms.P)))
         E = np.concatenate([1.0 / D, _power_of_two(np.abs(terms.G * D).max(axis=1, initial=0.0))])
@@ -73,7 +77,7 @@ class _Solve:
         self.L = np.linalg.cholesky(self.P)
         self.columns = solve_triangular(self.L, self.C.T, lower=True)  # L^-1 C'
         self.norms = np.sqrt((self.columns**2).sum(axis=0) + self.softness)
-        self.dependent = DEPENDENT / np.diagonal(self.L).min()
+        self.dependent = dependent * np.linalg.cond(self.L)  # rounding in the columns
         self.members: list[int] = []
         self.sides: list[int] = []
         self.x, self.mu = np.zeros((2, n)), np.zeros((2, M))
