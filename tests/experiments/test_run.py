@@ -40,7 +40,7 @@ ON_THE_PLANT = partial(NMPC, problem=PROBLEM, horizon=2, initial_input=HOVER)
 class Blind:
     """Applies a law of the state, whatever it is asked for; a call takes the seconds that ``seconds`` gives."""
 
-    horizon, problem, initial_input = 1, PROBLEM, HOVER
+    horizon, problem, initial_input = 1, replace(PROBLEM, input_lower=None, input_upper=None), HOVER
 
     def __init__(self, plant, law, seconds=lambda: 0.0):
         self.law, self.seconds = law, seconds
