@@ -39,7 +39,7 @@ def in_processes(function: Callable[[J], R], jobs: Sequence[J], workers: int | N
     mine = {"initializer": end_with, "initargs": (os.getpid(),)}
     with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), **mine) as pool:
         try:  # around the start as well: leaving the pool waits for what was begun
-            with deaf_children():
+            with children_ignore_interrupts():
                 running = {pool.submit(function, job): index for index, job in enumerate(jobs)}
             for done in as_completed(running):
                 yield running[done], done.result()
@@ -73,7 +73,7 @@ def end_with(parent: int) -> None:
 
 
 @contextmanager
-def deaf_children() -> Iterator[None]:
+def children_ignore_interrupts() -> Iterator[None]:
     """Processes started inside do not hear Ctrl-C, from their first moment on.
 
     This one hears it at the end of the block, or at once where it has another thread.

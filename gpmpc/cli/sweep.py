@@ -38,7 +38,7 @@ from gpmpc.compiling import tell_of_compiling
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.experiments.run_folder import PLAN, Busy, RunFolder, folder_name
 from gpmpc.files import write_whole
-from gpmpc.parallel import THREADS, deaf_children, end_with
+from gpmpc.parallel import THREADS, children_ignore_interrupts, end_with
 
 LOOK = 0.5  # between two looks at the folders [s]
 
@@ -198,8 +198,8 @@ def _launch(jobs: Sequence[Job], wait: bool, context: HydraContext, config: Dict
         workers |= {"initializer": end_with, "initargs": (os.getpid(),)}
         from joblib.externals.loky.backend import resource_tracker
 
-        resource_tracker.ensure_running()  # as in ``deaf_children``
-        quiet = deaf_children()  # the thread of the progress bar still hears Ctrl-C
+        resource_tracker.ensure_running()  # as in ``children_ignore_interrupts``
+        quiet = children_ignore_interrupts()  # the thread of the progress bar still hears Ctrl-C
     try:
         with quiet:
             returns = launcher.launch([job.overrides for job in jobs], initial_job_idx=0)
