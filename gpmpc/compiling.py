@@ -1,4 +1,4 @@
-"""Problem: kernels are compiled at their first use on a machine, which takes half a minute in which nothing is seen."""
+"""Problem: kernels are compiled at their first use on a machine, which takes up to a minute in which nothing is seen."""
 
 import time
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ def tell_of_compiling() -> Iterator[None]:
             if self.depth == 0:
                 self.began = time.perf_counter()
                 if not self.seconds:
-                    print("compiling numerical kernels: once on this machine, about half a minute", flush=True)
+                    print("compiling numerical kernels: once on this machine, up to a minute", flush=True)
             self.depth += 1
 
         def on_end(self, _: Any) -> None:
