@@ -172,6 +172,24 @@ def test_vertices_where_many_rows_meet_are_found_without_cycling(mode, rng):
         np.testing.assert_allclose(solution.x, x, atol=1e-7 * np.abs(vertex).max())
 
 
+@pytest.mark.parametrize("mode", ["gram", "lazy"])
+def test_rows_that_depend_on_each_other_but_for_rounding_are_no_obstacle(mode, rng):
+    """Two to six times as many rows as variables meet in a vertex, and span half of the space."""
+    solver = DualActiveSet()
+    for _ in range(20):
+        n = int(rng.integers(18, 40))
+        m = int(rng.integers(2 * n, 6 * n))
+        root, vertex = rng.standard_normal((n, n)), np.round(3 * rng.standard_normal(n))
+        P = root @ root.T / n + 1e-4 * np.eye(n)
+        G = rng.standard_normal((m, n // 2)) @ rng.standard_normal((n // 2, n))
+        multipliers = rng.uniform(0, 1, m) * (rng.random(m) < 0.5)
+        problem = QuadraticProgram((P + P.T) / 2, -P @ vertex - G.T @ multipliers, G, h_upper=G @ vertex)
+        prepared = solver.prepare(problem.P, problem.G)
+        solution = prepared.solve(problem.q, problem.lower, problem.upper) if mode == "gram" else solver.solve(problem)
+        assert solution.status is Status.SOLVED
+        np.testing.assert_allclose(solution.x, vertex, atol=1e-6 * np.abs(vertex).max())
+
+
 def test_a_second_look_keeps_the_time_limit(rng):
     """A program that one float does not decide, large enough for the doubled digits to take seconds."""
     problem = feasible_problem(rng, 60, 120)
