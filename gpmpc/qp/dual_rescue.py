@@ -26,7 +26,12 @@ Array = NDArray[np.float64]
 
 NEGLIGIBLE = 1e-26  # violation, as a share of the terms that it is a sum of, that doubled digits cannot tell from none
 ROUNDING = 1e-14  # share of these terms by which a row may contradict others that it depends on: the data's rounding
-DEPENDENT = (1e-14, 1e-12, 1e-10)  # distance from the span of the others, as a share of the row, that counts as none:
+DEPENDENT = (
+    1e-14,
+    1e-13,
+    1e-12,
+    1e-10,
+)  # distance from the span of the others, as a share of the row, that counts as none:
 # where rows that differ by rounding only are taken for independent ones, x does not converge; then by the next one
 CONVERGED = 1e-12  # last correction of x, as a share of its size
 CORRECTIONS = 12
@@ -77,7 +82,7 @@ class _Solve:
         self.L = np.linalg.cholesky(self.P)
         self.columns = solve_triangular(self.L, self.C.T, lower=True)  # L^-1 C'
         self.norms = np.sqrt((self.columns**2).sum(axis=0) + self.softness)
-        self.dependent = dependent * np.linalg.cond(self.L)  # rounding in the columns
+        self.dependent = dependent / np.diagonal(self.L).min()
         self.members: list[int] = []
         self.sides: list[int] = []
         self.x, self.mu = np.zeros((2, n)), np.zeros((2, M))

@@ -33,17 +33,18 @@ def error(problem, x, exact):
     return max(plain, (units * difference).max() / max((units * np.abs(exact_x)).max(), zero, 1e-300))
 
 
-def row_sizes(problem):
-    """The size of the numbers whose rounding a violation may be."""
+def row_sizes(problem, x):
+    """The size of the numbers whose rounding a violation may be: a constraint's bounds and own terms."""
     sizes = np.abs(np.stack([problem.lower, problem.upper]))
-    sizes = np.where(np.isfinite(sizes), sizes, 0.0).max(axis=0)
+    terms = np.append(np.abs(x), np.abs(problem.G) @ np.abs(x))
+    sizes = np.maximum(np.where(np.isfinite(sizes), sizes, 0.0).max(axis=0), terms)
     empty = np.append(np.zeros(len(problem.q), dtype=bool), ~problem.G.any(axis=1))
     return np.where(empty, zero_row_size(problem.G, problem.lower, problem.upper), sizes)
 
 
 def is_infeasible_by_rounding_only(problem, x):
     """Whether x solves the program with bounds that are wider by rounding."""
-    slack = 2e-14 * row_sizes(problem)
+    slack = 2e-14 * row_sizes(problem, x)
     exact = exact_solution(problem, problem.lower - slack, problem.upper + slack)
     return exact is not None and error(problem, x, exact) < 1e-6
 
