@@ -99,6 +99,7 @@ ROUNDS = 10  # returns from the residuals to the iteration
 REFINEMENTS = 3
 FINE, FINEST = 2e-10, 1e-15  # residuals at which refinement stops
 DOUBT = 3e-7  # times the shares that cancellation left of the pivots: the largest residual of a solution
+ILL = 5e-4  # such a share: what else x violates is seen of the best x only
 OLD = 1000  # changes after which a factor is computed anew
 
 
@@ -302,6 +303,8 @@ def optimise(lazy, P, inverse, linear, G, n, rows, L, traits, vectors, members, 
         best, share = np.inf, settings[workspace.SHARE]
         if k > 0:
             share = min(share, math.sqrt(smallest_share(k, slots, R)))
+        if share < ILL:
+            fine = FINEST
         for attempt in range(REFINEMENTS + 1):
             worst = residuals(lazy, P, G, n, traits, mu, k, slots, members, y, slope, least, gradient, active)
             if worst <= min(fine, DOUBT * share) or attempt == REFINEMENTS or not worst < 0.5 * best:
