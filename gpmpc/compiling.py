@@ -1,4 +1,4 @@
-"""Problem: kernels are compiled at their first use on a machine, which takes up to a minute in which nothing is seen."""
+"""Problem: kernels are compiled at their first use on a machine: up to a minute in which nothing is seen."""
 
 import time
 from collections.abc import Iterator

@@ -78,7 +78,7 @@ from gpmpc.qp.working_set import (
     take,
     watch,
 )
-from gpmpc.qp.workspace import carve, matrix, most_working, padded
+from gpmpc.qp.workspace import all_finite, carve, is_dense, is_dense_matrix, matrix, most_working, padded
 
 STATUS, ITERATIONS, VARIABLES, CONSTRAINTS = record.STATUS, record.ITERATIONS, record.VARIABLES, record.CONSTRAINTS
 WORKING, TAG, AGE, HEADER = record.WORKING, record.TAG, record.AGE, record.HEADER
@@ -379,25 +379,3 @@ def solve_lazy(P, q, G, lower, upper, warm, work, out):
         loss = max(loss, L[i, i] * L[i, i] * P[i, i])
     settings[workspace.SHARE] = 1.0 / loss
     return optimise(True, P, P, q, G, n, rows, L, traits, vectors, members, R, lower, upper, warm, settings, out)
-
-
-@woven
-def is_dense(vector):
-    """Whether a vector is as contiguous as its type claims: ``gpmpc.compiled.direct`` does not ask."""
-    return vector.strides[0] == vector.itemsize or len(vector) <= 1
-
-
-@woven
-def is_dense_matrix(A):
-    """The same for a matrix."""
-    rows, columns = A.shape
-    return (A.strides[0] == columns * A.itemsize and A.strides[1] == A.itemsize) or rows * columns == 0
-
-
-@woven
-def all_finite(vector):
-    """Whether no entry is infinite or NaN."""
-    undefined = 0.0
-    for value in vector:
-        undefined += value * 0.0
-    return undefined == 0.0

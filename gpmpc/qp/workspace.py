@@ -100,3 +100,25 @@ def carve(work):
     c = b + MEMBERS
     d = c + capacity + 1
     return settings, work[1:a], work[a:b], work[b:c].view(np.int64), work[c:d], work[d:]
+
+
+@woven
+def is_dense(vector):
+    """Whether a vector is as contiguous as its type claims: ``gpmpc.compiled.direct`` does not ask."""
+    return vector.strides[0] == vector.itemsize or len(vector) <= 1
+
+
+@woven
+def is_dense_matrix(A):
+    """The same for a matrix."""
+    rows, columns = A.shape
+    return (A.strides[0] == columns * A.itemsize and A.strides[1] == A.itemsize) or rows * columns == 0
+
+
+@woven
+def all_finite(vector):
+    """Whether no entry is infinite or NaN."""
+    undefined = 0.0
+    for value in vector:
+        undefined += value * 0.0
+    return undefined == 0.0
