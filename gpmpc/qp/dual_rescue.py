@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 
 NEGLIGIBLE = 1e-26  # violation, as a share of the terms that it is a sum of, that doubled digits cannot tell from none
 ROUNDING = 1e-14  # share of these terms by which a row may contradict others that it depends on: the data's rounding
-# Distances from the span of the others, as a share of the row, within which a row depends on them. Where rows that differ
-# by rounding only are taken for independent ones, x does not converge: then the next one is tried.
+# Distances from the span of the others, as a share of the row, within which a row depends on them. Where rows that
+# differ by rounding only are taken for independent ones, x does not converge: then the next one is tried.
 DEPENDENT = (1e-14, 1e-13, 1e-12, 1e-10)
 CONVERGED = 1e-12  # last correction of x, as a share of its size
 CORRECTIONS = 12
