@@ -27,10 +27,10 @@ import numpy as np
 import torch
 
 from gpmpc.bench.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
-from gpmpc.control.state_form import StateFormMPC
-from gpmpc.control.tracking import StateBounds
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.state_form import StateFormMPC
+from gpmpc.mpc.tracking import StateBounds
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.provenance import provenance
 from gpmpc.qp import CvxpySolver, PrimalActiveSet

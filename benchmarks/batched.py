@@ -28,8 +28,8 @@ import numpy as np
 import torch
 
 from gpmpc.bench.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
-from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.gp import GPPosterior, evaluation
+from gpmpc.mpc.convex_mpc import ConvexMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.provenance import provenance
 from gpmpc.simulation import closed_loop, closed_loops

@@ -21,16 +21,16 @@ import numpy as np
 import torch
 
 from gpmpc.bench.quadrotor import HOVER, INNER, OUTER, TRAJECTORIES, problem, trained
-from gpmpc.control.cascade import Cascade
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.nmpc import NMPC
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import GpmpcError
 from gpmpc.metrics import tracking_error
-from gpmpc.plants import Coupled, Integrated
+from gpmpc.mpc.cascade import Cascade
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.provenance import provenance
 from gpmpc.simulation import Gust, Noise, Replaced, cascade_loop
+from gpmpc.systems import Coupled, Integrated
 from gpmpc.trajectories import states_along
 
 PLANT = Integrated(Coupled(), time_step=0.05, substeps=2)

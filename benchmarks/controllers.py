@@ -5,7 +5,7 @@
 One process, one thread, process CPU time, GPs on 189 transitions. Questions are recorded on a flight with the plant in
 the loop, with the plans that the one controller made, and then put to each controller in turns, warm-started from its
 own last answer, shifted. The nonlinear ones stop at a projected gradient of 1e-6, in the norm of the inverse
-Gauss-Newton Hessian and relative to the cost (``gpmpc.control.descent``), which one program of the convex ones does not
+Gauss-Newton Hessian and relative to the cost (``gpmpc.mpc.descent``), which one program of the convex ones does not
 ask for; ``cold`` are the same questions without a plan, from the last input held. ``plain slsqp`` is what comes to mind
 first: SciPy's SLSQP on the inputs as they are, from hover, with the same compiled derivatives. ``jacobian`` is one call
 of ``differentiate`` with moment matching. Ratios are paired. Writes ``outputs/benchmarks/controllers.json``.
@@ -27,13 +27,13 @@ import torch
 from scipy.optimize import minimize
 
 from gpmpc.bench.quadrotor import HOVER, TRAJECTORIES, Asked, problem, recorded, trained
-from gpmpc.control.controller import Decision, Timing
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.descent import Program
-from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
-from gpmpc.control.request import Request
-from gpmpc.control.shooting import Shooting
 from gpmpc.gp import GPPosterior
+from gpmpc.mpc.controller import Decision, Timing
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.descent import Program
+from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.request import Request
+from gpmpc.mpc.shooting import Shooting
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.provenance import provenance
 from gpmpc.status import Status

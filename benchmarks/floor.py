@@ -2,12 +2,12 @@
 
     .venv/bin/python benchmarks/floor.py [--sizes 100 189 500 1000 2000]
 
-One process, one thread, process CPU time. The floor counts the arithmetic that ``gpmpc.fused`` has to issue for a pair
-of points and of outputs, in registers of eight numbers, and divides it by the rate at which this machine, in the same
-process, issues independent multiply-adds from registers. Loads, stores, loops and everything that grows slower than N^2
-are not in it: this is the arithmetic floor, to which ``ratio`` refers. ``streamed`` is what reading the two triangles
-once from memory takes, at the rate of a sum over an array of that size; at large N they no longer fit the caches.
-``with memory`` is the ratio to the arithmetic floor plus the reading of L^-1 alone, whose two instructions for eight
+One process, one thread, process CPU time. The floor counts the arithmetic that ``gpmpc.kernels`` has to issue for a
+pair of points and of outputs, in registers of eight numbers, and divides it by the rate at which this machine, in the
+same process, issues independent multiply-adds from registers. Loads, stores, loops and everything that grows slower
+than N^2 are not in it: this is the arithmetic floor, to which ``ratio`` refers. ``streamed`` is what reading the two
+triangles once from memory takes, at the rate of a sum over an array of that size; at large N they no longer fit the
+caches.
 numbers cannot hide it; those of E can, so its reading is in no floor.
 
 Two beliefs are measured. Where all exponents are near zero, as they are for a belief that is narrow beside the
@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gpmpc import fused
+from gpmpc import kernels
 from gpmpc.compiled import compiled
 from gpmpc.gp import GPPosterior
 from gpmpc.provenance import provenance
@@ -76,16 +76,16 @@ def main() -> None:
     print(f"written to {path}")
 
 
-def measured(packed: fused.Packed, size: int, belief: str) -> dict:
+def measured(packed: kernels.Packed, size: int, belief: str) -> dict:
     """One moment-matched Jacobian of six GPs over ``size`` points, beside its floor."""
     S = BELIEFS[belief] * (np.eye(STATES) + 0.1)
     asked = packed, np.zeros(STATES), S, np.zeros(INPUTS)
-    fused.moments_with_jacobian(*asked)
+    kernels.moments_with_jacobian(*asked)
     times, rates, began = [], [], time.process_time()
     while time.process_time() - began < TIMES["seconds"] or len(times) < TIMES["least"]:
         rates.append(issue_rate())
         start = time.process_time()
-        fused.moments_with_jacobian(*asked)
+        kernels.moments_with_jacobian(*asked)
         times.append(time.process_time() - start)
     middle, general = float(np.median(times)), instructions(packed, reduced=True) / max(rates)
     floor = general if belief == "wide" else instructions(packed, reduced=False) / max(rates)
@@ -106,7 +106,7 @@ def measured(packed: fused.Packed, size: int, belief: str) -> dict:
     }
 
 
-def instructions(packed: fused.Packed, reduced: bool) -> float:
+def instructions(packed: kernels.Packed, reduced: bool) -> float:
     """Vector instructions that a Jacobian must issue over all pairs, with or without the reduction of expm1."""
     k, padded = packed.output_dim, packed.points.shape[1]
     square, triangle = padded**2 / LANES, padded * (padded + LANES) / 2 / LANES

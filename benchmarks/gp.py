@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gpmpc import fused
+from gpmpc import kernels
 from gpmpc.bench.linearisations import linearisation_groups
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
@@ -44,9 +44,9 @@ def main() -> None:
     torch.set_default_dtype(torch.float64)
     results, began = [], time.perf_counter()
     gps, at, u = posterior(8).packed, belief(), np.zeros(INPUTS)
-    fused.mean_with_jacobian(gps, at.mean.numpy(), u)
-    fused.point_with_jacobian(gps, at.mean.numpy(), u)
-    fused.moments_with_jacobian(gps, at.mean.numpy(), at.covariance.numpy(), u)
+    kernels.mean_with_jacobian(gps, at.mean.numpy(), u)
+    kernels.point_with_jacobian(gps, at.mean.numpy(), u)
+    kernels.moments_with_jacobian(gps, at.mean.numpy(), at.covariance.numpy(), u)
     first = time.perf_counter() - began
     print(f"first calls of the three kernels: {first:.2f} s (compiled in a fresh installation, read from disk later)")
     print("process time in milliseconds, one thread")

@@ -67,11 +67,11 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
     """Loads the model and makes steps, in this process."""
     import torch
 
-    from gpmpc.control.controller import Reference
-    from gpmpc.control.convex_mpc import ConvexMPC
-    from gpmpc.control.tracking import TrackingProblem
     from gpmpc.gaussian import Gaussian
     from gpmpc.gp import GPPosterior
+    from gpmpc.mpc.controller import Reference
+    from gpmpc.mpc.convex_mpc import ConvexMPC
+    from gpmpc.mpc.tracking import TrackingProblem
     from gpmpc.propagation import Linearization
 
     torch.set_num_threads(1)

@@ -33,7 +33,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import numpy as np
 
-from gpmpc.control.controller import Decision, Timing
+from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.recording import McapRecorder, Step, wire
 from gpmpc.recording.ring import CAPACITY, FRAME

@@ -23,17 +23,17 @@ import numpy as np
 import torch
 
 from gpmpc.bench.quadrotor import HOVER, INNER, NOISE, OUTER, STATE_BOUNDS, TRAJECTORIES, problem, trained
-from gpmpc.control.cascade import Cascade
-from gpmpc.control.controller import Controller
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.lqr import LQR
-from gpmpc.control.nmpc import NMPC
-from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
-from gpmpc.control.state_form import StateFormMPC
-from gpmpc.control.tracking import StateBounds, TrackingProblem
-from gpmpc.plants import Coupled, Integrated
+from gpmpc.mpc.cascade import Cascade
+from gpmpc.mpc.controller import Controller
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.lqr import LQR
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.state_form import StateFormMPC
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import cascade_loop, closed_loop
+from gpmpc.systems import Coupled, Integrated
 from gpmpc.trajectories import states_along
 
 STEPS, H, PATH = 8, 6, TRAJECTORIES["lorenz"]

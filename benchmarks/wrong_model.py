@@ -23,14 +23,14 @@ import torch
 from matplotlib.figure import Figure
 
 from gpmpc.bench.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
-from gpmpc.control.convex_mpc import ConvexMPC
 from gpmpc.files import write_whole
 from gpmpc.metrics import tracking_error
-from gpmpc.plants import Integrated, Translational
+from gpmpc.mpc.convex_mpc import ConvexMPC
 from gpmpc.plotting.image import png
 from gpmpc.propagation import Linearization
 from gpmpc.provenance import provenance
 from gpmpc.simulation import Noise, Replaced, Rollout, closed_loop
+from gpmpc.systems import Integrated, Translational
 from gpmpc.trajectories import states_along
 
 HORIZON, ALTITUDE = 10, 4

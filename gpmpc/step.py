@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:  # a recorder's writer needs this file without torch
-    from gpmpc.control.controller import Decision
+    from gpmpc.mpc.controller import Decision
 
 
 @dataclass(frozen=True, eq=False)

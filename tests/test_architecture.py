@@ -46,7 +46,7 @@ def test_the_writer_of_recordings_starts_without_torch_and_without_compilers():
         ("hydra", ["cli"]),
         ("omegaconf", ["cli"]),
         ("matplotlib", ["plotting"]),
-        ("casadi", ["control", "gp/casadi_.py", "bench"]),
+        ("casadi", ["mpc", "gp/casadi_.py", "bench"]),
         ("rich", ["cli", "experiments", "simulation/trials.py"]),
         ("mcap", ["recording"]),
         ("mcap_protobuf", ["recording"]),

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.control.controller import Reference
-from gpmpc.control.nmpc import NMPC
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.gaussian import Gaussian
 from gpmpc.interrupts import interrupts_after
-from gpmpc.plants import Integrated, Translational
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.systems import Integrated, Translational
 
 
 def swallow():

@@ -5,18 +5,18 @@ import pytest
 import torch
 
 from gpmpc import metrics
-from gpmpc.control.controller import Reference
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
-from gpmpc.control.state_form import StateFormMPC
-from gpmpc.control.tracking import StateBounds, TrackingProblem
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Affine, GPPosterior, ResidualModel, Trainer, Transitions, train
-from gpmpc.plants import Integrated, step
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.state_form import StateFormMPC
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching, rollout
 from gpmpc.qp import DualActiveSet
 from gpmpc.simulation import Gust, closed_loop
+from gpmpc.systems import Integrated, step
 
 F = torch.float64
 

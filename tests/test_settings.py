@@ -5,17 +5,17 @@ import math
 import numpy as np
 import pytest
 
-from gpmpc.control.cascade import Cascade
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.nmpc import NMPC
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.datasets import Excitation, Tracking
 from gpmpc.exceptions import SettingError
-from gpmpc.plants import Coupled, Integrated, Map, Rotational, Translational
+from gpmpc.mpc.cascade import Cascade
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Dropout, Gust
+from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational
 from gpmpc.trajectories import Elliptical, Step, Waypoints
-from tests.control.small_models import double_integrator
+from tests.mpc.small_models import double_integrator
 
 PLANT = Integrated(Rotational(), 0.05, 1)
 PROBLEM = TrackingProblem([1.0] * 6, [1.0] * 3)

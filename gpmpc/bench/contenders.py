@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from gpmpc.bench.quadrotor import HOVER, OUTER, problem
-from gpmpc.control.controller import Controller
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.lqr import LQR
-from gpmpc.control.nmpc import NMPC
-from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
-from gpmpc.control.state_form import StateFormMPC
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gp import GPPosterior
+from gpmpc.mpc.controller import Controller
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.lqr import LQR
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 
 HORIZONS = (1, 5, 10, 20)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import gpytorch
 import torch
 
-from gpmpc import fused
+from gpmpc import kernels
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.model import exact_inference, gpytorch_model
@@ -39,7 +39,7 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
         return [dM[0], (dM[1] + dM[1].mT) / 2, dM[2], dV[0], (dV[1] + dV[1].mT) / 2, dV[2]]
 
     def jacobian():
-        d = fused.moments_with_jacobian(packed, mu, S, u)
+        d = kernels.moments_with_jacobian(packed, mu, S, u)
         return [d.J, d.dM_dS, d.dM_du, d.dV_dmu, d.dV_dS, d.dV_du]
 
     frozen = gpytorch_model(gp).requires_grad_(False)
@@ -59,15 +59,15 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
 
     groups: list[Group] = [
         {
-            "moments": lambda: fused.moments(packed, mu, S, u)[:2],
+            "moments": lambda: kernels.moments(packed, mu, S, u)[:2],
             "moments, torch": lambda: by_torch(belief.mean, belief.covariance, control),
         },
         {"moments with Jacobians": jacobian},
-        {"moments, diagonal": lambda: fused.moments(packed, mu, S, u, diagonal=True)},
-        {"diagonal with Jacobians": lambda: fused.moments_with_jacobian(packed, mu, S, u, diagonal=True)[:8]},
-        {"linearised": lambda: fused.point_with_jacobian(packed, mu, u)[:8]},
+        {"moments, diagonal": lambda: kernels.moments(packed, mu, S, u, diagonal=True)},
+        {"diagonal with Jacobians": lambda: kernels.moments_with_jacobian(packed, mu, S, u, diagonal=True)[:8]},
+        {"linearised": lambda: kernels.point_with_jacobian(packed, mu, u)[:8]},
         {
-            "mean with Jacobian": lambda: fused.mean_with_jacobian(packed, mu, u)[1:],
+            "mean with Jacobian": lambda: kernels.mean_with_jacobian(packed, mu, u)[1:],
             "mean with Jacobian, torch jacrev": by_jacrev,
             "mean with Jacobian, GPyTorch, frozen": by_gpytorch,
             "mean with Jacobian, GPyTorch": by_gpytorch_as_usual,

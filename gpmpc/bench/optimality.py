@@ -20,11 +20,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gpmpc.control.controller import Reference
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.tracking import TrackingProblem
 
 Array = np.ndarray
 

@@ -14,11 +14,11 @@ import casadi
 import numpy as np
 
 from gpmpc.bench.optimality import Question
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.casadi_ import casadi_function
 from gpmpc.interrupts import interrupts_after
+from gpmpc.mpc.tracking import TrackingProblem
 
 Array = np.ndarray
 

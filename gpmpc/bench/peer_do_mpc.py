@@ -14,10 +14,10 @@ import numpy as np
 
 from gpmpc.bench.optimality import Question
 from gpmpc.bench.peer_casadi import WARM, mean_function
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.interrupts import interrupts_after
+from gpmpc.mpc.tracking import TrackingProblem
 
 MISSING = "not installed: pip install 'gpmpc[bench]'"
 

@@ -13,10 +13,10 @@ import torch
 from scipy.optimize import minimize
 
 from gpmpc.bench.optimality import Question
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.model import exact_inference, gpytorch_model
+from gpmpc.mpc.tracking import TrackingProblem
 
 
 class Plan(NamedTuple):

@@ -31,13 +31,13 @@ from gpmpc.bench.peer_casadi import CasadiIpopt
 from gpmpc.bench.peer_gpytorch import GPyTorchSlsqp
 from gpmpc.bench.quadrotor import HOVER, problem, recorded, trained
 from gpmpc.bench.timing import WARM_UP, take_turns
-from gpmpc.control.controller import Controller, Decision, Timing
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
+from gpmpc.mpc.controller import Controller, Decision, Timing
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 

@@ -14,8 +14,8 @@ import torch
 
 from gpmpc.exceptions import check_number
 from gpmpc.gp import GPPosterior
-from gpmpc.plants import Integrated
-from gpmpc.plants.plant import step
+from gpmpc.systems import Integrated
+from gpmpc.systems.plant import step
 
 DAMPING = 0.3  # [1/s]
 SPRING = 1.0  # [1/s^2]

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gpmpc.control.controller import Controller, Decision, Reference
-from gpmpc.control.tracking import StateBounds, TrackingProblem
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, standardize
-from gpmpc.plants import Integrated, Rotational, Translational
+from gpmpc.mpc.controller import Controller, Decision, Reference
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.simulation import Noise, closed_loop
+from gpmpc.systems import Integrated, Rotational, Translational
 from gpmpc.trajectories import Elliptical, Lorenz, states_along
 
 TRAJECTORIES = {"elliptical": Elliptical(), "lorenz": Lorenz()}

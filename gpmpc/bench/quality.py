@@ -25,12 +25,12 @@ import numpy as np
 from gpmpc.bench.contenders import TRUTH, Contender
 from gpmpc.bench.groups import Group
 from gpmpc.bench.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
-from gpmpc.control.controller import Controller, Decision, Reference
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.metrics import tracking_error
+from gpmpc.mpc.controller import Controller, Decision, Reference
+from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.simulation import Rollout, closed_loop, rehearse
 from gpmpc.trajectories import states_along
 

@@ -16,12 +16,12 @@ import torch
 from gpmpc.bench.groups import Group
 from gpmpc.bench.pendulums import pendulum_gp, pendulum_plant, pendulum_references
 from gpmpc.bench.timing import Times, take_turns
-from gpmpc.control.controller import Controller, Decision, Reference, Timing
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
+from gpmpc.mpc.controller import Controller, Decision, Reference, Timing
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.simulation import closed_loop
 from gpmpc.status import Status

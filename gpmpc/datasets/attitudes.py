@@ -6,13 +6,13 @@ to give the mean acceleration a = (v[k+1] - v[k]) / T beside the weight. With z 
     U1 / m = |a - g e_z|,   ux = a_x / (U1 / m),   uy = a_y / (U1 / m),
 
 and eq. (2) of Cao, Lai and Alam (2017), inverted, makes roll and pitch of that direction, at a yaw of zero. The inner
-loop approaches each at first order, (angle_d - angle) / response time, as ``gpmpc.control.cascade.Cascade`` asks it to.
+loop approaches each at first order, (angle_d - angle) / response time, as ``gpmpc.mpc.cascade.Cascade`` asks it to.
 """
 
 import numpy as np
 
-from gpmpc.plants import attitude_for_thrust_direction
-from gpmpc.plants.quadrotor import GRAVITY
+from gpmpc.systems import attitude_for_thrust_direction
+from gpmpc.systems.quadrotor import GRAVITY
 from gpmpc.trajectories import Trajectory
 
 OUTER_STEP = 1.0  # [s] for which an attitude is asked for

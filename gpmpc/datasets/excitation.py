@@ -19,14 +19,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpmpc.control.nmpc import NMPC
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.datasets.attitudes import approached
 from gpmpc.datasets.flights import SUBSYSTEMS, check_weights, transitions_of
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gp.transitions import Transitions
-from gpmpc.plants import ATTITUDES, Plant, attitude_for_thrust_direction
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.simulation import Noise, Rollout, closed_loop
+from gpmpc.systems import ATTITUDES, Plant, attitude_for_thrust_direction
 from gpmpc.trajectories import Trajectory, states_along
 
 

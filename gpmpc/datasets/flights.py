@@ -14,12 +14,12 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from gpmpc.control.nmpc import NMPC
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import DataError, SettingError, check_number, check_numbers
 from gpmpc.gp.transitions import Transitions
-from gpmpc.plants import ATTITUDES, Plant, attitude_for_thrust_direction
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.simulation import Rollout, closed_loop
+from gpmpc.systems import ATTITUDES, Plant, attitude_for_thrust_direction
 from gpmpc.trajectories import Trajectory
 
 SUBSYSTEMS = ("translational", "rotational")

@@ -16,19 +16,19 @@ import numpy as np
 import torch
 
 from gpmpc.compiling import tell_of_compiling
-from gpmpc.control.controller import Controller, Reference
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.nmpc import NMPC
-from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
-from gpmpc.control.tracking import StateBounds, TrackingProblem
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.gp import Scaling
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.metrics import tracking_error, violation_rate
-from gpmpc.plants import Plant
-from gpmpc.plants.quadrotor import GRAVITY
+from gpmpc.mpc.controller import Controller, Reference
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import ModelLoop, Noise, Rollout, closed_loop, rehearse
+from gpmpc.systems import Plant
+from gpmpc.systems.quadrotor import GRAVITY
 
 PROPAGATIONS = {"moment_matching": MomentMatching, "linearization": Linearization}
 CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "convex": ConvexMPC}

@@ -26,14 +26,14 @@ import numpy as np
 import torch
 
 import gpmpc
-from gpmpc.control.controller import Reference
 from gpmpc.datasets import DataSource
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.experiments.flight import Flight, Row, Task, fly, problem_of
 from gpmpc.experiments.tables import FitStore, Subsystem, digest
 from gpmpc.gp import Scaling, Transitions
+from gpmpc.mpc.controller import Reference
 from gpmpc.parallel import in_processes
-from gpmpc.plants import Plant, Translational
+from gpmpc.systems import Plant, Translational
 from gpmpc.trajectories import Trajectory, states_along
 
 SOURCES = ("gaussian.py", "metrics.py", "control/*.py", "gp/*.py", "propagation/*.py", "fused/*.py", "qp/*.py")

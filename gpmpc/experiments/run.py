@@ -17,16 +17,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gpmpc.control.controller import Controller, Reference
-from gpmpc.control.supervision import OnFailure, check_policy
 from gpmpc.datasets import DataSource, rotational_states_along
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
 from gpmpc.gp import Training, Transitions
 from gpmpc.metrics import NEAR, ViolationRate, find_loss, time_quantiles, tracking_error, violation_rate
-from gpmpc.plants import Coupled, Map, Plant, Rotational, Translational
+from gpmpc.mpc.controller import Controller, Reference
+from gpmpc.mpc.supervision import OnFailure, check_policy
 from gpmpc.propagation import MomentMatching, Propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, Rollout, Step, closed_loop, rehearse
 from gpmpc.simulation.systems import RunningPlant
+from gpmpc.systems import Coupled, Map, Plant, Rotational, Translational
 from gpmpc.trajectories import Trajectory, states_along
 
 NAMES = {"translational": Translational.state_names, "rotational": Rotational.state_names}

@@ -1,6 +1,6 @@
 """Problem: a posterior's closed forms exist as compiled loops and as torch expressions; which of them answers a call?
 
-The loops of ``gpmpc.fused`` are many times faster, on one thread, for float64 numbers in host memory. Torch answers
+The loops of ``gpmpc.kernels`` are many times faster, on one thread, for float64 numbers in host memory. Torch answers
 everything else: other devices and types, and whatever autograd or a function transform follows. The two give the same
 numbers; ``evaluation`` forces one of them.
 """
@@ -85,13 +85,13 @@ def point_arrays(model: Any, function: str, x: np.ndarray, u: np.ndarray) -> lis
 
     Args:
         model: The posterior; float64, in host memory.
-        function: Of ``gpmpc.fused``: ``"mean_with_jacobian"`` or ``"point_with_jacobian"``.
+        function: Of ``gpmpc.kernels``: ``"mean_with_jacobian"`` or ``"point_with_jacobian"``.
         x: State (n,) or (H, n).
         u: Input (m,) or (H, m).
     """
-    from gpmpc import fused  # loads numba
+    from gpmpc import kernels  # loads numba
 
-    found = getattr(fused, function)(model.packed, x, u)
+    found = getattr(kernels, function)(model.packed, x, u)
     mean, *others = found[:3] if len(found) == 3 else found[:4]
     mean += model.offset.numpy()
     if model.predicts == "difference":

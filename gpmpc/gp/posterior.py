@@ -32,7 +32,7 @@ from gpmpc.gp.transitions import Transitions, check_transitions
 from gpmpc.gp.updating import extended, without
 
 if TYPE_CHECKING:
-    from gpmpc.fused import Packed
+    from gpmpc.kernels import Packed
 
 Predicts = Literal["next_state", "difference", "value"]
 IGNORED = 1e8  # length-scale of an input that drops out of a kernel, in units of its magnitude
@@ -199,7 +199,7 @@ class GPPosterior:
     @cached_property
     def packed(self) -> "Packed":
         """The arrays of the compiled loops, for a float64 model in host memory."""
-        from gpmpc.fused import pack  # loads numba
+        from gpmpc.kernels import pack  # loads numba
 
         parts = (self.features, self.lengthscales, self.signal_variance, self.cholesky, self.weights)
         return pack(*(part.numpy() for part in parts), self.state_dim)

@@ -40,11 +40,11 @@ def expand(model: DynamicsModel, state: Tensor, input: Tensor) -> Expansion | No
     if (arrays := host_arrays(model.weights, state, input)) is None:
         parts = _by_torch(model, state, input)
     else:
-        from gpmpc import fused  # loads numba
+        from gpmpc import kernels  # loads numba
 
         batch = state.shape[:-1]
         flat = arrays[1].reshape(-1, model.state_dim)
-        found = fused.point_with_jacobian(model.packed, flat, arrays[2].reshape(len(flat), model.input_dim))
+        found = kernels.point_with_jacobian(model.packed, flat, arrays[2].reshape(len(flat), model.input_dim))
         parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found[:8]]
     mean, A = parts[0] + model.offset, parts[2]
     if model.predicts == "difference":
@@ -53,7 +53,7 @@ def expand(model: DynamicsModel, state: Tensor, input: Tensor) -> Expansion | No
 
 
 def _by_torch(model: GPPosterior, state: Tensor, input: Tensor) -> list[Tensor]:
-    """The first eight entries of ``fused.Expansion``."""
+    """The first eight entries of ``kernels.Expansion``."""
     n, inverse_squares = model.state_dim, model.lengthscales**-2
     difference = (model.features - torch.cat([state, input], dim=-1)[..., None, :])[..., None, :, :]
     z = difference * inverse_squares[:, None, :]  # (*batch, k, N, d)

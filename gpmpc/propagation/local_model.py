@@ -79,7 +79,7 @@ def linearize(
     arrays = host_arrays(*parts, *derivatives)
     if arrays is None:
         return LocalModel(*_extended(belief, input, moved.belief, d), moved.belief)
-    from gpmpc.fused.extended import extended_models  # loads numba
+    from gpmpc.kernels.extended import extended_models  # loads numba
 
     H, p = batch.numel(), n + n * n
     arrays = [np.ascontiguousarray(array.reshape(H, *array.shape[len(batch) :])) for array in arrays]

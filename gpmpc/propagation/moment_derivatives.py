@@ -1,6 +1,6 @@
 """Problem: exact moments with all first derivatives, in torch: for many beliefs at once and on any device.
 
-``gpmpc.fused.moments`` states the derivatives (with the letters that stand here) and computes them in compiled loops
+``gpmpc.kernels.moments`` states the derivatives (with the letters that stand here) and computes them in compiled loops
 for a belief in host memory. Reverse mode through ``moment_matching.moments`` would give the same, one pass an entry of
 the next belief, and keep every N x N product of all pairs of outputs meanwhile. Here one pair of outputs has its N x N
 matrix at a time:

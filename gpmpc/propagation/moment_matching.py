@@ -95,16 +95,16 @@ class MomentMatching:
         return self._compiled(f, belief.mean.shape[:-1], arrays[1:])
 
     def _compiled(self, f: GPPosterior, batch: torch.Size, arrays: Sequence[Any], cross: bool | None = None) -> Latent:
-        """The moments of f by ``gpmpc.fused``; ``cross`` asks for derivatives, with those of J or without."""
-        from gpmpc import fused  # loads numba
+        """The moments of f by ``gpmpc.kernels``; ``cross`` asks for derivatives, with those of J or without."""
+        from gpmpc import kernels  # loads numba
 
         mean, S, u = arrays
         n, m = f.state_dim, f.input_dim
         flat = mean.reshape(-1, n), S.reshape(-1, n, n), u.reshape(len(mean.reshape(-1, n)), m)
         if cross is None:
-            found = fused.moments(f.packed, *flat, self.diagonal)
+            found = kernels.moments(f.packed, *flat, self.diagonal)
         else:
-            found = fused.moments_with_jacobian(f.packed, *flat, self.diagonal, cross)
+            found = kernels.moments_with_jacobian(f.packed, *flat, self.diagonal, cross)
         parts = [p if p is None else torch.from_numpy(p.reshape(*batch, *p.shape[1:])) for p in found]
         parts[0] += f.offset
         return Latent(*parts)

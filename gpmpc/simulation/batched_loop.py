@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.control.controller import Controller, Reference
-from gpmpc.control.supervision import Command, OnFailure, check_policy, commands
 from gpmpc.exceptions import Diverged, SettingError, SolverFailure, check_number
-from gpmpc.plants import Plant, step_many
+from gpmpc.mpc.controller import Controller, Reference
+from gpmpc.mpc.supervision import Command, OnFailure, check_policy, commands
 from gpmpc.simulation.disturbances import Disturbance
 from gpmpc.simulation.loop import Kept, Step, checked_references, kept, rollout, window
 from gpmpc.simulation.systems import ModelLoop, Noise, RunningPlant
 from gpmpc.simulation.trials import Trial, checked_seeds, failed, progress_bar
+from gpmpc.systems import Plant, step_many
 
 MEMORY = 2**30  # what the controller may take for all that fly at a time [bytes]
 

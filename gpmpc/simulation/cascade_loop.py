@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.control.cascade import Cascade
-from gpmpc.control.controller import Reference
-from gpmpc.control.supervision import Command, OnFailure, check_policy, command
 from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.plants import Coupled, Plant
+from gpmpc.mpc.cascade import Cascade
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.supervision import Command, OnFailure, check_policy, command
 from gpmpc.simulation.disturbances import Disturbance
 from gpmpc.simulation.loop import Rollout, Step, checked_references, kept, rollout, window
 from gpmpc.simulation.systems import Noise, RunningPlant
+from gpmpc.systems import Coupled, Plant
 
 OUTER, INNER = slice(0, 6), slice(6, 12)
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel, check_number
-from gpmpc.plants import Dynamics, Plant
+from gpmpc.systems import Dynamics, Plant
 
 
 class Disturbance(Protocol):

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpmpc.control.controller import Controller, Reference, Timing
-from gpmpc.control.supervision import Command, OnFailure, check_policy, command
 from gpmpc.exceptions import Diverged, GpmpcError, ShapeError, check_number
-from gpmpc.plants import Plant
+from gpmpc.mpc.controller import Controller, Reference, Timing
+from gpmpc.mpc.supervision import Command, OnFailure, check_policy, command
 from gpmpc.simulation.disturbances import Disturbance
 from gpmpc.simulation.systems import ModelLoop, Noise, Running, RunningModel, RunningPlant
 from gpmpc.status import Status
+from gpmpc.systems import Plant
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def closed_loop(
         noise: On a plant's states, measurements and inputs.
         disturbances: Gusts, other plants, dropouts: what the controller is not told of.
         on_failure: What is applied where a solve fails: ``"previous_plan"``, ``"hold"`` or ``"raise"``; see
-            ``gpmpc.control.supervision``.
+            ``gpmpc.mpc.supervision``.
         seed: Of all random numbers; the same seed gives the same numbers.
         on_step: Called with every step.
 

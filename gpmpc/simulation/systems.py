@@ -15,9 +15,9 @@ import torch
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.dynamics import DynamicsModel
-from gpmpc.plants import Plant, step
 from gpmpc.propagation.propagator import Propagator
 from gpmpc.simulation.disturbances import Disturbance
+from gpmpc.systems import Plant, step
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gpmpc import step as recorded
-from gpmpc.control.controller import Decision, Timing
+from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.simulation.cascade_loop import CascadeStep
 from gpmpc.simulation.loop import Step
 

@@ -12,15 +12,15 @@ from gpmpc.bench import peer_daqp, peer_do_mpc
 from gpmpc.bench.linearisations import linearisation_groups
 from gpmpc.bench.optimality import Question, kkt_residual
 from gpmpc.bench.peers import Pilot, converged, one_program
-from gpmpc.control.controller import Reference
-from gpmpc.control.tracking import StateBounds, TrackingProblem
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.plants import Integrated, Translational
-from gpmpc.plants.plant import step
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
+from gpmpc.systems import Integrated, Translational
+from gpmpc.systems.plant import step
 
 H, HOVER = 3, np.array([7.26, 0.0, 0.0])
 PROBLEM = TrackingProblem(

@@ -14,13 +14,13 @@ from gpmpc.bench.contenders import FAMILIES, TRUTH, Contender, contenders
 from gpmpc.bench.quadrotor import HOVER, OUTER, problem
 from gpmpc.bench.quality import Field, pareto_front, stage_cost
 from gpmpc.cli.run import experiment_of
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
-from gpmpc.plants import step
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.plotting import png, quality
 from gpmpc.propagation import Linearization
+from gpmpc.systems import step
 from gpmpc.trajectories import Elliptical, states_along
 
 CONF = Path(__file__).resolve().parents[2] / "conf"

@@ -5,7 +5,7 @@ import torch
 from gpmpc.bench.pendulums import Pendulums, pendulum_gp, pendulum_plant, pendulum_references
 from gpmpc.bench.steps import Answering, Grid, controllers, recorded_questions
 from gpmpc.exceptions import SettingError
-from gpmpc.plants.plant import step
+from gpmpc.systems.plant import step
 
 
 @pytest.mark.parametrize("n", [2, 6, 12])

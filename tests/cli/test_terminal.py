@@ -172,7 +172,7 @@ def test_settings_and_classes_of_the_users_own_folder_are_found(sweep, tmp_path)
     (tmp_path / "own" / "controller").mkdir(parents=True)
     (tmp_path / "own" / "controller" / "mine.yaml").write_text("defaults: [convex]\ntolerance: 0.5\n")
     (tmp_path / "own" / "ours.yaml").write_text("defaults: [run, _self_]\nseed: 5\n")
-    (tmp_path / "vehicle.py").write_text("from gpmpc.plants import Translational\nclass Mine(Translational): pass\n")
+    (tmp_path / "vehicle.py").write_text("from gpmpc.systems import Translational\nclass Mine(Translational): pass\n")
     found = ["--config-dir", "own", "--config-name", "ours", "controller=mine", "plant.dynamics._target_=vehicle.Mine"]
     done = forked("run", *sweep, *found, *TINY, "folder=tree", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

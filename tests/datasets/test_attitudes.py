@@ -5,8 +5,8 @@ import pytest
 
 from gpmpc.datasets import rotational_states_along
 from gpmpc.datasets.attitudes import approached, attitudes_along
-from gpmpc.plants import Integrated, Translational, step, thrust_direction
-from gpmpc.plants.quadrotor import GRAVITY
+from gpmpc.systems import Integrated, Translational, step, thrust_direction
+from gpmpc.systems.quadrotor import GRAVITY
 from gpmpc.trajectories import Elliptical, Hover, Lorenz, states_along
 
 

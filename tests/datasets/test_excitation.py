@@ -8,7 +8,7 @@ from hydra.utils import instantiate
 from gpmpc.cli.configuration import config_folder
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import SettingError
-from gpmpc.plants import Integrated, Rotational, Translational, step
+from gpmpc.systems import Integrated, Rotational, Translational, step
 from gpmpc.trajectories import Elliptical
 
 OUTER = Excitation(

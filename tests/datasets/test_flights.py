@@ -3,7 +3,7 @@ import pytest
 
 from gpmpc.datasets import NMPCData, PaperData, Tracking
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.plants import Integrated, Map, Rotational, Translational, attitude_for_thrust_direction, step
+from gpmpc.systems import Integrated, Map, Rotational, Translational, attitude_for_thrust_direction, step
 from gpmpc.trajectories import Elliptical, Hover, Lorenz
 
 TRANSLATIONAL = Map(Translational(frozen_attitude=(np.pi / 4, np.pi / 4)))

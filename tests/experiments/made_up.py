@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 
-from gpmpc.control.controller import Timing
 from gpmpc.experiments.run import Experiment, Flight, metrics
 from gpmpc.experiments.run_folder import PLAN, RunFolder, folder_name, record
-from gpmpc.plants import Integrated, Translational
+from gpmpc.mpc.controller import Timing
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
+from gpmpc.systems import Integrated, Translational
 
 SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
 PLANT = Integrated(Translational(), time_step=1.0, substeps=1)

@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 
-from gpmpc.control.controller import Reference
-from gpmpc.control.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.datasets import PaperData
 from gpmpc.exceptions import SettingError
 from gpmpc.experiments.flight import Row, fly
@@ -21,8 +19,10 @@ from gpmpc.experiments.flights import Flights
 from gpmpc.experiments.flights_report import LOOPS, paper_seconds, summarise
 from gpmpc.experiments.tables import FitStore, Subsystem
 from gpmpc.gp import SoftLimits, identity, train
-from gpmpc.plants import Integrated, Translational
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.propagation import MomentMatching
+from gpmpc.systems import Integrated, Translational
 from gpmpc.trajectories import Elliptical, Lorenz
 from tests.cli.command import forked
 
@@ -213,9 +213,9 @@ def test_on_the_authors_data_the_convex_controller_tracks_within_the_printed_bou
 
 def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
     """From the last input held, a nearly flat direction of this GP takes it hundreds of iterations."""
-    from gpmpc.control.tracking import TrackingProblem
     from gpmpc.gaussian import Gaussian
     from gpmpc.gp import Transitions
+    from gpmpc.mpc.tracking import TrackingProblem
 
     rng = np.random.default_rng(0)
     states, inputs = rng.normal(size=(40, 2)), rng.normal(size=(40, 1))

@@ -10,20 +10,20 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from gpmpc.cli.run import experiment_of
-from gpmpc.control.controller import Decision, Timing
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.nmpc import NMPC
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import Diverged, SettingError
 from gpmpc.experiments import run
 from gpmpc.experiments.run import Experiment, fly, metrics, training_rows
 from gpmpc.experiments.run_folder import Busy, RunFolder, folder_name
 from gpmpc.gp import Trainer
-from gpmpc.plants import Coupled, Integrated, Map, Rotational, Translational
+from gpmpc.mpc.controller import Decision, Timing
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise
 from gpmpc.status import Status
+from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational
 from gpmpc.trajectories import Elliptical, Hover, Lorenz, Step
 
 CONF = Path(__file__).resolve().parents[2] / "conf"

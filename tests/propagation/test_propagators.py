@@ -7,7 +7,7 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedMod
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Affine, GPPosterior, ResidualModel
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, differentiate
-from tests.control.systems import linear_gaussian
+from tests.mpc.systems import linear_gaussian
 
 DETERMINISTIC = {
     "mean equivalence": MeanEquivalence,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gpmpc.control.controller import Decision, Timing
+from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.recording import McapRecorder, Step
 from gpmpc.status import Status

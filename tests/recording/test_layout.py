@@ -9,10 +9,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from gpmpc.control.controller import Decision, Timing
-from gpmpc.plants import Coupled, Rotational
+from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.recording import McapRecorder, Step, layout, read_run
 from gpmpc.status import Status
+from gpmpc.systems import Coupled, Rotational
 from tests.recording import runs
 
 SHIPPED = Path(__file__).resolve().parents[2] / "docs" / "foxglove-layout.json"

@@ -6,10 +6,10 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
-from gpmpc.control.controller import Decision, Timing
-from gpmpc.plants import Coupled
+from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.recording import McapRecorder, Step
 from gpmpc.status import Status
+from gpmpc.systems import Coupled
 
 H = 3
 

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.control.controller import Decision, Reference, Timing
-from gpmpc.control.convex_mpc import ConvexMPC
-from gpmpc.control.tracking import StateBounds, TrackingProblem
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import evaluation
-from gpmpc.plants import Coupled, Integrated, Map, Rotational, Translational, step, step_many
+from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
 from gpmpc.simulation.batched_loop import chunk_size
 from gpmpc.status import Status
-from tests.control.systems import HOVER, QUADROTOR, quadrotor_gp
+from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational, step, step_many
+from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 
 H, STEPS = 3, 8
 GP = quadrotor_gp(20)

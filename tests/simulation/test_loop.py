@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.control.controller import Decision, Reference, Timing
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.plants import Integrated, Map, Translational, step
+from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.propagation import MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, Replaced, closed_loop
 from gpmpc.status import Status
+from gpmpc.systems import Integrated, Map, Translational, step
 
 
 class Cart:

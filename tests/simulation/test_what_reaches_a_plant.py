@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from gpmpc.control.cascade import Cascade
-from gpmpc.control.controller import Decision, Reference, Timing
-from gpmpc.control.supervision import command, commands
-from gpmpc.control.tracking import TrackingProblem
 from gpmpc.exceptions import ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.plants import Coupled, Integrated
+from gpmpc.mpc.cascade import Cascade
+from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc.supervision import command, commands
+from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import ModelLoop, cascade_loop, closed_loop, closed_loops, tell
 from gpmpc.status import Status
-from tests.control.systems import QUADROTOR, quadrotor_gp
+from gpmpc.systems import Coupled, Integrated
+from tests.mpc.systems import QUADROTOR, quadrotor_gp
 
 H, STEPS = 3, 12
 LOWER, UPPER, RATE = np.array([5.0, -0.2, -0.2]), np.array([9.0, 0.2, 0.2]), np.array([0.5, 0.1, 0.1])

@@ -1,0 +1,177 @@
+"""Problem: the best that a controller can do which knows the true model (nonlinear MPC, the paper's benchmark).
+
+A ``TrackingProblem`` under x_{i+1} = plant(x_i, u_i), from the belief's mean; state bounds hold for the states
+themselves, since the model is taken to be true. It generated the data of Cao, Lai and Alam (2017), whose sum over
+N = H + 1 states starts at the measured one (its cost is constant) and has one input more, which only pays for itself.
+Multiple shooting in CasADi (Andersson et al., 2019), solved by IPOPT (Waechter and Biegler, 2006) with exact
+derivatives.
+"""
+
+import time
+from collections.abc import Sequence
+from typing import Literal
+
+import casadi
+import numpy as np
+
+from gpmpc.exceptions import SettingError, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.interrupts import interrupts_after
+from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc.convergence import FEASIBLE
+from gpmpc.mpc.request import Request, check_controller
+from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.status import Status
+from gpmpc.systems import Plant
+
+IPOPT_STATUS = {
+    "Solve_Succeeded": Status.SOLVED,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE,
+    "Maximum_Iterations_Exceeded": Status.ITERATION_LIMIT,
+    "Maximum_CpuTime_Exceeded": Status.TIME_LIMIT,
+    "Maximum_WallTime_Exceeded": Status.TIME_LIMIT,
+}
+
+
+class NMPC:
+    """Nonlinear MPC on the true model.
+
+    Args:
+        plant: The model, and what ``x_{i+1} = plant(x_i, u_i)`` means.
+        problem: Weights and bounds. Soft state bounds get one slack variable each, with their weights.
+        horizon: H, the number of predicted states.
+        initial_input: Taken for the last input where there is no previous decision (m,): the first guess, and where
+            rates and increments start.
+        tolerance: IPOPT's, on the scaled optimality conditions.
+        first_guess: ``"hold"`` starts from the last input held; ``"shift"`` from the last plan shifted, which keeps to
+            its local minimum but saves an interior-point method nothing (6 iterations either way on smooth flights).
+            The paper's data need ``"hold"``: the end of a plan steers little of their cost, so its inputs lie far from
+            the next solution, and from there IPOPT found a worse local minimum on the elliptical flight.
+
+    Raises:
+        SettingError: A horizon below 1, weights of another dimension than the plant's, a guess of the wrong length, or
+            an unknown first guess.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        problem: TrackingProblem,
+        horizon: int,
+        initial_input: Sequence[float],
+        tolerance: float = 1e-10,
+        first_guess: Literal["hold", "shift"] = "hold",
+    ):
+        n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
+        self.initial_input = check_controller(problem, n, m, horizon, initial_input)
+        check_number("tolerance", tolerance, above=0)
+        if first_guess not in ("hold", "shift"):
+            raise SettingError("first_guess", f"must be 'hold' or 'shift'; got {first_guess!r}")
+        self.plant, self.problem, self.horizon, self.first_guess = plant, problem, horizon, first_guess
+        self._solver, self._bounds = _build(plant, problem, horizon, tolerance)
+
+    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+        """Solves the problem from the belief's mean along a reference; see ``Controller.control``.
+
+        Raises:
+            ShapeError: The reference does not belong to this controller.
+        """
+        n, m, H = self.problem.state_dim, self.problem.input_dim, self.horizon
+        start = time.perf_counter()
+        request = Request.read(self.problem, H, self.initial_input, belief, reference, previous)
+        if not request.finite:
+            return request.unanswered(Status.INVALID_MEASUREMENT)
+        guess = request.held if self.first_guess == "hold" else request.shifted
+        state, guess = request.state, guess.clip(self.problem.input_lower, self.problem.input_upper)
+        lower, upper = self._bounds
+        states = _rollout(self.plant, state, guess)
+        unknowns = np.zeros(len(lower["x"]))
+        unknowns[: H * (n + m)] = np.concatenate([states[1:].ravel(), guess.ravel()])
+        with interrupts_after():
+            solution = self._solver(
+                x0=unknowns,
+                p=np.concatenate([state, request.last, request.targets.ravel(), request.wanted.ravel()]),
+                lbx=lower["x"],
+                ubx=upper["x"],
+                lbg=lower["g"],
+                ubg=upper["g"],
+            )
+        plan = np.array(solution["x"]).ravel()
+        stats = self._solver.stats()
+        means = np.vstack([state, plan[: H * n].reshape(H, n)])
+        inputs = plan[H * n : H * (n + m)].reshape(H, m)
+        status = IPOPT_STATUS.get(stats["return_status"], Status.NUMERICAL_TROUBLE)
+        values = {"x": plan, "g": np.array(solution["g"]).ravel()}
+        missed = np.max([np.maximum(lower[key] - at, at - upper[key]).max() for key, at in values.items()])
+        suboptimal = status not in (Status.SOLVED, Status.INFEASIBLE) and bool(missed <= FEASIBLE)
+        return Decision(
+            input=inputs[0],
+            inputs=inputs,
+            means=means,
+            covariances=np.zeros((H + 1, n, n)),
+            status=status,
+            iterations=stats["iter_count"],
+            timing=Timing(0.0, 0.0, time.perf_counter() - start),
+            suboptimal=suboptimal,
+        )
+
+
+def _build(
+    plant: Plant, problem: TrackingProblem, horizon: int, tolerance: float
+) -> tuple[casadi.Function, tuple[dict, dict]]:
+    """IPOPT on the unknowns (x_1 .. x_H, u_0 .. u_{H-1}, slacks), and the bounds of unknowns and constraints."""
+    n, m, H, limits = problem.state_dim, problem.input_dim, horizon, problem.state_bounds
+    x0, last = casadi.SX.sym("x0", n), casadi.SX.sym("last", m)
+    x = [x0, *(casadi.SX.sym(f"x{i}", n) for i in range(1, H + 1))]
+    u = [casadi.SX.sym(f"u{i}", m) for i in range(H)]
+    r, wanted = [casadi.SX.sym(f"r{i}", n) for i in range(H)], [casadi.SX.sym(f"w{i}", m) for i in range(H)]
+    rates = [u[i] - (u[i - 1] if i else last) for i in range(H)]
+    penalized = {"inputs": u, "deviations": [a - b for a, b in zip(u, wanted, strict=True)], "increments": rates}
+    Q, R = casadi.DM(problem.Q), casadi.DM(problem.R)
+    cost = sum(casadi.bilin(R, v, v) for v in penalized[problem.penalized])
+    for i in range(1, H + 1):
+        error = x[i] - r[i - 1]
+        cost += casadi.bilin(casadi.DM(problem.terminal) if i == H else Q, error, error)
+    constraints = [x[i + 1] - casadi.vertcat(*plant.successor(x[i], u[i])) for i in range(H)]
+    g_lower, g_upper = [np.zeros(n)] * H, [np.zeros(n)] * H
+    if problem.rate_limited:
+        constraints += rates
+        g_lower, g_upper = [*g_lower, *[problem.rate_lower] * H], [*g_upper, *[problem.rate_upper] * H]
+    x_lower, x_upper, slacks = [np.full(H * n, -np.inf)], [np.full(H * n, np.inf)], []
+    if limits is not None and not limits.soft:
+        x_lower, x_upper = [np.tile(limits.lower, H)], [np.tile(limits.upper, H)]
+    x_lower.append(np.tile(problem.input_lower, H))
+    x_upper.append(np.tile(problem.input_upper, H))
+    if limits is not None and limits.soft:
+        for i in range(1, H + 1):
+            for bound, side in ((limits.lower, -1), (limits.upper, 1)):
+                for j in np.flatnonzero(np.isfinite(bound)):
+                    slack = casadi.SX.sym(f"e{i}_{j}_{side}")
+                    slacks.append(slack)
+                    cost += (limits.l1 or 0.0) * slack + (limits.l2 or 0.0) * slack**2
+                    constraints.append(side * (x[i][int(j)] - bound[j]) - slack)
+                    g_lower, g_upper = [*g_lower, [-np.inf]], [*g_upper, [0.0]]
+        x_lower.append(np.zeros(len(slacks)))
+        x_upper.append(np.full(len(slacks), np.inf))
+    nlp = {
+        "x": casadi.vertcat(*x[1:], *u, *slacks),
+        "p": casadi.vertcat(x0, last, *r, *wanted),
+        "f": cost,
+        "g": casadi.vertcat(*constraints),
+    }
+    options = {
+        "print_time": False,
+        "show_eval_warnings": False,
+        "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 500, "bound_relax_factor": 0.0},
+    }
+    lower = {"x": np.concatenate(x_lower), "g": np.concatenate(g_lower)}
+    upper = {"x": np.concatenate(x_upper), "g": np.concatenate(g_upper)}
+    return casadi.nlpsol("nmpc", "ipopt", nlp, options), (lower, upper)
+
+
+def _rollout(plant: Plant, state: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+    """States (H + 1, n) that inputs (H, m) lead to, from a state (n,)."""
+    states = [np.asarray(state, dtype=float)]
+    for u in inputs:
+        states.append(np.array(plant.successor(states[-1], u), dtype=float))
+    return np.array(states)

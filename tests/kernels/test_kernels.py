@@ -1,0 +1,409 @@
+"""The compiled moments against torch's closed form and its derivatives, 50 digits, and finite differences."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import mpmath
+import numba
+import numpy as np
+import pytest
+import torch
+
+from gpmpc import kernels
+from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.kernels.block import add_to_columns, expm1, expm1_near_zero, outer_sum
+from gpmpc.kernels.exponential import NEAR_ZERO, exp_all
+from gpmpc.kernels.packed import aligned_zeros, pack
+from gpmpc.kernels.pair_sums import Side, largest_exponent
+from gpmpc.kernels.point_rows import explain, explain_several
+from gpmpc.propagation.moment_matching import moments
+from tests.propagation.test_moment_matching import belief, by_mpmath, model
+
+
+def packed(gp):
+    parts = (gp.features, gp.lengthscales, gp.signal_variance, gp.cholesky, gp.weights)
+    return pack(*(part.numpy() for part in parts), gp.state_dim)
+
+
+def control(m):
+    return torch.linspace(-0.3, 0.4, m)
+
+
+def numbers(*tensors):
+    return [tensor.numpy() for tensor in tensors]
+
+
+def close(mine, other, tolerance):
+    other = np.asarray(other)
+    assert mine.shape == other.shape
+    assert np.abs(mine - other).max(initial=0) <= tolerance * max(np.abs(other).max(initial=0), 1e-300)
+
+
+def symmetric(derivative):
+    return (derivative + derivative.mT) / 2
+
+
+CASES = [
+    ("ordinary", {}, {}, 0.0),
+    ("one state and no control", {"n": 1, "m": 0}, {}, 0.0),
+    ("three states, two controls", {"n": 3, "m": 2, "size": 33}, {}, 0.0),
+    ("four states and no control", {"n": 4, "m": 0, "size": 9}, {}, 0.0),
+    ("little noise", {"noise": 1e-6}, {}, 0.0),
+    ("tiny covariance", {"noise": 1e-6}, {"spread": 1e-4}, 0.0),
+    ("large covariance", {}, {"spread": 5.0}, 0.0),
+    ("rank-deficient covariance", {}, {"rank": 1}, 0.0),
+    ("no covariance", {"n": 3}, {"n": 3, "spread": 0.0}, 0.0),
+    ("short length-scales", {"lengthscale": 0.05}, {}, 0.0),
+    ("ignored inputs", {"lengthscale": 1e8, "noise": 1e-2}, {}, 0.0),
+    ("far from the data", {}, {}, 6.0),
+    ("joint exponents", {"lengthscale": 0.02, "size": 12}, {"spread": 1.0, "seed": 3}, 0.0),
+]
+
+
+def case(arguments, at, shift):
+    gp = model(**arguments)
+    at = belief(**{"n": gp.state_dim} | at)
+    return gp, Gaussian(at.mean + shift, at.covariance), control(gp.input_dim)
+
+
+@pytest.mark.parametrize(("name", "arguments", "at", "shift"), CASES, ids=[c[0] for c in CASES])
+def test_values_and_derivatives_agree_with_torch(name, arguments, at, shift):
+    gp, at, u = case(arguments, at, shift)
+    mu, S = at.mean, at.covariance
+
+    def by_torch(mu, S, u):
+        return moments(gp, Gaussian(mu, S), u)
+
+    M, V, J = by_torch(mu, S, u)
+    dM, dV, _ = torch.func.jacrev(by_torch, argnums=(0, 1, 2))(mu, S, u)
+    mine = kernels.moments_with_jacobian(packed(gp), *numbers(mu, S, u), cross=True)
+    close(mine.M, M, 1e-10)
+    close(mine.V, V, 1e-10)
+    close(mine.J, J, 1e-10)
+    close(mine.J, dM[0], 1e-9)
+    close(mine.dM_dS, symmetric(dM[1]), 1e-9)
+    close(mine.dM_du, dM[2], 1e-9)
+    close(mine.dV_dmu, dV[0], 1e-9)
+    close(mine.dV_dS, symmetric(dV[1]), 1e-9)
+    close(mine.dV_du, dV[2], 1e-9)
+
+    def J(mu, S, u):
+        return torch.func.jacrev(lambda mu: by_torch(mu, S, u)[0])(mu)
+
+    dJ = torch.func.jacrev(J, argnums=(0, 1, 2))(mu, S, u)
+    close(mine.dJ_dmu, dJ[0], 1e-9)
+    close(mine.dJ_dS, symmetric(dJ[1]), 1e-9)
+    close(mine.dJ_du, dJ[2], 1e-9)
+    for value, with_jacobian in zip(kernels.moments(packed(gp), *numbers(mu, S, u)), mine[:3], strict=True):
+        close(value, with_jacobian, 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "at", "shift", "tolerance"),
+    [
+        ({}, {}, 0.0, 1e-11),
+        ({"noise": 1e-6}, {}, 0.0, 1e-9),
+        ({"noise": 1e-10, "lengthscale": 0.7}, {}, 0.0, 1e-7),
+        ({"noise": 1e-6}, {"spread": 1e-4}, 0.0, 1e-9),
+        ({}, {"spread": 5.0}, 0.0, 1e-10),
+        ({}, {"rank": 1}, 0.0, 1e-11),
+        ({"lengthscale": 0.05}, {}, 0.0, 1e-10),
+        ({}, {"seed": 5}, 6.0, 1e-11),
+    ],
+)
+def test_the_moments_agree_with_a_fifty_digit_evaluation(arguments, at, shift, tolerance):
+    gp, at, u = case({"size": 7} | arguments, at, shift)
+    exact_M, exact_V, exact_cross = (exact.numpy() for exact in by_mpmath(gp, at, u))
+    M, V, J = kernels.moments(packed(gp), *numbers(at.mean, at.covariance, u))
+    assert np.abs(V - exact_V).max() < tolerance * np.abs(exact_V).max()
+    assert np.abs(M - exact_M).max() < tolerance * max(1e-3, np.abs(exact_M).max())
+    cross = at.covariance.numpy() @ J.T
+    assert np.abs(cross - exact_cross).max() < tolerance * max(1e-3, np.abs(exact_cross).max())
+
+
+@pytest.mark.parametrize("size", [1, 7, 8, 9, 189, 500])
+@pytest.mark.parametrize("diagonal", [False, True])
+def test_padding_and_tiles_change_nothing(size, diagonal):
+    gp, at, u = model(size=size, n=3, m=1, noise=1e-2), belief(3), control(1)
+    M, V, J = moments(gp, at, u)
+    mine = kernels.moments_with_jacobian(packed(gp), *numbers(at.mean, at.covariance, u), diagonal=diagonal)
+    close(mine.M, M, 1e-10)
+    close(mine.V, torch.diag(V.diagonal()) if diagonal else V, 1e-10)
+    close(mine.J, J, 1e-10)
+    dV = torch.func.jacrev(lambda mu: moments(gp, Gaussian(mu, at.covariance), u)[1])(at.mean)
+    close(mine.dV_dmu, dV * torch.eye(3)[..., None] if diagonal else dV, 1e-9)
+    for value, with_jacobian in zip(
+        kernels.moments(packed(gp), *numbers(at.mean, at.covariance, u), diagonal=diagonal), mine[:3], strict=True
+    ):
+        close(value, with_jacobian, 1e-12)
+
+
+@pytest.mark.parametrize("spread", [0.3, 1e-3])
+def test_derivatives_agree_with_finite_differences(spread):
+    gp, at, u = model(n=3, m=2), belief(3, spread=spread), control(2).numpy()
+    mu, S, gps = at.mean.numpy(), at.covariance.numpy(), packed(gp)
+    rng = np.random.default_rng(0)
+    d_mu, d_S, d_u = rng.normal(size=3), rng.normal(size=(3, 3)), rng.normal(size=2)
+    d_S = d_S @ d_S.T * spread**2
+    step = 1e-5
+
+    def moved(t):
+        return kernels.moments(gps, mu + t * d_mu, S + t * d_S, u + t * d_u)
+
+    numeric = [(after - before) / (2 * step) for after, before in zip(moved(step), moved(-step), strict=True)]
+    d = kernels.moments_with_jacobian(gps, mu, S, u, cross=True)
+    close(d.J @ d_mu + np.tensordot(d.dM_dS, d_S) + d.dM_du @ d_u, numeric[0], 1e-7)
+    close(d.dV_dmu @ d_mu + np.tensordot(d.dV_dS, d_S) + d.dV_du @ d_u, numeric[1], 1e-7)
+    close(d.dJ_dmu @ d_mu + np.tensordot(d.dJ_dS, d_S) + d.dJ_du @ d_u, numeric[2], 1e-7)
+
+
+def test_derivatives_in_the_covariance_are_symmetric():
+    gp, at, u = case({"n": 3, "m": 2}, {}, 0.0)
+    d = kernels.moments_with_jacobian(packed(gp), *numbers(at.mean, at.covariance, u), cross=True)
+    for derivative in (d.dM_dS, d.dV_dS, d.dJ_dS):
+        assert (derivative == derivative.swapaxes(-1, -2)).all()
+    assert (d.V == d.V.T).all()
+    assert (d.dV_dS == d.dV_dS.swapaxes(0, 1)).all()
+
+
+def test_outputs_need_not_be_as_many_as_states():
+    gp, at, u = model(n=4, m=1), belief(4), control(1)
+    whole = kernels.moments_with_jacobian(packed(gp), *numbers(at.mean, at.covariance, u), cross=True)
+    rows = [2, 0]
+    few = pack(
+        *(v.numpy() for v in (gp.features, gp.lengthscales[rows], gp.signal_variance[rows])),
+        gp.cholesky[rows].numpy(),
+        gp.weights[rows].numpy(),
+        4,
+    )
+    part = kernels.moments_with_jacobian(few, *numbers(at.mean, at.covariance, u), cross=True)
+    for name in ("M", "J", "dM_dS", "dM_du", "dJ_dmu", "dJ_dS", "dJ_du"):
+        close(getattr(part, name), getattr(whole, name)[rows], 1e-13)
+    for name in ("V", "dV_dmu", "dV_dS", "dV_du"):
+        close(getattr(part, name), getattr(whole, name)[rows][:, rows], 1e-11)
+
+
+@pytest.mark.parametrize(("distance", "spread"), [(0.0, 1e3), (50.0, 10.0), (1e4, 1.0), (1e4, 1e4)])
+def test_wide_beliefs_far_from_the_data_neither_overflow_nor_lose_the_prior(distance, spread):
+    gp = model(lengthscale=0.05)
+    at = Gaussian(torch.full((2,), distance), spread**2 * torch.eye(2))
+    mine = kernels.moments_with_jacobian(packed(gp), *numbers(at.mean, at.covariance), np.zeros(1), cross=True)
+    assert all(np.isfinite(array).all() for array in mine)
+    close(mine.V.diagonal(), gp.signal_variance, 1e-3)
+    close(mine.V, moments(gp, at, torch.zeros(1))[1], 1e-10)
+
+
+def test_exponents_that_overflow_belong_to_nothing_that_counts():
+    # Here log(q q) is at most -897, delta reaches 5958, and log(q q) + delta is nowhere above -702.
+    gp = model(lengthscale=0.02, size=12)
+    at = Gaussian(torch.tensor([1.5, 1.5]), 2e-4 * torch.eye(2))
+    V = moments(gp, at, torch.zeros(1))[1]
+    mine = kernels.moments_with_jacobian(packed(gp), *numbers(at.mean, at.covariance), np.zeros(1), cross=True)
+    assert all(np.isfinite(array).all() for array in mine)
+    close(mine.V, V, 1e-12)
+    assert np.abs(mine.dV_dS).max() < 1e-100
+
+
+@pytest.mark.parametrize(("n", "m", "size"), [(1, 0, 5), (2, 1, 20), (3, 4, 33), (6, 3, 50)])
+def test_the_expansion_at_a_point_agrees_with_torch(n, m, size):
+    gp, x, u = model(size=size, n=n, m=m), belief(n).mean, control(m)
+
+    def mean(x, u):
+        return gp.predict(x, u).mean
+
+    def variance(x, u):
+        return gp.predict(x, u).covariance.diagonal()
+
+    point = kernels.point_with_jacobian(packed(gp), *numbers(x, u), hessian=True)
+    jacrev, both = torch.func.jacrev, (0, 1)
+    close(point.M, mean(x, u), 1e-12)
+    close(point.variance, variance(x, u), 1e-10)
+    for mine, other in zip((point.J, point.dM_du), jacrev(mean, both)(x, u), strict=True):
+        close(mine, other, 1e-10)
+    for mine, other in zip((point.dvariance_dx, point.dvariance_du), jacrev(variance, both)(x, u), strict=True):
+        close(mine, other, 1e-9)
+    for mine, other in zip((point.d2M_dx2, point.d2M_dxdu), jacrev(jacrev(mean), both)(x, u), strict=True):
+        close(mine, other, 1e-10)
+    third = jacrev(jacrev(jacrev(mean)), both)(x, u)
+    for mine, other in zip((point.d3M_dx3, point.d3M_dx2du), third, strict=True):
+        close(mine, other, 1e-9)
+    without = kernels.point_with_jacobian(packed(gp), *numbers(x, u))
+    assert without.d3M_dx3 is None
+    assert all((mine == other).all() for mine, other in zip(without[:8], point[:8], strict=True))
+    for mine, other in zip(
+        kernels.mean_with_jacobian(packed(gp), *numbers(x, u)), (point.M, point.J, point.dM_du), strict=True
+    ):
+        close(mine, other, 1e-12)
+
+
+@pytest.mark.parametrize("covariance", [0.0, 1e-14])
+def test_without_covariance_the_moments_are_the_expansion_at_the_mean(covariance):
+    gp, x, u = model(n=3, m=2), belief(3).mean, control(2)
+    d = kernels.moments_with_jacobian(packed(gp), *numbers(x, covariance * torch.eye(3), u))
+    point = kernels.point_with_jacobian(packed(gp), *numbers(x, u))
+    close(d.M, point.M, 1e-11)
+    close(d.V, np.diag(point.variance), 1e-10)
+    close(d.J, point.J, 1e-10)
+    close(2 * d.dM_dS, point.d2M_dx2, 1e-10)
+    diagonal = np.arange(3)
+    close(d.dV_dmu[diagonal, diagonal], point.dvariance_dx, 1e-9)
+    close(d.dV_du[diagonal, diagonal], point.dvariance_du, 1e-9)
+
+
+@pytest.mark.parametrize("size", [3, 21])
+def test_several_vectors_are_explained_as_each_alone(size):
+    mine = packed(model(size=size))
+    q = aligned_zeros(8, mine.points.shape[1])
+    q[:5, :size] = np.random.default_rng(0).normal(size=(5, size))
+    alone, totals = [explain(mine.inverse_cholesky[1], row, np.empty_like(row)) for row in q], np.zeros(8)
+    explain_several(mine.columns[1], q, totals)
+    assert np.allclose(totals, alone, rtol=1e-12, atol=0)
+
+
+def test_many_points_are_the_loop_over_them():
+    gps = packed(model(n=3, m=2))
+    beliefs = [belief(3, seed=s) for s in range(4)]
+    mu, S = np.stack([b.mean for b in beliefs]), np.stack([b.covariance for b in beliefs])
+    u = np.linspace(-1, 1, 8).reshape(4, 2)
+    together = [
+        kernels.mean_with_jacobian(gps, mu, u),
+        kernels.point_with_jacobian(gps, mu, u, hessian=True),
+        kernels.moments(gps, mu, S, u, diagonal=True),
+        kernels.moments_with_jacobian(gps, mu, S, u, cross=True),
+    ]
+    for h in range(4):
+        alone = [
+            kernels.mean_with_jacobian(gps, mu[h], u[h]),
+            kernels.point_with_jacobian(gps, mu[h], u[h], hessian=True),
+            kernels.moments(gps, mu[h], S[h], u[h], diagonal=True),
+            kernels.moments_with_jacobian(gps, mu[h], S[h], u[h], cross=True),
+        ]
+        for many, one in zip(together, alone, strict=True):
+            assert all((a[h] == b).all() for a, b in zip(many, one, strict=True))
+
+
+def test_threads_do_not_disturb_each_other():
+    gps, S, u = packed(model(size=60, n=3, m=1)), 0.1 * np.eye(3), np.zeros(1)
+    points = np.random.default_rng(0).normal(size=(16, 3))
+    alone = [kernels.moments_with_jacobian(gps, point, S, u).dV_dS for point in points]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda point: kernels.moments_with_jacobian(gps, point, S, u).dV_dS, points))
+    assert all((a == b).all() for a, b in zip(alone, together, strict=True))
+
+
+def test_inputs_may_be_read_only_transposed_or_lists():
+    gps, at, u = packed(model()), belief(), np.zeros(1)
+    mu, S = at.mean.numpy().copy(), np.asfortranarray(at.covariance.numpy())
+    mu.flags.writeable = False
+    for a, b in zip(kernels.moments(gps, mu, S, u), kernels.moments(gps, mu.tolist(), S.tolist(), [0.0]), strict=True):
+        assert (a == b).all()
+
+
+def test_not_a_number_is_passed_on():
+    gps = packed(model())
+    d = kernels.moments_with_jacobian(gps, [np.nan, 0.0], 0.1 * np.eye(2), [0.0])
+    assert np.isnan(d.M).all()
+    assert np.isnan(d.V).all()
+
+
+@numba.njit
+def add_expm1(x, row, one, sums, near):
+    for at in range(0, len(x), 16):
+        x_ij = outer_sum(row, 0, x, at)
+        add_to_columns(sums, at, expm1_near_zero(x_ij) if near else expm1(x_ij), one, 0)
+
+
+def block_expm1(values, near=False):
+    """expm1 of a block, read off its rows in turn."""
+    x, sums = np.zeros((2, -(-len(values) // 16) * 16))
+    x[: len(values)] = values
+    answers = []
+    for one in np.eye(4):
+        sums[:] = 0.0
+        with np.errstate(invalid="ignore"):
+            add_expm1(x, np.zeros(4), one, sums, near)
+        answers.append(sums[: len(values)].copy())
+    assert all(np.array_equal(answer, answers[0], equal_nan=True) for answer in answers)
+    return answers[0]
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.35, 0.35), (-1.1, 1.1), (-40, 30), (-1e-9, 1e-9), (-745, 709)])
+def test_the_exponentials_are_those_of_fifty_digits(low, high):
+    x = np.random.default_rng(0).uniform(low, high, 2000)
+    y = x.copy()
+    exp_all(y)
+    with mpmath.workdps(50):
+        exact = np.array([float(mpmath.exp(v)) for v in x])
+        assert np.abs(y - exact).max(where=exact < 3e-308, initial=0) <= 5e-324
+        normal = exact >= 3e-308
+        assert (np.abs(y - exact)[normal] <= 3e-16 * exact[normal]).all()
+        x = x[x <= 300]
+        exact = np.array([float(mpmath.expm1(v)) for v in x])
+        y = block_expm1(x)
+        assert (np.abs(y - exact) <= (4e-16 + 3.4e-17 * np.maximum(x, 0)) * np.abs(exact)).all()
+
+
+def test_near_zero_the_exponentials_without_reduction_are_the_same_to_the_last_bit():
+    x = np.random.default_rng(1).uniform(-NEAR_ZERO, NEAR_ZERO, 2000) * np.geomspace(1e-12, 1, 2000)
+    x[:2] = -NEAR_ZERO, NEAR_ZERO
+    assert np.array_equal(block_expm1(x), block_expm1(x, near=True))
+
+
+@pytest.mark.parametrize("dims", [3, 6])
+def test_no_exponent_of_a_pair_is_beyond_its_bound(dims):
+    generator = np.random.default_rng(dims)
+    left, z, shifts = (generator.standard_normal(shape) for shape in ((dims, 16), (dims, 16), (2, 16)))
+    z[:, 3], left[:, 5] = 8.0, 2.0  # parallel: the bound is met
+    delta = np.add.outer(*shifts) + left.T @ z
+    rows, columns = Side(left, shifts[0], shifts[0]), Side(z, shifts[1], shifts[1])
+    bound = largest_exponent(left, rows, columns, np.empty(16))
+    assert np.abs(delta).max() <= bound <= np.abs(delta).max() + 2 * np.abs(shifts).max(axis=1).sum()
+    for array in (left, z, shifts[0], shifts[1]):
+        last, array[..., -1] = array[..., -1].copy(), np.nan
+        assert np.isnan(largest_exponent(left, rows, columns, np.empty(16)))
+        array[..., -1] = last
+
+
+def test_the_exponentials_keep_the_limits():
+    x = np.array([0.0, -0.0, -1e9, -np.inf, 709.78, 710.0, 1e9, np.inf, np.nan, -745.2, -744.5])
+    y = x.copy()
+    exp_all(y)
+    with np.errstate(over="ignore"):
+        assert np.array_equal(y, np.exp(x), equal_nan=True) or np.allclose(y, np.exp(x), rtol=2e-16, equal_nan=True)
+    assert block_expm1([0.0, -1e9, -np.inf, 1e-320]).tolist() == [0.0, -1.0, -1.0, 1e-320]
+    large = block_expm1([1e9, np.inf, 300.0])
+    assert large[0] == large[1] == large[2] == pytest.approx(np.exp(300.0), rel=2e-14)
+    assert np.isnan(block_expm1([np.nan, 1.0])).tolist() == [True, False]
+
+
+def test_what_does_not_fit_is_refused():
+    gp = model()
+    gps = packed(gp)
+    with pytest.raises(ShapeError, match="the model has 2 states and 1 inputs; got 3 and 1"):
+        kernels.mean_with_jacobian(gps, np.zeros(3), np.zeros(1))
+    with pytest.raises(ShapeError, match="got 2 and 2"):
+        kernels.moments(gps, np.zeros(2), np.eye(2), np.zeros(2))
+    with pytest.raises(ShapeError, match=r"S must have shape \(2, 2\); got \(3, 3\)"):
+        kernels.moments(gps, np.zeros(2), np.eye(3), np.zeros(1))
+    with pytest.raises(ShapeError, match=r"weights must have shape \(2, 20\); got \(2, 19\)"):
+        packed(replace(gp, weights=gp.weights[:, :-1]))
+    with pytest.raises(SettingError, match="lengthscales: must be positive"):
+        packed(replace(gp, lengthscales=-gp.lengthscales))
+
+
+def test_the_compiled_moments_load_no_torch_of_their_own():
+    names = [
+        "belief_algebra",
+        "block",
+        "explained",
+        "exponential",
+        "moments",
+        "point",
+        "packed",
+        "pair_sums",
+        "point_rows",
+    ]
+    folder = Path(kernels.__file__).parent
+    assert not [name for name in names if "torch" in (folder / f"{name}.py").read_text()]

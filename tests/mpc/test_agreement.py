@@ -1,0 +1,75 @@
+"""Roads to one answer meet, on a few steps; ``benchmarks/agreement.py`` has the hundreds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.state_form import StateFormMPC
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.propagation import Linearization, MomentMatching
+from gpmpc.qp import PrimalActiveSet
+from tests.mpc.systems import HOVER, quadrotor_gp
+
+H = 4
+
+
+def problem(tilt):
+    box = {"input_lower": [0.0, -tilt, -tilt], "input_upper": [15.0, tilt, tilt]}
+    return TrackingProblem([1] * 6, [1] * 3, penalized="increments", **box)
+
+
+def questions(count, std):
+    rng = np.random.default_rng(1)
+    for _ in range(count):
+        start = rng.uniform(-0.5, 0.5, 6)
+        belief = Gaussian(torch.tensor(start), std**2 * torch.eye(6))
+        yield belief, Reference(start + np.linspace(0, 1, H + 1)[:, None] * rng.uniform(-0.4, 0.4, 6))
+
+
+@pytest.mark.parametrize("propagator", [Linearization(), MomentMatching()], ids=["linearisation", "moment matching"])
+def test_iterated_programs_reach_the_optimum_of_the_nonlinear_method(propagator):
+    gp = quadrotor_gp()
+    convex = ConvexMPC(gp, propagator, problem(0.5), H, HOVER, covariance="full", iterations=100, tolerance=1e-7)
+    nonlinear = NonlinearGPMPC(gp, propagator, problem(0.5), H, HOVER, tolerance=1e-6)
+    for belief, reference in questions(4, 0.05):
+        plans = [controller.control(belief, reference) for controller in (convex, nonlinear)]
+        assert all(plan.status.solved for plan in plans)
+        reached, least = (nonlinear.objective(plan.inputs, belief, reference, HOVER)[0] for plan in plans)
+        assert reached <= least * (1 + 1e-4)
+
+
+def test_dual_primal_and_state_form_give_the_same_inputs():
+    gp, active = quadrotor_gp(), 0
+    asked = (gp, Linearization(), problem(0.02), H, HOVER)
+    ours, primal, state_form = ConvexMPC(*asked), ConvexMPC(*asked, solver=PrimalActiveSet()), StateFormMPC(*asked)
+    for belief, reference in questions(5, 0.0):
+        plan = ours.control(belief, reference)
+        active += len(plan.solution.active_set)
+        for other in (primal, state_form):
+            assert np.allclose(other.control(belief, reference).inputs, plan.inputs, atol=1e-6)
+    assert active
+
+
+def test_a_bound_that_takes_a_large_step_of_the_inputs_is_kept_by_iterated_programs_only():
+    """Thrust and tilt multiply: where both have to change at once, one linearisation at the last inputs is far off."""
+    gp, limit = quadrotor_gp(150), 0.05
+    sides = np.full(6, np.inf)
+    sides[0] = limit
+    bounded = replace(problem(0.5), state_bounds=StateBounds(-np.inf * np.ones(6), sides, confidence=0.99, l1=100))
+    start = np.array([0.0, 0.4, 0.0, 0.0, 0.0, -0.5])
+    belief, reference = Gaussian.certain(start), Reference(np.stack([start, [0.2, 0.4, 0.0, 0.0, 0.3, 0.5]]))
+    reached = []
+    for iterations in (1, 30):
+        asked = (gp, Linearization(observation_noise=True), bounded, 1, HOVER)
+        plan = ConvexMPC(*asked, iterations=iterations, tolerance=1e-6).control(belief, reference)
+        assert plan.status.solved
+        after = Linearization(observation_noise=True)(gp, belief, torch.tensor(plan.input))
+        reached.append(float(after.mean[0] + bounded.state_bounds.kappa * after.covariance[0, 0].sqrt()) - limit)
+    assert abs(reached[0]) > 0.01  # [m]
+    assert abs(reached[1]) < 1e-5

@@ -1,0 +1,179 @@
+"""Many questions at once get the answers that each gets alone, on any device and in bounded memory."""
+
+import weakref
+
+import numpy as np
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from gpmpc.exceptions import SettingError
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import evaluation
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.stage_models import stage_model
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
+from gpmpc.status import Status
+from tests.mpc.systems import HOVER, linear_gaussian, quadrotor_gp
+
+H = 3
+GP = quadrotor_gp(15)
+REFERENCE = Reference(np.zeros((H + 1, 6)), np.tile(HOVER, (H, 1)))
+MODES = [
+    ("none", Linearization()),
+    ("zero_order", Linearization(observation_noise=True)),
+    ("zero_order", MomentMatching()),
+    ("diagonal", MomentMatching(diagonal=True)),
+    ("full", Linearization()),
+    ("full", MomentMatching()),
+    ("full", Unscented()),
+]
+FORMS = ["increment", "deviation", "trajectory"]
+
+
+def controller(form, covariance, propagator, model=GP, **settings):
+    box = {"input_lower": [0, -0.4, -0.4], "input_upper": [15, 0.4, 0.4]}
+    bounds = StateBounds([-2] * 6, [2] * 6, l1=50.0)
+    problem = TrackingProblem([1] * 6, [0.1] * 3, penalized="increments", state_bounds=bounds, **box)
+    return ConvexMPC(model, propagator, problem, H, HOVER, form=form, covariance=covariance, **settings)
+
+
+def beliefs(count, spread=0.05, seed=0):
+    rng = np.random.default_rng(seed)
+    roots = spread * rng.normal(size=(count, 6, 6))
+    return [Gaussian(torch.tensor(rng.uniform(-0.5, 0.5, 6)), torch.tensor(root @ root.T)) for root in roots]
+
+
+def assert_same(many, alone, tolerance=1e-9):
+    for ours, theirs in zip(many, alone, strict=True):
+        assert ours.status is theirs.status
+        for key in ("input", "inputs", "means", "covariances"):
+            assert np.allclose(getattr(ours, key), getattr(theirs, key), rtol=0, atol=tolerance, equal_nan=True)
+
+
+@pytest.mark.parametrize("choice", ["auto", "torch"])
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(
+    ("covariance", "propagator"), MODES, ids=lambda v: v if isinstance(v, str) else type(v).__name__
+)
+def test_many_questions_get_the_answers_that_each_gets_alone(form, covariance, propagator, choice):
+    asked = controller(form, covariance, propagator)
+    with evaluation(choice):
+        first = asked.control_many(beliefs(4), [REFERENCE] * 4, [None] * 4)
+        assert_same(first, [asked.control(b, REFERENCE) for b in beliefs(4)])
+        again = beliefs(4, seed=1)
+        again[1] = Gaussian.certain(again[1].mean)  # measured
+        again[2] = Gaussian.certain(np.full(6, np.nan))
+        before = [*first[:3], None]
+        second = asked.control_many(again, [REFERENCE] * 4, before)
+        assert_same(second, [asked.control(b, REFERENCE, p) for b, p in zip(again, before, strict=True)])
+    assert second[2].status is Status.INVALID_MEASUREMENT
+    assert all(second[t].status.solved for t in (0, 1, 3))
+
+
+def test_without_feedback_and_with_another_model_too():
+    open_loop = controller("trajectory", "zero_order", MomentMatching(), feedback=False)
+    other = controller("trajectory", "zero_order", Linearization(), linear_gaussian(6, 3))
+    for asked in (open_loop, other):
+        many = asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3)
+        assert_same(many, [asked.control(b, REFERENCE) for b in beliefs(3)])
+
+
+def test_compiled_and_torch_answer_alike():
+    for covariance, propagator in MODES:
+        asked = controller("trajectory", covariance, propagator)
+        compiled = asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3)
+        with evaluation("torch"):
+            assert_same(asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3), compiled)
+
+
+def test_one_that_cannot_be_answered_spoils_no_other():
+    asked, questions = controller("increment", "full", MomentMatching()), beliefs(3)
+    questions[1] = Gaussian(questions[1].mean, -torch.eye(6))  # no covariance
+    many = asked.control_many(questions, [REFERENCE] * 3, [None] * 3)
+    assert [d.status for d in many] == [Status.SOLVED, Status.NUMERICAL_TROUBLE, Status.SOLVED]
+    assert_same(many, [asked.control(b, REFERENCE) for b in questions])
+
+
+def test_nobody_asks():
+    assert controller("trajectory", "full", MomentMatching()).control_many([], [], []) == []
+
+
+def test_more_quadratic_programs_a_step_are_refused():
+    asked = controller("trajectory", "none", Linearization(), iterations=3)
+    with pytest.raises(SettingError, match="iterations: many questions at once take 1 quadratic program; got 3"):
+        asked.control_many(beliefs(1), [REFERENCE], [None])
+
+
+@pytest.mark.parametrize("covariance", ["none", "zero_order", "diagonal", "full"])
+@pytest.mark.parametrize(
+    "propagator",
+    [Linearization(), Linearization(hessian=True), MomentMatching(), MeanEquivalence(), Unscented()],
+    ids=lambda p: f"{type(p).__name__}{sorted(vars(p).items())}",
+)
+def test_a_stage_stays_on_the_device_of_the_model(covariance, propagator):
+    (belief,) = beliefs(1)
+    belief = Gaussian(belief.mean.expand(2, 6).clone(), belief.covariance.expand(2, 6, 6).clone())
+    input = torch.ones(2, 3)
+    with torch.device("meta"), evaluation("torch"):  # a tensor made without saying where lands there, and is noticed
+        stage = stage_model(covariance, propagator, GP, belief, input)
+    parts = [stage.A, stage.B, stage.c, stage.next.mean, stage.next.covariance]
+    assert {part.device for part in parts} == {GP.device}
+    assert all(bool(part.isfinite().all()) for part in parts)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(
+    ("covariance", "propagator"), MODES, ids=lambda v: v if isinstance(v, str) else type(v).__name__
+)
+def test_a_model_on_a_gpu_gives_the_same_answers(form, covariance, propagator):
+    here, there = controller(form, covariance, propagator), controller(form, covariance, propagator, GP.to("cuda"))
+    first, before = here.control_many(beliefs(4), [REFERENCE] * 4, [None] * 4), [None] * 4
+    assert_same(there.control_many(beliefs(4), [REFERENCE] * 4, before), first)
+    second = here.control_many(beliefs(4, seed=1), [REFERENCE] * 4, first)
+    assert_same(there.control_many(beliefs(4, seed=1), [REFERENCE] * 4, first), second)
+
+
+class Held(TorchDispatchMode):
+    """Counts the bytes of the tensors that are alive at a time."""
+
+    def __init__(self):
+        super().__init__()
+        self.sizes, self.now, self.most = {}, 0, 0
+
+    def __torch_dispatch__(self, function, types, arguments=(), keywords=None):
+        out = function(*arguments, **(keywords or {}))
+        for tensor in tree_leaves(out):
+            if isinstance(tensor, torch.Tensor) and (memory := tensor.untyped_storage())._cdata not in self.sizes:
+                self.sizes[memory._cdata] = memory.nbytes()
+                self.now += memory.nbytes()
+                self.most = max(self.most, self.now)
+                weakref.finalize(memory, self.gone, memory._cdata)
+        return out
+
+    def gone(self, key):
+        self.now -= self.sizes.pop(key, 0)
+
+
+@pytest.mark.parametrize("size", [10, 120])
+@pytest.mark.parametrize(
+    ("covariance", "propagator"), MODES, ids=lambda v: v if isinstance(v, str) else type(v).__name__
+)
+def test_no_question_takes_more_memory_than_it_is_said_to(covariance, propagator, size):
+    gp, T = quadrotor_gp(size), 6
+    _ = gp.precision  # belongs to the model
+    asked, held = controller("trajectory", covariance, propagator, gp), Held()
+    with evaluation("torch"):
+        said = asked.bytes_per_question
+        with held:
+            asked.control_many(beliefs(T), [REFERENCE] * T, [None] * T)
+    assert 0.1 * T * said < held.most < T * said
+
+
+def test_what_is_differentiated_by_autograd_takes_an_unknown_amount():
+    assert controller("trajectory", "full", Linearization(hessian=True)).bytes_per_question is None
+    assert controller("trajectory", "none", Linearization(), linear_gaussian(6, 3)).bytes_per_question is None

@@ -1,0 +1,141 @@
+"""What the model mispredicts for good is estimated, and leaves no offset between reference and state."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.exceptions import SettingError
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import evaluation
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.state_form import StateFormMPC
+from gpmpc.mpc.supervision import command
+from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.propagation import Linearization, MomentMatching
+from gpmpc.status import Status
+from tests.mpc.small_models import double_integrator, pendulum_posterior
+
+H = 8
+PENDULUM = pendulum_posterior()
+PROBLEM = TrackingProblem([10.0, 1.0], [0.1], penalized="increments", input_lower=[-6.0], input_upper=[6.0])
+AT_REST = Reference(np.tile([0.4, 0.0], (H + 1, 1)), np.zeros((H, 1)))
+UNKNOWN = np.array([0.0, 0.08])  # what the plant does that its model does not say [rad, rad/s]
+
+
+def controller(kind=ConvexMPC, model=PENDULUM, propagator=None, **settings):
+    return kind(model, propagator or Linearization(), PROBLEM, H, [0.0], **settings)
+
+
+def moved(model, state, input, unknown=UNKNOWN):
+    return model.predict(torch.tensor(state), torch.tensor(input)).mean.numpy() + unknown
+
+
+def flown(asked, model=PENDULUM, unknown=UNKNOWN, steps=40):
+    """States and decisions; the plant is the model and what it does not know."""
+    states, decisions, last = [np.zeros(2)], [], None
+    for _ in range(steps):
+        last = asked.control(Gaussian.certain(states[-1]), AT_REST, last)
+        assert last.status is Status.SOLVED
+        decisions.append(last)
+        states.append(moved(model, states[-1], last.input, unknown))
+    return np.array(states), decisions
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"form": "increment", "covariance": "none"},
+        {"disturbance_gain": 1.0},
+        {"disturbance_gain": 0.5, "covariance": "none"},
+        {"disturbance_gain": 0.5, "covariance": "none", "iterations": 30},
+        {"disturbance_gain": 0.5, "covariance": "full", "propagator": MomentMatching()},
+        {"disturbance_gain": 0.5, "covariance": "diagonal"},
+        {"disturbance_gain": 0.5, "form": "deviation"},
+    ],
+    ids=str,
+)
+def test_a_constant_error_leaves_no_offset(settings):
+    states, decisions = flown(controller(**settings))
+    # ``deviation`` is made at an input that is not the one held; ``full`` and ``diagonal`` weigh the spread as well.
+    exact = settings.get("form") != "deviation" and settings.get("covariance") not in ("full", "diagonal")
+    assert abs(states[-1, 0] - 0.4) < (1e-4 if exact else 2e-3)
+    if "disturbance_gain" in settings:
+        assert np.allclose(decisions[-1].disturbance, UNKNOWN, rtol=0, atol=1e-4)
+
+
+def test_without_an_estimate_it_does():
+    states, decisions = flown(controller())
+    assert abs(states[-1, 0] - 0.4) > 0.04
+    assert decisions[-1].disturbance is None
+
+
+def test_a_model_that_is_right_is_left_alone():
+    plain, told = flown(controller(), unknown=0.0), flown(controller(disturbance_gain=1.0), unknown=0.0)
+    assert np.allclose(plain[0], told[0], rtol=0, atol=1e-9)
+    assert np.abs([decision.disturbance for decision in told[1]]).max() < 1e-12
+
+
+def test_the_estimate_moves_by_its_gain_towards_what_the_last_step_showed():
+    asked = controller(disturbance_gain=0.3)
+    _, decisions = flown(asked, steps=6)
+    found = [decision.disturbance for decision in decisions]
+    assert np.allclose(found, [(1 - 0.7**k) * UNKNOWN for k in range(6)], rtol=0, atol=1e-12)
+
+
+def test_what_was_applied_counts_and_not_what_was_planned():
+    asked = controller(disturbance_gain=1.0)
+    last = asked.control(Gaussian.certain(np.zeros(2)), AT_REST)
+    held = replace(last, input=np.array([1.5]))
+    now = asked.control(Gaussian.certain(moved(PENDULUM, np.zeros(2), held.input)), AT_REST, held)
+    assert np.allclose(now.disturbance, UNKNOWN, rtol=0, atol=1e-12)
+
+
+def test_a_measurement_that_is_missing_leaves_the_estimate_as_it_is():
+    asked = controller(disturbance_gain=1.0)
+    states, _ = flown(asked, steps=5)
+    last = command(asked, Gaussian.certain(states[-1]), AT_REST, None, "previous_plan")
+    last = replace(last, plan=replace(last.plan, disturbance=UNKNOWN))
+    blind = command(asked, Gaussian.certain(np.full(2, np.nan)), AT_REST, last, "previous_plan")
+    assert blind.status is Status.INVALID_MEASUREMENT
+    assert np.array_equal(blind.plan.disturbance, UNKNOWN)
+
+
+@pytest.mark.parametrize("covariance", ["zero_order", "none"])
+@pytest.mark.parametrize("form", ["deviation", "trajectory"])
+def test_compiled_torch_batched_and_state_form_agree(form, covariance):
+    asked = controller(form=form, covariance=covariance, disturbance_gain=0.7)
+    states, decisions = flown(asked, steps=4)
+    belief, before = Gaussian.certain(states[-1]), decisions[-1]
+    answer = asked.control(belief, AT_REST, before)
+    in_cvxpy = controller(StateFormMPC, form=form, covariance=covariance, disturbance_gain=0.7)
+    others = [in_cvxpy.control(belief, AT_REST, before)]
+    with evaluation("torch"):
+        others += [asked.control(belief, AT_REST, before), *asked.control_many([belief], [AT_REST], [before])]
+    for other, tolerance in zip(others, (1e-6, 1e-9, 1e-9), strict=True):
+        assert np.allclose(other.disturbance, answer.disturbance, rtol=0, atol=1e-12)
+        assert np.allclose(other.inputs, answer.inputs, rtol=0, atol=tolerance)
+        assert np.allclose(other.means, answer.means, rtol=0, atol=tolerance)
+
+
+def test_any_model_can_be_wrong():
+    model = double_integrator()
+    states, decisions = flown(controller(model=model, disturbance_gain=0.5), model)
+    assert abs(states[-1, 0] - 0.4) < 1e-4
+    assert np.allclose(decisions[-1].disturbance, UNKNOWN, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "rule"),
+    [
+        ({"disturbance_gain": 1.2}, "lie between 0 and 1; got 1.2"),
+        ({"disturbance_gain": -0.1}, "got -0.1"),
+        ({"disturbance_gain": 0.5, "form": "increment"}, "be 0 for form 'increment', which needs none; got 0.5"),
+    ],
+)
+@pytest.mark.parametrize("kind", [ConvexMPC, StateFormMPC])
+def test_a_gain_out_of_range_is_refused(kind, settings, rule):
+    with pytest.raises(SettingError, match=rule):
+        controller(kind, **settings)

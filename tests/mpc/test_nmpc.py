@@ -1,0 +1,244 @@
+import numpy as np
+import pytest
+
+from gpmpc.exceptions import SettingError, ShapeError, SolverFailure
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.simulation import closed_loop
+from gpmpc.status import Status
+from gpmpc.systems import Integrated, Map, Rotational, Translational, step
+
+
+class DoubleIntegrator:
+    state_names, input_names = ("x", "v"), ("a",)
+
+    def derivative(self, x, u):
+        return [x[1], u[0]]
+
+
+def test_on_a_linear_plant_it_is_the_least_squares_solution(rng):
+    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    H, Q, R = 5, np.array([3.0, 0.5]), np.array([0.2])
+    state, reference = rng.normal(size=2), rng.normal(size=(H + 1, 2))
+    A, B = np.array([[1, 0.5], [0, 1]]), np.array([0.125, 0.5])
+    free = np.array([np.linalg.matrix_power(A, i + 1) @ state for i in range(H)])
+    response = np.zeros((H, 2, H))
+    for i in range(H):
+        for j in range(i + 1):
+            response[i, :, j] = np.linalg.matrix_power(A, i - j) @ B
+    rows = (np.sqrt(Q)[None, :, None] * response).reshape(-1, H)
+    right = (np.sqrt(Q) * (reference[1:] - free)).ravel()
+    best = np.linalg.lstsq(np.vstack([rows, np.sqrt(R) * np.eye(H)]), np.append(right, np.zeros(H)), rcond=None)[0]
+    controller = NMPC(plant, TrackingProblem(Q, R), H, [0.0])
+    decision = controller.control(Gaussian.certain(state), Reference(reference))
+    assert decision.status is Status.SOLVED
+    assert np.allclose(decision.inputs[:, 0], best, atol=1e-8)
+    assert np.allclose(decision.means[1:], free + response @ best, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "plant", [Map(Rotational()), Integrated(Translational(), time_step=0.5)], ids=["map", "integrated"]
+)
+def test_no_small_change_of_the_plan_is_cheaper(plant, rng):
+    H, Q, R = 4, np.array([20.0, 1, 20, 1, 20, 1]), np.array([1.0, 1, 1])
+    state, reference = 0.1 * rng.normal(size=6), 0.3 * rng.normal(size=(H + 1, 6))
+    initial = [7.26, 0, 0] if isinstance(plant, Integrated) else [0, 0, 0]
+    controller = NMPC(plant, TrackingProblem(Q, R), H, initial)
+    decision = controller.control(Gaussian.certain(state), Reference(reference))
+
+    def cost(inputs):
+        x, total = state, 0.0
+        for u, r in zip(inputs, reference[1:], strict=True):
+            x = step(plant, x, u)
+            total += Q @ (x - r) ** 2 + R @ u**2
+        return total
+
+    best = cost(decision.inputs)
+    assert decision.status is Status.SOLVED
+    for _ in range(50):
+        assert cost(decision.inputs + 1e-3 * rng.normal(size=decision.inputs.shape)) > best
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"horizon": 0}, SettingError, "horizon: must be a whole number, 1 or more; got 0"),
+        ({"problem": TrackingProblem([1.0] * 5, [1.0] * 3)}, SettingError, "must weigh 6 states and 3 inputs; got 5"),
+        ({"initial_input": [0.0]}, SettingError, "initial_input: must be a list of 3 numbers"),
+    ],
+)
+def test_misuse_is_refused_at_construction(arguments, error, message):
+    good = {"horizon": 3, "problem": TrackingProblem([1.0] * 6, [1.0] * 3), "initial_input": [0.0] * 3}
+    with pytest.raises(error, match=message):
+        NMPC(Map(Rotational()), **(good | arguments))
+
+
+def test_a_reference_of_another_shape_is_refused():
+    controller = NMPC(Map(Rotational()), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3)
+    with pytest.raises(ShapeError, match=r"shapes \(6,\) and \(4, 6\); got \(6,\) and \(2, 6\)"):
+        controller.control(Gaussian.certain(np.zeros(6)), Reference(np.zeros((2, 6))))
+
+
+def test_bounds_on_inputs_rates_and_states_are_kept(rng):
+    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    limits = StateBounds([-np.inf, -0.3], [np.inf, 0.3])
+    bounds = {"input_lower": [-1.0], "input_upper": [0.4], "rate_lower": [-0.3], "rate_upper": [0.3]}
+    problem = TrackingProblem([1.0, 0.0], [1e-3], state_bounds=limits, **bounds)
+    decision = NMPC(plant, problem, 8, [0.0]).control(Gaussian.certain(np.zeros(2)), Reference(np.full((9, 2), 1.0)))
+    assert decision.status is Status.SOLVED
+    rates = np.diff(decision.inputs[:, 0], prepend=0.0)
+    for values, low, high in ((decision.inputs, -1, 0.4), (rates, -0.3, 0.3), (decision.means[:, 1], -0.3, 0.3)):
+        assert low - 1e-8 <= values.min()
+        assert values.max() <= high + 1e-8
+    assert decision.means[:, 1].max() > 0.3 - 1e-6
+    assert rates.max() > 0.3 - 1e-6
+
+
+def test_soft_state_bounds_give_way_where_they_must():
+    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    limits = StateBounds([-np.inf, -0.3], [np.inf, 0.3], l1=100.0)
+    problem = TrackingProblem([1.0, 0.0], [1e-3], input_lower=[-0.2], input_upper=[0.2], state_bounds=limits)
+    fast = Gaussian.certain(np.array([0.0, 0.5]))
+    decision = NMPC(plant, problem, 5, [0.0]).control(fast, Reference(np.zeros((6, 2))))
+    assert decision.status is Status.SOLVED
+    assert np.allclose(decision.means[1:3, 1], [0.4, 0.3], atol=1e-6)
+    assert decision.means[2:, 1].max() < 0.3 + 1e-6
+
+
+class Scripted:
+    """Ends with the given statuses in turn."""
+
+    horizon = 2
+
+    def __init__(self, *statuses):
+        self.statuses, self.seen = list(statuses), []
+
+    def control(self, belief, reference, previous=None):
+        self.seen.append((belief.mean, reference.states, previous))
+        timing = Timing(0.0, 0.0, 0.0)
+        return Decision(
+            np.ones(1), np.ones((2, 1)), np.zeros((3, 2)), np.zeros((3, 2, 2)), self.statuses.pop(0), 1, timing
+        )
+
+
+def test_the_loop_hands_on_state_references_and_the_last_decision():
+    controller = Scripted(Status.SOLVED, Status.SOLVED, Status.SOLVED)
+    plant, references = Integrated(DoubleIntegrator(), time_step=1.0, substeps=1), np.arange(10.0).reshape(5, 2)
+    rollout = closed_loop(plant, controller, references, np.zeros(2), 3)
+    assert np.allclose(rollout.states, [[0, 0], [0.5, 1], [2, 2], [4.5, 3]])
+    assert rollout.inputs.shape == (3, 1)
+    assert [seen[1].tolist() for seen in controller.seen] == [references[k : k + 3].tolist() for k in range(3)]
+    assert controller.seen[0][2] is None
+    assert controller.seen[2][2].status is Status.SOLVED
+
+
+def test_a_failed_solve_stops_the_loop_and_is_not_applied():
+    controller = Scripted(Status.SOLVED, Status.ITERATION_LIMIT)
+    plant = Integrated(DoubleIntegrator(), time_step=1.0, substeps=1)
+    with pytest.raises(SolverFailure, match="failed at step 1: stopped at the iteration limit") as caught:
+        closed_loop(plant, controller, np.zeros((9, 2)), np.zeros(2), 3)
+    assert caught.value.step == 1
+    assert len(controller.seen) == 2
+
+
+def test_too_few_references_are_refused_before_the_first_step():
+    with pytest.raises(ShapeError, match="3 steps with horizon 2 need 5 references; got 3"):
+        closed_loop(Map(DoubleIntegrator()), Scripted(), np.zeros((3, 2)), np.zeros(2), 3)
+
+
+def test_soft_bounds_of_one_state_leave_the_others_free():
+    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    state, reference = Gaussian.certain(np.array([0.2, 0.1])), Reference(np.full((6, 2), 1.0))
+    wide = StateBounds([-np.inf, -9.0], [np.inf, 9.0], l1=1.0, l2=1.0)
+    free, bounded = (
+        NMPC(plant, TrackingProblem([1.0, 0.1], [0.1], state_bounds=bounds), 5, [0.0]).control(state, reference)
+        for bounds in (None, wide)
+    )
+    assert np.allclose(free.inputs, bounded.inputs, atol=1e-6)
+
+
+@pytest.mark.parametrize("first_guess", ["hold", "shift"])
+def test_both_first_guesses_fly_the_same_path(first_guess):
+    plant = Integrated(Translational(), time_step=0.5)
+    problem = TrackingProblem([10.0, 1, 10, 1, 10, 1], [0.1, 1, 1], "increments")
+    controller = NMPC(plant, problem, 6, [7.26, 0, 0], first_guess=first_guess)
+    t = 0.5 * np.arange(20)
+    references = np.stack([np.sin(t), np.cos(t), np.cos(t), -np.sin(t), -0.1 * t, 0 * t - 0.1], axis=1)
+    rollout = closed_loop(plant, controller, references, references[0], 12)
+    again = closed_loop(plant, NMPC(plant, problem, 6, [7.26, 0, 0]), references, references[0], 12)
+    assert np.allclose(rollout.inputs, again.inputs, atol=1e-5)
+
+
+def test_a_bad_measurement_is_said_so_and_the_last_plan_is_handed_on():
+    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    controller = NMPC(plant, TrackingProblem([1.0, 0.1], [0.1]), 3, [0.0])
+    good = controller.control(Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros((4, 2))))
+    decision = controller.control(Gaussian.certain(np.array([1.0, np.nan])), Reference(np.zeros((4, 2))), good)
+    assert decision.status is Status.INVALID_MEASUREMENT
+    assert np.array_equal(decision.inputs, good.inputs[[1, 2, 2]])
+
+
+def test_reference_inputs_of_another_number_are_refused():
+    controller = NMPC(Map(Rotational()), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3)
+    with pytest.raises(ShapeError, match=r"reference inputs must have shape \(3, 3\); got \(3, 2\)"):
+        controller.control(Gaussian.certain(np.zeros(6)), Reference(np.zeros((4, 6)), np.zeros((3, 2))))
+    with pytest.raises(SettingError, match="first_guess: must be 'hold' or 'shift'; got 'warm'"):
+        NMPC(Map(Rotational()), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3, first_guess="warm")
+
+
+@pytest.mark.parametrize("prices", [{"l1": 0.3}, {"l2": 2.0}, {"l1": 0.3, "l2": 2.0}], ids=str)
+def test_a_soft_state_bound_costs_what_it_says_on_either_side(prices):
+    """One step of x+ = x + u: minimise (x - r)^2 + u^2 + l1 v + l2 v^2 on a grid finer than the answer."""
+
+    class Shifted:
+        state_names, input_names = ("x",), ("u",)
+
+        def derivative(self, x, u):
+            return [x[0] + u[0]]
+
+    limits = StateBounds([-0.5], [0.2], **prices)
+    controller = NMPC(Map(Shifted()), TrackingProblem([1.0], [1.0], state_bounds=limits), 1, [0.0])
+    x = np.linspace(-3, 3, 600_001)
+    outside = np.maximum(0, np.maximum(x - 0.2, -0.5 - x))
+    for start, target in ((0.0, 2.0), (0.1, -3.0), (0.4, 0.1), (-2.0, -0.9)):
+        price = prices.get("l1", 0.0) * outside + prices.get("l2", 0.0) * outside**2
+        best = x[np.argmin((x - target) ** 2 + (x - start) ** 2 + price)]
+        decision = controller.control(Gaussian.certain(np.array([start])), Reference(np.full((2, 1), target)))
+        assert decision.status is Status.SOLVED
+        assert decision.means[1, 0] == pytest.approx(best, abs=2e-5)
+
+
+def test_bounds_that_contradict_each_other_are_not_called_solved():
+    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    limits = StateBounds([1.0, -np.inf], [np.inf, np.inf])
+    problem = TrackingProblem([1.0, 0.0], [1.0], input_lower=[-0.1], input_upper=[0.1], state_bounds=limits)
+    decision = NMPC(plant, problem, 3, [0.0]).control(Gaussian.certain(np.zeros(2)), Reference(np.zeros((4, 2))))
+    assert not decision.status.solved
+
+
+@pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
+def test_the_last_state_has_its_own_weight_and_inputs_are_weighed_as_asked(penalized, rng):
+    """No small change of the plan is cheaper by the problem's own words."""
+    plant, H = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1), 4
+    Q, T, R = np.array([[2.0, 0.3], [0.3, 1.0]]), np.diag([9.0, 0.1]), np.array([[0.4]])
+    controller = NMPC(plant, TrackingProblem(Q, R, penalized, T), H, [0.7])
+    state, reference = rng.normal(size=2), Reference(rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1)))
+    decision = controller.control(Gaussian.certain(state), reference)
+
+    def cost(inputs):
+        x, total, last = state, 0.0, np.array([0.7])
+        for k, u in enumerate(inputs):
+            x = step(plant, x, u)
+            error, weight = x - reference.states[k + 1], T if k == H - 1 else Q
+            v = {"inputs": u, "deviations": u - reference.inputs[k], "increments": u - last}[penalized]
+            total, last = total + error @ weight @ error + v @ R @ v, u
+        return total
+
+    best = cost(decision.inputs)
+    for k in range(H):
+        for change in (-1e-4, 1e-4):
+            changed = decision.inputs.copy()
+            changed[k] += change
+            assert cost(changed) > best

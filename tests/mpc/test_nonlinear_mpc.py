@@ -1,0 +1,361 @@
+"""The nonlinear problem against finite differences, autograd, quadratic programs and random search."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.descent import Program
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.request import Request
+from gpmpc.mpc.shooting import Shooting
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, rollout
+from gpmpc.qp import DualActiveSet, QuadraticProgram
+from gpmpc.status import Status
+from gpmpc.systems import Integrated
+from tests.mpc.small_models import double_integrator, pendulum_posterior
+
+PROPAGATORS = {
+    "mean equivalence": MeanEquivalence(),
+    "linearisation": Linearization(),
+    "second order": Linearization(hessian=True),
+    "moment matching": MomentMatching(),
+    "unscented": Unscented(),
+    "monte carlo": MonteCarlo(samples=40),
+}
+Q, R = np.array([[3.0, 0.4], [0.4, 0.5]]), np.array([0.2])
+SPREAD = torch.tensor([[0.02, 0.005], [0.005, 0.03]])
+OPTIMIZERS = ["sqp", "slsqp"]
+
+
+def belief(state=(0.4, -0.3), covariance=SPREAD):
+    return Gaussian(torch.tensor(state), covariance)
+
+
+def swing(H, amplitude=1.0):
+    t = 0.2 * np.arange(H + 1)
+    return Reference(np.stack([amplitude * np.sin(2 * t), 2 * amplitude * np.cos(2 * t)], axis=1), np.full((H, 1), 0.5))
+
+
+def request_of(problem, H, at=None, last=0.3, reference=None):
+    return Request.read(problem, H, np.array([last]), at or belief(), reference or swing(H), None)
+
+
+@pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
+@pytest.mark.parametrize("name", PROPAGATORS)
+def test_the_adjoint_gradient_is_that_of_torch_and_of_finite_differences(name, penalized, rng):
+    H, propagator, model = 4, PROPAGATORS[name], pendulum_posterior()
+    problem = TrackingProblem(Q, R, penalized, terminal=2 * Q)
+    controller = NonlinearGPMPC(model, propagator, problem, H, [0.0])
+    inputs, reference, last = rng.normal(size=(H, 1)), swing(H), np.array([0.3])
+    value, gradient = controller.objective(inputs, belief(), reference, last)
+
+    def by_torch(u):
+        moved = rollout(propagator, model, belief(), u)
+        error = moved.mean - torch.tensor(reference.states[1:])
+        W = torch.tensor(np.array([Q] * (H - 1) + [2 * Q]))
+        held = {"inputs": 0 * u, "deviations": torch.tensor(reference.inputs)}
+        v = u - held.get(penalized, torch.cat([torch.tensor(last)[None], u[:-1]]))
+        return torch.einsum("ia,iab,ib->", error, W, error) + (W * moved.covariance).sum() + 0.2 * v.square().sum()
+
+    u = torch.tensor(inputs, requires_grad=True)
+    expected = by_torch(u)
+    assert value == pytest.approx(float(expected.detach()), rel=1e-12)
+    assert np.allclose(gradient, torch.autograd.grad(expected, u)[0], rtol=1e-9, atol=1e-10)
+    direction, step = rng.normal(size=(H, 1)), 1e-5
+    ends = [controller.objective(inputs + s * direction, belief(), reference, last)[0] for s in (step, -step)]
+    assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float((gradient * direction).sum()), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["mean equivalence", "linearisation", "moment matching"])
+def test_margins_of_chance_constraints_and_their_jacobian(name, rng):
+    H, limits = 4, StateBounds([-1.0, -np.inf], [0.8, 1.5], kappa=2.0)
+    problem = TrackingProblem(Q, R, state_bounds=limits)
+    shooting, request, plan = (
+        Shooting(pendulum_posterior(), PROPAGATORS[name], problem, H),
+        request_of(problem, H),
+        rng.normal(size=H),
+    )
+    shot, _ = shooting(plan, request)
+    deviation = np.sqrt(shot.covariances[1:].diagonal(axis1=1, axis2=2))
+    mu = shot.means[1:]
+    expected = [
+        -1 - (mu[:, 0] - 2 * deviation[:, 0]),
+        mu[:, 0] + 2 * deviation[:, 0] - 0.8,
+        mu[:, 1] + 2 * deviation[:, 1] - 1.5,
+    ]
+    assert np.allclose(shot.margins, np.transpose(expected).ravel())
+    direction, step = rng.normal(size=H), 1e-5
+    ends = [shooting(plan + s * direction, request)[0] for s in (step, -step)]
+    assert np.allclose((ends[0].margins - ends[1].margins) / (2 * step), shot.margin_jacobian @ direction, atol=1e-7)
+    assert np.allclose((ends[0].means[1:] - ends[1].means[1:]) / (2 * step), shot.mean_jacobian @ direction, atol=1e-7)
+
+
+def condensed(H, problem, state, reference, last):
+    """The quadratic program of the double integrator with W = 0.01 I: P, q, rows and bounds."""
+    A, B = np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([0.125, 0.5])
+    free = np.array([np.linalg.matrix_power(A, i + 1) @ state for i in range(H)])
+    response = np.zeros((H, 2, H))
+    S, spread = np.zeros((2, 2)), []
+    for i in range(H):
+        S = A @ S @ A.T + 0.01 * np.eye(2)
+        spread.append(np.sqrt(S.diagonal()))
+        for j in range(i + 1):
+            response[i, :, j] = np.linalg.matrix_power(A, i - j) @ B
+    D = np.eye(H) - np.eye(H, k=-1) if problem.penalized == "increments" else np.eye(H)
+    offset = last * np.eye(H)[0] if problem.penalized == "increments" else np.zeros(H)
+    P = 2 * np.einsum("iaj,ab,ibk->jk", response, problem.Q, response) + 2 * problem.R * D.T @ D
+    gap = free - reference[1:]
+    q = 2 * np.einsum("iaj,ab,ib->j", response, problem.Q, gap) - 2 * float(problem.R[0, 0]) * D.T @ offset
+    rates = np.eye(H) - np.eye(H, k=-1)
+    start, kappa = last * np.eye(H)[0], problem.state_bounds.kappa
+    rows = np.concatenate([rates, response[:, 1]])
+    upper = np.concatenate([problem.rate_upper + start, 0.35 - kappa * np.array(spread)[:, 1] - free[:, 1]])
+    lower = np.concatenate([problem.rate_lower + start, np.full(H, -np.inf)])
+    box = np.full(H, problem.input_lower[0]), np.full(H, problem.input_upper[0])
+    return QuadraticProgram(P, q, rows, lower, upper, *box)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+@pytest.mark.parametrize("penalized", ["inputs", "increments"])
+def test_on_a_linear_model_the_optimum_is_the_quadratic_programs(optimizer, penalized):
+    H, limits = 6, StateBounds([-np.inf, -np.inf], [np.inf, 0.35], kappa=0.5)
+    bounds = {"input_lower": [-1.0], "input_upper": [0.3], "rate_lower": [-0.25], "rate_upper": [0.25]}
+    problem = TrackingProblem(Q, R, penalized, state_bounds=limits, **bounds)
+    model, state, reference = double_integrator(W=(0.01 * np.eye(2)).tolist()), np.array([0.2, -0.4]), np.ones((7, 2))
+    best = DualActiveSet().solve(condensed(H, problem, state, reference, 0.1))
+    assert (best.active_set != 0).sum() >= 3
+    controller = NonlinearGPMPC(model, Linearization(), problem, H, [0.1], optimizer, tolerance=1e-8)
+    decision = controller.control(Gaussian.certain(state), Reference(reference))
+    assert decision.status is Status.SOLVED
+    assert np.allclose(decision.inputs[:, 0], best.x, atol=1e-7)
+    if optimizer == "sqp":
+        assert decision.iterations == 1
+
+
+class DoubleIntegrator:
+    state_names, input_names = ("x", "v"), ("a",)
+
+    def derivative(self, x, u):
+        return [x[1], u[0]]
+
+
+def test_on_a_certain_model_it_is_nonlinear_mpc_of_the_true_plant(rng):
+    H, limits = 5, StateBounds([-np.inf, -0.4], [np.inf, 0.4])
+    problem = TrackingProblem(Q, R, "increments", state_bounds=limits, input_upper=[0.5])
+    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    state, reference = Gaussian.certain(np.array([0.1, 0.2])), Reference(rng.normal(size=(H + 1, 2)))
+    ours = NonlinearGPMPC(double_integrator(), MeanEquivalence(), problem, H, [0.1]).control(state, reference)
+    true = NMPC(plant, problem, H, [0.1]).control(state, reference)
+    assert np.allclose(ours.inputs, true.inputs, atol=1e-6)
+    assert np.allclose(ours.means, true.means, atol=1e-6)
+
+
+def constrained(**soft):
+    limits = StateBounds([-np.inf, -1.2], [0.75, np.inf], kappa=1.0, **soft)
+    bounds = {"input_lower": [-3.0], "input_upper": [4.0], "rate_lower": [-1.5], "rate_upper": [1.5]}
+    return TrackingProblem(Q, R, "increments", state_bounds=limits, **bounds)
+
+
+@pytest.mark.parametrize(
+    ("name", "optimizer"),
+    [
+        ("mean equivalence", "sqp"),
+        ("linearisation", "sqp"),
+        ("moment matching", "sqp"),
+        ("mean equivalence", "slsqp"),
+        ("linearisation", "slsqp"),
+    ],
+)
+def test_bounds_are_kept_and_no_feasible_perturbation_is_cheaper(name, optimizer, rng):
+    H, problem, model = 4, constrained(), pendulum_posterior()
+    controller = NonlinearGPMPC(model, PROPAGATORS[name], problem, H, [0.3], optimizer)
+    at = belief((0.3, 0.8), SPREAD / 20)
+    decision = controller.control(at, swing(H))
+    assert decision.status is Status.SOLVED
+    program = Program(Shooting(model, PROPAGATORS[name], problem, H), request_of(problem, H, at))
+    found = program(decision.inputs.ravel())
+    assert program.violation(found) < 1e-7
+    assert found.margins.max() > -1e-5  # a chance constraint is active: the case is not an idle one
+    assert (decision.inputs >= -3).all()
+    assert (decision.inputs <= 4).all()
+    tried = 0
+    for scale in np.repeat([1e-3, 1e-2, 0.1], 400):
+        plan = (found.plan + scale * rng.normal(size=H)).clip(-3, 4)
+        rates = np.diff(plan, prepend=0.3)
+        if np.abs(rates).max() > 1.5:
+            continue
+        trial = program(plan)
+        if program.violation(trial) == 0:
+            tried += 1
+            assert trial.cost > found.cost - 1e-7
+        if tried == 50:
+            break
+    assert tried == 50
+
+
+def test_both_optimizers_find_the_same_plan():
+    H, decisions = 5, []
+    for optimizer in OPTIMIZERS:
+        controller = NonlinearGPMPC(pendulum_posterior(), MomentMatching(), constrained(l1=30.0), H, [0.3], optimizer)
+        decisions.append(controller.control(belief((0.3, 0.8), SPREAD / 20), swing(H)))
+    assert [d.status for d in decisions] == [Status.SOLVED] * 2
+    assert np.allclose(decisions[0].inputs, decisions[1].inputs, atol=1e-3)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_a_warm_start_takes_fewer_iterations(optimizer):
+    H, cold, warm = 6, 0, 0
+    controller = NonlinearGPMPC(pendulum_posterior(), Linearization(), TrackingProblem(Q, R), H, [0.0], optimizer)
+    previous = controller.control(Gaussian.certain(np.array([0.5, -1.0])), swing(H))
+    for _ in range(3):
+        at = Gaussian.certain(previous.means[1])
+        cold += controller.control(at, swing(H)).iterations
+        previous = controller.control(at, swing(H), previous)
+        warm += previous.iterations
+        assert previous.status is Status.SOLVED
+    assert warm < cold
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+@pytest.mark.parametrize("weights", [{"l1": 50.0}, {"l2": 40.0}, {"l1": 20.0, "l2": 40.0}])
+def test_soft_bounds_give_way_and_their_price_is_at_its_minimum(optimizer, weights, rng):
+    H = 4
+    controller = NonlinearGPMPC(pendulum_posterior(), Linearization(), constrained(**weights), H, [0.3], optimizer)
+    at, reference = belief((0.9, 0.5), SPREAD / 20), swing(H, 1.3)  # beyond its bound already
+    decision = controller.control(at, reference)
+    assert decision.status is Status.SOLVED
+    assert decision.means[1, 0] > 0.75
+    best, _ = controller.objective(decision.inputs, at, reference, [0.3])
+    for scale in np.repeat([1e-4, 1e-2], 40):
+        plan = (decision.inputs + scale * rng.normal(size=(H, 1))).clip(-3, 4)
+        if np.abs(np.diff(plan[:, 0], prepend=0.3)).max() <= 1.5:
+            assert controller.objective(plan, at, reference, [0.3])[0] > best - 1e-7
+
+
+def test_an_exact_penalty_keeps_what_can_be_kept():
+    H, at = 5, belief((0.3, 0.8), SPREAD / 20)
+    plans = [
+        NonlinearGPMPC(pendulum_posterior(), Linearization(), constrained(**soft), H, [0.3])
+        .control(at, swing(H))
+        .inputs
+        for soft in ({}, {"l1": 1e4})
+    ]
+    assert np.allclose(*plans, atol=1e-5)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_the_gradient_of_the_objective_includes_the_price_of_soft_bounds(optimizer, rng):
+    controller = NonlinearGPMPC(pendulum_posterior(), Linearization(), constrained(l1=3.0, l2=2.0), 4, [0.3], optimizer)
+    inputs, direction, at = rng.normal(size=(4, 1)), rng.normal(size=(4, 1)), belief((0.9, 0.5))
+    _, gradient = controller.objective(inputs, at, swing(4), [0.0])
+    ends = [controller.objective(inputs + s * direction, at, swing(4), [0.0])[0] for s in (1e-5, -1e-5)]
+    assert (ends[0] - ends[1]) / 2e-5 == pytest.approx(float((gradient * direction).sum()), rel=1e-6)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_contradicting_bounds_are_infeasible(optimizer):
+    limits = StateBounds([-np.inf, -np.inf], [-3.0, np.inf])
+    hopeless = TrackingProblem(Q, R, input_lower=[-1.0], input_upper=[1.0], state_bounds=limits)
+    controller = NonlinearGPMPC(pendulum_posterior(), Linearization(), hopeless, 3, [0.0], optimizer)
+    assert controller.control(belief(), swing(3)).status is Status.INFEASIBLE
+    apart = TrackingProblem(Q, R, input_lower=[5.0], input_upper=[6.0], rate_lower=[-0.1], rate_upper=[0.1])
+    controller = NonlinearGPMPC(pendulum_posterior(), Linearization(), apart, 3, [0.0], optimizer)
+    assert controller.control(belief(), swing(3)).status is Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_too_few_iterations_are_said_so(optimizer):
+    problem = TrackingProblem(Q, R)
+    controller = NonlinearGPMPC(pendulum_posterior(), Linearization(), problem, 6, [0.0], optimizer, 1e-7, 1)
+    decision = controller.control(belief((2.0, -2.0)), swing(6))
+    assert decision.status is Status.ITERATION_LIMIT
+    assert decision.iterations == 1
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_bad_measurement_is_answered_by_the_shifted_plan(bad):
+    controller = NonlinearGPMPC(pendulum_posterior(), Linearization(), TrackingProblem(Q, R), 3, [0.2])
+    good = controller.control(belief(), swing(3))
+    decision = controller.control(Gaussian.certain(np.array([0.1, bad])), swing(3), good)
+    assert decision.status is Status.INVALID_MEASUREMENT
+    assert np.array_equal(decision.inputs, good.inputs[[1, 2, 2]])
+    first = controller.control(Gaussian.certain(np.array([0.1, bad])), swing(3))
+    assert np.array_equal(first.inputs, np.full((3, 1), 0.2))
+
+
+class Broken:
+    """A model that answers with NaN."""
+
+    def __init__(self):
+        self.model = double_integrator()
+
+    def __getattr__(self, name):
+        return getattr(self.model, name)
+
+    def predict(self, state, input=None):
+        at = self.model.predict(state, input)
+        return Gaussian(at.mean * np.nan, at.covariance)
+
+
+def test_a_model_that_breaks_down_is_numerical_trouble():
+    controller = NonlinearGPMPC(Broken(), MeanEquivalence(), TrackingProblem(Q, R), 3, [0.2])
+    decision = controller.control(belief(), swing(3))
+    assert decision.status is Status.NUMERICAL_TROUBLE
+    assert np.isfinite(decision.inputs).all()
+
+
+def test_a_failed_plan_is_no_warm_start_and_one_that_stopped_at_a_limit_is():
+    problem = TrackingProblem(Q, R)
+    impatient = NonlinearGPMPC(pendulum_posterior(), Linearization(), problem, 4, [0.0], "sqp", 1e-7, 1)
+    stopped = impatient.control(belief((2.0, -2.0)), swing(4))
+    request = Request.read(problem, 4, np.zeros(1), belief(), swing(4), stopped)
+    assert np.array_equal(request.shifted, stopped.inputs[[1, 2, 3, 3]])
+    failed = replace(stopped, suboptimal=False)
+    request = Request.read(problem, 4, np.zeros(1), belief(), swing(4), failed)
+    assert np.array_equal(request.shifted, request.held)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_the_same_question_has_the_same_answer(optimizer):
+    controller = NonlinearGPMPC(
+        pendulum_posterior(), MonteCarlo(samples=20), TrackingProblem(Q, R), 3, [0.0], optimizer
+    )
+    first, second = (controller.control(belief(), swing(3)) for _ in range(2))
+    assert np.array_equal(first.inputs, second.inputs)
+    assert first.iterations == second.iterations
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"horizon": 0}, "horizon: must be a whole number, 1 or more; got 0"),
+        ({"problem": TrackingProblem([1.0] * 3, R)}, "must weigh 2 states and 1 inputs; got 3 and 1"),
+        ({"initial_input": [0.0, 0.0]}, "initial_input: must be a list of 1 numbers"),
+        ({"optimizer": "newton"}, "optimizer: must be one of 'sqp', 'slsqp'; got 'newton'"),
+        ({"tolerance": 0.0}, "tolerance: must be a number above 0"),
+        ({"max_iterations": 0}, "max_iterations: must be a whole number, 1 or more"),
+    ],
+)
+def test_misuse_is_refused_at_construction(arguments, message):
+    good = {"problem": TrackingProblem(Q, R), "horizon": 3, "initial_input": [0.0]}
+    with pytest.raises(SettingError, match=message):
+        NonlinearGPMPC(pendulum_posterior(), Linearization(), **(good | arguments))
+
+
+def test_a_question_that_does_not_fit_is_refused():
+    controller = NonlinearGPMPC(pendulum_posterior(), Linearization(), TrackingProblem(Q, R), 3, [0.0])
+    with pytest.raises(ShapeError, match=r"shapes \(2,\) and \(4, 2\); got \(2,\) and \(3, 2\)"):
+        controller.control(belief(), swing(2))
+    with pytest.raises(ShapeError, match=r"reference inputs must have shape \(3, 1\); got \(3, 2\)"):
+        controller.control(belief(), Reference(np.zeros((4, 2)), np.zeros((3, 2))))
+    with pytest.raises(DataError, match="reference states must be finite; got nan"):
+        controller.control(belief(), Reference(np.full((4, 2), np.nan)))
+    with pytest.raises(ShapeError, match=r"inputs and last_input must have shapes \(3, 1\) and \(1,\)"):
+        controller.objective(np.zeros((2, 1)), belief(), swing(3), [0.0])

@@ -1,0 +1,88 @@
+import subprocess
+import sys
+from itertools import product
+
+import numpy as np
+import pytest
+
+from gpmpc.exceptions import SettingError
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.prediction import COVARIANCES, FORMS
+from gpmpc.mpc.state_form import StateFormMPC
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.propagation import Linearization, MeanEquivalence
+from gpmpc.qp import CvxpySolver
+from gpmpc.status import Status
+from gpmpc.systems import step
+from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
+
+H = 3
+PENALIZED = {"increment": "increments", "deviation": "deviations", "trajectory": "inputs"}
+REFERENCE = Reference(np.zeros((H + 1, 6)), np.tile(HOVER, (H, 1)))
+
+
+def problem(penalized="deviations", lower=-0.3, **prices):
+    return TrackingProblem(
+        [10.0, 1.0] * 3,
+        [0.1, 1.0, 1.0],
+        penalized,
+        [20.0, 1.0] * 3,
+        [4.0, -0.4, -0.4],
+        [10.5, 0.4, 0.4],
+        [-2.0, -0.3, -0.3],
+        [2.0, 0.3, 0.3],
+        StateBounds([-np.inf, lower] * 3, [2.0, 0.9] * 3, confidence=0.75, **prices),
+    )
+
+
+@pytest.mark.parametrize(("form", "covariance"), list(product(FORMS, COVARIANCES)))
+@pytest.mark.parametrize("prices", [{}, {"lower": -0.05, "l1": 3.0, "l2": 10.0}], ids=["hard", "soft"])
+def test_it_gives_the_inputs_of_the_condensed_program(form, covariance, prices):
+    moves = MeanEquivalence() if covariance == "none" else Linearization()
+    arguments = (quadrotor_gp(), moves, problem(PENALIZED[form], **prices), H, HOVER, form, covariance)
+    controllers = [ConvexMPC(*arguments), StateFormMPC(*arguments)]
+    if not prices:
+        controllers.append(ConvexMPC(*arguments, CvxpySolver()))
+    state, last, worked = np.array([0.8, 0.2, -0.4, 0.1, 0.3, 0.0]), None, 0
+    for _ in range(3):
+        decisions = [c.control(Gaussian.certain(state), REFERENCE, last) for c in controllers]
+        assert [d.status for d in decisions] == [Status.SOLVED] * len(decisions)
+        for other in decisions[1:]:
+            assert np.allclose(other.inputs, decisions[0].inputs, rtol=0, atol=1e-6)
+            assert np.allclose(other.means, decisions[0].means, rtol=0, atol=1e-6)
+        last = decisions[0]
+        worked += int((np.abs(last.solution.z[3 * H :]) > 1e-6).sum())
+        state = step(QUADROTOR, state, last.input)
+    assert worked
+
+
+def test_a_constraint_of_ones_own_takes_one_line():
+    arguments = quadrotor_gp(), MeanEquivalence(), problem(), H, HOVER, "trajectory", "none"
+    belief = Gaussian.certain(np.array([0.5, 0.0, 0.5, 0.0, 0.0, 0.0]))
+    free = StateFormMPC(*arguments).control(belief, REFERENCE)
+    bound = StateFormMPC(*arguments, constraints=lambda s, u: [s[1:, 0] + s[1:, 2] >= 0.8]).control(belief, REFERENCE)
+    assert (free.means[1:, 0] + free.means[1:, 2]).min() < 0.7
+    assert (bound.means[1:, 0] + bound.means[1:, 2]).min() == pytest.approx(0.8, abs=1e-7)
+
+
+def test_a_constraint_that_is_not_convex_is_refused():
+    with pytest.raises(SettingError, match="constraints: must be convex"):
+        StateFormMPC(
+            quadrotor_gp(), MeanEquivalence(), problem(), H, HOVER, constraints=lambda s, u: [s[1:, 0] ** 2 >= 0.1]
+        )
+
+
+def test_what_cannot_be_solved_is_reported():
+    arguments = quadrotor_gp(), MeanEquivalence(), problem(), H, HOVER, "trajectory", "none"
+    controller = StateFormMPC(*arguments, constraints=lambda s, u: [u[0, 0] >= 100.0])
+    assert controller.control(Gaussian.certain(np.zeros(6)), REFERENCE).status is Status.INFEASIBLE
+    assert controller.control(Gaussian.certain(np.full(6, np.nan)), REFERENCE).status is Status.INVALID_MEASUREMENT
+
+
+def test_importing_the_controllers_does_not_load_cvxpy():
+    modules = "gpmpc.mpc, gpmpc.mpc.convex_mpc, gpmpc.mpc.state_form"
+    code = f"import sys, {modules}; print([m for m in ('cvxpy', 'hydra', 'matplotlib') if m in sys.modules])"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+    assert loaded == "[]"

@@ -1,0 +1,115 @@
+"""A solve that stops at a limit with a plan that keeps its bounds steers all the same, and is the next start."""
+
+from dataclasses import replace
+
+import casadi
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.state_form import StateFormMPC
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.propagation import Linearization
+from gpmpc.qp import DualActiveSet, PrimalActiveSet
+from gpmpc.simulation import closed_loop
+from gpmpc.status import Status
+from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
+
+GP, H, STEPS = quadrotor_gp(60), 12, 20
+LOWER, UPPER, RATE = np.array([3.0, -0.5, -0.5]), np.array([12.0, 0.5, 0.5]), np.array([2.0, 0.3, 0.3])
+PROBLEM = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, "increments", None, LOWER, UPPER, -RATE, RATE)
+REFERENCES = Reference(np.zeros((STEPS + H, 6)), np.tile(HOVER, (STEPS + H - 1, 1)))
+START = np.array([0.9, 0.0, -0.8, 0.2, 0.7, 0.0])
+
+
+def convex(problem=PROBLEM, **settings):
+    return ConvexMPC(GP, Linearization(), problem, H, HOVER, **settings)
+
+
+def nmpc(monkeypatch):
+    build = casadi.nlpsol
+    with monkeypatch.context() as patch:
+        few = lambda *known: build(*known[:-1], known[-1] | {"ipopt": known[-1]["ipopt"] | {"max_iter": 8}})  # noqa: E731
+        patch.setattr(casadi, "nlpsol", few)
+        return NMPC(QUADROTOR, PROBLEM, H, HOVER, first_guess="shift")
+
+
+STOPPED = {
+    "two programs": lambda _: convex(iterations=2, tolerance=1e-12),
+    "five programs": lambda _: convex(iterations=5, tolerance=1e-12),
+    "no step lowers the cost": lambda _: convex(iterations=50, tolerance=1e-300),
+    "two, of the whole belief": lambda _: convex(iterations=2, tolerance=1e-12, covariance="diagonal"),
+    "two, of another solver": lambda _: convex(iterations=2, tolerance=1e-12, solver=PrimalActiveSet()),
+    "a primal solver": lambda _: convex(solver=PrimalActiveSet(iteration_limit=2)),
+    "a state form": lambda _: StateFormMPC(GP, Linearization(), PROBLEM, H, HOVER, options={"max_iter": 3}),
+    "sqp": lambda _: NonlinearGPMPC(GP, Linearization(), PROBLEM, H, HOVER, "sqp", 1e-9, 2),
+    "slsqp": lambda _: NonlinearGPMPC(GP, Linearization(), PROBLEM, 4, HOVER, "slsqp", 1e-9, 3),
+    "nmpc": nmpc,
+}
+
+
+@pytest.mark.parametrize("kind", STOPPED)
+def test_a_vehicle_comes_home_with_plans_that_were_not_optimal_yet(kind, monkeypatch):
+    controller = STOPPED[kind](monkeypatch)
+    references = REFERENCES if controller.horizon == H else Reference(REFERENCES.states[:-8], REFERENCES.inputs[:-8])
+    flight = closed_loop(QUADROTOR, controller, references, START, STEPS, on_failure="raise")
+    assert flight.failures == ()
+    assert flight.suboptimal
+    assert {flight.statuses[k] for k in flight.suboptimal} <= {Status.ITERATION_LIMIT, Status.NUMERICAL_TROUBLE}
+    assert np.isfinite(flight.predicted_means).all()
+    assert np.abs(flight.states[-1]).max() < 0.1
+    assert (flight.inputs >= LOWER).all()
+    assert (flight.inputs <= UPPER).all()
+    assert (np.abs(np.diff(np.vstack([HOVER, flight.inputs]), axis=0)) <= RATE + 1e-12).all()
+
+
+@pytest.mark.parametrize("limit", [2, 4, 8])
+def test_the_plan_at_a_limit_is_the_best_that_the_iteration_got_to(limit):
+    """Its cost falls from limit to limit, down to the optimum, by an evaluation that is not the iteration's own."""
+
+    def of_the_mean(plan):
+        x, before, total = torch.tensor(START), HOVER, 0.0
+        for u in plan:
+            x = GP.predict(x, torch.tensor(u)).mean
+            total += x.numpy() @ PROBLEM.Q @ x.numpy() + (u - before) @ PROBLEM.R @ (u - before)
+            before = u
+        return float(total)
+
+    at, reference = Gaussian.certain(START), Reference(REFERENCES.states[: H + 1], REFERENCES.inputs[:H])
+
+    def cost(count):
+        controller = convex(covariance="none", iterations=count, tolerance=1e-14)
+        decision = controller.control(at, reference)
+        assert decision.applicable
+        assert np.isfinite(decision.inputs).all()
+        return of_the_mean(decision.inputs), decision
+
+    value, decision = cost(limit)
+    assert decision.suboptimal
+    assert decision.status is Status.ITERATION_LIMIT
+    assert cost(60)[0] <= value * (1 + 1e-9)
+    assert value <= cost(limit // 2)[0] * (1 + 1e-9)
+
+
+def test_a_plan_that_breaks_a_hard_bound_is_not_applied():
+    """There is no time to stop before the bound, so none of the programs can be solved."""
+    limits = StateBounds([-np.inf] * 6, [0.95, *[np.inf] * 5])
+    problem = replace(PROBLEM, state_bounds=limits)
+    at = Gaussian.certain(np.array([0.9, 3.0, 0.0, 0.0, 0.0, 0.0]))
+    reference = Reference(REFERENCES.states[: H + 1], REFERENCES.inputs[:H])
+    for controller in (convex(problem, iterations=3), convex(problem)):
+        decision = controller.control(at, reference)
+        assert not decision.applicable
+        assert not decision.suboptimal
+
+
+def test_a_solver_that_stopped_outside_of_the_bounds_has_no_plan():
+    controller = convex(replace(PROBLEM, rate_upper=0.1 * RATE), solver=DualActiveSet(iteration_limit=1))
+    decision = controller.control(Gaussian.certain(START), Reference(REFERENCES.states[: H + 1], REFERENCES.inputs[:H]))
+    assert decision.status is Status.ITERATION_LIMIT
+    assert not decision.applicable

@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+
+from gpmpc.exceptions import SettingError, SolverFailure
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc.supervision import command
+from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.status import Status
+
+STATE, FAR = Gaussian.certain(np.zeros(1)), Reference(np.zeros((5, 1)))
+LOST = Gaussian.certain(np.array([np.nan]))
+
+
+class Planner:
+    """Plans (10 k, 10 k + 1, ..) at call k, unless the call is among the failing ones, which plan 666."""
+
+    horizon = 4
+
+    def __init__(self, *failing):
+        self.failing, self.previous = failing, []
+
+    def control(self, belief, reference, previous=None):
+        k = len(self.previous)
+        self.previous.append(previous)
+        failed = k in self.failing
+        inputs = np.full((4, 1), 666.0) if failed else 10.0 * k + np.arange(4.0)[:, None]
+        means, covariances = np.arange(5.0)[:, None] + 100 * k, np.arange(5.0)[:, None, None] + 100 * k
+        status = Status.ITERATION_LIMIT if failed else Status.SOLVED
+        return Decision(inputs[0], inputs, means, covariances, status, 1, Timing(0.0, 0.0, 0.0))
+
+
+def run(planner, steps, on_failure, beliefs=None, reference=FAR):
+    last, commands = None, []
+    for k in range(steps):
+        last = command(planner, beliefs[k] if beliefs else STATE, reference, last, on_failure, k)
+        commands.append(last)
+    return commands
+
+
+def test_the_previous_plan_gives_its_input_of_the_right_age_and_holds_the_last_when_used_up():
+    commands = run(Planner(2, 3, 4, 5, 6), 8, "previous_plan")
+    assert [c.input[0] for c in commands] == [0, 10, 11, 12, 13, 13, 13, 70]
+
+
+def test_hold_keeps_the_last_input_that_was_applied():
+    commands = run(Planner(2, 3, 4), 6, "hold")
+    assert [c.input[0] for c in commands] == [0, 10, 10, 10, 10, 50]
+
+
+@pytest.mark.parametrize("on_failure", ["previous_plan", "hold"])
+def test_a_failed_iterate_is_never_handed_on(on_failure):
+    planner = Planner(1, 2, 5)
+    commands = run(planner, 8, on_failure)
+    assert all(p is None or (p.status.solved and not (p.inputs == 666).any()) for p in planner.previous)
+    assert [c.status.solved for c in commands] == [k not in (1, 2, 5) for k in range(8)]
+    assert commands[1].decision.status is Status.ITERATION_LIMIT
+
+
+def test_the_plan_handed_on_is_the_last_solved_one_as_if_made_one_step_ago():
+    planner = Planner(1, 2)
+    run(planner, 4, "previous_plan")
+    aged = planner.previous[3]  # made at step 0, two steps of which have gone by when step 2 is over
+    assert aged.inputs[:, 0].tolist() == [2, 3, 3, 3]
+    assert aged.input[0] == 2  # what step 2 applied
+    assert aged.means[:, 0].tolist() == [2, 3, 4, 4, 4]
+    assert aged.covariances[:, 0, 0].tolist() == [2, 3, 4, 4, 4]
+
+
+def test_what_is_handed_on_begins_with_what_was_applied_when_the_input_is_held():
+    planner = Planner(1)
+    run(planner, 3, "hold")
+    assert planner.previous[2].inputs[:, 0].tolist() == [0, 2, 3, 3]
+    assert planner.previous[2].input[0] == 0
+
+
+def test_a_state_that_is_not_finite_is_not_given_to_the_controller():
+    planner = Planner()
+    infinite = Gaussian(STATE.mean, STATE.covariance + np.inf)
+    commands = run(planner, 4, "previous_plan", [STATE, LOST, infinite, STATE])
+    assert len(planner.previous) == 2
+    assert [c.status for c in commands[1:3]] == [Status.INVALID_MEASUREMENT] * 2
+    assert [c.input[0] for c in commands] == [0, 1, 2, 10]
+    assert commands[1].decision is None
+
+
+def test_before_the_first_plan_the_references_input_is_taken_or_the_loop_stops():
+    known = Reference(np.zeros((5, 1)), np.full((4, 1), 7.0))
+    assert [c.input[0] for c in run(Planner(0, 1), 3, "hold", reference=known)] == [7, 7, 20]
+    with pytest.raises(SolverFailure, match="step 0: .* no reference input to fall back on"):
+        run(Planner(0), 1, "previous_plan")
+
+
+def test_raise_stops_at_the_step():
+    with pytest.raises(SolverFailure, match="step 1: stopped at the iteration limit"):
+        run(Planner(1), 3, "raise")
+    with pytest.raises(SolverFailure, match="step 0: the state is not finite: check the estimator"):
+        run(Planner(), 1, "raise", [LOST])
+
+
+def test_a_misspelt_policy_is_refused():
+    with pytest.raises(SettingError, match="on_failure: must be one of 'previous_plan', 'hold', 'raise'; got 'held'"):
+        run(Planner(), 1, "held")
+
+
+def test_before_the_first_plan_the_reference_input_is_applied_within_the_bounds_and_told_to_the_controller():
+    planner = Planner()
+    planner.problem = TrackingProblem([1.0], [1.0], input_lower=[-2.0], input_upper=[2.0])
+    reference = Reference(np.zeros((5, 1)), np.full((4, 1), 5.0))
+    commands = run(planner, 3, "previous_plan", [LOST, LOST, STATE], reference)
+    assert [c.input[0] for c in commands] == [2, 2, 0]
+    told = planner.previous[0]
+    assert told.input[0] == 2
+    assert not told.status.solved
+
+
+@pytest.mark.parametrize("on_failure", ["previous_plan", "hold"])
+def test_before_the_first_plan_each_step_applies_its_own_reference_input(on_failure):
+    """What was applied for want of a plan is no plan, and is not gone on along."""
+    planner, last, applied = Planner(0, 1, 2), None, []
+    for k in range(4):
+        reference = Reference(np.zeros((5, 1)), 100.0 + k + np.arange(4.0)[:, None])
+        last = command(planner, STATE, reference, last, on_failure, k)
+        applied.append(last.input[0])
+    assert applied == [100, 101, 102, 30]
+    assert last.plan.status.solved
