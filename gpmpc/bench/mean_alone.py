@@ -5,8 +5,8 @@ The mean goes through the model; no covariance is predicted, so the expected cos
 
 import torch
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.propagation.propagator import Propagation, checked_input
 from gpmpc.propagation.sensitivity import Sensitivity
 
