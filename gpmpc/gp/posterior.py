@@ -252,16 +252,7 @@ class GPPosterior:
         return self._belief(k, state)
 
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
-        """Linearises the mean at K points in one compiled call; a model that is not float64 in host memory uses torch.
-
-        Args:
-            states: (K, n), float64.
-            inputs: (K, m), float64.
-            covariance: Whether the covariances at the points are computed.
-
-        Raises:
-            ShapeError: States or inputs do not fit the model.
-        """
+        """Linearises the mean at K points (K, n), (K, m): by the compiled kernels where they can, else by torch."""
         if host_arrays(self.weights) is not None:
             from gpmpc import kernels  # loads numba
 
