@@ -153,15 +153,16 @@ def batched_jacobian(
         outputs = values[0].shape[-1]
         eye = torch.eye(outputs, dtype=values[0].dtype, device=values[0].device)
         weights = eye.reshape(outputs, *[1] * (values[0].dim() - 1), outputs).expand(outputs, *values[0].shape)
-        options = {"create_graph": again, "retain_graph": True, "materialize_grads": True}
-        try:
-            if not values[0].requires_grad:  # a constant
-                columns = [a.new_zeros(outputs, *a.shape) for a in leaves]
-            else:
+        options = {"create_graph": again, "retain_graph": True, "allow_unused": True}
+        if not values[0].requires_grad:  # a constant
+            columns = [None] * len(leaves)
+        else:
+            try:
                 columns = torch.autograd.grad(values[0], leaves, weights, is_grads_batched=True, **options)
-        except RuntimeError:
-            rows = [torch.autograd.grad(values[0], leaves, weight, **options) for weight in weights]
-            columns = [torch.stack(column) for column in zip(*rows, strict=True)]
+            except RuntimeError:  # an operation of which torch cannot vectorise the derivative
+                rows = [torch.autograd.grad(values[0], leaves, weight, **options) for weight in weights]
+                columns = [None if c[0] is None else torch.stack(c) for c in zip(*rows, strict=True)]
+        columns = [a.new_zeros(outputs, *a.shape) if c is None else c for a, c in zip(leaves, columns, strict=True)]
     jacobians = [column.movedim(0, -2) for column in columns]
     if not again:
         values = tuple(value.detach() for value in values)
