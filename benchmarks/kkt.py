@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.tracking import TrackingProblem
 
