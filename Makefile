@@ -3,7 +3,7 @@
 PYTHON ?= python3
 ENV := .venv/.installed
 
-.PHONY: tables figures test lint guard clean
+.PHONY: tables figures test lint guard docs clean
 
 tables: $(ENV)  ## The paper's Tables 1 and 2 beside ours; settings: make tables SET="draws=50 data=paper data.folder=DIR"
 	.venv/bin/gpmpc tables $(SET)
@@ -21,6 +21,10 @@ lint: $(ENV)  ## Format check, linter and import contracts
 
 guard: $(ENV)  ## Whether anything became slower, against reference kernels in the same run
 	.venv/bin/python benchmarks/guard.py
+
+docs: $(ENV)  ## The documentation as a site in docs/_build; a warning is an error
+	.venv/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	.venv/bin/python -m sphinx -q -W -b html docs docs/_build
 
 $(ENV): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' \
