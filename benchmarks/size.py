@@ -4,8 +4,8 @@
 
 *Lines* are all lines of ``gpmpc/**/*.py``. A *public name* is a function or class at the top level of a module, without
 an underscore at the beginning of its name or of a module's above it; constants are counted apart. *Arguments* are those
-of functions and methods, ``self`` and ``cls`` apart. A *circle* is a set of modules, or of rooms, that import each other,
-wherever the import statement stands. ``tests/test_architecture.py`` holds the limits.
+of functions and methods, ``self`` and ``cls`` apart. A *circle* is a set of modules, or of rooms, that import each
+other, wherever the import statement stands. ``tests/test_architecture.py`` holds the limits.
 """
 
 import ast
