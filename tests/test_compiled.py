@@ -160,7 +160,9 @@ def test_numba_still_has_the_private_parts_that_are_used_here():
 
     assert isinstance(kernel._cache._cache_file._source_stamp, tuple)
     assert (kernel(1.0), inner(1.0)) == (3.0, 2.0)  # as a part of the kernel, and in Python
-    library = kernel.overloads[kernel.signatures[0]].library
+    anew = numba.njit(**gpmpc.compiled._PRIVATE_OPTIONS[True])(kernel.py_func)  # ``kernel`` may have been loaded
+    anew(1.0)
+    library = anew.overloads[anew.signatures[0]].library
     assert type(library) is gpmpc.compiled._KernelLibrary
     assert gpmpc.compiled._InnerLibrary in {type(part) for part in library._linking_libraries}
     assert gpmpc.compiled.unchecked_entry_point(kernel) is kernel.overloads[kernel.signatures[0]].entry_point
