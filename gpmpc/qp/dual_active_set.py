@@ -10,7 +10,6 @@ Farkas' proof are tried again with doubled digits (``gpmpc.qp.dual_rescue``); wh
 ``Status.NUMERICAL_TROUBLE``.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 
@@ -18,17 +17,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 
-from gpmpc.compiled import compile_for, direct
+from gpmpc.compiled import compile_for, unchecked_entry_point
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import record as layout
 from gpmpc.qp.dual_kernels import SIGNATURE, solve
 from gpmpc.qp.dual_rescue import rescue
 from gpmpc.qp.problem import QuadraticProgram, SoftRows, stack_softness
 from gpmpc.qp.solution import QPSolution, Terms, WarmStart, proves_infeasibility
-from gpmpc.qp.workspace import PREPARED, factor_and_rows, new_memory
+from gpmpc.qp.workspace import PREPARED, factor_and_rows, new_memory, softness_in
 
 Array = NDArray[np.float64]
 
+_NO_RECORD = layout.NO_RECORD
 _FLOAT = np.dtype(np.float64)
 _empty = np.empty  # a local name saves a look-up
 _new = tuple.__new__  # half the time of a named tuple's own constructor
@@ -63,7 +63,7 @@ class DualActiveSet:
                 raise ProblemError(f"{name} must be positive; got {value}")
         global _run
         compile_for(solve, SIGNATURE)
-        _run = direct(solve)
+        _run = unchecked_entry_point(solve)
 
     def solve(
         self, problem: QuadraticProgram, warm_start: WarmStart = None, soft: SoftRows | None = None
@@ -83,13 +83,12 @@ class DualActiveSet:
         Raises:
             ProblemError: The problem was not checked and breaks a rule of ``QuadraticProgram``.
         """
-        plan = None
-        if soft is None:
-            try:
-                plan = self._plans.get(problem.G.shape)
-            except AttributeError:  # of an unchecked program
-                pass
-        return _solve(problem, warm_start, plan or self._plan(*np.shape(problem.G), soft), self)
+        try:
+            plan = self._plans[problem.G.shape] if soft is None else self._plan(*problem.G.shape, soft)
+        except (AttributeError, KeyError, TypeError):  # the first of its shape, or an unchecked one without a shape
+            problem = QuadraticProgram.from_stacked(*problem)
+            plan = self._plan(*problem.G.shape, soft)
+        return _solve(problem, warm_start, plan, self)
 
     def prepare(self, P: ArrayLike, G: ArrayLike | None = None, soft: SoftRows | None = None) -> "Prepared":
         """Does once what depends on P, G and soft weights only.
@@ -102,8 +101,7 @@ class DualActiveSet:
         Raises:
             ProblemError: As for ``QuadraticProgram``.
         """
-        problem = QuadraticProgram(P, np.zeros(len(np.atleast_1d(P))), G)
-        return Prepared(self, problem, soft)
+        return Prepared(self, QuadraticProgram(P, np.zeros(len(np.atleast_1d(P))), G), soft)
 
     def workspace(self, rows: int, variables: int, soft: SoftRows | None = None) -> tuple[Array, Array]:
         """Returns softness and memory for kernels that call ``dual_kernels.solve`` themselves, holding the lock."""
@@ -136,11 +134,13 @@ class Prepared:
         self._P, self._G, self._solver = problem.P, problem.G, solver
         m, n = problem.G.shape
         self._plan = solver._plan(m, n, soft, prepared=True)
-        _solve(problem, None, self._plan, solver)  # factorises P and measures the rows of G
-        memory = self._plan[1]
-        L, rows = factor_and_rows(memory, n, m)
-        rows[:] = solve_triangular(L, np.vstack([np.eye(n), problem.G]).T, lower=True, trans="T", check_finite=False).T
-        memory[0, PREPARED] = True
+        _, memory, size, _ = self._plan
+        status = solve(*problem, layout.NO_RECORD, memory, np.empty(size))  # factorises P, measures the rows of G
+        if status == layout.SOLVED:  # else numbers overflow, and every solve is to find that out by itself
+            L, rows = factor_and_rows(memory, n, m)
+            C = np.vstack([np.eye(n), problem.G])
+            rows[:] = solve_triangular(L, C.T, lower=True, trans="T", check_finite=False).T  # L^-T c_p
+            memory[0, PREPARED] = True
         self.build_seconds = perf_counter() - began
 
     def solve(self, q: Array, lower: Array, upper: Array, warm_start: WarmStart = None) -> QPSolution:
@@ -155,51 +155,50 @@ class Prepared:
         Raises:
             ProblemError: Shapes that do not match, NaN, crossed bounds.
         """
-        problem = QuadraticProgram.unchecked(self._P, q, self._G, lower, upper)
-        return _solve(problem, warm_start, self._plan, self._solver)
+        return _solve((self._P, q, self._G, lower, upper), warm_start, self._plan, self._solver)
 
 
-def _solve(problem: QuadraticProgram, warm_start: WarmStart, plan: tuple, solver: DualActiveSet) -> QPSolution:
-    """Solves one problem in the memory of ``plan``."""
+def _solve(problem: tuple[Array, ...], warm_start: WarmStart, plan: tuple, solver: DualActiveSet) -> QPSolution:
+    """Solves (P, q, G, lower, upper) in the memory of ``plan``."""
     began = perf_counter()
-    P, q, G, lower, upper = problem.P, problem.q, problem.G, problem.lower, problem.upper
+    P, q, G, lower, upper = problem
     softness, memory, size, where = plan
     record = _empty(size)
     try:
-        guess = layout.NO_RECORD if warm_start is None else warm_start.record
+        guess = _NO_RECORD if warm_start is None else warm_start.record
         if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
             status = _run(P, q, G, lower, upper, guess, memory, record)
         else:  # may still be float64: a dtype that was pickled is another object
             status = solve(P, q, G, lower, upper, guess, memory, record)
     except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
         status = layout.MISUSE
+    if status:
+        problem, record = _solve_again(problem, warm_start, memory, solver, status, record, began)
+        P, q, G, lower, upper = problem
+    return _new(
+        QPSolution, (record[where], _new(Terms, (P, G, softness)), q, lower, upper, record, 0.0, perf_counter() - began)
+    )
+
+
+def _solve_again(problem, warm_start, memory, solver, status, record, began) -> tuple[tuple[Array, ...], Array]:
+    """Continues a solve that did not end as ``SOLVED``: checks the problem, goes on, accepts the status or tries again.
+
+    Returns:
+        The problem's arrays as the kernel takes them, and the record.
+
+    Raises:
+        ProblemError: The problem breaks a rule of ``QuadraticProgram``.
+    """
     if status == layout.MISUSE:
-        problem = QuadraticProgram.from_stacked(P, q, G, lower, upper)  # raises if it is misuse indeed
-        P, q, G, lower, upper = problem.P, problem.q, problem.G, problem.lower, problem.upper
-        status = solve(P, q, G, lower, upper, _as_record(warm_start, len(q), len(lower)), memory, record)
+        problem = QuadraticProgram.from_stacked(*problem)  # raises if it is misuse indeed
+        n, M = len(problem.q), len(problem.lower)
+        status = solve(*problem, _as_record(warm_start, n, M), memory, record)
         if status == layout.MISUSE:  # a proper problem: rows that overflow, P at the edge of definiteness
             record[:] = 0.0
-            record[[layout.STATUS, layout.VARIABLES, layout.CONSTRAINTS]] = layout.NUMERICAL_TROUBLE, len(q), len(lower)
-    terms = _new(Terms, (P, G, softness))
-    if status != layout.SOLVED:
-
-        def again(guess: Array, record: Array) -> int:
-            return solve(P, q, G, lower, upper, guess, memory, record)
-
-        record = _finish(solver, again, terms, (q, lower, upper), record, began)
-    return _new(QPSolution, (record[where], terms, q, lower, upper, record, 0.0, perf_counter() - began))
-
-
-def _finish(
-    solver: DualActiveSet,
-    again: Callable,
-    terms: Terms,
-    vectors: tuple[Array, Array, Array],
-    record: Array,
-    began: float,
-) -> Array:
-    """Decides on a solve that did not end as ``SOLVED``: goes on, accepts it, or tries again; returns the record."""
-    q, lower, upper = vectors
+            record[[layout.STATUS, layout.VARIABLES, layout.CONSTRAINTS]] = layout.NUMERICAL_TROUBLE, n, M
+        elif status == layout.SOLVED:
+            return problem, record
+    P, q, G, lower, upper = problem
     done, limit = record[layout.ITERATIONS], solver._limit(len(lower))
 
     def late() -> bool:
@@ -210,19 +209,20 @@ def _finish(
             record[layout.STATUS] = layout.TIME_LIMIT if late() else layout.ITERATION_LIMIT
             break
         guess, record = record, np.empty_like(record)
-        again(guess, record)
+        solve(*problem, guess, memory, record)
         done += record[layout.ITERATIONS]
     record[layout.ITERATIONS] = done
     stopped = record[layout.STATUS] == layout.ITERATION_LIMIT and solver.iteration_limit is not None
-    if stopped or _is_certain(record, terms.G, lower, upper):
-        return record
+    if stopped or _is_certain(record, G, lower, upper):
+        return problem, record
     guess, record = record, np.empty_like(record)
-    if again(guess, record) == layout.MISUSE:
+    if solve(*problem, guess, memory, record) == layout.MISUSE:
         record = guess
     record[layout.ITERATIONS] += done
-    if _is_certain(record, terms.G, lower, upper):
-        return record
-    return rescue(terms, q, lower, upper, record, limit, late)
+    if not _is_certain(record, G, lower, upper):
+        terms = Terms(P, G, softness_in(memory, len(lower)))
+        record = rescue(terms, q, lower, upper, record, limit, late)
+    return problem, record
 
 
 def _is_certain(record: Array, G: Array, lower: Array, upper: Array) -> bool:

@@ -11,14 +11,13 @@ The functions take a ``Workspace``, a ``WorkingSet`` and the number k of its con
 
 import numpy as np
 
-from gpmpc.compiled import borrowing, woven
+from gpmpc.compiled import inline_njit
+from gpmpc.kernels.linalg import dot, four_dots
 from gpmpc.qp.record import INFEASIBLE, ITERATION_LIMIT, SOLVED
 from gpmpc.qp.triangular import (
     append_row,
     delete_row,
-    dot,
-    four_dots,
-    multiply,
+    multiply_rows,
     solve_lower,
     solve_transposed,
     subtract_rows,
@@ -35,7 +34,7 @@ _BATCHES = 4  # times that all badly violated constraints enter at once
 _BAD = 0.5  # those violated by more than this share of the worst
 
 
-@borrowing
+@inline_njit
 def iterate(work, active, k, count, margin, iterations, batches):
     """Changes the working set until no constraint is violated; ``count`` are, and listed.
 
@@ -86,7 +85,7 @@ def iterate(work, active, k, count, margin, iterations, batches):
     return SOLVED, k, iterations, batches, passed
 
 
-@borrowing
+@inline_njit
 def satisfy_constraint(work, active, k, p):
     """Moves multipliers until constraint p is satisfied: steps 1 and 2 of Goldfarb and Idnani's algorithm.
 
@@ -101,7 +100,7 @@ def satisfy_constraint(work, active, k, p):
     row, size = work.rows[place], int(work.end[p])
     free_value = dot(row, work.v, len(work.x))
     K_pp = dot(row, row, size) + work.softness[p]
-    multiply(work.rows, active.place, k, row, size, solved)  # K_Wp
+    multiply_rows(work.rows, active.place, k, row, size, solved)  # K_Wp
     solve_lower(active.factor, k, solved)
     while True:
         write_slot(work, active, k, p, above)
@@ -113,7 +112,7 @@ def satisfy_constraint(work, active, k, p):
         d = K_pp - dot(solved, solved, k)
         if d < _DOUBTFUL * K_pp:
             d = distance_to_span(work, active, k, p, row)
-        # ratio test:  t = min(t1, t2),  t2 = violation / d  makes p hold,  t1 takes a multiplier to the end of its range
+        # ratio test:  t = min(t1, t2);  t2 = violation / d makes p hold,  t1 takes a multiplier to the end of its range
         step = max(0.0, violation) / d if d > _DEPENDENT * K_pp and k < work.capacity else np.inf
         room = active.most[k] - mu[p] if sense > 0.0 else mu[p] - active.least[k]
         capped = room < step
@@ -145,9 +144,9 @@ def satisfy_constraint(work, active, k, p):
             return True, k + 1, changes
 
 
-@woven
+@inline_njit
 def first_blocking(work, active, k, sense, step):
-    """Returns the longest step, up to ``step``, that keeps the multipliers in range, and the slot that ends it (or k)."""
+    """Returns the longest step up to ``step`` that keeps the multipliers in range, and the slot that ends it (or k)."""
     r, size = work.r, 0.0
     for i in range(k):
         size = max(size, abs(r[i]))
@@ -161,7 +160,7 @@ def first_blocking(work, active, k, sense, step):
     return step, blocking
 
 
-@woven
+@inline_njit
 def distance_to_span(work, active, k, p, row):
     """Returns ``d = |w_p - sum r_i w_i|^2``, softness included, as a sum of squares, which cannot cancel."""
     rest, n = work.scratch, len(work.x)
@@ -174,7 +173,7 @@ def distance_to_span(work, active, k, p, row):
     return d
 
 
-@woven
+@inline_njit
 def write_ray(work, active, k, p):
     """Writes Farkas' proof that p contradicts the working constraints to mu: ``C' ray = 0``, ``ray' bounds < 0``."""
     sense = 1.0 if work.y[p] > work.upper[p] else -1.0
@@ -188,7 +187,7 @@ def write_ray(work, active, k, p):
     work.mu[p] = sense
 
 
-@woven
+@inline_njit
 def add_constraints(work, active, k, count):
     """Adds the first ``count`` candidates to the working set, but for those that depend on others; returns its size."""
     first, solved = k, work.solved
@@ -196,7 +195,7 @@ def add_constraints(work, active, k, count):
         p = abs(work.candidates[i]) - 1
         place = make_row(work, active, first + i, p)
         row, size = work.rows[place], int(work.end[p])
-        multiply(work.rows, active.place, k, row, size, solved)
+        multiply_rows(work.rows, active.place, k, row, size, solved)
         solve_lower(active.factor, k, solved)
         K_pp = dot(row, row, size) + work.softness[p]
         pivot = K_pp - dot(solved, solved, k)
@@ -211,7 +210,7 @@ def add_constraints(work, active, k, count):
     return k
 
 
-@woven
+@inline_njit
 def make_row(work, active, slot, p):
     """Returns the place of ``w_p = L^-T c_p``, computed in the place that the slot has free if it is not known."""
     if work.prepared:
@@ -230,9 +229,9 @@ def make_row(work, active, slot, p):
     return place
 
 
-@woven
+@inline_njit
 def write_slot(work, active, k, p, above):
-    """Writes constraint p at its upper bound (``above``) or its lower one, and the range of its multiplier, to slot k."""
+    """Writes constraint p, at its upper bound (``above``) or its lower one, and its multiplier's range to slot k."""
     cap, equality = work.cap[p], work.lower[p] == work.upper[p]
     active.name[k] = p + 1 if above else -(p + 1)
     active.bound[k] = work.upper[p] if above else work.lower[p]
@@ -240,7 +239,7 @@ def write_slot(work, active, k, p, above):
     active.most[k] = cap if equality or above else 0.0
 
 
-@woven
+@inline_njit
 def drop_constraint(work, active, k, slot):
     """Drops the constraint in a slot from the working set of k, and from ``work.solved``; its place becomes free."""
     delete_row(active.factor, k, slot, work.solved, work.cosines, work.sines)
@@ -252,7 +251,7 @@ def drop_constraint(work, active, k, slot):
     active.place[k - 1] = place
 
 
-@woven
+@inline_njit
 def drop_wrong_multipliers(work, active, k):
     """Solves ``K_WW mu = y_W - b_W``; drops the most wrong multiplier until all are in range. Returns the size.
 
@@ -283,7 +282,7 @@ def drop_wrong_multipliers(work, active, k):
     return k
 
 
-@woven
+@inline_njit
 def minimise(work, active, k):
     """Writes the minimiser of the Lagrangian, ``P x = -(q + C'mu)``, to the first n entries of y."""
     n, y = len(work.x), work.y
@@ -301,28 +300,28 @@ def minimise(work, active, k):
     solve_lower(work.L, n, y)
 
 
-@woven
+@inline_njit
 def evaluate(work, active, k):
     """Writes ``y = C x`` for the minimiser x of the Lagrangian."""
     minimise(work, active, k)
-    multiply_rows(work)
+    multiply_constraints(work)
 
 
-@woven
-def multiply_rows(work):
+@inline_njit
+def multiply_constraints(work):
     """Writes ``y[n:] = G y[:n]``, four rows at a time, as far as they may not be zero."""
     n, y, G = len(work.x), work.y, work.G
     product, end, p = y[n:], work.end[n:], 0
     while p + 4 <= len(G):
         size = int(max(max(end[p], end[p + 1]), max(end[p + 2], end[p + 3])))
-        four_dots(G[p], G[p + 1], G[p + 2], G[p + 3], y, size, product[p:])
+        four_dots((G[p], G[p + 1], G[p + 2], G[p + 3]), y, size, product[p:])
         p += 4
     while p < len(G):
         product[p] = dot(G[p], y, n)
         p += 1
 
 
-@woven
+@inline_njit
 def add_multipliers(work, active, k):
     """Writes ``slope = q + C' mu``; only where rows are soft can others than the working ones have a multiplier."""
     n, mu, slope = len(work.x), work.mu, work.slope
@@ -336,7 +335,7 @@ def add_multipliers(work, active, k):
                 slope[j] += weight * row[j]
 
 
-@woven
+@inline_njit
 def restore_limits(work, p):
     """Lets constraint p, outside the working set, count as violated again.
 
@@ -351,15 +350,15 @@ def restore_limits(work, p):
         work.allowed_low[p], work.allowed_high[p] = -np.inf, low + below
 
 
-@woven
+@inline_njit
 def ignore_violations(work, p):
     """Lets constraint p count as satisfied whatever its value: it is a working one, or cannot be told from one."""
     work.allowed_low[p], work.allowed_high[p] = -np.inf, np.inf
 
 
-@woven
+@inline_njit
 def list_violated(work, margin):
-    """Lists the constraints violated by more than ``margin`` with their excess, in units of ``scale``; returns how many."""
+    """Lists the constraints violated by more than ``margin``, in units of ``scale``; returns how many."""
     y, low, high, scale, excess, count = work.y, work.allowed_low, work.allowed_high, work.scale, work.excess, 0
     for p in range(len(y)):
         excess[p] = max(y[p] - high[p], low[p] - y[p]) - margin * scale[p]
@@ -374,9 +373,9 @@ def list_violated(work, margin):
     return count
 
 
-@woven
+@inline_njit
 def keep_violated(work, margin, count):
-    """Computes the listed constraints anew from x = y[:n]; keeps those that are still violated, and returns how many."""
+    """Computes the listed constraints anew from x = y[:n]; keeps the violated ones, and returns how many."""
     kept, n, y = 0, len(work.x), work.y
     for i in range(count):
         p = work.violated[i]
@@ -389,7 +388,7 @@ def keep_violated(work, margin, count):
     return kept
 
 
-@woven
+@inline_njit
 def most_violated(work, count):
     """Returns the listed constraint with the largest excess."""
     worst = work.violated[0]
@@ -399,7 +398,7 @@ def most_violated(work, count):
     return worst
 
 
-@woven
+@inline_njit
 def count_bad(work, threshold, count):
     """Returns how many of the listed constraints have an excess above the threshold."""
     above = 0
@@ -408,7 +407,7 @@ def count_bad(work, threshold, count):
     return above
 
 
-@woven
+@inline_njit
 def choose_bad(work, threshold, count, room):
     """Writes the constraints that ``count_bad`` counts to the candidates, at most ``room``, none at a cap; how many."""
     chosen = 0
@@ -421,7 +420,7 @@ def choose_bad(work, threshold, count, room):
     return chosen
 
 
-@woven
+@inline_njit
 def choose_guess(work, names):
     """Writes the guessed constraints that can work to the candidates; returns how many."""
     chosen = 0

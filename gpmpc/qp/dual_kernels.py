@@ -11,7 +11,8 @@ import math
 
 import numpy as np
 
-from gpmpc.compiled import borrowing, woven
+from gpmpc.compiled import compiled, inline_njit
+from gpmpc.kernels.linalg import dot, multiply
 from gpmpc.qp.dual_iteration import (
     NEGLIGIBLE,
     add_constraints,
@@ -21,9 +22,10 @@ from gpmpc.qp.dual_iteration import (
     evaluate,
     iterate,
     list_violated,
-    multiply_rows,
+    multiply_constraints,
     restore_limits,
 )
+from gpmpc.qp.lanes import any_nonzero, lanes, no_lanes, plus, plus_product, product, some_lanes, total
 from gpmpc.qp.record import (
     CONSTRAINTS,
     HEADER,
@@ -36,7 +38,7 @@ from gpmpc.qp.record import (
     VARIABLES,
     WORKING,
 )
-from gpmpc.qp.triangular import dot, factorise, four_dots, multiply, solve_lower, solve_transposed, subtract_rows
+from gpmpc.qp.triangular import factorise, multiply_rows, solve_lower, solve_transposed, subtract_rows
 from gpmpc.qp.workspace import all_finite, is_dense, is_dense_matrix, open_workspace, round_end
 
 SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
@@ -54,7 +56,7 @@ _TINY = 1e-300
 _UNDEFINED = 1e300  # a residual that overflowed; less than infinity, so that refinement is tried
 
 
-@borrowing(locked=True)
+@compiled(allocates=False, locked=True)
 def solve(P, q, G, lower, upper, guess, memory, out):
     """Solves one program; ``memory`` is of ``gpmpc.qp.workspace``, ``guess`` a record or empty. Returns a status."""
     n, M = P.shape[0], len(P) + len(G)
@@ -71,25 +73,25 @@ def solve(P, q, G, lower, upper, guess, memory, out):
     least *= NEGLIGIBLE
     if not read_bounds(work, lower, upper, least):
         return MISUSE
+    return solve_opened(work, active, guess, least)
+
+
+@inline_njit
+def solve_opened(work, active, guess, least):
+    """Solves the program in the workspace."""
+    n, M = len(work.x), len(work.mu)
     known = len(guess) > HEADER and guess[VARIABLES] == n and guess[CONSTRAINTS] == M and 0 <= guess[WORKING] <= M
     k = start(work, active, guess if known else guess[:0])
     evaluate(work, active, k)
     pivots = 1.0  # what cancellation left of the pivots of P, as a share of P_ii
     for i in range(n):
-        pivots = max(pivots, work.L[i, i] * work.L[i, i] * P[i, i])
+        pivots = max(pivots, work.L[i, i] * work.L[i, i] * work.P[i, i])
     pivots = 1.0 / pivots
     margin, fine = _LATER / NEGLIGIBLE * least, _FINE
-    iterations, rounds, status, passed, moved = (
-        np.int64(0),
-        0,
-        NUMERICAL_TROUBLE,
-        False,
-        False,
-    )  # a literal compiles anew
+    iterations, rounds = np.int64(0), 0  # for a literal numba compiles callees anew
+    status, passed, moved = NUMERICAL_TROUBLE, False, False
     interrupted = known and guess[STATUS] == ITERATION_LIMIT
-    batches = np.int64(
-        _BATCHES if interrupted else 0
-    )  # the dual objective climbs with single steps only, and so the end is sure
+    batches = np.int64(_BATCHES if interrupted else 0)  # with single steps only the dual objective cannot fall
     count = list_violated(work, margin)
     while True:
         if count > 0:
@@ -122,6 +124,7 @@ def solve(P, q, G, lower, upper, guess, memory, out):
     unsure = passed or rounds == _ROUNDS  # of the violations that are left
     if unsure and status == SOLVED and worst_violation(work, least) > _NOISE:
         status = NUMERICAL_TROUBLE
+    out = work.record
     out[STATUS], out[ITERATIONS], out[WORKING], out[VARIABLES], out[CONSTRAINTS] = status, iterations, k, n, M
     for i in range(n):
         work.x[i] = work.y[i]
@@ -130,7 +133,7 @@ def solve(P, q, G, lower, upper, guess, memory, out):
     return status
 
 
-@woven
+@inline_njit
 def start(work, active, guess):
     """Starts from a guess: x_u, soft rows that stay violated, and the working set; returns its size."""
     n, M = len(work.x), len(work.mu)
@@ -153,7 +156,7 @@ def start(work, active, guess):
     return drop_wrong_multipliers(work, active, add_constraints(work, active, np.int64(0), count))
 
 
-@woven
+@inline_njit
 def read_bounds(work, lower, upper, least):
     """Copies the bounds, with absent ones infinite, and clears mu; returns False if any are crossed or undefined."""
     wrong = 0
@@ -166,31 +169,36 @@ def read_bounds(work, lower, upper, least):
     return wrong == 0
 
 
-@woven
+@inline_njit
 def measure_rows(work):
     """Writes lengths in the metric of P's diagonal, and the ends of the rows of G; returns False if not finite."""
     n, G, units, scale = len(work.x), work.G, work.scratch, work.scale
     for i in range(n):
         scale[i] = units[i] = 1.0 / math.sqrt(work.P[i, i])
+    for i in range(n, n + 8):
+        units[i] = 0.0
     undefined, end = 0.0, 0
     for p in range(len(G)):
-        row, near, far = G[p], 0.0, 0.0
-        for j in range(end):
-            near += (row[j] * units[j]) ** 2
-        for j in range(end, n):
-            far += (row[j] * units[j]) ** 2
-        if far != 0.0:  # longer than the row before
+        row, near, far = G[p], no_lanes(), no_lanes()
+        head, tail, rest = row[:end], row[end:], units[end:]
+        for j in range(0, end, 8):
+            values = product(some_lanes(head, j), lanes(units, j))
+            near = plus_product(near, values, values)
+        for j in range(0, n - end, 8):
+            values = product(some_lanes(tail, j), lanes(rest, j))
+            far = plus_product(far, values, values)
+        if any_nonzero(far):  # longer than the row before
             end = n
             while end > 0 and row[end - 1] == 0.0:
                 end -= 1
             end = round_end(end, n)
-        length = math.sqrt(near + far)
+        length = math.sqrt(total(plus(near, 1.0, far)))
         undefined += length * 0.0
         scale[n + p], work.end[n + p] = (length if length > 0.0 else 1.0), end
     return undefined == 0.0
 
 
-@woven
+@inline_njit
 def refine(work, active, k, least, fine):
     """Corrects x and mu on the working set until their residual is ``fine``, or no longer halves.
 
@@ -209,7 +217,7 @@ def refine(work, active, k, least, fine):
     return worst, moved
 
 
-@woven
+@inline_njit
 def measure_residuals(work, active, k, least):
     """Returns the largest residual of stationarity and of the working constraints, as a share of x = y[:n], y = C x.
 
@@ -221,13 +229,7 @@ def measure_residuals(work, active, k, least):
     Fills ``gradient = P x + slope`` and ``rest = y_W - softness mu_W - b``, where slope = q + C'mu.
     """
     P, y, slope, gradient, n = work.P, work.y, work.slope, work.gradient, len(work.x)
-    i = 0
-    while i + 4 <= n:
-        four_dots(P[i], P[i + 1], P[i + 2], P[i + 3], y, n, gradient[i:])
-        i += 4
-    while i < n:
-        gradient[i] = dot(P[i], y, n)
-        i += 1
+    multiply(P, n, y, n, gradient)
     size = math.sqrt(max(dot(gradient, y, n), least * least, _TINY))
     length, shift, entry, undefined = 0.0, 0.0, _TINY, 0.0
     for i in range(n):
@@ -251,14 +253,14 @@ def measure_residuals(work, active, k, least):
     return worst if worst + undefined + size < np.inf else _UNDEFINED
 
 
-@woven
+@inline_njit
 def take_newton_step(work, active, k):
     """Takes one Newton step on the working set for the residuals; multipliers stay in range."""
     n, y, change, trial = len(work.x), work.y, work.scratch, work.r
     for i in range(n):
         change[i] = work.gradient[i]
     solve_transposed(work.L, n, change)
-    multiply(work.rows, active.place, k, change, n, trial)
+    multiply_rows(work.rows, active.place, k, change, n, trial)
     for i in range(k):
         trial[i] = work.rest[i] - trial[i]
     solve_lower(active.factor, k, trial)
@@ -273,10 +275,10 @@ def take_newton_step(work, active, k):
     for i in range(k):
         p = abs(active.name[i]) - 1
         work.mu[p] = min(max(work.mu[p] + trial[i], active.least[i]), active.most[i])
-    multiply_rows(work)
+    multiply_constraints(work)
 
 
-@borrowing
+@inline_njit
 def worst_violation(work, least):
     """Returns the largest violation beyond what multipliers pay for, as a share of its bound or, a thousandth, of x."""
     y, mu, worst = work.y, work.mu, 0.0

@@ -9,7 +9,7 @@ from numba.core import cgutils, types
 from numba.core.errors import TypingError
 from numba.extending import intrinsic, models, register_model
 
-from gpmpc.compiled import woven
+from gpmpc.compiled import inline_njit
 
 WIDTH = 8
 VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
@@ -140,7 +140,7 @@ def plus_product(typing_context, values, ones, others):
     return LANES(LANES, LANES, LANES), generate
 
 
-@woven
+@inline_njit
 def product(values, others):
     """``values others``, entry by entry."""
     return plus_product(no_lanes(), values, others)
@@ -215,7 +215,7 @@ def folded(typing_context, values, distance):
     return LANES(LANES, distance), generate
 
 
-@woven
+@inline_njit
 def largest(values):
     """The largest size among eight numbers."""
     values = larger(values, folded(values, 4))
@@ -223,7 +223,7 @@ def largest(values):
     return max(lane(values, 0), lane(values, 1))
 
 
-@woven
+@inline_njit
 def total(values):
     """The sum of eight numbers."""
     values = plus(values, 1.0, folded(values, 4))
@@ -231,7 +231,7 @@ def total(values):
     return lane(values, 0) + lane(values, 1)
 
 
-@woven
+@inline_njit
 def combine(rows, count, factors, start, width, target):
     """``target[start:][:width] = sum_j factors[j] rows[j, start:][:width]`` over ``count`` rows, in whole lanes.
 

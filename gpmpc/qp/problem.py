@@ -11,6 +11,7 @@ Solvers see the constraints *stacked*, box first: ``lower <= C x <= upper`` with
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,7 @@ from gpmpc.exceptions import ProblemError
 
 Array = NDArray[np.float64]
 
+_new = tuple.__new__
 ABSENT = 1e20  # a bound of this size or more is none
 _SYMMETRY = 1e-10  # largest |P - P'| accepted, as a share of the largest diagonal entry
 
@@ -79,8 +81,15 @@ def _check_bounds(kind: str, low: Array, high: Array, names: tuple[str, str]) ->
             raise ProblemError(f"{kind} {i}: no number satisfies {name} = {array[i]:.6g}")
 
 
-@dataclass(frozen=True, eq=False, init=False)
-class QuadraticProgram:
+class _Arrays(NamedTuple):
+    P: Array
+    q: Array
+    G: Array
+    lower: Array
+    upper: Array
+
+
+class QuadraticProgram(_Arrays):
     """``min 1/2 x'Px + q'x`` subject to ``h_lower <= Gx <= h_upper`` and ``lb <= x <= ub``, checked at construction.
 
     Attributes:
@@ -91,14 +100,10 @@ class QuadraticProgram:
         upper: (M,) upper bounds likewise.
     """
 
-    P: Array
-    q: Array
-    G: Array
-    lower: Array
-    upper: Array
+    __slots__ = ()
 
-    def __init__(
-        self,
+    def __new__(
+        cls,
         P: ArrayLike,
         q: ArrayLike,
         G: ArrayLike | None = None,
@@ -125,16 +130,20 @@ class QuadraticProgram:
         if G is None and (h_lower is not None or h_upper is not None):
             raise ProblemError("h_lower and h_upper bound the rows of G; got bounds without G")
         (n, m), P, q, G = _check_matrices(P, q, G)
+        given = {
+            "lb": (lb, n, -np.inf),
+            "h_lower": (h_lower, m, -np.inf),
+            "ub": (ub, n, np.inf),
+            "h_upper": (h_upper, m, np.inf),
+        }
         bounds = {
             name: _as_float_array(name, np.full(size, absent) if value is None else value, (size,))
-            for name, value, size, absent in (
-                ("lb", lb, n, -np.inf), ("h_lower", h_lower, m, -np.inf), ("ub", ub, n, np.inf), ("h_upper", h_upper, m, np.inf),
-            )
-        }  # fmt: skip
+            for name, (value, size, absent) in given.items()
+        }
         _check_bounds("row", bounds["h_lower"], bounds["h_upper"], ("h_lower", "h_upper"))
         _check_bounds("variable", bounds["lb"], bounds["ub"], ("lb", "ub"))
         parts = [*bounds.values()]
-        vars(self).update(P=P, q=q, G=G, lower=np.concatenate(parts[:2]), upper=np.concatenate(parts[2:]))
+        return cls.unchecked(P, q, G, np.concatenate(parts[:2]), np.concatenate(parts[2:]))
 
     @classmethod
     def from_stacked(
@@ -150,9 +159,10 @@ class QuadraticProgram:
     @classmethod
     def unchecked(cls, P: Array, q: Array, G: Array, lower: Array, upper: Array) -> "QuadraticProgram":
         """Takes the arrays as they are, in 0.2 us; ``DualActiveSet.solve`` checks them in compiled code."""
-        program = _new(cls)
-        program.__dict__.update(P=P, q=q, G=G, lower=lower, upper=upper)
-        return program
+        return _new(cls, (P, q, G, lower, upper))
+
+    def __reduce__(self):
+        return QuadraticProgram.unchecked, tuple(self)
 
     @property
     def h_lower(self) -> Array:
@@ -173,9 +183,6 @@ class QuadraticProgram:
     def ub(self) -> Array:
         """(n,) upper bounds of x."""
         return self.upper[: len(self.q)]
-
-
-_new = object.__new__
 
 
 def _check_matrices(P: ArrayLike, q: ArrayLike, G: ArrayLike | None) -> tuple[tuple[int, int], Array, Array, Array]:

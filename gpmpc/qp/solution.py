@@ -1,7 +1,8 @@
 """The solution of a quadratic program, its residuals, and the protocol of a solver.
 
-A solution is judged by its residuals, which it computes from the problem's own data; a solver's flag proves nothing. With the stacked constraints C = [I; G] and multipliers y (positive at upper, negative at lower bounds) the
-conditions of Karush, Kuhn and Tucker are P x + q + C'y = 0, lower <= C x <= upper, and a zero duality gap.
+A solution is judged by its residuals, which it computes from the problem's own data; a solver's flag proves nothing.
+With the stacked constraints C = [I; G] and multipliers y (positive at upper, negative at lower bounds) the conditions
+of Karush, Kuhn and Tucker are P x + q + C'y = 0, lower <= C x <= upper, and a zero duality gap.
 """
 
 from typing import NamedTuple, Protocol

@@ -1,13 +1,13 @@
 """Dense algebra of the dual active-set kernels: products, and triangular factors L with reciprocals on the diagonal.
 
 A factor is lower triangular and stored by rows, so that one pair of solves serves both P = L'L and K_WW = L L'. Loops
-take four rows at a time: their sums hide each other's latency. Shapes are ``L`` (k, k) or larger, vectors of length k or
-more; nothing is allocated and nothing is checked.
+take four rows at a time: their sums hide each other's latency. Nothing is allocated and nothing is checked.
 """
 
 import math
 
-from gpmpc.compiled import woven
+from gpmpc.compiled import inline_njit
+from gpmpc.kernels.linalg import dot, four_dots
 from gpmpc.qp.lanes import lanes, less, put, scaled, some_lanes
 
 _LANES, _BLOCK = 8, 4
@@ -15,42 +15,20 @@ _ROUNDING = 2.3e-16  # times n: share of P_ii below which a pivot is rounding
 _SKEW = 1e-10  # largest |P - P'| accepted, as a share of the largest diagonal entry
 
 
-@woven
-def dot(a, b, size):
-    """Returns the inner product of the first ``size`` entries."""
-    total = 0.0
-    for i in range(size):
-        total += a[i] * b[i]
-    return total
-
-
-@woven
-def four_dots(r0, r1, r2, r3, vector, size, product):
-    """Writes the inner products of four rows with one vector."""
-    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
-    for j in range(size):
-        value = vector[j]
-        s0 += r0[j] * value
-        s1 += r1[j] * value
-        s2 += r2[j] * value
-        s3 += r3[j] * value
-    product[0], product[1], product[2], product[3] = s0, s1, s2, s3
-
-
-@woven
-def multiply(A, places, count, vector, size, product):
+@inline_njit
+def multiply_rows(A, places, count, vector, size, product):
     """Writes ``product[i] = A[places[i]] . vector``."""
     i = 0
     while i + 4 <= count:
         r0, r1, r2, r3 = A[places[i]], A[places[i + 1]], A[places[i + 2]], A[places[i + 3]]
-        four_dots(r0, r1, r2, r3, vector, size, product[i:])
+        four_dots((r0, r1, r2, r3), vector, size, product[i:])
         i += 4
     while i < count:
         product[i] = dot(A[places[i]], vector, size)
         i += 1
 
 
-@woven
+@inline_njit
 def subtract_rows(target, rows, places, factors, count, size):
     """Writes ``target -= sum_i factors[i] rows[places[i]]``."""
     i = 0
@@ -67,14 +45,14 @@ def subtract_rows(target, rows, places, factors, count, size):
         i += 1
 
 
-@woven
+@inline_njit
 def solve_lower(L, k, a):
     """Writes ``a <- L^-1 a``."""
     i = 0
     while i + 4 <= k:
         r1, r2, r3 = L[i + 1], L[i + 2], L[i + 3]
         a0, a1, a2, a3 = a[i], a[i + 1], a[i + 2], a[i + 3]
-        four_dots(L[i], r1, r2, r3, a, i, a[i:])
+        four_dots((L[i], r1, r2, r3), a, i, a[i:])
         a0 = (a0 - a[i]) * L[i, i]
         a1 = (a1 - a[i + 1] - r1[i] * a0) * r1[i + 1]
         a2 = (a2 - a[i + 2] - r2[i] * a0 - r2[i + 1] * a1) * r2[i + 2]
@@ -86,7 +64,7 @@ def solve_lower(L, k, a):
         i += 1
 
 
-@woven
+@inline_njit
 def solve_transposed(L, end, a):
     """Writes ``a <- L^-T a`` for a vector that is zero from ``end`` on."""
     j = end
@@ -108,7 +86,7 @@ def solve_transposed(L, end, a):
             a[i] -= a0 * r0[i] + a1 * r1[i] + a2 * r2[i] + a3 * r3[i]
 
 
-@woven
+@inline_njit
 def append_row(L, k, solved, pivot):
     """Writes row k of ``L L' = K_WW``: ``solved = L^-1 K_Wp`` and ``pivot = K_pp - |solved|^2 > 0``."""
     row = L[k]
@@ -117,7 +95,7 @@ def append_row(L, k, solved, pivot):
     row[k] = 1.0 / math.sqrt(pivot)
 
 
-@woven
+@inline_njit
 def delete_row(L, k, gone, solved, cosines, sines):
     """Deletes row ``gone`` of L, which has k rows, and entry ``gone`` of a in ``solved = L^-1 a``.
 
@@ -140,7 +118,7 @@ def delete_row(L, k, gone, solved, cosines, sines):
         solved[i - 1], left = cosines[i] * left + sines[i] * below, cosines[i] * below - sines[i] * left
 
 
-@woven
+@inline_njit
 def factorise(P, L):
     """Writes L of ``P = L'L``; returns False unless P is symmetric, finite and positive definite.
 
@@ -161,27 +139,35 @@ def factorise(P, L):
     return good
 
 
-@woven
+@inline_njit
 def is_symmetric(P):
     """Returns whether P equals its transpose but for rounding; reads blocks that stay in the cache."""
-    n, largest, skewed = len(P), 0.0, 0
+    n, largest, squares, skewed = len(P), 0.0, 0.0, 0
     for i in range(n):
         largest = max(largest, abs(P[i, i]))
     allowed = _SKEW * largest
     for left in range(0, n, 8):
-        for i in range(left, n):
-            for j in range(left, min(left + 8, i)):
-                skewed += not abs(P[i, j] - P[j, i]) <= allowed
+        for i in range(left, min(left + 8, n)):
+            for j in range(left, i):
+                squares += (P[i, j] - P[j, i]) * (P[i, j] - P[j, i])
+        for i in range(left + 8, n):
+            for j in range(left, left + 8):
+                squares += (P[i, j] - P[j, i]) * (P[i, j] - P[j, i])
+    if squares <= allowed * allowed:  # enough, and quickly summed
+        return True
+    for i in range(n):
+        for j in range(i):
+            skewed += not abs(P[i, j] - P[j, i]) <= allowed
     return skewed == 0
 
 
-@woven
+@inline_njit
 def _is_pivot(pivot, diagonal, n):
     """Returns whether a pivot is positive, finite, and more than rounding."""
     return (pivot > n * _ROUNDING * diagonal) & (pivot < math.inf)
 
 
-@woven
+@inline_njit
 def _finish_last_rows(P, L, top):
     """Writes the rows from ``top`` on, fewer than four."""
     n = len(P)
@@ -203,7 +189,7 @@ def _finish_last_rows(P, L, top):
     return True
 
 
-@woven
+@inline_njit
 def _subtract_below(P, L, top, j):
     """Returns eight columns of four rows of P less what the rows of L below take off: registers hold all of it."""
     a0, a1, a2, a3 = (
@@ -224,7 +210,7 @@ def _subtract_below(P, L, top, j):
     return a0, a1, a2, a3
 
 
-@woven
+@inline_njit
 def _finish_four_rows(P, L, top):
     """Writes rows ``top`` to ``top + 3``, given those below; returns False where a pivot is none."""
     n = len(P)

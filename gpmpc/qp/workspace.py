@@ -1,8 +1,7 @@
 """The memory that the dual active-set kernels work in, besides the record that a solve writes.
 
 Asking the system for memory costs as much as a small solve, so each shape (and each prepared problem) keeps its own.
-Threads may share it, since a solve keeps the interpreter's lock. It is one matrix of rows as long as the longest vector,
-which ``open_workspace`` names.
+Threads may share it, since a solve keeps the interpreter's lock. It is one matrix, whose rows ``open_workspace`` names.
 """
 
 from typing import Any, NamedTuple
@@ -13,7 +12,7 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
 
-from gpmpc.compiled import woven
+from gpmpc.compiled import inline_njit
 from gpmpc.qp.record import HEADER
 
 Array = NDArray[np.float64]
@@ -45,8 +44,9 @@ class Workspace(NamedTuple):
     softness: Any  # (M,) 1/rho of a quadratic price: added to K_pp
     cap: Any  # (M,) linear price: the largest size of a multiplier
     end: Any  # (M,) leading entries of c_p that may not be zero
+    record: Any  # what the solve returns, see ``gpmpc.qp.record``; in it
     x: Any  # (n,) the point and
-    mu: Any  # (M,) its multipliers (in the record)
+    mu: Any  # (M,) its multipliers
     y: Any  # (M,) C x
     excess: Any  # (M,) violations in units of ``scale``
     violated: Any  # (M,) integers: the constraints with one
@@ -96,6 +96,11 @@ def new_memory(softness: Array, n: int, limit: int, tolerance: float, soft: bool
     return memory
 
 
+def softness_in(memory: Array, M: int) -> Array:
+    """Returns softness and caps (2, M), a view."""
+    return memory[2:4, :M]
+
+
 def factor_and_rows(memory: Array, n: int, m: int) -> tuple[Array, Array]:
     """Returns L of P = L'L, a copy, and the rows w_p (M, n) of prepared memory, a view."""
     settings, rest = memory[0], memory[_REST:]
@@ -112,19 +117,19 @@ def aligned(rows: int, columns: int) -> Array:
     return memory[start : start + rows * columns].reshape(rows, columns)
 
 
-@woven
+@inline_njit
 def most_working(n, M, soft):
     """Returns how many constraints can work at once."""
     return M if soft else min(n, M)
 
 
-@woven
+@inline_njit
 def padded(size):
     """Returns the next multiple of eight."""
     return (size + 7) // 8 * 8
 
 
-@woven
+@inline_njit
 def round_end(end, n):
     """Returns the number of leading entries that are read where ``end`` may not be zero."""
     return min(n, (end + _END_STEP - 1) // _END_STEP * _END_STEP)
@@ -147,7 +152,7 @@ def matrix(typing_context, memory, start, rows, columns):
     return kind(memory, types.intp, types.intp, types.intp), generate
 
 
-@woven
+@inline_njit
 def open_workspace(P, q, G, memory, out):
     """Returns the workspace and the working set in ``memory`` and the record ``out``."""
     n, M = len(q), len(q) + len(G)
@@ -159,7 +164,7 @@ def open_workspace(P, q, G, memory, out):
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     work = Workspace(
         P, q, G, L, rows, real[0], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2], memory[3],
-        memory[4], x, mu, real[6][:M], real[7], whole[0], whole[1], real[8], real[9], real[10], real[11], real[12],
+        memory[4], out, x, mu, real[6][:M], real[7], whole[0], whole[1], real[8], real[9], real[10], real[11], real[12],
         real[13], real[14], real[15], capacity, int(settings[LIMIT]), settings[TOLERANCE], soft,
         settings[PREPARED] != 0.0,
     )  # fmt: skip
@@ -167,20 +172,20 @@ def open_workspace(P, q, G, memory, out):
     return work, active
 
 
-@woven
+@inline_njit
 def is_dense(vector):
-    """Returns whether a vector is as contiguous as its type claims, which ``gpmpc.compiled.direct`` does not check."""
+    """Returns whether a vector is as contiguous as its type claims: an unchecked entry point does not look."""
     return vector.strides[0] == vector.itemsize or len(vector) <= 1
 
 
-@woven
+@inline_njit
 def is_dense_matrix(A):
     """Returns whether a matrix is as contiguous as its type claims."""
     rows, columns = A.shape
     return (A.strides[0] == columns * A.itemsize and A.strides[1] == A.itemsize) or rows * columns == 0
 
 
-@woven
+@inline_njit
 def all_finite(vector):
     """Returns whether no entry is infinite or NaN."""
     undefined = 0.0
