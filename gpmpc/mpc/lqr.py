@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from scipy.linalg import solve_discrete_are
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import DynamicsModel
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.request import Request, check_controller, check_dynamics
 from gpmpc.mpc.tracking import TrackingProblem
