@@ -1,0 +1,154 @@
+"""Computes gains of the linear-quadratic regulator, u = -K x, by the Riccati recursion.
+
+For x_{k+1} = A_k x_k + B_k u_k and the cost sum_{k=0..H-1} |x_k|^2_Q + |u_k|^2_R + |x_H|^2_T, backward from P_H = T
+(Anderson and Moore, 1990, section 2.4; the second line keeps P positive semidefinite whatever is rounded):
+
+    D_k = R + B_k' P_{k+1} B_k,   K_k = D_k^-1 B_k' P_{k+1} A_k
+    P_k = Q + K_k' R K_k + (A_k - B_k K_k)' P_{k+1} (A_k - B_k K_k)
+
+R is positive definite, so that every step exists whatever A and B are.
+"""
+
+import math
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from gpmpc.compiled import borrowing, compiled, copy_matrix
+from gpmpc.exceptions import SettingError
+
+Array = np.ndarray
+
+_SETTLED = 1e-9  # relative change of P at which the gains of a constant system have converged
+_LONGEST = 10_000  # stages after which there is taken to be no limit
+_STATIONARY = 1e-12  # relative change of P at which a stationary gain has converged
+
+
+@compiled
+def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
+    """Gains K_0 .. K_{H-1} (H, m, n) and the Hessians D_k of the cost in u_k (H, m, m).
+
+    Args:
+        A: (H, n, n), or (1, n, n) where it is constant: then the recursion ends where P settles.
+        B: (H, n, m) or (1, n, m).
+        Q: (n, n), positive semidefinite.
+        R: (m, m), positive definite.
+        terminal: T (n, n), positive semidefinite.
+        horizon: H.
+    """
+    n, m = B.shape[1:]
+    gains, hessians = np.zeros((horizon, m, n)), np.empty((horizon, m, m))
+    P, following, PB, PC = terminal.copy(), np.empty((n, n)), np.empty((n, m)), np.empty((n, n))
+    closed, factor, RK = np.empty((n, n)), np.empty((m, m)), np.empty((m, n))
+    for k in range(horizon - 1, -1, -1):
+        A_k, B_k, K, D = A[min(k, len(A) - 1)], B[min(k, len(B) - 1)], gains[k], hessians[k]
+        PB[:] = 0.0
+        add_product(P, B_k, PB, 1.0)
+        copy_matrix(R, D)
+        add_transposed_product(B_k, PB, D)
+        add_transposed_product(PB, A_k, K)
+        copy_matrix(D, factor)
+        solve_positive(factor, K)
+        copy_matrix(A_k, closed)
+        add_product(B_k, K, closed, -1.0)
+        PC[:], RK[:] = 0.0, 0.0
+        add_product(P, closed, PC, 1.0)
+        add_product(R, K, RK, 1.0)
+        copy_matrix(Q, following)
+        add_transposed_product(closed, PC, following)
+        add_transposed_product(K, RK, following)
+        change, size = 0.0, 0.0
+        for i in range(n):
+            for j in range(i + 1):
+                value = 0.5 * (following[i, j] + following[j, i])
+                change, size = max(change, abs(value - P[i, j])), max(size, abs(value))
+                P[i, j] = P[j, i] = value
+        if len(A) == 1 and change <= _SETTLED * size:
+            for j in range(k):
+                copy_matrix(K, gains[j])
+                copy_matrix(D, hessians[j])
+            break
+    return gains, hessians
+
+
+@borrowing
+def add_product(A, X, Y, sign):
+    """Y += sign A X."""
+    for r in range(len(A)):
+        out = Y[r]
+        for c in range(A.shape[1]):
+            a, row = sign * A[r, c], X[c]
+            for i in range(len(row)):
+                out[i] += a * row[i]
+
+
+@borrowing
+def add_transposed_product(A, X, Y):
+    """Y += A' X."""
+    for c in range(len(A)):
+        row = X[c]
+        for r in range(A.shape[1]):
+            a, out = A[c, r], Y[r]
+            for i in range(len(row)):
+                out[i] += a * row[i]
+
+
+@borrowing
+def solve_positive(W, X):
+    """X <- W^-1 X for a symmetric positive definite W, whose lower triangle is overwritten (Cholesky)."""
+    m, n = len(W), X.shape[1]
+    for i in range(m):
+        for j in range(i + 1):
+            total = W[i, j]
+            for k in range(j):
+                total -= W[i, k] * W[j, k]
+            W[i, j] = total / W[j, j] if j < i else math.sqrt(total)
+    for i in range(m):
+        for j in range(i):
+            for k in range(n):
+                X[i, k] -= W[i, j] * X[j, k]
+        for k in range(n):
+            X[i, k] /= W[i, i]
+    for i in range(m - 1, -1, -1):
+        for j in range(i + 1, m):
+            for k in range(n):
+                X[i, k] -= W[j, i] * X[j, k]
+        for k in range(n):
+            X[i, k] /= W[i, i]
+
+
+def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
+    """The gain K (m, n) of u = -K x that minimises sum_k |x_k|^2_Q + |u_k|^2_R under x_{k+1} = A x_k + B u_k for ever.
+
+    From the discrete algebraic Riccati equation; where its solver fails (modes on the unit circle that Q does not
+    weigh), from the recursion run to its limit.
+
+    Args:
+        A: (n, n).
+        B: (n, m).
+        Q: (n, n), positive semidefinite.
+        R: (m, m), positive definite.
+
+    Raises:
+        SettingError: The recursion has no limit: inputs do not reach a mode that grows and that Q weighs.
+    """
+    A, B, Q, R = (np.ascontiguousarray(matrix, dtype=float) for matrix in (A, B, Q, R))
+    try:
+        P = solve_discrete_are(A, B, Q, R)
+        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        if np.isfinite(K).all() and np.abs(np.linalg.eigvals(A - B @ K)).max() < 1:
+            return K
+    except (np.linalg.LinAlgError, ValueError):
+        pass
+    P, change = Q, np.inf
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_LONGEST):
+            K = finite_horizon_lqr(A[None], B[None], Q, R, P, 1)[0][0]
+            closed = A - B @ K
+            P, before = closed.T @ P @ closed + K.T @ R @ K + Q, P
+            change = np.abs(P - before).max() / max(np.abs(P).max(), np.finfo(float).tiny)
+            if not change > _STATIONARY:
+                break
+    if not change <= _STATIONARY:
+        raise SettingError("A, B, Q", "there is no stationary gain: inputs do not reach a growing mode that Q weighs")
+    return K
