@@ -42,11 +42,11 @@ def test_the_writer_of_recordings_starts_without_torch_and_without_compilers():
 @pytest.mark.parametrize(
     ("library", "rooms"),
     [
-        ("gpytorch", ["gp/model.py", "gp/gpytorch_posterior.py", "gp/gpytorch_training.py", "bench"]),
+        ("gpytorch", ["gp/model.py", "gp/gpytorch_posterior.py", "gp/gpytorch_training.py"]),
         ("hydra", ["cli"]),
         ("omegaconf", ["cli"]),
         ("matplotlib", ["plotting"]),
-        ("casadi", ["mpc", "gp/casadi_.py", "bench"]),
+        ("casadi", ["mpc", "gp/casadi_.py"]),
         ("rich", ["cli", "experiments", "simulation/trials.py"]),
         ("mcap", ["recording"]),
         ("mcap_protobuf", ["recording"]),
