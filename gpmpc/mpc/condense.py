@@ -350,13 +350,14 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
     (p, m), r, E = stages.B.shape[1:], rows.E.shape[1], rows.E
     H, limited = len(references.inputs), bounds.rate_lower.size
     size, count = H * m, H * m + limited + H * r
-    P, G, feedback = np.zeros((size, size)), np.zeros((count, size)), np.zeros((H, m, p + m + 1))
-    _write_optimal_feedback(cost, stages, references, feedback, P)
+    P, G, (feedback, hessians) = np.zeros((size, size)), np.zeros((count, size)), optimal_feedback(cost, stages, references)
     reach, following, factors = _zeros(p + m, size), _zeros(p, size), np.empty(p + m)  # of s_k and u_{k-1}; of s_{k+1}
     inputs = _zeros(m, size)  # of u_k
     for k in range(H):
         at, here, width = min(k, len(stages.A) - 1), k * m, (k + 1) * m
         for i in range(m):
+            for j in range(m):
+                P[here + i, here + j] = 2.0 * hessians[k, i, j]
             combine(reach, p + m, feedback[k, i], 0, here, inputs[i])
             inputs[i, here + i] = 1.0
             copy(inputs[i], G[here + i, :width])
@@ -383,10 +384,11 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
 
 
 @compiled
-def _write_optimal_feedback(cost, stages, references, feedback, P):
-    """Writes the feedback that minimises the cost without bounds, and the Hessian of what is added to it.
+def optimal_feedback(cost, stages, references):
+    """The feedback F (H, m, p + m + 1) that minimises the cost without bounds, u_k = F_k [s_k; u_{k-1}; 1].
 
-    By the regulator of [s_k - r_k; u_{k-1}; 1], without u_{k-1} but for increments, whose input is the penalized v.
+    It is that of the regulator of [s_k - r_k; u_{k-1}; 1], without u_{k-1} but for increments, whose input is the
+    penalized v. The second result is half the Hessian of the cost in what is added to each u_k (H, m, m).
     """
     (p, m), targets, R = stages.B.shape[1:], references.states, cost.input
     (H, n), e = targets.shape, p + (m if cost.penalized == INCREMENTS else 0)
@@ -414,11 +416,10 @@ def _write_optimal_feedback(cost, stages, references, feedback, P):
             for j in range(p):
                 A[k, j, p + i] = stages.B[at, j, i]
     gains, hessians = finite_horizon_lqr(A, B, weight, R, terminal, H)
+    feedback = np.zeros((H, m, p + m + 1))
     for k in range(H):
         for i in range(m):
             F, K = feedback[k, i], gains[k, i]
-            for j in range(m):
-                P[k * m + i, k * m + j] = 2.0 * hessians[k, i, j]
             for j in range(e):
                 F[j] = -K[j]
             if cost.penalized == INCREMENTS:
@@ -426,6 +427,7 @@ def _write_optimal_feedback(cost, stages, references, feedback, P):
             F[p + m] = -K[e] + (references.inputs[k, i] if cost.penalized == DEVIATIONS else 0.0)
             if k > 0:
                 F[p + m] += _dot(K[:n], targets[k - 1])
+    return feedback, hessians
 
 
 @compiled
