@@ -350,7 +350,11 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
     (p, m), r, E = stages.B.shape[1:], rows.E.shape[1], rows.E
     H, limited = len(references.inputs), bounds.rate_lower.size
     size, count = H * m, H * m + limited + H * r
-    P, G, (feedback, hessians) = np.zeros((size, size)), np.zeros((count, size)), optimal_feedback(cost, stages, references)
+    P, G, (feedback, hessians) = (
+        np.zeros((size, size)),
+        np.zeros((count, size)),
+        optimal_feedback(cost, stages, references),
+    )
     reach, following, factors = _zeros(p + m, size), _zeros(p, size), np.empty(p + m)  # of s_k and u_{k-1}; of s_{k+1}
     inputs = _zeros(m, size)  # of u_k
     for k in range(H):

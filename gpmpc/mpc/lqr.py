@@ -1,7 +1,7 @@
 """Linear-quadratic tracking on the local models of a learned mean; a baseline.
 
-Along the reference the mean is x_{i+1} = A_i x_i + B_i u_i + c_i, for which the tracking cost is minimised by one Riccati
-recursion (``gpmpc.mpc.condense.optimal_feedback``). It knows no bound; what it gives is clipped.
+Along the reference the mean is x_{i+1} = A_i x_i + B_i u_i + c_i, for which one Riccati recursion minimises the cost
+(``gpmpc.mpc.condense.optimal_feedback``). It knows no bound; what it gives is clipped.
 """
 
 import time
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gpmpc.dynamics import DynamicsModel
+from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.condense import PENALIZED, References, Stages, TrackingCost, optimal_feedback
 from gpmpc.mpc.controller import Decision, Reference, Timing
@@ -53,9 +53,9 @@ class LQR:
         if not request.finite:
             return request.unanswered(Status.INVALID_MEASUREMENT)
         states = np.vstack([request.state, request.targets[:-1]])
-        at = self.model.linearize(states, request.held if reference.inputs is None else request.wanted, covariance=False)
-        modelled = time.perf_counter()
         inputs = request.held if reference.inputs is None else request.wanted
+        at = linearize(self.model, states, inputs, covariance=False)
+        modelled = time.perf_counter()
         c = at.mean - np.einsum("iab,ib->ia", at.A, states) - np.einsum("iab,ib->ia", at.B, inputs)
         stages = Stages(at.A, at.B, c)
         if not all(np.isfinite(part).all() for part in stages):
