@@ -5,8 +5,8 @@ for that in the prediction (Hewing, Kabzan and Zeilinger, 2020):
 
     Sigma_{k+1} = (A + B K) Sigma_k (A + B K)' + V
 
-K is the first gain of the regulator over the horizon (``gpmpc.mpc.riccati``), its sign turned. The bounds of the
-inputs hold for u_k, not for what K adds to it.
+K is the first gain of the regulator over the horizon (``gpmpc.mpc.linear_quadratic``), its sign turned. The bounds of
+the inputs hold for u_k, not for what K adds to it.
 """
 
 import numpy as np

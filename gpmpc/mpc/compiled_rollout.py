@@ -14,7 +14,7 @@ from gpmpc.gp.posterior import GPPosterior
 from gpmpc.kernels.point import expand_at
 from gpmpc.kernels.point_rows import aligned_rows, explain_several
 from gpmpc.mpc.ancillary_feedback import step_spread
-from gpmpc.mpc.riccati import finite_horizon_lqr
+from gpmpc.mpc.linear_quadratic import finite_horizon_lqr
 from gpmpc.mpc.tracking import TrackingProblem
 
 Array = np.ndarray

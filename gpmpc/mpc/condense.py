@@ -19,9 +19,8 @@ u_k = F_k [s_k; u_{k-1}; 1] + v_k, by the Riccati recursion: P is block diagonal
 zero, and what v leads to is stable. The bounds of inputs are rows. This costs stable plants a dense row for each bound,
 so it is used where a diagonal entry of P exceeds that of R by more than ``LARGEST_GROWTH``.
 
-A stage-structured (Riccati) factorisation costs O(H), and a pair of its recursions for every working constraint. With
-n = 6, m = 3 and nothing working, condensing with the dense factor takes 0.9 of its time at H = 30, 1.1 at H = 50 and
-2.4 at H = 100; where constraints work, condensing gains. So every horizon is condensed.
+A stage-structured (Riccati) factorisation costs O(H), and two of its recursions for every working constraint: with none
+condensing takes 1.1 of its time at H = 50 (n = 6, m = 3), and less where constraints work.
 """
 
 from typing import NamedTuple
@@ -32,32 +31,24 @@ from numba import types
 from gpmpc.compiled import borrowing, compile_for, compiled, copy, copy_matrix, direct
 from gpmpc.exceptions import ShapeError
 from gpmpc.kernels.point_rows import aligned_rows
-from gpmpc.mpc.riccati import finite_horizon_lqr
+from gpmpc.mpc.linear_quadratic import (
+    DEVIATIONS,
+    INCREMENTS,
+    PENALIZED,
+    References,
+    Stages,
+    TrackingCost,
+    add_blocks,
+    dot,
+    expand,
+    optimal_feedback,
+)
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.qp.lanes import combine
 
 Array = np.ndarray
 
-PENALIZED = ("inputs", "deviations", "increments")
-INPUTS, DEVIATIONS, INCREMENTS = range(3)
 LARGEST_GROWTH = 1e10
-
-
-class Stages(NamedTuple):
-    """Affine stages s_{k+1} = A_k s_k + B_k u_k + c_k; H of them, or one that is constant over the horizon."""
-
-    A: Array  # (H or 1, p, p)
-    B: Array  # (H or 1, p, m)
-    c: Array  # (H or 1, p)
-
-
-class TrackingCost(NamedTuple):
-    """Weights of the cost."""
-
-    state: Array  # W of s_1 .. s_{H-1} (p / n, n, n)
-    terminal: Array  # W of s_H (p / n, n, n)
-    input: Array  # R (m, m)
-    penalized: int  # what R weighs: INPUTS, DEVIATIONS or INCREMENTS
 
 
 class InputBounds(NamedTuple):
@@ -67,14 +58,6 @@ class InputBounds(NamedTuple):
     upper: Array  # (H, m)
     rate_lower: Array  # (H, m), or (0, m) where rates have no bounds
     rate_upper: Array  # (H, m) or (0, m)
-
-
-class References(NamedTuple):
-    """What is tracked."""
-
-    states: Array  # r_1 .. r_H of the mean (H, n); the rest of s is to be zero
-    inputs: Array  # (H, m), used where R weighs deviations
-    previous_input: Array  # u_{-1} (m,)
 
 
 class StateRows(NamedTuple):
@@ -157,52 +140,6 @@ def _condense(cost, bounds, stages, start, references, rows, program):
 
 
 @compiled
-def expand(stages, start, feedback, previous_input, unknowns):
-    """Inputs (H, m) and states s_0 .. s_H (H + 1, p) of the unknowns v (H m,)."""
-    p, m = stages.B.shape[1:]
-    H, last = len(unknowns) // m, len(stages.A) - 1
-    inputs, states = unknowns.copy().reshape(H, m), np.empty((H + 1, p))
-    copy(start, states[0])
-    for k in range(H):
-        s, u, after, at = states[k], inputs[k], states[k + 1], min(k, last)
-        if len(feedback) > 0:
-            before = inputs[k - 1] if k > 0 else previous_input
-            for i in range(m):
-                F = feedback[k, i]
-                u[i] += F[p + m] + _dot(F[:p], s) + _dot(F[p : p + m], before)
-        for i in range(p):
-            after[i] = stages.c[at, i] + _dot(stages.A[at, i], s) + _dot(stages.B[at, i], u)
-    return inputs, states
-
-
-@compiled
-def tracking_cost(cost, states, inputs, references):
-    """The cost itself, constants included, of states s_0 .. s_H (H + 1, p) and inputs (H, m)."""
-    W, R, targets = cost.state, cost.input, references.states
-    (H, n), m = targets.shape, len(R)
-    total, error, v = 0.0, np.empty(states.shape[1]), np.empty(m)
-    for k in range(H):
-        copy(states[k + 1], error)
-        for i in range(n):
-            error[i] -= targets[k, i]
-        weight = cost.terminal if k == H - 1 else W
-        for b in range(len(W)):
-            for i in range(n):
-                for j in range(n):
-                    total += error[b * n + i] * weight[b, i, j] * error[b * n + j]
-        for i in range(m):
-            v[i] = inputs[k, i]
-            if cost.penalized == DEVIATIONS:
-                v[i] -= references.inputs[k, i]
-            elif cost.penalized == INCREMENTS:
-                v[i] -= inputs[k - 1, i] if k > 0 else references.previous_input[i]
-        for i in range(m):
-            for j in range(m):
-                total += v[i] * R[i, j] * v[j]
-    return total
-
-
-@compiled
 def write_hessian_and_rows(cost, bounds, stages, rows, program):
     """Writes P and G in input coordinates, which do not depend on where the state is."""
     (H, m), first, P, G = bounds.lower.shape, bounds.rate_lower.size, program.P, program.G
@@ -233,7 +170,7 @@ def _add_varying_stages(cost, stages, E, H, P, G):
     BM = np.empty((H, m, p))  # 2 B_k' M_{k+1}
     for k in range(H - 1, -1, -1):  # backward: M_{k+1} = W_{k+1} + A' M A, the second part is there already
         at = min(k, last)
-        _add_blocks(cost.terminal if k == H - 1 else cost.state, M)
+        add_blocks(cost.terminal if k == H - 1 else cost.state, M)
         for i in range(p):
             for j in range(p):
                 A[i, j] = transposed[j, i] = stages.A[at, i, j]
@@ -316,7 +253,7 @@ def write_gradient_and_bounds(cost, bounds, stages, start, references, rows, pro
     copy(start, free[0])
     for k in range(H):
         for i in range(p):
-            free[k + 1, i] = stages.c[min(k, last), i] + _dot(A[min(k, last), i], free[k])
+            free[k + 1, i] = stages.c[min(k, last), i] + dot(A[min(k, last), i], free[k])
     q[:] = 0.0
     W, T = _padded(cost.state), _padded(cost.terminal)
     error, gradient, pulled = np.empty(p), np.zeros(p + 8), np.zeros(p)
@@ -388,53 +325,6 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
 
 
 @compiled
-def optimal_feedback(cost, stages, references):
-    """The feedback F (H, m, p + m + 1) that minimises the cost without bounds, u_k = F_k [s_k; u_{k-1}; 1].
-
-    It is that of the regulator of [s_k - r_k; u_{k-1}; 1], without u_{k-1} but for increments, whose input is the
-    penalized v. The second result is half the Hessian of the cost in what is added to each u_k (H, m, m).
-    """
-    (p, m), targets, R = stages.B.shape[1:], references.states, cost.input
-    (H, n), e = targets.shape, p + (m if cost.penalized == INCREMENTS else 0)
-    A, B = np.zeros((H, e + 1, e + 1)), np.zeros((H, e + 1, m))
-    weight, terminal = np.zeros((e + 1, e + 1)), np.zeros((e + 1, e + 1))
-    _add_blocks(cost.state, weight)
-    _add_blocks(cost.terminal, terminal)
-    for k in range(H):
-        at = min(k, len(stages.A) - 1)
-        A[k, e, e] = 1.0
-        for i in range(p):
-            A[k, i, e] = stages.c[at, i]
-            for j in range(p):
-                A[k, i, j] = stages.A[at, i, j]
-            for j in range(n):
-                A[k, i, e] += stages.A[at, i, j] * targets[k - 1, j] if k > 0 else 0.0
-            for j in range(m):
-                B[k, i, j] = stages.B[at, i, j]
-                if cost.penalized == DEVIATIONS:
-                    A[k, i, e] += stages.B[at, i, j] * references.inputs[k, j]
-        for i in range(n):
-            A[k, i, e] -= targets[k, i]
-        for i in range(e - p):
-            A[k, p + i, p + i] = B[k, p + i, i] = 1.0
-            for j in range(p):
-                A[k, j, p + i] = stages.B[at, j, i]
-    gains, hessians = finite_horizon_lqr(A, B, weight, R, terminal, H)
-    feedback = np.zeros((H, m, p + m + 1))
-    for k in range(H):
-        for i in range(m):
-            F, K = feedback[k, i], gains[k, i]
-            for j in range(e):
-                F[j] = -K[j]
-            if cost.penalized == INCREMENTS:
-                F[p + i] += 1.0
-            F[p + m] = -K[e] + (references.inputs[k, i] if cost.penalized == DEVIATIONS else 0.0)
-            if k > 0:
-                F[p + m] += _dot(K[:n], targets[k - 1])
-    return feedback, hessians
-
-
-@compiled
 def _write_bounds(bounds, rows, inputs, states, previous_input, unbounded, program):
     """Writes bounds of the stacked constraints after the unbounded ones, given what inputs and states are at v = 0."""
     (H, m), limited, E, lower, upper = inputs.shape, bounds.rate_lower.size, rows.E, program.lower, program.upper
@@ -448,7 +338,7 @@ def _write_bounds(bounds, rows, inputs, states, previous_input, unbounded, progr
                 at = first + k * m + i
                 lower[at], upper[at] = bounds.rate_lower[k, i] - rate, bounds.rate_upper[k, i] - rate
         for e in range(r):
-            at, value = first + limited + k * r + e, _dot(E[min(k, len(E) - 1), e], states[k + 1])
+            at, value = first + limited + k * r + e, dot(E[min(k, len(E) - 1), e], states[k + 1])
             lower[at], upper[at] = rows.lower[k, e] - value, rows.upper[k, e] - value
 
 
@@ -479,24 +369,6 @@ def _weigh(W, x, y):
 
 
 @borrowing
-def _add_blocks(W, M):
-    """Adds the blocks of a weight to the diagonal of M."""
-    n = W.shape[1]
-    for b in range(len(W)):
-        for i in range(n):
-            for j in range(n):
-                M[b * n + i, b * n + j] += W[b, i, j]
-
-
-@borrowing
-def _dot(x, y):
-    total = 0.0
-    for i in range(len(x)):
-        total += x[i] * y[i]
-    return total
-
-
-@borrowing
 def _mirror(P):
     """Takes the upper triangle from the lower one; in blocks, which stay in the cache."""
     size = len(P)
@@ -511,6 +383,6 @@ def _record(kind, *fields):
     return types.NamedTuple([types.Array(types.float64, axes, "C") if axes else types.int64 for axes in fields], kind)
 
 
-_VECTOR, _PROGRAM = types.Array(types.float64, 1, "C"), _record(CondensedProgram, 2, 1, 2, 1, 1, 3)
+_PROGRAM, _VECTOR = _record(CondensedProgram, 2, 1, 2, 1, 1, 3), types.Array(types.float64, 1, "C")
 _GIVEN = _record(TrackingCost, 3, 3, 2, 0), _record(InputBounds, 2, 2, 2, 2), _record(Stages, 3, 3, 2)
 _SIGNATURE = types.float64(*_GIVEN, _VECTOR, _record(References, 2, 2, 1), _record(StateRows, 3, 2, 2), _PROGRAM)

@@ -27,9 +27,10 @@ from gpmpc.exceptions import DataError, ProblemError, SettingError, ShapeError, 
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.batched_prediction import bytes_per_request, predict_many
 from gpmpc.mpc.chance_constraints import ChanceConstraints
-from gpmpc.mpc.condense import Condenser, References, Stages, StateRows, expand
+from gpmpc.mpc.condense import Condenser, StateRows
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.convergence import FEASIBLE
+from gpmpc.mpc.linear_quadratic import References, Stages, expand
 from gpmpc.mpc.prediction import Covariance, Form, Prediction, Predictor
 from gpmpc.mpc.request import Request, check_controller, check_dynamics, check_method
 from gpmpc.mpc.sequential import Reached, SequentialPrograms

@@ -1,7 +1,7 @@
 """Linear-quadratic tracking on the local models of a learned mean; a baseline.
 
 Along the reference the mean is x_{i+1} = A_i x_i + B_i u_i + c_i, for which one Riccati recursion minimises the cost
-(``gpmpc.mpc.condense.optimal_feedback``). It knows no bound; what it gives is clipped.
+(``gpmpc.mpc.linear_quadratic.optimal_feedback``). It knows no bound; what it gives is clipped.
 """
 
 import time
@@ -11,8 +11,8 @@ import numpy as np
 
 from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.condense import PENALIZED, References, Stages, TrackingCost, optimal_feedback
 from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc.linear_quadratic import PENALIZED, References, Stages, TrackingCost, optimal_feedback
 from gpmpc.mpc.request import Request, check_controller, check_dynamics
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.status import Status

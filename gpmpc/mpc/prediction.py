@@ -38,10 +38,9 @@ from gpmpc.gp.posterior import GPPosterior
 from gpmpc.kernels.extended import roots
 from gpmpc.mpc.ancillary_feedback import spread
 from gpmpc.mpc.compiled_rollout import CompiledRollout
-from gpmpc.mpc.condense import Stages, expand
 from gpmpc.mpc.controller import Decision
+from gpmpc.mpc.linear_quadratic import Stages, expand, finite_horizon_lqr
 from gpmpc.mpc.request import Request, check_method
-from gpmpc.mpc.riccati import finite_horizon_lqr
 from gpmpc.mpc.stage_models import disturbed, is_first_order, stage_model
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Propagator

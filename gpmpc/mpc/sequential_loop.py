@@ -15,17 +15,13 @@ from gpmpc.mpc.compiled_rollout import roll_out
 from gpmpc.mpc.condense import (
     CondensedProgram,
     InputBounds,
-    References,
-    Stages,
     StateRows,
-    TrackingCost,
-    expand,
-    tracking_cost,
     write_gradient_and_bounds,
     write_hessian_and_rows,
 )
 from gpmpc.mpc.convergence import FEASIBLE, kkt_share
 from gpmpc.mpc.flat_arrays import part
+from gpmpc.mpc.linear_quadratic import References, Stages, TrackingCost, expand, tracking_cost
 from gpmpc.mpc.quasi_newton import MEMORY, correct
 from gpmpc.qp import record as layout
 from gpmpc.qp.dual_kernels import solve_lazy

@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import ShapeError
-from gpmpc.mpc.condense import (
-    Condenser,
-    References,
-    Stages,
-    StateRows,
-    condense_with_feedback,
-    expand,
-    tracking_cost,
-)
+from gpmpc.mpc.condense import Condenser, StateRows, condense_with_feedback
+from gpmpc.mpc.linear_quadratic import References, Stages, expand, tracking_cost
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.qp import DualActiveSet, SoftRows
 from gpmpc.status import Status

@@ -10,18 +10,93 @@ R is positive definite, so that every step exists whatever A and B are.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from gpmpc.compiled import borrowing, compiled, copy_matrix
+from gpmpc.compiled import borrowing, compiled, copy, copy_matrix
 from gpmpc.exceptions import SettingError
 
 Array = np.ndarray
 
+PENALIZED = ("inputs", "deviations", "increments")
+INPUTS, DEVIATIONS, INCREMENTS = range(3)
+
 _SETTLED = 1e-9  # relative change of P at which the gains of a constant system have converged
 _LONGEST = 10_000  # stages after which there is taken to be no limit
 _STATIONARY = 1e-12  # relative change of P at which a stationary gain has converged
+
+
+class Stages(NamedTuple):
+    """Affine stages s_{k+1} = A_k s_k + B_k u_k + c_k; H of them, or one that is constant over the horizon."""
+
+    A: Array  # (H or 1, p, p)
+    B: Array  # (H or 1, p, m)
+    c: Array  # (H or 1, p)
+
+
+class TrackingCost(NamedTuple):
+    """Weights of the cost."""
+
+    state: Array  # W of s_1 .. s_{H-1} (p / n, n, n)
+    terminal: Array  # W of s_H (p / n, n, n)
+    input: Array  # R (m, m)
+    penalized: int  # what R weighs: INPUTS, DEVIATIONS or INCREMENTS
+
+
+class References(NamedTuple):
+    """What is tracked."""
+
+    states: Array  # r_1 .. r_H of the mean (H, n); the rest of s is to be zero
+    inputs: Array  # (H, m), used where R weighs deviations
+    previous_input: Array  # u_{-1} (m,)
+
+
+@compiled
+def expand(stages, start, feedback, previous_input, unknowns):
+    """Inputs (H, m) and states s_0 .. s_H (H + 1, p) of the unknowns v (H m,)."""
+    p, m = stages.B.shape[1:]
+    H, last = len(unknowns) // m, len(stages.A) - 1
+    inputs, states = unknowns.copy().reshape(H, m), np.empty((H + 1, p))
+    copy(start, states[0])
+    for k in range(H):
+        s, u, after, at = states[k], inputs[k], states[k + 1], min(k, last)
+        if len(feedback) > 0:
+            before = inputs[k - 1] if k > 0 else previous_input
+            for i in range(m):
+                F = feedback[k, i]
+                u[i] += F[p + m] + dot(F[:p], s) + dot(F[p : p + m], before)
+        for i in range(p):
+            after[i] = stages.c[at, i] + dot(stages.A[at, i], s) + dot(stages.B[at, i], u)
+    return inputs, states
+
+
+@compiled
+def tracking_cost(cost, states, inputs, references):
+    """The cost itself, constants included, of states s_0 .. s_H (H + 1, p) and inputs (H, m)."""
+    W, R, targets = cost.state, cost.input, references.states
+    (H, n), m = targets.shape, len(R)
+    total, error, v = 0.0, np.empty(states.shape[1]), np.empty(m)
+    for k in range(H):
+        copy(states[k + 1], error)
+        for i in range(n):
+            error[i] -= targets[k, i]
+        weight = cost.terminal if k == H - 1 else W
+        for b in range(len(W)):
+            for i in range(n):
+                for j in range(n):
+                    total += error[b * n + i] * weight[b, i, j] * error[b * n + j]
+        for i in range(m):
+            v[i] = inputs[k, i]
+            if cost.penalized == DEVIATIONS:
+                v[i] -= references.inputs[k, i]
+            elif cost.penalized == INCREMENTS:
+                v[i] -= inputs[k - 1, i] if k > 0 else references.previous_input[i]
+        for i in range(m):
+            for j in range(m):
+                total += v[i] * R[i, j] * v[j]
+    return total
 
 
 @compiled
@@ -69,6 +144,72 @@ def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
                 copy_matrix(D, hessians[j])
             break
     return gains, hessians
+
+
+@compiled
+def optimal_feedback(cost, stages, references):
+    """The feedback F (H, m, p + m + 1) that minimises the cost without bounds, u_k = F_k [s_k; u_{k-1}; 1].
+
+    It is that of the regulator of [s_k - r_k; u_{k-1}; 1], without u_{k-1} but for increments, whose input is the
+    penalized v. The second result is half the Hessian of the cost in what is added to each u_k (H, m, m).
+    """
+    (p, m), targets, R = stages.B.shape[1:], references.states, cost.input
+    (H, n), e = targets.shape, p + (m if cost.penalized == INCREMENTS else 0)
+    A, B = np.zeros((H, e + 1, e + 1)), np.zeros((H, e + 1, m))
+    weight, terminal = np.zeros((e + 1, e + 1)), np.zeros((e + 1, e + 1))
+    add_blocks(cost.state, weight)
+    add_blocks(cost.terminal, terminal)
+    for k in range(H):
+        at = min(k, len(stages.A) - 1)
+        A[k, e, e] = 1.0
+        for i in range(p):
+            A[k, i, e] = stages.c[at, i]
+            for j in range(p):
+                A[k, i, j] = stages.A[at, i, j]
+            for j in range(n):
+                A[k, i, e] += stages.A[at, i, j] * targets[k - 1, j] if k > 0 else 0.0
+            for j in range(m):
+                B[k, i, j] = stages.B[at, i, j]
+                if cost.penalized == DEVIATIONS:
+                    A[k, i, e] += stages.B[at, i, j] * references.inputs[k, j]
+        for i in range(n):
+            A[k, i, e] -= targets[k, i]
+        for i in range(e - p):
+            A[k, p + i, p + i] = B[k, p + i, i] = 1.0
+            for j in range(p):
+                A[k, j, p + i] = stages.B[at, j, i]
+    gains, hessians = finite_horizon_lqr(A, B, weight, R, terminal, H)
+    feedback = np.zeros((H, m, p + m + 1))
+    for k in range(H):
+        for i in range(m):
+            F, K = feedback[k, i], gains[k, i]
+            for j in range(e):
+                F[j] = -K[j]
+            if cost.penalized == INCREMENTS:
+                F[p + i] += 1.0
+            F[p + m] = -K[e] + (references.inputs[k, i] if cost.penalized == DEVIATIONS else 0.0)
+            if k > 0:
+                F[p + m] += dot(K[:n], targets[k - 1])
+    return feedback, hessians
+
+
+@borrowing
+def add_blocks(W, M):
+    """Adds the blocks of a weight to the diagonal of M."""
+    n = W.shape[1]
+    for b in range(len(W)):
+        for i in range(n):
+            for j in range(n):
+                M[b * n + i, b * n + j] += W[b, i, j]
+
+
+@borrowing
+def dot(x, y):
+    """The inner product of two vectors."""
+    total = 0.0
+    for i in range(len(x)):
+        total += x[i] * y[i]
+    return total
 
 
 @borrowing
