@@ -28,8 +28,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from gpmpc.compiled import borrowing, compile_for, compiled, copy, copy_matrix, direct
+from gpmpc.compiled import compile_for, compiled, njit_inner, njit_noalloc, unchecked_entry_point
 from gpmpc.exceptions import ShapeError
+from gpmpc.kernels.linalg import copy, copy_matrix, dot
 from gpmpc.kernels.point_rows import aligned_rows
 from gpmpc.mpc.linear_quadratic import (
     DEVIATIONS,
@@ -39,7 +40,6 @@ from gpmpc.mpc.linear_quadratic import (
     Stages,
     TrackingCost,
     add_blocks,
-    dot,
     expand,
     optimal_feedback,
 )
@@ -104,7 +104,7 @@ class Condenser:
             np.tile(problem.rate_upper, (rated, 1)),
         )
         compile_for(_condense, _SIGNATURE)
-        self._condense = direct(_condense)
+        self._condense = unchecked_entry_point(_condense)
         n, m = problem.state_dim, problem.input_dim
         self._size, self._rates, self._plain = horizon * m, rated * m, np.empty((0, m, len(weight) * n + m + 1))
 
@@ -139,7 +139,7 @@ def _condense(cost, bounds, stages, start, references, rows, program):
     return growth
 
 
-@compiled
+@njit_inner
 def write_hessian_and_rows(cost, bounds, stages, rows, program):
     """Writes P and G in input coordinates, which do not depend on where the state is."""
     (H, m), first, P, G = bounds.lower.shape, bounds.rate_lower.size, program.P, program.G
@@ -161,7 +161,7 @@ def write_hessian_and_rows(cost, bounds, stages, rows, program):
         _add_varying_stages(cost, stages, rows.E, H, P, G[first:])
 
 
-@compiled
+@njit_inner
 def _add_varying_stages(cost, stages, E, H, P, G):
     """Adds 2 Gamma' W Gamma to P, and writes E Gamma to G; whole registers at a time, in padded copies."""
     (p, m), r, last = stages.B.shape[1:], E.shape[1], len(stages.A) - 1
@@ -202,7 +202,7 @@ def _add_varying_stages(cost, stages, E, H, P, G):
     _mirror(P)
 
 
-@compiled
+@njit_inner
 def _add_constant_stages(cost, stages, E, H, P, G):
     """``_add_varying_stages`` for one A, B and E."""
     (p, m), r, size = stages.B.shape[1:], len(E), len(P)
@@ -244,7 +244,7 @@ def _add_constant_stages(cost, stages, E, H, P, G):
     _mirror(P)
 
 
-@compiled
+@njit_inner
 def write_gradient_and_bounds(cost, bounds, stages, start, references, rows, program):
     """Writes q by the adjoint recursion, and the bounds of the stacked constraints, in input coordinates."""
     A, B, R, targets, last = stages.A, stages.B, cost.input, references.states, len(stages.A) - 1
@@ -253,7 +253,7 @@ def write_gradient_and_bounds(cost, bounds, stages, start, references, rows, pro
     copy(start, free[0])
     for k in range(H):
         for i in range(p):
-            free[k + 1, i] = stages.c[min(k, last), i] + dot(A[min(k, last), i], free[k])
+            free[k + 1, i] = stages.c[min(k, last), i] + dot(A[min(k, last), i], free[k], p)
     q[:] = 0.0
     W, T = _padded(cost.state), _padded(cost.terminal)
     error, gradient, pulled = np.empty(p), np.zeros(p + 8), np.zeros(p)
@@ -324,7 +324,7 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
     return program
 
 
-@compiled
+@njit_inner
 def _write_bounds(bounds, rows, inputs, states, previous_input, unbounded, program):
     """Writes bounds of the stacked constraints after the unbounded ones, given what inputs and states are at v = 0."""
     (H, m), limited, E, lower, upper = inputs.shape, bounds.rate_lower.size, rows.E, program.lower, program.upper
@@ -338,11 +338,11 @@ def _write_bounds(bounds, rows, inputs, states, previous_input, unbounded, progr
                 at = first + k * m + i
                 lower[at], upper[at] = bounds.rate_lower[k, i] - rate, bounds.rate_upper[k, i] - rate
         for e in range(r):
-            at, value = first + limited + k * r + e, dot(E[min(k, len(E) - 1), e], states[k + 1])
+            at, value = first + limited + k * r + e, dot(E[min(k, len(E) - 1), e], states[k + 1], E.shape[2])
             lower[at], upper[at] = rows.lower[k, e] - value, rows.upper[k, e] - value
 
 
-@compiled
+@njit_inner
 def _zeros(rows, columns):
     """Zeros in rows of whole registers, on cache lines."""
     matrix = aligned_rows(rows, (columns + 7) // 8 * 8)
@@ -350,7 +350,7 @@ def _zeros(rows, columns):
     return matrix
 
 
-@compiled
+@njit_inner
 def _padded(W):
     """The blocks of a weight in rows of whole registers (p / n, n, n padded)."""
     wide = np.zeros((len(W), W.shape[1], (W.shape[1] + 7) // 8 * 8))
@@ -360,7 +360,7 @@ def _padded(W):
     return wide
 
 
-@borrowing
+@njit_noalloc
 def _weigh(W, x, y):
     """Writes W x for the symmetric blocks of ``_padded`` to ``y``, and up to seven numbers after it."""
     n = W.shape[1]
@@ -368,7 +368,7 @@ def _weigh(W, x, y):
         combine(W[b], n, x[b * n :], 0, n, y[b * n :])
 
 
-@borrowing
+@njit_noalloc
 def _mirror(P):
     """Takes the upper triangle from the lower one; in blocks, which stay in the cache."""
     size = len(P)

@@ -9,23 +9,22 @@ For x_{k+1} = A_k x_k + B_k u_k and the cost sum_{k=0..H-1} |x_k|^2_Q + |u_k|^2_
 R is positive definite, so that every step exists whatever A and B are.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
-from gpmpc.compiled import borrowing, compiled, copy, copy_matrix
+from gpmpc.compiled import compiled, njit_noalloc
 from gpmpc.exceptions import SettingError
+from gpmpc.kernels.linalg import add_transposed_product, copy, copy_matrix, dot, product, solve_positive
 
 Array = np.ndarray
 
 PENALIZED = ("inputs", "deviations", "increments")
 INPUTS, DEVIATIONS, INCREMENTS = range(3)
 
-_SETTLED = 1e-9  # relative change of P at which the gains of a constant system have converged
-_LONGEST = 10_000  # stages after which there is taken to be no limit
-_STATIONARY = 1e-12  # relative change of P at which a stationary gain has converged
+_SETTLED = 1e-12  # relative change of P at which the gains of a constant system have converged
+_LONGEST = 10_000  # stages after which they are taken to have
+_STABLE = 1e-9  # by how much an eigenvalue may lie outside the unit circle by rounding
 
 
 class Stages(NamedTuple):
@@ -66,9 +65,9 @@ def expand(stages, start, feedback, previous_input, unknowns):
             before = inputs[k - 1] if k > 0 else previous_input
             for i in range(m):
                 F = feedback[k, i]
-                u[i] += F[p + m] + dot(F[:p], s) + dot(F[p : p + m], before)
+                u[i] += F[p + m] + dot(F, s, p) + dot(F[p:], before, m)
         for i in range(p):
-            after[i] = stages.c[at, i] + dot(stages.A[at, i], s) + dot(stages.B[at, i], u)
+            after[i] = stages.c[at, i] + dot(stages.A[at, i], s, p) + dot(stages.B[at, i], u, m)
     return inputs, states
 
 
@@ -117,18 +116,18 @@ def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
     closed, factor, RK = np.empty((n, n)), np.empty((m, m)), np.empty((m, n))
     for k in range(horizon - 1, -1, -1):
         A_k, B_k, K, D = A[min(k, len(A) - 1)], B[min(k, len(B) - 1)], gains[k], hessians[k]
-        PB[:] = 0.0
-        add_product(P, B_k, PB, 1.0)
+        product(P, B_k, PB)
         copy_matrix(R, D)
         add_transposed_product(B_k, PB, D)
         add_transposed_product(PB, A_k, K)
         copy_matrix(D, factor)
         solve_positive(factor, K)
-        copy_matrix(A_k, closed)
-        add_product(B_k, K, closed, -1.0)
-        PC[:], RK[:] = 0.0, 0.0
-        add_product(P, closed, PC, 1.0)
-        add_product(R, K, RK, 1.0)
+        product(B_k, K, closed)
+        for i in range(n):
+            for j in range(n):
+                closed[i, j] = A_k[i, j] - closed[i, j]
+        product(P, closed, PC)
+        product(R, K, RK)
         copy_matrix(Q, following)
         add_transposed_product(closed, PC, following)
         add_transposed_product(K, RK, following)
@@ -189,11 +188,11 @@ def optimal_feedback(cost, stages, references):
                 F[p + i] += 1.0
             F[p + m] = -K[e] + (references.inputs[k, i] if cost.penalized == DEVIATIONS else 0.0)
             if k > 0:
-                F[p + m] += dot(K[:n], targets[k - 1])
+                F[p + m] += dot(K, targets[k - 1], n)
     return feedback, hessians
 
 
-@borrowing
+@njit_noalloc
 def add_blocks(W, M):
     """Adds the blocks of a weight to the diagonal of M."""
     n = W.shape[1]
@@ -203,66 +202,8 @@ def add_blocks(W, M):
                 M[b * n + i, b * n + j] += W[b, i, j]
 
 
-@borrowing
-def dot(x, y):
-    """The inner product of two vectors."""
-    total = 0.0
-    for i in range(len(x)):
-        total += x[i] * y[i]
-    return total
-
-
-@borrowing
-def add_product(A, X, Y, sign):
-    """Y += sign A X."""
-    for r in range(len(A)):
-        out = Y[r]
-        for c in range(A.shape[1]):
-            a, row = sign * A[r, c], X[c]
-            for i in range(len(row)):
-                out[i] += a * row[i]
-
-
-@borrowing
-def add_transposed_product(A, X, Y):
-    """Y += A' X."""
-    for c in range(len(A)):
-        row = X[c]
-        for r in range(A.shape[1]):
-            a, out = A[c, r], Y[r]
-            for i in range(len(row)):
-                out[i] += a * row[i]
-
-
-@borrowing
-def solve_positive(W, X):
-    """X <- W^-1 X for a symmetric positive definite W, whose lower triangle is overwritten (Cholesky)."""
-    m, n = len(W), X.shape[1]
-    for i in range(m):
-        for j in range(i + 1):
-            total = W[i, j]
-            for k in range(j):
-                total -= W[i, k] * W[j, k]
-            W[i, j] = total / W[j, j] if j < i else math.sqrt(total)
-    for i in range(m):
-        for j in range(i):
-            for k in range(n):
-                X[i, k] -= W[i, j] * X[j, k]
-        for k in range(n):
-            X[i, k] /= W[i, i]
-    for i in range(m - 1, -1, -1):
-        for j in range(i + 1, m):
-            for k in range(n):
-                X[i, k] -= W[j, i] * X[j, k]
-        for k in range(n):
-            X[i, k] /= W[i, i]
-
-
 def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
     """The gain K (m, n) of u = -K x that minimises sum_k |x_k|^2_Q + |u_k|^2_R under x_{k+1} = A x_k + B u_k for ever.
-
-    From the discrete algebraic Riccati equation; where its solver fails (modes on the unit circle that Q does not
-    weigh), from the recursion run to its limit.
 
     Args:
         A: (n, n).
@@ -271,25 +212,10 @@ def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
         R: (m, m), positive definite.
 
     Raises:
-        SettingError: The recursion has no limit: inputs do not reach a mode that grows and that Q weighs.
+        SettingError: The inputs do not reach a mode that grows.
     """
     A, B, Q, R = (np.ascontiguousarray(matrix, dtype=float) for matrix in (A, B, Q, R))
-    try:
-        P = solve_discrete_are(A, B, Q, R)
-        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-        if np.isfinite(K).all() and np.abs(np.linalg.eigvals(A - B @ K)).max() < 1:
-            return K
-    except (np.linalg.LinAlgError, ValueError):
-        pass
-    P, change = Q, np.inf
-    with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(_LONGEST):
-            K = finite_horizon_lqr(A[None], B[None], Q, R, P, 1)[0][0]
-            closed = A - B @ K
-            P, before = closed.T @ P @ closed + K.T @ R @ K + Q, P
-            change = np.abs(P - before).max() / max(np.abs(P).max(), np.finfo(float).tiny)
-            if not change > _STATIONARY:
-                break
-    if not change <= _STATIONARY:
-        raise SettingError("A, B, Q", "there is no stationary gain: inputs do not reach a growing mode that Q weighs")
+    K = finite_horizon_lqr(A[None], B[None], Q, R, Q, _LONGEST)[0][0]
+    if not np.isfinite(K).all() or np.abs(np.linalg.eigvals(A - B @ K)).max() > 1 + _STABLE:
+        raise SettingError("A, B, Q", "there is no stationary gain: the inputs do not reach a growing mode")
     return K
