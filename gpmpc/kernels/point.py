@@ -13,14 +13,23 @@ The moments are summed over x~_i - x~, which all outputs share, and scaled by D_
 
 import numpy as np
 
-from gpmpc.compiled import borrowing, compiled
+from gpmpc.compiled import compiled, njit_noalloc
 from gpmpc.kernels.exponential import exp, exp_all, widest
-from gpmpc.kernels.point_rows import LINE, aligned_rows, combine, explain, multiply, project, summed
+from gpmpc.kernels.point_rows import (
+    LINE,
+    aligned_rows,
+    combine,
+    explain,
+    explain_several,
+    multiply,
+    project,
+    summed,
+)
 
 JACOBIAN, HESSIAN = 1, 2  # how much is wanted: up to second derivatives of M, up to third
 
 
-@borrowing
+@njit_noalloc
 def offsets(points, x, u, difference):
     """Writes x~_i - x~ as rows."""
     states = (len(x) + 2) // 3 * 3
@@ -35,7 +44,7 @@ def offsets(points, x, u, difference):
             row[j] = source[j] - at
 
 
-@borrowing
+@njit_noalloc
 def correlate(log_signal, D, squares, factors, k):
     """Writes k_i = sf2 exp(-1/2 sum_d D_d (x~_i - x~)_d^2) to ``k``, from squared offsets; ``factors`` is scratch."""
     for c in range(len(squares)):
@@ -50,12 +59,13 @@ def means_memory(rows, padded):
     return (2 * rows + 1) * padded + rows + LINE
 
 
-@borrowing
+@compiled(allocates=False)
 def means_along(points, inverse_squares, log_signal, beta, queries, n, memory, out):
     """M and its gradient at H points x~ = (x, u), queries (H, n + m), into out (H, k, 1 + n + m).
 
     What it works in is lent by the caller, ``means_memory`` numbers: counting references costs a third of a call.
     """
+    widest()
     rows, padded = points.shape
     skipped = (n + 2) // 3 * 3 - n  # padded rows between the states' and the controls'
     skip = (-(memory.ctypes.data >> 3)) % LINE  # rows start on cache lines
@@ -76,13 +86,13 @@ def means_along(points, inverse_squares, log_signal, beta, queries, n, memory, o
                 answer[1 + c] = D[row] * sums[row]
 
 
-@borrowing
+@njit_noalloc
 def padded_inputs(m):
     """Rows of the controls."""
     return (m + 2) // 3 * 3
 
 
-@borrowing
+@njit_noalloc
 def expand_at(gp, x, u, memory, kept, place, M, J, J_u):
     """M, its gradient J (k, n) and J_u (k, m) at one point, for other loops; the k_a stay in ``kept[:, place]``.
 
@@ -136,6 +146,7 @@ def expand_at(gp, x, u, memory, kept, place, M, J, J_u):
 @compiled
 def points_along(order, points, inverse_squares, log_signal, beta, inverse_cholesky, x, u, out):
     """Everything at H points, into the ten arrays of ``gpmpc.kernels.Expansion`` with H in front."""
+    widest()
     M, variance, dM_dx, dM_du, dvar_dx, dvar_du, d2M_dx2, d2M_dxdu, d3M_dx3, d3M_dx2du = out
     (rows, padded), n, m = points.shape, x.shape[1], u.shape[1]
     U = rows - padded_inputs(m)  # where the controls begin
@@ -187,3 +198,34 @@ def points_along(order, points, inverse_squares, log_signal, beta, inverse_chole
                         for e in range(m):
                             value = D[c] * D[d] * D[U + e] * moment[U + e] - (D[c] * J_u[e] if c == d else 0.0)
                             third_u[c, d, e] = third_u[d, c, e] = value
+
+
+@compiled
+def linearize_along(gp, columns, offset, adds_state, x, u, M, J, J_u, covariance):
+    """Writes M (K, k), its derivatives J (K, k, n) and J_u (K, k, m), and the diagonals of covariance (K, k, k).
+
+    ``gp`` and ``columns`` are the posterior's arrays, ``offset`` (k,) its prior mean; ``adds_state`` where the GPs
+    predict differences. No covariance is computed where there is no room for one (0, k, k). The triangle L_a is read
+    once for all K points.
+    """
+    points, _, log_signal, beta = gp
+    K, k, padded = len(x), len(beta), points.shape[1]
+    memory = aligned_rows(2 * len(points) + 2, padded)
+    places = (K + 3) // 4 * 4 if len(covariance) else 1
+    correlations = aligned_rows(k * places, padded).reshape(k, places, padded)
+    for h in range(K):
+        expand_at(gp, x[h], u[h], memory, correlations, h if len(covariance) else 0, M[h], J[h], J_u[h])
+        for a in range(k):
+            M[h, a] += offset[a]
+            if adds_state:
+                M[h, a] += x[h, a]
+                J[h, a, a] += 1.0
+    if len(covariance):
+        correlations[:, K:] = 0.0
+        explained = np.zeros(places)
+        for a in range(k):
+            explained[:] = 0.0
+            explain_several(columns[a], correlations[a], explained)
+            signal = np.exp(log_signal[a])
+            for h in range(K):
+                covariance[h, a, a] = max(signal - explained[h], 0.0)
