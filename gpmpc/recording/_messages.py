@@ -11,14 +11,16 @@ message that of ``bytes`` that hold it serialised. The reader and the recorder u
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.status import Status
 
 STEP, PLAN, QP = "/step", "/plan", "/qp"
@@ -65,6 +67,41 @@ _LARGEST = 1000  # states or inputs
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
+@dataclass(frozen=True)
+class RecordedSystem:
+    """Describes the system whose steps are recorded.
+
+    Attributes:
+        state_names: Names of the n states; they become field names. x, y, z and phi, theta, psi are drawn in space.
+        input_names: Names of the m inputs.
+        time_step: Of the plant [s]; it dates the stages of a plan.
+        units: By name of state or input, such as ``{"x": "m"}``.
+        input_bounds: Lower and upper bounds of the input (2, m), repeated in every step for plots.
+        frame: Name of the frame that positions are in.
+        z_down: Whether that frame's z axis points downwards, as the quadrotor's does.
+
+    Raises:
+        SettingError: Names that cannot be fields, units of unknown names, a time step that is not positive.
+        ShapeError: Bounds that are not (2, m).
+    """
+
+    state_names: Sequence[str]
+    input_names: Sequence[str]
+    time_step: float  # [s]
+    units: Mapping[str, str] = field(default_factory=dict)
+    input_bounds: Any = None
+    frame: str = "world"
+    z_down: bool = True
+
+    def __post_init__(self) -> None:
+        for key in ("state_names", "input_names"):
+            object.__setattr__(self, key, check_names(key, getattr(self, key)))
+        check_number("time_step", self.time_step, above=0, unit="[s]")
+        if self.input_bounds is not None and np.shape(self.input_bounds) != (2, len(self.input_names)):
+            raise ShapeError(f"input bounds must be (2, {len(self.input_names)}); got {np.shape(self.input_bounds)}")
+        units_by_field(self.units, self.state_names, self.input_names)
+
+
 def check_names(kind: str, names: Sequence[str]) -> tuple[str, ...]:
     """Returns the names, if each can be a field of a message and none comes twice.
 
@@ -99,11 +136,11 @@ def descriptor(
     named = {"State": states, "Input": inputs, "Timing": TIMING}
     for name, fields in ({k: dict.fromkeys(v, "double") for k, v in named.items()} | _FIELDS).items():
         message = file.message_type.add(name=name)
-        for number, (field, kind) in enumerate(fields.items(), start=1):
+        for number, (key, kind) in enumerate(fields.items(), start=1):
             if kind:
                 *repeated, kind = twin.get(kind, kind).split()
                 label = FieldDescriptorProto.LABEL_REPEATED if repeated else FieldDescriptorProto.LABEL_OPTIONAL
-                added = message.field.add(name=field, number=number, label=label)
+                added = message.field.add(name=key, number=number, label=label)
                 if kind in _SCALARS:
                     added.type = _SCALARS[kind]
                 else:
@@ -132,7 +169,7 @@ def schema_data(file: FileDescriptorProto) -> bytes:
     return FileDescriptorSet(file=[file]).SerializeToString()
 
 
-def units_by_field(units: dict[str, str], states: Sequence[str], inputs: Sequence[str]) -> dict[str, str]:
+def units_by_field(units: Mapping[str, str], states: Sequence[str], inputs: Sequence[str]) -> dict[str, str]:
     """Finds the unit of every scalar field by its path: of ``gpmpc.Step``, and of ``gpmpc.Plan`` after ``stages``.
 
     Args:
@@ -147,7 +184,7 @@ def units_by_field(units: dict[str, str], states: Sequence[str], inputs: Sequenc
         raise SettingError("units", f"must be of {', '.join([*states, *inputs])}; got {', '.join(sorted(unknown))}")
     fields = {"time": "s", "stages.time": "s"}
     for message, prefix in (("Step", ""), ("Stage", "stages.")):
-        for field, kind in _FIELDS[message].items():
+        for key, kind in _FIELDS[message].items():
             names = {"State": states, "Input": inputs}.get(kind, ())
-            fields |= {f"{prefix}{field}.{name}": units.get(name, "?") for name in names}
+            fields |= {f"{prefix}{key}.{name}": units.get(name, "?") for name in names}
     return fields | {f"timing.{name}": "s" for name in TIMING}

@@ -9,14 +9,13 @@ from foxglove.messages import Log, LogLevel, Timestamp
 
 from gpmpc.exceptions import ShapeError
 from gpmpc.recording import _messages
-from gpmpc.recording._messages import PLAN, QP, QP_ARRAYS, STEP, TOPICS
+from gpmpc.recording._messages import PLAN, QP, QP_ARRAYS, STEP, TOPICS, RecordedSystem
 from gpmpc.status import Status
 from gpmpc.step import Step
 
 if TYPE_CHECKING:
     from gpmpc.mpc.controller import Decision
     from gpmpc.qp import QPSolution
-    from gpmpc.recording.recorder import RecordedSystem
 
 Array = np.ndarray
 _NUMBERS = {status: number for number, status in enumerate(Status)}
@@ -95,7 +94,7 @@ class Encoder:
         system: What is recorded.
     """
 
-    def __init__(self, system: "RecordedSystem"):
+    def __init__(self, system: RecordedSystem):
         states, inputs, self._time_step = system.state_names, system.input_names, system.time_step
         declared = _messages.descriptor(states, inputs)
         self._schema = _messages.schema_data(declared)

@@ -13,19 +13,17 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import foxglove
-import numpy as np
 from foxglove.channels import LogChannel
 from foxglove.mcap import MCAPWriteOptions
 
-from gpmpc.exceptions import RecordingError, ShapeError, check_number
+from gpmpc.exceptions import RecordingError, check_number
 from gpmpc.provenance import provenance
-from gpmpc.recording import _messages
+from gpmpc.recording._messages import RecordedSystem, units_by_field
 from gpmpc.recording._records import CONFIG, LARGEST
 from gpmpc.recording._scene import Scene
 from gpmpc.recording._steps import Encoder, Kept, failure_log, keep
@@ -33,41 +31,6 @@ from gpmpc.step import Step
 
 _INTERVAL = 1.0  # [s] after which the next step ends a chunk
 _PORT = 8765  # of the live view, if it is free
-
-
-@dataclass(frozen=True)
-class RecordedSystem:
-    """Describes the system whose steps are recorded.
-
-    Attributes:
-        state_names: Names of the n states; they become field names. x, y, z and phi, theta, psi are drawn in space.
-        input_names: Names of the m inputs.
-        time_step: Of the plant [s]; it dates the stages of a plan.
-        units: By name of state or input, such as ``{"x": "m"}``.
-        input_bounds: Lower and upper bounds of the input (2, m), repeated in every step for plots.
-        frame: Name of the frame that positions are in.
-        z_down: Whether that frame's z axis points downwards, as the quadrotor's does.
-
-    Raises:
-        SettingError: Names that cannot be fields, units of unknown names, a time step that is not positive.
-        ShapeError: Bounds that are not (2, m).
-    """
-
-    state_names: Sequence[str]
-    input_names: Sequence[str]
-    time_step: float  # [s]
-    units: Mapping[str, str] = field(default_factory=dict)
-    input_bounds: Any = None
-    frame: str = "world"
-    z_down: bool = True
-
-    def __post_init__(self) -> None:
-        for key in ("state_names", "input_names"):
-            object.__setattr__(self, key, _messages.check_names(key, getattr(self, key)))
-        check_number("time_step", self.time_step, above=0, unit="[s]")
-        if self.input_bounds is not None and np.shape(self.input_bounds) != (2, len(self.input_names)):
-            raise ShapeError(f"input bounds must be (2, {len(self.input_names)}); got {np.shape(self.input_bounds)}")
-        _messages.units_by_field(self.units, self.state_names, self.input_names)
 
 
 class McapRecorder:
@@ -107,7 +70,7 @@ class McapRecorder:
         states, inputs = system.state_names, system.input_names
         about = _flat(provenance() | {"host": platform.node()} | dict(metadata or {}))
         about |= {"state_names": " ".join(states), "input_names": " ".join(inputs)}
-        units = _messages.units_by_field(system.units, states, inputs)
+        units = units_by_field(system.units, states, inputs)
         frames = {"positions": system.frame, "z axis": "down" if system.z_down else "up", "display": "z axis up"}
         config = config if isinstance(config, str) else json.dumps(config, indent=2, default=str)
 

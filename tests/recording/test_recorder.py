@@ -418,7 +418,7 @@ def _record_many(folder, name):
 
 
 def test_two_processes_recording_into_one_tree_lose_nothing(tmp_path):
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("fork")
     processes = [context.Process(target=_record_many, args=(tmp_path, name)) for name in ("a", "b")]
     for process in processes:
         process.start()
