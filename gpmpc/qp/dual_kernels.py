@@ -17,13 +17,10 @@ from gpmpc.qp.dual_iteration import (
     NEGLIGIBLE,
     add_constraints,
     add_multipliers,
-    choose_guess,
     drop_wrong_multipliers,
     evaluate,
     iterate,
-    list_violated,
     multiply_constraints,
-    restore_limits,
 )
 from gpmpc.qp.lanes import any_nonzero, lanes, no_lanes, plus, plus_product, product, some_lanes, total
 from gpmpc.qp.record import (
@@ -39,6 +36,7 @@ from gpmpc.qp.record import (
     WORKING,
 )
 from gpmpc.qp.triangular import factorise, multiply_rows, solve_lower, solve_transposed, subtract_rows
+from gpmpc.qp.violations import choose_guess, list_violated, restore_limits
 from gpmpc.qp.workspace import all_finite, is_dense, is_dense_matrix, open_workspace, round_end
 
 SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
