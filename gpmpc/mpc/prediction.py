@@ -33,7 +33,7 @@ import torch
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.evaluation import chosen_evaluation, host_arrays, point_arrays
+from gpmpc.gp.backend import chosen_backend, host_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.kernels.extended import roots
 from gpmpc.mpc.ancillary_feedback import spread
@@ -129,7 +129,7 @@ class Predictor:
     @property
     def compiled(self) -> bool:
         """Whether compiled loops answer: a rollout takes microseconds, and many of them go one by one."""
-        if chosen_evaluation() == "auto":
+        if chosen_backend() == "auto":
             return self._compiles and self._in_host_memory
         return self._compiles and host_arrays(self.model.weights) is not None
 
@@ -281,11 +281,11 @@ class Predictor:
             return A, B, c, stage.next, None if stage.V is None else _array(stage.V)
         x, u = _array(belief.mean), _array(input)
         if self.covariance == "none":
-            (mean, A, B), V = point_arrays(self.model, "mean_with_jacobian", x, u), None
+            mean, A, B = (part[0] for part in self.model.linearize(x[None], u[None], covariance=False)[:3])
+            V = None
             S = belief.covariance
         else:
-            mean, variance, A, B = point_arrays(self.model, "point_with_jacobian", x, u)
-            V = np.diag(variance)
+            mean, A, B, V = (part[0] for part in self.model.linearize(x[None], u[None]))
             if self.propagator.observation_noise:
                 V += _array(self.model.noise_covariance)
             S = self._tensor(A @ _array(belief.covariance) @ A.T + V)
