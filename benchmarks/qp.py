@@ -4,6 +4,7 @@
     .venv/bin/python -m benchmarks.qp --quick              # short sequences, horizons 1, 10, 20: about a minute
     .venv/bin/python -m benchmarks.qp --horizons 50 --modes changing --slow-solvers 0
     .venv/bin/python -m benchmarks.qp --rows 6,3           # also with bounds on the positions only
+    .venv/bin/python -m benchmarks.qp --trajectories elliptical,lorenz --modes changing
 
 Every solver meets the same sequence of QPs (``quadrotor_sequences``) in one process on one thread, warm-started from
 its own last solution. The solvers take turns, sequence by sequence, ``--passes`` times, and the fastest of a QP's
@@ -145,7 +146,7 @@ def worst_residual(problem: SequenceProblem, answer) -> float:
     return max(solution.residuals())
 
 
-def measure_cell(horizon: int, mode: str, rows: int, settings: argparse.Namespace) -> dict:
+def measure_cell(trajectory: str, horizon: int, mode: str, rows: int, settings: argparse.Namespace) -> dict:
     """All solvers on one sequence."""
     changing = mode == "changing"
     closing = DualActiveSet()
@@ -153,10 +154,15 @@ def measure_cell(horizon: int, mode: str, rows: int, settings: argparse.Namespac
     def close_loop(p: SequenceProblem) -> np.ndarray:
         return closing.solve(QuadraticProgram.unchecked(*vars(p).values())).x
 
-    problems = list(quadrotor_sequence(horizon, changing, settings.length, close_loop, positions_only=rows == 3))
+    problems = list(
+        quadrotor_sequence(
+            horizon, changing, settings.length, close_loop, positions_only=rows == 3, trajectory=trajectory
+        )
+    )
     fast = {OURS: ours(changing), DAQP_WARM: daqp_warm(changing), DAQP_COLD: daqp_cold}
     slow = {PRIMAL: by_protocol(PrimalActiveSet()), CVXPY: by_protocol(CvxpySolver("CLARABEL", {}))}
     cell = {
+        "trajectory": trajectory,
         "horizon": horizon,
         "mode": mode,
         "n": 3 * horizon,
@@ -201,7 +207,7 @@ def quantiles(seconds: np.ndarray) -> dict[str, float]:
 def describe(cell: dict) -> str:
     """One line per cell for the terminal."""
     solvers, ratio = cell["solvers"], cell["ratio hot"]
-    text = f"{cell['mode']:9s} H = {cell['horizon']:3d}, m = {cell['m']:3d}: "
+    text = f"{cell['trajectory']:10s} {cell['mode']:9s} H = {cell['horizon']:3d}, m = {cell['m']:3d}: "
     text += f"{solvers[OURS]['hot']['median']:8.2f} us, {cell['best DAQP path']} "
     text += f"{solvers[cell['best DAQP path']]['hot']['median']:8.2f} us, ratio {ratio['median']:.3f}"
     if cell["horizon"] in TARGETS[cell["mode"]]:
@@ -258,6 +264,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--horizons", default="1,5,10,20,50", help="comma-separated")
     parser.add_argument("--modes", default="constant,changing", help="comma-separated")
+    parser.add_argument("--trajectories", default="lissajous", help="lissajous, elliptical, lorenz, or several of them")
     parser.add_argument("--rows", default="6", help="bounded states a stage: 6 (positions, velocities), 3, or 6,3")
     parser.add_argument("--length", type=int, default=440, help="QPs per cell")
     parser.add_argument("--passes", type=int, default=3, help="turns of each solver")
@@ -270,13 +277,16 @@ def main() -> None:
     settings.out.mkdir(parents=True, exist_ok=True)
     cells = []
     families = map(int, settings.rows.split(","))
-    for rows, mode, horizon in product(families, settings.modes.split(","), map(int, settings.horizons.split(","))):
-        cells.append(measure_cell(horizon, mode, rows, settings))
+    horizons = list(map(int, settings.horizons.split(",")))
+    for trajectory, rows, mode, horizon in product(
+        settings.trajectories.split(","), families, settings.modes.split(","), horizons
+    ):
+        cells.append(measure_cell(trajectory, horizon, mode, rows, settings))
         print(describe(cells[-1]), flush=True)
     machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count(), "threads": 1}
     versions = {"python": sys.version.split()[0], "numpy": np.__version__, "unit": "microseconds"}
     (settings.out / "qp.json").write_text(json.dumps({"machine": machine | versions, "cells": cells}, indent=1))
-    first = [cell for cell in cells if cell["rows a stage"] == cells[0]["rows a stage"]]
+    first = [cell for cell in cells if all(cell[key] == cells[0][key] for key in ("trajectory", "rows a stage"))]
     draw(first, settings.out / "qp.png")
     print(f"written to {settings.out}")
 

@@ -2,11 +2,11 @@
 
 A solver that is warm-started is judged only by a sequence in which the next problem resembles the last one as it does
 in use. Here the translational subsystem of the quadrotor (thrust and two tilts in, positions and velocities out)
-follows a fast Lissajous curve under process noise. Its MPC is condensed to the inputs of the horizon: input bounds
-become the box of the QP (n = 3H), bounds on the six states of every stage its rows (6H); or, as a second family, on
-the three positions (3H). The bounds narrow and widen
-(a corridor that the vehicle passes), so that constraints come and go; they are never narrower than what a known
-feasible plan needs.
+follows a curve under process noise. Its MPC is condensed to the inputs of the horizon: input bounds become the box of
+the QP (n = 3H), bounds on the six states of every stage its rows (6H); or, as a second family, on the three positions
+(3H). On a fast Lissajous curve the bounds narrow and widen (a corridor that the vehicle passes), so that constraints
+come and go; the paper's trajectories are flown four times as fast, within bounds a little inside them. Bounds are never
+narrower than what a known feasible plan needs.
 
 ``constant``: the model is linearised once, at hover; P and G stay. ``changing``: it is linearised at every step around
 the thrust and tilt of the reference motion, so P and G are new in each problem.
@@ -17,6 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from gpmpc.trajectories import Elliptical, Lorenz, states_along
 
 Array = NDArray[np.float64]
 
@@ -29,6 +31,8 @@ INPUT_WEIGHT = np.diag([0.05, 2.0, 2.0])
 INPUT_LIMIT = np.array([4.0, 0.45, 0.45])  # deviation from hover: thrust [N], tilts [-]
 WIDE = np.array([5.0, 6.0] * 3)  # bounds on positions [m] and velocities [m/s] outside the corridor
 NARROW = np.array([2.5, 2.5] * 3)  # and inside it
+SPEED_UP = 4.0  # of the paper's trajectories
+LIMITS = {"elliptical": np.array([14.0, 8.0] * 2 + [1e3, 8.0]), "lorenz": np.array([10.0, 8.0, 13.0, 8.0, 1e3, 8.0])}
 POSITION_NOISE, VELOCITY_NOISE = 0.01, 0.05  # standard deviations per step [m], [m/s]
 
 
@@ -43,8 +47,11 @@ class SequenceProblem:
     upper: Array
 
 
-def _reference(times: Array) -> Array:
+def _reference(times: Array, trajectory: str) -> Array:
     """Positions and velocities of the curve, one row of six per time."""
+    if trajectory != "lissajous":
+        states = states_along({"elliptical": Elliptical(), "lorenz": Lorenz()}[trajectory], SPEED_UP * times)
+        return states * np.tile([1.0, SPEED_UP], 3)
     frequencies, amplitudes = np.array([0.9, 1.3, 0.7]), np.array([4.0, 3.0, 2.0])
     phase = times[:, None] * frequencies
     positions, velocities = amplitudes * np.sin(phase), amplitudes * frequencies * np.cos(phase)
@@ -77,14 +84,22 @@ def _condense(A: Array, B: Array, horizon: int) -> tuple[Array, Array]:
     return free, forced
 
 
-def _state_limits(times: Array) -> Array:
-    """The bound on each state at each time: a corridor of two seconds out of every six."""
+def _state_limits(times: Array, trajectory: str) -> Array:
+    """The bound on each state at each time: of a trajectory, or a corridor of two seconds out of every six."""
+    if trajectory != "lissajous":
+        return np.tile(LIMITS[trajectory], len(times))
     inside = np.mod(times, 6.0) > 4.0
     return np.where(inside[:, None], NARROW, WIDE).ravel()
 
 
 def quadrotor_sequence(
-    horizon: int, changing: bool, length: int, solve, seed: int = 0, positions_only: bool = False
+    horizon: int,
+    changing: bool,
+    length: int,
+    solve,
+    seed: int = 0,
+    positions_only: bool = False,
+    trajectory: str = "lissajous",
 ) -> Iterator[SequenceProblem]:
     """The QPs of ``length`` closed-loop steps; ``solve(problem) -> x`` closes the loop.
 
@@ -94,7 +109,7 @@ def quadrotor_sequence(
     rng = np.random.default_rng(seed)
     weight = np.kron(np.eye(horizon), STATE_WEIGHT)
     box = np.tile(INPUT_LIMIT, horizon)
-    state, plan = _reference(np.zeros(1))[0], np.zeros(3 * horizon)
+    state, plan = _reference(np.zeros(1), trajectory)[0], np.zeros(3 * horizon)
     prepared = None
     for step in range(length):
         now = step * TIME_STEP
@@ -108,8 +123,9 @@ def quadrotor_sequence(
         G = np.ascontiguousarray(forced[bounded])
         times = now + TIME_STEP * np.arange(1, horizon + 1)
         drift = free @ state
-        q = gradient @ (drift - _reference(times).ravel())
-        limits, offset = _state_limits(times)[bounded], drift[bounded]
+        reference = _reference(times, trajectory).ravel()
+        q = gradient @ (drift - reference)
+        limits, offset = _state_limits(times, trajectory)[bounded], drift[bounded]
         feasible = G @ np.clip(np.concatenate([plan[3:], plan[-3:]]), -box, box)
         lower = np.concatenate([-box, np.minimum(-limits - offset, feasible - 0.01)])
         upper = np.concatenate([box, np.maximum(limits - offset, feasible + 0.01)])
