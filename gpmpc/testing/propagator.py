@@ -61,7 +61,7 @@ def check_propagator(
     *,
     linear: bool = True,
     diagonal: bool = False,
-    observation_noise: bool = False,
+    process_noise: bool = False,
     samples: int | None = None,
 ) -> None:
     """Checks a propagator against the protocol ``gpmpc.propagation.Propagator``.
@@ -78,7 +78,7 @@ def check_propagator(
         linear: It claims to be exact where the model is linear, and first-order accurate in its input-output
             covariance. All methods of this package but mean equivalence do.
         diagonal: It claims the variances only, and predicts no correlation of the outputs.
-        observation_noise: It adds the model's noise covariance.
+        process_noise: It adds the model's noise covariance.
         samples: How many states it draws, if it does; its own standard error is then allowed for.
 
     Raises:
@@ -89,7 +89,7 @@ def check_propagator(
         n, like = model.state_dim, {"dtype": model.dtype, "device": model.device}
         root = 0.2 * torch.eye(n, **like) + 0.05 * torch.ones(n, n, **like).tril(-1)
         belief = Gaussian(torch.linspace(0.3, -0.4, n, **like), root @ root.mT)
-        noise = model.noise_covariance if observation_noise else torch.zeros_like(model.noise_covariance)
+        noise = model.noise_covariance if process_noise else torch.zeros_like(model.noise_covariance)
         return _Case(propagator, model, belief, torch.full((model.input_dim,), 0.2, **like), diagonal, noise, samples)
 
     for each in [_small_gp("next_state"), _small_gp("difference")] if model is None else [model]:
