@@ -167,10 +167,7 @@ class NoDimension(Honest):
     [
         (ForgetsItsBatch, "a batch is the loop over its members; the covariance is off by"),
         (MovesTheMean, "a batch is the loop over its members; the mean is off by"),
-        (
-            WrongShape,
-            r"mean \(\*batch, k\) and covariance .*; got \(\(4, 1\), \(4, 1, 1\)\), should be \(\(4, 2\), \(4, 2, 2\)\)",
-        ),
+        (WrongShape, r"mean \(\*batch, k\) and covariance .*; got \(\(4, 1\), \(4, 1, 1\)\), should be \(\(4, 2\), "),
         (Lopsided, "the covariance is symmetric; an entry and its mirror image differ by 1.00e-06"),
         (Indefinite, "the covariance is positive semidefinite; its lowest eigenvalue is -"),
         (Scribbles, "the caller's state and input are left as they are"),
