@@ -24,13 +24,12 @@ import gpmpc
 from gpmpc.cli.bench import bench
 from gpmpc.cli.completion import complete
 from gpmpc.cli.configuration import config_folder, find_modules_here
-from gpmpc.cli.figures import figures
 from gpmpc.cli.log import log
 from gpmpc.cli.plot import plot
 from gpmpc.cli.report import report
 from gpmpc.cli.run import run
 from gpmpc.cli.streams import tell
-from gpmpc.cli.tables import tables
+from gpmpc.cli.study import figures, tables
 from gpmpc.exceptions import GpmpcError
 
 EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher
