@@ -1,6 +1,6 @@
 """Do two roads to one answer meet? Sequential quadratic programs, solvers and forms, and a long horizon with bounds.
 
-    .venv/bin/python benchmarks/agreement.py [--steps 200] [--recorded 500]
+    .venv/bin/python -m benchmarks.agreement [--steps 200] [--recorded 500]
 
 1. ``trajectory`` iterated to tolerance against ``NonlinearGPMPC`` on sampled steps of flights, full covariances: the
    nonlinear objective at the one's plan over that at the other's.
@@ -13,26 +13,19 @@ One process, one thread. Writes ``outputs/benchmarks/agreement.json``.
 """
 
 import argparse
-import json
-import os
 import time
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from gpmpc.bench.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
+from benchmarks.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
+from benchmarks.timing import write_results
 from gpmpc.mpc.convex_mpc import ConvexMPC
 from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import StateBounds
 from gpmpc.propagation import Linearization, MomentMatching
-from gpmpc.provenance import provenance
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
 
 # Bounds that bite at about one step in ten: of ux and uy [-], and of the increments of U1 [N], ux, uy.
@@ -54,10 +47,7 @@ def main() -> None:
         "solvers": solvers(posteriors, arguments.recorded),
         "long_horizon": [long_horizon(posteriors[name], name, l1) for name in TRAJECTORIES for l1 in (None, 1e4)],
     }
-    path = Path("outputs/benchmarks/agreement.json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
-    print(f"written to {path}")
+    write_results("agreement", results)
 
 
 def optimality(posteriors: dict, propagation: str, arguments: argparse.Namespace) -> dict:

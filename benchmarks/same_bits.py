@@ -1,6 +1,6 @@
 """Whether flights are the same to the last bit, whatever was compiled or loaded before.
 
-    .venv/bin/python benchmarks/same_bits.py [--only convex iterated]
+    .venv/bin/python -m benchmarks.same_bits [--only convex iterated]
 
 In an empty, a full and a half-empty cache of kernels, where none can be kept, and with the controllers flown in the
 other order, each in a process of its own with its own seed of Python's hashes; compiling takes a minute or two in four
@@ -16,13 +16,10 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
 import numpy as np
 import torch
 
-from gpmpc.bench.quadrotor import HOVER, INNER, NOISE, OUTER, STATE_BOUNDS, TRAJECTORIES, problem, trained
+from benchmarks.quadrotor import HOVER, INNER, NOISE, OUTER, STATE_BOUNDS, TRAJECTORIES, problem, trained
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.controller import Controller
 from gpmpc.mpc.convex_mpc import ConvexMPC
@@ -85,7 +82,9 @@ def main() -> int:
             into = folder / f"{number}.npz"
             environment = {"NUMBA_CACHE_DIR": str(cache), "PYTHONHASHSEED": str(number)}
             subprocess.run(
-                [sys.executable, __file__, "--into", into, "--only", *order], check=True, env=os.environ | environment
+                [sys.executable, "-m", "benchmarks.same_bits", "--into", into, "--only", *order],
+                check=True,
+                env=os.environ | environment,
             )
             flown[state] = dict(np.load(into))
             differing = [key for key, value in flown["empty"].items() if value.tobytes() != flown[state][key].tobytes()]

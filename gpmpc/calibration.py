@@ -20,9 +20,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.gp.transitions import Transitions
 from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
 from gpmpc.propagation import MomentMatching, Propagator

@@ -1,7 +1,7 @@
 """Gaussian process dynamics models: data, training (GPyTorch), and the frozen posterior that predicts."""
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.gp.budget import Budget
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.gp.evaluation import evaluation
 from gpmpc.gp.gpytorch_posterior import KernelPosterior
 from gpmpc.gp.gpytorch_training import fit

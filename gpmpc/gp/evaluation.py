@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from gpmpc.dynamics import check_query
 from gpmpc.exceptions import SettingError
-from gpmpc.gp.dynamics import check_query
 
 Evaluation = Literal["auto", "compiled", "torch"]
 

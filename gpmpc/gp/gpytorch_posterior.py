@@ -18,9 +18,16 @@ import gpytorch
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import (
+    Array,
+    Linearized,
+    batched_jacobian,
+    check_destination,
+    check_query,
+    linearize_by_autograd,
+)
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import batched_jacobian, check_destination, check_query
 from gpmpc.gp.kernel import PREDICTS
 from gpmpc.gp.model import exact_inference, members
 from gpmpc.gp.posterior import Predicts
@@ -118,6 +125,10 @@ class KernelPosterior:
         input = state[..., :0] if input is None else input
         check_query(self, state, input)
         return Gaussian(*self._moments(state, input))
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises the mean at K points (K, n), (K, m) by torch autograd."""
+        return linearize_by_autograd(self, states, inputs, covariance)
 
     def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
         """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""

@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import Array, Linearized, check_destination, check_query, tensors_for, to_array
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.gp.dynamics import check_destination, check_query
 from gpmpc.gp.evaluation import compiled_point, host_arrays
 from gpmpc.gp.kernel import check_posterior, factorised
 from gpmpc.gp.model import hyperparameters as trained
@@ -250,6 +250,19 @@ class GPPosterior:
         """
         k, _ = self._correlations(state, input)
         return self._belief(k, state)
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises the mean at K points (K, n), (K, m): by the compiled kernels where they can, else by torch."""
+        if host_arrays(self.weights) is not None:
+            from gpmpc import kernels  # loads numba
+
+            offset, adds_state = self.offset.numpy(), self.predicts == "difference"
+            return Linearized(*kernels.linearize(self.packed, states, inputs, covariance, offset, adds_state))
+        x, u = tensors_for(self, states, inputs)
+        k, difference = self._correlations(x, u)
+        A, B = self._jacobian(k, difference)
+        V = to_array(self._belief(k, x).covariance) if covariance else None
+        return Linearized(to_array(self._mean(k, x)), to_array(A), to_array(B), V)
 
     def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
         """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""

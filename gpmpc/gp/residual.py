@@ -8,16 +8,26 @@ Kabzan and Zeilinger, 2020, eq. (3)).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import (
+    Array,
+    Linearized,
+    batched_jacobian,
+    check_destination,
+    check_query,
+    tensors_for,
+    to_array,
+)
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp.budget import Budget
-from gpmpc.gp.dynamics import batched_jacobian, check_destination, check_query
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.training import Trainer
 from gpmpc.gp.transitions import Transitions, check_transitions
@@ -51,6 +61,16 @@ class Affine:
     def __call__(self, state: Tensor, input: Tensor) -> Tensor:
         """The nominal next state (*batch, n)."""
         return state @ self.A.mT + input @ self.B.mT + self.c
+
+    def linearize(self, states: Array, inputs: Array) -> tuple[Array, Array, Array]:
+        """The nominal next states (K, n) and their constant derivatives (K, n, n) and (K, n, m)."""
+        A, B, c = self._arrays
+        K = len(states)
+        return states @ A.T + inputs @ B.T + c, np.tile(A, (K, 1, 1)), np.tile(B, (K, 1, 1))
+
+    @cached_property
+    def _arrays(self) -> tuple[Array, Array, Array]:
+        return to_array(self.A), to_array(self.B), to_array(self.c)
 
 
 @dataclass(frozen=True)
@@ -199,6 +219,39 @@ class ResidualModel:
         check_query(self, state, input)
         d = self.residual.predict(*self.selected(state, input))
         return self._combined(_nominal(self.nominal, state, input), d)
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises the model at K points (K, n), (K, m): the nominal model's expansion plus B times the GP's.
+
+        A nominal model with a method ``linearize(states, inputs)``, such as ``Affine`` or ``CasadiFunction``, is
+        linearised by it; any other by one batched call of torch autograd.
+        """
+        mean, A, G = self._linearize_nominal(states, inputs)
+        states_seen, inputs_seen = self._columns
+        d = self.residual.linearize(states[:, states_seen], inputs[:, inputs_seen], covariance)
+        B = self._acts_on
+        mean += d.mean @ B.T
+        A[:, :, states_seen] += B @ d.A
+        G[:, :, inputs_seen] += B @ d.B
+        V = None if d.covariance is None else B @ d.covariance @ B.T
+        return Linearized(mean, A, G, V)
+
+    @cached_property
+    def _linearize_nominal(self) -> Callable[[Array, Array], tuple[Array, Array, Array]]:
+        return getattr(self.nominal, "linearize", self._linearize_torch)
+
+    def _linearize_torch(self, states: Array, inputs: Array) -> tuple[Array, Array, Array]:
+        arguments = tensors_for(self, states, inputs)
+        (mean,), (A, G) = batched_jacobian(lambda x, u: (_nominal(self.nominal, x, u),), arguments)
+        return to_array(mean), to_array(A), to_array(G)
+
+    @cached_property
+    def _columns(self) -> tuple[Array, Array]:
+        return np.array(self.states, dtype=int), np.array(self.inputs, dtype=int)
+
+    @cached_property
+    def _acts_on(self) -> Array:
+        return to_array(self.B)
 
     def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
         """``predict``, and its mean's derivatives by the state (*batch, n, n) and by the input (*batch, n, m)."""

@@ -15,12 +15,13 @@ from numpy.typing import ArrayLike
 from gpmpc.exceptions import ShapeError
 from gpmpc.kernels.moments import CROSS, JACOBIAN, VALUE, moments_along
 from gpmpc.kernels.packed import Array, Packed, pack
-from gpmpc.kernels.point import HESSIAN, means_along, means_memory, points_along
+from gpmpc.kernels.point import HESSIAN, linearize_along, means_along, means_memory, points_along
 
 __all__ = [
     "Expansion",
     "Moments",
     "Packed",
+    "linearize",
     "mean_with_jacobian",
     "moments",
     "moments_with_jacobian",
@@ -90,6 +91,37 @@ class Moments(NamedTuple):
     def dJ_dmu(self) -> Array:
         """The second derivatives of M in mu (k, n, n), which are twice dM/dS."""
         return 2 * self.dM_dS
+
+
+def linearize(
+    packed: Packed, x: Array, u: Array, covariance: bool, offset: Array, adds_state: bool
+) -> tuple[Array, Array, Array, Array | None]:
+    """Linearises k GPs at K points in one call.
+
+    Args:
+        packed: The GPs.
+        x: States (K, n), float64 like ``u``.
+        u: Inputs (K, m).
+        covariance: Whether the covariances are computed; they take most of the time.
+        offset: Constant prior means (k,).
+        adds_state: Whether the GPs predict differences x+ - x (k = n).
+
+    Returns:
+        Means (K, k), their derivatives by x (K, k, n) and by u (K, k, m), and covariances (K, k, k) or None.
+
+    Raises:
+        ShapeError: x or u do not fit the model.
+    """
+    K, k, n, m = len(x), packed.output_dim, packed.state_dim, packed.input_dim
+    if x.shape != (K, n) or u.shape != (K, m):
+        raise ShapeError(f"the model takes states (K, {n}) and inputs (K, {m}); got {x.shape} and {u.shape}")
+    x, u = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(u, dtype=np.float64)
+    M, J, J_u = np.empty((K, k)), np.empty((K, k, n)), np.empty((K, k, m))
+    V = np.zeros((K if covariance else 0, k, k))
+    gp = packed.points, packed.inverse_squares, packed.log_signal, packed.weights
+    columns = packed.columns if covariance else V
+    linearize_along(gp, columns, offset, adds_state, x, u, M, J, J_u, V)
+    return M, J, J_u, V if covariance else None
 
 
 def mean_with_jacobian(packed: Packed, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array, Array]:

@@ -15,7 +15,16 @@ import numpy as np
 
 from gpmpc.compiled import borrowing, compiled
 from gpmpc.kernels.exponential import exp, exp_all, widest
-from gpmpc.kernels.point_rows import LINE, aligned_rows, combine, explain, multiply, project, summed
+from gpmpc.kernels.point_rows import (
+    LINE,
+    aligned_rows,
+    combine,
+    explain,
+    explain_several,
+    multiply,
+    project,
+    summed,
+)
 
 JACOBIAN, HESSIAN = 1, 2  # how much is wanted: up to second derivatives of M, up to third
 
@@ -187,3 +196,34 @@ def points_along(order, points, inverse_squares, log_signal, beta, inverse_chole
                         for e in range(m):
                             value = D[c] * D[d] * D[U + e] * moment[U + e] - (D[c] * J_u[e] if c == d else 0.0)
                             third_u[c, d, e] = third_u[d, c, e] = value
+
+
+@compiled
+def linearize_along(gp, columns, offset, adds_state, x, u, M, J, J_u, covariance):
+    """Writes M (K, k), its derivatives J (K, k, n) and J_u (K, k, m), and the diagonals of covariance (K, k, k).
+
+    ``gp`` and ``columns`` are the posterior's arrays, ``offset`` (k,) its prior mean; ``adds_state`` where the GPs
+    predict differences. No covariance is computed where there is no room for one (0, k, k). The triangle L_a is read
+    once for all K points.
+    """
+    points, _, log_signal, beta = gp
+    K, k, padded = len(x), len(beta), points.shape[1]
+    memory = aligned_rows(2 * len(points) + 2, padded)
+    places = (K + 3) // 4 * 4 if len(covariance) else 1
+    correlations = aligned_rows(k * places, padded).reshape(k, places, padded)
+    for h in range(K):
+        expand_at(gp, x[h], u[h], memory, correlations, h if len(covariance) else 0, M[h], J[h], J_u[h])
+        for a in range(k):
+            M[h, a] += offset[a]
+            if adds_state:
+                M[h, a] += x[h, a]
+                J[h, a, a] += 1.0
+    if len(covariance):
+        correlations[:, K:] = 0.0
+        explained = np.zeros(places)
+        for a in range(k):
+            explained[:] = 0.0
+            explain_several(columns[a], correlations[a], explained)
+            signal = np.exp(log_signal[a])
+            for h in range(K):
+                covariance[h, a, a] = max(signal - explained[h], 0.0)

@@ -22,9 +22,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, ProblemError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.mpc.batched_prediction import bytes_per_request, predict_many
 from gpmpc.mpc.chance_constraints import ChanceConstraints
 from gpmpc.mpc.condensing import Condenser

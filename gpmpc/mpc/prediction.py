@@ -30,9 +30,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.gp.evaluation import chosen_evaluation, host_arrays, point_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.kernels.extended import roots

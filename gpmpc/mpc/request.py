@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from gpmpc.compiled import compile_for, compiled, direct
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.status import Status

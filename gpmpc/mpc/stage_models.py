@@ -13,8 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation import Linearization, Propagator, differentiate, linearize
 

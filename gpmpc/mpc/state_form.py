@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.mpc.chance_constraints import ChanceConstraints
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.convergence import FEASIBLE

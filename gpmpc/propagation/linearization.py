@@ -11,8 +11,8 @@ Candela and Murray-Smith, 2003, for GPs). The model's variance is taken at the m
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.propagation.composition import Composition
 from gpmpc.propagation.expansion import expand
 from gpmpc.propagation.propagator import Propagation, checked_input

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors, square_root_differential
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.gp.evaluation import host_arrays
 from gpmpc.propagation.propagator import Propagator
 from gpmpc.propagation.sensitivity import Sensitivity, differentiate

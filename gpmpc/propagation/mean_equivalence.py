@@ -6,8 +6,8 @@ mu+ = m(mu, u), Sigma+ = Var[f(mu, u)] (Hewing, Kabzan and Zeilinger, 2020, "mea
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.propagation.expansion import expand
 from gpmpc.propagation.propagator import Propagation, checked_input
 from gpmpc.propagation.sensitivity import Sensitivity

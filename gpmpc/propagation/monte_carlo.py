@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import check_number
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite, square_root
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.propagation.propagator import Propagation, checked_input
 
 CHUNK = 1000  # samples predicted at once: bounds the memory at about chunk * N * outputs numbers

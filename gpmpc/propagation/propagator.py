@@ -6,9 +6,9 @@ from typing import Any, Protocol
 import numpy as np
 from torch import Tensor
 
+from gpmpc.dynamics import DynamicsModel, check_query
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.gp.dynamics import DynamicsModel, check_query
 
 
 @dataclass(frozen=True)

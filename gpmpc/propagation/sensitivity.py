@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import DynamicsModel, batched_jacobian
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel, batched_jacobian
 from gpmpc.propagation.propagator import Propagation, Propagator, checked_input
 
 

@@ -11,9 +11,9 @@ import math
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite, square_root, square_root_differential
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.propagation.expansion import expand
 from gpmpc.propagation.propagator import Propagation, checked_input
 from gpmpc.propagation.sensitivity import Sensitivity

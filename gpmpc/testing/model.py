@@ -10,15 +10,15 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.testing.promise import require, require_close, require_covariance
 
 
 def check_model(
     model: DynamicsModel, states: Tensor | None = None, inputs: Tensor | None = None, seed: int = 0
 ) -> None:
-    """Checks ``model`` against the protocol ``gpmpc.gp.dynamics.DynamicsModel``.
+    """Checks ``model`` against the protocol ``gpmpc.dynamics.DynamicsModel``.
 
     Args:
         model: The object to check.

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.bench.optimality import Question, kkt_residual
-from gpmpc.bench.pendulums import pendulum_gp
+from benchmarks.kkt import Instance, kkt_residual
+from benchmarks.pendulums import pendulum_gp
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc import sequential_loop
@@ -78,7 +78,7 @@ def test_the_residual_vanishes_with_the_distance_where_the_cost_does(quadrotor):
     for u in inputs:
         states.append(quadrotor.predict(torch.tensor(states[-1]), torch.tensor(u)).mean.numpy())
     problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="increments", **BOX)
-    question = Question(Gaussian.certain(np.zeros(6)), Reference(np.array(states)), HOVER)
+    question = Instance(Gaussian.certain(np.zeros(6)), Reference(np.array(states)), HOVER)
     far, near, nearer = (kkt_residual(quadrotor, problem, question, inputs + d) for d in (1e-1, 1e-6, 1e-8))
     assert far > 0.1
     assert near < 1e-2
@@ -111,7 +111,7 @@ def test_what_is_called_solved_is_within_ten_times_the_tolerance(quadrotor, tole
         reference = Reference(np.tile(0.5 * random.uniform(-1, 1, 6), (6, 1)))
         last = controller.control(belief, reference, last)
         assert last.status is Status.SOLVED
-        residual = kkt_residual(quadrotor, problem, Question(belief, reference, before), last.inputs)
+        residual = kkt_residual(quadrotor, problem, Instance(belief, reference, before), last.inputs)
         assert residual < 10 * tolerance
         before = last.input
 

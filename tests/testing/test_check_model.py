@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
+from gpmpc.dynamics import batched_jacobian
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Affine, GPPosterior, ResidualModel
-from gpmpc.gp.dynamics import batched_jacobian
 from gpmpc.testing import check_model
 
 

@@ -1,0 +1,74 @@
+"""Problem: what a GPyTorch user has at hand for control: the trained model, autograd through its rollout, and SciPy.
+
+The cost of a plan is rolled out through the model's own predictions, its gradient comes from ``backward``, and SLSQP
+(Kraft, 1988) keeps the inputs in their box. Predictions of the mean alone, from GPyTorch's cache, no parameter with a
+gradient: what such a user would do after reading the manual.
+"""
+
+from typing import NamedTuple
+
+import gpytorch
+import numpy as np
+import torch
+from scipy.optimize import minimize
+
+from benchmarks.kkt import Instance
+from gpmpc.exceptions import SettingError
+from gpmpc.gp import GPPosterior
+from gpmpc.gp.model import exact_inference, gpytorch_model
+from gpmpc.mpc.tracking import TrackingProblem
+
+
+class Plan(NamedTuple):
+    """A plan (H, m)."""
+
+    inputs: np.ndarray
+
+
+class GPyTorchSlsqp:
+    """Solves one tracking problem after the other on the mean of GPs.
+
+    Args:
+        gp: The GPs, of next states or differences.
+        problem: Weights of increments, and bounds of the inputs.
+        horizon: H.
+        tolerance: SLSQP's, of the cost.
+
+    Raises:
+        SettingError: The problem weighs something else than increments, or bounds more than inputs.
+    """
+
+    def __init__(self, gp: GPPosterior, problem: TrackingProblem, horizon: int, tolerance: float):
+        if problem.penalized != "increments" or problem.state_bounds is not None or problem.rate_limited:
+            raise SettingError("problem", "must weigh increments, and bound nothing but inputs")
+        self._model, self._adds_state = gpytorch_model(gp).requires_grad_(False), gp.predicts == "difference"
+        self._horizon, self._tolerance = horizon, tolerance
+        self._Q, self._R, self._terminal = map(torch.from_numpy, (problem.Q, problem.R, problem.terminal))
+        self._bounds = list(zip(problem.input_lower, problem.input_upper, strict=True)) * horizon
+
+    def __call__(self, instance: Instance, last: Plan | None) -> Plan:
+        """The plan from a state along a reference, started from the last one, shifted."""
+        start = np.tile(instance.last, (self._horizon, 1))
+        if last is not None:
+            start = np.concatenate([last.inputs[1:], last.inputs[-1:]])
+        targets, before = torch.from_numpy(instance.targets), torch.from_numpy(np.array(instance.last))
+
+        def cost(plan: np.ndarray) -> tuple[float, np.ndarray]:
+            inputs = torch.tensor(plan.reshape(start.shape), requires_grad=True)
+            total = self._cost(instance.belief.mean, before, inputs, targets)
+            total.backward()
+            return float(total.detach()), inputs.grad.numpy().ravel()
+
+        options = {"maxiter": 200, "ftol": self._tolerance}
+        with exact_inference(), gpytorch.settings.skip_posterior_variances():
+            found = minimize(cost, start.ravel(), jac=True, method="SLSQP", bounds=self._bounds, options=options)
+        return Plan(found.x.reshape(start.shape))
+
+    def _cost(self, x: torch.Tensor, last: torch.Tensor, inputs: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+        increments = torch.diff(inputs, dim=0, prepend=last[None])
+        total = (increments @ self._R * increments).sum()
+        for k, target in enumerate(targets):
+            moved = self._model(torch.cat([x, inputs[k]])[None]).mean[:, 0]
+            x = x + moved if self._adds_state else moved
+            total = total + (x - target) @ (self._terminal if k + 1 == len(targets) else self._Q) @ (x - target)
+        return total

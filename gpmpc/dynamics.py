@@ -1,0 +1,210 @@
+"""The protocol of learned and known models x[k+1] = f(x[k], u[k]), and their linearisation at many points at once."""
+
+import logging
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.gaussian import Gaussian, check_tensors
+
+Array = NDArray[np.float64]
+
+_log = logging.getLogger(__name__)
+
+
+class Linearized(NamedTuple):
+    """A model's first-order expansions at K points, as C-contiguous float64 arrays.
+
+    Attributes:
+        mean: Next states f(x, u) (K, n).
+        A: Derivatives of the means by the state (K, n, n).
+        B: Derivatives of the means by the input (K, n, m).
+        covariance: Of the latent next states at the points, without observation noise (K, n, n); None where not wanted.
+    """
+
+    mean: Array
+    A: Array
+    B: Array
+    covariance: Array | None
+
+
+class DynamicsModel(Protocol):
+    """A probabilistic model of the next state; ``gpmpc.testing.check_model`` tests a model against this protocol.
+
+    ``linearize_by_autograd`` is a ready-made ``linearize`` for models that torch can differentiate.
+    """
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states, n."""
+        ...
+
+    @property
+    def input_dim(self) -> int:
+        """Number of inputs, m."""
+        ...
+
+    @property
+    def output_dim(self) -> int:
+        """Number of outputs, k; equal to n where the outputs are next states."""
+        ...
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Type of every tensor that ``predict`` takes and returns."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Device of every tensor that ``predict`` takes and returns."""
+        ...
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """Covariance of the observations' noise (k, k); not contained in ``predict``."""
+        ...
+
+    def predict(self, state: Tensor, input: Tensor) -> Gaussian:
+        """Predicts the latent next state at x (*batch, n) and u (*batch, m), without observation noise."""
+        ...
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises the mean at K points x (K, n), u (K, m), with the covariances there unless they are not wanted."""
+        ...
+
+
+def linearize(model: DynamicsModel, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    """Linearises a model at K points: by its method ``linearize``, or by autograd where it has none.
+
+    Args:
+        model: Has ``linearize``, or at least ``predict``.
+        states: (K, n), float64.
+        inputs: (K, m), float64.
+        covariance: Whether the covariances are computed.
+    """
+    method = getattr(model, "linearize", None)
+    if method is None:
+        return linearize_by_autograd(model, states, inputs, covariance)
+    return method(states, inputs, covariance)
+
+
+def linearize_by_autograd(model: Any, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    """Linearises any model that has ``predict``, by one evaluation of all K points and torch autograd.
+
+    It is slower than a closed form; the log says so once a class.
+
+    Args:
+        model: With ``predict``, ``dtype`` and ``device``; arguments and results are converted.
+        states: (K, n).
+        inputs: (K, m).
+        covariance: Whether the covariances are returned.
+    """
+    _log_slow(type(model).__name__)
+    x, u = tensors_for(model, states, inputs)
+
+    def prediction(x: Tensor, u: Tensor) -> tuple[Tensor, ...]:
+        belief = model.predict(x, u)
+        return (belief.mean, belief.covariance) if covariance else (belief.mean,)
+
+    (mean, *rest), (A, B) = batched_jacobian(prediction, (x, u))
+    return Linearized(to_array(mean), to_array(A), to_array(B), to_array(rest[0]) if rest else None)
+
+
+@cache
+def _log_slow(name: str) -> None:
+    _log.warning("%s has no linearize() of its own: torch autograd linearises it, which takes longer", name)
+
+
+def tensors_for(model: Any, *arrays: Array) -> list[Tensor]:
+    """Converts arrays to tensors of a model's type on its device."""
+    return [torch.as_tensor(array, dtype=model.dtype, device=model.device) for array in arrays]
+
+
+def to_array(tensor: Tensor) -> Array:
+    """Converts a tensor to a C-contiguous float64 array."""
+    return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float64)
+
+
+def batched_jacobian(
+    function: Callable[..., tuple[Tensor, ...]], arguments: Sequence[Tensor]
+) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+    """Evaluates a function and its first value's Jacobians, by one reverse pass of torch autograd over the batch.
+
+    Where the derivative of an operation cannot be vectorised over the outputs, each output takes a pass of its own.
+    The Jacobians can be differentiated again.
+
+    Args:
+        function: Of the arguments, batch element by batch element; the first value is (*batch, k).
+        arguments: Each (*batch, d_i).
+
+    Returns:
+        The values, and d value / d argument (*batch, k, d_i) for each argument.
+    """
+    again = torch.is_grad_enabled() and any(argument.requires_grad for argument in arguments)
+    with torch.inference_mode(False), torch.enable_grad():
+        leaves = [a if again and a.requires_grad else a.detach().clone().requires_grad_() for a in arguments]
+        values = function(*leaves)
+        outputs = values[0].shape[-1]
+        eye = torch.eye(outputs, dtype=values[0].dtype, device=values[0].device)
+        weights = eye.reshape(outputs, *[1] * (values[0].dim() - 1), outputs).expand(outputs, *values[0].shape)
+        options = {"create_graph": again, "retain_graph": True, "allow_unused": True}
+        if not values[0].requires_grad:  # a constant
+            columns = [None] * len(leaves)
+        else:
+            try:
+                columns = torch.autograd.grad(values[0], leaves, weights, is_grads_batched=True, **options)
+            except RuntimeError:  # an operation of which torch cannot vectorise the derivative
+                rows = [torch.autograd.grad(values[0], leaves, weight, **options) for weight in weights]
+                columns = [None if c[0] is None else torch.stack(c) for c in zip(*rows, strict=True)]
+        columns = [a.new_zeros(outputs, *a.shape) if c is None else c for a, c in zip(leaves, columns, strict=True)]
+    jacobians = [column.movedim(0, -2) for column in columns]
+    if not again:
+        values = tuple(value.detach() for value in values)
+    return values, jacobians
+
+
+def check_query(model: Any, state: Tensor, input: Tensor) -> None:
+    """Raises unless a state (*batch, n) and an input (*batch, m) fit a model in shape, type and device.
+
+    Raises:
+        ShapeError: Another number of states or inputs.
+        SettingError: No tensor, or another dtype or device.
+    """
+    check_tensors(state=state, input=input)
+    if state.shape[-1:] != (model.state_dim,) or input.shape[-1:] != (model.input_dim,):
+        got = [tensor.shape[-1] if tensor.dim() else "a scalar" for tensor in (state, input)]
+        raise ShapeError(
+            f"the model has {model.state_dim} states and {model.input_dim} inputs; got {got[0]} and {got[1]}"
+        )
+    if state.shape[:-1] != input.shape[:-1]:
+        raise ShapeError(
+            "state (*batch, n) and input (*batch, m) must have the same batch; "
+            f"got {tuple(state.shape[:-1])} and {tuple(input.shape[:-1])}"
+        )
+    for name, value in (("state", state), ("input", input)):
+        if value.dtype != model.dtype or value.device != model.device:
+            raise SettingError(
+                name, f"must be {model.dtype} on {model.device} like the model; got {value.dtype} on {value.device}"
+            )
+
+
+def check_destination(device: Any, dtype: Any) -> None:
+    """Raises unless a model can go to a device and a type; None stays where it is.
+
+    Raises:
+        SettingError: torch finds no such device here, or the type is neither float32 nor float64.
+    """
+    if device is not None:
+        try:
+            torch.empty(0, device=device)
+        except (AssertionError, RuntimeError, TypeError) as error:
+            reason = str(error).partition("\n")[0]
+            raise SettingError("device", f"must be one that torch finds here; got {device!r} ({reason})") from error
+    if dtype not in (None, torch.float32, torch.float64):
+        raise SettingError("dtype", f"must be torch.float32 or torch.float64; got {dtype!r}")
