@@ -199,7 +199,9 @@ def _curve(record: dict, key: str, columns: Sequence[int]) -> Curve:
     reference = drawn.get({"states": "references", "inputs": "reference_inputs"}.get(key))
     bounds = record["bounds"] if key == "inputs" and record["bounded"] else None
     label = record["name"] + (f" (H = {record['horizon']})" if record["loop"] == "plant" else "")
-    return Curve(label, np.arange(len(values)), values, None if reference is None else np.array(reference)[:, at], bounds)
+    return Curve(
+        label, np.arange(len(values)), values, None if reference is None else np.array(reference)[:, at], bounds
+    )
 
 
 def _over_horizon(rows: pd.DataFrame) -> dict[str, list[Curve]]:
@@ -220,7 +222,10 @@ def _over_horizon(rows: pd.DataFrame) -> dict[str, list[Curve]]:
 
 def _over_confidence(rows: pd.DataFrame) -> dict[str, list[Curve]]:
     panels: dict[str, list[Curve]] = {}
-    which = (("violations", "steps", "all steps"), ("violations_at_bound", "steps_at_bound", "steps planned at a bound"))
+    which = (
+        ("violations", "steps", "all steps"),
+        ("violations_at_bound", "steps_at_bound", "steps planned at a bound"),
+    )
     for trajectory, here in rows[rows.violations.notna()].groupby("trajectory", sort=False):
         for (name, H), group in _groups(here, ["name", "horizon"]):
             for broken, steps, label in which:

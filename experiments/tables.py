@@ -119,7 +119,9 @@ class Tables:
                         raise SettingError("sizes", f"must be at most {rows}; got {size}")
                     fit = Fit(data, scaling, reported, size, self.model, float(self.state_std))
                     for draw in range(self.draws):
-                        seed = derived_seed(self.seed, *(crc32(n.encode()) for n in (trajectory, subsystem)), size, draw)
+                        seed = derived_seed(
+                            self.seed, *(crc32(n.encode()) for n in (trajectory, subsystem)), size, draw
+                        )
                         settings = [self.model_settings, self.state_std, reported, size, seed]
                         arrays = data.features, data.next_states, scaling.factor
                         table = {"elliptical": 1, "lorenz": 2}.get(trajectory)

@@ -6,8 +6,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from gpmpc.cli.folder import folder_of, writing
-from gpmpc.cli.screen import progress_bar, told_console
+from gpmpc.cli.arguments import folder_of, writing
+from gpmpc.cli.terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
 
 SHOWN_ERRORS = 10
@@ -76,8 +76,8 @@ def _run(study: Any, config: DictConfig) -> None:
     from gpmpc.studies.document import json_text, terminal
     from gpmpc.studies.study import TrialStore, run_study
 
-    settings, console = _plain(config), told_console()
-    folder = folder_of(settings)
+    settings, console = _plain(config), logging_console()
+    folder = folder_of(settings["folder"])
     with progress_bar(console) as progress:
         task = progress.add_task("preparing data and models", total=None)
         trials = study.trials(folder)

@@ -122,9 +122,7 @@ def _group(report: Report, key: str, text: str) -> dict[str, str]:
 def _cells(report: Report, group: Mapping[str, str]) -> list[Cell]:
     """Returns those of a group."""
     return [
-        cell
-        for cell in report.cells
-        if group.items() <= dict(zip(report.variables, cell.values, strict=True)).items()
+        cell for cell in report.cells if group.items() <= dict(zip(report.variables, cell.values, strict=True)).items()
     ]
 
 

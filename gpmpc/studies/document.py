@@ -143,7 +143,9 @@ class Document:
             head = "".join(f"<th>{escape(name)}</th>" for name in table.header)
             body = "\n".join(f"<tr>{''.join(f'<td>{_html(cell)}</td>' for cell in row)}</tr>" for row in table.rows)
             parts += [f"<h2>{escape(table.title)}</h2>"] if table.title else []
-            parts.append(f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>')
+            parts.append(
+                f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
+            )
         parts += [f"<p>{escape(note)}</p>" for note in self.notes]
         for heading, items in self.lists.items():
             parts.append(f"<h2>{heading}</h2><ul>{''.join(f'<li>{escape(item)}</li>' for item in items)}</ul>")
@@ -194,7 +196,13 @@ def figure_label(text: str) -> str:
 
 
 def _terminal_table(table: Table) -> TerminalTable:
-    style = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0), "title_justify": "left", "title_style": "bold"}
+    style: dict[str, Any] = {
+        "show_header": any(table.header),
+        "box": box.SIMPLE_HEAD,
+        "padding": (0, 1, 0, 0),
+        "title_justify": "left",
+        "title_style": "bold",
+    }
     shown = TerminalTable(title=Text(f"\n{table.title}") if table.title else None, **style)
     columns = list(zip(*table.rows, strict=True)) or [()] * len(table.header)
     for name, cells in list(zip(table.header, columns, strict=True))[table.sections :]:

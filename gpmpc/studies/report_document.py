@@ -109,7 +109,9 @@ def _figures(report: Report) -> dict[str, bytes]:
         for name in (name for name in _DRAWN if name in _telling(report)):
             series = []
             for label, cells in lines.items():
-                values = [[v for cell in cells if cell.values[index] == p for v in cell.numbers(name)] for p in positions]
+                values = [
+                    [v for cell in cells if cell.values[index] == p for v in cell.numbers(name)] for p in positions
+                ]
                 series.append(Series(figure_label(label), values))
             title, label, *ticks = map(figure_label, (variable, report.label(name), *positions))
             figure = over_variable(title, ticks, label, series, MEASURES[name].logarithmic, connected=numbers)

@@ -191,9 +191,7 @@ def random_rows(count: int, size: int, seed: int) -> list[int]:
     return np.sort(np.random.default_rng(seed).permutation(count)[:size]).tolist()
 
 
-def trained_model(
-    train: Callable[..., Training], settings: Any, data: Transitions, seed: int, folder: Path
-) -> Path:
+def trained_model(train: Callable[..., Training], settings: Any, data: Transitions, seed: int, folder: Path) -> Path:
     """Trains GPs unless a file in ``folder`` holds those of the same settings, data and seed; returns that file."""
     path = folder / "models" / f"{fingerprint([settings, seed], data.features, data.next_states)}.npz"
     if not path.exists():
