@@ -51,7 +51,7 @@ def flattened(arrays: Sequence[Array]) -> tuple[Array, Array]:
     return flat, layout.table
 
 
-@compiled(woven=True)
+@compiled(kernel=False, inline=True)
 def part(flat, place):
     """One of ``Layout.parts`` in compiled code, with two dimensions; ``place`` is its row of the table."""
     return matrix(flat, place[0], place[1], place[2])  # with its number numba would compile this for each of them
