@@ -49,12 +49,12 @@ def test_the_writer_of_recordings_starts_without_torch_and_without_compilers():
         ("omegaconf", ["cli"]),
         ("matplotlib", ["plotting"]),
         ("casadi", ["mpc", "gp/casadi_.py"]),
-        ("rich", ["cli", "experiments", "simulation/trials.py"]),
+        ("rich", ["cli", "studies", "simulation/trials.py"]),
         ("mcap", ["recording"]),
         ("mcap_protobuf", ["recording"]),
         ("google.protobuf", ["recording"]),
         ("foxglove_schemas_protobuf", ["recording"]),
-        ("pandas", ["recording", "cli"]),
+        ("pandas", ["recording", "cli", "studies"]),
     ],
 )
 def test_a_heavy_library_has_one_door(library, rooms):

@@ -1,12 +1,12 @@
 """Writes results as text for a terminal, Markdown, CSV, LaTeX, HTML and JSON.
 
-Names and messages that a user chose stand in the results. They are text in every format: no HTML or link in Markdown, no
-command in LaTeX, no formula in a spreadsheet, no control sequence in a terminal.
+Names and messages that a user chose stand in the results. They are text in every format: no HTML or link in Markdown,
+no command in LaTeX, no formula in a spreadsheet, no control sequence in a terminal.
 """
 
-import base64
 import json
 import re
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -135,8 +135,8 @@ class Document:
         """Returns one HTML page with the images inside, which opens without a server."""
         parts = [f"<h1>{escape(self.title)}</h1>", f"<p>{escape(self.lead)}</p>"]
         images = (
-            f'<img alt="{escape(name.removesuffix(".png"))}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
-            for name, png in self.images.items()
+            f'<img alt="{escape(name.removesuffix(".png"))}" src="data:image/png;base64,{b64encode(image).decode()}">'
+            for name, image in self.images.items()
         )
         parts.append(f'<div class="figures">{"".join(images)}</div>')
         for table in self.tables:

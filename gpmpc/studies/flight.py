@@ -2,11 +2,11 @@
 
     data -> a random subset -> training -> controller -> closed loop -> metrics
 
-``Experiment`` holds everything that the numbers follow from, as objects; files and settings are not among them. Flown is
-the translational subsystem along a trajectory, or the rotational one on its own, at its own rate, along the attitudes that
-the trajectory asks for (``gpmpc.datasets.attitudes``). The seed is that of the subset, of the training's random starts and
-of the noise: the same seed gives the same numbers, and the subsets of one seed are nested, so that sizes can be compared in
-pairs.
+``Experiment`` holds everything that the numbers follow from, as objects; files and settings are not among them. It
+flies the translational subsystem along a trajectory, or the rotational one on its own, at its own rate, along the
+attitudes that the trajectory needs (``gpmpc.datasets.attitudes``). The seed is that of the subset, of the training's
+random starts and of the noise: one seed gives one result, and the subsets of one seed are nested, so that sizes can be
+compared in pairs.
 """
 
 import inspect

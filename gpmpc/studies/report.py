@@ -1,9 +1,9 @@
 """Puts a tree of runs together: what was varied, the results, what failed and what is missing.
 
 A *cell* is one combination of the varied settings; its runs differ in their seed. Missing is only what a sweep asked
-for, in the plans that it leaves in the tree. Runs are read from their ``metrics.json`` and ``error.json`` alone. Those may
-be damaged, or of any other origin: numbers are finite and texts are one printable line from here on, and a run that cannot
-give them is skipped, with the reason.
+for, in the plans that it leaves in the tree. Runs are read from their ``metrics.json`` and ``error.json`` alone. Those
+may be damaged, or of any other origin: numbers are finite and texts are one printable line from here on, and a run that
+cannot give them is skipped, with the reason.
 """
 
 import json

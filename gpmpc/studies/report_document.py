@@ -1,7 +1,7 @@
 """Shows a tree of runs: a row a cell, figures over what was varied, what failed and what is missing."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -17,8 +17,16 @@ _MOST_LINES = 8  # in a figure; what is varied besides is pooled
 _LEGEND = "Median [first to third quartile] over the seeds. In figures, every run is a dot."
 
 
-def report_document(report: Report, comparison: Sequence[str] = ()) -> Document:
-    """Returns everything that is written of a report; what is zero everywhere is left out of the LaTeX table."""
+def report_document(
+    report: Report, comparison: Sequence[str] = (), images: Mapping[str, bytes] | None = None
+) -> Document:
+    """Returns everything that is written of a report; what is zero everywhere is left out of the LaTeX table.
+
+    Args:
+        report: All runs.
+        comparison: Lines about two groups of them.
+        images: Figures by file name; by default they are drawn.
+    """
     constants = ", ".join(f"{key}={value}" for key, value in report.constants.items())
     lists = {"Comparison": list(comparison)} | notes(report)
     return Document(
@@ -29,7 +37,7 @@ def report_document(report: Report, comparison: Sequence[str] = ()) -> Document:
         notes=[_LEGEND],
         lists={heading: items for heading, items in lists.items() if items},
         code={"To fill the gaps": report.commands()} if report.commands() else {},
-        images=_figures(report),
+        images=_figures(report) if images is None else images,
         latex=[_table(report, _telling(report))],
     )
 

@@ -1,8 +1,8 @@
 """Runs every condition of a study with every seed, and keeps each record as soon as it is there.
 
-A *trial* is one condition with one seed. Trials are independent: they run in worker processes of one thread each, and the
-record of a finished one is appended to a file under the fingerprint of everything that it depends on. A study that was
-killed at any moment goes on where it stopped.
+A *trial* is one condition with one seed. Trials are independent: they run in worker processes of one thread each, and
+the record of a finished one is appended to a file under the fingerprint of everything that it depends on. A study that
+was killed at any moment goes on where it stopped.
 """
 
 import hashlib
