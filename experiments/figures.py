@@ -71,7 +71,7 @@ class Row:
         bounded: Whether the inputs are bounded.
         horizon: H, or several.
         propagation: ``"moment_matching"`` or ``"linearization"``: how the controller's belief moves.
-        observation_noise: Whether the learned noise counts as part of the predicted state; chance constraints with a
+        process_noise: Whether the learned noise counts as part of the predicted state; chance constraints with a
             noisy plant in the loop need it.
         data: What the GP learned from: a name in ``Figures.data``.
         size: Training transitions, or several; 0 for all.
@@ -93,7 +93,7 @@ class Row:
     bounded: bool = True
     horizon: Any = 1
     propagation: str = "moment_matching"
-    observation_noise: bool = False
+    process_noise: bool = False
     data: str = "data"
     size: Any = 0
     confidence: Any = None
@@ -172,7 +172,7 @@ class Condition:
         at_first = np.clip(at_first, problem.input_lower, problem.input_upper)
         if self.model is None:
             return NMPC(self.plant, problem, row.horizon, at_first, **settings)
-        propagator = PROPAGATIONS[row.propagation](observation_noise=row.observation_noise)
+        propagator = PROPAGATIONS[row.propagation](process_noise=row.process_noise)
         make = CONTROLLERS[row.controller]
         return make(load_model(self.model), propagator, problem, row.horizon, at_first, **settings)
 

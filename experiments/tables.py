@@ -29,8 +29,7 @@ from torch import Tensor
 from gpmpc.datasets import DataSource, Subsystem
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import Scaling, Training, Transitions
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp import GPPosterior, Scaling, Training, Transitions
 from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
 from gpmpc.plotting import Panel, error_over_size, png
 from gpmpc.propagation import MomentMatching

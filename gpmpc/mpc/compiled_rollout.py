@@ -13,7 +13,8 @@ from gpmpc.compiled import compiled, copy, copy_matrix
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.kernels.point import expand_at
 from gpmpc.kernels.point_rows import aligned_rows, explain_several
-from gpmpc.mpc.ancillary_feedback import lqr_gain, step_spread
+from gpmpc.mpc.ancillary_feedback import step_spread
+from gpmpc.mpc.linear_quadratic import finite_horizon_lqr
 from gpmpc.mpc.tracking import TrackingProblem
 
 Array = np.ndarray
@@ -120,7 +121,7 @@ def roll_out(known, start, covariance, disturbance, follow, out):
                 M[i] += x[i]
                 A[k, i, i] += 1.0
         if k == 0 and feedback and (uncertain or len(follow) > 0):
-            K = lqr_gain(A[k], B[k], Q, R, terminal, H)
+            K = -finite_horizon_lqr(A[:1], B[:1], Q, R, terminal, H)[0][0]
         for i in range(n):
             c[k, i] = M[i]
             for j in range(n):

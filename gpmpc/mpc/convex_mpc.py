@@ -1,7 +1,7 @@
 """Problem: steer an uncertain system by one convex program a step, although its model is a Gaussian process.
 
 The belief's future is taken as affine in the inputs (``gpmpc.mpc.prediction`` says how), the states are eliminated
-(``gpmpc.mpc.condensing``), and what is left is a quadratic program in the inputs: the convex GP-MPC of Cao, Lai and
+(``gpmpc.mpc.condense``), and what is left is a quadratic program in the inputs: the convex GP-MPC of Cao, Lai and
 Alam (2017, section 4), and its time-varying relatives.
 
 With ``form="trajectory"`` the program is that of a Gauss-Newton step from the last plan, shifted: one of them a control
@@ -27,15 +27,16 @@ from gpmpc.exceptions import DataError, ProblemError, SettingError, ShapeError, 
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.batched_prediction import bytes_per_request, predict_many
 from gpmpc.mpc.chance_constraints import ChanceConstraints
-from gpmpc.mpc.condensing import Condenser
+from gpmpc.mpc.condense import Condenser, StateRows
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.convergence import FEASIBLE
+from gpmpc.mpc.linear_quadratic import References, Stages, expand
 from gpmpc.mpc.prediction import Covariance, Form, Prediction, Predictor
 from gpmpc.mpc.request import Request, check_controller, check_dynamics, check_method
 from gpmpc.mpc.sequential import Reached, SequentialPrograms
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Propagator
-from gpmpc.qp import DualActiveSet, Prepared, QPSolution, QPSolver, QuadraticProgram
+from gpmpc.qp import DualActiveSet, Prepared, QPSolution, QPSolver, QuadraticProgram, SoftRows
 from gpmpc.status import Status
 
 Array = np.ndarray
@@ -51,6 +52,8 @@ class _Stacked(NamedTuple):
     G: Array
     lower: Array
     upper: Array
+    feedback: Array
+    soft: SoftRows | None
     prepared: Prepared | None
 
 
@@ -60,8 +63,6 @@ class _Held(NamedTuple):
     A: Array
     B: Array
     rows: Array
-    P: Array
-    G: Array
     prepared: Prepared | None
 
 
@@ -121,7 +122,7 @@ class ConvexMPC:
         weights = self.predictor.extended(problem.Q), self.predictor.extended(problem.terminal)
         self._condenser = Condenser(problem, horizon, *weights)
         self._chance = ChanceConstraints(problem.state_bounds, problem.state_dim, horizon, covariance)
-        self.soft = self._chance.softness(self._condenser.rate_rows)
+        self.soft = self._chance.softness(self._condenser.bounds.rate_lower.size)
         if self.soft is not None and not isinstance(self.solver, DualActiveSet):
             raise SettingError(
                 "solver", f"state bounds with a price (l1, l2) need DualActiveSet; got {type(self.solver).__name__}"
@@ -223,34 +224,32 @@ class ConvexMPC:
             timing = Timing(modelled + perf_counter() - began, 0.0, 0.0)
             return request.unanswered(Status.NUMERICAL_TROUBLE, timing=timing)
         timing = Timing(modelled, built - began, perf_counter() - built)
-        inputs = solution.x.reshape(request.shifted.shape)
-        program, states = QuadraticProgram.unchecked(*stacked[:5]), prediction.states(inputs)
+        stages, program = Stages(prediction.A, prediction.B, prediction.c), QuadraticProgram.unchecked(*stacked[:5])
+        inputs, states = expand(stages, prediction.start, stacked.feedback, request.last, solution.x)
         ended = solution.status, _improves(solution, request.shifted.ravel()), 1
         return self._decide(request, Reached(*ended, timing, program, solution, inputs, states, prediction.covariances))
 
     def _stack(self, prediction: Prediction, request: Request) -> _Stacked:
         A, B, rows = prediction.A, prediction.B, self._chance.rows(prediction)
-        held = self._held if len(A) == 1 else None
-        if held is not None and all(map(np.array_equal, (A, B, rows), held[:3])):
-            if held.prepared is None and isinstance(self.solver, DualActiveSet):  # seen twice: it may well stay
-                held = self._held = held._replace(prepared=self.solver.prepare(held.P, held.G, self.soft))
-            P, G, prepared = held.P, held.G, held.prepared
-        else:
-            (P, G), prepared = self._condenser.curvature(A, B, rows), None
-            self._held = _Held(A, B, rows, P, G, None) if len(A) == 1 else None
-        q, values = self._condenser.slope(
-            A, B, prediction.c, prediction.start, rows, request.targets, request.wanted, request.last
-        )
         low, high = self._chance.limits(prediction)
-        lower, upper = self._condenser.bounds(request.last, low - values, high - values)
-        return _Stacked(P, q, G, lower, upper, prepared)
+        references = References(request.targets, request.wanted, request.last)
+        stages, state_rows = Stages(A, B, prediction.c), StateRows(rows, low, high)
+        program = self._condenser.condense(stages, prediction.start, references, state_rows)
+        plain, held = not len(program.feedback), self._held if len(A) == 1 else None
+        soft = self.soft if plain else self._chance.softness(len(program.G) - low.size)
+        if held is not None and plain and all(map(np.array_equal, (A, B, rows), held[:3])):
+            if held.prepared is None and isinstance(self.solver, DualActiveSet):  # seen twice: it may well stay
+                held = self._held = held._replace(prepared=self.solver.prepare(program.P, program.G, soft))
+        else:
+            held = self._held = _Held(A, B, rows, None) if len(A) == 1 else None
+        return _Stacked(*program, soft, None if held is None else held.prepared)
 
     def _solve(self, stacked: _Stacked, warm: QPSolution | None) -> QPSolution:
-        P, q, G, lower, upper, prepared = stacked
+        P, q, G, lower, upper, _, soft, prepared = stacked
         if prepared is not None:
             return prepared.solve(q, lower, upper, warm)
         if isinstance(self.solver, DualActiveSet):
-            return self.solver.solve_stacked(P, q, G, lower, upper, warm, self.soft)
+            return self.solver.solve_stacked(P, q, G, lower, upper, warm, soft)
         warm = warm if warm is not None and len(warm.q) == len(q) and len(warm.lower) == len(lower) else None
         return self.solver.solve(QuadraticProgram.from_stacked(P, q, G, lower, upper), warm)
 

@@ -15,9 +15,9 @@ from typing import Literal
 
 import numpy as np
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import DynamicsModel
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.convergence import FEASIBLE
 from gpmpc.mpc.descent import FAILURES, Program, slsqp, sqp

@@ -33,13 +33,13 @@ import torch
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.evaluation import chosen_evaluation, host_arrays, point_arrays
+from gpmpc.gp.backend import chosen_backend, host_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.kernels.extended import roots
-from gpmpc.mpc.ancillary_feedback import lqr_gain, spread
+from gpmpc.mpc.ancillary_feedback import spread
 from gpmpc.mpc.compiled_rollout import CompiledRollout
-from gpmpc.mpc.condensing import respond
 from gpmpc.mpc.controller import Decision
+from gpmpc.mpc.linear_quadratic import Stages, expand, finite_horizon_lqr
 from gpmpc.mpc.request import Request, check_method
 from gpmpc.mpc.stage_models import disturbed, is_first_order, stage_model
 from gpmpc.mpc.tracking import TrackingProblem
@@ -76,9 +76,8 @@ class Prediction:
 
     def states(self, inputs: Array) -> Array:
         """s_0 .. s_H (H + 1, p) under inputs (H, m), as the stage models have it."""
-        states = np.empty((len(inputs) + 1, len(self.start)))
-        respond(self.A, self.B, self.c, self.start, np.ascontiguousarray(inputs), states)
-        return states
+        (_, p, m), stages = self.B.shape, Stages(self.A, self.B, self.c)
+        return expand(stages, self.start, np.empty((0, m, p + m + 1)), np.zeros(m), inputs.ravel())[1]
 
 
 class Predictor:
@@ -130,7 +129,7 @@ class Predictor:
     @property
     def compiled(self) -> bool:
         """Whether compiled loops answer: a rollout takes microseconds, and many of them go one by one."""
-        if chosen_evaluation() == "auto":
+        if chosen_backend() == "auto":
             return self._compiles and self._in_host_memory
         return self._compiles and host_arrays(self.model.weights) is not None
 
@@ -282,11 +281,11 @@ class Predictor:
             return A, B, c, stage.next, None if stage.V is None else _array(stage.V)
         x, u = _array(belief.mean), _array(input)
         if self.covariance == "none":
-            (mean, A, B), V = point_arrays(self.model, "mean_with_jacobian", x, u), None
+            mean, A, B = (part[0] for part in self.model.linearize(x[None], u[None], covariance=False)[:3])
+            V = None
             S = belief.covariance
         else:
-            mean, variance, A, B = point_arrays(self.model, "point_with_jacobian", x, u)
-            V = np.diag(variance)
+            mean, A, B, V = (part[0] for part in self.model.linearize(x[None], u[None]))
             if self.propagator.observation_noise:
                 V += _array(self.model.noise_covariance)
             S = self._tensor(A @ _array(belief.covariance) @ A.T + V)
@@ -298,7 +297,7 @@ class Predictor:
     def gain(self, A: Array, B: Array) -> Array:
         """K (m, n) of the ancillary feedback, from dmu+/dmu (n, n) and dmu+/du (n, m)."""
         problem = self.problem
-        return lqr_gain(A, B, problem.Q, problem.R, problem.terminal, self.horizon)
+        return -finite_horizon_lqr(A[None], B[None], problem.Q, problem.R, problem.terminal, self.horizon)[0][0]
 
     def _belief(self, mean: Array, covariance: Array) -> Gaussian:
         known = np.zeros_like(covariance) if self.covariance == "none" else covariance

@@ -25,7 +25,7 @@ from gpmpc.exceptions import DataError
 from gpmpc.mpc import sequential_loop as loop
 from gpmpc.mpc.chance_constraints import ChanceConstraints
 from gpmpc.mpc.compiled_rollout import NO_MODEL, NOTHING
-from gpmpc.mpc.condensing import Condenser
+from gpmpc.mpc.condense import Condenser
 from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.mpc.flat_arrays import Layout, flattened
 from gpmpc.mpc.prediction import Predictor
@@ -97,7 +97,7 @@ class SequentialPrograms:
         self._predictor, self._chance, self._solver, self._soft = predictor, chance, solver, soft
         self._condenser, self._limits = condenser, (limit, tolerance)
         problem, H, r = predictor.problem, predictor.horizon, len(chance.known[0])
-        n, m, rows = problem.state_dim, problem.input_dim, condenser.rate_rows + predictor.horizon * r
+        n, m, rows = problem.state_dim, problem.input_dim, condenser.bounds.rate_lower.size + predictor.horizon * r
         p, size = n * len(predictor.extended(problem.Q)), H * m
         self._ours = isinstance(solver, DualActiveSet)
         self._softness, self._work = (solver if self._ours else DualActiveSet()).workspace(rows, size, soft)
@@ -120,14 +120,14 @@ class SequentialPrograms:
         """What the loop knows of its controller: columns, what is flat, and its table."""
         uncertain, _, gp, columns, (offset, difference), *_, noise = rollout
         problem, (limit, tolerance) = self._predictor.problem, self._limits
-        (weight, terminal, R, penalized), of_inputs = self._condenser.known
+        weight, terminal, R, penalized = self._condenser.cost
         *bounds, kappa, prices = self._chance.known
         constant = np.empty((1, 0, 1)) if self._chance.constant is None else self._chance.constant
         sides = problem.input_lower, problem.input_upper, problem.rate_lower, problem.rate_upper
         settings = np.array(
             [uncertain, self._predictor.feedback, difference, penalized, kappa, limit, tolerance], dtype=float
         )
-        weights = problem.Q, problem.terminal, *sides, weight, terminal, R, *of_inputs
+        weights = problem.Q, problem.terminal, *sides, weight, terminal, R, *self._condenser.bounds
         return columns, *flattened([*gp, offset, noise, *weights, *bounds, prices, constant, settings])
 
     def __call__(self, request: Request, previous: Decision | None, warm: QPSolution | None) -> Reached:

@@ -12,9 +12,16 @@ from numba import types
 from gpmpc.compiled import borrowing, clock, compiled, copy, copy_matrix
 from gpmpc.mpc.chance_constraints import tighten, violation_price
 from gpmpc.mpc.compiled_rollout import roll_out
-from gpmpc.mpc.condensing import condense, respond, tracking_cost
+from gpmpc.mpc.condense import (
+    CondensedProgram,
+    InputBounds,
+    StateRows,
+    write_gradient_and_bounds,
+    write_hessian_and_rows,
+)
 from gpmpc.mpc.convergence import FEASIBLE, kkt_share
 from gpmpc.mpc.flat_arrays import part
+from gpmpc.mpc.linear_quadratic import References, Stages, TrackingCost, expand, tracking_cost
 from gpmpc.mpc.quasi_newton import MEMORY, correct
 from gpmpc.qp import record as layout
 from gpmpc.qp.dual_kernels import solve_lazy
@@ -26,7 +33,7 @@ HEADER, RECORD_STATUS = layout.HEADER, layout.STATUS
 # What is known, in this order:
 POINTS, SQUARES, LOG_SIGNAL, BETA, OFFSET, NOISE, FEEDBACK_Q, FEEDBACK_TERMINAL = range(8)  # of the rollout
 INPUT_LOWER, INPUT_UPPER, RATE_LOWER, RATE_UPPER = range(8, 12)
-WEIGHT, TERMINAL, INPUT_WEIGHT, INPUT_HESSIAN, RATE_ROWS, BOX_LOWER, BOX_UPPER = range(12, 19)  # of the condenser
+WEIGHT, TERMINAL, INPUT_WEIGHT, BOX_LOWER, BOX_UPPER, RATES_LOWER, RATES_UPPER = range(12, 19)  # of the condenser
 BOUNDED, SIGN, BOUND, PRICES, CONSTANT_ROWS, SETTINGS = range(19, 25)  # of the chance constraints; numbers
 UNCERTAIN, FEEDBACK, DIFFERENCE, PENALIZED, KAPPA, LIMIT, TOLERANCE = range(7)  # settings
 
@@ -71,7 +78,9 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
         answer: What comes out, flat.
         parts: Its table.
     """
-    model, condenser, chance, (rate_lower, rate_upper), constant, (limit, tolerance) = told(known, places, columns)
+    model, (weights, bounds), chance, (rate_lower, rate_upper), constant, (limit, tolerance) = told(
+        known, places, columns
+    )
     start, covariance, disturbance, targets, wanted, last, shifted = question
     H, m = wanted.shape
     kept = np.empty_like(along)  # of the plan that was reached; ``along`` is of the one that is tried
@@ -81,8 +90,9 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
     P, q, G = part(answer, parts[P_OF]), part(answer, parts[Q_OF])[0], part(answer, parts[G_OF])
     lower, upper, record = part(answer, parts[LOWER])[0], part(answer, parts[UPPER])[0], part(answer, parts[RECORD])[0]
     states, outcome = part(answer, parts[STATES]), part(answer, parts[OUTCOME])[0]
-    size, M, bounded, limited = len(q), len(lower), low.shape[1] > 0, len(condenser[1][1])
-    program, warm, solved = (P, q, G, lower, upper), guess, np.empty_like(record)
+    size, M, bounded, limited = len(q), len(lower), low.shape[1] > 0, bounds.rate_lower.size
+    references, plain = References(targets, wanted, last), np.empty((0, m, A.shape[1] + m + 1))
+    program, warm, solved = CondensedProgram(P, q, G, lower, upper, plain), guess, np.empty_like(record)
     solution, z = record[HEADER : HEADER + size], record[HEADER + size + size : HEADER + size + M]
     vectors, pairs, count = np.empty((6, size)), np.empty((2, MEMORY, size)), 0
     slope, diagonal, step, before = vectors[0], vectors[1], vectors[2], vectors[3]
@@ -99,13 +109,15 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
     else:
         yield MODEL
     respond(A_tried, B_tried, c_tried, start, trial, states)
-    cost = tracking_cost(condenser, states, trial, targets, wanted, last)
+    cost = tracking_cost(weights, states, trial, references)
     copy(along, kept)
     copy(moved, plan)
     for number in range(limit):
         now = clock()
         outcome[COUNT] = number + 1
-        condense(condenser, (A, B, c, E, low_here, high_here), start, targets, wanted, last, program)
+        affine, bounded_rows = Stages(A, B, c), StateRows(E, low_here, high_here)
+        write_hessian_and_rows(weights, bounds, affine, bounded_rows, program)
+        write_gradient_and_bounds(weights, bounds, affine, start, references, bounded_rows, program)
         apply(P, plan, scratch)
         for i in range(size):
             slope[i], diagonal[i] = q[i] + scratch[i], P[i, i]
@@ -176,7 +188,7 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
             else:
                 yield MODEL
             respond(A_tried, B_tried, c_tried, start, trial, states)
-            reached = tracking_cost(condenser, states, trial, targets, wanted, last)
+            reached = tracking_cost(weights, states, trial, references)
             merit = reached
             if bounded:  # the tightening of zero_order stays during the search
                 merit += violation_price(chance, rows, states, low_here, high_here, price)
@@ -213,6 +225,13 @@ programs = compiled(locked=True)(sequence)
 
 
 @compiled
+def respond(A, B, c, start, inputs, states):
+    """Writes s_0 .. s_H (H + 1, p) under inputs (H, m) to ``states``."""
+    (_, p, m), unknowns = B.shape, inputs.copy().reshape(inputs.size)
+    copy_matrix(expand(Stages(A, B, c), start, np.empty((0, m, p + m + 1)), np.zeros(m), unknowns)[1], states)
+
+
+@compiled
 def told(known, places, columns):
     """What stays, as those take it who need it."""
     settings = part(known, places[SETTINGS])[0]
@@ -239,12 +258,12 @@ def told(known, places, columns):
         part(known, places[NOISE]),
     )
     condenser = (
-        (weight.reshape(-1, n, n), terminal.reshape(-1, n, n), R, int(settings[PENALIZED])),
-        (
-            part(known, places[INPUT_HESSIAN]),
-            part(known, places[RATE_ROWS]),
-            part(known, places[BOX_LOWER])[0],
-            part(known, places[BOX_UPPER])[0],
+        TrackingCost(weight.reshape(-1, n, n), terminal.reshape(-1, n, n), R, int(settings[PENALIZED])),
+        InputBounds(
+            part(known, places[BOX_LOWER]),
+            part(known, places[BOX_UPPER]),
+            part(known, places[RATES_LOWER]),
+            part(known, places[RATES_UPPER]),
         ),
     )
     chance = (

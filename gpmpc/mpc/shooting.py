@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import DynamicsModel
 from gpmpc.mpc.request import Request
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Propagator, differentiate

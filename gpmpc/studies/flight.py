@@ -141,7 +141,7 @@ class Experiment:
         It is what the model has learned of it; a controller that knows the plant knows its noise as well.
         """
         n = len(self.plant.dynamics.state_names)
-        if getattr(self.propagator, "observation_noise", False) or self.loop == "model":
+        if getattr(self.propagator, "process_noise", False) or self.loop == "model":
             return np.zeros(n)
         if training is not None:
             return training.posterior.noise_covariance.diagonal().sqrt().numpy()

@@ -23,8 +23,7 @@ from threadpoolctl import threadpool_limits
 import gpmpc
 from gpmpc.compiling import tell_of_compiling
 from gpmpc.exceptions import DataError, GpmpcError, check_number
-from gpmpc.gp import Training, Transitions
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp import GPPosterior, Training, Transitions, load_posterior, save_posterior
 from gpmpc.parallel import in_processes
 from gpmpc.studies.document import Document, Table
 
@@ -193,11 +192,11 @@ def random_rows(count: int, size: int, seed: int) -> list[int]:
 
 def trained_model(train: Callable[..., Training], settings: Any, data: Transitions, seed: int, folder: Path) -> Path:
     """Trains GPs unless a file in ``folder`` holds those of the same settings, data and seed; returns that file."""
-    path = folder / "models" / f"{fingerprint([settings, seed], data.features, data.next_states)}.npz"
+    path = folder / "models" / f"{fingerprint([settings, seed], data.features, data.next_states)}.safetensors"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         with one_thread():
-            train(data, seed=seed).posterior.save(path)
+            save_posterior(train(data, seed=seed).posterior, path)
     return path
 
 
@@ -216,4 +215,4 @@ def one_thread() -> Iterator[None]:
 @lru_cache(maxsize=8)
 def load_model(path: Path) -> GPPosterior:
     """Reads trained GPs, once a process."""
-    return GPPosterior.load(path)
+    return load_posterior(path)

@@ -8,7 +8,7 @@ import torch
 
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import evaluation
+from gpmpc.gp import backend
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.convex_mpc import ConvexMPC
 from gpmpc.mpc.nmpc import NMPC
@@ -208,7 +208,7 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
         return found
 
     controller.predictor.along = watched
-    with evaluation("torch"):  # which the loop has to ask
+    with backend("torch"):  # which the loop has to ask
         decision = controller.control(Gaussian.certain(state), reference)
     assert decision.status is Status.SOLVED
     assert 2 < decision.iterations < 25
@@ -432,7 +432,7 @@ def test_the_compiled_rollout_is_the_one_stage_by_stage(covariance, feedback, ob
     compiled, by_torch = ConvexMPC(*arguments, feedback=feedback), ConvexMPC(*arguments, feedback=feedback)
     belief = Gaussian(torch.full((6,), 0.2), 1e-3 * torch.eye(6))
     first = compiled.control(belief, at_origin(H))
-    with evaluation("torch"):
+    with backend("torch"):
         expected = by_torch.control(belief, at_origin(H), first)
     found = compiled.control(belief, at_origin(H), first)
     assert np.allclose(found.inputs, expected.inputs, atol=1e-9)
@@ -447,6 +447,6 @@ def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_reque
     for noise in (False, True):
         how = Linearization(observation_noise=noise)
         controller = ConvexMPC(gp(), how, quadrotor_problem(), 3, HOVER, form, covariance, feedback=False)
-        with evaluation(evaluated):
+        with backend(evaluated):
             found.append(controller.control(state, at_origin(3)).covariances[1])
     assert np.allclose(found[1] - found[0], gp().noise_covariance, atol=1e-6)  # of 1e-4; the plans differ a little

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from gpmpc.gaussian import Gaussian, square_root
-from gpmpc.gp import Affine, GPPosterior, ResidualModel
+from gpmpc.gp import GPPosterior
+from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc.stage_models import disturbed, stage_model
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from tests.mpc.small_models import double_integrator, pendulum_posterior
