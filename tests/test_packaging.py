@@ -20,10 +20,11 @@ def wheel(tmp_path_factory):
     return path
 
 
-def test_the_wheel_carries_the_settings_and_the_printed_figures(wheel):
+def test_the_wheel_carries_the_settings_the_printed_figures_and_its_types(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     settings = {str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml")}
     assert {f"gpmpc/{name}" for name in settings} <= set(names)
+    assert "gpmpc/py.typed" in names
     results = {path.name for path in (ROOT / "experiments").iterdir() if path.is_file()}
     assert {"paper_tables.csv", "paper_timings.csv", "tables.py", "figures.py"} <= results
     assert {f"gpmpc/experiments/{name}" for name in results} <= set(names)

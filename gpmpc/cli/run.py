@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -86,7 +87,6 @@ def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
 
 def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
     """Trains, flies and records; returns the metrics."""
-    from gpmpc.simulation import recording_callback
     from gpmpc.studies.flight import metrics, run_trial
 
     if config.recorder != "mcap":
@@ -95,7 +95,7 @@ def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, abou
 
         def prepare(controller: Any, training: Any) -> Callable:
             recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller.problem, training))
-            callback = recording_callback(recorder, 0 if training is None else len(training.posterior))
+            callback = partial(recorder.record, gp_size=0 if training is None else len(training.posterior))
             return _in_real_time(callback, experiment.plant.time_step) if config.live else callback
 
         flown = run_trial(experiment, prepare)
