@@ -7,10 +7,11 @@ returns nothing if all is well.
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import DynamicsModel
+from gpmpc.dynamics import DynamicsModel, linearize, to_array
 from gpmpc.gaussian import Gaussian
 from gpmpc.testing.promise import require, require_close, require_covariance
 
@@ -31,7 +32,7 @@ def check_model(
         AssertionError: The model breaks a promise; the message says which.
     """
     _check_attributes(model)
-    n, m, k = model.state_dim, model.input_dim, model.output_dim
+    n, m = model.state_dim, model.input_dim
     generator = torch.Generator().manual_seed(seed)
     like = {"dtype": model.dtype, "device": model.device}
     states = torch.randn(4, n, generator=generator) if states is None else states
@@ -61,20 +62,34 @@ def check_model(
     if m == 0:
         _check_same("predict: without inputs u may be left out", model.predict(states), together, exact)
 
-    at, by_state, by_input = _untouched(model.predict_with_jacobian, "predict_with_jacobian", states, inputs)
-    _check_same("predict_with_jacobian: its prediction is predict's", at, together, exact)
-    for name, got, columns in (("state", by_state, n), ("input", by_input, m)):
-        promise = f"predict_with_jacobian: the derivative by the {name} is (*batch, k, {'n' if columns == n else 'm'})"
-        shape, expected = tuple(got.shape), (len(states), k, columns)
-        require(shape == expected and got.dtype == model.dtype, promise, f"got {got.dtype} {shape}, not {expected}")
+    x, u = to_array(states), to_array(inputs)
+    at = linearize(model, x, u)
     expected = _numeric_jacobian(model, states, inputs)
-    for name, got, numbers in (("state", by_state, expected[..., :n]), ("input", by_input, expected[..., n:])):
-        promise = f"predict_with_jacobian: the derivative by the {name} agrees with finite differences of predict"
-        require_close(promise, got, numbers, numeric)
-    single_out = model.predict_with_jacobian(states[1], inputs[1])
-    for name, got, whole in (("state", single_out[1], by_state), ("input", single_out[2], by_input)):
-        promise = f"predict_with_jacobian: a batch is the loop over its members (derivative by the {name})"
-        require_close(promise, got, whole[1], exact)
+    wanted = {
+        "mean": (together.mean, exact),
+        "A": (expected[..., :n], numeric),
+        "B": (expected[..., n:], numeric),
+        "covariance": (together.covariance, exact),
+    }
+    for name, (numbers, tolerance) in wanted.items():
+        got = getattr(at, name)
+        promise = f"linearize: {name} is a C-contiguous float64 array of shape {tuple(numbers.shape)}"
+        right = isinstance(got, np.ndarray) and got.dtype == np.float64 and got.flags.c_contiguous
+        require(right and got.shape == tuple(numbers.shape), promise, f"got {type(got).__name__} {np.shape(got)}")
+        source = "the finite differences of predict" if name in "AB" else "the prediction of predict"
+        promise, floor = f"linearize: {name} agrees with {source}", 1e-4 if tolerance < 1e-6 else 1.0
+        require_close(promise, torch.from_numpy(got), numbers.cpu().double(), tolerance, name, floor)
+    one_out, without = linearize(model, x[1:2], u[1:2]), linearize(model, x, u, covariance=False)
+    require(without.covariance is None, "linearize: without covariance it is None", f"got {without.covariance!r}")
+    for name in ("mean", "A", "B"):
+        parts = [torch.from_numpy(getattr(found, name)) for found in (at, one_out, without)]
+        promise = f"linearize: a batch is the loop over its points ({name})"
+        require_close(promise, parts[1][0], parts[0][1], exact)
+        require_close(
+            f"linearize: {name} does not depend on whether the covariance is wanted", parts[2], parts[0], exact
+        )
+    unchanged = np.array_equal(x, to_array(states)) and np.array_equal(u, to_array(inputs))
+    require(unchanged, "linearize: the caller's states and inputs are left as they are", "one was modified")
 
 
 def _check_attributes(model: DynamicsModel) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import predict_with_jacobian
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.gp.posterior import GPPosterior
@@ -236,7 +237,7 @@ def _check_monte_carlo(case: _Case) -> None:
 
 def _check_first_order_correlation(case: _Case) -> None:
     at, scale = case.belief, 1e-6
-    _, A, _ = case.model.predict_with_jacobian(at.mean, case.input)
+    _, A, _ = predict_with_jacobian(case.model, at.mean, case.input)
     got = case(Gaussian(at.mean, scale * at.covariance)).cross_covariance / scale
     tolerance = 1e-3 + (10 * case.samples**-0.5 if case.samples else 0)
     promise = "the cross covariance Cov[x, x+] is S A' to first order"
