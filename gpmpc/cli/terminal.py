@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-_SEARCH = "gpmpc.gp.search"  # logs single evaluations, where a bar says how far the work is
+_SEARCH = "gpmpc.gp._search"  # logs single evaluations, where a bar says how far the work is
 
 
 class Output:
