@@ -2,11 +2,11 @@
 
 A solver that is warm-started is judged only by a sequence in which the next problem resembles the last one as it does
 in use. Here the translational subsystem of the quadrotor (thrust and two tilts in, positions and velocities out)
-follows a curve under process noise. Its MPC is condensed to the inputs of the horizon: input bounds become the box of
-the QP (n = 3H), bounds on the six states of every stage its rows (6H); or, as a second family, on the three positions
-(3H). On a fast Lissajous curve the bounds narrow and widen (a corridor that the vehicle passes), so that constraints
-come and go; the paper's trajectories are flown four times as fast, within bounds a little inside them. Bounds are never
-narrower than what a known feasible plan needs.
+follows a fast Lissajous curve under process noise. Its MPC is condensed to the inputs of the horizon: input bounds
+become the box of the QP (n = 3H), bounds on the six states of every stage its rows (6H); or, as a second family, on
+the three positions (3H). The bounds narrow and widen
+(a corridor that the vehicle passes), so that constraints come and go; they are never narrower than what a known
+feasible plan needs.
 
 ``constant``: the model is linearised once, at hover; P and G stay. ``changing``: it is linearised at every step around
 the thrust and tilt of the reference motion, so P and G are new in each problem.
@@ -18,7 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gpmpc.trajectories import Elliptical, Lorenz, states_along
+from benchmarks.quadrotor import HOVER, TRAJECTORIES, problem, recorded, trained
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.tracking import StateBounds
+from gpmpc.propagation import Linearization
+from gpmpc.trajectories import states_along
 
 Array = NDArray[np.float64]
 
@@ -31,9 +35,11 @@ INPUT_WEIGHT = np.diag([0.05, 2.0, 2.0])
 INPUT_LIMIT = np.array([4.0, 0.45, 0.45])  # deviation from hover: thrust [N], tilts [-]
 WIDE = np.array([5.0, 6.0] * 3)  # bounds on positions [m] and velocities [m/s] outside the corridor
 NARROW = np.array([2.5, 2.5] * 3)  # and inside it
-SPEED_UP = 4.0  # of the paper's trajectories
-LIMITS = {"elliptical": np.array([14.0, 8.0] * 2 + [1e3, 8.0]), "lorenz": np.array([10.0, 8.0, 13.0, 8.0, 1e3, 8.0])}
 POSITION_NOISE, VELOCITY_NOISE = 0.01, 0.05  # standard deviations per step [m], [m/s]
+
+
+# Bounds that are active at about one step in ten: of ux and uy [-], and of the increments of U1 [N], ux, uy.
+TIGHT = {"elliptical": (0.015, [0.014, 0.004, 0.004]), "lorenz": (0.04, [0.2, 0.02, 0.03])}
 
 
 @dataclass(frozen=True)
@@ -47,11 +53,8 @@ class SequenceProblem:
     upper: Array
 
 
-def _reference(times: Array, trajectory: str) -> Array:
+def _reference(times: Array) -> Array:
     """Positions and velocities of the curve, one row of six per time."""
-    if trajectory != "lissajous":
-        states = states_along({"elliptical": Elliptical(), "lorenz": Lorenz()}[trajectory], SPEED_UP * times)
-        return states * np.tile([1.0, SPEED_UP], 3)
     frequencies, amplitudes = np.array([0.9, 1.3, 0.7]), np.array([4.0, 3.0, 2.0])
     phase = times[:, None] * frequencies
     positions, velocities = amplitudes * np.sin(phase), amplitudes * frequencies * np.cos(phase)
@@ -84,22 +87,14 @@ def _condense(A: Array, B: Array, horizon: int) -> tuple[Array, Array]:
     return free, forced
 
 
-def _state_limits(times: Array, trajectory: str) -> Array:
-    """The bound on each state at each time: of a trajectory, or a corridor of two seconds out of every six."""
-    if trajectory != "lissajous":
-        return np.tile(LIMITS[trajectory], len(times))
+def _state_limits(times: Array) -> Array:
+    """The bound on each state at each time: a corridor of two seconds out of every six."""
     inside = np.mod(times, 6.0) > 4.0
     return np.where(inside[:, None], NARROW, WIDE).ravel()
 
 
 def quadrotor_sequence(
-    horizon: int,
-    changing: bool,
-    length: int,
-    solve,
-    seed: int = 0,
-    positions_only: bool = False,
-    trajectory: str = "lissajous",
+    horizon: int, changing: bool, length: int, solve, seed: int = 0, positions_only: bool = False
 ) -> Iterator[SequenceProblem]:
     """The QPs of ``length`` closed-loop steps; ``solve(problem) -> x`` closes the loop.
 
@@ -109,7 +104,7 @@ def quadrotor_sequence(
     rng = np.random.default_rng(seed)
     weight = np.kron(np.eye(horizon), STATE_WEIGHT)
     box = np.tile(INPUT_LIMIT, horizon)
-    state, plan = _reference(np.zeros(1), trajectory)[0], np.zeros(3 * horizon)
+    state, plan = _reference(np.zeros(1))[0], np.zeros(3 * horizon)
     prepared = None
     for step in range(length):
         now = step * TIME_STEP
@@ -123,14 +118,37 @@ def quadrotor_sequence(
         G = np.ascontiguousarray(forced[bounded])
         times = now + TIME_STEP * np.arange(1, horizon + 1)
         drift = free @ state
-        reference = _reference(times, trajectory).ravel()
-        q = gradient @ (drift - reference)
-        limits, offset = _state_limits(times, trajectory)[bounded], drift[bounded]
+        q = gradient @ (drift - _reference(times).ravel())
+        limits, offset = _state_limits(times)[bounded], drift[bounded]
         feasible = G @ np.clip(np.concatenate([plan[3:], plan[-3:]]), -box, box)
         lower = np.concatenate([-box, np.minimum(-limits - offset, feasible - 0.01)])
         upper = np.concatenate([box, np.maximum(limits - offset, feasible + 0.01)])
-        problem = SequenceProblem(P, q, G, lower, upper)
-        yield problem
-        plan = solve(problem)
+        program = SequenceProblem(P, q, G, lower, upper)
+        yield program
+        plan = solve(program)
         noise = rng.standard_normal(6) * np.tile([POSITION_NOISE, VELOCITY_NOISE], 3)
         state = A @ state + B @ plan[:3] + noise
+
+
+def flight_sequence(trajectory: str, horizon: int, length: int) -> list[SequenceProblem]:
+    """The QPs of a flight of the learned quadrotor with the plant in the loop, those without a solution left out."""
+    states = states_along(TRAJECTORIES[trajectory], np.arange(length + horizon + 1.0))
+    margin = 0.05 + 0.02 * np.ptp(states, axis=0)  # [m, m/s] around all that the reference visits
+    bounds = StateBounds(states.min(axis=0) - margin, states.max(axis=0) + margin)
+    bounded = problem(bounds, tilt=TIGHT[trajectory][0])
+    controller = ConvexMPC(trained(trajectory), Linearization(), bounded, horizon, HOVER)
+    steps = recorded(controller, trajectory, length)
+    programs = [step.decision.problem for step in steps if step.decision.status.solved]
+    return [_two_sided(*(np.array(part) for part in program[:5])) for program in programs]
+
+
+def _two_sided(P: Array, q: Array, G: Array, lower: Array, upper: Array) -> SequenceProblem:
+    """Merges rows that are equal, such as an upper and a lower bound of one state: other solvers have fewer to scan."""
+    n = len(q)
+    rows, first, group = np.unique(G, axis=0, return_index=True, return_inverse=True)
+    low, high = np.full(len(rows), -np.inf), np.full(len(rows), np.inf)
+    np.maximum.at(low, group.ravel(), lower[n:])
+    np.minimum.at(high, group.ravel(), upper[n:])
+    order = np.argsort(first)
+    G, low, high = np.ascontiguousarray(rows[order]), low[order], high[order]
+    return SequenceProblem(P, q, G, np.concatenate([lower[:n], low]), np.concatenate([upper[:n], high]))
