@@ -1,0 +1,313 @@
+"""GP model predictive control: the control step, from a belief and a reference to the input.
+
+The dynamics of the belief are linearised along a plan (``gpmpc.mpc.prediction_model``), the states eliminated
+(``gpmpc.mpc.condensing``), and what is left is a quadratic program in the inputs. One of them a step, of the form
+``trajectory``, is the real-time iteration (Diehl, Bock and Schloeder, 2005); of the form ``velocity`` with moments
+matched it is the convex GP-MPC of Cao, Lai and Alam (2017, section 4). Iterated (``gpmpc.mpc.sqp``), programs solve the
+nonlinear problem itself. Where the iteration ends, in the covariance modes of ``gpmpc.mpc.stages``:
+
+* ``full``, ``diagonal``: at a KKT point of the expected cost of the propagated belief, tr(Q Sigma) included, under
+  chance constraints: the nonlinear GP-MPC of Cao, Lai and Alam (2017, eq. (22)), where moments are matched.
+* ``zero_order``: the cost of the means under bounds tightened by the covariances that the solution itself leads to;
+  that these depend on the inputs is left out of the derivatives.
+* ``none``: the cost of the means.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+import torch
+
+from gpmpc.exceptions import DataError, ProblemError, SettingError, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.mpc.condensing import Condenser, condense, respond, tracking_cost
+from gpmpc.mpc.constraints import price_violations
+from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc.prediction_model import Form, Prediction, PredictionModel
+from gpmpc.mpc.request import Request, check_method
+from gpmpc.mpc.sqp import FEASIBLE, Functions, Globalization
+from gpmpc.mpc.stages import Covariance, Plan, Stages
+from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.propagation import Propagator
+from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
+from gpmpc.status import Status
+
+Array = np.ndarray
+
+_SMALL = 1e-3  # share of an input's size whose cost counts where the cost itself vanishes
+_FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, torch.linalg.LinAlgError)  # no finite numbers
+
+
+class GPMPC:
+    """GP-MPC by quadratic programs.
+
+    Args:
+        model: What was learned.
+        propagator: How the belief moves; ``covariance="none"`` needs the model's mean only.
+        problem: Weights and bounds.
+        horizon: H, the number of predicted states.
+        initial_input: The input before the first step, and the first guess of every planned one (m,).
+        form: ``"trajectory"`` or ``"velocity"``; see ``gpmpc.mpc.prediction_model``.
+        covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see ``gpmpc.mpc.stages``.
+        solver: Of the quadratic program; ``DualActiveSet()`` by default, which state bounds with a price need.
+        iterations: Quadratic programs a step at most; more than one for ``"trajectory"`` only.
+        tolerance: Of more iterations: relative offset and defects of a plan that counts as solved (``gpmpc.mpc.sqp``),
+            estimated from the slower of the last two rates of convergence. 1e-8 may be out of reach.
+        feedback: Predicts the covariances of ``"zero_order"`` under a feedback, without which no long horizon with
+            state bounds is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"`` and
+            ``"diagonal"`` are those without feedback.
+        disturbance_gain: L in [0, 1], the observer gain of the constant-disturbance estimate; 0 disables it.
+
+    Attributes:
+        soft: Prices of the rows of the program's G, None where all are hard.
+
+    Raises:
+        SettingError: A setting is unknown or out of its range, or model and problem have other dimensions.
+    """
+
+    def __init__(
+        self,
+        model: DynamicsModel,
+        propagator: Propagator,
+        problem: TrackingProblem,
+        horizon: int,
+        initial_input: Sequence[float],
+        form: Form = "trajectory",
+        covariance: Covariance = "zero_order",
+        solver: QPSolver | None = None,
+        iterations: int = 1,
+        tolerance: float = 1e-6,
+        feedback: bool = True,
+        disturbance_gain: float = 0.0,
+    ):
+        settings = form, covariance, feedback, disturbance_gain
+        self.prediction = PredictionModel(model, propagator, problem, horizon, initial_input, *settings)
+        check_number("iterations", iterations, least=1, whole=True)
+        check_number("tolerance", tolerance, above=0)
+        if iterations > 1 and form != "trajectory":
+            raise SettingError("iterations", f"form {form!r} is one quadratic program, so 1; got {iterations}")
+        self.initial_input, self.problem, self.horizon = self.prediction.initial_input, problem, horizon
+        self.iterations, self.tolerance = iterations, tolerance
+        self.solver = DualActiveSet() if solver is None else solver
+        check_method("solver", self.solver, "solve", "DualActiveSet()")
+        weight = self.prediction.linearizer.weight
+        self._condenser = Condenser(problem, horizon, weight(problem.Q), weight(problem.terminal))
+        self.soft = self.prediction.constraints.softness(self._condenser.rate_rows)
+        if self.soft is not None and not isinstance(self.solver, DualActiveSet):
+            raise SettingError(
+                "solver", f"state bounds with a price (l1, l2) need DualActiveSet; got {type(self.solver).__name__}"
+            )
+
+    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+        """Decides the input for one step; see ``Controller.control``.
+
+        A belief that is not finite gives ``INVALID_MEASUREMENT``. ``iterations`` of the decision counts quadratic
+        programs; with more than one allowed, ``ITERATION_LIMIT`` says that the tolerance was not reached, and the plan
+        is the best that was: ``suboptimal``.
+
+        Args:
+            belief: What is known of the state.
+            reference: Over the horizon, with inputs where the weights ask for them.
+            previous: The last decision; one that is not applicable is ignored.
+
+        Raises:
+            ShapeError: Belief or reference have other dimensions, or reference inputs are missing.
+        """
+        request, clock = self.prediction.read(belief, reference, previous), _Stopwatch()
+        if not request.finite:
+            return request.unanswered(Status.INVALID_MEASUREMENT)
+        try:
+            plan = self.prediction.initial_guess(request, previous)
+            prediction = self.prediction.linearize(plan, request, previous)
+            return self._improve(prediction, request, previous, clock)
+        except _FAILURES:
+            return request.unanswered(Status.NUMERICAL_TROUBLE, timing=clock.timing)
+
+    def _improve(
+        self, prediction: Prediction, request: Request, previous: Decision | None, clock: "_Stopwatch"
+    ) -> Decision:
+        """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
+        guess, solution = prediction.plan, previous.solution if previous is not None and previous.applicable else None
+        globalize = self._globalization(request) if self.iterations > 1 else _take_full_step
+        for count in range(1, self.iterations + 1):
+            clock.model()
+            program = self._condense(prediction, request)
+            clock.build()
+            solution = self._solve(program, solution)
+            clock.solve()
+            if not _is_usable(solution, prediction.plan):
+                status = solution.status
+                break
+            proposed = self._proposed(prediction, solution)
+            prediction, status = globalize(prediction, proposed, solution)
+            if status is not None:
+                break
+        clock.model()
+        status = Status.ITERATION_LIMIT if status is None else status
+        program = QuadraticProgram.unchecked(*program)
+        suboptimal = not status.solved and prediction.plan is not guess and self._missed(prediction) <= FEASIBLE
+        if not (status.solved or suboptimal):
+            return replace(request.unanswered(status, count, clock.timing), problem=program, solution=solution)
+        plan, disturbance = prediction.plan, request.disturbance if self.prediction.disturbance_gain else None
+        inputs, beliefs = plan.inputs.copy(), self.prediction.linearizer.moments(plan.states, prediction.covariances)
+        found = program, solution, disturbance, suboptimal
+        return Decision(inputs[0], inputs, *beliefs, status, count, clock.timing, *found)
+
+    def control_many(
+        self, beliefs: Sequence[Gaussian], references: Sequence[Reference], previous: Sequence[Decision | None]
+    ) -> list[Decision]:
+        """``control`` for T questions, with the first stages of all of them linearised in one call.
+
+        The quadratic programs are solved one by one. The model's time is shared out equally.
+
+        Args:
+            beliefs: T, one a question.
+            references: T.
+            previous: T decisions, None where there is none.
+
+        Raises:
+            ShapeError: As for ``control``.
+        """
+        asked = list(zip(beliefs, references, previous, strict=True))
+        requests = [self.prediction.read(*question) for question in asked]
+        known, clock = [t for t, request in enumerate(requests) if request.finite], _Stopwatch()
+        decisions = [request.unanswered(Status.INVALID_MEASUREMENT) for request in requests]
+        try:
+            made = self.prediction.linearize_many([requests[t] for t in known], [previous[t] for t in known])
+        except _FAILURES:  # one of them spoils the batch: which one, they say alone
+            return [self.control(*question) for question in asked]
+        clock.model(len(known))
+        for t, prediction in zip(known, made, strict=True):
+            try:
+                decisions[t] = self._improve(prediction, requests[t], previous[t], clock.copy())
+            except _FAILURES:
+                decisions[t] = requests[t].unanswered(Status.NUMERICAL_TROUBLE, timing=clock.timing)
+        return decisions
+
+    def build(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> QuadraticProgram:
+        """The (first) quadratic program of a step, checked.
+
+        Its unknowns are the inputs u_0 .. u_{H-1}, one after the other. Rows of G: increments u_k - u_{k-1} where they
+        are bounded, then the bounded states of the stages 1 to H, upper bounds first; ``soft`` has their prices.
+
+        Args:
+            belief: As for ``control``.
+            reference: As for ``control``.
+            previous: As for ``control``.
+
+        Raises:
+            ShapeError: As for ``control``.
+            DataError: The belief is not finite, or it does not stay so.
+            ProblemError: The program is malformed, numerically.
+        """
+        request = self.prediction.read(belief, reference, previous)
+        plan = self.prediction.initial_guess(request, previous)
+        prediction = self.prediction.linearize(plan, request, previous)
+        return QuadraticProgram.from_stacked(*self._condense(prediction, request))
+
+    def _condense(self, prediction: Prediction, request: Request) -> tuple[Array, ...]:
+        """P, q, G and the bounds of [U; G U]."""
+        (A, B, c, *_), (E, low, high), known = prediction.stages, prediction.rows, self._condenser.known
+        start, (H, m) = prediction.plan.states[0], request.wanted.shape
+        asked = request.targets, request.wanted, request.last
+        if len(A) == 1:
+            P, G = self._condenser.curvature(A, B, E)
+            q, values = self._condenser.slope(A, B, c, start, E, *asked)
+            return P, q, G, *self._condenser.bounds(request.last, low - values, high - values)
+        rows = self._condenser.rate_rows + low.size
+        P, q, G = np.empty((H * m, H * m)), np.empty(H * m), np.empty((rows, H * m))
+        lower, upper = np.empty((2, H * m + rows))
+        condense(known, (A, B, c, E, low, high), start, *asked, (P, q, G, lower, upper))
+        return P, q, G, lower, upper
+
+    def _solve(self, program: tuple[Array, ...], warm: QPSolution | None) -> QPSolution:
+        if isinstance(self.solver, DualActiveSet):
+            return self.solver.solve_stacked(*program, warm, self.soft)
+        _, q, _, lower, _ = program
+        fits = warm is not None and len(warm.q) == len(q) and len(warm.lower) == len(lower)
+        return self.solver.solve(QuadraticProgram.from_stacked(*program), warm if fits else None)
+
+    def _proposed(self, prediction: Prediction, solution: QPSolution) -> Plan:
+        """The plan of a program's solution: its inputs, and the states that the stages lead to."""
+        (A, B, c, *_), plan = prediction.stages, prediction.plan
+        inputs, states = solution.x.reshape(plan.inputs.shape), np.empty_like(plan.states)
+        respond(A, B, c, plan.states[0], inputs, states)
+        return Plan(states, inputs, prediction.covariances)
+
+    def _globalization(self, request: Request) -> Globalization:
+        """Steps and end of the iteration for the problem of one request."""
+        known, prices, of = self._condenser.known, self.prediction.constraints.prices, self.prediction
+        asked = request.targets, request.wanted, request.last
+        zero = tuple(np.zeros_like(part) for part in asked)
+        sizes = np.minimum(np.maximum(1.0, np.abs(request.last)), self.problem.input_upper - self.problem.input_lower)
+        functions = Functions(
+            linearize=lambda plan: of.linearize(of.canonical(plan), request),
+            roll_out=(lambda plan, at: of.roll_out(plan, at, request)) if of.feedback else None,
+            cost=lambda states, inputs: tracking_cost(known, states, inputs, *asked),
+            curvature=lambda states, inputs: tracking_cost(known, states, inputs, *zero),
+            price=lambda rows, states, hard: price_violations(prices, rows, states, hard),
+            multiplier=lambda solution: np.abs(solution.z[self._condenser.rate_rows :]).max(initial=0.0),
+        )
+        smallest = float((np.diag(self.problem.R) * (_SMALL * sizes) ** 2).min()) + np.finfo(float).tiny
+        return Globalization(functions, smallest, self.tolerance, _FAILURES)
+
+    def _missed(self, prediction: Prediction) -> float:
+        """Violations of hard state bounds by a plan, summed."""
+        if self.soft is not None:
+            return 0.0
+        return price_violations(self.prediction.constraints.prices, prediction.rows, prediction.plan.states, 1.0)
+
+
+def _take_full_step(prediction: Prediction, proposed: Plan, solution: QPSolution) -> tuple[Prediction, Status]:
+    return prediction._replace(plan=proposed), solution.status
+
+
+def _is_usable(solution: QPSolution, plan: Plan) -> bool:
+    """Whether a program was solved, or its solver stopped at a limit at a feasible point no worse than the plan."""
+    if solution.status.solved:
+        return True
+    if solution.status not in (Status.ITERATION_LIMIT, Status.TIME_LIMIT) or not np.isfinite(solution.x).all():
+        return False
+    other = solution._replace(x=plan.inputs.ravel())
+    if not _violation(solution) <= FEASIBLE:
+        return False
+    return solution.objective <= other.objective or _violation(other) > FEASIBLE
+
+
+def _violation(solution: QPSolution) -> float:
+    """The largest violation of a hard row."""
+    softness, caps = solution.terms.softness
+    return float(solution.violation()[(softness == 0.0) & np.isinf(caps)].max(initial=0.0))
+
+
+class _Stopwatch:
+    """Where the time goes, in laps: each call adds the time since the last one to its part."""
+
+    def __init__(self) -> None:
+        self._parts, self._last = [0.0, 0.0, 0.0], perf_counter()
+
+    def model(self, shares: int = 1) -> None:
+        self._lap(0, shares)
+
+    def build(self) -> None:
+        self._lap(1)
+
+    def solve(self) -> None:
+        self._lap(2)
+
+    def copy(self) -> "_Stopwatch":
+        other = _Stopwatch()
+        other._parts[:] = self._parts
+        return other
+
+    @property
+    def timing(self) -> Timing:
+        return Timing(*self._parts)
+
+    def _lap(self, part: int, shares: int = 1) -> None:
+        now = perf_counter()
+        self._parts[part] += (now - self._last) / max(1, shares)
+        self._last = now

@@ -1,0 +1,311 @@
+"""What a controller predicts with: the first guess of a plan, the stages at it, their covariances, the tightened rows.
+
+Its *form* says where the dynamics are linearised:
+
+* ``trajectory``: at every stage of the last plan, one step on; before the first plan, of the reference. Plans need not
+  obey the dynamics (multiple shooting): what they miss, the defects, is part of the stages.
+* ``velocity``: at the current belief and the last input, one linearisation held over the horizon (Cao, Lai and Alam,
+  2017, section 4): ds_{k+1} = A ds_k + B du_k, which summed up is affine again, c = s_0 - A s_{-1} - B u_{-1}. Between
+  two measured states S does not change, which says nothing of how it will grow: there the rows of S take the c of the
+  linearisation itself.
+
+A constant error of the model leaves an offset between reference and state. ``velocity`` has none: the error is in both
+of two steps, and not in their difference. To ``trajectory`` an estimate of it may be added (Pannocchia and Rawlings,
+2003), which an observer moves by its gain L towards what the last step showed:
+
+    d_k = (1 - L) d_{k-1} + L (mu_k - f(mu_{k-1}, u_{k-1}))
+
+Covariances of ``zero_order`` are predicted under a feedback u = u_k - K (x - mu_k),
+
+    Sigma_{k+1} = (A_k - B_k K) Sigma_k (A_k - B_k K)' + V_k
+
+because without it the uncertainty grows over a long horizon until no input satisfies the bounds, while the next solves
+will see the next states and correct what went wrong (Hewing, Kabzan and Zeilinger, 2020). K is the gain of the
+finite-horizon LQR at the first stage. It is part of the covariances only: the bounds of the inputs hold for u_k.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from gpmpc.compiled import borrowing, compiled, copy_matrix
+from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp.dynamics import DynamicsModel
+from gpmpc.mpc.constraints import ChanceConstraints, Rows
+from gpmpc.mpc.controller import Decision, Reference
+from gpmpc.mpc.request import Request, check_controller, check_dynamics, check_method
+from gpmpc.mpc.small_matrices import add_product, add_transposed_product, solve_positive
+from gpmpc.mpc.stages import Covariance, Plan, StageLinearizer, Stages
+from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.propagation import Linearization, Propagator
+
+Array = np.ndarray
+
+Form = Literal["trajectory", "velocity"]
+FORMS = ("trajectory", "velocity")
+SETTLED = 1e-9  # relative change of the cost to go at which the recursion has reached its limit
+
+
+class Prediction(NamedTuple):
+    """A plan, the stages linearised at it, the covariances of its states, and the rows tightened by them.
+
+    Attributes:
+        plan: Where the stages were linearised; with ``velocity`` its first stage only.
+        stages: Of it.
+        covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
+        rows: Of the bounded states.
+    """
+
+    plan: Plan
+    stages: Stages
+    covariances: Array
+    rows: Rows
+
+
+class PredictionModel:
+    """Predicts beliefs for one tracking problem.
+
+    Args:
+        model: What was learned.
+        propagator: How the belief moves.
+        problem: Weights of the feedback, and bounds.
+        horizon: H.
+        initial_input: The input before the first step (m,).
+        form: See the module's text.
+        covariance: See ``gpmpc.mpc.stages``.
+        feedback: Whether covariances of ``zero_order`` are predicted under a feedback.
+        disturbance_gain: L, from 0 (no disturbance is estimated) to 1 (it is what the last step showed).
+
+    Raises:
+        SettingError: An unknown form or covariance mode, no propagator, a gain out of range, or one with ``velocity``.
+    """
+
+    def __init__(
+        self,
+        model: DynamicsModel,
+        propagator: Propagator,
+        problem: TrackingProblem,
+        horizon: int,
+        initial_input: Array,
+        form: Form,
+        covariance: Covariance,
+        feedback: bool,
+        disturbance_gain: float,
+    ):
+        self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
+        if form not in FORMS:
+            raise SettingError("form", f"must be one of {', '.join(map(repr, FORMS))}; got {form!r}")
+        if not isinstance(feedback, bool):
+            raise SettingError("feedback", f"must be true or false; got {feedback!r}")
+        check_method("propagator", propagator, "propagate", "Linearization()")
+        check_number("disturbance_gain", disturbance_gain, least=0)
+        if disturbance_gain > (form != "velocity"):
+            rule = "be 0 for form 'velocity', which needs none" if form == "velocity" else "lie between 0 and 1"
+            raise SettingError("disturbance_gain", f"must {rule}; got {disturbance_gain}")
+        self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
+        self.form, self.feedback, self.disturbance_gain = form, feedback, disturbance_gain
+        self.points = horizon if form == "trajectory" else 1
+        self.linearizer = StageLinearizer(model, propagator, covariance)
+        self.constraints = ChanceConstraints(problem.state_bounds, problem.state_dim, horizon, covariance)
+        self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
+
+    def read(self, belief: Gaussian, reference: Reference, previous: Decision | None) -> Request:
+        """The checked arguments of a controller's ``control``, with the disturbance estimate.
+
+        Raises:
+            ShapeError: Belief or reference have other dimensions, or reference inputs are missing.
+        """
+        problem, H = self.problem, self.horizon
+        request = Request.read(problem, H, self.initial_input, belief, reference, previous)
+        if reference.inputs is None and problem.penalized == "deviations":
+            raise ShapeError(f"penalized 'deviations' needs reference inputs ({H}, {problem.input_dim}); got none")
+        if self.disturbance_gain and request.finite:
+            return request._replace(disturbance=self._disturbance(request, previous))
+        return request
+
+    def initial_guess(self, request: Request, previous: Decision | None) -> Plan:
+        """The last plan, shifted by a stage; without one the reference, under its inputs where R weighs deviations.
+
+        Covariances are those of the last plan, unshifted: they depend on the time since the last measurement.
+        """
+        H, n, problem = self.horizon, self.problem.state_dim, self.problem
+        means, covariances = np.empty((H + 1, n)), np.zeros((H + 1, n, n))
+        means[0] = request.state
+        if self.linearizer.covariance != "none":
+            covariances[0] = request.covariance
+        if self.form == "velocity":
+            means[1:], covariances[1:] = request.state, covariances[0]
+            return Plan(self.linearizer.state(means, covariances), np.tile(request.last, (H, 1)), covariances)
+        inputs, known = request.shifted, previous is not None and previous.applicable
+        known = known and len(previous.means) == H + 1
+        if known:
+            means[1:H], means[H] = previous.means[2:], previous.means[H]
+        else:
+            means[1:] = request.targets
+            if problem.penalized == "deviations":
+                inputs = request.wanted.clip(problem.input_lower, problem.input_upper)
+        if problem.rate_limited:
+            inputs = inputs.copy()
+            _keep_rates(inputs, request.last, problem.rate_lower, problem.rate_upper)
+        if not self.linearizer.at_points:
+            covariances[1:] = previous.covariances[1:] if known else self._first_covariances(means, inputs, request)
+        return Plan(self.linearizer.state(means, covariances), inputs, covariances)
+
+    def linearize(self, plan: Plan, request: Request, previous: Decision | None = None) -> Prediction:
+        """The stages of a plan, linearised in one call, with covariances and rows.
+
+        Args:
+            plan: Where.
+            request: Of the step.
+            previous: The last decision, from which ``velocity`` counts its increments.
+        """
+        K = self.points
+        disturbance = request.disturbance if len(request.disturbance) else None
+        stages = self.linearizer(plan.states[:K], plan.inputs[:K], plan.covariances[:K], disturbance)
+        return self.predict(plan, stages, request, previous)
+
+    def linearize_many(self, requests: Sequence[Request], previous: Sequence[Decision | None]) -> list[Prediction]:
+        """``linearize`` at the first guesses of many requests, all stages of all of them in one call."""
+        if not requests:
+            return []
+        K, T = self.points, len(requests)
+        plans = [self.initial_guess(*question) for question in zip(requests, previous, strict=True)]
+        points = [np.concatenate([part[:K] for part in parts]) for parts in zip(*plans, strict=True)]
+        disturbances = [np.broadcast_to(r.disturbance, (K, len(r.state))) for r in requests if len(r.disturbance)]
+        disturbance = np.concatenate(disturbances) if disturbances else None
+        stages = self.linearizer(*points, disturbance)
+        parts = zip(*(part.reshape(T, K, *part.shape[1:]) for part in stages), strict=True)
+        asked = zip(plans, map(Stages._make, parts), requests, previous, strict=True)
+        return [self.predict(*question) for question in asked]
+
+    def canonical(self, plan: Plan) -> Plan:
+        """A plan whose s are those of its beliefs: with roots that are positive semidefinite."""
+        means, covariances = self.linearizer.moments(plan.states, plan.covariances)
+        return Plan(self.linearizer.state(means, covariances), plan.inputs, covariances)
+
+    def predict(self, plan: Plan, stages: Stages, request: Request, previous: Decision | None = None) -> Prediction:
+        """Covariances and rows for stages that were linearised at a plan; see ``linearize``."""
+        covariances, mode = plan.covariances, self.linearizer.covariance
+        if mode == "zero_order":
+            covariances, K = np.empty_like(covariances), self.gain(stages)
+            _predict_covariances(stages.A, stages.B, stages.V, request.covariance, K, covariances)
+        elif self.form == "velocity" and mode != "none":
+            covariances = np.repeat(self.linearizer.moments(stages.next, covariances)[1], self.horizon + 1, axis=0)
+            covariances[0] = request.covariance
+        if self.form == "velocity" and previous is not None and previous.applicable:
+            stages = self._increments(plan, stages, request, previous)
+        return Prediction(plan, stages, covariances, self.constraints.at(covariances))
+
+    def _increments(self, plan: Plan, stages: Stages, request: Request, previous: Decision) -> Stages:
+        """A held linearisation as that of the increments since s_{-1}, the state that the last decision began at."""
+        before = self.linearizer.state(previous.means[:1], previous.covariances[:1])[0]
+        c = plan.states[0] - stages.A[0] @ before - stages.B[0] @ request.last
+        if not request.covariance.any():
+            n = self.problem.state_dim
+            c[n:] = stages.c[0, n:]
+        return stages._replace(c=c[None])
+
+    def roll_out(self, towards: Plan, prediction: Prediction, request: Request) -> Plan:
+        """The plan that obeys the dynamics under the feedback towards another one, within box and rates."""
+        problem, n = self.problem, self.problem.state_dim
+        K = self.gain(prediction.stages)
+        states, inputs, covariances = (part.copy() for part in towards)
+        last, disturbance = request.last, request.disturbance if len(request.disturbance) else None
+        for k in range(self.horizon):
+            input = towards.inputs[k] - K @ (states[k, :n] - towards.states[k, :n])
+            input = np.clip(input, last + problem.rate_lower, last + problem.rate_upper)
+            last = inputs[k] = np.clip(input, problem.input_lower, problem.input_upper)
+            after = self.linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance).next
+            states[k + 1] = after[0]
+            covariances[k + 1] = self.linearizer.moments(after, covariances[k + 1 : k + 2])[1][0]
+        return Plan(states, inputs, covariances)
+
+    def gain(self, stages: Stages) -> Array:
+        """K (m, n) of the feedback u = u_k - K (x - mu_k); zero without feedback."""
+        problem, n = self.problem, self.problem.state_dim
+        if not self.feedback:
+            return np.zeros((problem.input_dim, n))
+        A, B = np.ascontiguousarray(stages.A[0, :n, :n]), np.ascontiguousarray(stages.B[0, :n])
+        return _feedback_gain(A, B, problem.Q, problem.R, problem.terminal, self.horizon)
+
+    def _first_covariances(self, means: Array, inputs: Array, request: Request) -> Array:
+        """Sigma_1 .. Sigma_H (H, n, n) along a first guess, linearised at its points."""
+        stages = self._at_points(means[:-1], inputs, np.zeros((self.horizon, *request.covariance.shape)))
+        covariances = np.empty((self.horizon + 1, *request.covariance.shape))
+        gain = self.gain(stages)
+        _predict_covariances(stages.A, stages.B, stages.V, request.covariance, gain, covariances)
+        return covariances[1:]
+
+    def _disturbance(self, request: Request, previous: Decision | None) -> Array:
+        """d_k (n,), from the estimate of the last decision and the state that its input led to; at first zero."""
+        if previous is None or not previous.applicable:
+            return np.zeros(self.problem.state_dim)
+        before = np.zeros_like(request.state) if previous.disturbance is None else previous.disturbance
+        predicted = self.model.linearize(previous.means[:1], request.last[None], covariance=False).mean[0]
+        return before + self.disturbance_gain * (request.state - predicted - before)
+
+
+@compiled
+def _predict_covariances(A, B, V, start, K, covariances):
+    """Writes Sigma_0 .. Sigma_H (H + 1, n, n) of H stages, or of one that is held."""
+    n, m, held = B.shape[1], B.shape[2], len(A) - 1
+    closed, product = np.empty((n, n)), np.empty((n, n))
+    copy_matrix(start, covariances[0])
+    for k in range(len(covariances) - 1):
+        at, after = min(k, held), covariances[k + 1]
+        for i in range(n):
+            for j in range(n):
+                closed[i, j] = A[at, i, j]
+                for r in range(m):
+                    closed[i, j] -= B[at, i, r] * K[r, j]
+        product[:] = 0.0
+        add_product(closed, covariances[k], product)
+        for i in range(n):
+            for j in range(i + 1):
+                total = (V[at, i, j] + V[at, j, i]) / 2.0
+                for c in range(n):
+                    total += product[i, c] * closed[j, c]
+                after[i, j] = after[j, i] = total
+
+
+@compiled
+def _feedback_gain(A, B, Q, R, terminal, horizon):
+    """K (m, n) of the first stage of the LQR for x+ = A x + B u over a horizon, by the Riccati recursion."""
+    n, m = B.shape
+    M, cost, MA, MB = terminal.copy(), np.empty((n, n)), np.empty((n, n)), np.empty((n, m))
+    K, W, MBA = np.zeros((m, n)), np.empty((m, m)), np.empty((m, n))
+    for _ in range(horizon):
+        MA[:], MB[:], MBA[:] = 0.0, 0.0, 0.0
+        copy_matrix(R, W)
+        copy_matrix(Q, cost)
+        add_product(M, A, MA)
+        add_product(M, B, MB)
+        add_transposed_product(MB, A, MBA)
+        add_transposed_product(B, MB, W)
+        copy_matrix(MBA, K)
+        solve_positive(W, K)
+        add_transposed_product(A, MA, cost)
+        for j in range(m):
+            for i in range(n):
+                MBA[j, i] = -MBA[j, i]
+        add_transposed_product(MBA, K, cost)
+        change, size = 0.0, 0.0
+        for i in range(n):
+            for j in range(i + 1):
+                value = (cost[i, j] + cost[j, i]) / 2.0
+                change, size = max(change, abs(value - M[i, j])), max(size, abs(value))
+                M[i, j] = M[j, i] = value
+        if change <= SETTLED * size:
+            break
+    return K
+
+
+@borrowing
+def _keep_rates(inputs, last, lower, upper):
+    """Moves inputs (H, m), one after the other, to within their rates from the one before."""
+    for k in range(len(inputs)):
+        for j in range(len(last)):
+            before = inputs[k - 1, j] if k > 0 else last[j]
+            inputs[k, j] = min(max(inputs[k, j], before + lower[j]), before + upper[j])
