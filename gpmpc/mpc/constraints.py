@@ -97,7 +97,9 @@ class ChanceConstraints:
             E[:, each, n + self._state] = self._sign * self._kappa
         elif self._covariance == "full" and r:
             columns = n + self._state[:, None] * n + np.arange(n)
-            E[:, each[:, None], columns] = (self._sign * self._kappa)[:, None] * _directions(covariances)[:, self._state]
+            E[:, each[:, None], columns] = (self._sign * self._kappa)[:, None] * _directions(covariances)[
+                :, self._state
+            ]
         return E
 
 

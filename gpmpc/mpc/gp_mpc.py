@@ -20,16 +20,16 @@ from time import perf_counter
 import numpy as np
 import torch
 
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, ProblemError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.mpc.condensing import Condenser, condense, respond, tracking_cost
 from gpmpc.mpc.constraints import price_violations
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.prediction_model import Form, Prediction, PredictionModel
 from gpmpc.mpc.request import Request, check_method
-from gpmpc.mpc.sqp import FEASIBLE, Functions, Globalization
-from gpmpc.mpc.stages import Covariance, Plan, Stages
+from gpmpc.mpc.sqp import FEASIBLE, FullStep, Functions, Globalization
+from gpmpc.mpc.stages import Covariance, Plan
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Propagator
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
@@ -131,10 +131,10 @@ class GPMPC:
     ) -> Decision:
         """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
         guess, solution = prediction.plan, previous.solution if previous is not None and previous.applicable else None
-        globalize = self._globalization(request) if self.iterations > 1 else _take_full_step
+        globalize = self._globalization(request) if self.iterations > 1 else FullStep()
         for count in range(1, self.iterations + 1):
             clock.model()
-            program = self._condense(prediction, request)
+            program = globalize.correct(self._condense(prediction, request), prediction.plan)
             clock.build()
             solution = self._solve(program, solution)
             clock.solve()
@@ -259,10 +259,6 @@ class GPMPC:
         if self.soft is not None:
             return 0.0
         return price_violations(self.prediction.constraints.prices, prediction.rows, prediction.plan.states, 1.0)
-
-
-def _take_full_step(prediction: Prediction, proposed: Plan, solution: QPSolution) -> tuple[Prediction, Status]:
-    return prediction._replace(plan=proposed), solution.status
 
 
 def _is_usable(solution: QPSolution, plan: Plan) -> bool:

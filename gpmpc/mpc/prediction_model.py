@@ -30,9 +30,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from gpmpc.compiled import borrowing, compiled, copy_matrix
+from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.mpc.constraints import ChanceConstraints, Rows
 from gpmpc.mpc.controller import Decision, Reference
 from gpmpc.mpc.request import Request, check_controller, check_dynamics, check_method
@@ -243,7 +243,7 @@ class PredictionModel:
         if previous is None or not previous.applicable:
             return np.zeros(self.problem.state_dim)
         before = np.zeros_like(request.state) if previous.disturbance is None else previous.disturbance
-        predicted = self.model.linearize(previous.means[:1], request.last[None], covariance=False).mean[0]
+        predicted = linearize(self.model, previous.means[:1], request.last[None], covariance=False).mean[0]
         return before + self.disturbance_gain * (request.state - predicted - before)
 
 

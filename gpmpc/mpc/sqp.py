@@ -15,11 +15,13 @@ its defects, relative to the states.
 """
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
+from gpmpc.compiled import compiled
 from gpmpc.mpc.constraints import Rows
 from gpmpc.mpc.prediction_model import Prediction
 from gpmpc.mpc.stages import Plan
@@ -31,6 +33,9 @@ Array = np.ndarray
 FEASIBLE = 1e-3  # hard bounds may be missed by so much, in their units, by a plan that a next step would mend
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 _SHORTEST_STEP = 2.0**-10
+_MEMORY = 10  # pairs of a corrected Hessian
+_NEAR = 0.1  # relative offset from which pairs are kept: those from far away mislead
+_CREEP = 0.25  # ratio of two offsets above which the Hessian is corrected
 _ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
 
 
@@ -54,6 +59,18 @@ class Functions(NamedTuple):
     multiplier: Callable[[QPSolution], float]
 
 
+class FullStep:
+    """Takes one program's solution as it is: the real-time iteration."""
+
+    def correct(self, program: tuple[Array, ...], _: Plan) -> tuple[Array, ...]:
+        """The program itself."""
+        return program
+
+    def __call__(self, at: Prediction, proposed: Plan, solution: QPSolution) -> tuple[Prediction, Status]:
+        """The prediction with the proposed plan, which is the last one."""
+        return at._replace(plan=proposed), solution.status
+
+
 class Globalization:
     """Chooses the steps of one problem's iteration, and says where it ends.
 
@@ -67,7 +84,33 @@ class Globalization:
     def __init__(self, functions: Functions, smallest: float, tolerance: float, failures: tuple[type[Exception], ...]):
         self._of, self._smallest, self._tolerance, self._failures = functions, smallest, tolerance, failures
         self._defect_price = self._row_price = 0.0
-        self._size, self._rate = math.inf, 1.0
+        self._size, self._rate, self._creeps = math.inf, 1.0, False
+        self._pairs: deque[tuple[Array, Array]] = deque(maxlen=_MEMORY)
+        self._last: tuple[Array, ...] | None = None  # inputs, gradient and multipliers of the last program
+
+    def correct(self, program: tuple[Array, ...], plan: Plan) -> tuple[Array, ...]:
+        """A program with the curvature of the Lagrangian that Gauss-Newton misses, where the iteration creeps.
+
+        Damped BFGS updates (Nocedal and Wright, 2006, procedure 18.2) by the last steps and changes of the gradient.
+
+        Args:
+            program: P, q, G and the bounds, in the inputs.
+            plan: Where it was made.
+        """
+        P, q, G, *bounds = program
+        inputs = plan.inputs.ravel()
+        slope = P @ inputs + q
+        if self._last is not None:
+            before, gradient, z = self._last
+            if self._size < _NEAR and np.any(inputs != before):
+                self._pairs.append((inputs - before, slope + G.T @ z - gradient))
+        self._last = inputs, slope, G
+        if not (self._pairs and self._creeps):
+            return program
+        P = P.copy()
+        for step, change in self._pairs:
+            _update(P, step, change)
+        return P, slope - P @ inputs, G, *bounds
 
     def __call__(self, at: Prediction, proposed: Plan, solution: QPSolution) -> tuple[Prediction, Status | None]:
         """The prediction at the next plan, and how the iteration ends: None where it goes on.
@@ -84,14 +127,18 @@ class Globalization:
         defect, reach = float(defects.sum()), max(1.0, float(np.abs(plan.states).max()))
         size = max(math.sqrt(curvature / (cost + self._smallest)), float(defects.max()) / reach)
         self._size, self._rate = size, size / self._size if math.isfinite(self._size) else 1.0
+        self._creeps = self._creeps or (self._rate > _CREEP and size < _NEAR)
+        if self._last is not None:
+            _, slope, G = self._last
+            self._last = plan.inputs.ravel(), slope + G.T @ solution.z, solution.z
         slower = max(self._rate, last_rate)  # the solution is better than the plan by about the slower of two rates
         if size <= self._tolerance or size * slower <= self._tolerance * (1.0 - slower):
             return at._replace(plan=proposed), Status.SOLVED
         promised = of.cost(proposed.states, proposed.inputs) + of.price(at.rows, proposed.states, self._row_price)
-        slope = promised - curvature - cost
-        if slope > 0.0 and defect > 0.0:
-            self._defect_price = max(self._defect_price, 3.0 * slope / defect)
-        slope, merit = slope - self._defect_price * defect, cost + self._defect_price * defect
+        if promised > cost and defect > 0.0:
+            self._defect_price = max(self._defect_price, 3.0 * (promised - cost) / defect)
+        merit = cost + self._defect_price * defect
+        slope = promised - curvature - merit
         length = 1.0
         while length >= _SHORTEST_STEP:
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
@@ -116,6 +163,27 @@ class Globalization:
                     yield self._of.linearize(make(towards, at))
             except self._failures:
                 continue
+
+
+@compiled
+def _update(P, step, change):
+    """Updates P so that P step = change, damped so that it stays positive definite (Powell, 1978)."""
+    n = len(P)
+    moved = np.zeros(n)
+    curvature = found = 0.0
+    for i in range(n):
+        for j in range(n):
+            moved[i] += P[i, j] * step[j]
+        curvature += step[i] * moved[i]
+        found += step[i] * change[i]
+    share = 1.0
+    if found < 0.2 * curvature:
+        share = 0.8 * curvature / (curvature - found)
+        found = 0.2 * curvature
+    for i in range(n):
+        a = (share * change[i] + (1.0 - share) * moved[i]) / found
+        for j in range(n):
+            P[i, j] += a * (share * change[j] + (1.0 - share) * moved[j]) - moved[i] * moved[j] / curvature
 
 
 def _between(plan: Plan, other: Plan, share: float) -> Plan:

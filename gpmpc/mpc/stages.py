@@ -11,17 +11,17 @@ The *covariance* mode says what s holds of the belief N(mu, Sigma):
 ``full`` and ``diagonal`` are linearised at the means and covariances of the plan, whatever the propagator.
 """
 
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 
+from gpmpc.dynamics import DynamicsModel, linearize, tensors_for, to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.dynamics import DynamicsModel
 from gpmpc.kernels.extended import roots
-from gpmpc.propagation import Propagator, differentiate, linearize
+from gpmpc.propagation import Propagator, differentiate
+from gpmpc.propagation import linearize as linearize_belief
 
 Array = np.ndarray
 
@@ -81,7 +81,7 @@ class StageLinearizer:
         first_order = getattr(propagator, "first_order", False)
         self.at_points = covariance == "none" or (covariance == "zero_order" and first_order)
         noisy = covariance == "zero_order" and getattr(propagator, "observation_noise", False)
-        self._noise = model.noise_covariance.numpy(force=True).astype(float) if noisy else None
+        self._noise = to_array(model.noise_covariance) if noisy else None
         moments = {"full": self._full, "diagonal": self._diagonal, "zero_order": self._zero_order}
         self._linearize = self._points if self.at_points else moments[covariance]
 
@@ -129,7 +129,7 @@ class StageLinearizer:
         return Stages(A, B, c, after, V)
 
     def _points(self, states: Array, inputs: Array, _: Array) -> tuple[Array, ...]:
-        found = self.model.linearize(states, inputs, self.covariance == "zero_order")
+        found = linearize(self.model, states, inputs, self.covariance == "zero_order")
         V = np.zeros((len(states), self._n, self._n)) if found.covariance is None else found.covariance
         return found.mean, found.A, found.B, V if self._noise is None else V + self._noise
 
@@ -139,13 +139,13 @@ class StageLinearizer:
         passed = A @ moved.cross_covariance  # mean equivalence passes nothing on
         eigenvalues, vectors = torch.linalg.eigh(S - (passed + passed.mT) / 2)
         V = (vectors * eigenvalues.clamp_min(0)[..., None, :]) @ vectors.mT
-        return tuple(map(_array, (moved.belief.mean, A, d.mean_by_input, V)))
+        return tuple(map(to_array, (moved.belief.mean, A, d.mean_by_input, V)))
 
     def _full(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
         belief, input = self._tensors(states[:, : self._n], covariances, inputs)
-        local = linearize(self.propagator, self.model, belief, input)
-        after = self.state(_array(local.next.mean), _array(local.next.covariance))
-        return after, _array(local.A), _array(local.B), np.zeros_like(covariances)
+        local = linearize_belief(self.propagator, self.model, belief, input)
+        after = self.state(to_array(local.next.mean), to_array(local.next.covariance))
+        return after, to_array(local.A), to_array(local.B), np.zeros_like(covariances)
 
     def _diagonal(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
         n = self._n
@@ -157,21 +157,15 @@ class StageLinearizer:
         backwards = torch.where(sd_next > 0, 0.5 / torch.where(sd_next > 0, sd_next, 1.0), 0.0)[..., None]
         twice = 2 * sd[..., None, :]
         mean_by_sd = d.mean_by_covariance.diagonal(dim1=-2, dim2=-1) * twice
-        by_mean, by_input = (part.diagonal(dim1=-3, dim2=-2).mT for part in (d.covariance_by_mean, d.covariance_by_input))
+        by_mean, by_input = (
+            part.diagonal(dim1=-3, dim2=-2).mT for part in (d.covariance_by_mean, d.covariance_by_input)
+        )
         by_variance = d.covariance_by_covariance.diagonal(dim1=-2, dim2=-1).diagonal(dim1=-3, dim2=-2).mT
         upper = torch.cat([d.mean_by_mean, mean_by_sd], dim=-1)
         lower = torch.cat([backwards * by_mean, backwards * by_variance * twice], dim=-1)
         A, B = torch.cat([upper, lower], dim=-2), torch.cat([d.mean_by_input, backwards * by_input], dim=-2)
-        return *map(_array, (torch.cat([moved.belief.mean, sd_next], dim=-1), A, B)), np.zeros_like(covariances)
+        return *map(to_array, (torch.cat([moved.belief.mean, sd_next], dim=-1), A, B)), np.zeros_like(covariances)
 
     def _tensors(self, means: Array, covariances: Array, inputs: Array) -> tuple[Gaussian, torch.Tensor]:
-        mean, covariance, input = (
-            torch.as_tensor(part, dtype=self.model.dtype, device=self.model.device)
-            for part in (means, covariances, inputs)
-        )
+        mean, covariance, input = tensors_for(self.model, means, covariances, inputs)
         return Gaussian(mean, covariance), input
-
-
-def _array(tensor: torch.Tensor) -> Array:
-    """A tensor as a contiguous float64 array in host memory."""
-    return np.ascontiguousarray(tensor.numpy(force=True), dtype=np.float64)

@@ -30,6 +30,11 @@ class Linearization:
     def __init__(self, hessian: bool = False, observation_noise: bool = False):
         self.hessian, self.observation_noise = hessian, observation_noise
 
+    @property
+    def first_order(self) -> bool:
+        """Whether mean, derivatives and variance of the model at the belief's mean are all that it takes."""
+        return not self.hessian
+
     def __call__(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Gaussian:
         """The next state's belief; see ``propagate``."""
         return self.propagate(model, belief, input).belief
