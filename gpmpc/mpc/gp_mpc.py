@@ -1,6 +1,6 @@
 """GP model predictive control: the control step, from a belief and a reference to the input.
 
-The dynamics of the belief are linearised along a plan (``gpmpc.mpc.prediction_model``), the states eliminated
+The dynamics of the belief are linearised along a plan (``gpmpc.mpc.prediction``), the states eliminated
 (``gpmpc.mpc.condensing``), and what is left is a quadratic program in the inputs. One of them a step, of the form
 ``trajectory``, is the real-time iteration (Diehl, Bock and Schloeder, 2005); of the form ``velocity`` with moments
 matched it is the convex GP-MPC of Cao, Lai and Alam (2017, section 4). Iterated (``gpmpc.mpc.sqp``), programs solve the
@@ -26,7 +26,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.condensing import Condenser, condense, respond, tracking_cost
 from gpmpc.mpc.constraints import price_violations
 from gpmpc.mpc.controller import Decision, Reference, Timing
-from gpmpc.mpc.prediction_model import Form, Prediction, PredictionModel
+from gpmpc.mpc.prediction import Form, Prediction, PredictionModel
 from gpmpc.mpc.request import Request, check_method
 from gpmpc.mpc.sqp import FEASIBLE, FullStep, Functions, Globalization
 from gpmpc.mpc.stages import Covariance, Plan
@@ -50,7 +50,7 @@ class GPMPC:
         problem: Weights and bounds.
         horizon: H, the number of predicted states.
         initial_input: The input before the first step, and the first guess of every planned one (m,).
-        form: ``"trajectory"`` or ``"velocity"``; see ``gpmpc.mpc.prediction_model``.
+        form: ``"trajectory"`` or ``"velocity"``; see ``gpmpc.mpc.prediction``.
         covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see ``gpmpc.mpc.stages``.
         solver: Of the quadratic program; ``DualActiveSet()`` by default, which state bounds with a price need.
         iterations: Quadratic programs a step at most; more than one for ``"trajectory"`` only.

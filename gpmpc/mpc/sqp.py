@@ -23,7 +23,7 @@ import numpy as np
 
 from gpmpc.compiled import compiled
 from gpmpc.mpc.constraints import Rows
-from gpmpc.mpc.prediction_model import Prediction
+from gpmpc.mpc.prediction import Prediction
 from gpmpc.mpc.stages import Plan
 from gpmpc.qp import QPSolution
 from gpmpc.status import Status
@@ -33,6 +33,7 @@ Array = np.ndarray
 FEASIBLE = 1e-3  # hard bounds may be missed by so much, in their units, by a plan that a next step would mend
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 _SHORTEST_STEP = 2.0**-10
+_NOISE = 1e-10  # the square of an offset that a model with that round-off need not get below
 _MEMORY = 10  # pairs of a corrected Hessian
 _NEAR = 0.1  # relative offset from which pairs are kept: those from far away mislead
 _CREEP = 0.25  # ratio of two offsets above which the Hessian is corrected
@@ -132,7 +133,8 @@ class Globalization:
             _, slope, G = self._last
             self._last = plan.inputs.ravel(), slope + G.T @ solution.z, solution.z
         slower = max(self._rate, last_rate)  # the solution is better than the plan by about the slower of two rates
-        if size <= self._tolerance or size * slower <= self._tolerance * (1.0 - slower):
+        settled = self._rate >= 1.0 and size**2 <= _NOISE  # and what is left is round-off of the model
+        if settled or size <= self._tolerance or size * slower <= self._tolerance * (1.0 - slower):
             return at._replace(plan=proposed), Status.SOLVED
         promised = of.cost(proposed.states, proposed.inputs) + of.price(at.rows, proposed.states, self._row_price)
         if promised > cost and defect > 0.0:
