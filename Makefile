@@ -2,8 +2,9 @@
 # Each builds .venv first when it is missing or when the dependencies have changed.
 PYTHON ?= python3
 ENV := .venv/.installed
+ONLY ?= steps peers gp qp
 
-.PHONY: tables figures test lint guard clean
+.PHONY: tables figures test lint bench guard docs clean
 
 tables: $(ENV)  ## The paper's Tables 1 and 2 beside ours; settings: make tables SET="draws=50 data=paper data.folder=DIR"
 	.venv/bin/gpmpc tables $(SET)
@@ -19,8 +20,15 @@ lint: $(ENV)  ## Format check, linter and import contracts
 	.venv/bin/ruff check .
 	.venv/bin/lint-imports
 
+bench: $(ENV)  ## What everything costs on this machine, beside others; some of it: make bench ONLY="peers qp"
+	for name in $(ONLY); do .venv/bin/python -m benchmarks.$$name || exit 1; done
+
 guard: $(ENV)  ## Whether anything became slower, against reference kernels in the same run
-	.venv/bin/python benchmarks/guard.py
+	.venv/bin/python -m benchmarks.guard
+
+docs: $(ENV)  ## The documentation as a site in docs/_build; a warning is an error
+	.venv/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	.venv/bin/python -m sphinx -q -W -b html docs docs/_build
 
 $(ENV): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' \

@@ -1,6 +1,6 @@
 """Do two roads to one answer meet? Sequential quadratic programs, solvers and forms, and a long horizon with bounds.
 
-    .venv/bin/python benchmarks/agreement.py [--steps 200] [--recorded 500]
+    .venv/bin/python -m benchmarks.agreement [--steps 200] [--recorded 500]
 
 1. ``trajectory`` iterated to tolerance against ``NonlinearGPMPC`` on sampled steps of flights, full covariances: the
    nonlinear objective at the one's plan over that at the other's.
@@ -13,26 +13,18 @@ One process, one thread. Writes ``outputs/benchmarks/agreement.json``.
 """
 
 import argparse
-import json
-import os
 import time
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from gpmpc.bench.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
-from gpmpc.mpc.convex_mpc import ConvexMPC
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from benchmarks.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
+from benchmarks.timing import write_results
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import StateBounds
 from gpmpc.propagation import Linearization, MomentMatching
-from gpmpc.provenance import provenance
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
 
 # Bounds that bite at about one step in ten: of ux and uy [-], and of the increments of U1 [N], ux, uy.
@@ -54,10 +46,7 @@ def main() -> None:
         "solvers": solvers(posteriors, arguments.recorded),
         "long_horizon": [long_horizon(posteriors[name], name, l1) for name in TRAJECTORIES for l1 in (None, 1e4)],
     }
-    path = Path("outputs/benchmarks/agreement.json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
-    print(f"written to {path}")
+    write_results("agreement", results)
 
 
 def optimality(posteriors: dict, propagation: str, arguments: argparse.Namespace) -> dict:
@@ -65,10 +54,10 @@ def optimality(posteriors: dict, propagation: str, arguments: argparse.Namespace
     propagator, gaps, times, failed = PROPAGATIONS[propagation], [], [[], []], {"convex": 0, "nonlinear": 0}
     for trajectory, gp in posteriors.items():
         asked = (problem(), arguments.horizon, HOVER)
-        convex = ConvexMPC(gp, propagator, *asked, form="trajectory", covariance="full", iterations=100, tolerance=1e-7)
+        convex = GPMPC(gp, propagator, *asked, form="trajectory", covariance="full", iterations=100, tolerance=1e-7)
         nonlinear = NonlinearGPMPC(gp, propagator, *asked, tolerance=1e-6, max_iterations=300)
         count = arguments.steps // len(posteriors)
-        flown = recorded(ConvexMPC(gp, Linearization(), *asked), trajectory, count, std=0.01)
+        flown = recorded(GPMPC(gp, Linearization(), *asked), trajectory, count, std=0.01)
         for step in flown:
             plans = []
             for controller, spent in zip((convex, nonlinear), times, strict=True):
@@ -107,10 +96,10 @@ def solvers(posteriors: dict, count: int) -> dict:
         hard = (replace(problem(tilt=tilt), rate_lower=np.negative(rate), rate_upper=rate), 10, HOVER)
         soft = (problem(bounds), 10, HOVER)
         for asked, kinds, steps in ((hard, tuple(found), count // 2), (soft, ("state_form",), count // 4)):
-            ours = ConvexMPC(gp, Linearization(), *asked)
+            ours = GPMPC(gp, Linearization(), *asked)
             others = {
-                "primal_active_set": lambda a=asked, g=gp: ConvexMPC(g, Linearization(), *a, solver=PrimalActiveSet()),
-                "clarabel": lambda a=asked, g=gp: ConvexMPC(g, Linearization(), *a, solver=CvxpySolver()),
+                "primal_active_set": lambda a=asked, g=gp: GPMPC(g, Linearization(), *a, solver=PrimalActiveSet()),
+                "clarabel": lambda a=asked, g=gp: GPMPC(g, Linearization(), *a, solver=CvxpySolver()),
                 "state_form": lambda a=asked, g=gp: StateFormMPC(g, Linearization(), *a),
             }
             others = {kind: others[kind]() for kind in kinds}
@@ -141,7 +130,7 @@ def solvers(posteriors: dict, count: int) -> dict:
 def long_horizon(gp, trajectory: str, l1: float | None) -> dict:
     """H = 50 with state bounds that the reference breaks, hard or at a price."""
     limits = StateBounds(*STATE_BOUNDS[trajectory], l1=l1)
-    flown = recorded(ConvexMPC(gp, Linearization(), problem(limits), 50, HOVER), trajectory, 189)
+    flown = recorded(GPMPC(gp, Linearization(), problem(limits), 50, HOVER), trajectory, 189)
     statuses = [step.decision.status.name for step in flown]
     times = [step.decision.timing.total for step in flown]
     result = {

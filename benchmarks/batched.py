@@ -1,6 +1,6 @@
 """How many trials a second fly together, and one at a time.
 
-    .venv/bin/python benchmarks/batched.py [--device cuda] [--sizes 10 50 189] [--trials 1 10 50 200] [--steps 3]
+    .venv/bin/python -m benchmarks.batched [--device cuda] [--sizes 10 50 189] [--trials 1 10 50 200] [--steps 3]
 
 The quadrotor's translational subsystem with the plant in the loop, H = 10. *alone*: ``closed_loop``, a trial after
 the other, the model in host memory (compiled loops). *together*: ``closed_loops`` with the model on ``--device``; on
@@ -14,24 +14,17 @@ than ``--alone`` of them are flown and their time is scaled. Ratios are paired; 
 """
 
 import argparse
-import json
-import os
 import time
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
 from contextlib import nullcontext
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from gpmpc.bench.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
+from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
+from benchmarks.timing import write_results
 from gpmpc.gp import GPPosterior, evaluation
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.propagation import Linearization, MomentMatching
-from gpmpc.provenance import provenance
 from gpmpc.simulation import closed_loop, closed_loops
 from gpmpc.trajectories import states_along
 
@@ -67,24 +60,21 @@ def main() -> None:
                     {"mode": name, "size": size, "trials": trials} | measured(gp, MODES[name], trials, arguments)
                 )
                 show(results[-1])
-    path = Path(f"outputs/benchmarks/batched-{arguments.device.replace(':', '')}.json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    meta = provenance() | {"threads": 1, "device": arguments.device, "horizon": HORIZON, "steps": arguments.steps}
+    meta = {"device": arguments.device, "horizon": HORIZON, "steps": arguments.steps}
     if arguments.device != "cpu":
         meta["device_name"] = torch.cuda.get_device_name(arguments.device)
-    path.write_text(json.dumps({"meta": meta, "results": results}, indent=1))
-    print(f"written to {path}")
+    write_results(f"batched-{arguments.device.replace(':', '')}", results, **meta)
 
 
 def measured(gp: GPPosterior, mode: dict, trials: int, arguments: argparse.Namespace) -> dict:
     """Trials a second and ratios to those alone at one number of trials."""
     states = states_along(TRAJECTORIES["elliptical"], np.arange(arguments.steps + HORIZON + 1.0))
     flight = {"references": states, "initial": states[0], "steps": arguments.steps, "noise": NOISE}
-    here = ConvexMPC(gp, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
+    here = GPMPC(gp, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
     there = here
     if arguments.device != "cpu":
         moved = gp.to(arguments.device)
-        there = ConvexMPC(moved, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
+        there = GPMPC(moved, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
 
     def alone() -> float:
         flown = range(min(trials, arguments.alone))

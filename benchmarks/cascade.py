@@ -1,6 +1,6 @@
 """The whole quadrotor on learned models: two GPs at 1 and 20 Hz beside the same cascade on the true models.
 
-    .venv/bin/python benchmarks/cascade.py [--steps 189] [--seeds 5]
+    .venv/bin/python -m benchmarks.cascade [--steps 189] [--seeds 5]
 
 Twelve states; outer and inner controller are convex GP-MPC, the outer one with and without an estimate of what its
 model mispredicts (``disturbance_gain``), and NMPC on the true subsystems for comparison. Flown along both trajectories
@@ -10,25 +10,19 @@ y, z, after every outer step. Writes ``outputs/benchmarks/cascade.json``.
 
 import argparse
 import json
-import os
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from gpmpc.bench.quadrotor import HOVER, INNER, OUTER, TRAJECTORIES, problem, trained
+from benchmarks.quadrotor import HOVER, INNER, OUTER, TRAJECTORIES, problem, trained
+from benchmarks.timing import write_results
 from gpmpc.exceptions import GpmpcError
 from gpmpc.metrics import tracking_error
 from gpmpc.mpc.cascade import Cascade
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization
-from gpmpc.provenance import provenance
 from gpmpc.simulation import Gust, Noise, Replaced, cascade_loop
 from gpmpc.systems import Coupled, Integrated
 from gpmpc.trajectories import states_along
@@ -59,9 +53,9 @@ def main() -> None:
                 NMPC(OUTER, problem(), 1, HOVER), NMPC(INNER, INNER_PROBLEM, 1, [0.0] * 3, tolerance=1e-8)
             ),
         }
-        inner_gp = ConvexMPC(inner, Linearization(), INNER_PROBLEM, 1, [0.0] * 3, covariance="none")
+        inner_gp = GPMPC(inner, Linearization(), INNER_PROBLEM, 1, [0.0] * 3, covariance="none")
         for name, gain in (("GP", 0.0), ("GP, error estimated", 1.0)):
-            outer_gp = ConvexMPC(outer, Linearization(), problem(), 1, HOVER, disturbance_gain=gain)
+            outer_gp = GPMPC(outer, Linearization(), problem(), 1, HOVER, disturbance_gain=gain)
             cascades[name] = Cascade(outer_gp, inner_gp)
         for case in CASES:
             flown = {name: flights(cascade, trajectory, case, arguments) for name, cascade in cascades.items()}
@@ -69,10 +63,7 @@ def main() -> None:
             ratios = {name: flight["rmse"] / truth for name, flight in flown.items()}
             results.append({"trajectory": trajectory, "case": case, "ratios": ratios} | flown)
             print(json.dumps(results[-1]), flush=True)
-    path = Path("outputs/benchmarks/cascade.json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
-    print(f"written to {path}")
+    write_results("cascade", results)
 
 
 def flights(cascade: Cascade, trajectory: str, case: str, arguments: argparse.Namespace) -> dict:

@@ -1,41 +1,33 @@
-"""What a control step costs beside one moment-matched Jacobian, and beside nonlinear GP-MPC on the same questions.
+"""What a control step costs beside one moment-matched Jacobian, and beside nonlinear GP-MPC on the same instances.
 
-    .venv/bin/python benchmarks/controllers.py [--steps 14] [--horizons 1 10 20 50] [--rivals 1 10]
+    .venv/bin/python -m benchmarks.controllers [--steps 14] [--horizons 1 10 20 50] [--rivals 1 10]
 
 One process, one thread, process CPU time, GPs on 189 transitions. Questions are recorded on a flight with the plant in
 the loop, with the plans that the one controller made, and then put to each controller in turns, warm-started from its
 own last answer, shifted. The nonlinear ones stop at a projected gradient of 1e-6, in the norm of the inverse
 Gauss-Newton Hessian and relative to the cost (``gpmpc.mpc.descent``), which one program of the convex ones does not
-ask for; ``cold`` are the same questions without a plan, from the last input held. ``plain slsqp`` is what comes to mind
+ask for; ``cold`` are the same instances without a plan, from the last input held. ``plain slsqp`` is what comes to mind
 first: SciPy's SLSQP on the inputs as they are, from hover, with the same compiled derivatives. ``jacobian`` is one call
 of ``differentiate`` with moment matching. Ratios are paired. Writes ``outputs/benchmarks/controllers.json``.
 """
 
 import argparse
-import json
-import os
 import time
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from gpmpc.bench.quadrotor import HOVER, TRAJECTORIES, Asked, problem, recorded, trained
+from benchmarks.quadrotor import HOVER, TRAJECTORIES, Asked, problem, recorded, trained
+from benchmarks.timing import write_results
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc.controller import Decision, Timing
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.descent import Program
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.mpc.request import Request
 from gpmpc.mpc.shooting import Shooting
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
-from gpmpc.provenance import provenance
 from gpmpc.status import Status
 
 COLD = ", cold"
@@ -58,10 +50,7 @@ def main() -> None:
             results.append(measured(gp, convex, trajectory, horizon, 10 * arguments.steps))
             if horizon in arguments.rivals:
                 results.append(measured(gp, rivals, trajectory, horizon, arguments.steps))
-    path = Path("outputs/benchmarks/controllers.json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
-    print(f"written to {path}")
+    write_results("controllers", results)
 
 
 def ways(gp: GPPosterior, horizon: int) -> list[dict]:
@@ -70,10 +59,10 @@ def ways(gp: GPPosterior, horizon: int) -> list[dict]:
     Whoever comes after a rival finds the caches full of it; so they take turns apart, each with the paper's form.
     """
     exact, asked = MomentMatching(), (problem(), horizon, HOVER)
-    paper = {"paper's form": ConvexMPC(gp, exact, *asked, form="increment", covariance="full")}
+    paper = {"paper's form": GPMPC(gp, exact, *asked, form="increment", covariance="full")}
     convex = {
-        "trajectory, linearised": ConvexMPC(gp, Linearization(), *asked),
-        "trajectory, mean": ConvexMPC(gp, Linearization(), *asked, covariance="none"),
+        "trajectory, linearised": GPMPC(gp, Linearization(), *asked),
+        "trajectory, mean": GPMPC(gp, Linearization(), *asked, covariance="none"),
     }
     rivals = {
         f"nonlinear, {method}{start}": NonlinearGPMPC(gp, exact, *asked, method, tolerance=1e-6, max_iterations=300)
@@ -109,7 +98,7 @@ class PlainSLSQP(NonlinearGPMPC):
 
 def measured(gp: GPPosterior, controllers: dict, trajectory: str, horizon: int, steps: int) -> dict:
     """Median times [ms] and ratios of some controllers at one horizon."""
-    flown: list[Asked] = recorded(ConvexMPC(gp, Linearization(), problem(), horizon, HOVER), trajectory, steps, STD)
+    flown: list[Asked] = recorded(GPMPC(gp, Linearization(), problem(), horizon, HOVER), trajectory, steps, STD)
     exact = MomentMatching()
     taken = {name: [] for name in ["jacobian", *controllers]}
     unsolved, last = dict.fromkeys(controllers, 0), dict.fromkeys(controllers)

@@ -1,6 +1,6 @@
 """How far one moment-matched Jacobian is from what its instructions must take, over the number of training points.
 
-    .venv/bin/python benchmarks/floor.py [--sizes 100 189 500 1000 2000]
+    .venv/bin/python -m benchmarks.floor [--sizes 100 189 500 1000 2000]
 
 One process, one thread, process CPU time. The floor counts the arithmetic that ``gpmpc.kernels`` has to issue for a
 pair of points and of outputs, in registers of eight numbers, and divides it by the rate at which this machine, in the
@@ -18,22 +18,15 @@ of four numbers, twice as many at the same rate: those that LLVM takes by itself
 """
 
 import argparse
-import json
-import os
 import time
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
-from pathlib import Path
 
 import numpy as np
 import torch
 
+from benchmarks.timing import write_results
 from gpmpc import kernels
 from gpmpc.compiled import compiled
 from gpmpc.gp import GPPosterior
-from gpmpc.provenance import provenance
 from gpmpc.qp.lanes import lanes, plus, put
 
 STATES, INPUTS, LANES = 6, 3, 8
@@ -70,10 +63,7 @@ def main() -> None:
                 flush=True,
             )
             results.append(result)
-    path = Path("outputs/benchmarks/floor.json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
-    print(f"written to {path}")
+    write_results("floor", results)
 
 
 def measured(packed: kernels.Packed, size: int, belief: str) -> dict:

@@ -1,88 +1,65 @@
-"""How long one step through the GPs takes: exact moments and the mean, with Jacobians, beside torch and GPyTorch.
+"""What one step through the GPs costs: exact moments, linearised, mean, with Jacobians, beside torch and GPyTorch.
 
-    .venv/bin/python benchmarks/gp.py [--sizes 10 50 100 189 500 1000 2000] [--seconds 2] [--torch-jacobian-up-to 500]
+    .venv/bin/python -m benchmarks.gp [--sizes 10 50 100 189 500 1000 2000] [--seconds 2] [--torch-jacobian-up-to 500]
 
-One process, one thread, process time. Six outputs, six states and three controls; at each size all contenders predict
-with the same posterior and take turns. Above ``--torch-jacobian-up-to`` points torch's reverse mode through the closed
-form is left out (it keeps all N x N products of the 21 pairs). Beside the times stands the rate of a 1000 x 1000 matrix
-product, measured in between, and the largest relative difference between the contenders' results. Writes
-``outputs/benchmarks/gp.json``.
+One process, one thread, processor time. Six outputs, six states and three inputs; at each size all calls that compute
+one quantity take turns on one posterior, ours first. Above ``--torch-jacobian-up-to`` points torch's reverse mode
+through the closed form is left out (it keeps all N x N products of the 21 pairs). Beside the times stands the largest
+relative difference of a result from ours. Writes ``outputs/benchmarks/gp.json``.
 """
 
 import argparse
-import json
-import os
 import time
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
 from collections.abc import Callable
-from pathlib import Path
 
+import gpytorch
 import numpy as np
 import torch
 
+from benchmarks.timing import describe, machine, markdown_table, time_interleaved, write_results
 from gpmpc import kernels
-from gpmpc.bench.linearisations import linearisation_groups
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.provenance import provenance
+from gpmpc.gp.model import exact_inference, gpytorch_model
+from gpmpc.propagation.moment_matching import moments
 
 STATES, INPUTS = 6, 3
-LEAST = 1e-4  # s a sample, shorter calls are repeated within it
+Group = dict[str, Callable[[], list | tuple]]
 
 
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", type=int, nargs="+", default=[10, 50, 100, 189, 500, 1000, 2000])
-    parser.add_argument("--seconds", type=float, default=2.0, help="time a contender and size")
+    parser.add_argument("--seconds", type=float, default=2.0, help="processor time of a group and size [s]")
     parser.add_argument("--torch-jacobian-up-to", type=int, default=500)
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
-    results, began = [], time.perf_counter()
+    here, results, began = machine(), [], time.perf_counter()
     gps, at, u = posterior(8).packed, belief(), np.zeros(INPUTS)
     kernels.mean_with_jacobian(gps, at.mean.numpy(), u)
     kernels.point_with_jacobian(gps, at.mean.numpy(), u)
     kernels.moments_with_jacobian(gps, at.mean.numpy(), at.covariance.numpy(), u)
     first = time.perf_counter() - began
-    print(f"first calls of the three kernels: {first:.2f} s (compiled in a fresh installation, read from disk later)")
-    print("process time in milliseconds, one thread")
-    print(f"{'N':>5}  {'what':34}{'median':>10}{'p99':>10}{'ratio':>8}{'GFlop/s':>9}{'difference':>12}")
+    print(f"{describe(here)}\nfirst calls of the three kernels: {first:.2f} s (compiled, or read from the cache)\n")
     for size in arguments.sizes:
-        for group in contenders(size, size <= arguments.torch_jacobian_up_to):
+        gp, control = posterior(size), torch.linspace(-0.3, 0.3, INPUTS)
+        rows = []
+        for group in linearisation_groups(gp, belief(), control, size <= arguments.torch_jacobian_up_to):
             own = next(iter(group))
-            seconds = take_turns(group, arguments.seconds)
-            rate, answers = product_rate(), {name: call() for name, call in group.items()}
-            for name in group:
-                times = np.array(seconds[name])
-                result = {
-                    "size": size,
-                    "what": name,
-                    "median": float(np.median(times)),
-                    "p99": float(np.quantile(times, 0.99)),
-                    "samples": len(times),
-                    "ratio": float(np.median(times) / np.median(seconds[own])),
-                    "gflops": rate,
-                    "difference": difference(answers[name], answers[own]),
-                }
-                results.append(result)
-                print(
-                    f"{size:5}  {name:34}{1e3 * result['median']:10.4f}{1e3 * result['p99']:10.4f}"
-                    f"{result['ratio']:8.1f}{rate:9.1f}{result['difference']:12.1e}",
-                    flush=True,
-                )
-    path = Path("outputs/benchmarks/gp.json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    meta = provenance() | {"threads": 1, "first_calls": first, "states": STATES, "inputs": INPUTS}
-    path.write_text(json.dumps({"meta": meta, "results": results}, indent=1))
-    print(f"written to {path}")
+            times, found = time_interleaved(group, arguments.seconds), {name: call() for name, call in group.items()}
+            for name, taken in times.items():
+                row = {"N": size, "what": name} | taken.summary() | {"ratio": taken.over(times[own])}
+                rows.append(row | {"difference": difference(found[name], found[own])})
+        keys = ("what", "median", "p99", "ratio", "difference", "samples")
+        header = (f"N = {size}", "ms, median", "99 %", "times ours", "difference", "calls")
+        print(markdown_table(header, [[row[key] for key in keys] for row in rows]), "\n", flush=True)
+        results += rows
+    write_results("gp", results, machine=here, first_calls=first, states=STATES, inputs=INPUTS)
 
 
 def posterior(size: int) -> GPPosterior:
-    """Six GPs on smooth functions of nine inputs."""
+    """Builds six GPs on smooth functions of nine inputs."""
     generator = torch.Generator().manual_seed(size)
     features = 4 * torch.rand(size, STATES + INPUTS, generator=generator) - 2
     targets = torch.stack([torch.sin(features[:, a]) + features[:, -1] * features[:, a - 1] for a in range(STATES)], 1)
@@ -92,50 +69,76 @@ def posterior(size: int) -> GPPosterior:
 
 
 def belief() -> Gaussian:
-    """Mean near the middle of the data, standard deviations near 0.3."""
+    """Builds a belief near the middle of the data with standard deviations near 0.3."""
     root = 0.3 * torch.randn(STATES, STATES, generator=torch.Generator().manual_seed(1)) / STATES**0.5
     return Gaussian(torch.linspace(-0.5, 0.5, STATES), root @ root.T + 0.01 * torch.eye(STATES))
 
 
-def contenders(size: int, torch_jacobian: bool) -> list[dict[str, Callable]]:
-    """Groups that answer the same question, ours first; each call returns what is compared."""
-    return linearisation_groups(posterior(size), belief(), torch.linspace(-0.3, 0.3, INPUTS), torch_jacobian)
+def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tensor, reverse_mode: bool) -> list[Group]:
+    """Builds the calls that predict one step of the latent functions, grouped by what they compute.
+
+    Args:
+        gp: The GPs.
+        belief: Where; points take its mean.
+        control: The input (m,).
+        reverse_mode: Includes torch's reverse mode through the closed form of the moments, which keeps all N x N
+            products of all pairs of outputs.
+    """
+    n, packed = gp.state_dim, gp.packed
+    mu, S, u = belief.mean.numpy(), belief.covariance.numpy(), control.numpy()
+    query = torch.cat([belief.mean, control])
+
+    def by_torch(mean, covariance, control):
+        return moments(gp, Gaussian(mean, covariance), control)[:2]
+
+    def jacobian_by_torch():
+        dM, dV = torch.func.jacrev(by_torch, argnums=(0, 1, 2))(belief.mean, belief.covariance, control)
+        return [dM[0], (dM[1] + dM[1].mT) / 2, dM[2], dV[0], (dV[1] + dV[1].mT) / 2, dV[2]]
+
+    def jacobian():
+        d = kernels.moments_with_jacobian(packed, mu, S, u)
+        return [d.J, d.dM_dS, d.dM_du, d.dV_dmu, d.dV_dS, d.dV_du]
+
+    frozen = gpytorch_model(gp).requires_grad_(False)
+    trained = gpytorch_model(gp)  # as it comes from training
+
+    def by_gpytorch():
+        with exact_inference(), gpytorch.settings.skip_posterior_variances():  # the mean alone, from its cache
+            return torch.autograd.functional.jacobian(lambda x: frozen(x[None]).mean[:, 0], query).split(n, dim=1)
+
+    def by_gpytorch_as_usual():
+        return torch.autograd.functional.jacobian(lambda x: trained(x[None]).mean[:, 0], query).split(n, dim=1)
+
+    def by_jacrev():
+        adds = torch.eye(n, len(query), dtype=query.dtype) * (gp.predicts == "difference")
+        whole = torch.func.jacrev(lambda x: gp.predict(x[:n], x[n:]).mean)(query)
+        return (whole - adds).split(n, dim=1)
+
+    groups: list[Group] = [
+        {
+            "moments": lambda: kernels.moments(packed, mu, S, u)[:2],
+            "moments, torch": lambda: by_torch(belief.mean, belief.covariance, control),
+        },
+        {"moments with Jacobians": jacobian},
+        {"moments, diagonal": lambda: kernels.moments(packed, mu, S, u, diagonal=True)},
+        {"diagonal with Jacobians": lambda: kernels.moments_with_jacobian(packed, mu, S, u, diagonal=True)[:8]},
+        {"linearised": lambda: kernels.point_with_jacobian(packed, mu, u)[:8]},
+        {
+            "mean with Jacobian": lambda: kernels.mean_with_jacobian(packed, mu, u)[1:],
+            "mean with Jacobian, torch jacrev": by_jacrev,
+            "mean with Jacobian, GPyTorch, frozen": by_gpytorch,
+            "mean with Jacobian, GPyTorch": by_gpytorch_as_usual,
+        },
+    ]
+    if reverse_mode:
+        groups[1]["moments with Jacobians, torch jacrev"] = jacobian_by_torch
+    return groups
 
 
-def take_turns(group: dict[str, Callable], seconds: float) -> dict[str, list[float]]:
-    """Process times of single calls (means over a sample where calls are short); the contenders alternate."""
-    repeats = {}
-    for name, call in group.items():
-        call()
-        start = time.process_time()
-        call()
-        repeats[name] = 1 + int(LEAST / max(time.process_time() - start, 1e-6))
-    times = {name: [] for name in group}
-    while any(sum(times[name]) * repeats[name] < seconds for name in group):
-        for name, call in group.items():
-            if len(times[name]) >= 5 and sum(times[name]) * repeats[name] >= seconds:
-                continue
-            start = time.process_time()
-            for _ in range(repeats[name]):
-                call()
-            times[name].append((time.process_time() - start) / repeats[name])
-    return times
-
-
-def difference(answer, reference) -> float:
-    """The largest difference of two lists of arrays, relative to each array's largest entry."""
-    pairs = [(np.asarray(a), np.asarray(b)) for a, b in zip(answer, reference, strict=True)]
+def difference(result, reference) -> float:
+    """Largest difference of two lists of arrays, relative to each array's largest entry."""
+    pairs = [(np.asarray(a), np.asarray(b)) for a, b in zip(result, reference, strict=True)]
     return max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs)
-
-
-def product_rate() -> float:
-    """GFlop/s of a 1000 x 1000 matrix product, best of three."""
-    matrix, seconds = np.ones((1000, 1000)), []
-    for _ in range(3):
-        start = time.process_time()
-        matrix @ matrix
-        seconds.append(time.process_time() - start)
-    return 2 / min(seconds)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Whether something became slower: times over those of reference kernels in the same run, against recorded limits.
 
     make guard                                   # exit code 1 where a ratio is above its limit
-    .venv/bin/python benchmarks/guard.py --record   # after a change that is meant to change them, on a calm machine
+    .venv/bin/python -m benchmarks.guard --record   # after a change that is meant to change them, on a calm machine
 
 A time says little on another machine, so each is divided by that of a kernel that no change here touches and that does
 the same kind of work: ``exp`` is exponentials over a matrix of pairs, as the GPs' kernels are; ``python`` is small
@@ -12,22 +12,16 @@ since a machine has bad seconds. One thread, processor time.
 
 import argparse
 import json
-import os
 import sys
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
 from itertools import cycle
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from gpmpc.bench.machine import one_thread
-from gpmpc.bench.pendulums import pendulum_gp
-from gpmpc.bench.steps import QUESTIONS, STD, Answering, controllers, recorded_questions
-from gpmpc.bench.timing import take_turns
+from benchmarks.pendulums import pendulum_gp
+from benchmarks.steps import RECORDED_STEPS, STD, WarmStarted, controllers, record_steps
+from benchmarks.timing import time_interleaved, use_one_thread
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import MomentMatching, differentiate
 from gpmpc.qp import DualActiveSet
@@ -43,7 +37,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--record", action="store_true", help="writes the ratios as the new record")
     arguments = parser.parse_args()
-    one_thread()
+    use_one_thread()
     measured = ratios()
     if arguments.record:
         RECORD.write_text(json.dumps({name: round(ratio, 4) for name, ratio in measured.items()}, indent=1) + "\n")
@@ -72,7 +66,7 @@ def ratios() -> dict[str, float]:
     """Median ratio of everything that is guarded to its reference kernel."""
     found = {}
     for reference, kernel, contenders in groups():
-        times = take_turns({"reference": kernel} | contenders, SECONDS, least=50, most=400)
+        times = time_interleaved({"reference": kernel} | contenders, SECONDS, min_rounds=50, max_rounds=400)
         for name in contenders:
             found[f"{name} / {reference}"] = times[name].over(times["reference"])
     return found
@@ -84,9 +78,9 @@ def groups() -> list[tuple]:
     exact, input = MomentMatching(), torch.zeros(gp.state_dim // 2, dtype=torch.float64)
     belief = Gaussian(torch.zeros(STATES, dtype=torch.float64), STD**2 * torch.eye(STATES, dtype=torch.float64))
     held = controllers(gp, HORIZON)
-    questions = recorded_questions(gp, held["mean only"], QUESTIONS)
-    answering = {f"step, {name}": Answering(controller, questions) for name, controller in held.items()}
-    programs = [held["zero order"].build(*question) for question in questions]
+    steps = record_steps(gp, held["mean only"], RECORDED_STEPS)
+    stepping = {f"step, {name}": WarmStarted(controller, steps) for name, controller in held.items()}
+    programs = [held["zero order"].build(*step) for step in steps]
     return [
         (
             "exp",
@@ -94,13 +88,13 @@ def groups() -> list[tuple]:
             {
                 "exact moments, all Jacobians": lambda: differentiate(exact, gp, belief, input),
                 "exact moments": lambda: exact(gp, belief, input),
-                "step, paper's form": answering.pop("step, paper's form"),
+                "step, paper's form": stepping.pop("step, paper's form"),
             },
         ),
         (
             "python",
             small_calls(),
-            answering
+            stepping
             | {
                 "mean with Jacobian": lambda: gp.mean_with_jacobian(belief.mean, input),
                 "program": solving(programs),

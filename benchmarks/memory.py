@@ -1,6 +1,6 @@
 """What memory a control step takes: peak resident set of a fresh process, and what its steps allocate once it runs.
 
-    .venv/bin/python benchmarks/memory.py [--size 2000] [--horizon 20]
+    .venv/bin/python -m benchmarks.memory [--size 2000] [--horizon 20]
 
 A posterior of six GPs over ``size`` points is written to a file; a process of its own then loads it and steers with the
 ``trajectory`` form, mean only and zero-order. ``peak`` is the operating system's count over the whole life of that
@@ -11,13 +11,8 @@ compiled code and torch too). The model is as large as its Cholesky factors. Wri
 
 import argparse
 import json
-import os
 import subprocess
 import sys
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
 import tempfile
 import tracemalloc
 from pathlib import Path
@@ -41,11 +36,20 @@ def main() -> None:
     results = []
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder) / "model.npz"
-        from floor import posterior  # loads torch
+        from benchmarks.floor import posterior  # loads torch
 
         posterior(arguments.size).save(model)
         for covariance in ("none", "zero_order"):
-            command = [sys.executable, __file__, "--horizon", str(arguments.horizon), "--child", str(model), covariance]
+            command = [
+                sys.executable,
+                "-m",
+                "benchmarks.memory",
+                "--horizon",
+                str(arguments.horizon),
+                "--child",
+                str(model),
+                covariance,
+            ]
             for _ in range(2):  # the first may have to compile, which is not a step's memory
                 answer = subprocess.run(command, check=True, capture_output=True, text=True).stdout
             result = {"N": arguments.size, "horizon": arguments.horizon} | json.loads(answer)
@@ -55,12 +59,9 @@ def main() -> None:
                 f"(libraries {result['libraries_mib']:.0f}, model {result['model_mib']:.0f}); steady state: largest "
                 f"allocations {result['steady_mib']:.2f} MiB, resident set +{result['risen_mib']:.2f} MiB"
             )
-    path = Path("outputs/benchmarks/memory.json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    from gpmpc.provenance import provenance
+    from benchmarks.timing import write_results
 
-    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
-    print(f"written to {path}")
+    write_results("memory", results)
 
 
 def flown(file: str, covariance: str, horizon: int) -> dict:
@@ -70,7 +71,7 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
     from gpmpc.gaussian import Gaussian
     from gpmpc.gp import GPPosterior
     from gpmpc.mpc.controller import Reference
-    from gpmpc.mpc.convex_mpc import ConvexMPC
+    from gpmpc.mpc.gp_mpc import GPMPC
     from gpmpc.mpc.tracking import TrackingProblem
     from gpmpc.propagation import Linearization
 
@@ -80,7 +81,7 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
     n, m = gp.state_dim, gp.input_dim
     box = {"input_lower": [-1] * m, "input_upper": [1] * m}
     problem = TrackingProblem([1] * n, [1] * m, penalized="increments", **box)
-    controller = ConvexMPC(gp, Linearization(), problem, horizon, [0.0] * m, covariance=covariance)
+    controller = GPMPC(gp, Linearization(), problem, horizon, [0.0] * m, covariance=covariance)
     reference = Reference(np.zeros((horizon + 1, n)))
     eye, generator = torch.eye(n, dtype=torch.float64), torch.Generator().manual_seed(0)
     decision, steady, risen, peak = None, 0, 0.0, 0.0

@@ -1,6 +1,6 @@
 """What it costs to learn one more point while running, and to forget one, beside a factorisation from the start.
 
-    .venv/bin/python benchmarks/online.py [--repeats 31] [--sizes 100 200 500 1000]
+    .venv/bin/python -m benchmarks.online [--repeats 31] [--sizes 100 200 500 1000]
 
 One process, one thread, process CPU time; six outputs, nine features. For every size N the posterior of N points is
 conditioned on one more, ten more, drops its oldest point, and is built from the hyperparameters on N + 1 points, in
@@ -10,21 +10,14 @@ in, one out) is timed under both rules. Writes ``outputs/benchmarks/online.json`
 """
 
 import argparse
-import json
-import os
 import time
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
 
+from benchmarks.timing import write_results
 from gpmpc.gp import Budget, GPPosterior
-from gpmpc.provenance import provenance
 
 OUTPUTS, FEATURES, INPUTS = 6, 9, 3
 
@@ -74,10 +67,7 @@ def main() -> None:
         results.append({"size": size, "seconds": medians} | found)
         row = "".join(f"{1e3 * median:12.2f}" for median in medians.values())
         print(f"{size:12}{row}{np.median(ratios):12.1f}{after:12.1f}", flush=True)
-    path = Path("outputs/benchmarks/online.json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
-    print(f"written to {path}")
+    write_results("online", results)
 
 
 def problem(rows: int) -> tuple[torch.Tensor, torch.Tensor, dict]:

@@ -1,9 +1,9 @@
 """How fast are the QP solvers in closed loop, beside DAQP and CVXPY with Clarabel?
 
-    python benchmarks/qp.py                      # every cell of the table, about ten minutes
-    python benchmarks/qp.py --quick              # short sequences, horizons 1, 10, 20: about a minute
-    python benchmarks/qp.py --horizons 50 --modes changing --slow-solvers 0
-    python benchmarks/qp.py --rows 6,3           # also with bounds on the positions only
+    .venv/bin/python -m benchmarks.qp                      # every cell of the table, about ten minutes
+    .venv/bin/python -m benchmarks.qp --quick              # short sequences, horizons 1, 10, 20: about a minute
+    .venv/bin/python -m benchmarks.qp --horizons 50 --modes changing --slow-solvers 0
+    .venv/bin/python -m benchmarks.qp --rows 6,3           # also with bounds on the positions only
 
 Every solver meets the same sequence of QPs (``quadrotor_sequences``) in one process on one thread, warm-started from
 its own last solution. The solvers take turns, sequence by sequence, ``--passes`` times, and the fastest of a QP's
@@ -27,13 +27,10 @@ from itertools import product
 from pathlib import Path
 from time import perf_counter
 
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
 import daqp
 import numpy as np
-from quadrotor_sequences import SequenceProblem, quadrotor_sequence
 
+from benchmarks.quadrotor_sequences import SequenceProblem, quadrotor_sequence
 from gpmpc.qp import CvxpySolver, DualActiveSet, PrimalActiveSet, QuadraticProgram, make_solution
 from gpmpc.status import Status
 

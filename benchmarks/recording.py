@@ -1,7 +1,7 @@
 """What does recording cost a control loop, in a loop of 1 kHz?
 
-    python benchmarks/recording.py                 # about a minute
-    python benchmarks/recording.py --horizon 20 --seconds 10
+    .venv/bin/python -m benchmarks.recording                 # about a minute
+    .venv/bin/python -m benchmarks.recording --horizon 20 --seconds 10
 
 A step is that of the quadrotor: n = 6, m = 3, a plan over the horizon H with covariances, and the condensed quadratic
 program (3 H variables, 6 H rows). Sixteen different steps take turns: in use, too, a step's numbers have just been
@@ -27,9 +27,6 @@ import platform
 import tempfile
 from pathlib import Path
 from time import perf_counter, process_time, thread_time
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
 
 import numpy as np
 

@@ -1,6 +1,6 @@
 """Whether flights are the same to the last bit, whatever was compiled or loaded before.
 
-    .venv/bin/python benchmarks/same_bits.py [--only convex iterated]
+    .venv/bin/python -m benchmarks.same_bits [--only convex iterated]
 
 In an empty, a full and a half-empty cache of kernels, where none can be kept, and with the controllers flown in the
 other order, each in a process of its own with its own seed of Python's hashes; compiling takes a minute or two in four
@@ -16,19 +16,15 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
 import numpy as np
 import torch
 
-from gpmpc.bench.quadrotor import HOVER, INNER, NOISE, OUTER, STATE_BOUNDS, TRAJECTORIES, problem, trained
+from benchmarks.quadrotor import HOVER, INNER, NOISE, OUTER, STATE_BOUNDS, TRAJECTORIES, problem, trained
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.controller import Controller
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.lqr import LQR
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
@@ -40,17 +36,17 @@ STEPS, H, PATH = 8, 6, TRAJECTORIES["lorenz"]
 BOUNDS = StateBounds(*STATE_BOUNDS["lorenz"], l1=10.0, l2=10.0)
 MATCHED, LINEARIZED = MomentMatching(), Linearization()
 CONTROLLERS: dict[str, Callable[[], Controller | Cascade]] = {
-    "convex": lambda: ConvexMPC(trained("lorenz"), LINEARIZED, problem(), H, HOVER),
-    "paper": lambda: ConvexMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, "increment", "diagonal"),
-    "full": lambda: ConvexMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, covariance="full"),
-    "iterated": lambda: ConvexMPC(trained("lorenz"), LINEARIZED, problem(BOUNDS), H, HOVER, iterations=30),
+    "convex": lambda: GPMPC(trained("lorenz"), LINEARIZED, problem(), H, HOVER),
+    "paper": lambda: GPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, "increment", "diagonal"),
+    "full": lambda: GPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, covariance="full"),
+    "iterated": lambda: GPMPC(trained("lorenz"), LINEARIZED, problem(BOUNDS), H, HOVER, iterations=30),
     "nonlinear": lambda: NonlinearGPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
     "state form": lambda: StateFormMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
     "lqr": lambda: LQR(trained("lorenz"), problem(), H, HOVER),
     "nmpc": lambda: NMPC(OUTER, problem(), H, HOVER),
     "cascade": lambda: Cascade(
-        ConvexMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
-        ConvexMPC(trained("lorenz", "rotational"), LINEARIZED, TrackingProblem([1] * 6, [1] * 3), H, [0.0] * 3),
+        GPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
+        GPMPC(trained("lorenz", "rotational"), LINEARIZED, TrackingProblem([1] * 6, [1] * 3), H, [0.0] * 3),
     ),
 }
 
@@ -85,7 +81,9 @@ def main() -> int:
             into = folder / f"{number}.npz"
             environment = {"NUMBA_CACHE_DIR": str(cache), "PYTHONHASHSEED": str(number)}
             subprocess.run(
-                [sys.executable, __file__, "--into", into, "--only", *order], check=True, env=os.environ | environment
+                [sys.executable, "-m", "benchmarks.same_bits", "--into", into, "--only", *order],
+                check=True,
+                env=os.environ | environment,
             )
             flown[state] = dict(np.load(into))
             differing = [key for key, value in flown["empty"].items() if value.tobytes() != flown[state][key].tobytes()]

@@ -1,6 +1,6 @@
 """How long the training of six GPs takes, beside GPyTorch's automatic differentiation and the paper's seconds.
 
-    .venv/bin/python benchmarks/training.py [--repeats 15] [--sizes 10 50 100 189]
+    .venv/bin/python -m benchmarks.training [--repeats 15] [--sizes 10 50 100 189]
 
 One process, one thread. For every trajectory, subsystem and size the closed-form trainer (as ``gpmpc tables`` runs it:
 four starts a GP) and GPyTorch's likelihood under the same search take turns on the same rows; the ratio is paired.
@@ -8,25 +8,18 @@ Writes ``outputs/benchmarks/training.json``.
 """
 
 import argparse
-import json
-import os
 import time
 from dataclasses import replace
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
-from pathlib import Path
 
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from benchmarks.timing import write_results
 from gpmpc.cli.configuration import config_folder
 from gpmpc.experiments.tables import Tables
 from gpmpc.gp import Trainer
-from gpmpc.provenance import provenance
 
 PAPER_SECONDS = {10: 1.12, 189: 4.01}  # stated by Cao, Lai and Alam (2017)
 
@@ -74,10 +67,7 @@ def main() -> None:
             f"{result['gpytorch_median']:10.2f}{ratio:8.1f}{paper:>8}",
             flush=True,
         )
-    path = Path("outputs/benchmarks/training.json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
-    print(f"written to {path}")
+    write_results("training", results)
 
 
 def process_seconds(trainer: Trainer, data, seed: int) -> float:

@@ -1,8 +1,8 @@
 """How time and memory of training grow with the number of points: exact GPs to 5000, sparse ones to 20000.
 
-    python benchmarks/training_scale.py                      # about ten minutes
-    python benchmarks/training_scale.py --quick              # to 1000 points; a minute
-    python benchmarks/training_scale.py --threads 2
+    .venv/bin/python -m benchmarks.training_scale                      # about ten minutes
+    .venv/bin/python -m benchmarks.training_scale --quick              # to 1000 points; a minute
+    .venv/bin/python -m benchmarks.training_scale --threads 2
 
 One output of nine features; every case in a process of its own, whose peak resident set less that after the imports is
 the memory. Times are processor time (of all threads together, as many as ``--threads``): of one evaluation of the
@@ -48,7 +48,7 @@ def main() -> None:
         if time.monotonic() - began > 60 * settings.minutes:
             left_out.append(case)
             continue
-        command = [sys.executable, __file__, "--case", json.dumps(case)]
+        command = [sys.executable, "-m", "benchmarks.training_scale", "--case", json.dumps(case)]
         finished = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
         results.append(case | json.loads(finished.stdout.splitlines()[-1]))
         print(described(results[-1]), flush=True)

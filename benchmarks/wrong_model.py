@@ -1,6 +1,6 @@
 """What an estimate of the model's error is worth: a vehicle that is a fifth heavier than the data say, and noise.
 
-    .venv/bin/python benchmarks/wrong_model.py [--steps 189] [--seeds 5] [--figure docs/figures/wrong_mass.png]
+    .venv/bin/python -m benchmarks.wrong_model [--steps 189] [--seeds 5] [--figure docs/figures/wrong_mass.png]
 
 The translational quadrotor with the plant in the loop, GPs of 189 dithered transitions of the lighter one, convex
 GP-MPC with H = 10: ``trajectory`` with several gains of its disturbance estimate, and the paper's increments, which
@@ -10,25 +10,19 @@ how the heavier vehicle comes to its altitude.
 """
 
 import argparse
-import json
-import os
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
 from pathlib import Path
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from gpmpc.bench.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
+from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
+from benchmarks.timing import write_results
 from gpmpc.files import write_whole
 from gpmpc.metrics import tracking_error
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.plotting.image import png
 from gpmpc.propagation import Linearization
-from gpmpc.provenance import provenance
 from gpmpc.simulation import Noise, Replaced, Rollout, closed_loop
 from gpmpc.systems import Integrated, Translational
 from gpmpc.trajectories import states_along
@@ -64,7 +58,7 @@ def main() -> None:
     for trajectory in TRAJECTORIES:
         model = trained(trajectory)
         for way, settings in WAYS.items():
-            controller = ConvexMPC(model, Linearization(), problem(), HORIZON, HOVER, **settings)
+            controller = GPMPC(model, Linearization(), problem(), HORIZON, HOVER, **settings)
             row = []
             for mass in MASSES:
                 for noise in NOISES:
@@ -74,16 +68,14 @@ def main() -> None:
                     keys = {"trajectory": trajectory, "way": way, "mass": mass, "noise": noise}
                     results.append(keys | {"rmse": row[-1], "failures": sum(len(flight.failures) for flight in flown)})
             print(f"{trajectory:12}{way:22}" + "".join(f"{rmse:14.4f}" for rmse in row), flush=True)
-    path = Path("outputs/benchmarks/wrong_model.json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"meta": provenance() | {"threads": 1}, "results": results}, indent=1))
+    write_results("wrong_model", results)
     arguments.figure.parent.mkdir(parents=True, exist_ok=True)
     write_whole(arguments.figure, png(altitudes(shown)))
-    print(f"written to {path} and {arguments.figure}")
+    print(f"written to {arguments.figure}")
 
 
 def flights(
-    controller: ConvexMPC, trajectory: str, mass: str, noise: str, arguments: argparse.Namespace
+    controller: GPMPC, trajectory: str, mass: str, noise: str, arguments: argparse.Namespace
 ) -> list[Rollout]:
     """One a seed."""
     references = states_along(TRAJECTORIES[trajectory], np.arange(arguments.steps + HORIZON + 1.0))

@@ -1,4 +1,8 @@
-"""How the kernels of this package are compiled: serially, mostly without the interpreter's lock, once per machine.
+"""Compilation of the package's kernels by numba: serial, mostly without the interpreter's lock, once per machine.
+
+A kernel is what Python calls: ``compiled``. What only other compiled functions call is ``njit_inner``, ``njit_noalloc``
+or ``inline_njit``: it has no machine code of its own but is optimised inside each kernel that it is a part of, which
+saves more than half of the time that compilation takes.
 
 numba keeps the machine code beside the source, or in the user's cache folder when the installation is read-only. When
 neither can be written it refuses to cache; the kernels are then compiled anew in each process. Sums may be reordered
@@ -21,18 +25,11 @@ from threading import Lock
 import numba
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic
-
-try:  # not promised
-    from numba.core.codegen import JITCodeLibrary
-    from numba.core.compiler import Compiler
-except ImportError:
-    JITCodeLibrary = Compiler = None
-
-_compiling = Lock()
-
+from numba.extending import intrinsic, register_jitable
 
 REORDERED = frozenset({"reassoc", "contract", "nsz"})
+
+_compiling = Lock()
 
 
 def compiled(
@@ -40,7 +37,8 @@ def compiled(
     *,
     fastmath: frozenset[str] = REORDERED,
     allocates: bool = True,
-    woven: bool = False,
+    kernel: bool = True,
+    inline: bool = False,
     locked: bool = False,
 ) -> Callable:
     """Compiles ``function`` at its first call.
@@ -50,62 +48,110 @@ def compiled(
         fastmath: LLVM's flags for it.
         allocates: False if it, and all that it calls, make no array but views of those they are given. numba then
             counts no references: an atomic operation for each view, which is 40 % of a solve of two microseconds.
-        woven: Whether its code is put into each of its callers. A call hands over an array as seven numbers, so that
+        kernel: Whether Python calls its machine code. Otherwise only other compiled functions do, which is cheaper to
+            compile; in Python it stays the function that it is.
+        inline: Whether its code is put into each of its callers. A call hands over an array as seven numbers, so that
             one with a dozen arrays takes longer than the work on a few short vectors.
         locked: Whether it keeps the interpreter's lock, as a kernel of microseconds may: two threads are then never in
             it at once and can share its workspace. To let go of the lock takes a fortieth of a microsecond.
     """
     if function is None:
-        return partial(compiled, fastmath=fastmath, allocates=allocates, woven=woven, locked=locked)
-    options = {"nogil": not locked, "fastmath": set(fastmath), "forceinline": woven}
-    if not allocates and _knows("_nrt"):  # not promised; kernels are slower without it
+        return partial(compiled, fastmath=fastmath, allocates=allocates, kernel=kernel, inline=inline, locked=locked)
+    options = {"nogil": not locked, "fastmath": set(fastmath), "forceinline": inline}
+    options |= _PRIVATE_OPTIONS[kernel]
+    if not allocates and _NRT_OPTION:
         options["_nrt"] = False
-    if _knows("no_cfunc_wrapper"):  # nothing in C calls a kernel; a way in for it is another tenth of compiling
-        options["no_cfunc_wrapper"] = True
-    if Compiler is not None:
-        options["pipeline_class"] = _Compiler
-    return _jit(function, options)
+    return _jit_cached(function, options) if kernel else register_jitable(**options)(function)
 
 
-def _knows(option: str) -> bool:
-    """Whether this numba has an option that it does not document."""
-    try:
-        from numba.core.cpu import CPUTargetOptions
-    except ImportError:
-        return False
-    return hasattr(CPUTargetOptions, option)
+njit_inner = partial(compiled, kernel=False)
+"""Compiles a part of other compiled functions."""
+
+njit_noalloc = partial(njit_inner, allocates=False)
+"""Compiles a part of other compiled functions that makes no arrays but views."""
+
+inline_njit = partial(njit_noalloc, inline=True)
+"""Compiles such a function into each of its callers."""
+
+woven = inline_njit  # former names
 
 
-class _Code(JITCodeLibrary or object):
-    """A kernel's machine code, with copies of all that it calls.
-
-    numba makes such copies, but lets the linker take any other of the same name for them: that of the function compiled
-    by itself, or of another kernel that was loaded earlier. They are optimised, and so rounded, each in its own way,
-    and a kernel's last digits then depend on what else has been compiled or loaded. Here they are the kernel's own.
-    """
-
-    def _finalize_final_module(self):
-        for_callers = self._final_module  # in which copies have to remain mergeable
-        self._final_module = for_callers.clone()
-        self._final_module.name = for_callers.name
-        for function in self._final_module.functions:
-            if function.linkage.name == "linkonce_odr":
-                function.linkage = "internal"
-        super()._finalize_final_module()
-        self._final_module = for_callers
+def borrowing(function=None, *, locked=False, **options):
+    """Former name of ``njit_noalloc``, and of ``compiled(allocates=False)`` for kernels that keep the lock."""
+    return compiled(function, allocates=False, kernel=locked, locked=locked, **options)
 
 
-class _Compiler(Compiler or object):
-    """numba's compiler, for ``_Code``."""
+# numba optimises every function that a kernel calls, and makes machine code of it, before it does so for the kernel,
+# which contains it all. No public interface prevents that, nor does one prevent a kernel from running another kernel's
+# copy of what both call. Where a numba without these private parts is installed, kernels are compiled as it does by
+# itself: slower to start, and their last digits depend on what was loaded before. ``tests/test_compiled.py`` notices.
+try:
+    from numba.core.codegen import JITCodeLibrary
+    from numba.core.compiler import Compiler
+    from numba.core.cpu import CPUTargetOptions
+except ImportError:
+    _PRIVATE_OPTIONS, _NRT_OPTION = {True: {}, False: {}}, False
+else:
+    _NRT_OPTION = hasattr(CPUTargetOptions, "_nrt")
 
-    def define_pipelines(self):
-        if self.state.library is None:
-            self.state.library = _Code(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
-            self.state.library.enable_object_caching()  # as numba does where it makes a library of its own
-        return super().define_pipelines()
+    class _KernelLibrary(JITCodeLibrary):
+        """A kernel's machine code, with its own copies of all that it calls.
+
+        numba lets the linker take any other copy of the same name: that of another kernel that was loaded earlier. They
+        are optimised, and so rounded, each in its own way.
+        """
+
+        def _finalize_final_module(self):
+            for function in self._final_module.functions:
+                if function.linkage.name == "linkonce_odr":
+                    function.linkage = "internal"
+            super()._finalize_final_module()
+
+    class _InnerLibrary(JITCodeLibrary):
+        """LLVM's intermediate code of a part of kernels: linked into them, neither optimised nor assembled before."""
+
+        class _NoEngine:
+            """Stands for the code generator where numba would tell loaded machine code its environment."""
+
+            def set_env(self, name, environment):
+                """Does nothing: there is no machine code."""
+
+        codegen = _NoEngine()
+
+        def _optimize_final_module(self):
+            pass
+
+        def _finalize_final_module(self):
+            self._finalize_dynamic_globals()
+            self._finalized = True
+
+        def get_pointer_to_function(self, name):
+            """Nothing: Python calls the function itself."""
+            return 0
+
+    class _KernelCompiler(Compiler):
+        """numba's compiler for ``_KernelLibrary``."""
+
+        library = _KernelLibrary
+
+        def define_pipelines(self):
+            if self.state.library is None:
+                self.state.library = self.library(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+                self.state.library.enable_object_caching()  # as numba does where it makes a library of its own
+            return super().define_pipelines()
+
+    class _InnerCompiler(_KernelCompiler):
+        """numba's compiler for ``_InnerLibrary``."""
+
+        library = _InnerLibrary
+
+    _PRIVATE_OPTIONS = {  # nothing in C calls a kernel, and Python no inner function: ways in take a tenth of the time
+        True: {"pipeline_class": _KernelCompiler, "no_cfunc_wrapper": True},
+        False: {"pipeline_class": _InnerCompiler, "no_cfunc_wrapper": True, "no_cpython_wrapper": True},
+    }
 
 
-def _jit(function: Callable, options: dict) -> Callable:
+def _jit_cached(function: Callable, options: dict) -> Callable:
     try:
         kernel = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # "cannot cache function ...: no locator available"
@@ -156,21 +202,14 @@ def _read_source(path: str | None) -> tuple[bytes, list[str]]:
     return hashlib.sha256(source).digest(), imported
 
 
-borrowing = partial(compiled, allocates=False)
-"""Compiles a function whose arrays are all borrowed from its caller."""
-
-woven = partial(borrowing, woven=True)
-"""Compiles such a function as a part of its callers."""
-
-
-@borrowing
+@njit_noalloc
 def copy(x, y):
     """Writes a vector to one of its length. For ``y[:] = x`` numba compiles an error's words: a second a kernel."""
     for i in range(len(y)):
         y[i] = x[i]
 
 
-@borrowing
+@njit_noalloc
 def copy_matrix(X, Y):
     """Writes a matrix to one of its shape."""
     for r in range(len(Y)):
@@ -188,7 +227,7 @@ def compile_for(kernel: Callable, signature: str) -> None:
             kernel.disable_compile()
 
 
-def direct(kernel: Callable) -> Callable:
+def unchecked_entry_point(kernel: Callable) -> Callable:
     """The machine code of a kernel that ``compile_for`` has compiled, called without numba's look at the arguments.
 
     That look takes a quarter of a microsecond. The caller has to see to it that each argument is a NumPy array of the
@@ -198,6 +237,9 @@ def direct(kernel: Callable) -> Callable:
         return next(iter(kernel.overloads.values())).entry_point
     except (AttributeError, StopIteration):  # another numba
         return kernel
+
+
+direct = unchecked_entry_point  # former name
 
 
 @intrinsic

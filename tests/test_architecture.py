@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.size import House
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -42,11 +44,11 @@ def test_the_writer_of_recordings_starts_without_torch_and_without_compilers():
 @pytest.mark.parametrize(
     ("library", "rooms"),
     [
-        ("gpytorch", ["gp/model.py", "gp/gpytorch_posterior.py", "gp/gpytorch_training.py", "bench"]),
+        ("gpytorch", ["gp/model.py", "gp/gpytorch_posterior.py", "gp/gpytorch_training.py"]),
         ("hydra", ["cli"]),
         ("omegaconf", ["cli"]),
         ("matplotlib", ["plotting"]),
-        ("casadi", ["mpc", "gp/casadi_.py", "bench"]),
+        ("casadi", ["mpc", "gp/casadi_.py"]),
         ("rich", ["cli", "experiments", "simulation/trials.py"]),
         ("mcap", ["recording"]),
         ("mcap_protobuf", ["recording"]),
@@ -68,3 +70,38 @@ def test_no_file_grows_past_400_lines():
         str(p.relative_to(ROOT)): n for p in ROOT.glob("gpmpc/**/*.py") if (n := len(p.read_text().splitlines())) > 400
     }
     assert not long
+
+
+HOUSE = House(ROOT)
+
+
+@pytest.mark.parametrize(
+    ("what", "count", "most"),
+    [
+        ("lines of gpmpc/", HOUSE.lines, 27_900),  # to become 16 000
+        ("public functions and classes", len(HOUSE.public_names), 720),  # to become 300
+        ("functions with more than 10 arguments", len(HOUSE.functions_above(10)), 20),  # to become 0
+        ("files of mpc/", HOUSE.mpc_files, 27),  # to become 13
+        ("circles of rooms", len(HOUSE.room_circles), 0),
+        ("circles of modules", len(HOUSE.module_circles), 2),  # to become 0
+    ],
+)
+def test_the_house_stays_as_small_as_it_is(what, count, most):
+    assert count <= most, f"{what}: {count}, at most {most}; python -m benchmarks.size prints them"
+
+
+def test_the_count_of_the_house_finds_what_it_is_made_for(tmp_path):
+    room = tmp_path / "gpmpc" / "room"
+    room.mkdir(parents=True)
+    (room / "__init__.py").write_text("")
+    (room / "a.py").write_text("from gpmpc.room import b\nX, _Y = 1, 2\ndef f(a, *, b): ...\ndef _g(): ...\n")
+    (room / "b.py").write_text("class C:\n    def m(self, x, *y, z, **w):\n        import gpmpc.room.a\n")
+    (room / "_hidden.py").write_text("def h(): ...\n")
+    (tmp_path / "gpmpc" / "other.py").write_text("from gpmpc.room.b import C\n")
+    house = House(tmp_path)
+    assert house.lines == 9
+    assert house.public_names == ["gpmpc.room.a.f", "gpmpc.room.b.C"]
+    assert house.public_constants == ["gpmpc.room.a.X"]
+    assert list(house.functions_above(3).values()) == [4]
+    assert house.module_circles == [["gpmpc.room.a", "gpmpc.room.b"]]
+    assert house.room_circles == []

@@ -20,12 +20,12 @@ def kernel(x):
 print(kernel(1.0), sum(kernel.stats.cache_hits.values()))
 """
 CALLEE = """
-from gpmpc.compiled import woven
+from gpmpc.compiled import inline_njit
 from tiny import (
     constants,  # a module
 )
 FACTOR = constants.FACTOR
-@woven
+@inline_njit
 def double(x):
     return FACTOR * x
 """
@@ -136,6 +136,52 @@ def test_the_stamp_of_a_kernel_covers_constants_and_callees_and_spares_the_rest(
     assert {f"gpmpc.qp.{name}" for name in ("dual_iteration", "working_set", "factor", "lanes", "record")} <= kernels
     assert "gpmpc.compiled" in kernels
     assert not {"gpmpc.qp", "gpmpc.qp.dual_active_set", "gpmpc.qp.primal_active_set"} & kernels
+
+
+def test_numba_still_has_the_private_parts_that_are_used_here():
+    """Where one has moved, see ``gpmpc.compiled``: kernels compile for longer, and edits of other files go unseen."""
+    from numba.core.codegen import JITCodeLibrary
+    from numba.core.compiler import Compiler
+    from numba.core.cpu import CPUTargetOptions
+
+    hooks = ("_optimize_final_module", "_finalize_final_module", "_finalize_dynamic_globals", "get_pointer_to_function")
+    assert all(callable(getattr(JITCodeLibrary, hook)) for hook in hooks)
+    assert isinstance(JITCodeLibrary.codegen, property)
+    assert callable(Compiler.define_pipelines)
+    assert all(hasattr(CPUTargetOptions, option) for option in ("_nrt", "no_cfunc_wrapper", "no_cpython_wrapper"))
+
+    @gpmpc.compiled.njit_noalloc
+    def inner(x):
+        return 2.0 * x
+
+    @gpmpc.compiled.compiled
+    def kernel(x):
+        return inner(x) + 1.0
+
+    assert isinstance(kernel._cache._cache_file._source_stamp, tuple)
+    assert (kernel(1.0), inner(1.0)) == (3.0, 2.0)  # as a part of the kernel, and in Python
+    anew = numba.njit(**gpmpc.compiled._PRIVATE_OPTIONS[True])(kernel.py_func)  # ``kernel`` may have been loaded
+    anew(1.0)
+    library = anew.overloads[anew.signatures[0]].library
+    assert type(library) is gpmpc.compiled._KernelLibrary
+    assert gpmpc.compiled._InnerLibrary in {type(part) for part in library._linking_libraries}
+    assert gpmpc.compiled.unchecked_entry_point(kernel) is kernel.overloads[kernel.signatures[0]].entry_point
+
+
+def test_without_numbas_private_parts_kernels_compile_in_its_own_way(monkeypatch):
+    monkeypatch.setattr(gpmpc.compiled, "_PRIVATE_OPTIONS", {True: {}, False: {}})
+    monkeypatch.setattr(gpmpc.compiled, "_NRT_OPTION", False)
+
+    @gpmpc.compiled.njit_noalloc
+    def inner(x):
+        return 2.0 * x
+
+    @gpmpc.compiled.compiled(allocates=False)
+    def kernel(x):
+        return inner(x) + 1.0
+
+    assert kernel(1.0) == 3.0
+    assert gpmpc.compiled.unchecked_entry_point(print) is print
 
 
 def test_another_numba_caches_in_its_own_way(monkeypatch):

@@ -21,7 +21,6 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 import gpmpc
-from gpmpc.cli.bench import bench
 from gpmpc.cli.completion import complete
 from gpmpc.cli.configuration import config_folder, find_modules_here
 from gpmpc.cli.figures import figures
@@ -49,7 +48,6 @@ commands:
   report    A tree of runs as one table, with figures; whether two groups of runs differ
   plot      A recorded flight as figures and an animation
   figures   Figures 2 to 4 and section 5.2: the flights, in the paper's reading and with the plant in the loop
-  bench     What everything costs on this machine, beside others; two measurements as ratios
   log       What is in a recording (info), rescue an unfinished one (recover), a table of its steps (export),
             a layout to look at it in Foxglove (layout)
 
@@ -206,6 +204,5 @@ COMMANDS: dict[str, tuple[Callable[[DictConfig], None], str]] = {
     "run": (run, "run"),
     "tables": (tables, "tables"),
     "figures": (figures, "figures"),
-    "bench": (bench, "bench"),
 }
 PLAIN: dict[str, Callable[[list[str]], None]] = {"log": log, "plot": plot, "report": report}

@@ -21,9 +21,8 @@ from gpmpc.gp import Scaling
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.metrics import tracking_error, violation_rate
 from gpmpc.mpc.controller import Controller, Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import ModelLoop, Noise, Rollout, closed_loop, rehearse
@@ -31,7 +30,7 @@ from gpmpc.systems import Plant
 from gpmpc.systems.quadrotor import GRAVITY
 
 PROPAGATIONS = {"moment_matching": MomentMatching, "linearization": Linearization}
-CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "convex": ConvexMPC}
+CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "convex": GPMPC}
 LOOPS = ("model", "plant")
 SUBSYSTEMS = ("translational", "rotational")
 PRICES = ("l1", "l2")  # of unkept state bounds, among a row's settings

@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import njit_inner
 
 
-@compiled
+@njit_inner
 def condition(S, D, n, whiten, G):
     """Writes G = (I + S D)^-1 and W = C^-1 D^1/2, |W nu|^2 = nu' (S + D^-1)^-1 nu; returns 1/2 log|I + S D|."""
     half_logdet = 0.0
@@ -52,7 +52,7 @@ def condition(S, D, n, whiten, G):
     return half_logdet
 
 
-@compiled
+@njit_inner
 def product(left, right, n, out):
     """Writes left @ right."""
     for c in range(n):
@@ -63,7 +63,7 @@ def product(left, right, n, out):
                 out[c, d] += left[c, e] * right[e, d]
 
 
-@compiled
+@njit_inner
 def transposed_product(left, diagonal, right, n, out):
     """Writes left' @ diag(diagonal) @ right."""
     for c in range(n):
@@ -75,7 +75,7 @@ def transposed_product(left, diagonal, right, n, out):
                 out[c, d] += factor * right[e, d]
 
 
-@compiled
+@njit_inner
 def congruent(G, inner, n, scratch, out):
     """Writes G' inner G."""
     product(inner, G, n, scratch)
@@ -87,7 +87,7 @@ def congruent(G, inner, n, scratch, out):
                 out[c, d] += G[e, c] * scratch[e, d]
 
 
-@compiled
+@njit_inner
 def add_difference(out, F, moment, G_ab, G_a, n, x, y):
     """Adds G_ab' moment G_ab - G_a' moment G_a = F moment G_ab + G_a' moment F' for F = G_ab' - G_a'."""
     product(F, moment, n, x)
@@ -101,7 +101,7 @@ def add_difference(out, F, moment, G_ab, G_a, n, x, y):
             out[c, d] += y[d, c]
 
 
-@compiled
+@njit_inner
 def transposed_times(matrix, vector, n, out):
     """Writes matrix' @ vector."""
     for c in range(n):
@@ -111,7 +111,7 @@ def transposed_times(matrix, vector, n, out):
         out[c] = total
 
 
-@compiled
+@njit_inner
 def symmetrise(matrix, n):
     """Replaces a matrix by the mean of itself and its transpose."""
     for c in range(n):

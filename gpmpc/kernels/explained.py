@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy import ndarray
 
-from gpmpc.compiled import borrowing, compiled
+from gpmpc.compiled import njit_inner, njit_noalloc
 from gpmpc.kernels.point_rows import aligned_rows, explain_four
 
 OUTPUT, ROW, PLACE, ASKED = range(4)
@@ -36,7 +36,7 @@ class Explained(NamedTuple):
     progress: ndarray
 
 
-@compiled
+@njit_inner
 def unexplained(triangles, q):
     """``Explained`` at its beginning; triangles (k, T), q (k, P)."""
     solved = aligned_rows(*q.shape)
@@ -44,7 +44,7 @@ def unexplained(triangles, q):
     return Explained(triangles.reshape(triangles.size), q, solved, np.zeros(len(q)), np.zeros(4, np.int64))
 
 
-@borrowing
+@njit_noalloc
 def explain_asked(explained):
     """Deals with the rows that have been asked for and must have arrived."""
     triangles, progress = explained.triangles, explained.progress
@@ -61,7 +61,7 @@ def explain_asked(explained):
     progress[OUTPUT], progress[ROW], progress[PLACE] = a, row, place
 
 
-@borrowing
+@njit_noalloc
 def explain_rest(explained):
     """Deals with all that is left."""
     explained.progress[ASKED] = len(explained.triangles)

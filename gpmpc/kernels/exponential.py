@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from gpmpc.compiled import borrowing
+from gpmpc.compiled import njit_noalloc
 
 EXACT = frozenset({"contract", "nsz"})  # "reassoc" would cancel the constant that rounds
 
@@ -89,7 +89,7 @@ def float_of(typing_context, bits):
     return types.float64(types.int64), generate
 
 
-@borrowing(fastmath=EXACT)
+@njit_noalloc(fastmath=EXACT)
 def reduced_expm1(r):
     """expm1(r) for |r| <= ln(2)/2."""
     g = G9 * r + G8
@@ -104,7 +104,7 @@ def reduced_expm1(r):
     return g * (r * r) + r
 
 
-@borrowing(fastmath=EXACT)
+@njit_noalloc(fastmath=EXACT)
 def exp(x):
     """The exponential of any x; 2^k is applied in two halves, so that results reach down to the subnormal numbers."""
     x = -750.0 if x < -750.0 else x
@@ -117,7 +117,7 @@ def exp(x):
     return (reduced_expm1(r) + 1.0) * float_of((half + 1023) << 52) * float_of((power - half + 1023) << 52)
 
 
-@borrowing
+@njit_noalloc
 def exp_all(x):
     """Replaces x by exp(x)."""
     widest()

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from gpmpc.compiled import borrowing, compiled, copy
+from gpmpc.compiled import compiled, copy, njit_inner, njit_noalloc
 
 
 @compiled
@@ -75,7 +75,7 @@ def roots(covariances, out):
         root(covariances[h], out[h])
 
 
-@compiled
+@njit_inner
 def root(covariance, out):
     """Writes the symmetric root; returns its eigenvalues and eigenvectors."""
     r, U = np.linalg.eigh(covariance)
@@ -91,7 +91,7 @@ def root(covariance, out):
     return r, U.copy()
 
 
-@borrowing
+@njit_noalloc
 def by_root(D, S, row):
     """Writes 2 D S, row by row."""
     n = len(S)
@@ -103,7 +103,7 @@ def by_root(D, S, row):
             row[i * n + j] = 2.0 * total
 
 
-@borrowing
+@njit_noalloc
 def turn(U, matrices, out):
     """Writes (U X)' of each column's matrix X; twice in a row U X U'."""
     n = len(U)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy import ndarray
 
-from gpmpc.compiled import borrowing, compiled
+from gpmpc.compiled import compiled, njit_inner, njit_noalloc
 from gpmpc.kernels.belief_algebra import (
     add_difference,
     condition,
@@ -30,7 +30,7 @@ from gpmpc.kernels.belief_algebra import (
     transposed_times,
 )
 from gpmpc.kernels.explained import explain_rest, unexplained
-from gpmpc.kernels.exponential import exp_all
+from gpmpc.kernels.exponential import exp_all, widest
 from gpmpc.kernels.pair_sums import Side, pair_sums, strips_memory
 from gpmpc.kernels.point_rows import (
     add_products,
@@ -106,7 +106,7 @@ class Derivatives(NamedTuple):
     dJ_du: ndarray
 
 
-@compiled
+@njit_inner
 def seen_from(points, mu, S, u):
     """The ``Belief``."""
     n, m = len(mu), len(u)
@@ -119,14 +119,14 @@ def seen_from(points, mu, S, u):
     return Belief(S, nu, control, m)
 
 
-@borrowing
+@njit_noalloc
 def centre(row, number, out):
     """Writes row - number."""
     for j in range(len(out)):
         out[j] = row[j] - number
 
 
-@compiled
+@njit_inner
 def room(k, R, padded):
     """An empty ``Single``."""
     z, moved = aligned_rows(k * R, padded).reshape(k, R, padded), aligned_rows(k * R, padded).reshape(k, R, padded)
@@ -136,9 +136,10 @@ def room(k, R, padded):
     return Single(z, moved, q, weighted, G, T, numbers[0], vectors[0], second, numbers[1], vectors[1], e_second)
 
 
-@compiled
+@njit_inner
 def evaluate_single(belief, D, signal, beta, a, single, n):
     """Fills everything of output a but the sums; returns M_a."""
+    widest()
     nu, control, R = belief.nu, belief.control, len(belief.nu)
     z, moved, q, G, T, whiten = single.z[a], single.moved[a], single.q[a], single.G[a], single.T[a], np.zeros((R, R))
     single.half_logdet[a] = condition(belief.S, D, n, whiten, G)
@@ -158,9 +159,10 @@ def evaluate_single(belief, D, signal, beta, a, single, n):
     return summed(single.weighted[a])
 
 
-@compiled
+@njit_inner
 def differentiate_mean(belief, D, a, single, n, M, to, work, x, y):
     """Fills the second moments of output a and dM."""
+    widest()
     control, R, G = belief.control, len(belief.nu), single.G[a]
     controls = np.empty(len(control))
     second_moments(single.weighted[a], single.z[a], single.second[a], n, work[0])
@@ -173,9 +175,10 @@ def differentiate_mean(belief, D, a, single, n, M, to, work, x, y):
         to.dM_du[a, c] = controls[c] * D[R + c]
 
 
-@compiled
+@njit_inner
 def differentiate_explained(belief, D, a, single, solved, n, to, work, x, y):
     """Fills the sums over e_i of output a and what -|L_a^-1 q_a|^2 adds to dV_aa."""
+    widest()
     control, R, G, e = belief.control, len(belief.nu), single.G[a], work[1]
     controls = np.empty(len(control))
     multiply(solved, single.q[a], e)
@@ -193,9 +196,10 @@ def differentiate_explained(belief, D, a, single, solved, n, to, work, x, y):
         to.dV_du[a, a, c] = -2 * controls[c] * D[R + c]
 
 
-@compiled
+@njit_inner
 def differentiate_cross(belief, D, a, single, n, J, to, work):
     """dJ/dS = 1/2 [sum_i beta_i q_i w_i w_i w_i - three times G'D with J] and dJ/du = sum_i beta_i q_i w_i c_i'."""
+    widest()
     control, R, padded = belief.control, len(belief.nu), len(work[0])
     w, A = aligned_rows(R, padded), np.empty((n, n))
     transform(single.G[a].T.copy(), single.z[a], w, n)
@@ -219,9 +223,10 @@ def differentiate_cross(belief, D, a, single, n, J, to, work):
                 dJ_dS[d, e, c] = dJ_dS[e, c, d] = dJ_dS[e, d, c] = value
 
 
-@compiled
+@njit_inner
 def evaluate_pair(belief, D_a, D_b, a, b, single, triangle, explained, n, order, work, left, strips, G_ab, x):
     """sum_ij P_ij of the pair; its parts go to ``work[3:]``, G_ab is filled."""
+    widest()
     T_ab, D_ab, rise, fall = np.zeros_like(G_ab), D_a + D_b, work[1], work[2]
     r = single.half_logdet[a] + single.half_logdet[b] - condition(belief.S, D_ab, n, x, G_ab)
     product(G_ab, belief.S, n, T_ab)
@@ -241,9 +246,10 @@ def evaluate_pair(belief, D_a, D_b, a, b, single, triangle, explained, n, order,
     return pair_sums(a == b, order > VALUE, triangle, left, rows, columns, explained, strips, work[3:])
 
 
-@compiled
+@njit_inner
 def differentiate_pair(belief, D_a, D_b, a, b, single, n, M, P_total, to, work, G_ab, x, y, H):
     """Adds the derivatives of the pair's sum to those of V_ab."""
+    widest()
     R, control, same = len(belief.nu), belief.control, a == b
     p_i, p_j, g = work[3], work[4], work[5:]
     vector, U1, U2 = np.zeros((2, R)), np.zeros((2, R)), np.zeros((2, R, R))
@@ -304,11 +310,12 @@ def differentiate_pair(belief, D_a, D_b, a, b, single, n, M, P_total, to, work, 
             to.dV_du[b, a, c] = to.dV_du[a, b, c]
 
 
-@compiled
+@njit_inner
 def moments_at(
     order, diagonal, points, inverse_squares, signal, beta, inverse_cholesky, centred, mu, S, u, M, V, J, to
 ):
     """M, V, J and the derivatives ``to`` of one belief."""
+    widest()
     n, k, padded = len(mu), len(M), points.shape[1]
     belief = seen_from(points, mu, S, u)
     R = len(belief.nu)
@@ -351,6 +358,7 @@ def moments_at(
 @compiled
 def moments_along(order, diagonal, points, inverse_squares, signal, beta, inverse_cholesky, centred, mu, S, u, out):
     """``moments_at`` for H beliefs: mu (H, n), S (H, n, n), u (H, m) and ten outputs with H in front."""
+    widest()
     M, V, J, dM_dS, dM_du, dV_dmu, dV_dS, dV_du, dJ_dS, dJ_du = out
     for h in range(len(mu)):
         to = Derivatives(dM_dS[h], dM_du[h], dV_dmu[h], dV_dS[h], dV_du[h], dJ_dS[h], dJ_du[h])

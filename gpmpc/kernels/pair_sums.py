@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 from numpy import ndarray
 
-from gpmpc.compiled import borrowing
+from gpmpc.compiled import njit_noalloc
 from gpmpc.kernels.block import (
     SIZE,
     add_to_columns,
@@ -64,25 +64,25 @@ class Side(NamedTuple):
     weights: ndarray
 
 
-@borrowing
+@njit_noalloc
 def column_strip(dims):
     """Numbers in a strip of columns: shift, vectors, weights; a sum and the sums of vectors, all of sixteen columns."""
     return (2 * dims + 3) * COLUMNS
 
 
-@borrowing
+@njit_noalloc
 def row_strip(dims):
     """Numbers in a strip of rows: shift, vectors, weights, weights times z, all of four rows; four vectors of sums."""
     return (2 * dims + 2) * ROWS + ROWS * LANES
 
 
-@borrowing
+@njit_noalloc
 def strips_memory(dims, padded):
     """Numbers that ``pair_sums`` works in, for ``padded`` points and vectors z of ``dims`` entries."""
     return padded // ROWS * row_strip(dims) + -(-padded // COLUMNS) * column_strip(dims)
 
 
-@borrowing
+@njit_noalloc
 def fill_rows(strips, step, shift, left, weights, z):
     """Writes what the rows bring, and zeros for what they gather."""
     dims, padded = left.shape
@@ -98,7 +98,7 @@ def fill_rows(strips, step, shift, left, weights, z):
         at += step
 
 
-@borrowing
+@njit_noalloc
 def fill_columns(strips, step, shift, z, weights):
     """Writes what the columns bring, and zeros for what they gather and for eight columns that may be missing."""
     dims, padded = z.shape
@@ -114,7 +114,7 @@ def fill_columns(strips, step, shift, z, weights):
         at += step
 
 
-@borrowing
+@njit_noalloc
 def gather(strips, step, place, weights, out):
     """Writes the sums of columns at each strip's ``place``, times their weights."""
     for first in range(0, len(out), COLUMNS):
@@ -123,7 +123,7 @@ def gather(strips, step, place, weights, out):
         place += step
 
 
-@borrowing(fastmath=EXACT)
+@njit_noalloc(fastmath=EXACT)
 def values_of(near, rows, row, tile, at, dims):
     """expm1(delta) of the rows of the strip at ``row`` and the columns of the strip at ``at``."""
     inlined()
@@ -135,7 +135,7 @@ def values_of(near, rows, row, tile, at, dims):
     return expm1_near_zero(x) if near else expm1(x)
 
 
-@borrowing(fastmath=EXACT)
+@njit_noalloc(fastmath=EXACT)
 def add_vectors(tile, at, block, rows, row, dims):
     """Adds sum_i weights_i z_i block_ij to the sums of vectors from ``at`` on."""
     inlined()
@@ -145,7 +145,7 @@ def add_vectors(tile, at, block, rows, row, dims):
         add_to_columns(tile, at + (d + 2) * COLUMNS, block, rows, row + (d + 2) * ROWS)
 
 
-@borrowing(fastmath=EXACT)
+@njit_noalloc(fastmath=EXACT)
 def meet(derivatives, near, rows, tile, dims, explained):
     """All rows meet a tile of columns of another output; memory is idle meanwhile and is asked for what comes next."""
     widest()
@@ -165,7 +165,7 @@ def meet(derivatives, near, rows, tile, dims, explained):
         explain_asked(explained)
 
 
-@borrowing(fastmath=EXACT)
+@njit_noalloc(fastmath=EXACT)
 def meet_same(derivatives, near, rows, tile, dims, triangle):
     """Rows meet a tile of columns of the same output; returns how much of E, which starts with the tile's, was used."""
     widest()
@@ -187,7 +187,7 @@ def meet_same(derivatives, near, rows, tile, dims, triangle):
     return place
 
 
-@borrowing
+@njit_noalloc
 def largest_exponent(left, rows, columns, work):
     """What no |delta_ij| exceeds, by Cauchy and Schwarz."""
     squared_lengths(left, work)
@@ -196,7 +196,7 @@ def largest_exponent(left, rows, columns, work):
     return largest(rows.shift) + largest(columns.shift) + math.sqrt(square * largest(work))
 
 
-@borrowing
+@njit_noalloc
 def pair_sums(same, derivatives, triangle, left, rows, columns, explained, memory, out):
     """The sums of the module's text.
 

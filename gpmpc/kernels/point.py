@@ -13,7 +13,7 @@ The moments are summed over x~_i - x~, which all outputs share, and scaled by D_
 
 import numpy as np
 
-from gpmpc.compiled import borrowing, compiled
+from gpmpc.compiled import compiled, njit_noalloc
 from gpmpc.kernels.exponential import exp, exp_all, widest
 from gpmpc.kernels.point_rows import (
     LINE,
@@ -29,7 +29,7 @@ from gpmpc.kernels.point_rows import (
 JACOBIAN, HESSIAN = 1, 2  # how much is wanted: up to second derivatives of M, up to third
 
 
-@borrowing
+@njit_noalloc
 def offsets(points, x, u, difference):
     """Writes x~_i - x~ as rows."""
     states = (len(x) + 2) // 3 * 3
@@ -44,7 +44,7 @@ def offsets(points, x, u, difference):
             row[j] = source[j] - at
 
 
-@borrowing
+@njit_noalloc
 def correlate(log_signal, D, squares, factors, k):
     """Writes k_i = sf2 exp(-1/2 sum_d D_d (x~_i - x~)_d^2) to ``k``, from squared offsets; ``factors`` is scratch."""
     for c in range(len(squares)):
@@ -59,12 +59,13 @@ def means_memory(rows, padded):
     return (2 * rows + 1) * padded + rows + LINE
 
 
-@borrowing
+@compiled(allocates=False)
 def means_along(points, inverse_squares, log_signal, beta, queries, n, memory, out):
     """M and its gradient at H points x~ = (x, u), queries (H, n + m), into out (H, k, 1 + n + m).
 
     What it works in is lent by the caller, ``means_memory`` numbers: counting references costs a third of a call.
     """
+    widest()
     rows, padded = points.shape
     skipped = (n + 2) // 3 * 3 - n  # padded rows between the states' and the controls'
     skip = (-(memory.ctypes.data >> 3)) % LINE  # rows start on cache lines
@@ -85,13 +86,13 @@ def means_along(points, inverse_squares, log_signal, beta, queries, n, memory, o
                 answer[1 + c] = D[row] * sums[row]
 
 
-@borrowing
+@njit_noalloc
 def padded_inputs(m):
     """Rows of the controls."""
     return (m + 2) // 3 * 3
 
 
-@borrowing
+@njit_noalloc
 def expand_at(gp, x, u, memory, kept, place, M, J, J_u):
     """M, its gradient J (k, n) and J_u (k, m) at one point, for other loops; the k_a stay in ``kept[:, place]``.
 
@@ -145,6 +146,7 @@ def expand_at(gp, x, u, memory, kept, place, M, J, J_u):
 @compiled
 def points_along(order, points, inverse_squares, log_signal, beta, inverse_cholesky, x, u, out):
     """Everything at H points, into the ten arrays of ``gpmpc.kernels.Expansion`` with H in front."""
+    widest()
     M, variance, dM_dx, dM_du, dvar_dx, dvar_du, d2M_dx2, d2M_dxdu, d3M_dx3, d3M_dx2du = out
     (rows, padded), n, m = points.shape, x.shape[1], u.shape[1]
     U = rows - padded_inputs(m)  # where the controls begin

@@ -6,13 +6,13 @@ memory does three multiplications. Lengths are multiples of 8, numbers of rows m
 
 import numpy as np
 
-from gpmpc.compiled import borrowing, compiled
+from gpmpc.compiled import njit_inner, njit_noalloc
 from gpmpc.kernels.exponential import EXACT, bits_of, float_of, widest
 
 LINE = 8  # doubles in a cache line
 
 
-@compiled
+@njit_inner
 def aligned(size):
     """Uninitialised doubles that start on a cache line."""
     memory = np.empty(size + LINE)
@@ -20,13 +20,13 @@ def aligned(size):
     return memory[skip : skip + size]
 
 
-@compiled
+@njit_inner
 def aligned_rows(rows, length):
     """The same as a matrix."""
     return aligned(rows * length).reshape(rows, length)
 
 
-@borrowing(fastmath=EXACT)
+@njit_noalloc(fastmath=EXACT)
 def combine(out, factors, rows):
     """Adds sum_d factors[d] rows[d] to ``out``."""
     widest()
@@ -37,7 +37,7 @@ def combine(out, factors, rows):
             out[j] = out[j] + factor0 * row0[j] + factor1 * row1[j] + factor2 * row2[j]
 
 
-@borrowing
+@njit_noalloc
 def project(row, rows, out):
     """Writes row . rows[d] to out[d]."""
     widest()
@@ -51,7 +51,7 @@ def project(row, rows, out):
         out[d], out[d + 1], out[d + 2] = sum0, sum1, sum2
 
 
-@borrowing
+@njit_noalloc
 def summed(row):
     """The sum of a row: numba's own adds one number after the other."""
     widest()
@@ -61,7 +61,7 @@ def summed(row):
     return result
 
 
-@borrowing
+@njit_noalloc
 def largest(row):
     """The largest magnitude; NaN is the largest of all. Compared as integers, which LLVM turns into full vectors."""
     widest()
@@ -71,7 +71,7 @@ def largest(row):
     return float_of(most)
 
 
-@borrowing
+@njit_noalloc
 def squared_lengths(rows, out):
     """Writes sum_d rows[d]^2."""
     widest()
@@ -82,7 +82,7 @@ def squared_lengths(rows, out):
             out[j] = before + row0[j] * row0[j] + row1[j] * row1[j] + row2[j] * row2[j]
 
 
-@borrowing
+@njit_noalloc
 def multiply(row, other, out):
     """Writes the elementwise product to ``out``."""
     widest()
@@ -90,7 +90,7 @@ def multiply(row, other, out):
         out[j] = row[j] * other[j]
 
 
-@borrowing(fastmath=EXACT)
+@njit_noalloc(fastmath=EXACT)
 def transform(matrix, rows, out, n):
     """Writes matrix @ rows, of n rows, to the first rows of ``out``."""
     widest()
@@ -103,7 +103,7 @@ def transform(matrix, rows, out, n):
         combine(target, factors[3:], rows[3:])
 
 
-@borrowing
+@njit_noalloc
 def second_moments(weights, rows, out, n, scratch):
     """Writes sum_i weights[i] rows[c, i] rows[d, i] to the symmetric out[c, d], c and d < n."""
     for c in range(n):
@@ -114,7 +114,7 @@ def second_moments(weights, rows, out, n, scratch):
             out[d, c] = out[c, d]
 
 
-@borrowing(fastmath=EXACT)
+@njit_noalloc(fastmath=EXACT)
 def add_products(out, factors, rows, others, n):
     """Adds sum_d factors[d] rows[d] others[d] over n rows to ``out``."""
     widest()
@@ -124,7 +124,7 @@ def add_products(out, factors, rows, others, n):
             out[j] = out[j] + (factor * row[j]) * other[j]
 
 
-@borrowing
+@njit_noalloc
 def explain(triangle, q, solved):
     """Returns |L^-1 q|^2 and writes (K + sn2 I)^-1 q to ``solved``, in one pass over the block triangle of L^-1."""
     solved[:] = 0.0
@@ -136,7 +136,7 @@ def explain(triangle, q, solved):
     return total
 
 
-@borrowing
+@njit_noalloc
 def explain_four(triangle, at, length, q, solved):
     """The part of four rows of L^-1, which start at ``at``: returns theirs of the square, adds theirs to ``solved``."""
     widest()
@@ -153,7 +153,7 @@ def explain_four(triangle, at, length, q, solved):
     return v0 * v0 + v1 * v1 + v2 * v2 + v3 * v3
 
 
-@borrowing
+@njit_noalloc
 def explain_several(columns, q, totals):
     """Adds |L^-1 q_h|^2 of the rows of q, a multiple of four of them, to ``totals``; q is overwritten.
 
@@ -192,7 +192,7 @@ def explain_several(columns, q, totals):
         j += 1
 
 
-@borrowing
+@njit_noalloc
 def solve_four(c0, c1, c2, c3, j, row):
     """Entries j to j + 3 of L^-1 q, where what the columns before have to say is in ``row`` already."""
     v0 = row[j] / c0[j]

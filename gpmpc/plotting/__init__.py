@@ -8,7 +8,6 @@ from gpmpc.plotting.image import png
 from gpmpc.plotting.quality import quality
 from gpmpc.plotting.recorded import inputs_figure, timing_figure, tracking_figure
 from gpmpc.plotting.results import Curve, Panel, calibration_figure, error_over_size, over_settings, tracking
-from gpmpc.plotting.speed import speed
 from gpmpc.plotting.sweeps import Series, over_variable
 
 __all__ = [
@@ -24,7 +23,6 @@ __all__ = [
     "over_variable",
     "png",
     "quality",
-    "speed",
     "timing_figure",
     "tracking",
     "tracking_figure",

@@ -13,7 +13,6 @@ IMPORTED = [
     "gpytorch",
     "cvxpy",
     "matplotlib.pyplot",
-    "gpmpc.bench.quality",
     "gpmpc.cli.command",
     "gpmpc.recording",
 ]

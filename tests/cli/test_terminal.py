@@ -121,7 +121,7 @@ def test_help_and_tab_list_only_choices_that_the_command_has(tmp_path):
 @pytest.mark.parametrize(
     ("line", "offered"),
     [
-        ("gpmpc ", {"run", "tables", "figures", "bench", "report", "plot", "log"}),
+        ("gpmpc ", {"run", "tables", "figures", "report", "plot", "log"}),
         ("gpmpc run trajectory=l", {"trajectory=lorenz"}),
         ("gpmpc run -m steps=3 controller=c", {"controller=convex"}),
         ("gpmpc figures study=h", {"study=horizon"}),

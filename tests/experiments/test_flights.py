@@ -20,7 +20,7 @@ from gpmpc.experiments.flights_report import LOOPS, paper_seconds, summarise
 from gpmpc.experiments.tables import FitStore, Subsystem
 from gpmpc.gp import SoftLimits, identity, train
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.propagation import MomentMatching
 from gpmpc.systems import Integrated, Translational
 from gpmpc.trajectories import Elliptical, Lorenz

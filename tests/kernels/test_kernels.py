@@ -13,13 +13,27 @@ import torch
 from gpmpc import kernels
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
+from gpmpc.kernels import exponential, pair_sums, point_rows
 from gpmpc.kernels.block import add_to_columns, expm1, expm1_near_zero, outer_sum
-from gpmpc.kernels.exponential import NEAR_ZERO, exp_all
+from gpmpc.kernels.exponential import NEAR_ZERO
 from gpmpc.kernels.packed import aligned_zeros, pack
-from gpmpc.kernels.pair_sums import Side, largest_exponent
-from gpmpc.kernels.point_rows import explain, explain_several
+from gpmpc.kernels.pair_sums import Side
 from gpmpc.propagation.moment_matching import moments
 from tests.propagation.test_moment_matching import belief, by_mpmath, model
+
+
+def from_python(inner):
+    """A function that Python can call."""
+
+    @numba.njit
+    def call(*arguments):
+        return inner(*arguments)
+
+    return call
+
+
+exp_all, largest_exponent = from_python(exponential.exp_all), from_python(pair_sums.largest_exponent)
+explain, explain_several = from_python(point_rows.explain), from_python(point_rows.explain_several)
 
 
 def packed(gp):

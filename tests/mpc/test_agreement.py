@@ -8,8 +8,7 @@ import torch
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
@@ -35,7 +34,7 @@ def questions(count, std):
 @pytest.mark.parametrize("propagator", [Linearization(), MomentMatching()], ids=["linearisation", "moment matching"])
 def test_iterated_programs_reach_the_optimum_of_the_nonlinear_method(propagator):
     gp = quadrotor_gp()
-    convex = ConvexMPC(gp, propagator, problem(0.5), H, HOVER, covariance="full", iterations=100, tolerance=1e-7)
+    convex = GPMPC(gp, propagator, problem(0.5), H, HOVER, covariance="full", iterations=100, tolerance=1e-7)
     nonlinear = NonlinearGPMPC(gp, propagator, problem(0.5), H, HOVER, tolerance=1e-6)
     for belief, reference in questions(4, 0.05):
         plans = [controller.control(belief, reference) for controller in (convex, nonlinear)]
@@ -47,7 +46,7 @@ def test_iterated_programs_reach_the_optimum_of_the_nonlinear_method(propagator)
 def test_dual_primal_and_state_form_give_the_same_inputs():
     gp, active = quadrotor_gp(), 0
     asked = (gp, Linearization(), problem(0.02), H, HOVER)
-    ours, primal, state_form = ConvexMPC(*asked), ConvexMPC(*asked, solver=PrimalActiveSet()), StateFormMPC(*asked)
+    ours, primal, state_form = GPMPC(*asked), GPMPC(*asked, solver=PrimalActiveSet()), StateFormMPC(*asked)
     for belief, reference in questions(5, 0.0):
         plan = ours.control(belief, reference)
         active += len(plan.solution.active_set)
@@ -67,7 +66,7 @@ def test_a_bound_that_takes_a_large_step_of_the_inputs_is_kept_by_iterated_progr
     reached = []
     for iterations in (1, 30):
         asked = (gp, Linearization(observation_noise=True), bounded, 1, HOVER)
-        plan = ConvexMPC(*asked, iterations=iterations, tolerance=1e-6).control(belief, reference)
+        plan = GPMPC(*asked, iterations=iterations, tolerance=1e-6).control(belief, reference)
         assert plan.status.solved
         after = Linearization(observation_noise=True)(gp, belief, torch.tensor(plan.input))
         reached.append(float(after.mean[0] + bounded.state_bounds.kappa * after.covariance[0, 0].sqrt()) - limit)

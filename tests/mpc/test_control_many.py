@@ -12,7 +12,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import evaluation
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.stage_models import stage_model
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
@@ -38,7 +38,7 @@ def controller(form, covariance, propagator, model=GP, **settings):
     box = {"input_lower": [0, -0.4, -0.4], "input_upper": [15, 0.4, 0.4]}
     bounds = StateBounds([-2] * 6, [2] * 6, l1=50.0)
     problem = TrackingProblem([1] * 6, [0.1] * 3, penalized="increments", state_bounds=bounds, **box)
-    return ConvexMPC(model, propagator, problem, H, HOVER, form=form, covariance=covariance, **settings)
+    return GPMPC(model, propagator, problem, H, HOVER, form=form, covariance=covariance, **settings)
 
 
 def beliefs(count, spread=0.05, seed=0):

@@ -10,7 +10,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import evaluation
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.supervision import command
 from gpmpc.mpc.tracking import TrackingProblem
@@ -25,7 +25,7 @@ AT_REST = Reference(np.tile([0.4, 0.0], (H + 1, 1)), np.zeros((H, 1)))
 UNKNOWN = np.array([0.0, 0.08])  # what the plant does that its model does not say [rad, rad/s]
 
 
-def controller(kind=ConvexMPC, model=PENDULUM, propagator=None, **settings):
+def controller(kind=GPMPC, model=PENDULUM, propagator=None, **settings):
     return kind(model, propagator or Linearization(), PROBLEM, H, [0.0], **settings)
 
 
@@ -135,7 +135,7 @@ def test_any_model_can_be_wrong():
         ({"disturbance_gain": 0.5, "form": "increment"}, "be 0 for form 'increment', which needs none; got 0.5"),
     ],
 )
-@pytest.mark.parametrize("kind", [ConvexMPC, StateFormMPC])
+@pytest.mark.parametrize("kind", [GPMPC, StateFormMPC])
 def test_a_gain_out_of_range_is_refused(kind, settings, rule):
     with pytest.raises(SettingError, match=rule):
         controller(kind, **settings)

@@ -11,7 +11,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.descent import Program
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.mpc.request import Request
 from gpmpc.mpc.shooting import Shooting
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.bench.optimality import Question, kkt_residual
-from gpmpc.bench.pendulums import pendulum_gp
+from benchmarks.kkt import Instance, kkt_residual
+from benchmarks.pendulums import pendulum_gp
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc import sequential_loop
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.convergence import kkt_share
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.sqp import kkt_share
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.sequential_loop import keeps_rates
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization
@@ -42,7 +42,7 @@ def reachable(quadrotor):
 def test_a_reference_that_can_be_reached_at_no_cost_is_reached(quadrotor, reachable, tolerance):
     """1e-300 asks for more than there is: it ends where every step is lost in round-off."""
     problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
-    controller = ConvexMPC(
+    controller = GPMPC(
         quadrotor, Linearization(), problem, 5, HOVER, covariance="none", iterations=40, tolerance=tolerance
     )
     decision = controller.control(Gaussian.certain(np.zeros(6)), reachable)
@@ -60,7 +60,7 @@ def test_a_regulator_at_its_origin_has_no_trouble(penalized, tolerance):
     parts = half.lengthscales, half.signal_variance, half.noise_variance
     model = GPPosterior.from_hyperparameters(features, targets, *parts, 1, predicts="difference")
     problem = TrackingProblem([10.0, 1.0], [0.1], penalized=penalized, input_lower=[-6.0], input_upper=[6.0])
-    controller = ConvexMPC(
+    controller = GPMPC(
         model, Linearization(), problem, 8, [0.0], covariance="none", iterations=20, tolerance=tolerance
     )
     state, last = np.array([0.8, 0.0]), None
@@ -78,7 +78,7 @@ def test_the_residual_vanishes_with_the_distance_where_the_cost_does(quadrotor):
     for u in inputs:
         states.append(quadrotor.predict(torch.tensor(states[-1]), torch.tensor(u)).mean.numpy())
     problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="increments", **BOX)
-    question = Question(Gaussian.certain(np.zeros(6)), Reference(np.array(states)), HOVER)
+    question = Instance(Gaussian.certain(np.zeros(6)), Reference(np.array(states)), HOVER)
     far, near, nearer = (kkt_residual(quadrotor, problem, question, inputs + d) for d in (1e-1, 1e-6, 1e-8))
     assert far > 0.1
     assert near < 1e-2
@@ -102,7 +102,7 @@ def test_the_share_is_the_cosine_but_where_moving_an_input_costs_more_than_there
 def test_what_is_called_solved_is_within_ten_times_the_tolerance(quadrotor, tolerance):
     """The stop estimates the residual of a plan that it has not rolled out; here another measures it."""
     problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="increments", **BOX)
-    controller = ConvexMPC(
+    controller = GPMPC(
         quadrotor, Linearization(), problem, 5, HOVER, covariance="none", iterations=80, tolerance=tolerance
     )
     random, last, before = np.random.default_rng(1), None, HOVER
@@ -111,7 +111,7 @@ def test_what_is_called_solved_is_within_ten_times_the_tolerance(quadrotor, tole
         reference = Reference(np.tile(0.5 * random.uniform(-1, 1, 6), (6, 1)))
         last = controller.control(belief, reference, last)
         assert last.status is Status.SOLVED
-        residual = kkt_residual(quadrotor, problem, Question(belief, reference, before), last.inputs)
+        residual = kkt_residual(quadrotor, problem, Instance(belief, reference, before), last.inputs)
         assert residual < 10 * tolerance
         before = last.input
 
@@ -123,7 +123,7 @@ def test_plans_of_the_program_keep_their_rates_whatever_the_unit_of_the_inputs(s
     problem = TrackingProblem(
         [10.0, 1.0], [0.1 / scale**2], penalized="increments", rate_lower=[-bound], rate_upper=[bound]
     )
-    controller = ConvexMPC(model, Linearization(), problem, 8, [1.234567 * scale], covariance="none", iterations=10)
+    controller = GPMPC(model, Linearization(), problem, 8, [1.234567 * scale], covariance="none", iterations=10)
     state, last, before, bitten = np.array([0.8, 0.0]), None, np.array([1.234567 * scale]), 0
     for _ in range(20):
         last = controller.control(Gaussian.certain(state), Reference(np.zeros((9, 2))), last)
@@ -165,7 +165,7 @@ def test_what_the_loop_asks_for_and_what_it_computes_are_the_same(quadrotor, cov
     problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="increments", **BOX, **limits)
     arguments = quadrotor, Linearization(), problem, 5, HOVER, "trajectory", covariance
     told = {} if "state_bounds" in limits else {"solver": Told(None)}  # whose prices need our own solver
-    alone, asking = (ConvexMPC(*arguments, **solver, iterations=60, tolerance=1e-7) for solver in ({}, told))
+    alone, asking = (GPMPC(*arguments, **solver, iterations=60, tolerance=1e-7) for solver in ({}, told))
     asking._sequence._predictor = Told(asking.predictor)
     random, last, other, programs = np.random.default_rng(2), None, None, 0
     for _ in range(8):
@@ -183,7 +183,7 @@ def test_what_the_loop_asks_for_and_what_it_computes_are_the_same(quadrotor, cov
 
 def test_the_order_in_memory_of_what_is_asked_changes_nothing(quadrotor):
     problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
-    controller = ConvexMPC(quadrotor, Linearization(), problem, 5, HOVER, iterations=30)
+    controller = GPMPC(quadrotor, Linearization(), problem, 5, HOVER, iterations=30)
     random = np.random.default_rng(3)
     states, inputs = 0.3 * random.uniform(-1, 1, (6, 6)), HOVER + 0.1 * random.uniform(-1, 1, (5, 3))
     S = torch.tensor(np.cov(random.normal(size=(6, 40)))) * 1e-3
@@ -198,7 +198,7 @@ def test_the_order_in_memory_of_what_is_asked_changes_nothing(quadrotor):
 
 def test_the_parts_of_the_time_are_within_what_the_step_took(quadrotor, reachable):
     problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
-    controller = ConvexMPC(quadrotor, Linearization(), problem, 5, HOVER, covariance="none", iterations=30)
+    controller = GPMPC(quadrotor, Linearization(), problem, 5, HOVER, covariance="none", iterations=30)
     began = perf_counter()
     timing = controller.control(Gaussian.certain(np.zeros(6)), reachable).timing
     assert timing.total <= perf_counter() - began

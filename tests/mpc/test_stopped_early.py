@@ -9,9 +9,8 @@ import torch
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization
@@ -28,7 +27,7 @@ START = np.array([0.9, 0.0, -0.8, 0.2, 0.7, 0.0])
 
 
 def convex(problem=PROBLEM, **settings):
-    return ConvexMPC(GP, Linearization(), problem, H, HOVER, **settings)
+    return GPMPC(GP, Linearization(), problem, H, HOVER, **settings)
 
 
 def nmpc(monkeypatch):

@@ -2,11 +2,9 @@
 
 import pickle
 
-import numba
 import numpy as np
 import pytest
 
-import gpmpc.compiled
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from tests.qp.problems import feasible_problem, worst_residual
 
@@ -79,11 +77,3 @@ def test_a_record_with_gaps_is_a_warm_start_too(rng):
     for solution in (DualActiveSet().solve(problem, gappy), prepared.solve(*vectors, gappy)):
         assert solution.status.solved
         np.testing.assert_allclose(solution.x, cold.x, atol=1e-9)
-
-
-def test_without_numbas_private_parts_kernels_are_slower_and_no_worse(monkeypatch):
-    monkeypatch.setattr(gpmpc.compiled, "_knows", lambda option: False)
-    monkeypatch.setattr(numba, "njit", lambda **options: lambda function: (function, options))
-    _, options = gpmpc.compiled.borrowing(len)
-    assert not {"_nrt", "no_cfunc_wrapper"} & set(options)
-    assert gpmpc.compiled.direct(print) is print

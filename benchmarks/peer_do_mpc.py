@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import casadi
 import numpy as np
 
-from gpmpc.bench.optimality import Question
-from gpmpc.bench.peer_casadi import WARM, mean_function
+from benchmarks.kkt import Instance
+from benchmarks.peer_casadi import WARM, mean_function
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.interrupts import interrupts_after
@@ -75,18 +75,18 @@ class DoMpc:
         mpc.set_tvp_fun(lambda time: self._references)
         mpc.setup()
 
-    def __call__(self, question: Question, last: Planned | None) -> Planned:
+    def __call__(self, instance: Instance, last: Planned | None) -> Planned:
         """The plan from a state along a reference, started as do-mpc does."""
         mpc = self._mpc
-        for k, target in enumerate(question.reference.states):
+        for k, target in enumerate(instance.reference.states):
             self._references["_tvp", k, "r"] = target
-        mpc.u0 = question.last
+        mpc.u0 = instance.last
         if last is None:
             mpc.reset_history()
-            mpc.x0 = question.state
+            mpc.x0 = instance.state
             mpc.set_initial_guess()
         with interrupts_after():
-            mpc.make_step(question.state)
+            mpc.make_step(instance.state)
         inputs = [np.array(mpc.opt_x_num["_u", k, 0]).ravel() for k in range(self._horizon)]
         return Planned(np.array(inputs))
 

@@ -10,13 +10,12 @@ from hydra import compose, initialize_config_dir
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gpmpc.bench.contenders import FAMILIES, TRUTH, Contender, contenders
-from gpmpc.bench.quadrotor import HOVER, OUTER, problem
-from gpmpc.bench.quality import Field, pareto_front, stage_cost
+from benchmarks.quadrotor import HOVER, OUTER, problem
+from benchmarks.quality import FAMILIES, TRUTH, Contender, Field, contenders, pareto_front, stage_cost
 from gpmpc.cli.run import experiment_of
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.plotting import png, quality
 from gpmpc.propagation import Linearization
@@ -33,7 +32,7 @@ class Astray(Contender):
     """Hardly ever moves an input."""
 
     def controller(self, model):
-        return ConvexMPC(model, Linearization(), replace(problem(), R=[1e12] * 3), self.horizon, HOVER)
+        return GPMPC(model, Linearization(), replace(problem(), R=[1e12] * 3), self.horizon, HOVER)
 
 
 def model(N=60):
@@ -113,10 +112,8 @@ def rows():
     truth, astray = Contender(TRUTH.name, TRUTH.words, 2), Astray("astray", "controller=convex", 2)
     short = replace(CHEAP, horizon=1)
     field = Field([truth, CHEAP, short, astray], steps=12, seeds=2, trajectories=["elliptical"])
-    groups = field.groups({"elliptical": model()})
-    assert len({group.name for group in groups}) == len(groups) == 8
-    records = [json.loads(json.dumps(group.measure())) for group in groups]  # as they are kept
-    assert field.rows(records[:-1]) == []
+    records = [json.loads(json.dumps(record)) for record in field.fly({"elliptical": model()})]  # as they are kept
+    assert len(records) == 8
     return field.rows(records)
 
 

@@ -32,7 +32,7 @@ SMALL = 1e-3  # share of an input's size
 
 
 @dataclass(frozen=True)
-class Question:
+class Instance:
     """What every contender is asked at one step.
 
     Attributes:
@@ -56,13 +56,13 @@ class Question:
         return self.reference.states[1:]
 
 
-def kkt_residual(model: DynamicsModel, problem: TrackingProblem, question: Question, inputs: Array) -> float:
+def kkt_residual(model: DynamicsModel, problem: TrackingProblem, instance: Instance, inputs: Array) -> float:
     """How far a plan is from a KKT point; see the module's text.
 
     Args:
         model: Its mean is the dynamics; float64 in host memory.
         problem: Weights, and bounds of the inputs; increments or the inputs themselves are weighed.
-        question: Where the plan starts and what it follows.
+        instance: Where the plan starts and what it follows.
         inputs: The plan (H, m).
 
     Raises:
@@ -71,15 +71,15 @@ def kkt_residual(model: DynamicsModel, problem: TrackingProblem, question: Quest
     """
     if problem.state_bounds is not None or problem.rate_limited or problem.penalized == "deviations":
         raise SettingError("problem", "must bound nothing but inputs, and weigh inputs or increments")
-    H, m = len(question.targets), problem.input_dim
+    H, m = len(instance.targets), problem.input_dim
     if np.shape(inputs) != (H, m):
         raise ShapeError(f"a plan of {H} stages and {m} inputs must have shape ({H}, {m}); got {np.shape(inputs)}")
     if not np.isfinite(inputs).all():
         return np.inf
-    states, A, B = _rollout(model, question.state, np.asarray(inputs, dtype=float))
-    errors = states[1:] - question.targets
+    states, A, B = _rollout(model, instance.state, np.asarray(inputs, dtype=float))
+    errors = states[1:] - instance.targets
     weights = np.array([problem.Q] * (H - 1) + [problem.terminal])
-    cost, gradient, curvature = _of_the_inputs(problem, question.last, inputs)
+    cost, gradient, curvature = _of_the_inputs(problem, instance.last, inputs)
     cost += np.einsum("ia,iab,ib->", errors, weights, errors)
     adjoint = np.zeros(problem.state_dim)
     for i in reversed(range(H)):

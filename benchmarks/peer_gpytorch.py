@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from gpmpc.bench.optimality import Question
+from benchmarks.kkt import Instance
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.model import exact_inference, gpytorch_model
@@ -46,16 +46,16 @@ class GPyTorchSlsqp:
         self._Q, self._R, self._terminal = map(torch.from_numpy, (problem.Q, problem.R, problem.terminal))
         self._bounds = list(zip(problem.input_lower, problem.input_upper, strict=True)) * horizon
 
-    def __call__(self, question: Question, last: Plan | None) -> Plan:
+    def __call__(self, instance: Instance, last: Plan | None) -> Plan:
         """The plan from a state along a reference, started from the last one, shifted."""
-        start = np.tile(question.last, (self._horizon, 1))
+        start = np.tile(instance.last, (self._horizon, 1))
         if last is not None:
             start = np.concatenate([last.inputs[1:], last.inputs[-1:]])
-        targets, before = torch.from_numpy(question.targets), torch.from_numpy(np.array(question.last))
+        targets, before = torch.from_numpy(instance.targets), torch.from_numpy(np.array(instance.last))
 
         def cost(plan: np.ndarray) -> tuple[float, np.ndarray]:
             inputs = torch.tensor(plan.reshape(start.shape), requires_grad=True)
-            total = self._cost(question.belief.mean, before, inputs, targets)
+            total = self._cost(instance.belief.mean, before, inputs, targets)
             total.backward()
             return float(total.detach()), inputs.grad.numpy().ravel()
 

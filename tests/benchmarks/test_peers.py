@@ -1,4 +1,4 @@
-"""Contenders are asked the same question and judged by the same measure, which knows an optimum when it sees one."""
+"""Contenders are asked the same instance and judged by the same measure, which knows an optimum when it sees one."""
 
 import itertools
 from dataclasses import replace
@@ -8,10 +8,10 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from gpmpc.bench import peer_daqp, peer_do_mpc
-from gpmpc.bench.linearisations import linearisation_groups
-from gpmpc.bench.optimality import Question, kkt_residual
-from gpmpc.bench.peers import Pilot, converged, one_program
+from benchmarks import peer_daqp, peer_do_mpc
+from benchmarks.gp import linearisation_groups
+from benchmarks.kkt import Instance, kkt_residual
+from benchmarks.peers import EVICTED, LOOP, Run, converged, measure, one_program, table
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
@@ -42,31 +42,31 @@ def gp():
 
 
 @pytest.fixture(scope="module")
-def questions():
+def instances():
     def asked(shift):
         states = np.tile([0.3 + shift, 0.0, -0.2, 0.0, 0.4, 0.0], (H + 1, 1))
         belief = Gaussian.certain(torch.tensor([0.1 * shift, 0.1, 0.0, -0.1, 0.0, 0.0], dtype=torch.float64))
-        return Question(belief, Reference(states), HOVER + np.array([0.05, 0.0, -0.005]))
+        return Instance(belief, Reference(states), HOVER + np.array([0.05, 0.0, -0.005]))
 
     return [asked(0.0), asked(0.05)]
 
 
-def cost_of(gp, question, plan):
+def cost_of(gp, instance, plan):
     """By torch, from the posterior's predictions alone."""
-    x, total = question.belief.mean, 0.0
-    for u, target in zip(plan, torch.from_numpy(question.targets), strict=True):
+    x, total = instance.belief.mean, 0.0
+    for u, target in zip(plan, torch.from_numpy(instance.targets), strict=True):
         x = gp.predict(x, u).mean
         total = total + (x - target).square().sum()
-    return total + torch.diff(plan, dim=0, prepend=torch.from_numpy(question.last)[None]).square().sum()
+    return total + torch.diff(plan, dim=0, prepend=torch.from_numpy(instance.last)[None]).square().sum()
 
 
 @pytest.fixture(scope="module")
-def optimum(gp, questions):
+def optimum(gp, instances):
     """By L-BFGS-B on torch's gradient, polished until nothing moves."""
 
     def value(flat):
         plan = torch.tensor(flat.reshape(H, 3) * [1.0, 0.1, 0.1], requires_grad=True)
-        cost = cost_of(gp, questions[0], plan)
+        cost = cost_of(gp, instances[0], plan)
         cost.backward()
         return float(cost.detach()), (plan.grad.numpy() * [1.0, 0.1, 0.1]).ravel()
 
@@ -78,28 +78,28 @@ def optimum(gp, questions):
     return plan.reshape(H, 3) * [1.0, 0.1, 0.1]
 
 
-def test_the_residual_vanishes_at_an_optimum_found_otherwise_and_nowhere_near_it(gp, questions, optimum):
+def test_the_residual_vanishes_at_an_optimum_found_otherwise_and_nowhere_near_it(gp, instances, optimum):
     at_bounds = (optimum == PROBLEM.input_lower) | (optimum == PROBLEM.input_upper)
     assert at_bounds.any()
     assert not at_bounds.all()
-    assert kkt_residual(gp, PROBLEM, questions[0], optimum) < 1e-6
-    assert kkt_residual(gp, PROBLEM, questions[1], optimum) > 1e-3
+    assert kkt_residual(gp, PROBLEM, instances[0], optimum) < 1e-6
+    assert kkt_residual(gp, PROBLEM, instances[1], optimum) > 1e-3
     for k, j in itertools.product(range(H), range(3)):
         moved = optimum.copy()
         moved[k, j] += 0.01 * (PROBLEM.input_upper[j] - PROBLEM.input_lower[j]) * (-1 if moved[k, j] > HOVER[j] else 1)
-        assert kkt_residual(gp, PROBLEM, questions[0], moved) > 1e-4
-    assert kkt_residual(gp, PROBLEM, questions[0], np.full((H, 3), np.nan)) == np.inf
+        assert kkt_residual(gp, PROBLEM, instances[0], moved) > 1e-4
+    assert kkt_residual(gp, PROBLEM, instances[0], np.full((H, 3), np.nan)) == np.inf
 
 
-def test_a_plan_beyond_its_bounds_is_no_optimum_even_where_the_slope_is_zero(gp, questions):
+def test_a_plan_beyond_its_bounds_is_no_optimum_even_where_the_slope_is_zero(gp, instances):
     free = TrackingProblem(PROBLEM.Q, PROBLEM.R, "increments")
-    answer = converged(gp, free, H)[0]["ConvexMPC, iterated"]()(questions[0], None)
+    answer = converged(gp, free, H)[LOOP]()(instances[0], None)
     assert ((answer.inputs < PROBLEM.input_lower) | (answer.inputs > PROBLEM.input_upper)).any()
-    assert kkt_residual(gp, free, questions[0], answer.inputs) < 1e-5
-    assert kkt_residual(gp, PROBLEM, questions[0], answer.inputs) > 1e-3
+    assert kkt_residual(gp, free, instances[0], answer.inputs) < 1e-5
+    assert kkt_residual(gp, PROBLEM, instances[0], answer.inputs) > 1e-3
 
 
-def test_the_residual_knows_no_units_of_the_cost(gp, questions):
+def test_the_residual_knows_no_units_of_the_cost(gp, instances):
     plan = np.tile(HOVER, (H, 1))
     scaled = TrackingProblem(
         100 * PROBLEM.Q,
@@ -108,36 +108,36 @@ def test_the_residual_knows_no_units_of_the_cost(gp, questions):
         input_lower=PROBLEM.input_lower,
         input_upper=PROBLEM.input_upper,
     )
-    residual = kkt_residual(gp, PROBLEM, questions[0], plan)
+    residual = kkt_residual(gp, PROBLEM, instances[0], plan)
     assert 1e-3 < residual <= 1.0
-    assert kkt_residual(gp, scaled, questions[0], plan) == pytest.approx(residual, rel=1e-12)
+    assert kkt_residual(gp, scaled, instances[0], plan) == pytest.approx(residual, rel=1e-12)
 
 
-def test_all_contenders_that_are_here_agree(gp, questions, optimum):
+def test_all_contenders_that_are_here_agree(gp, instances, optimum):
     """Each stops by a measure of its own; what that leaves is less than a hundredth of the inputs' range."""
-    makers = {name: make for group in converged(gp, PROBLEM, H) for name, make in group.items()}
-    assert len(makers) == 8
-    assert (makers["do-mpc + IPOPT"] is None) == (not peer_do_mpc.installed())
+    makers = converged(gp, PROBLEM, H)
+    assert (makers["do-mpc, IPOPT"] is None) == (not peer_do_mpc.installed())
     accuracy = 1e-2 * (PROBLEM.input_upper - PROBLEM.input_lower)
     for name, make in makers.items():
         if make is None:
             continue
         solve = make()
-        first = solve(questions[0], None)
+        first = solve(instances[0], None)
         assert (np.abs(first.inputs - optimum) <= accuracy).all(), name
-        warm, cold = solve(questions[1], first), solve(questions[1], None)
+        warm, cold = solve(instances[1], first), solve(instances[1], None)
         for answer in (warm, cold):
-            assert kkt_residual(gp, PROBLEM, questions[1], answer.inputs) < 1e-3, name
+            assert kkt_residual(gp, PROBLEM, instances[1], answer.inputs) < 1e-3, name
         assert (np.abs(warm.inputs - cold.inputs) <= accuracy).all(), name
 
 
 @pytest.mark.skipif(not peer_daqp.installed(), reason="daqp is not installed")
-def test_daqp_in_the_controller_decides_the_same(gp, questions):
-    for ours, theirs in (group.values() for group in one_program(gp, PROBLEM, H)):
-        first, second = ours(), theirs()
+def test_daqp_in_the_controller_decides_the_same(gp, instances):
+    cases = one_program(gp, PROBLEM, H)
+    for name in ("gpmpc, mean only", "gpmpc, zero order"):
+        first, second = cases[name](), cases[f"{name}, DAQP inside"]()
         mine, other = None, None
-        for question in [*questions, questions[0]]:
-            mine, other = first(question, mine), second(question, other)
+        for instance in [*instances, instances[0]]:
+            mine, other = first(instance, mine), second(instance, other)
             assert other.status is Status.SOLVED
             assert np.allclose(mine.inputs, other.inputs, rtol=0, atol=1e-7)
 
@@ -154,19 +154,32 @@ def test_daqp_says_what_has_no_solution_and_goes_on():
     assert np.allclose(found.x, DualActiveSet().solve(possible).x)
 
 
-def test_a_pilot_forgets_its_last_answer_when_the_questions_begin_again(questions):
+@pytest.mark.parametrize("cold", [False, True])
+def test_a_run_forgets_its_last_solution_when_the_instances_begin_again_or_at_once_when_cold(cold, instances):
     seen = []
 
-    def solve(question, last):
-        seen.append((question, last))
+    def solve(instance, last):
+        seen.append((instance, last and last.inputs))
         return _Plan(len(seen))
 
-    pilot = Pilot(solve, questions)
+    run = Run(solve, instances, cold)
     for _ in range(3):
-        pilot()
-    assert [question is questions[k] for (question, _), k in zip(seen, (0, 1, 0), strict=True)] == [True] * 3
-    assert [last if last is None else last.inputs for _, last in seen] == [None, 1, None]
-    assert pilot.plans == [(0, 1), (1, 2), (0, 3)]
+        run()
+    assert [instance is instances[k] for (instance, _), k in zip(seen, (0, 1, 0), strict=True)] == [True] * 3
+    assert [last for _, last in seen] == [None, None if cold else 1, None]
+    assert run.plans == [(0, 1), (1, 2), (0, 3)]
+
+
+def test_the_table_of_peers_has_a_row_for_everybody_and_says_who_is_missing(gp, instances):
+    cases = converged(gp, PROBLEM, H) | {"absent": None}
+    cases = {name: cases[name] for name in (EVICTED, LOOP, "CasADi, IPOPT, Gauss-Newton", "absent")}
+    *rows, missing = measure(cases, gp, PROBLEM, instances, 0.01, cold=False)
+    assert [row["what"] for row in rows] == list(cases)[:3]
+    assert rows[1]["times_ours"] == rows[0]["times_ours_evicted"] == 1.0
+    assert rows[2]["times_ours"] > 1
+    assert all(row["kkt"] <= row["kkt_worst"] < 1e-3 for row in rows)
+    assert "not installed" in missing["note"]
+    assert len(table([*rows, missing]).splitlines()) == 6
 
 
 class _Plan:
@@ -185,9 +198,9 @@ def test_ways_to_linearise_give_the_same_derivatives(gp):
                 assert np.allclose(a, b, rtol=1e-6, atol=1e-9)
 
 
-def test_what_the_measure_does_not_cover_is_refused(gp, questions):
+def test_what_the_measure_does_not_cover_is_refused(gp, instances):
     bounded = TrackingProblem([1.0] * 6, [1.0] * 3, state_bounds=StateBounds([-1.0] * 6, [1.0] * 6))
     with pytest.raises(SettingError, match="problem: must bound nothing but inputs"):
-        kkt_residual(gp, bounded, questions[0], np.tile(HOVER, (H, 1)))
+        kkt_residual(gp, bounded, instances[0], np.tile(HOVER, (H, 1)))
     with pytest.raises(ShapeError, match=r"shape \(3, 3\); got \(2, 3\)"):
-        kkt_residual(gp, PROBLEM, questions[0], np.tile(HOVER, (2, 1)))
+        kkt_residual(gp, PROBLEM, instances[0], np.tile(HOVER, (2, 1)))

@@ -8,7 +8,7 @@ import importlib.util
 
 import numpy as np
 
-from gpmpc.bench.peer_do_mpc import MISSING
+from benchmarks.peer_do_mpc import MISSING
 from gpmpc.exceptions import SettingError
 from gpmpc.qp import QPSolution, QuadraticProgram
 from gpmpc.qp.problem import ABSENT

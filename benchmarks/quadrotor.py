@@ -32,7 +32,7 @@ TRAINER = Trainer(predicts="difference", scaling=standardize)
 
 @dataclass(frozen=True)
 class Asked:
-    """One recorded question to a controller, and what it decided."""
+    """One recorded instance to a controller, and what it decided."""
 
     belief: Gaussian
     reference: Reference
@@ -54,7 +54,7 @@ def problem(bounds: StateBounds | None = None, thrust: Sequence[float] = (0.0, 1
 
 
 def recorded(controller: Controller, trajectory: str, steps: int, std: float = 0.0, seed: int = 0) -> list[Asked]:
-    """The questions of a flight with the plant in the loop; ``std`` is what the controller is told to be unsure of."""
+    """The instances of a flight with the plant in the loop; ``std`` is what the controller is told to be unsure of."""
     asked: list[Asked] = []
 
     class Recording:

@@ -1,41 +1,192 @@
-"""Problem: which controller gives the best flight for the time at hand? Cost over time, for all of them at once.
+"""Closed-loop cost over the time of a decision, for every controller and propagation of the package.
+
+    .venv/bin/python -m benchmarks.quality [--steps 50] [--seeds 3]
 
 Every contender flies the same flights: the quadrotor's translational subsystem, the plant in the loop, the same seeds
-of its noise. What is paid is the stage cost that all of them were told to make small, summed along the true flight,
+of its noise. Its name is what is typed after ``gpmpc run``, and it is built from that name alone. The cost is the stage
+cost that all of them minimise, summed along the true flight,
 
     1/K  sum_{k=1..K} |x_k - r_k|^2_Q + sum_{k=0..K-1} |u_k - u_{k-1}|^2_R
 
-and it is divided, flights by flights, by what NMPC on the true model pays with the longest horizon: 1 is what knowing
-the truth and having all the time in the world buys. Nothing bounds a state here, so what covariances are for, keeping
-away from bounds, does not show; what they take does.
-
-Contenders take turns, flight by flight. A decision's time is the processor time of its thread; what is compiled or
-loaded at a first call is spent before.
+divided by that of NMPC on the true model with the longest horizon. Nothing bounds a state here, so what covariances buy
+does not show; what they take does. Contenders take turns, flight by flight. A decision's time is the processor time of
+its thread; compiling and loading come before. Writes ``outputs/benchmarks/quality.json`` and ``quality.png``.
 """
 
+import argparse
+import math
 import time
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from itertools import chain, product
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpmpc.bench.contenders import TRUTH, Contender
-from gpmpc.bench.groups import Group
-from gpmpc.bench.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
+from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
+from benchmarks.timing import RESULTS, markdown_table, use_one_thread, write_results
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.metrics import tracking_error
 from gpmpc.mpc.controller import Controller, Decision, Reference
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
+from gpmpc.mpc.lqr import LQR
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.plotting import png, quality
+from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from gpmpc.simulation import Rollout, closed_loop, rehearse
 from gpmpc.trajectories import states_along
 
 LOST = 5.0  # [m] from the reference, some hundred times what is usual: nothing to compare costs with
 SAME = 1e-3  # difference of two costs below which the seeds' noise hides it: it buys no time
+HORIZONS = (1, 5, 10, 20)
+PROPAGATIONS = {
+    "mean_equivalence": MeanEquivalence(),
+    "linearization": Linearization(),
+    "moment_matching": MomentMatching(),
+    "unscented": Unscented(),
+}
+CONTROLLERS = {  # by their names in conf/controller: class, propagation, and what else is set there
+    "convex": (GPMPC, "linearization", {}),
+    "paper": (GPMPC, "moment_matching", {"form": "increment", "covariance": "full"}),
+    "state_form": (StateFormMPC, "linearization", {}),
+    "nonlinear": (NonlinearGPMPC, "moment_matching", {}),
+    "lqr": (LQR, None, {}),
+    "nmpc": (NMPC, None, {}),
+}
+
+
+def main() -> None:
+    """Flies, prints and draws."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=50, help="of a flight")
+    parser.add_argument("--seeds", type=int, default=3, help="flights on each trajectory")
+    arguments = parser.parse_args()
+    use_one_thread()
+    field = Field(contenders(), arguments.steps, arguments.seeds)
+    rows = field.rows(list(field.fly()))
+    header = ("what", "H", "median", "p99", "cost", "failed", "lost")
+    print(markdown_table(header, [[row.get(key) for key in header] for row in rows]))
+    write_results("quality", rows)
+    (RESULTS / "quality.png").write_bytes(png(quality(rows), dpi=130))
+
+
+class Family(NamedTuple):
+    """One choice of settings, at many horizons.
+
+    Attributes:
+        name: Kind of controller, for the reader.
+        words: What chooses it.
+        longest: The longest horizon that is worth the time.
+    """
+
+    name: str
+    words: str
+    longest: float = math.inf
+
+
+TRUTH = Family("NMPC, true model", "controller=nmpc")
+INCREMENTS, DEVIATIONS, STATES = "increments (paper)", "deviations", "state form, Clarabel"
+MEAN, ZERO_ORDER = "trajectory, mean only", "trajectory, zero order"
+SPREAD, CONVERGED = "trajectory, diagonal or full", "trajectory, converged"
+NONLINEAR = "nonlinear GP-MPC"
+CONVEX, FULL, DIAGONAL = "controller=convex", "controller.covariance=full", "controller.covariance=diagonal"
+NONE, EXACT, POINTS = "controller.covariance=none", "propagation=moment_matching", "propagation=unscented"
+MORE = "controller.iterations=100 controller.tolerance=1e-6"
+FIRST_ORDER, SLSQP = "propagation=linearization", "controller.optimizer=slsqp"
+FAMILIES = (
+    TRUTH,
+    Family("LQR", "controller=lqr"),
+    Family(INCREMENTS, "controller=paper"),
+    Family(INCREMENTS, f"controller=paper {DIAGONAL}"),
+    Family(INCREMENTS, f"controller=paper {NONE}"),
+    Family(DEVIATIONS, f"{CONVEX} controller.form=deviation"),
+    Family(DEVIATIONS, f"{CONVEX} controller.form=deviation {FULL} {EXACT}"),
+    Family(MEAN, f"{CONVEX} {NONE}"),
+    Family(ZERO_ORDER, CONVEX),
+    Family(ZERO_ORDER, f"{CONVEX} propagation=mean_equivalence"),
+    Family(ZERO_ORDER, f"{CONVEX} {EXACT}"),
+    Family(ZERO_ORDER, f"{CONVEX} {POINTS}"),
+    Family(SPREAD, f"{CONVEX} {DIAGONAL}"),
+    Family(SPREAD, f"{CONVEX} {DIAGONAL} {EXACT}"),
+    Family(SPREAD, f"{CONVEX} {FULL}"),
+    Family(SPREAD, f"{CONVEX} {FULL} {EXACT}"),
+    Family(SPREAD, f"{CONVEX} {FULL} {POINTS}"),
+    Family(CONVERGED, f"{CONVEX} {NONE} {MORE}"),
+    Family(CONVERGED, f"{CONVEX} {MORE}"),
+    Family(CONVERGED, f"{CONVEX} {FULL} {EXACT} {MORE}", longest=10),
+    Family(STATES, "controller=state_form"),
+    Family(NONLINEAR, f"controller=nonlinear {FIRST_ORDER}"),
+    Family(NONLINEAR, "controller=nonlinear"),
+    Family(NONLINEAR, f"controller=nonlinear {FIRST_ORDER} {SLSQP}", longest=10),
+    Family(NONLINEAR, f"controller=nonlinear {SLSQP}", longest=10),
+)
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A controller with its settings.
+
+    Attributes:
+        family: Kind of controller, for the reader.
+        words: What is typed after ``gpmpc run`` to choose it, the horizon apart.
+        horizon: H.
+    """
+
+    family: str
+    words: str
+    horizon: int
+
+    def controller(self, model: GPPosterior) -> Controller:
+        """The controller that the words mean, on a learned model, or for ``nmpc`` on the plant itself.
+
+        Raises:
+            SettingError: Words that mean none.
+        """
+        chosen = dict(word.split("=", 1) for word in self.words.split())
+        name = chosen.pop("controller", None)
+        if name not in CONTROLLERS:
+            raise SettingError("controller", f"must be one of {', '.join(CONTROLLERS)}; got {name!r}")
+        make, propagation, own = CONTROLLERS[name]
+        propagation = chosen.pop("propagation", propagation)
+        own = own | {key.removeprefix("controller."): _value(text) for key, text in chosen.items()}
+        parts: list[Any] = [OUTER if make is NMPC else model]
+        if propagation is not None:
+            parts.append(PROPAGATIONS[propagation])
+        return make(*parts, problem(), self.horizon, HOVER, **own)
+
+
+def contenders(horizons: Sequence[int] = HORIZONS) -> list[Contender]:
+    """Every controller and propagation of the package, at every horizon that is worth its time.
+
+    Raises:
+        SettingError: No horizon, or one that is none.
+    """
+    if not isinstance(horizons, list | tuple) or not horizons:
+        raise SettingError("horizons", f"must be a list with something in it; got {horizons!r}")
+    for horizon in horizons:
+        check_number("horizons", horizon, least=1, whole=True)
+    return [
+        Contender(family.name, family.words, horizon)
+        for family in FAMILIES
+        for horizon in sorted(set(horizons))
+        if horizon <= family.longest
+    ]
+
+
+def _value(text: str) -> str | int | float:
+    """A setting's value as YAML would read it."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
 
 
 @dataclass(frozen=True)
@@ -46,7 +197,7 @@ class Field:
         contenders: In any order.
         steps: Of a flight.
         seeds: Of the noise: flights on each trajectory.
-        trajectories: Of ``gpmpc.bench.quadrotor.TRAJECTORIES``.
+        trajectories: Of ``benchmarks.quadrotor.TRAJECTORIES``.
 
     Raises:
         SettingError: A number out of range, nobody, or an unknown trajectory.
@@ -77,8 +228,8 @@ class Field:
         everyone = list(dict.fromkeys([self.truth, *self.contenders]))
         return list(product(range(self.seeds), dict.fromkeys(self.trajectories), everyone))
 
-    def groups(self, models: Mapping[str, GPPosterior] | None = None) -> list[Group]:
-        """A flight each; ``lost`` says why one has no result.
+    def fly(self, models: Mapping[str, GPPosterior] | None = None) -> Iterator[dict]:
+        """Yields the record of every flight; ``lost`` says why one has no result.
 
         Args:
             models: What was learned, by trajectory; by default GPs of 189 transitions of a dithered flight.
@@ -86,19 +237,14 @@ class Field:
         model = cache(trained) if models is None else models.__getitem__
         controller = cache(lambda trajectory, contender: contender.controller(model(trajectory)))
 
-        def flown(seed: int, trajectory: str, contender: Contender) -> dict:
+        for seed, trajectory, contender in self._flights:
             try:
-                return _paid(*_flight(controller(trajectory, contender), trajectory, self.steps, seed))
+                yield _paid(*_flight(controller(trajectory, contender), trajectory, self.steps, seed))
             except GpmpcError as error:
-                return {"lost": f"{trajectory}, seed {seed}: {error}"}
-
-        return [
-            Group(f"{name} seed {seed} H={who.horizon} {who.words}", partial(flown, seed, name, who))
-            for seed, name, who in self._flights
-        ]
+                yield {"lost": f"{trajectory}, seed {seed}: {error}"}
 
     def rows(self, records: Sequence[dict]) -> list[dict]:
-        """What each contender paid, in cost and in time; nothing before all have flown all flights.
+        """What each contender paid, in cost and in time.
 
         Returns:
             A row for every contender: ``what`` is typed after ``gpmpc run``, with ``horizon=H``; ``median`` and ``p99``
@@ -107,11 +253,8 @@ class Field:
             other controller on a learned model is as good, to 0.1 %, in less time or better in the same. Who lost a
             flight has none of these numbers, and ``lost`` says how.
         """
-        flights = self._flights
-        if len(records) < len(flights):
-            return []
         flown: dict[Contender, dict[str, list[dict]]] = defaultdict(lambda: defaultdict(list))
-        for (_, trajectory, contender), record in zip(flights, records, strict=True):
+        for (_, trajectory, contender), record in zip(self._flights, records, strict=True):
             flown[contender][trajectory].append(record)
         rows = [_row(contender, flown[contender], flown[self.truth], self.steps) for contender in self.contenders]
         candidates = [row for row in rows if row["lost"] is None and row["family"] != TRUTH.name]
@@ -224,3 +367,7 @@ def _row(contender: Contender, flown: Mapping[str, list[dict]], truth: Mapping[s
         f"rmse {name}": float(np.sqrt(np.mean([record["rmse"] ** 2 for record in of]))) for name, of in flown.items()
     }
     return row | {"failed": sum(record["failed"] for record in records), "samples": len(seconds)}
+
+
+if __name__ == "__main__":
+    main()

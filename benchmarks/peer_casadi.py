@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import casadi
 import numpy as np
 
-from gpmpc.bench.optimality import Question
+from benchmarks.kkt import Instance
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.casadi_ import casadi_function
@@ -105,11 +105,11 @@ class CasadiIpopt:
         self._upper = np.concatenate([free, np.tile(problem.input_upper, H)])
         self._shape = (H, n, m)
 
-    def __call__(self, question: Question, last: Answer | None) -> Answer:
+    def __call__(self, instance: Instance, last: Answer | None) -> Answer:
         """The plan from a state along a reference, started from the last one, shifted."""
         H, n, m = self._shape
         if last is None:
-            start = np.concatenate([question.targets.ravel(), np.tile(question.last, H)])
+            start = np.concatenate([instance.targets.ravel(), np.tile(instance.last, H)])
             multipliers = {}
         else:
             bounds_x, bounds_u = last.of_bounds[: H * n], last.of_bounds[H * n :]
@@ -121,7 +121,7 @@ class CasadiIpopt:
         with interrupts_after():
             found = self._solver(
                 x0=start,
-                p=np.concatenate([question.state, question.last, question.targets.ravel()]),
+                p=np.concatenate([instance.state, instance.last, instance.targets.ravel()]),
                 lbx=self._lower,
                 ubx=self._upper,
                 lbg=0.0,

@@ -1,0 +1,219 @@
+"""The nonlinear problem of a control step solved to one common accuracy, beside CasADi, do-mpc and GPyTorch.
+
+    .venv/bin/python -m benchmarks.peers [--horizons 10 20] [--alone 50] [--seconds 20] [--starts warm cold]
+
+The quadrotor follows the Lorenz path with the plant in the loop; GPs of 189 transitions of a dithered flight (n = 6,
+m = 3), weights of one on positions, velocities and increments of the inputs, bounds of the inputs that are active in
+half of the steps. The instances of that flight (state, reference, last input) are solved by every solver in turns, one
+instance per call, in one process on one thread; times are processor time.
+
+* ``converged``: a KKT point of the nonlinear problem on the GPs' mean. Every plan is judged by one function
+  (``benchmarks.kkt``); solvers stop by tests of their own, whose tolerances are the loosest powers of ten that brought
+  the plans within ``ACCURACY``; the share that is within is printed. *Warm* solvers start from their own last solution,
+  shifted where the library allows it, *cold* ones from the last input and the reference.
+* ``one program``: one quadratic program per step from the last plan (real-time iteration), with our QP solver and DAQP.
+
+``times ours`` is the median ratio of paired calls to ours called right after itself, as in a loop that does nothing
+else; ``times ours, evicted`` to ours called right after a peer that has filled the caches. Writes
+``outputs/benchmarks/peers.json`` and ``peers.md``.
+"""
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks import peer_daqp, peer_do_mpc
+from benchmarks.kkt import Instance, kkt_residual
+from benchmarks.peer_casadi import CasadiIpopt
+from benchmarks.peer_gpytorch import GPyTorchSlsqp
+from benchmarks.quadrotor import HOVER, problem, recorded, trained
+from benchmarks.timing import (
+    RESULTS,
+    WARM_UP_CALLS,
+    describe,
+    machine,
+    markdown_table,
+    time_interleaved,
+    use_one_thread,
+    write_results,
+)
+from gpmpc.gp import GPPosterior
+from gpmpc.mpc.controller import Controller, Decision, Timing
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.propagation import Linearization
+from gpmpc.status import Status
+
+TRAJECTORY, STEPS = "lorenz", 150
+ACCURACY = 1e-5  # of the common KKT residual
+IPOPT, SLSQP, OURS = 1e-6, 1e-12, 1e-6  # tolerances of the solvers' own tests
+MIN_ROUNDS = 6  # where a solver takes seconds
+SLOW_ABOVE = 10  # horizon above which SLSQP is left out: minutes
+EVICTED = "gpmpc, iterated, evicted"
+LOOP = "gpmpc, iterated"
+
+Solve = Callable[[Instance, Any], Any]
+"""From an instance and the last solution (None at first) to a solution, which has ``inputs`` (H, m)."""
+Cases = dict[str, Callable[[], Solve] | None]
+"""Solvers by name; None where the package is not installed."""
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--horizons", type=int, nargs="*", default=[1, 10, 20])
+    parser.add_argument("--alone", type=int, nargs="*", default=[50], help="horizons for gpmpc only")
+    parser.add_argument("--seconds", type=float, default=20.0, help="processor time of each table [s]")
+    parser.add_argument("--starts", nargs="+", choices=["warm", "cold"], default=["warm", "cold"])
+    arguments = parser.parse_args()
+    use_one_thread()
+    here, rows, sections = machine(), [], []
+    gp, task = trained(TRAJECTORY), peers_problem()
+    print(f"{describe(here)}\n")
+    for horizon in (*arguments.horizons, *arguments.alone):
+        instances = record_instances(gp, task, horizon, STEPS)
+        tables = {("converged", start): converged(gp, task, horizon) for start in arguments.starts}
+        if horizon in arguments.alone:
+            tables = {key: {LOOP: cases[LOOP]} for key, cases in tables.items()}
+        tables["one program", "warm"] = one_program(gp, task, horizon)
+        for (kind, start), cases in tables.items():
+            found = measure(cases, gp, task, instances, arguments.seconds, cold=start == "cold")
+            title = f"{kind}, started {start}" if kind == "converged" else kind
+            sections.append(f"H = {horizon}, {title}\n\n{table(found)}\n")
+            print(sections[-1], flush=True)
+            rows += [{"kind": kind, "start": start, "H": horizon} | row for row in found]
+    write_results("peers", rows, machine=here)
+    (RESULTS / "peers.md").write_text("\n".join([f"{describe(here)}\n", *sections]))
+
+
+def peers_problem() -> TrackingProblem:
+    """Builds weights and bounds of the comparison."""
+    return problem(thrust=(6.0, 8.0), tilt=0.05)
+
+
+def record_instances(gp: GPPosterior, task: TrackingProblem, horizon: int, steps: int) -> list[Instance]:
+    """Flies with one program per step and returns the optimal control problems of the flight."""
+    flown = recorded(GPMPC(gp, Linearization(), task, horizon, HOVER, covariance="none"), TRAJECTORY, steps)
+    before = [np.array(HOVER) if step.previous is None else step.previous.input for step in flown]
+    return [Instance(step.belief, step.reference, last) for step, last in zip(flown, before, strict=True)]
+
+
+def converged(gp: GPPosterior, task: TrackingProblem, horizon: int) -> Cases:
+    """Builds the solvers of the nonlinear problem."""
+
+    def ours() -> Solve:
+        settings = {"covariance": "none", "iterations": 50, "tolerance": OURS}
+        return by_controller(GPMPC(gp, Linearization(), task, horizon, HOVER, **settings))
+
+    def do_mpc() -> Solve:
+        return peer_do_mpc.DoMpc(gp, task, horizon, IPOPT)
+
+    cases: Cases = {
+        EVICTED: ours,
+        LOOP: ours,
+        "CasADi, IPOPT, exact Hessian": lambda: CasadiIpopt(gp, task, horizon, "exact", IPOPT),
+        "CasADi, IPOPT, Gauss-Newton": lambda: CasadiIpopt(gp, task, horizon, "gauss-newton", IPOPT),
+        "do-mpc, IPOPT": do_mpc if peer_do_mpc.installed() else None,
+    }
+    if horizon <= SLOW_ABOVE:
+        cases["GPyTorch autograd, SLSQP"] = lambda: GPyTorchSlsqp(gp, task, horizon, SLSQP)
+    return cases
+
+
+def one_program(gp: GPPosterior, task: TrackingProblem, horizon: int) -> Cases:
+    """Builds the real-time iterations, with our QP solver and with DAQP."""
+    cases: Cases = {}
+    for name, covariance in (("mean only", "none"), ("zero order", "zero_order")):
+        settings: dict[str, Any] = {"covariance": covariance}
+        common = (gp, Linearization(), task, horizon, HOVER)
+        cases[f"gpmpc, {name}"] = lambda a=common, s=settings: by_controller(GPMPC(*a, **s))
+        daqp = settings | {"solver": peer_daqp.Daqp()} if peer_daqp.installed() else None
+        cases[f"gpmpc, {name}, DAQP inside"] = daqp and (lambda a=common, s=daqp: by_controller(GPMPC(*a, **s)))
+    return cases
+
+
+def by_controller(controller: Controller) -> Solve:
+    """Wraps a controller of this package as a solver."""
+
+    def solve(instance: Instance, last: Decision | None) -> Decision:
+        return controller.control(instance.belief, instance.reference, _previous(instance, last))
+
+    return solve
+
+
+def _previous(instance: Instance, last: Decision | None) -> Decision:
+    """The last decision with the input that was applied; without one, no plan but an input."""
+    if last is not None:  # ``dataclasses.replace`` takes as long as a program
+        return Decision(
+            input=instance.last, inputs=last.inputs, means=last.means, covariances=last.covariances,
+            status=last.status, iterations=0, timing=Timing(0.0, 0.0, 0.0), solution=last.solution,
+        )  # fmt: skip
+    H, n = instance.targets.shape
+    inputs, nothing = np.tile(instance.last, (H, 1)), np.full((H + 1, n, n), np.nan)
+    return Decision(
+        input=inputs[0], inputs=inputs, means=nothing[:, 0], covariances=nothing,
+        status=Status.ITERATION_LIMIT, iterations=0, timing=Timing(0.0, 0.0, 0.0),
+    )  # fmt: skip
+
+
+class Run:
+    """Solves the next instance with every call, from its own last solution or from none.
+
+    Attributes:
+        plans: Number of the instance and the plan (H, m), in the order of the calls.
+    """
+
+    def __init__(self, solve: Solve, instances: Sequence[Instance], cold: bool = False):
+        self._solve, self._instances, self._cold, self._last = solve, instances, cold, None
+        self.plans: list[tuple[int, np.ndarray]] = []
+
+    def __call__(self) -> None:
+        """Solves one instance; after the last one comes the first again, without a last solution."""
+        number = len(self.plans) % len(self._instances)
+        last = self._last if number and not self._cold else None
+        self._last = self._solve(self._instances[number], last)
+        self.plans.append((number, self._last.inputs))
+
+
+def measure(
+    cases: Cases, gp: GPPosterior, task: TrackingProblem, instances: Sequence[Instance], seconds: float, cold: bool
+) -> list[dict]:
+    """Times the solvers in turns and judges their plans."""
+    runs = {name: Run(make(), instances, cold) for name, make in cases.items() if make is not None}
+    times = time_interleaved(runs, seconds, min_rounds=MIN_ROUNDS)
+    rows = []
+    for name, make in cases.items():
+        if make is None:
+            rows.append({"what": name, "note": peer_do_mpc.MISSING})
+            continue
+        residuals = [kkt_residual(gp, task, instances[k], plan) for k, plan in runs[name].plans[WARM_UP_CALLS:]]
+        row = {"what": name} | times[name].summary() | {"times_ours": times[name].over(times[_ours(name, times)])}
+        row |= {"kkt": float(np.median(residuals)), "kkt_worst": float(max(residuals))}
+        row["within"] = float((np.array(residuals) <= ACCURACY).mean())
+        if EVICTED in times:
+            row["times_ours_evicted"] = times[name].over(times[EVICTED])
+        rows.append(row)
+    return rows
+
+
+def _ours(name: str, cases: Mapping[str, Any]) -> str:
+    """Whom a case is compared with: the one solver of ours, or its own controller with our QP solver in it."""
+    return LOOP if LOOP in cases else name.removesuffix(", DAQP inside")
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Formats the rows of one comparison."""
+    columns = {
+        "what": "", "median": "ms, median", "p99": "99 %", "times_ours": "times ours",
+        "times_ours_evicted": "times ours, evicted", "kkt": "KKT, median", "kkt_worst": "worst",
+        "within": f"within {ACCURACY:g}", "samples": "calls", "note": "note",
+    }  # fmt: skip
+    used = [key for key in columns if any(key in row for row in rows)]
+    cells = [[f"{row[key]:.0%}" if key == "within" and key in row else row.get(key) for key in used] for row in rows]
+    return markdown_table([columns[key] for key in used], cells)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""Settings of the documentation's site: ``make docs``."""
+
+from importlib.metadata import version as installed
+
+project = "gpmpc"
+author = "the gpmpc authors"
+copyright = author
+version = release = installed("gpmpc")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+myst_enable_extensions = ["colon_fence"]
+myst_heading_anchors = 3
+exclude_patterns = ["_build"]
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+
+html_theme = "furo"
+html_title = "gpmpc"
+
+
+def escape_stars(app, what, name, obj, options, lines):
+    """Lets docstrings write shapes as (*batch, n) and norms as |x|, outside of code."""
+    for i, line in enumerate(lines):
+        parts = line.split("``")
+        parts[::2] = [part.replace("*", r"\*").replace("|", r"\|") for part in parts[::2]]
+        lines[i] = "``".join(parts)
+
+
+def setup(app):
+    """Registers what this site adds to Sphinx."""
+    app.connect("autodoc-process-docstring", escape_stars, priority=100)

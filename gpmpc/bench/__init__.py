@@ -1,1 +1,0 @@
-"""Problem: speed is claimed by everybody; a reader wants to see it measured, beside others, on his own machine."""

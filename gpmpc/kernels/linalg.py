@@ -1,0 +1,180 @@
+"""Dense linear algebra for compiled loops: small vectors and matrices, where a library call costs more than its work.
+
+The functions write into arrays of their caller and allocate nothing, but for ``square_root``. Sizes come from the
+arrays; where rows are padded, a caller passes the number of entries that count.
+"""
+
+import math
+
+import numpy as np
+
+from gpmpc.compiled import inline_njit, njit_inner, njit_noalloc
+
+
+@njit_noalloc
+def copy(x, y):
+    """Copies x to y: ``y[:] = x`` makes numba compile the message of an error, a second per kernel."""
+    for i in range(len(y)):
+        y[i] = x[i]
+
+
+@njit_noalloc
+def copy_matrix(X, Y):
+    """Copies X to Y."""
+    for i in range(len(Y)):
+        copy(X[i], Y[i])
+
+
+@inline_njit
+def dot(x, y, size):
+    """Returns x' y of the first ``size`` entries."""
+    total = 0.0
+    for i in range(size):
+        total += x[i] * y[i]
+    return total
+
+
+@inline_njit
+def four_dots(rows, x, size, out):
+    """Writes rows[i]' x of four vectors to ``out``; x is read once, and four sums hide each other's latency."""
+    r0, r1, r2, r3 = rows
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    for j in range(size):
+        value = x[j]
+        s0 += r0[j] * value
+        s1 += r1[j] * value
+        s2 += r2[j] * value
+        s3 += r3[j] * value
+    out[0], out[1], out[2], out[3] = s0, s1, s2, s3
+
+
+@inline_njit
+def multiply(A, count, x, size, out):
+    """Writes A x for the first ``count`` rows and ``size`` columns of A, four rows at a time."""
+    i = 0
+    while i + 4 <= count:
+        four_dots((A[i], A[i + 1], A[i + 2], A[i + 3]), x, size, out[i:])
+        i += 4
+    while i < count:
+        out[i] = dot(A[i], x, size)
+        i += 1
+
+
+@njit_noalloc
+def multiply_transposed(A, x, out):
+    """Writes A' x."""
+    for j in range(len(out)):
+        out[j] = A[0, j] * x[0]
+    for i in range(1, len(x)):
+        for j in range(len(out)):
+            out[j] += A[i, j] * x[i]
+
+
+@njit_noalloc
+def add_product(A, B, out):
+    """Adds A B."""
+    for i in range(len(A)):
+        row = out[i]
+        for k in range(len(B)):
+            factor, other = A[i, k], B[k]
+            for j in range(len(row)):
+                row[j] += factor * other[j]
+
+
+@njit_noalloc
+def add_transposed_product(A, B, out):
+    """Adds A' B."""
+    for k in range(len(B)):
+        other = B[k]
+        for i in range(len(out)):
+            factor, row = A[k, i], out[i]
+            for j in range(len(row)):
+                row[j] += factor * other[j]
+
+
+@njit_noalloc
+def product(A, B, out):
+    """Writes A B."""
+    out[:] = 0.0
+    add_product(A, B, out)
+
+
+@njit_noalloc
+def congruence(A, X, scratch, out):
+    """Writes A' X A; ``scratch`` has the shape of X A."""
+    product(X, A, scratch)
+    out[:] = 0.0
+    add_transposed_product(A, scratch, out)
+
+
+@njit_noalloc
+def symmetrize(A):
+    """Replaces A by (A + A') / 2."""
+    for i in range(len(A)):
+        for j in range(i):
+            A[i, j] = A[j, i] = (A[i, j] + A[j, i]) / 2
+
+
+@njit_noalloc
+def cholesky(A):
+    """Replaces the lower triangle of A = L L' by L; False where a pivot is not positive. The upper one is not read."""
+    for i in range(len(A)):
+        for j in range(i):
+            A[i, j] = (A[i, j] - dot(A[i], A[j], j)) / A[j, j]
+        pivot = A[i, i] - dot(A[i], A[i], i)
+        if not pivot > 0.0:
+            return False
+        A[i, i] = math.sqrt(pivot)
+    return True
+
+
+@njit_noalloc
+def solve_lower(L, X):
+    """Replaces X by L^-1 X."""
+    for i in range(len(L)):
+        row = X[i]
+        for j in range(i):
+            factor, other = L[i, j], X[j]
+            for k in range(len(row)):
+                row[k] -= factor * other[k]
+        for k in range(len(row)):
+            row[k] /= L[i, i]
+
+
+@njit_noalloc
+def solve_lower_transposed(L, X):
+    """Replaces X by L^-T X."""
+    for i in range(len(L) - 1, -1, -1):
+        row = X[i]
+        for j in range(i + 1, len(L)):
+            factor, other = L[j, i], X[j]
+            for k in range(len(row)):
+                row[k] -= factor * other[k]
+        for k in range(len(row)):
+            row[k] /= L[i, i]
+
+
+@njit_noalloc
+def solve_positive(A, X):
+    """Replaces X by A^-1 X and the lower triangle of A by its Cholesky factor; False where A is not positive."""
+    if not cholesky(A):
+        return False
+    solve_lower(A, X)
+    solve_lower_transposed(A, X)
+    return True
+
+
+@njit_inner
+def square_root(S, out):
+    """Writes the symmetric root of S; returns its eigenvalues, not below zero, and its eigenvectors."""
+    r, U = np.linalg.eigh(S)
+    n = len(r)
+    for i in range(n):
+        r[i] = math.sqrt(max(r[i], 0.0))
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(n):
+                total += U[i, k] * r[k] * U[j, k]
+            out[i, j] = out[j, i] = total
+    return r, U.copy()
