@@ -33,7 +33,7 @@ TORCH_LIMIT = 2_000_000  # T N^2 of exact moments above which torch on the CPU i
 MODES = {
     "mean": {"propagator": Linearization(), "covariance": "none"},
     "linearised": {"propagator": Linearization(), "covariance": "zero_order"},
-    "moment-matched": {"propagator": MomentMatching(), "covariance": "full", "form": "increment"},
+    "moment-matched": {"propagator": MomentMatching(), "covariance": "full", "form": "velocity"},
 }
 
 

@@ -37,7 +37,7 @@ BOUNDS = StateBounds(*STATE_BOUNDS["lorenz"], l1=10.0, l2=10.0)
 MATCHED, LINEARIZED = MomentMatching(), Linearization()
 CONTROLLERS: dict[str, Callable[[], Controller | Cascade]] = {
     "convex": lambda: GPMPC(trained("lorenz"), LINEARIZED, problem(), H, HOVER),
-    "paper": lambda: GPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, "increment", "diagonal"),
+    "paper": lambda: GPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, "velocity", "diagonal"),
     "full": lambda: GPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, covariance="full"),
     "iterated": lambda: GPMPC(trained("lorenz"), LINEARIZED, problem(BOUNDS), H, HOVER, iterations=30),
     "nonlinear": lambda: NonlinearGPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),

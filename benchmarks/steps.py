@@ -65,7 +65,7 @@ def controllers(gp: GPPosterior, horizon: int) -> dict[str, Controller]:
     problem = TrackingProblem([10.0, 1.0] * m, [0.1] * m, input_lower=[-6.0] * m, input_upper=[6.0] * m)
     common = (problem, horizon, [0.0] * m)
     return {
-        "paper's form": GPMPC(gp, MomentMatching(), *common, form="increment", covariance="full"),
+        "paper's form": GPMPC(gp, MomentMatching(), *common, form="velocity", covariance="full"),
         "zero order": GPMPC(gp, Linearization(), *common),
         "mean only": GPMPC(gp, Linearization(), *common, covariance="none"),
     }

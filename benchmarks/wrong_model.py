@@ -39,7 +39,7 @@ WAYS = {
     "trajectory, L = 0": {},
     "trajectory, L = 0.3": {"disturbance_gain": 0.3},
     "trajectory, L = 1": {"disturbance_gain": 1.0},
-    "increment": {"form": "increment", "covariance": "none"},
+    "velocity": {"form": "velocity", "covariance": "none"},
 }
 COLOURS = ("tab:red", "tab:orange", "tab:blue", "tab:gray")
 
@@ -74,9 +74,7 @@ def main() -> None:
     print(f"written to {arguments.figure}")
 
 
-def flights(
-    controller: GPMPC, trajectory: str, mass: str, noise: str, arguments: argparse.Namespace
-) -> list[Rollout]:
+def flights(controller: GPMPC, trajectory: str, mass: str, noise: str, arguments: argparse.Namespace) -> list[Rollout]:
     """One a seed."""
     references = states_along(TRAJECTORIES[trajectory], np.arange(arguments.steps + HORIZON + 1.0))
     return [
@@ -102,7 +100,7 @@ def altitudes(shown: dict[tuple, Rollout]) -> Figure:
         for way, colour in zip(WAYS, COLOURS, strict=True):
             flight = shown[trajectory, way, "20 % heavier", "process 0.01"]
             away = (flight.states - flight.references)[:41, ALTITUDE]
-            dashes = "--" if way == "increment" else "-"
+            dashes = "--" if way == "velocity" else "-"
             axis.plot(np.arange(len(away)), away, color=colour, linestyle=dashes, label=way)
         axis.axhline(0, color="black", linewidth=0.5)
         axis.set(title=trajectory, xlabel="time [s]")

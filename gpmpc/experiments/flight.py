@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from experiments.slsqp import SLSQP
 
 from gpmpc.compiling import tell_of_compiling
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
@@ -30,7 +31,7 @@ from gpmpc.systems import Plant
 from gpmpc.systems.quadrotor import GRAVITY
 
 PROPAGATIONS = {"moment_matching": MomentMatching, "linearization": Linearization}
-CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "convex": GPMPC}
+CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "slsqp": SLSQP, "convex": GPMPC}
 LOOPS = ("model", "plant")
 SUBSYSTEMS = ("translational", "rotational")
 PRICES = ("l1", "l2")  # of unkept state bounds, among a row's settings

@@ -20,6 +20,7 @@ from time import perf_counter
 import numpy as np
 import torch
 
+from gpmpc.compiled import compiled
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, ProblemError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
@@ -132,19 +133,16 @@ class GPMPC:
         """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
         guess, solution = prediction.plan, previous.solution if previous is not None and previous.applicable else None
         globalize = self._globalization(request) if self.iterations > 1 else FullStep()
-        for count in range(1, self.iterations + 1):
+        status, count = None, 0
+        while status is None and count < self.iterations:
             clock.model()
             program = globalize.correct(self._condense(prediction, request), prediction.plan)
             clock.build()
             solution = self._solve(program, solution)
             clock.solve()
-            if not _is_usable(solution, prediction.plan):
-                status = solution.status
-                break
-            proposed = self._proposed(prediction, solution)
-            prediction, status = globalize(prediction, proposed, solution)
-            if status is not None:
-                break
+            count, status = count + 1, solution.status
+            if _is_usable(solution, prediction.plan):
+                prediction, status = globalize(prediction, self._proposed(prediction, solution), solution)
         clock.model()
         status = Status.ITERATION_LIMIT if status is None else status
         program = QuadraticProgram.unchecked(*program)
@@ -186,6 +184,23 @@ class GPMPC:
             except _FAILURES:
                 decisions[t] = requests[t].unanswered(Status.NUMERICAL_TROUBLE, timing=clock.timing)
         return decisions
+
+    @property
+    def bytes_per_question(self) -> int | None:
+        """Memory that ``control_many`` takes for each question at most [bytes]; None where it cannot be known.
+
+        It is known for GPs and derivatives in closed form: by torch a point takes some arrays (outputs, N, n + m + 1),
+        and a belief of which moments are matched some matrices (N, N) as well. The compiled kernels take far less.
+        """
+        model, linearizer = self.prediction.model, self.prediction.linearizer
+        if not hasattr(model, "features") or getattr(linearizer.propagator, "hessian", False):
+            return None
+        (N, d), n, size = model.features.shape, model.state_dim, self.horizon * self.problem.input_dim
+        p = len(linearizer.weight(self.problem.Q)) * n
+        each = 8 * n * N * (d + 1) + 4 * p * (p + d)
+        if not linearizer.at_points:
+            each += 8 * N * N + 4 * n * n * (N * (n + 1) + n * n + d)
+        return 8 * (self.prediction.points * each + 4 * size * (size + n * self.horizon))
 
     def build(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> QuadraticProgram:
         """The (first) quadratic program of a step, checked.
@@ -241,6 +256,7 @@ class GPMPC:
         """Steps and end of the iteration for the problem of one request."""
         known, prices, of = self._condenser.known, self.prediction.constraints.prices, self.prediction
         asked = request.targets, request.wanted, request.last
+        first = self._condenser.rate_rows
         zero = tuple(np.zeros_like(part) for part in asked)
         sizes = np.minimum(np.maximum(1.0, np.abs(request.last)), self.problem.input_upper - self.problem.input_lower)
         functions = Functions(
@@ -249,7 +265,10 @@ class GPMPC:
             cost=lambda states, inputs: tracking_cost(known, states, inputs, *asked),
             curvature=lambda states, inputs: tracking_cost(known, states, inputs, *zero),
             price=lambda rows, states, hard: price_violations(prices, rows, states, hard),
-            multiplier=lambda solution: np.abs(solution.z[self._condenser.rate_rows :]).max(initial=0.0),
+            multiplier=lambda solution: np.abs(solution.z[first:]).max(initial=0.0),
+            costates=lambda at, plan, solution: _costates(
+                known, at.stages.A, plan.states, asked[0], at.rows.E, solution.z[first:]
+            ),
         )
         smallest = float((np.diag(self.problem.R) * (_SMALL * sizes) ** 2).min()) + np.finfo(float).tiny
         return Globalization(functions, smallest, self.tolerance, _FAILURES)
@@ -259,6 +278,35 @@ class GPMPC:
         if self.soft is not None:
             return 0.0
         return price_violations(self.prediction.constraints.prices, prediction.rows, prediction.plan.states, 1.0)
+
+
+class NonlinearGPMPC(GPMPC):
+    """Nonlinear GP-MPC (Cao, Lai and Alam, 2017, eq. (22)): programs of the whole belief, iterated to convergence.
+
+    Args:
+        model: As for ``GPMPC``.
+        propagator: As for ``GPMPC``.
+        problem: As for ``GPMPC``.
+        horizon: As for ``GPMPC``.
+        initial_input: As for ``GPMPC``.
+        covariance: As for ``GPMPC``.
+        iterations: As for ``GPMPC``.
+        tolerance: As for ``GPMPC``.
+    """
+
+    def __init__(
+        self,
+        model: DynamicsModel,
+        propagator: Propagator,
+        problem: TrackingProblem,
+        horizon: int,
+        initial_input: Sequence[float],
+        covariance: Covariance = "full",
+        iterations: int = 100,
+        tolerance: float = 1e-5,
+    ):
+        settings = {"covariance": covariance, "iterations": iterations, "tolerance": tolerance}
+        super().__init__(model, propagator, problem, horizon, initial_input, **settings)
 
 
 def _is_usable(solution: QPSolution, plan: Plan) -> bool:
@@ -277,6 +325,26 @@ def _violation(solution: QPSolution) -> float:
     """The largest violation of a hard row."""
     softness, caps = solution.terms.softness
     return float(solution.violation()[(softness == 0.0) & np.isinf(caps)].max(initial=0.0))
+
+
+@compiled
+def _costates(known, A, states, targets, E, z):
+    """Multipliers of the dynamics (H, p): the derivatives of cost and rows by s_1 .. s_H, through all that follows."""
+    W, T = known[0][:2]
+    (H, n), p, r = targets.shape, states.shape[1], E.shape[1]
+    costates = np.zeros((H, p))
+    for k in range(H - 1, -1, -1):
+        weight, out = T if k == H - 1 else W, costates[k]
+        for i in range(p):
+            for j in range(n):
+                error = states[k + 1, i // n * n + j] - (targets[k, j] if i < n else 0.0)
+                out[i] += 2.0 * weight[i // n, i % n, j] * error
+            for e in range(r):
+                out[i] += E[min(k, len(E) - 1), e, i] * z[k * r + e]
+            if k < H - 1:
+                for j in range(p):
+                    out[i] += A[k + 1, j, i] * costates[k + 1, j]
+    return costates
 
 
 class _Stopwatch:

@@ -35,7 +35,7 @@ _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 _SHORTEST_STEP = 2.0**-10
 _NOISE = 1e-10  # the square of an offset that a model with that round-off need not get below
 _MEMORY = 10  # pairs of a corrected Hessian
-_NEAR = 0.1  # relative offset from which pairs are kept: those from far away mislead
+_NEAR = 0.2  # relative offset from which pairs are kept: those from far away mislead
 _CREEP = 0.25  # ratio of two offsets above which the Hessian is corrected
 _ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
 
@@ -50,6 +50,7 @@ class Functions(NamedTuple):
         curvature: Of a change of both: its cost were the references zero.
         price: Of violated rows, from rows, states and the price per unit of those that are hard.
         multiplier: The largest that a solution has for a row of states.
+        costates: Multipliers of the dynamics (H, p): of a prediction, a proposed plan, and the solution behind it.
     """
 
     linearize: Callable[[Plan], Prediction]
@@ -58,6 +59,7 @@ class Functions(NamedTuple):
     curvature: Callable[[Array, Array], float]
     price: Callable[[Rows, Array, float], float]
     multiplier: Callable[[QPSolution], float]
+    costates: Callable[[Prediction, Plan, QPSolution], Array]
 
 
 class FullStep:
@@ -84,7 +86,7 @@ class Globalization:
 
     def __init__(self, functions: Functions, smallest: float, tolerance: float, failures: tuple[type[Exception], ...]):
         self._of, self._smallest, self._tolerance, self._failures = functions, smallest, tolerance, failures
-        self._defect_price = self._row_price = 0.0
+        self._defect_price, self._row_price = 0.0, 0.0
         self._size, self._rate, self._creeps = math.inf, 1.0, False
         self._pairs: deque[tuple[Array, Array]] = deque(maxlen=_MEMORY)
         self._last: tuple[Array, ...] | None = None  # inputs, gradient and multipliers of the last program
@@ -125,7 +127,7 @@ class Globalization:
         self._row_price = max(self._row_price, 2.0 * of.multiplier(solution))
         curvature = of.curvature(proposed.states - plan.states, proposed.inputs - plan.inputs)
         cost, defects = self._cost(at, at.rows), np.abs(at.stages.next - plan.states[1:])
-        defect, reach = float(defects.sum()), max(1.0, float(np.abs(plan.states).max()))
+        reach = max(1.0, float(np.abs(plan.states).max()))
         size = max(math.sqrt(curvature / (cost + self._smallest)), float(defects.max()) / reach)
         self._size, self._rate = size, size / self._size if math.isfinite(self._size) else 1.0
         self._creeps = self._creeps or (self._rate > _CREEP and size < _NEAR)
@@ -137,16 +139,16 @@ class Globalization:
         if settled or size <= self._tolerance or size * slower <= self._tolerance * (1.0 - slower):
             return at._replace(plan=proposed), Status.SOLVED
         promised = of.cost(proposed.states, proposed.inputs) + of.price(at.rows, proposed.states, self._row_price)
-        if promised > cost and defect > 0.0:
-            self._defect_price = max(self._defect_price, 3.0 * (promised - cost) / defect)
-        merit = cost + self._defect_price * defect
+        costates = np.abs(of.costates(at, proposed, solution)).max(axis=0)
+        self._defect_price = np.maximum(self._defect_price, 1.5 * costates)
+        merit = cost + float(defects.sum(axis=0) @ self._defect_price)
         slope = promised - curvature - merit
         length = 1.0
         while length >= _SHORTEST_STEP:
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
             for trial in self._candidates(at, proposed if length == 1.0 else _between(plan, proposed, length)):
-                defect = float(np.abs(trial.stages.next - trial.plan.states[1:]).sum())
-                if self._cost(trial, at.rows) + self._defect_price * defect <= bound:
+                defects = np.abs(trial.stages.next - trial.plan.states[1:]).sum(axis=0)
+                if self._cost(trial, at.rows) + float(defects @ self._defect_price) <= bound:
                     return trial, None
             length /= 2.0
         if size**2 <= _ROUND_OFF:  # size^2 of the cost is what could still be gained

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-
 from gpmpc.mpc.ancillary_feedback import lqr_gain, spread
+
 from gpmpc.mpc.condensing import Condenser, respond
 from gpmpc.mpc.tracking import TrackingProblem
 

@@ -47,20 +47,18 @@ def flown(asked, model=PENDULUM, unknown=UNKNOWN, steps=40):
 @pytest.mark.parametrize(
     "settings",
     [
-        {"form": "increment", "covariance": "none"},
+        {"form": "velocity", "covariance": "none"},
         {"disturbance_gain": 1.0},
         {"disturbance_gain": 0.5, "covariance": "none"},
         {"disturbance_gain": 0.5, "covariance": "none", "iterations": 30},
         {"disturbance_gain": 0.5, "covariance": "full", "propagator": MomentMatching()},
         {"disturbance_gain": 0.5, "covariance": "diagonal"},
-        {"disturbance_gain": 0.5, "form": "deviation"},
     ],
     ids=str,
 )
 def test_a_constant_error_leaves_no_offset(settings):
     states, decisions = flown(controller(**settings))
-    # ``deviation`` is made at an input that is not the one held; ``full`` and ``diagonal`` weigh the spread as well.
-    exact = settings.get("form") != "deviation" and settings.get("covariance") not in ("full", "diagonal")
+    exact = settings.get("covariance") not in ("full", "diagonal")  # these weigh the covariance as well
     assert abs(states[-1, 0] - 0.4) < (1e-4 if exact else 2e-3)
     if "disturbance_gain" in settings:
         assert np.allclose(decisions[-1].disturbance, UNKNOWN, rtol=0, atol=1e-4)
@@ -104,13 +102,12 @@ def test_a_measurement_that_is_missing_leaves_the_estimate_as_it_is():
 
 
 @pytest.mark.parametrize("covariance", ["zero_order", "none"])
-@pytest.mark.parametrize("form", ["deviation", "trajectory"])
-def test_compiled_torch_batched_and_state_form_agree(form, covariance):
-    asked = controller(form=form, covariance=covariance, disturbance_gain=0.7)
+def test_compiled_torch_batched_and_state_form_agree(covariance):
+    asked = controller(covariance=covariance, disturbance_gain=0.7)
     states, decisions = flown(asked, steps=4)
     belief, before = Gaussian.certain(states[-1]), decisions[-1]
     answer = asked.control(belief, AT_REST, before)
-    in_cvxpy = controller(StateFormMPC, form=form, covariance=covariance, disturbance_gain=0.7)
+    in_cvxpy = controller(StateFormMPC, covariance=covariance, disturbance_gain=0.7)
     others = [in_cvxpy.control(belief, AT_REST, before)]
     with evaluation("torch"):
         others += [asked.control(belief, AT_REST, before), *asked.control_many([belief], [AT_REST], [before])]
@@ -132,7 +129,7 @@ def test_any_model_can_be_wrong():
     [
         ({"disturbance_gain": 1.2}, "lie between 0 and 1; got 1.2"),
         ({"disturbance_gain": -0.1}, "got -0.1"),
-        ({"disturbance_gain": 0.5, "form": "increment"}, "be 0 for form 'increment', which needs none; got 0.5"),
+        ({"disturbance_gain": 0.5, "form": "velocity"}, "be 0 for form 'velocity', which needs none; got 0.5"),
     ],
 )
 @pytest.mark.parametrize("kind", [GPMPC, StateFormMPC])

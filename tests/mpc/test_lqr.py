@@ -7,8 +7,8 @@ import torch
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.lqr import LQR, lqr_gain
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
+from gpmpc.mpc.lqr import LQR, lqr_gain
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import MeanEquivalence
 from gpmpc.status import Status

@@ -9,7 +9,8 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import COVARIANCES, FORMS
+from gpmpc.mpc.prediction import FORMS
+from gpmpc.mpc.stages import COVARIANCES
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MeanEquivalence
@@ -19,7 +20,7 @@ from gpmpc.systems import step
 from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 
 H = 3
-PENALIZED = {"increment": "increments", "deviation": "deviations", "trajectory": "inputs"}
+PENALIZED = {"velocity": "increments", "trajectory": "deviations"}
 REFERENCE = Reference(np.zeros((H + 1, 6)), np.tile(HOVER, (H, 1)))
 
 

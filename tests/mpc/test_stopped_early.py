@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
@@ -46,8 +47,8 @@ STOPPED = {
     "two, of another solver": lambda _: convex(iterations=2, tolerance=1e-12, solver=PrimalActiveSet()),
     "a primal solver": lambda _: convex(solver=PrimalActiveSet(iteration_limit=2)),
     "a state form": lambda _: StateFormMPC(GP, Linearization(), PROBLEM, H, HOVER, options={"max_iter": 3}),
-    "sqp": lambda _: NonlinearGPMPC(GP, Linearization(), PROBLEM, H, HOVER, "sqp", 1e-9, 2),
-    "slsqp": lambda _: NonlinearGPMPC(GP, Linearization(), PROBLEM, 4, HOVER, "slsqp", 1e-9, 3),
+    "nonlinear": lambda _: NonlinearGPMPC(GP, Linearization(), PROBLEM, H, HOVER, iterations=2, tolerance=1e-9),
+    "slsqp": lambda _: SLSQP(GP, Linearization(), PROBLEM, 4, HOVER, iterations=3, tolerance=1e-9),
     "nmpc": nmpc,
 }
 
