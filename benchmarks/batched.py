@@ -22,7 +22,7 @@ import torch
 
 from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
 from benchmarks.timing import write_results
-from gpmpc.gp import GPPosterior, evaluation
+from gpmpc.gp import GPPosterior, backend
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import closed_loop, closed_loops
@@ -83,7 +83,7 @@ def measured(gp: GPPosterior, mode: dict, trials: int, arguments: argparse.Names
         return trials / len(flown)
 
     def together(choice: str = "auto") -> float:
-        with nullcontext() if choice == "auto" else evaluation(choice):
+        with nullcontext() if choice == "auto" else backend(choice):
             flown = closed_loops(OUTER, there, **flight, seeds=trials)
         errors = {trial.error for trial in flown if trial.error}
         if errors:

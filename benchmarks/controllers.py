@@ -2,12 +2,13 @@
 
     .venv/bin/python -m benchmarks.controllers [--steps 14] [--horizons 1 10 20 50] [--rivals 1 10]
 
-One process, one thread, process CPU time, GPs on 189 transitions. Questions are recorded on a flight with the plant in
+One process, one thread, process CPU time, GPs on 189 transitions. Instances are recorded on a flight with the plant in
 the loop, with the plans that the one controller made, and then put to each controller in turns, warm-started from its
-own last answer, shifted. The nonlinear ones stop at a relative offset of 1e-6 (``gpmpc.mpc.sqp``;
-``experiments.slsqp``: a share of the cost), which one program of the convex ones does not ask for; ``cold`` are the same instances without a plan, from the last input held. ``plain slsqp`` is what comes to mind
-first: SciPy's SLSQP on the inputs as they are, from hover, with the same compiled derivatives. ``jacobian`` is one call
-of ``differentiate`` with moment matching. Ratios are paired. Writes ``outputs/benchmarks/controllers.json``.
+own last decision, shifted. ``nonlinear, sqp`` stops at a relative offset of 1e-6 (``gpmpc.mpc.sqp``), ``slsqp`` where a
+round lowers the cost by less than 1e-12 of it (``experiments.slsqp``); one program of the convex ones asks for neither.
+``cold`` are the same instances without a plan, from the last input held. ``plain slsqp`` is what comes to mind first:
+SciPy's SLSQP on the inputs as they are, from hover, with the same compiled derivatives. ``jacobian`` is one call of
+``differentiate`` with moment matching. Ratios are paired. Writes ``outputs/benchmarks/controllers.json``.
 """
 
 import argparse

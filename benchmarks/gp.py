@@ -20,7 +20,7 @@ from benchmarks.timing import describe, machine, markdown_table, time_interleave
 from gpmpc import kernels
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.gp.model import exact_inference, gpytorch_model
+from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
 from gpmpc.propagation.moment_matching import moments
 
 STATES, INPUTS = 6, 3
@@ -99,8 +99,8 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
         d = kernels.moments_with_jacobian(packed, mu, S, u)
         return [d.J, d.dM_dS, d.dM_du, d.dV_dmu, d.dV_dS, d.dV_du]
 
-    frozen = gpytorch_model(gp).requires_grad_(False)
-    trained = gpytorch_model(gp)  # as it comes from training
+    frozen = to_gpytorch(gp).requires_grad_(False)
+    trained = to_gpytorch(gp)  # as it comes from training
 
     def by_gpytorch():
         with exact_inference(), gpytorch.settings.skip_posterior_variances():  # the mean alone, from its cache

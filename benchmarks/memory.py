@@ -69,7 +69,7 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
     import torch
 
     from gpmpc.gaussian import Gaussian
-    from gpmpc.gp import GPPosterior
+    from gpmpc.gp import load_posterior
     from gpmpc.mpc.controller import Reference
     from gpmpc.mpc.gp_mpc import GPMPC
     from gpmpc.mpc.tracking import TrackingProblem
@@ -77,7 +77,7 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
 
     torch.set_num_threads(1)
     libraries = resident()
-    gp = GPPosterior.load(file)
+    gp = load_posterior(file)
     n, m = gp.state_dim, gp.input_dim
     box = {"input_lower": [-1] * m, "input_upper": [1] * m}
     problem = TrackingProblem([1] * n, [1] * m, penalized="increments", **box)

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from benchmarks.timing import write_results
-from gpmpc.gp import Budget, GPPosterior
+from gpmpc.gp import GPPosterior, SlidingWindow, append_points, remove_points
 
 OUTPUTS, FEATURES, INPUTS = 6, 9, 3
 
@@ -37,14 +37,14 @@ def main() -> None:
         x, y, settings = problem(size + 10)
         gp = GPPosterior.from_hyperparameters(x[:size], y[:size], **settings)
         one, ten = (x[size : size + 1], y[size : size + 1]), (x[size:], y[size:])
-        oldest, least = Budget(size), Budget(size, "least_informative")
+        oldest, least = SlidingWindow(size), SlidingWindow(size, "least_informative")
         ways: dict[str, Callable[[], GPPosterior]] = {
             "fresh": lambda s=size, x=x, y=y, h=settings: GPPosterior.from_hyperparameters(x[: s + 1], y[: s + 1], **h),
-            "add_one": lambda gp=gp, new=one: gp.condition_on_targets(*new),
-            "add_ten": lambda gp=gp, new=ten: gp.condition_on_targets(*new),
-            "drop_oldest": lambda gp=gp: gp.drop(0),
-            "budget_oldest": lambda gp=gp, new=one, b=oldest: b.condition(gp, *new),
-            "budget_least_informative": lambda gp=gp, new=one, b=least: b.condition(gp, *new),
+            "add_one": lambda gp=gp, new=one: append_points(gp, *new),
+            "add_ten": lambda gp=gp, new=ten: append_points(gp, *new),
+            "drop_oldest": lambda gp=gp: remove_points(gp, 0),
+            "budget_oldest": lambda gp=gp, new=one, b=oldest: b.append(gp, *new),
+            "budget_least_informative": lambda gp=gp, new=one, b=least: b.append(gp, *new),
         }
         cold, warming, taken = ({name: [] for name in ways} for _ in range(3))
         for repeat in range(arguments.repeats + 1):

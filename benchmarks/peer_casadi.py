@@ -1,14 +1,15 @@
-"""Problem: what most people would do with a learned model and an optimal control problem: CasADi and IPOPT.
+"""CasADi with IPOPT, with its SQP method and HPIPM, and with FATROP, on the mean of learned GPs.
 
-Multiple shooting (Bock and Plitt, 1984) with the states among the unknowns, as CasADi's own examples have it, and what
-was found to be its best settings here (N = 189, H = 10, in parentheses the time of the alternative over that chosen):
-the GPs' mean as scalar expressions (as matrices 1.8; mapped over the stages 1.4; compiled to C by ``jit`` 1.4 and a
-minute and a half of compiling), MUMPS, and a warm start of states, inputs and all multipliers from the last answer,
-shifted, with a small barrier parameter (cold 1.5). The Hessian is the exact one or, for a sum of squares, that of Gauss
-and Newton, which spares the second derivatives of the GPs (0.6; IPOPT's limited-memory updates 2).
+Multiple shooting (Bock and Plitt, 1984) with the states among the unknowns, as CasADi's own examples have it. What was
+found to be the best settings here, with the time of the alternative over that chosen at N = 189, H = 10: the whole
+problem expanded to scalar expressions (IPOPT 1.5 to 2.7, the SQP method 2, FATROP 3; compiled to C by ``jit`` slower
+still, after a minute and a half of compiling), MUMPS for IPOPT, and a warm start of states, inputs and all multipliers
+from the last solution, shifted, with a small barrier parameter (cold 1.5 for IPOPT; 3 for FATROP). The Hessian is the
+exact one or, for a sum of squares, that of Gauss and Newton, which spares the second derivatives of the GPs; the SQP
+method has the latter, since HPIPM needs a convex program; FATROP takes the exact one only.
 """
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import casadi
 import numpy as np
@@ -22,7 +23,7 @@ from gpmpc.mpc.tracking import TrackingProblem
 
 Array = np.ndarray
 
-WARM = {  # IPOPT's options for a start from the solution of a similar problem
+IPOPT_WARM = {  # IPOPT's options for a start from the solution of a similar problem
     "warm_start_init_point": "yes",
     "mu_init": 1e-6,
     **dict.fromkeys(
@@ -36,33 +37,35 @@ WARM = {  # IPOPT's options for a start from the solution of a similar problem
         1e-8,
     ),
 }
+MAX_ITERATIONS = 200
 
 
-class Answer(NamedTuple):
-    """A plan, with what the next solve starts from.
+class Solution(NamedTuple):
+    """A plan with what the next solve starts from.
 
     Attributes:
         inputs: (H, m).
-        states: x_1 .. x_H (H, n).
-        of_bounds: Multipliers of the bounds of states and inputs, in their order (H (n + m),).
-        of_steps: Multipliers of x_{i+1} = m(x_i, u_i) (H n,).
+        unknowns: u_k and x_{k+1} (and u_k again where the last input is a state) of every stage (H, ...).
+        bound_multipliers: Of the bounds of the unknowns (H, ...).
+        dynamics_multipliers: Of x_{k+1} = m(x_k, u_k) (H, ...).
     """
 
     inputs: Array
-    states: Array
-    of_bounds: Array
-    of_steps: Array
+    unknowns: Array
+    bound_multipliers: Array
+    dynamics_multipliers: Array
 
 
-class CasadiIpopt:
-    """Solves one tracking problem after the other on the mean of GPs.
+class Casadi:
+    """Solves one tracking problem after the other on the mean of GPs by a solver of CasADi.
 
     Args:
         gp: The GPs.
         problem: Weights of states and increments, and bounds of the inputs.
         horizon: H.
-        hessian: ``"exact"`` or ``"gauss-newton"``.
-        tolerance: IPOPT's, on its own scaled optimality conditions.
+        method: ``"ipopt"`` or ``"ipopt, gauss-newton"``; ``"sqpmethod"`` with HPIPM; ``"fatrop"``. The last two want
+            costs that couple one stage only, so their states are (x_k, u_{k-1}).
+        tolerance: The solver's own.
 
     Raises:
         SettingError: The problem weighs something else than increments, or bounds more than inputs.
@@ -73,54 +76,55 @@ class CasadiIpopt:
         gp: GPPosterior,
         problem: TrackingProblem,
         horizon: int,
-        hessian: Literal["exact", "gauss-newton"],
+        method: Literal["ipopt", "ipopt, gauss-newton", "sqpmethod", "fatrop"],
         tolerance: float,
     ):
-        if problem.penalized != "increments" or problem.state_bounds is not None or problem.rate_limited:
-            raise SettingError("problem", "must weigh increments, and bound nothing but inputs")
+        check_problem(problem)
         n, m, H = problem.state_dim, problem.input_dim, horizon
-        step, Q, R = mean_function(gp), casadi.DM(problem.Q), casadi.DM(problem.R)
-        X, U, r = casadi.MX.sym("X", n, H), casadi.MX.sym("U", m, H), casadi.MX.sym("r", n, H)
-        x0, last = casadi.MX.sym("x0", n), casadi.MX.sym("last", m)
-        before = [x0, *casadi.horzsplit(X)]
-        errors, increments = X - r, U - casadi.horzcat(last, U[:, :-1])
-        cost = casadi.sum2(casadi.sum1(errors[:, :-1] * (Q @ errors[:, :-1])))
-        cost += casadi.bilin(casadi.DM(problem.terminal), errors[:, -1], errors[:, -1])
-        cost += casadi.sum2(casadi.sum1(increments * (R @ increments)))
-        unknowns, given = casadi.veccat(X, U), casadi.veccat(x0, last, r)
-        defects = casadi.vec(X - casadi.horzcat(*[step(before[k], U[:, k]) for k in range(H)]))
-        options = {
-            "print_time": False,
-            "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 200, **WARM},
-        }
-        if hessian == "gauss-newton":
-            weight, multipliers = casadi.MX.sym("weight"), casadi.MX.sym("multipliers", H * n)
-            triangle = casadi.triu(weight * casadi.hessian(cost, unknowns)[0])
-            arguments, names = [unknowns, given, weight, multipliers], ["x", "p", "lam_f", "lam_g"]
-            options["hess_lag"] = casadi.Function("nlp_hess_l", arguments, [triangle], names, ["triu_hess_gamma_x_x"])
-        nlp = {"x": unknowns, "p": given, "f": cost, "g": defects}
-        self._solver = casadi.nlpsol("peer", "ipopt", nlp, options)
-        free = np.full(H * n, np.inf)
-        self._lower = np.concatenate([-free, np.tile(problem.input_lower, H)])
-        self._upper = np.concatenate([free, np.tile(problem.input_upper, H)])
+        plugin = method.split(",")[0]
+        self._stagewise = plugin != "ipopt"
+        carried = m if self._stagewise else 0  # of the last input in the state
+        step, Q, R, terminal = mean_function(gp), *map(casadi.DM, (problem.Q, problem.R, problem.terminal))
+        u, r = casadi.SX.sym("u", m, H), casadi.SX.sym("r", n, H)
+        x = casadi.SX.sym("x", n + carried, H + 1)  # the first one is given
+        last = casadi.SX.sym("last", m)
+        cost, gaps, unknowns = 0, [], []
+        for k in range(H):
+            before = x[n:, k] if carried and k else u[:, k - 1] if k else last
+            following = casadi.vertcat(step(x[:n, k], u[:, k]), u[:, k] if carried else [])
+            error = x[:n, k + 1] - r[:, k]
+            cost += casadi.bilin(R, u[:, k] - before) + casadi.bilin(terminal if k == H - 1 else Q, error)
+            gaps.append(
+                following - x[:, k + 1] if plugin == "sqpmethod" else x[:, k + 1] - following
+            )  # as they want it
+            unknowns += [u[:, k], x[:, k + 1]]
+        w, p, g = casadi.vertcat(*unknowns), casadi.veccat(x[:n, 0], last, r), casadi.vertcat(*gaps)
+        hessian = _gauss_newton(w, p, g, cost, triangle=plugin == "ipopt")
+        options = _options(plugin, H, n + m, m, tolerance)
+        if method in ("ipopt, gauss-newton", "sqpmethod"):
+            options["hess_lag"] = hessian
+        self._solver = casadi.nlpsol("peer", plugin, {"x": w, "p": p, "f": cost, "g": g}, options)
+        free = np.full(n + carried, np.inf)
+        self._lower = np.tile(np.concatenate([problem.input_lower, -free]), H)
+        self._upper = np.tile(np.concatenate([problem.input_upper, free]), H)
         self._shape = (H, n, m)
 
-    def __call__(self, instance: Instance, last: Answer | None) -> Answer:
-        """The plan from a state along a reference, started from the last one, shifted."""
-        H, n, m = self._shape
+    def __call__(self, instance: Instance, last: Solution | None) -> Solution:
+        """Plans from a state along a reference, started from the last solution, shifted."""
+        H, _, m = self._shape
         if last is None:
-            start = np.concatenate([instance.targets.ravel(), np.tile(instance.last, H)])
+            inputs = np.tile(instance.last, (H, 1))
+            start = np.hstack([inputs, instance.targets, inputs] if self._stagewise else [inputs, instance.targets])
             multipliers = {}
         else:
-            bounds_x, bounds_u = last.of_bounds[: H * n], last.of_bounds[H * n :]
-            start = np.concatenate([_shifted(last.states, n), _shifted(last.inputs, m)])
+            start = _shifted(last.unknowns)
             multipliers = {
-                "lam_x0": np.concatenate([_shifted(bounds_x, n), _shifted(bounds_u, m)]),
-                "lam_g0": _shifted(last.of_steps, n),
+                "lam_x0": _shifted(last.bound_multipliers).ravel(),
+                "lam_g0": _shifted(last.dynamics_multipliers).ravel(),
             }
         with interrupts_after():
             found = self._solver(
-                x0=start,
+                x0=start.ravel(),
                 p=np.concatenate([instance.state, instance.last, instance.targets.ravel()]),
                 lbx=self._lower,
                 ubx=self._upper,
@@ -128,8 +132,14 @@ class CasadiIpopt:
                 ubg=0.0,
                 **multipliers,
             )
-        x, of_bounds, of_steps = (np.array(found[key]).ravel() for key in ("x", "lam_x", "lam_g"))
-        return Answer(x[H * n :].reshape(H, m), x[: H * n].reshape(H, n), of_bounds, of_steps)
+        unknowns, of_bounds, of_dynamics = (np.array(found[key]).reshape(H, -1) for key in ("x", "lam_x", "lam_g"))
+        return Solution(unknowns[:, :m].copy(), unknowns, of_bounds, of_dynamics)
+
+
+def check_problem(problem: TrackingProblem) -> None:
+    """Raises where a problem has what the peers' formulations do not hand on."""
+    if problem.penalized != "increments" or problem.state_bounds is not None or problem.rate_limited:
+        raise SettingError("problem", "must weigh increments, and bound nothing but inputs")
 
 
 def mean_function(gp: GPPosterior) -> casadi.Function:
@@ -138,7 +148,32 @@ def mean_function(gp: GPPosterior) -> casadi.Function:
     return casadi.Function("mean", [x, u], [casadi_function(gp)(x, u)[0]], ["state", "input"], ["mean"]).expand()
 
 
-def _shifted(values: Array, width: int) -> Array:
-    """Stages (H width,) one step on, the last one repeated."""
-    flat = values.ravel()
-    return np.concatenate([flat[width:], flat[-width:]])
+def _gauss_newton(w: Any, p: Any, g: Any, cost: Any, triangle: bool) -> casadi.Function:
+    """Hessian of the cost alone, which is that of Gauss and Newton for a quadratic cost of the unknowns."""
+    weight, multipliers = casadi.SX.sym("weight"), casadi.SX.sym("multipliers", g.numel())
+    hessian = weight * casadi.hessian(cost, w)[0]
+    name, value = ("triu_hess_gamma_x_x", casadi.triu(hessian)) if triangle else ("hess_gamma_x_x", hessian)
+    return casadi.Function("nlp_hess_l", [w, p, weight, multipliers], [value], ["x", "p", "lam_f", "lam_g"], [name])
+
+
+def _options(plugin: str, H: int, n: int, m: int, tolerance: float) -> dict[str, Any]:
+    """Options of a solver for H stages of n states and m inputs, the first state given."""
+    options: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+    if plugin == "ipopt":
+        return options | {
+            "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": MAX_ITERATIONS, **IPOPT_WARM}
+        }
+    stages = {"N": H, "nx": [0] + [n] * H, "nu": [m] * H + [0], "ng": [0] * (H + 1)}
+    if plugin == "sqpmethod":
+        quiet = dict.fromkeys(("print_header", "print_iteration", "print_status"), False)
+        hpipm = {"print_time": False, "error_on_fail": False, **stages, "hpipm": {"iter_max": 100}}
+        found = {"qpsol": "hpipm", "qpsol_options": hpipm, "tol_du": tolerance, "tol_pr": tolerance}
+        return options | quiet | found | {"max_iter": MAX_ITERATIONS}
+    fatrop = {"print_level": 0, "tol": tolerance, "mu_init": IPOPT_WARM["mu_init"]}
+    structure = {"structure_detection": "manual", "equality": [True] * (H * n), **stages}
+    return options | structure | {"fatrop": fatrop}
+
+
+def _shifted(stages: Array) -> Array:
+    """Rows of the stages (H, ...) one step on, the last one repeated."""
+    return np.concatenate([stages[1:], stages[-1:]])

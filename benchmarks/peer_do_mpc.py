@@ -13,7 +13,7 @@ import casadi
 import numpy as np
 
 from benchmarks.kkt import Instance
-from benchmarks.peer_casadi import WARM, mean_function
+from benchmarks.peer_casadi import IPOPT_WARM, MAX_ITERATIONS, check_problem, mean_function
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.interrupts import interrupts_after
@@ -49,8 +49,7 @@ class DoMpc:
     def __init__(self, gp: GPPosterior, problem: TrackingProblem, horizon: int, tolerance: float):
         if not installed():
             raise SettingError("peers", f"do-mpc is {MISSING}")
-        if problem.penalized != "increments" or problem.state_bounds is not None or problem.rate_limited:
-            raise SettingError("problem", "must weigh increments, and bound nothing but inputs")
+        check_problem(problem)
         if np.count_nonzero(problem.R - np.diag(problem.R.diagonal())):
             raise SettingError("R", "must be diagonal: do-mpc's penalty of the increments is")
         self._horizon = horizon
@@ -63,7 +62,10 @@ class DoMpc:
         model = _model(toolbox, gp)
         self._mpc = mpc = toolbox.controller.MPC(model)
         mpc.settings.n_horizon, mpc.settings.t_step, mpc.settings.store_full_solution = self._horizon, 1.0, False
-        settings = {"tol": tolerance, "max_iter": 200} | WARM  # it hands on the last multipliers, but no such option
+        settings = {
+            "tol": tolerance,
+            "max_iter": MAX_ITERATIONS,
+        } | IPOPT_WARM  # it hands on the last multipliers, but no such option
         mpc.settings.nlpsol_opts = {f"ipopt.{name}": value for name, value in settings.items()}
         mpc.settings.supress_ipopt_output()
         x, r = model.x["x"], model.tvp["r"]

@@ -13,9 +13,9 @@ import torch
 from scipy.optimize import minimize
 
 from benchmarks.kkt import Instance
-from gpmpc.exceptions import SettingError
+from benchmarks.peer_casadi import check_problem
 from gpmpc.gp import GPPosterior
-from gpmpc.gp.model import exact_inference, gpytorch_model
+from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
 from gpmpc.mpc.tracking import TrackingProblem
 
 
@@ -39,9 +39,8 @@ class GPyTorchSlsqp:
     """
 
     def __init__(self, gp: GPPosterior, problem: TrackingProblem, horizon: int, tolerance: float):
-        if problem.penalized != "increments" or problem.state_bounds is not None or problem.rate_limited:
-            raise SettingError("problem", "must weigh increments, and bound nothing but inputs")
-        self._model, self._adds_state = gpytorch_model(gp).requires_grad_(False), gp.predicts == "difference"
+        check_problem(problem)
+        self._model, self._adds_state = to_gpytorch(gp).requires_grad_(False), gp.predicts == "difference"
         self._horizon, self._tolerance = horizon, tolerance
         self._Q, self._R, self._terminal = map(torch.from_numpy, (problem.Q, problem.R, problem.terminal))
         self._bounds = list(zip(problem.input_lower, problem.input_upper, strict=True)) * horizon

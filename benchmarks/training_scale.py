@@ -123,22 +123,21 @@ def evaluation(route: str, x, y, inducing: int):
     import numpy as np
     import torch
 
-    from gpmpc.gp.collapsed_bound import collapsed_bound_with_gradient
-    from gpmpc.gp.evidence import LogEvidence
-    from gpmpc.gp.evidence_in_place import InPlaceEvidence
-    from gpmpc.gp.hyperparameter_search import IN_PLACE
-    from gpmpc.gp.model import BatchExactGP, GPyTorchEvidence
+    from gpmpc.gp.gpytorch_ import GPyTorchLikelihood
+    from gpmpc.gp.kernel import Hyperparameters
+    from gpmpc.gp.likelihood import NegativeLogMarginalLikelihood
+    from gpmpc.gp.sparse import collapsed_bound_with_gradient
 
     theta = np.append(np.linspace(0.5, 1.5, D), [0.5, np.log(30.0)])
     if route == EXACT:
-        evidence = (LogEvidence if len(x) < IN_PLACE else InPlaceEvidence)(x.numpy(), y[:, 0].numpy())
-        return lambda: evidence(theta)
+        likelihood = NegativeLogMarginalLikelihood(x.numpy(), y[:, 0].numpy())
+        return lambda: likelihood(theta)
     if route == GPYTORCH:
-        batch = GPyTorchEvidence(BatchExactGP(x, y))
-        return lambda: batch(theta[None])
+        likelihood = GPyTorchLikelihood(x.numpy(), y[:, 0].numpy())
+        return lambda: likelihood(theta)
     scales, sf2 = torch.from_numpy(np.exp(theta[None, :D])), torch.tensor([np.exp(1.0)], dtype=torch.float64)
     if route == SPARSE:
-        return lambda: collapsed_bound_with_gradient(x[:inducing], x, y, scales, sf2, sf2 / 900)
+        return lambda: collapsed_bound_with_gradient(x[:inducing], x, y, Hyperparameters(scales, sf2, sf2 / 900))
     return gpytorch_sparse(x, y, inducing, scales, sf2)
 
 

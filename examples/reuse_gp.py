@@ -1,7 +1,8 @@
 """A GP for somebody else's project: from a CSV recording to a saved model and a forecast with its uncertainty.
 
-Run as `python examples/reuse_gp.py FOLDER` (the present folder by default); it writes pendulum.csv, pendulum.npz and
-tube.png there. The recording is a simulated damped pendulum, pushed at random and measured with noise.
+Run as `python examples/reuse_gp.py FOLDER` (the present folder by default); it writes pendulum.csv,
+pendulum.safetensors and tube.png there. The recording is a simulated damped pendulum, pushed at random and measured
+with noise.
 """
 
 import sys
@@ -12,7 +13,7 @@ import torch
 from matplotlib.figure import Figure
 
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import GPPosterior, Transitions, train
+from gpmpc.gp import Transitions, load_posterior, save_posterior, train
 from gpmpc.propagation import MomentMatching, rollout
 
 STEP = 0.1  # sampling time [s]
@@ -36,10 +37,10 @@ np.savetxt(folder / "pendulum.csv", log, delimiter=",", header="angle,rate,torqu
 
 # A project with a recording starts here: read it, train, save ...
 data = Transitions.from_csv(folder / "pendulum.csv", states=["angle", "rate"], inputs=["torque"])
-train(data).posterior.save(folder / "pendulum.npz")
+save_posterior(train(data).posterior, folder / "pendulum.safetensors")
 
 # ... and later, or elsewhere: load, and forecast 20 steps from an uncertain start.
-gp = GPPosterior.load(folder / "pendulum.npz")
+gp = load_posterior(folder / "pendulum.safetensors")
 push = np.where(np.arange(20) < 8, 2.5, -1.0)  # [N m]
 start = Gaussian(torch.tensor([1.0, 0.0]).double(), torch.diag(torch.tensor([0.1, 0.2]).double() ** 2))
 forecast = rollout(MomentMatching(), gp, start, torch.from_numpy(push)[:, None])

@@ -7,7 +7,8 @@ import torch
 from gpmpc import metrics
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import Affine, GPPosterior, ResidualModel, Trainer, Transitions, train
+from gpmpc.gp import GPPosterior, Trainer, Transitions, append_points, train
+from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.state_form import StateFormMPC
@@ -88,7 +89,7 @@ def test_a_certain_belief_of_no_vector_is_refused(value):
         lambda: posterior().predict([0.0, 0.0], [0.0]),
         lambda: posterior().predict(np.zeros(2), np.zeros(1)),
         lambda: posterior().predict(torch.zeros(2, dtype=F), 0.0),
-        lambda: posterior().condition_on_targets([[0.0] * 3], [[0.0] * 2]),
+        lambda: append_points(posterior(), [[0.0] * 3], [[0.0] * 2]),
         lambda: MomentMatching()(posterior(), belief(), [0.0]),
         lambda: rollout(Linearization(), posterior(), belief(), [[0.0], [0.0]]),
         lambda: Affine([[1.0]], [[1.0]], [0.0]),

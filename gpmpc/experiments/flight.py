@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from experiments.slsqp import SLSQP
 
+from experiments.slsqp import SLSQP
 from gpmpc.compiling import tell_of_compiling
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
-from gpmpc.gp import Scaling
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp import GPPosterior, Scaling, load_posterior
 from gpmpc.metrics import tracking_error, violation_rate
 from gpmpc.mpc.controller import Controller, Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
@@ -243,7 +242,7 @@ def _measured(rollout: Rollout, flight: Flight, limits: StateBounds | None) -> d
 
 @lru_cache(maxsize=8)
 def _loaded(path: Path) -> GPPosterior:
-    return GPPosterior.load(path)
+    return load_posterior(path)
 
 
 def _several(value: Any) -> list:

@@ -30,7 +30,7 @@ from gpmpc.datasets import DataSource
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.experiments.flight import Flight, Row, Task, fly, problem_of
 from gpmpc.experiments.tables import FitStore, Subsystem, digest
-from gpmpc.gp import Scaling, Transitions
+from gpmpc.gp import Scaling, Transitions, save_posterior
 from gpmpc.mpc.controller import Reference
 from gpmpc.parallel import in_processes
 from gpmpc.systems import Plant, Translational
@@ -198,10 +198,10 @@ class Flights:
     def _trained(self, loop: str, data: Transitions, folder: Path) -> Path:
         settings = json.dumps([self.model_settings[loop], self.seed], sort_keys=True).encode()
         name = digest(settings, data.features.numpy().tobytes(), data.next_states.numpy().tobytes())
-        path = folder / "models" / f"{name}.npz"
+        path = folder / "models" / f"{name}.safetensors"
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
-            self.models[loop](data, seed=self.seed).posterior.save(path)
+            save_posterior(self.models[loop](data, seed=self.seed).posterior, path)
         return path
 
     def run(self, store: FitStore, flights: Sequence[Flight], progress: Callable[[dict], None]) -> list[dict]:

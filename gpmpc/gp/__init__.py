@@ -1,41 +1,46 @@
-"""Gaussian process dynamics models: data, training (GPyTorch), and the frozen posterior that predicts."""
+"""Gaussian process models of dynamics: data, training, and the frozen posterior that predicts."""
 
-from gpmpc.dynamics import DynamicsModel
-from gpmpc.gp.budget import Budget
-from gpmpc.gp.evaluation import evaluation
-from gpmpc.gp.gpytorch_posterior import KernelPosterior
-from gpmpc.gp.gpytorch_training import fit
-from gpmpc.gp.many import train_many
-from gpmpc.gp.penalties import SoftLimits
+from gpmpc.gp.backend import backend
+from gpmpc.gp.gpytorch_ import fit, to_gpytorch
+from gpmpc.gp.gpytorch_posteriors import KernelPosterior, from_gpytorch
+from gpmpc.gp.kernel import Hyperparameters
+from gpmpc.gp.online import SlidingWindow, append_points, append_transitions, remove_points
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.residual import Affine, ResidualModel
 from gpmpc.gp.scaling import Scaling, centre, identity, min_max, standardize
+from gpmpc.gp.search import SoftLimits
 from gpmpc.gp.sparse import sparse_posterior
 from gpmpc.gp.sparse_training import SparseTrainer, SparseTraining
-from gpmpc.gp.training import Trainer, Training, train
+from gpmpc.gp.storage import load_metadata, load_posterior, save_posterior
+from gpmpc.gp.training import Trainer, Training, train, train_many
 from gpmpc.gp.transitions import Transitions
 
 __all__ = [
-    "Affine",
-    "Budget",
-    "DynamicsModel",
     "GPPosterior",
+    "Hyperparameters",
     "KernelPosterior",
-    "ResidualModel",
     "Scaling",
+    "SlidingWindow",
     "SoftLimits",
     "SparseTrainer",
     "SparseTraining",
     "Trainer",
     "Training",
     "Transitions",
+    "append_points",
+    "append_transitions",
+    "backend",
     "centre",
-    "evaluation",
     "fit",
+    "from_gpytorch",
     "identity",
+    "load_metadata",
+    "load_posterior",
     "min_max",
+    "remove_points",
+    "save_posterior",
     "sparse_posterior",
     "standardize",
+    "to_gpytorch",
     "train",
     "train_many",
 ]

@@ -1,4 +1,4 @@
-"""Problem: a file of arrays must not pass for another one where it was damaged, nor ask for memory that it cannot fill.
+"""The .npz files of transitions and of the models of gpmpc 1, which no damaged file passes for.
 
 The file is an ``.npz`` archive, as NumPy makes it: a zip of ``.npy`` arrays, each with its own CRC-32, and here of a
 ``header.json``, which holds a checksum of itself and of the arrays' names, sizes and CRCs: parts that changed places

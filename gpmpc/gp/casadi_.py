@@ -1,4 +1,4 @@
-"""Problem: hand a learned model to CasADi, whose users bring their own optimal control problem and IPOPT.
+"""A learned model as a CasADi function, for users with an optimal control problem and IPOPT of their own.
 
     mean_a = offset_a + sum_i beta_ai k_ai (+ x_a),   variance_a = sf2_a - |L_a^-1 k_a|^2,   k_ai = k_a(x~_i, x~)
 
@@ -9,17 +9,18 @@ Jacobians and Hessians from it (Andersson, Gillis, Horn, Rawlings and Diehl, 201
 Importing this file loads CasADi; ``gpmpc.gp`` does not import it.
 """
 
+from typing import Any
+
 import casadi
 import numpy as np
 import torch
 
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.residual import Affine, ResidualModel
 
 
-def casadi_function(model: GPPosterior | ResidualModel, name: str = "gp") -> casadi.Function:
-    """``model.predict`` as a CasADi function (state, input) -> (mean, variance), in physical units.
+def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
+    """Builds ``model.predict`` as a CasADi function (state, input) -> (mean, variance), in physical units.
 
     Over a horizon use ``function.map(H)``, which takes columns (n, H) and (m, H).
 
@@ -33,21 +34,24 @@ def casadi_function(model: GPPosterior | ResidualModel, name: str = "gp") -> cas
         has added the state), or of the value that the model predicts.
 
     Raises:
-        UnsupportedModel: The nominal part is a Python function, or the model another one.
+        UnsupportedModel: The model has no ``affine_form``: its nominal part is a Python function, or it is another one.
     """
-    x, u = casadi.MX.sym("state", model.state_dim), casadi.MX.sym("input", model.input_dim)
-    if isinstance(model, GPPosterior):
-        mean, variance = _moments(model, x, u)
-    elif isinstance(model, ResidualModel) and isinstance(model.nominal, Affine):
-        states, inputs = list(model.states), list(model.inputs)
-        residual, spread = _moments(model.residual, x[states], u[inputs])
-        nominal, B = model.nominal, _numbers(model.B)
-        mean = _numbers(nominal.A) @ x + _numbers(nominal.B) @ u + _numbers(nominal.c) + B @ residual
-        variance = B**2 @ spread
-    else:
+    form = getattr(model, "affine_form", None)
+    if form is None:
         nominal = getattr(model, "nominal", None)
         got = type(model).__name__ + (f" of a nominal {type(nominal).__name__}" if nominal is not None else "")
         raise UnsupportedModel(f"CasADi can take a GPPosterior, or a ResidualModel with an Affine nominal; got {got}")
+    x, u = casadi.MX.sym("state", model.state_dim), casadi.MX.sym("input", model.input_dim)
+    states, inputs = (form.states, form.inputs) if form.states is not None else (slice(None), slice(None))
+    mean, variance = _moments(form.f, x[states], u[inputs])
+    if form.B is not None:
+        B = _numbers(form.B)
+        mean, variance = B @ mean, B**2 @ variance
+    for factor, vector in ((form.A, x), (form.G, u)):
+        if factor is not None:
+            mean = mean + _numbers(factor) @ vector
+    if form.c is not None:
+        mean = mean + _numbers(form.c)
     return casadi.Function(name, [x, u], [mean, variance], ["state", "input"], ["mean", "variance"])
 
 
@@ -58,8 +62,6 @@ def _moments(gp: GPPosterior, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, ca
     exponents = difference**2 @ _numbers(gp.lengthscales.mT.double() ** -2) / -2  # (N, k)
     k = casadi.exp(exponents) * casadi.repmat(_numbers(gp.signal_variance).T, size, 1)
     mean = casadi.sum1(k * _numbers(gp.weights.mT)).T + _numbers(gp.offset)
-    if gp.predicts == "difference":
-        mean = mean + x
     variance = []
     lower = casadi.Sparsity.lower(size)
     for a, column in enumerate(casadi.horzsplit(k)):

@@ -1,16 +1,18 @@
-"""Problem: the SE-ARD kernel between two sets of points, its noisy matrix factorised, and what may go into it."""
+"""The SE-ARD kernel between two sets of points, the factor of its noisy matrix, and the checks of its arguments."""
 
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from torch import Tensor, float64, int32, isfinite, linalg, nonzero, zeros
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import check_tensors
 
+Predicts = Literal["next_state", "difference", "value"]
 PREDICTS = ("next_state", "difference", "value")
-MANY = 1000  # points: from here on kernel matrices are made and factorised one after another, in place
-ROWS = 64  # of such a matrix at a time: they fit the cache
-FEW = 16  # columns of a kernel matrix whose differences, all at once, fit the cache
+IGNORED = 1e8  # length-scale of an input that drops out of a kernel, in units of its magnitude
+_MANY = 1000  # points: from here on kernel matrices are made and factorised one after another, in place
+_ROWS = 64  # of such a matrix at a time: they fit the cache
+_FEW = 16  # columns of a kernel matrix whose differences, all at once, fit the cache
 
 
 def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_variance: Tensor) -> Tensor:
@@ -19,7 +21,7 @@ def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_v
     Summed over differences, a column at a time where there are many: exact for near points, where
     |x|^2 + |x'|^2 - 2 x'x cancels.
     """
-    if len(others) <= FEW:
+    if len(others) <= _FEW:
         squares = (points[:, None] - others).square() @ lengthscales.mT**-2  # (N, M, k)
         return signal_variance[:, None, None] * (squares.movedim(-1, 0) / -2).exp()
     shape = (len(lengthscales), len(points), len(others))
@@ -32,21 +34,23 @@ def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_v
 def centred(points: Any) -> Any:
     """Points (N, d), NumPy's or torch's, moved to mean zero: elsewhere distances from a matrix product cancel.
 
-    A stationary kernel does not see it. The first point is subtracted first, which is exact between near numbers: so a
-    shift of all points changes no bit of the result.
+    A stationary kernel does not depend on it. The first point is subtracted first, which is exact between near numbers:
+    so a shift of all points changes no bit of the result.
     """
     away = points - points[0]
     return away - away.mean(0)
 
 
-def factorised(inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor) -> Tensor:
+def factorize(inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor) -> Tensor:
     """The lower Cholesky factors of K + sn2 I (k, N, N).
 
     Raises:
         SettingError: The matrix of an output is not positive definite in double precision.
     """
-    if len(inputs) > MANY and not any(t.requires_grad for t in (inputs, lengthscales, signal_variance, noise_variance)):
-        cholesky, info = _factorised_in_place(inputs, lengthscales, signal_variance, noise_variance)
+    if len(inputs) > _MANY and not any(
+        t.requires_grad for t in (inputs, lengthscales, signal_variance, noise_variance)
+    ):
+        cholesky, info = _factorize_in_place(inputs, lengthscales, signal_variance, noise_variance)
     else:
         kernel = kernel_matrix(inputs, inputs, lengthscales, signal_variance)
         kernel.diagonal(dim1=-2, dim2=-1).add_(noise_variance[:, None])
@@ -61,7 +65,7 @@ def factorised(inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, no
     return cholesky
 
 
-def _factorised_in_place(
+def _factorize_in_place(
     inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The same numbers in the memory of the result (k, N, N) and little more; with LAPACK's info (k,)."""
@@ -69,8 +73,8 @@ def _factorised_in_place(
     info = zeros(outputs, dtype=int32, device=inputs.device)
     cholesky = inputs.new_empty(outputs, size, size).mT  # columns contiguous, as LAPACK wants them
     for a, factor in enumerate(cholesky):
-        for end in range(ROWS, size + ROWS, ROWS):  # the lower triangle
-            rows, columns = slice(end - ROWS, end), slice(0, end)
+        for end in range(_ROWS, size + _ROWS, _ROWS):  # the lower triangle
+            rows, columns = slice(end - _ROWS, end), slice(0, end)
             scales = lengthscales[a, None], signal_variance[a, None]
             factor[rows, columns] = kernel_matrix(inputs[rows], inputs[columns], *scales)[0]
         factor.diagonal().add_(noise_variance[a])
@@ -118,3 +122,26 @@ def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> 
     for name in ("lengthscales", "signal_variance", "noise_variance"):
         if name in given and not bool((given[name] > 0).all()):
             raise SettingError(name, f"must be positive; got {given[name].tolist()}")
+
+
+class Hyperparameters(NamedTuple):
+    """Of k SE-ARD GPs over d features.
+
+    Attributes:
+        lengthscales: (k, d).
+        signal_variance: sf2 (k,).
+        noise_variance: sn2 (k,).
+    """
+
+    lengthscales: Tensor
+    signal_variance: Tensor
+    noise_variance: Tensor
+
+    @classmethod
+    def from_theta(cls, theta: Tensor) -> "Hyperparameters":
+        """Of rows (log l, log sf, log(sf / sn)), one an output (k, d + 2)."""
+        return cls(theta[:, :-2].exp(), (2 * theta[:, -2]).exp(), (2 * (theta[:, -2] - theta[:, -1])).exp())
+
+    def output(self, a: int) -> "Hyperparameters":
+        """Of output a alone (k = 1)."""
+        return Hyperparameters(*(value[a, None] for value in self))

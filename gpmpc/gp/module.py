@@ -1,4 +1,4 @@
-"""Problem: put a learned model where there is no gpmpc: torch.export, ONNX, a C++ runtime.
+"""A learned model as a torch module, for places without gpmpc: torch.export, ONNX, a C++ runtime.
 
 ``PosteriorModule`` is the posterior as a ``torch.nn.Module`` of buffers, with a forward pass of multiplications, sums
 and one exponential. ONNX has no triangular solve, so the inverse of the factor takes its place; the variance stays

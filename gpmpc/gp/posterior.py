@@ -1,50 +1,62 @@
-"""Problem: predict the next state from a trained exact GP, fast and safely under torch's function transforms.
+"""Exact GPs with the SE-ARD kernel, frozen to plain tensors: data and prediction.
 
-GPyTorch trains; what it found is frozen here to plain tensors: data, Cholesky factor, weights and hyperparameters, one
-GP per output with the squared exponential kernel with automatic relevance determination (SE-ARD),
+One GP per output with the squared exponential kernel with automatic relevance determination,
 
     k_a(x~, x~') = sf2_a exp(-1/2 sum_d (x~_d - x~'_d)^2 / l_ad^2),   x~ = (x, u)
 
-Rasmussen and Williams (2006), eqs. (2.25)-(2.26), Algorithm 2.1; the GP model of Cao, Lai and Alam (2017).
-
-An affine scaling of the data is only another parametrisation of such a GP: length-scales in the units of the inputs,
-standard deviations in those of the output, and a constant prior mean. So a posterior knows no scaling: it holds, takes
-and gives physical units.
+Rasmussen and Williams (2006), eqs. (2.25)-(2.26), Algorithm 2.1; the GP model of Cao, Lai and Alam (2017). An affine
+scaling of the data is only another parametrisation of such a GP (length-scales in the units of the inputs, standard
+deviations in those of the output, and a constant prior mean), so a posterior is in physical units.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from gpmpc.dynamics import Array, Linearized, check_destination, check_query, tensors_for, to_array
-from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.gp.evaluation import compiled_point, host_arrays
-from gpmpc.gp.kernel import check_posterior, factorised
-from gpmpc.gp.model import hyperparameters as trained
+from gpmpc.gp.backend import host_arrays
+from gpmpc.gp.kernel import Predicts, check_posterior, factorize
 from gpmpc.gp.scaling import Scaling
-from gpmpc.gp.transitions import Transitions, check_transitions
-from gpmpc.gp.updating import extended, without
 
 if TYPE_CHECKING:
     from gpmpc.kernels import Packed
 
-Predicts = Literal["next_state", "difference", "value"]
-IGNORED = 1e8  # length-scale of an input that drops out of a kernel, in units of its magnitude
+
+class AffineForm(NamedTuple):
+    """A model of the form x+ = A x + G u + c + B f(x_s, u_s), through which moments go exactly.
+
+    None stands for A = 0, G = 0, c = 0, B = I, or a selection of everything.
+
+    Attributes:
+        f: The latent functions.
+        A: (n, n).
+        G: (n, m).
+        c: (n,).
+        B: (n, k).
+        states: The states that f depends on.
+        inputs: The inputs that f depends on.
+    """
+
+    f: "GPPosterior"
+    A: Tensor | None = None
+    G: Tensor | None = None
+    c: Tensor | None = None
+    B: Tensor | None = None
+    states: list[int] | None = None
+    inputs: list[int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class GPPosterior:
-    """Exact GPs, one per output, over the same N points; build it with one of the ``from_`` methods.
+    """Exact GPs, one per output, over the same N points; a training, ``from_hyperparameters`` or a file makes them.
 
     Attributes:
         features: x~ = (x, u) of the training points (N, n + m).
-        targets: What the GPs learned (N, k): next states, differences x[k+1] - x[k] (k = n), or any values.
+        targets: Of the GPs (N, k): next states, differences x[k+1] - x[k] (k = n), or any values.
         lengthscales: l (k, n + m), one row an output.
         signal_variance: sf2 (k,).
         noise_variance: sn2 (k,).
@@ -109,36 +121,11 @@ class GPPosterior:
         }
         check_posterior(given, input_dim, predicts)
         inputs, targets, lengthscales, signal_variance, noise_variance, offset = (v.clone() for v in given.values())
-        cholesky = factorised(inputs, lengthscales, signal_variance, noise_variance)
+        cholesky = factorize(inputs, lengthscales, signal_variance, noise_variance)
         rights = (targets - offset).mT[..., None]  # one after another: torch copies the factors it is given
         weights = torch.stack([torch.cholesky_solve(b, L)[:, 0] for b, L in zip(rights, cholesky, strict=True)])
         hyperparameters = (lengthscales, signal_variance, noise_variance, offset)
         return cls(inputs, targets, *hyperparameters, cholesky, weights, input_dim, predicts)
-
-    @classmethod
-    def from_gpytorch(
-        cls, model: Any, likelihood: Any = None, *, input_dim: int, predicts: Predicts = "next_state"
-    ) -> "GPPosterior":
-        """Freezes trained SE-ARD ExactGPs of GPyTorch: one, a batch (one batch dimension, an output each), or a list.
-
-        A sparse one (``InducingPointKernel``) comes out as its pseudo-observations; see ``gp.sparse``.
-
-        Args:
-            model: An ``ExactGP`` with a zero or constant mean and an ``RBFKernel``, scaled by a ``ScaleKernel`` or
-                not; an ``IndependentModelList``; or a sequence of models over the same inputs.
-            likelihood: Its ``GaussianLikelihood``, or a list of them; the models' own by default.
-            input_dim: m.
-            predicts: What the training targets mean.
-
-        Raises:
-            UnsupportedModel: The kernel, mean or likelihood is another one, or transforms are attached.
-        """
-        found = trained(model, likelihood)
-        if "inducing" in found:
-            from gpmpc.gp.sparse import sparse_posterior  # which builds on this module
-
-            return sparse_posterior(features=found.pop("inputs"), **found, input_dim=input_dim, predicts=predicts)
-        return cls.from_hyperparameters(**found, input_dim=input_dim, predicts=predicts)
 
     def unscaled(self, features: Scaling, targets: Scaling) -> "GPPosterior":
         """The same GPs in physical units, where these were trained on scaled data.
@@ -205,7 +192,13 @@ class GPPosterior:
         return pack(*(part.numpy() for part in parts), self.state_dim)
 
     @property
-    def exact(self) -> bool:
+    def affine_form(self) -> AffineForm:
+        """Next states (A = 0) or differences (A = I) as moments are composed of them."""
+        adds_state = self.predicts == "difference"
+        return AffineForm(self, torch.eye(self.state_dim, dtype=self.dtype, device=self.device) if adds_state else None)
+
+    @property
+    def has_observation_noise(self) -> bool:
         """Whether ``targets`` are observations with noise sn2, not a sparse model's pseudo-observations."""
         diagonal = (self.signal_variance + self.noise_variance)[:, None]
         error = (self.cholesky.square().sum(-1) - diagonal).abs()
@@ -216,23 +209,6 @@ class GPPosterior:
         check_destination(device, dtype)
         tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
         return replace(self, **{name: value.to(device=device, dtype=dtype) for name, value in tensors.items()})
-
-    def save(self, path: str | Path) -> None:
-        """Writes one file without pickle, in one piece or not at all; see ``gpmpc.gp.storage``."""
-        from gpmpc.gp.storage import save_posterior  # which knows this class
-
-        save_posterior(self, path)
-
-    @classmethod
-    def load(cls, path: str | Path) -> "GPPosterior":
-        """Reads what ``save`` wrote; the predictions are the same, bit by bit.
-
-        Raises:
-            DataError: The file is missing, damaged, of another kind or of a newer format.
-        """
-        from gpmpc.gp.storage import load_posterior
-
-        return load_posterior(path)
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
         """The next state's distribution at a certain state and input (Rasmussen and Williams, 2006, eq. (2.25)).
@@ -266,20 +242,24 @@ class GPPosterior:
 
     def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
         """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""
-        input = state[..., :0] if input is None else input
-        if host_arrays(self.weights, state, input) is not None:
-            mean, variance, by_state, by_input = compiled_point(self, "point_with_jacobian", state, input)
-            return Gaussian(mean, torch.diag_embed(variance)), by_state, by_input
-        k, difference = self._correlations(state, input)
-        return self._belief(k, state), *self._jacobian(k, difference)
+        mean, A, B, V = self._expanded(state, input, covariance=True)
+        return Gaussian(mean, V), A, B
 
     def mean_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """``predict_with_jacobian`` without the variance, which costs most of it: the mean (*batch, k) comes first."""
+        """``predict_with_jacobian`` without the covariance, which costs most: mean (*batch, k), derivatives."""
+        return self._expanded(state, input, covariance=False)[:3]
+
+    def _expanded(self, state: Tensor, input: Tensor | None, covariance: bool) -> tuple[Tensor, ...]:
         input = state[..., :0] if input is None else input
-        if host_arrays(self.weights, state, input) is not None:
-            return compiled_point(self, "mean_with_jacobian", state, input)
-        k, difference = self._correlations(state, input)
-        return self._mean(k, state), *self._jacobian(k, difference)
+        check_query(self, state, input)
+        if host_arrays(self.weights, state, input) is None:
+            k, difference = self._correlations(state, input)
+            V = self._belief(k, state).covariance if covariance else k
+            return self._mean(k, state), *self._jacobian(k, difference), V
+        batch, count = state.shape[:-1], state.shape[:-1].numel()
+        x, u = state.numpy().reshape(count, self.state_dim), input.numpy().reshape(count, self.input_dim)
+        found = [part for part in self.linearize(x, u, covariance) if part is not None]
+        return tuple(torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found)
 
     def mean_hessian(self, state: Tensor, input: Tensor | None = None) -> Tensor:
         """The mean's second derivatives by the state (*batch, k, n, n)."""
@@ -312,50 +292,8 @@ class GPPosterior:
         normal = torch.randn(shape, generator=generator, dtype=self.dtype, device=self.device)
         return belief.mean + variance.sqrt() * normal
 
-    def condition_on(self, transitions: Transitions) -> "GPPosterior":
-        """The posterior that has seen more transitions, by an extension of the Cholesky factor: O(N^2) a point.
-
-        The hyperparameters stay; ``Trainer.refit`` fits them anew.
-
-        Raises:
-            ShapeError: The transitions have other dimensions.
-            UnsupportedModel: The GPs learned values, which transitions do not hold: ``condition_on_targets``.
-            SettingError: The larger kernel matrix is not positive definite in this dtype.
-        """
-        targets = self.learned(transitions)
-        return extended(self, transitions.features, targets)
-
-    def condition_on_targets(self, features: Tensor, targets: Tensor) -> "GPPosterior":
-        """The posterior that has seen more points: x~ = (x, u) (p, n + m) and what the GPs learn of them (p, k)."""
-        return extended(self, features, targets)
-
-    def drop(self, indices: Sequence[int] | Tensor) -> "GPPosterior":
-        """The posterior that has not seen some of its points (rows of ``features``), in O(N^2) a point.
-
-        Raises:
-            SettingError: An index is out of range or stands there twice.
-            DataError: No point is left.
-        """
-        return without(self, indices)
-
-    def learned(self, transitions: Transitions) -> Tensor:
-        """What the GPs would be told of transitions: next states, or differences (N, n).
-
-        Raises:
-            ShapeError: The transitions have other dimensions.
-            UnsupportedModel: The GPs learned values, which transitions do not hold.
-        """
-        check_transitions(transitions)
-        targets = transitions.targets(self.predicts)
-        if (transitions.state_dim, transitions.input_dim) != (self.state_dim, self.input_dim):
-            raise ShapeError(
-                f"the model has {self.state_dim} states and {self.input_dim} inputs; "
-                f"got transitions with {transitions.state_dim} and {transitions.input_dim}"
-            )
-        return targets
-
-    def explained(self, k: Tensor) -> Tensor:
-        """|L_a^-1 k_a|^2 (*batch, k) of k (*batch, k, N): how much of the variance the data explain.
+    def variance_reduction(self, k: Tensor) -> Tensor:
+        """|L_a^-1 k_a|^2 (*batch, k) of correlations k (*batch, k, N): by how much the data reduce the variance.
 
         The batch goes to the right-hand side's columns: broadcast against it, L would be copied for every member.
         """
@@ -365,8 +303,8 @@ class GPPosterior:
         squares = torch.linalg.solve_triangular(self.cholesky, columns, upper=False).square().sum(-2)
         return squares.mT.unflatten(0, k.shape[:-2])
 
-    def solved(self, k: Tensor) -> Tensor:
-        """(K_a + sn2_a I)^-1 k_a (*batch, k, N) of k (*batch, k, N), likewise."""
+    def solve(self, k: Tensor) -> Tensor:
+        """(K_a + sn2_a I)^-1 k_a (*batch, k, N) of k (*batch, k, N); the batch becomes columns as above."""
         if k.dim() == 2:
             return torch.cholesky_solve(k[..., None], self.cholesky)[..., 0]
         columns = k.flatten(0, -3).movedim(0, -1)  # (k, N, batch)
@@ -385,7 +323,7 @@ class GPPosterior:
         return mean + state if self.predicts == "difference" else mean
 
     def _belief(self, k: Tensor, state: Tensor) -> Gaussian:
-        variance = (self.signal_variance - self.explained(k)).clamp_min(0)
+        variance = (self.signal_variance - self.variance_reduction(k)).clamp_min(0)
         return Gaussian(self._mean(k, state), torch.diag_embed(variance))
 
     def _jacobian(self, k: Tensor, difference: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Problem: columns of very different ranges have to be brought to one scale before a GP is trained, and back after.
+"""Affine scalings of data columns of very different ranges, before training and back.
 
 A ``Scaling`` is one affine map a column, scaled = (value - offset) / factor. The four in use: none at all, zero mean,
 zero mean and unit standard deviation, and a range onto an interval (the paper's rotational data: [0.1, 0.9]).

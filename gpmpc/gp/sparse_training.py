@@ -1,9 +1,9 @@
-"""Problem: train sparse GPs on thousands of transitions, hyperparameters and inducing points together.
+"""Training of sparse GPs on thousands of transitions, hyperparameters and inducing points together.
 
 The hyperparameters start where exact training on a random subset ends; the inducing points start greedily, each where
 the outputs' conditional variances given those before it, in units of their noise, add up to the most (Burt, Rasmussen
 and van der Wilk, 2020, section 4: this is the step that closes most of the bound's gap tr(Kxx - Qxx) / sn2). What they
-leave unexplained, on average, is added to the noise. Then L-BFGS climbs the collapsed bound over all of it. One
+leave unexplained, on average, is added to the noise. Then L-BFGS maximises the collapsed bound over all of it. One
 evaluation costs O(N M^2) an output.
 """
 
@@ -19,22 +19,29 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, TrainingError, check_number
-from gpmpc.gp.collapsed_bound import JITTER, Method, collapsed_bound_with_gradient, data_sums, inducing_factor
-from gpmpc.gp.hyperparameter_search import FAILED, spread
-from gpmpc.gp.kernel import kernel_matrix
-from gpmpc.gp.posterior import GPPosterior, Predicts
+from gpmpc.gp.kernel import Hyperparameters, Predicts, kernel_matrix
+from gpmpc.gp.likelihood import FAILED
+from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.scaling import Scaling, centre, identity
-from gpmpc.gp.sparse import sparse_posterior
-from gpmpc.gp.training import Trainer, log_hyperparameters, training_data
+from gpmpc.gp.search import column_std, log_hyperparameters, training_data
+from gpmpc.gp.sparse import (
+    JITTER,
+    Method,
+    collapsed_bound_with_gradient,
+    inducing_factor,
+    sparse_posterior,
+    variance_reductions,
+)
+from gpmpc.gp.training import Trainer
 from gpmpc.gp.transitions import Transitions, check_transitions
 
-log = logging.getLogger(__name__)
-EVERY = 10  # iterations between two lines of the log
+_log = logging.getLogger(__name__)
+_EVERY = 10  # iterations between two lines of the log
 
 
 @dataclass(frozen=True)
 class SparseTraining:
-    """What sparse training found.
+    """The result of a sparse training.
 
     Attributes:
         posterior: The trained GPs, frozen to M pseudo-observations at the inducing points.
@@ -58,7 +65,7 @@ class SparseTrainer:
     """Fits one sparse SE-ARD GP per output, over inducing points that all share.
 
     Six outputs of nine features, 5000 transitions and 100 inducing points take 0.3 s an iteration on one
-    core; the log tells how it goes.
+    core; progress is logged.
 
     Attributes:
         inducing: M; no more than there are distinct points.
@@ -128,14 +135,14 @@ class SparseTrainer:
         chosen = np.random.default_rng(seed).permutation(len(x))[: self.subset]
         exact = self._exact().fit(features[chosen], y[chosen], input_dim, "value", seed)
         theta = log_hyperparameters(exact.posterior, feature_scaling, identity(y))
-        Z = greedy_points(x, *hyperparameters(torch.from_numpy(theta)), count=self.inducing)
-        log.info(
+        Z = greedy_points(x, Hyperparameters.from_theta(torch.from_numpy(theta)), self.inducing)
+        _log.info(
             "sparse training: %d inducing points chosen among %d after %.1f s",
             len(Z),
             len(x),
             time.perf_counter() - begin,
         )
-        bound = _Bound(self, x, y, torch.from_numpy(spread(features.numpy())) / feature_scaling.factor, len(Z))
+        bound = _Bound(self, x, y, torch.from_numpy(column_std(features.numpy())) / feature_scaling.factor, len(Z))
         start = bound.best = bound.vector(self._with_unexplained(theta, Z, x, y), Z)
         if self.iterations:  # of none L-BFGS-B makes one
             limits = {"maxiter": self.iterations, "maxfun": 3 * self.iterations + 1}
@@ -147,11 +154,10 @@ class SparseTrainer:
         if not np.isfinite(objective).all():
             failed = [a for a, value in enumerate(objective) if not np.isfinite(value)]
             raise TrainingError(failed, "the inducing points' kernel matrix is not positive definite: raise jitter")
-        self._check_learned(noise_alone(y) - objective, noise_alone(y[chosen]) - exact.objective, x.shape[1] + 2)
+        self._check_learned(_noise_alone(y) - objective, _noise_alone(y[chosen]) - exact.objective, x.shape[1] + 2)
         theta, Z = bound.parts(torch.from_numpy(bound.best))
-        lengthscales, sf2, sn2 = hyperparameters(theta)
         posterior = sparse_posterior(
-            Z, x, y, lengthscales, sf2, sn2, input_dim, predicts, method=self.method, jitter=self.jitter
+            Z, x, y, Hyperparameters.from_theta(theta), input_dim, predicts, method=self.method, jitter=self.jitter
         ).unscaled(feature_scaling, target_scaling)
         theta = theta.numpy().copy()
         theta[:, :-2] += feature_scaling.factor.log().numpy()
@@ -165,9 +171,9 @@ class SparseTrainer:
         """
         if self.method == "fitc":  # has that noise of its own
             return theta
-        lengthscales, sf2, sn2 = hyperparameters(torch.from_numpy(theta))
-        Lz = inducing_factor(Z, lengthscales, sf2, self.jitter)
-        explained = data_sums(Lz, Z, x, y, lengthscales, sf2, sn2, self.method).gram.diagonal(dim1=-2, dim2=-1).sum(-1)
+        current = Hyperparameters.from_theta(torch.from_numpy(theta))
+        _, sf2, sn2 = current
+        explained = variance_reductions(inducing_factor(Z, current, self.jitter), Z, x, y, current, self.method)
         sn2 = sn2 + (sf2 - explained * sn2 / len(x)).clamp_min(0)
         return np.column_stack([theta[:, :-1], (sf2 / sn2).log().numpy() / 2])
 
@@ -188,7 +194,7 @@ class SparseTrainer:
                 f"where exact GPs of {self.subset} points learned more: raise inducing",
             )
         if nothing:
-            log.warning("sparse training: nothing but noise was found in output %s", ", ".join(map(str, nothing)))
+            _log.warning("sparse training: nothing but noise was found in output %s", ", ".join(map(str, nothing)))
 
     def _exact(self) -> Trainer:
         return Trainer(
@@ -200,24 +206,18 @@ class SparseTrainer:
         )
 
 
-def hyperparameters(theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Length-scales (k, d), sf2 (k,) and sn2 (k,) of rows (log l, log sf, log(sf / sn))."""
-    return theta[:, :-2].exp(), (2 * theta[:, -2]).exp(), (2 * (theta[:, -2] - theta[:, -1])).exp()
-
-
-def noise_alone(targets: Tensor) -> np.ndarray:
+def _noise_alone(targets: Tensor) -> np.ndarray:
     """The least negative log evidence (k,) of targets (N, k) as noise alone; minus infinity where all are zero."""
     return (len(targets) / 2 * (2 * math.pi * math.e * targets.square().mean(0)).log()).numpy()
 
 
-def greedy_points(
-    features: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor, count: int
-) -> Tensor:
+def greedy_points(features: Tensor, hyperparameters: Hyperparameters, count: int) -> Tensor:
     """Inducing points (M, d) among the features (N, d): each where most is unexplained by those before it.
 
     A pivoted Cholesky factorisation of sum_a K_a / sn2_a's diagonal. Fewer than ``count`` come back where nothing is
     left to explain: less than round-off of every output's variance.
     """
+    lengthscales, signal_variance, noise_variance = hyperparameters
     left = signal_variance[:, None].repeat(1, len(features))
     rows = features.new_zeros(len(lengthscales), min(count, len(features)), len(features))
     chosen: list[int] = []
@@ -243,7 +243,7 @@ class _Bound:
         self.trainer, self.x, self.y, self.unit, self.count = trainer, features, targets, unit, count
         self.evaluations, self.iteration, self._last, self._least = 0, 0, np.nan, np.inf
         outputs, d = targets.shape[1], features.shape[1]
-        log_inputs, log_outputs = self.unit.log().numpy(), np.log(spread(targets.numpy()))
+        log_inputs, log_outputs = self.unit.log().numpy(), np.log(column_std(targets.numpy()))
         reach = np.append(np.full(d, np.log(1e4)), [np.log(1e6), np.log(trainer.signal_to_noise_limit)])
         centre = np.array([np.append(log_inputs, [own, 0.0]) for own in log_outputs]).ravel()
         reach = np.tile(reach, outputs)
@@ -281,7 +281,7 @@ class _Bound:
         variables = torch.from_numpy(vector.copy()).requires_grad_()
         with torch.enable_grad():
             theta, Z = self.parts(variables)
-            tensors = (Z, *hyperparameters(theta))
+            tensors = (Z, *Hyperparameters.from_theta(theta))
         try:
             bounds, slopes = self._bounds(tuple(t.detach() for t in tensors))
         except (SettingError, torch.linalg.LinAlgError):
@@ -300,17 +300,19 @@ class _Bound:
         """Minus the bound of every output (k,); infinite where a matrix is not positive definite."""
         theta, Z = self.parts(torch.from_numpy(vector))
         try:
-            return -self._bounds((Z, *hyperparameters(theta)))[0].numpy()
+            return -self._bounds((Z, *Hyperparameters.from_theta(theta)))[0].numpy()
         except (SettingError, torch.linalg.LinAlgError):
             return np.full(self.shape[0], np.inf)
 
     def report(self, _: np.ndarray) -> None:
-        """One line of the log every ``EVERY`` iterations."""
+        """One line of the log every ``_EVERY`` iterations."""
         self.iteration += 1
-        if self.iteration % EVERY == 0:
-            log.info("sparse training: iteration %d, minus the bound %.6g", self.iteration, self._last)
+        if self.iteration % _EVERY == 0:
+            _log.info("sparse training: iteration %d, minus the bound %.6g", self.iteration, self._last)
 
     def _bounds(self, tensors: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
-        Z, *hyperparameters = tensors
+        Z, *kernel = tensors
         trainer = self.trainer
-        return collapsed_bound_with_gradient(Z, self.x, self.y, *hyperparameters, trainer.method, trainer.jitter)
+        return collapsed_bound_with_gradient(
+            Z, self.x, self.y, Hyperparameters(*kernel), trainer.method, trainer.jitter
+        )

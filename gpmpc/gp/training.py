@@ -1,41 +1,55 @@
-"""Problem: find every output's hyperparameters by maximum marginal likelihood, reliably, on nearly noise-free data.
+"""Training of one exact GP per output by maximum marginal likelihood (Cao, Lai and Alam, 2017, eq. (9)).
 
-Each output is fitted on its own, over theta = (log length-scales, log sf, log(sf / sn)) inside a wide box; how, says
-``gpmpc.gp.hyperparameter_search``. What is found is frozen to a ``GPPosterior``. Exact GPs are cubic in time and square
-in memory over the points: one factor of 200 MB an output at N = 5000. What cannot fit is refused before the work.
+Each output is fitted on its own, over theta = (log length-scales, log sf, log(sf / sn)) inside a wide box; see
+``gpmpc.gp.search``. Exact GPs are cubic in time and square in memory over the points: one factor of 200 MB an output at
+N = 5000. What cannot fit is refused before the work.
 
-Cao, Lai and Alam (2017), eq. (9); the penalty is the one of their experiment.
+Many sets are trained side by side on every core (``train_many``), one output of one set a job, with bitwise the numbers
+of each training alone on one thread.
 """
 
 import logging
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError, UnsupportedModel, check_number
-from gpmpc.gaussian import check_tensors
-from gpmpc.gp.hyperparameter_search import FAILED, Found, Task, constant_columns, find_hyperparameters, spread
-from gpmpc.gp.kernel import PREDICTS, check_posterior
-from gpmpc.gp.model import BatchExactGP, gpytorch_model
-from gpmpc.gp.penalties import Penalty
-from gpmpc.gp.posterior import GPPosterior, Predicts
+from gpmpc.gp.kernel import PREDICTS, Predicts
+from gpmpc.gp.likelihood import FAILED
+from gpmpc.gp.online import targets_of
+from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.scaling import Scaling, centre
+from gpmpc.gp.search import (
+    Penalty,
+    SearchProblem,
+    SearchResult,
+    SearchSettings,
+    column_std,
+    constant_columns,
+    find_hyperparameters,
+    log_hyperparameters,
+    training_data,
+)
 from gpmpc.gp.transitions import Transitions, check_transitions
 from gpmpc.memory import GIB, available_memory
+from gpmpc.parallel import cores, in_processes
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 # N x N matrices that one evaluation of the likelihood holds, measured; the posterior holds one an output.
-MATRICES = {"closed_form": 1, "gpytorch": 13}
-MANY = 1000  # points: from here on the log has a line an output
+_MATRICES = {"closed_form": 1, "gpytorch": 13}
+_MANY = 1000  # points: from here on the log has a line an output
+_PROCESS = 0.4 * GIB  # bytes that a worker takes before it has data: torch and its kin
 
 
 @dataclass(frozen=True)
 class Training:
-    """What training found.
+    """The result of a training.
 
     Attributes:
         posterior: The trained GPs, frozen.
@@ -53,10 +67,6 @@ class Training:
     explored: np.ndarray
     evaluations: int
     seconds: float  # [s]
-
-    def gpytorch_model(self) -> BatchExactGP:
-        """The same GPs as a GPyTorch model, to go on with there."""
-        return gpytorch_model(self.posterior)
 
 
 @dataclass(frozen=True)
@@ -84,7 +94,7 @@ class Trainer:
     """
 
     predicts: Predicts = "next_state"
-    scaling: Callable[[torch.Tensor, Sequence[str]], Scaling] = centre
+    scaling: Callable[[Tensor, Sequence[str]], Scaling] = centre
     penalty: Penalty | None = None
     restarts: int = 3
     subset: int | None = 1000
@@ -130,20 +140,20 @@ class Trainer:
             TrainingError: Every start failed for an output, which is named.
         """
         _check_start("posterior", posterior)
-        if not posterior.exact:
+        if not posterior.has_observation_noise:
             raise UnsupportedModel(
                 "the posterior holds a sparse model's pseudo-observations, no data: train again with SparseTrainer"
             )
         features, targets = (t.to("cpu", torch.float64) for t in (posterior.features, posterior.targets))
         if transitions is not None:
-            learned = posterior.learned(transitions)
-            features, targets = torch.cat([features, transitions.features]), torch.cat([targets, learned])
+            targets = torch.cat([targets, targets_of(posterior, transitions)])
+            features = torch.cat([features, transitions.features])
         return self.fit(features, targets, posterior.input_dim, posterior.predicts, seed, start=posterior)
 
     def fit(
         self,
-        features: torch.Tensor,
-        targets: torch.Tensor,
+        features: Tensor,
+        targets: Tensor,
         input_dim: int,
         predicts: Predicts | None = None,
         seed: int = 0,
@@ -167,84 +177,29 @@ class Trainer:
             TrainingError: Every start failed for an output, which is named.
         """
         begin = time.perf_counter()
-        problem = self.problem(features, targets, input_dim, predicts, seed, start)
+        problem = _prepared(self, features, targets, input_dim, predicts, seed, start)
         found = []
         for task in problem.tasks:
-            found.append(find_hyperparameters(task, self))
-            if len(features) > MANY:
-                log.info("training: %s: %d evaluations, %.1f s", task.name, found[-1].evaluations, found[-1].seconds)
-        return problem.solved(found, begin)
-
-    def problem(
-        self,
-        features: torch.Tensor,
-        targets: torch.Tensor,
-        input_dim: int,
-        predicts: Predicts | None = None,
-        seed: int = 0,
-        start: GPPosterior | None = None,
-    ) -> "Problem":
-        """What ``fit`` solves, one task an output, for those that solve the tasks themselves; arguments as there."""
-        check_number("seed", seed, least=0, whole=True)
-        predicts = self.predicts if predicts is None else predicts
-        features, targets = training_data(features, targets, input_dim, predicts)
-        (size, d), outputs = features.shape, targets.shape[1]
-        check_memory([(size, outputs)], self.likelihood)
-        names = [f"x{i + 1}" for i in range(d - input_dim)] + [f"u{i + 1}" for i in range(input_dim)]
-        feature_scaling = self.scaling(features, names)
-        target_scaling = self.scaling(targets, [f"y{a + 1}" for a in range(outputs)])
-        x, y = feature_scaling.scale(features).numpy(), target_scaling.scale(targets).numpy()
-        first: list[np.ndarray | None] = [None] * outputs
-        if start is not None:
-            _check_start("start", start)
-            first = list(log_hyperparameters(start, feature_scaling, target_scaling))
-        rng = np.random.default_rng(seed)
-        perturbations = rng.normal(size=(outputs, self.restarts + 1, d + 2))
-        rows = None
-        known = start is not None and not self.restarts  # where to begin: a subset tells no more
-        if self.subset is not None and size > self.subset and not known:
-            rows = np.sort(rng.permutation(size)[: self.subset])
-        columns = features.numpy()
-        of_inputs = (rows, spread(columns) / feature_scaling.factor.numpy(), constant_columns(columns))
-        tasks = [
-            Task(f"output {a + 1} of {outputs}", x, y[:, a], first[a], perturbations[a], *of_inputs)
-            for a in range(outputs)
-        ]
-        return Problem(features, targets, feature_scaling, target_scaling, input_dim, predicts, tasks)
+            found.append(find_hyperparameters(task))
+            if len(features) > _MANY:
+                _log.info("training: %s: %d evaluations, %.1f s", task.name, found[-1].evaluations, found[-1].seconds)
+        return problem.training(found, begin)
 
 
 @dataclass(frozen=True)
-class Problem:
-    """A data set's training, taken apart by outputs; ``Trainer.problem`` makes it.
+class _Prepared:
+    """A data set's training, taken apart by outputs."""
 
-    Attributes:
-        features: x~ = (x, u) (N, n + m).
-        targets: (N, k).
-        feature_scaling: Of the features in the tasks.
-        target_scaling: Of the targets.
-        input_dim: m.
-        predicts: What the targets mean.
-        tasks: One an output (k).
-    """
-
-    features: torch.Tensor
-    targets: torch.Tensor
+    features: Tensor
+    targets: Tensor
     feature_scaling: Scaling
     target_scaling: Scaling
     input_dim: int
     predicts: Predicts
-    tasks: Sequence[Task]
+    tasks: Sequence[SearchProblem]
 
-    def solved(self, found: Sequence[Found], begin: float | None = None) -> Training:
-        """The training that the outputs' results make.
-
-        Args:
-            found: One a task.
-            begin: When the work began (``time.perf_counter``); by default their seconds add up.
-
-        Raises:
-            TrainingError: Every start failed for an output, which is named.
-        """
+    def training(self, found: Sequence[SearchResult], begin: float | None = None) -> Training:
+        """Joins the outputs' results; without ``begin`` (``time.perf_counter``) their seconds add up."""
         assembling = time.perf_counter()
         failed = [a for a, one in enumerate(found) if one.objective >= FAILED]
         if failed:
@@ -278,28 +233,122 @@ class Problem:
         )
 
 
+def _prepared(
+    trainer: Trainer,
+    features: Tensor,
+    targets: Tensor,
+    input_dim: int,
+    predicts: Predicts | None,
+    seed: int,
+    start: GPPosterior | None = None,
+) -> _Prepared:
+    check_number("seed", seed, least=0, whole=True)
+    predicts = trainer.predicts if predicts is None else predicts
+    features, targets = training_data(features, targets, input_dim, predicts)
+    (size, d), outputs = features.shape, targets.shape[1]
+    _check_memory([(size, outputs)], trainer.likelihood)
+    names = [f"x{i + 1}" for i in range(d - input_dim)] + [f"u{i + 1}" for i in range(input_dim)]
+    feature_scaling = trainer.scaling(features, names)
+    target_scaling = trainer.scaling(targets, [f"y{a + 1}" for a in range(outputs)])
+    x, y = feature_scaling.scale(features).numpy(), target_scaling.scale(targets).numpy()
+    first: list[np.ndarray | None] = [None] * outputs
+    if start is not None:
+        _check_start("start", start)
+        first = list(log_hyperparameters(start, feature_scaling, target_scaling))
+    rng = np.random.default_rng(seed)
+    perturbations = rng.normal(size=(outputs, trainer.restarts + 1, d + 2))
+    rows = None
+    converged = start is not None and not trainer.restarts  # a subset could not improve on where the search begins
+    if trainer.subset is not None and size > trainer.subset and not converged:
+        rows = np.sort(rng.permutation(size)[: trainer.subset])
+    columns = features.numpy()
+    std, constant = column_std(columns) / feature_scaling.factor.numpy(), constant_columns(columns)
+    limits = trainer.tolerance, trainer.lengthscale_limit, trainer.signal_to_noise_limit
+    settings = SearchSettings(trainer.penalty, trainer.likelihood, *limits)
+    tasks = [
+        SearchProblem(
+            f"output {a + 1} of {outputs}", x, y[:, a], first[a], perturbations[a], rows, std, constant, settings
+        )
+        for a in range(outputs)
+    ]
+    return _Prepared(features, targets, feature_scaling, target_scaling, input_dim, predicts, tasks)
+
+
 def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
     """``Trainer(**settings)(transitions, seed)``: fits one GP per output in one call."""
     return Trainer(**settings)(transitions, seed)
 
 
-def training_data(
-    features: torch.Tensor, targets: torch.Tensor, input_dim: int, predicts: str
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Features and targets as training takes them, apart from any graph, after a look at both.
+def train_many(
+    trainer: Trainer,
+    sets: Sequence[Transitions],
+    seeds: int | Sequence[int] = 0,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Training | TrainingError]:
+    """Trains on many sets of transitions at once, on every core; as ``trainer(set, seed)`` one after another.
+
+    A script calls it below ``if __name__ == "__main__":``, since every worker process imports the script.
+
+    Args:
+        trainer: Its settings; picklable.
+        sets: Of any sizes and dimensions.
+        seeds: One a set, or one for all.
+        workers: Processes; None takes one a core, or fewer where memory asks for it. Starting them takes seconds: a few
+            small trainings are faster alone.
+        progress: Called with the number of outputs fitted so far, and of all.
+
+    Returns:
+        One training a set, in their order; the error instead where every start failed for one of its outputs.
 
     Raises:
-        ShapeError: They do not belong together, or there is no row.
-        SettingError: They are no float64 tensors in host memory, or ``predicts`` is unknown.
-        DataError: An entry is not finite.
+        SettingError: A seed or the number of workers is out of range.
+        ShapeError: There are not as many seeds as sets.
+        DataError: The kernel matrices would not fit the memory that is available, those of all workers or all results.
     """
-    given = {"features": features, "targets": targets}
-    check_tensors(**given)
-    for name, value in given.items():
-        if value.device.type != "cpu":
-            raise SettingError(name, f"must be in host memory for training ({name}.cpu()); got {value.device}")
-    check_posterior(given, input_dim, predicts)
-    return features.detach(), targets.detach()
+    if workers is not None:
+        check_number("workers", workers, least=1, whole=True)
+    seeds = [int(seeds)] * len(sets) if isinstance(seeds, int | np.integer) else list(seeds)
+    for seed in seeds:
+        check_number("seeds", seed, least=0, whole=True)
+    if len(seeds) != len(sets):
+        raise ShapeError(f"one seed a set is needed, or one for all; got {len(seeds)} for {len(sets)} sets")
+    for one in sets:
+        check_transitions(one)
+    problems = [
+        _prepared(trainer, one.features, one.targets(trainer.predicts), one.input_dim, trainer.predicts, seed)
+        for one, seed in zip(sets, seeds, strict=True)
+    ]
+    places = [(s, a) for s, problem in enumerate(problems) for a in range(len(problem.tasks))]
+    places.sort(key=lambda place: -len(sets[place[0]]))  # the last jobs to run are then short ones
+    tasks = [problems[s].tasks[a] for s, a in places]
+    if not tasks:
+        return []
+    shapes = [(len(one), one.state_dim) for one in sets]
+    workers = min(workers, len(tasks)) if workers else _workers_that_fit(shapes, trainer.likelihood, len(tasks))
+    _check_memory(shapes, trainer.likelihood, workers)
+    found: dict[tuple[int, int], SearchResult] = {}
+    with closing(in_processes(find_hyperparameters, tasks, workers)) as finished:
+        for index, result in finished:
+            found[places[index]] = result
+            if progress is not None:
+                progress(len(found), len(tasks))
+    trainings: list[Training | TrainingError] = []
+    for s, problem in enumerate(problems):
+        try:
+            trainings.append(problem.training([found[s, a] for a in range(len(problem.tasks))]))
+        except TrainingError as error:  # of this set; the others stand
+            trainings.append(error)
+    return trainings
+
+
+def _workers_that_fit(shapes: Sequence[tuple[int, int]], likelihood: str, tasks: int) -> int:
+    free, workers = available_memory(), min(cores(), tasks)
+    while free is not None and workers > 1:
+        if _needed_memory(shapes, likelihood, workers) + workers * _PROCESS <= free:
+            break
+        workers -= 1
+    return workers
 
 
 def _check_start(key: str, posterior: Any) -> None:
@@ -307,42 +356,9 @@ def _check_start(key: str, posterior: Any) -> None:
         raise UnsupportedModel(f"{key} must be a GPPosterior; got {type(posterior).__name__}")
 
 
-def log_hyperparameters(posterior: GPPosterior, features: Scaling, targets: Scaling) -> np.ndarray:
-    """Rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), of a posterior, in scaled units.
-
-    Raises:
-        ShapeError: The scalings belong to other dimensions.
-    """
-    k, d = len(targets.factor), len(features.factor)
-    if posterior.lengthscales.shape != (k, d):
-        got = tuple(posterior.lengthscales.shape[::-1])
-        raise ShapeError(
-            f"the posterior to start from must have {d} features and {k} outputs; got {got[0]} and {got[1]}"
-        )
-    length, sf2, sn2 = (
-        t.to("cpu", torch.float64)
-        for t in (posterior.lengthscales, posterior.signal_variance, posterior.noise_variance)
-    )
-    columns = [
-        (length / features.factor).log(),
-        (sf2.sqrt() / targets.factor).log()[:, None],
-        (sf2 / sn2).log()[:, None] / 2,
-    ]
-    return torch.cat(columns, dim=1).numpy()
-
-
-def check_memory(shapes: Sequence[tuple[int, int]], likelihood: str, workers: int = 1) -> None:
-    """Raises where trainings would not fit the memory that is available.
-
-    Args:
-        shapes: Points N and outputs k of every training whose result is kept.
-        likelihood: The trainer's.
-        workers: Searches at a time.
-
-    Raises:
-        DataError: They would not; the text has the numbers, and what to do.
-    """
-    free, needed = available_memory(), needed_memory(shapes, likelihood, workers)
+def _check_memory(shapes: Sequence[tuple[int, int]], likelihood: str, workers: int = 1) -> None:
+    """Raises ``DataError`` where trainings of N points and k outputs each would not fit the available memory."""
+    free, needed = available_memory(), _needed_memory(shapes, likelihood, workers)
     if free is None or needed <= free:
         return
     size, outputs = max(shapes)
@@ -354,9 +370,9 @@ def check_memory(shapes: Sequence[tuple[int, int]], likelihood: str, workers: in
     )
 
 
-def needed_memory(shapes: Sequence[tuple[int, int]], likelihood: str, workers: int = 1) -> int:
-    """The bytes that ``check_memory`` asks for: of the searches, or of the posteriors, whichever take more."""
+def _needed_memory(shapes: Sequence[tuple[int, int]], likelihood: str, workers: int = 1) -> int:
+    """The bytes of the searches, or of the posteriors, whichever take more."""
     tasks = sorted((size for size, outputs in shapes for _ in range(outputs)), reverse=True)
-    searches = sum(8 * MATRICES[likelihood] * size**2 for size in tasks[:workers])
+    searches = sum(8 * _MATRICES[likelihood] * size**2 for size in tasks[:workers])
     kept = sum(8 * outputs * size**2 for size, outputs in shapes)
     return max(searches, kept + 2 * 8 * max(tasks) ** 2)  # two more while a factor is made

@@ -1,8 +1,7 @@
-"""Problem: observed transitions (x[k], u[k]) -> x[k+1] are what a dynamics model is learned from.
+"""Observed transitions (x[k], u[k]) -> x[k+1], the data of a dynamics model.
 
-They arrive from a simulation, an ``.npz`` file written here, a CSV file with named columns, or the text format in which
-Cao, Lai and Alam published their data. Whatever the source, what comes out is finite float64 of matching shapes, and
-what is wrong with a file is said with its name, row and column.
+They come from arrays, an ``.npz`` file, a CSV file with named columns, or the text format in which Cao, Lai and Alam
+published their data, and are finite float64 of matching shapes; errors name file, row and column.
 """
 
 import csv
@@ -100,8 +99,8 @@ class Transitions:
         """
         if predicts == "value":
             raise UnsupportedModel(
-                "transitions hold no targets of GPs with predicts='value': use condition_on_targets of a posterior, "
-                "fit(features, targets, ...) of a trainer"
+                "transitions hold no targets of GPs with predicts='value': use append_points, "
+                "or fit(features, targets, ...) of a trainer"
             )
         return self.next_states - self.states if predicts == "difference" else self.next_states
 

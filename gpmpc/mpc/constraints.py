@@ -8,30 +8,16 @@ the mode ``zero_order`` the bounds move inwards by kappa sd_j of the covariances
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from gpmpc.compiled import compiled
+from gpmpc.mpc.condense import StateRows
 from gpmpc.mpc.stages import Covariance
 from gpmpc.mpc.tracking import StateBounds
 from gpmpc.qp import SoftRows
 
 Array = np.ndarray
-
-
-class Rows(NamedTuple):
-    """Rows l_k <= E_k s_k <= h_k of the stages k = 1 .. H, those of lower bounds after those of upper ones.
-
-    Attributes:
-        E: (H, r, p), or (1, r, p) where all stages have one.
-        lower: (H, r).
-        upper: (H, r).
-    """
-
-    E: Array
-    lower: Array
-    upper: Array
 
 
 class ChanceConstraints:
@@ -68,12 +54,12 @@ class ChanceConstraints:
         moves = covariance == "full" and self.per_stage > 0
         self._constant = None if moves else self._rows(np.zeros((1, state_dim, state_dim)))
 
-    def at(self, covariances: Array) -> Rows:
+    def at(self, covariances: Array) -> StateRows:
         """The rows, tightened, at covariances of the states Sigma_0 .. Sigma_H (H + 1, n, n)."""
         lower, upper = np.empty((2, self._horizon, len(self._bound)))
         if len(self._bound):
             _tighten(self._state, self._sign, self._bound, self._margin, covariances, lower, upper)
-        return Rows(self._rows(covariances[1:]) if self._constant is None else self._constant, lower, upper)
+        return StateRows(self._rows(covariances[1:]) if self._constant is None else self._constant, lower, upper)
 
     def softness(self, hard_rows: int) -> SoftRows | None:
         """The prices of all rows of a program's G, after ``hard_rows`` that have none; None where all are hard."""

@@ -1,7 +1,7 @@
 """GP model predictive control: the control step, from a belief and a reference to the input.
 
 The dynamics of the belief are linearised along a plan (``gpmpc.mpc.prediction``), the states eliminated
-(``gpmpc.mpc.condensing``), and what is left is a quadratic program in the inputs. One of them a step, of the form
+(``gpmpc.mpc.condense``), and what is left is a quadratic program in the inputs. One of them a step, of the form
 ``trajectory``, is the real-time iteration (Diehl, Bock and Schloeder, 2005); of the form ``velocity`` with moments
 matched it is the convex GP-MPC of Cao, Lai and Alam (2017, section 4). Iterated (``gpmpc.mpc.sqp``), programs solve the
 nonlinear problem itself. Where the iteration ends, in the covariance modes of ``gpmpc.mpc.stages``:
@@ -18,18 +18,17 @@ from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
-import torch
 
-from gpmpc.compiled import compiled
 from gpmpc.dynamics import DynamicsModel
-from gpmpc.exceptions import DataError, ProblemError, SettingError, check_number
+from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.condensing import Condenser, condense, respond, tracking_cost
+from gpmpc.mpc.condense import CondensedProgram, Condenser
 from gpmpc.mpc.constraints import price_violations
 from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc.linear_quadratic import References, Stages, expand
 from gpmpc.mpc.prediction import Form, Prediction, PredictionModel
 from gpmpc.mpc.request import Request, check_method
-from gpmpc.mpc.sqp import FEASIBLE, FullStep, Functions, Globalization
+from gpmpc.mpc.sqp import FAILURES, FEASIBLE, FullStep, Globalization
 from gpmpc.mpc.stages import Covariance, Plan
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Propagator
@@ -37,9 +36,6 @@ from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
 from gpmpc.status import Status
 
 Array = np.ndarray
-
-_SMALL = 1e-3  # share of an input's size whose cost counts where the cost itself vanishes
-_FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, torch.linalg.LinAlgError)  # no finite numbers
 
 
 class GPMPC:
@@ -96,7 +92,8 @@ class GPMPC:
         check_method("solver", self.solver, "solve", "DualActiveSet()")
         weight = self.prediction.linearizer.weight
         self._condenser = Condenser(problem, horizon, weight(problem.Q), weight(problem.terminal))
-        self.soft = self.prediction.constraints.softness(self._condenser.rate_rows)
+        self._rates = self._condenser.bounds.rate_lower.size
+        self.soft = self.prediction.constraints.softness(self._rates)
         if self.soft is not None and not isinstance(self.solver, DualActiveSet):
             raise SettingError(
                 "solver", f"state bounds with a price (l1, l2) need DualActiveSet; got {type(self.solver).__name__}"
@@ -124,7 +121,7 @@ class GPMPC:
             plan = self.prediction.initial_guess(request, previous)
             prediction = self.prediction.linearize(plan, request, previous)
             return self._improve(prediction, request, previous, clock)
-        except _FAILURES:
+        except FAILURES:
             return request.unanswered(Status.NUMERICAL_TROUBLE, timing=clock.timing)
 
     def _improve(
@@ -132,7 +129,9 @@ class GPMPC:
     ) -> Decision:
         """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
         guess, solution = prediction.plan, previous.solution if previous is not None and previous.applicable else None
-        globalize = self._globalization(request) if self.iterations > 1 else FullStep()
+        globalize = FullStep()
+        if self.iterations > 1:
+            globalize = Globalization(self.prediction, self._condenser.cost, request, self.tolerance)
         status, count = None, 0
         while status is None and count < self.iterations:
             clock.model()
@@ -141,11 +140,12 @@ class GPMPC:
             solution = self._solve(program, solution)
             clock.solve()
             count, status = count + 1, solution.status
-            if _is_usable(solution, prediction.plan):
-                prediction, status = globalize(prediction, self._proposed(prediction, solution), solution)
+            if _is_usable(program, solution, prediction.plan):
+                proposed = self._proposed(prediction, program, solution, request.last)
+                prediction, status = globalize(prediction, program, solution, proposed)
         clock.model()
         status = Status.ITERATION_LIMIT if status is None else status
-        program = QuadraticProgram.unchecked(*program)
+        program = QuadraticProgram.unchecked(*program[:5])
         suboptimal = not status.solved and prediction.plan is not guess and self._missed(prediction) <= FEASIBLE
         if not (status.solved or suboptimal):
             return replace(request.unanswered(status, count, clock.timing), problem=program, solution=solution)
@@ -175,13 +175,13 @@ class GPMPC:
         decisions = [request.unanswered(Status.INVALID_MEASUREMENT) for request in requests]
         try:
             made = self.prediction.linearize_many([requests[t] for t in known], [previous[t] for t in known])
-        except _FAILURES:  # one of them spoils the batch: which one, they say alone
+        except FAILURES:  # one of them spoils the batch: which one, they say alone
             return [self.control(*question) for question in asked]
         clock.model(len(known))
         for t, prediction in zip(known, made, strict=True):
             try:
                 decisions[t] = self._improve(prediction, requests[t], previous[t], clock.copy())
-            except _FAILURES:
+            except FAILURES:
                 decisions[t] = requests[t].unanswered(Status.NUMERICAL_TROUBLE, timing=clock.timing)
         return decisions
 
@@ -221,57 +221,27 @@ class GPMPC:
         request = self.prediction.read(belief, reference, previous)
         plan = self.prediction.initial_guess(request, previous)
         prediction = self.prediction.linearize(plan, request, previous)
-        return QuadraticProgram.from_stacked(*self._condense(prediction, request))
+        return QuadraticProgram.from_stacked(*self._condense(prediction, request)[:5])
 
-    def _condense(self, prediction: Prediction, request: Request) -> tuple[Array, ...]:
-        """P, q, G and the bounds of [U; G U]."""
-        (A, B, c, *_), (E, low, high), known = prediction.stages, prediction.rows, self._condenser.known
-        start, (H, m) = prediction.plan.states[0], request.wanted.shape
-        asked = request.targets, request.wanted, request.last
-        if len(A) == 1:
-            P, G = self._condenser.curvature(A, B, E)
-            q, values = self._condenser.slope(A, B, c, start, E, *asked)
-            return P, q, G, *self._condenser.bounds(request.last, low - values, high - values)
-        rows = self._condenser.rate_rows + low.size
-        P, q, G = np.empty((H * m, H * m)), np.empty(H * m), np.empty((rows, H * m))
-        lower, upper = np.empty((2, H * m + rows))
-        condense(known, (A, B, c, E, low, high), start, *asked, (P, q, G, lower, upper))
-        return P, q, G, lower, upper
+    def _condense(self, prediction: Prediction, request: Request) -> CondensedProgram:
+        stages, references = Stages(*prediction.stages[:3]), References(request.targets, request.wanted, request.last)
+        return self._condenser.condense(stages, prediction.plan.states[0], references, prediction.rows)
 
-    def _solve(self, program: tuple[Array, ...], warm: QPSolution | None) -> QPSolution:
+    def _solve(self, program: CondensedProgram, warm: QPSolution | None) -> QPSolution:
+        P, q, G, lower, upper, feedback = program
         if isinstance(self.solver, DualActiveSet):
-            return self.solver.solve_stacked(*program, warm, self.soft)
-        _, q, _, lower, _ = program
+            soft = self.soft
+            if soft is not None and len(feedback):  # there the bounds of inputs are rows, too
+                soft = self.prediction.constraints.softness(len(G) - len(soft.linear) + self._rates)
+            return self.solver.solve_stacked(P, q, G, lower, upper, warm, soft)
         fits = warm is not None and len(warm.q) == len(q) and len(warm.lower) == len(lower)
-        return self.solver.solve(QuadraticProgram.from_stacked(*program), warm if fits else None)
+        return self.solver.solve(QuadraticProgram.from_stacked(P, q, G, lower, upper), warm if fits else None)
 
-    def _proposed(self, prediction: Prediction, solution: QPSolution) -> Plan:
+    def _proposed(self, prediction: Prediction, program: CondensedProgram, solution: QPSolution, last: Array) -> Plan:
         """The plan of a program's solution: its inputs, and the states that the stages lead to."""
-        (A, B, c, *_), plan = prediction.stages, prediction.plan
-        inputs, states = solution.x.reshape(plan.inputs.shape), np.empty_like(plan.states)
-        respond(A, B, c, plan.states[0], inputs, states)
+        stages, start = Stages(*prediction.stages[:3]), prediction.plan.states[0]
+        inputs, states = expand(stages, start, program.feedback, last, solution.x)
         return Plan(states, inputs, prediction.covariances)
-
-    def _globalization(self, request: Request) -> Globalization:
-        """Steps and end of the iteration for the problem of one request."""
-        known, prices, of = self._condenser.known, self.prediction.constraints.prices, self.prediction
-        asked = request.targets, request.wanted, request.last
-        first = self._condenser.rate_rows
-        zero = tuple(np.zeros_like(part) for part in asked)
-        sizes = np.minimum(np.maximum(1.0, np.abs(request.last)), self.problem.input_upper - self.problem.input_lower)
-        functions = Functions(
-            linearize=lambda plan: of.linearize(of.canonical(plan), request),
-            roll_out=(lambda plan, at: of.roll_out(plan, at, request)) if of.feedback else None,
-            cost=lambda states, inputs: tracking_cost(known, states, inputs, *asked),
-            curvature=lambda states, inputs: tracking_cost(known, states, inputs, *zero),
-            price=lambda rows, states, hard: price_violations(prices, rows, states, hard),
-            multiplier=lambda solution: np.abs(solution.z[first:]).max(initial=0.0),
-            costates=lambda at, plan, solution: _costates(
-                known, at.stages.A, plan.states, asked[0], at.rows.E, solution.z[first:]
-            ),
-        )
-        smallest = float((np.diag(self.problem.R) * (_SMALL * sizes) ** 2).min()) + np.finfo(float).tiny
-        return Globalization(functions, smallest, self.tolerance, _FAILURES)
 
     def _missed(self, prediction: Prediction) -> float:
         """Violations of hard state bounds by a plan, summed."""
@@ -309,15 +279,15 @@ class NonlinearGPMPC(GPMPC):
         super().__init__(model, propagator, problem, horizon, initial_input, **settings)
 
 
-def _is_usable(solution: QPSolution, plan: Plan) -> bool:
+def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> bool:
     """Whether a program was solved, or its solver stopped at a limit at a feasible point no worse than the plan."""
     if solution.status.solved:
         return True
     if solution.status not in (Status.ITERATION_LIMIT, Status.TIME_LIMIT) or not np.isfinite(solution.x).all():
         return False
-    other = solution._replace(x=plan.inputs.ravel())
     if not _violation(solution) <= FEASIBLE:
         return False
+    other = solution._replace(x=0.0 * solution.x if len(program.feedback) else plan.inputs.ravel())
     return solution.objective <= other.objective or _violation(other) > FEASIBLE
 
 
@@ -325,26 +295,6 @@ def _violation(solution: QPSolution) -> float:
     """The largest violation of a hard row."""
     softness, caps = solution.terms.softness
     return float(solution.violation()[(softness == 0.0) & np.isinf(caps)].max(initial=0.0))
-
-
-@compiled
-def _costates(known, A, states, targets, E, z):
-    """Multipliers of the dynamics (H, p): the derivatives of cost and rows by s_1 .. s_H, through all that follows."""
-    W, T = known[0][:2]
-    (H, n), p, r = targets.shape, states.shape[1], E.shape[1]
-    costates = np.zeros((H, p))
-    for k in range(H - 1, -1, -1):
-        weight, out = T if k == H - 1 else W, costates[k]
-        for i in range(p):
-            for j in range(n):
-                error = states[k + 1, i // n * n + j] - (targets[k, j] if i < n else 0.0)
-                out[i] += 2.0 * weight[i // n, i % n, j] * error
-            for e in range(r):
-                out[i] += E[min(k, len(E) - 1), e, i] * z[k * r + e]
-            if k < H - 1:
-                for j in range(p):
-                    out[i] += A[k + 1, j, i] * costates[k + 1, j]
-    return costates
 
 
 class _Stopwatch:

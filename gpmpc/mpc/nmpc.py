@@ -82,28 +82,27 @@ class NMPC:
         if not request.finite:
             return request.unanswered(Status.INVALID_MEASUREMENT)
         guess = request.held if self.first_guess == "hold" else request.shifted
-        state, guess = request.state, guess.clip(self.problem.input_lower, self.problem.input_upper)
+        guess = guess.clip(self.problem.input_lower, self.problem.input_upper)
         lower, upper = self._bounds
-        states = _rollout(self.plant, state, guess)
+        states = [request.state]
+        for u in guess:
+            states.append(np.array(self.plant.successor(states[-1], u), dtype=float))
         unknowns = np.zeros(len(lower["x"]))
-        unknowns[: H * (n + m)] = np.concatenate([states[1:].ravel(), guess.ravel()])
+        unknowns[: H * (n + m)] = np.concatenate([*states[1:], guess.ravel()])
         with interrupts_after():
             solution = self._solver(
                 x0=unknowns,
-                p=np.concatenate([state, request.last, request.targets.ravel(), request.wanted.ravel()]),
+                p=np.concatenate([request.state, request.last, request.targets.ravel(), request.wanted.ravel()]),
                 lbx=lower["x"],
                 ubx=upper["x"],
                 lbg=lower["g"],
                 ubg=upper["g"],
             )
-        plan = np.array(solution["x"]).ravel()
-        stats = self._solver.stats()
-        means = np.vstack([state, plan[: H * n].reshape(H, n)])
-        inputs = plan[H * n : H * (n + m)].reshape(H, m)
+        stats, found = self._solver.stats(), {key: np.array(solution[key]).ravel() for key in ("x", "g")}
+        means = np.vstack([request.state, found["x"][: H * n].reshape(H, n)])
+        inputs = found["x"][H * n : H * (n + m)].reshape(H, m)
         status = IPOPT_STATUS.get(stats["return_status"], Status.NUMERICAL_TROUBLE)
-        values = {"x": plan, "g": np.array(solution["g"]).ravel()}
-        missed = np.max([np.maximum(lower[key] - at, at - upper[key]).max() for key, at in values.items()])
-        suboptimal = status not in (Status.SOLVED, Status.INFEASIBLE) and bool(missed <= FEASIBLE)
+        violation = np.max([np.maximum(lower[key] - at, at - upper[key]).max() for key, at in found.items()])
         return Decision(
             input=inputs[0],
             inputs=inputs,
@@ -112,7 +111,7 @@ class NMPC:
             status=status,
             iterations=stats["iter_count"],
             timing=Timing(0.0, 0.0, time.perf_counter() - start),
-            suboptimal=suboptimal,
+            suboptimal=status not in (Status.SOLVED, Status.INFEASIBLE) and bool(violation <= FEASIBLE),
         )
 
 
@@ -122,40 +121,35 @@ def _build(
     """IPOPT on the unknowns (x_1 .. x_H, u_0 .. u_{H-1}, slacks), and the bounds of unknowns and constraints."""
     n, m, H, limits = problem.state_dim, problem.input_dim, horizon, problem.state_bounds
     x0, last = casadi.SX.sym("x0", n), casadi.SX.sym("last", m)
-    x = [x0, *(casadi.SX.sym(f"x{i}", n) for i in range(1, H + 1))]
-    u = [casadi.SX.sym(f"u{i}", m) for i in range(H)]
-    r, wanted = [casadi.SX.sym(f"r{i}", n) for i in range(H)], [casadi.SX.sym(f"w{i}", m) for i in range(H)]
-    rates = [u[i] - (u[i - 1] if i else last) for i in range(H)]
-    penalized = {"inputs": u, "deviations": [a - b for a, b in zip(u, wanted, strict=True)], "increments": rates}
-    Q, R = casadi.DM(problem.Q), casadi.DM(problem.R)
-    cost = sum(casadi.bilin(R, v, v) for v in penalized[problem.penalized])
-    for i in range(1, H + 1):
-        error = x[i] - r[i - 1]
-        cost += casadi.bilin(casadi.DM(problem.terminal) if i == H else Q, error, error)
-    constraints = [x[i + 1] - casadi.vertcat(*plant.successor(x[i], u[i])) for i in range(H)]
-    g_lower, g_upper = [np.zeros(n)] * H, [np.zeros(n)] * H
+    x, u, r, wanted = (casadi.SX.sym(name, size, H) for name, size in (("x", n), ("u", m), ("r", n), ("wanted", m)))
+    rates = u - casadi.horzcat(last, u[:, :-1])
+    penalized = {"inputs": u, "deviations": u - wanted, "increments": rates}[problem.penalized]
+    Q, R, T = casadi.DM(problem.Q), casadi.DM(problem.R), casadi.DM(problem.terminal)
+    cost = sum(casadi.bilin(R, v, v) for v in casadi.horzsplit(penalized))
+    cost += sum(casadi.bilin(T if k == H - 1 else Q, e, e) for k, e in enumerate(casadi.horzsplit(x - r)))
+    before = casadi.horzsplit(casadi.horzcat(x0, x[:, :-1]))
+    after = [casadi.vertcat(*plant.successor(s, v)) for s, v in zip(before, casadi.horzsplit(u), strict=True)]
+    constraints, g = [casadi.vec(x - casadi.horzcat(*after))], [np.zeros((2, H * n))]
     if problem.rate_limited:
-        constraints += rates
-        g_lower, g_upper = [*g_lower, *[problem.rate_lower] * H], [*g_upper, *[problem.rate_upper] * H]
-    x_lower, x_upper, slacks = [np.full(H * n, -np.inf)], [np.full(H * n, np.inf)], []
-    if limits is not None and not limits.soft:
-        x_lower, x_upper = [np.tile(limits.lower, H)], [np.tile(limits.upper, H)]
-    x_lower.append(np.tile(problem.input_lower, H))
-    x_upper.append(np.tile(problem.input_upper, H))
+        constraints.append(casadi.vec(rates))
+        g.append(np.tile([problem.rate_lower, problem.rate_upper], H))
+    hard = limits is not None and not limits.soft
+    box = [np.tile([limits.lower, limits.upper] if hard else [[-np.inf] * n, [np.inf] * n], H)]
+    box.append(np.tile([problem.input_lower, problem.input_upper], H))
+    unknowns = [casadi.vec(x), casadi.vec(u)]
     if limits is not None and limits.soft:
-        for i in range(1, H + 1):
-            for bound, side in ((limits.lower, -1), (limits.upper, 1)):
-                for j in np.flatnonzero(np.isfinite(bound)):
-                    slack = casadi.SX.sym(f"e{i}_{j}_{side}")
-                    slacks.append(slack)
-                    cost += (limits.l1 or 0.0) * slack + (limits.l2 or 0.0) * slack**2
-                    constraints.append(side * (x[i][int(j)] - bound[j]) - slack)
-                    g_lower, g_upper = [*g_lower, [-np.inf]], [*g_upper, [0.0]]
-        x_lower.append(np.zeros(len(slacks)))
-        x_upper.append(np.full(len(slacks), np.inf))
+        sides = [(limits.upper, 1), (limits.lower, -1)]
+        rows = [(int(j), sign, bound[j]) for bound, sign in sides for j in np.flatnonzero(np.isfinite(bound))]
+        slack = casadi.SX.sym("slack", len(rows), H)
+        cost += casadi.sum1(casadi.vec((limits.l1 or 0.0) * slack + (limits.l2 or 0.0) * slack**2))
+        beyond = [sign * (x[j, :] - bound) for j, sign, bound in rows]
+        constraints.append(casadi.vec(casadi.vertcat(*beyond) - slack))
+        unknowns.append(casadi.vec(slack))
+        g.append(np.tile([[-np.inf], [0.0]], H * len(rows)))
+        box.append(np.tile([[0.0], [np.inf]], H * len(rows)))
     nlp = {
-        "x": casadi.vertcat(*x[1:], *u, *slacks),
-        "p": casadi.vertcat(x0, last, *r, *wanted),
+        "x": casadi.vertcat(*unknowns),
+        "p": casadi.vertcat(x0, last, casadi.vec(r), casadi.vec(wanted)),
         "f": cost,
         "g": casadi.vertcat(*constraints),
     }
@@ -164,14 +158,5 @@ def _build(
         "show_eval_warnings": False,
         "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 500, "bound_relax_factor": 0.0},
     }
-    lower = {"x": np.concatenate(x_lower), "g": np.concatenate(g_lower)}
-    upper = {"x": np.concatenate(x_upper), "g": np.concatenate(g_upper)}
-    return casadi.nlpsol("nmpc", "ipopt", nlp, options), (lower, upper)
-
-
-def _rollout(plant: Plant, state: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-    """States (H + 1, n) that inputs (H, m) lead to, from a state (n,)."""
-    states = [np.asarray(state, dtype=float)]
-    for u in inputs:
-        states.append(np.array(plant.successor(states[-1], u), dtype=float))
-    return np.array(states)
+    bounds = [{"x": np.hstack(box)[side], "g": np.hstack(g)[side]} for side in (0, 1)]
+    return casadi.nlpsol("nmpc", "ipopt", nlp, options), tuple(bounds)

@@ -29,15 +29,17 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from gpmpc.compiled import borrowing, compiled, copy_matrix
+from gpmpc.compiled import compiled
 from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.constraints import ChanceConstraints, Rows
+from gpmpc.kernels.linalg import copy_matrix, product
+from gpmpc.mpc.condense import StateRows
+from gpmpc.mpc.constraints import ChanceConstraints
 from gpmpc.mpc.controller import Decision, Reference
+from gpmpc.mpc.linear_quadratic import finite_horizon_lqr
 from gpmpc.mpc.request import Request, check_controller, check_dynamics, check_method
-from gpmpc.mpc.small_matrices import add_product, add_transposed_product, solve_positive
-from gpmpc.mpc.stages import Covariance, Plan, StageLinearizer, Stages
+from gpmpc.mpc.stages import Covariance, LinearizedStages, Plan, StageLinearizer
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization, Propagator
 
@@ -45,7 +47,6 @@ Array = np.ndarray
 
 Form = Literal["trajectory", "velocity"]
 FORMS = ("trajectory", "velocity")
-SETTLED = 1e-9  # relative change of the cost to go at which the recursion has reached its limit
 
 
 class Prediction(NamedTuple):
@@ -59,9 +60,9 @@ class Prediction(NamedTuple):
     """
 
     plan: Plan
-    stages: Stages
+    stages: LinearizedStages
     covariances: Array
-    rows: Rows
+    rows: StateRows
 
 
 class PredictionModel:
@@ -177,7 +178,7 @@ class PredictionModel:
         disturbance = np.concatenate(disturbances) if disturbances else None
         stages = self.linearizer(*points, disturbance)
         parts = zip(*(part.reshape(T, K, *part.shape[1:]) for part in stages), strict=True)
-        asked = zip(plans, map(Stages._make, parts), requests, previous, strict=True)
+        asked = zip(plans, map(LinearizedStages._make, parts), requests, previous, strict=True)
         return [self.predict(*question) for question in asked]
 
     def canonical(self, plan: Plan) -> Plan:
@@ -185,7 +186,9 @@ class PredictionModel:
         means, covariances = self.linearizer.moments(plan.states, plan.covariances)
         return Plan(self.linearizer.state(means, covariances), plan.inputs, covariances)
 
-    def predict(self, plan: Plan, stages: Stages, request: Request, previous: Decision | None = None) -> Prediction:
+    def predict(
+        self, plan: Plan, stages: LinearizedStages, request: Request, previous: Decision | None = None
+    ) -> Prediction:
         """Covariances and rows for stages that were linearised at a plan; see ``linearize``."""
         covariances, mode = plan.covariances, self.linearizer.covariance
         if mode == "zero_order":
@@ -198,7 +201,9 @@ class PredictionModel:
             stages = self._increments(plan, stages, request, previous)
         return Prediction(plan, stages, covariances, self.constraints.at(covariances))
 
-    def _increments(self, plan: Plan, stages: Stages, request: Request, previous: Decision) -> Stages:
+    def _increments(
+        self, plan: Plan, stages: LinearizedStages, request: Request, previous: Decision
+    ) -> LinearizedStages:
         """A held linearisation as that of the increments since s_{-1}, the state that the last decision began at."""
         before = self.linearizer.state(previous.means[:1], previous.covariances[:1])[0]
         c = plan.states[0] - stages.A[0] @ before - stages.B[0] @ request.last
@@ -207,14 +212,22 @@ class PredictionModel:
             c[n:] = stages.c[0, n:]
         return stages._replace(c=c[None])
 
-    def roll_out(self, towards: Plan, prediction: Prediction, request: Request) -> Plan:
-        """The plan that obeys the dynamics under the feedback towards another one, within box and rates."""
+    def roll_out(self, towards: Plan, prediction: Prediction, feedback: Array, request: Request) -> Plan:
+        """The plan that obeys the dynamics under the feedback towards another one, within box and rates.
+
+        Args:
+            towards: Whose states are followed.
+            prediction: Its first stage gives the feedback, where a program has none.
+            feedback: Of the program, F_k (H, m, p + m + 1), or nothing (0, m, p + m + 1).
+            request: Of the step.
+        """
         problem, n = self.problem, self.problem.state_dim
-        K = self.gain(prediction.stages)
+        gains = np.broadcast_to(-self.gain(prediction.stages), (self.horizon, problem.input_dim, n))
+        gains = feedback[:, :, :n] if len(feedback) else gains
         states, inputs, covariances = (part.copy() for part in towards)
         last, disturbance = request.last, request.disturbance if len(request.disturbance) else None
         for k in range(self.horizon):
-            input = towards.inputs[k] - K @ (states[k, :n] - towards.states[k, :n])
+            input = towards.inputs[k] + gains[k] @ (states[k, :n] - towards.states[k, :n])
             input = np.clip(input, last + problem.rate_lower, last + problem.rate_upper)
             last = inputs[k] = np.clip(input, problem.input_lower, problem.input_upper)
             after = self.linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance).next
@@ -222,13 +235,13 @@ class PredictionModel:
             covariances[k + 1] = self.linearizer.moments(after, covariances[k + 1 : k + 2])[1][0]
         return Plan(states, inputs, covariances)
 
-    def gain(self, stages: Stages) -> Array:
+    def gain(self, stages: LinearizedStages) -> Array:
         """K (m, n) of the feedback u = u_k - K (x - mu_k); zero without feedback."""
         problem, n = self.problem, self.problem.state_dim
         if not self.feedback:
             return np.zeros((problem.input_dim, n))
-        A, B = np.ascontiguousarray(stages.A[0, :n, :n]), np.ascontiguousarray(stages.B[0, :n])
-        return _feedback_gain(A, B, problem.Q, problem.R, problem.terminal, self.horizon)
+        A, B = np.ascontiguousarray(stages.A[:1, :n, :n]), np.ascontiguousarray(stages.B[:1, :n])
+        return finite_horizon_lqr(A, B, problem.Q, problem.R, problem.terminal, self.horizon)[0][0]
 
     def _first_covariances(self, means: Array, inputs: Array, request: Request) -> Array:
         """Sigma_1 .. Sigma_H (H, n, n) along a first guess, linearised at its points."""
@@ -251,7 +264,7 @@ class PredictionModel:
 def _predict_covariances(A, B, V, start, K, covariances):
     """Writes Sigma_0 .. Sigma_H (H + 1, n, n) of H stages, or of one that is held."""
     n, m, held = B.shape[1], B.shape[2], len(A) - 1
-    closed, product = np.empty((n, n)), np.empty((n, n))
+    closed, moved = np.empty((n, n)), np.empty((n, n))
     copy_matrix(start, covariances[0])
     for k in range(len(covariances) - 1):
         at, after = min(k, held), covariances[k + 1]
@@ -260,49 +273,16 @@ def _predict_covariances(A, B, V, start, K, covariances):
                 closed[i, j] = A[at, i, j]
                 for r in range(m):
                     closed[i, j] -= B[at, i, r] * K[r, j]
-        product[:] = 0.0
-        add_product(closed, covariances[k], product)
+        product(closed, covariances[k], moved)
         for i in range(n):
             for j in range(i + 1):
                 total = (V[at, i, j] + V[at, j, i]) / 2.0
                 for c in range(n):
-                    total += product[i, c] * closed[j, c]
+                    total += moved[i, c] * closed[j, c]
                 after[i, j] = after[j, i] = total
 
 
 @compiled
-def _feedback_gain(A, B, Q, R, terminal, horizon):
-    """K (m, n) of the first stage of the LQR for x+ = A x + B u over a horizon, by the Riccati recursion."""
-    n, m = B.shape
-    M, cost, MA, MB = terminal.copy(), np.empty((n, n)), np.empty((n, n)), np.empty((n, m))
-    K, W, MBA = np.zeros((m, n)), np.empty((m, m)), np.empty((m, n))
-    for _ in range(horizon):
-        MA[:], MB[:], MBA[:] = 0.0, 0.0, 0.0
-        copy_matrix(R, W)
-        copy_matrix(Q, cost)
-        add_product(M, A, MA)
-        add_product(M, B, MB)
-        add_transposed_product(MB, A, MBA)
-        add_transposed_product(B, MB, W)
-        copy_matrix(MBA, K)
-        solve_positive(W, K)
-        add_transposed_product(A, MA, cost)
-        for j in range(m):
-            for i in range(n):
-                MBA[j, i] = -MBA[j, i]
-        add_transposed_product(MBA, K, cost)
-        change, size = 0.0, 0.0
-        for i in range(n):
-            for j in range(i + 1):
-                value = (cost[i, j] + cost[j, i]) / 2.0
-                change, size = max(change, abs(value - M[i, j])), max(size, abs(value))
-                M[i, j] = M[j, i] = value
-        if change <= SETTLED * size:
-            break
-    return K
-
-
-@borrowing
 def _keep_rates(inputs, last, lower, upper):
     """Moves inputs (H, m), one after the other, to within their rates from the one before."""
     for k in range(len(inputs)):

@@ -135,11 +135,7 @@ def check_dynamics(model: DynamicsModel) -> tuple[int, int]:
 
 
 def check_method(key: str, value: object, method: str, example: str) -> None:
-    """Raises unless a setting is an object (no class of them) with a method.
-
-    Raises:
-        SettingError: It is not.
-    """
+    """Raises ``SettingError`` unless a setting is an object (no class of them) with a method."""
     if isinstance(value, type) or not hasattr(value, method):
         got = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
         raise SettingError(key, f"must be an object with the method {method!r}, such as {example}; got {got}")

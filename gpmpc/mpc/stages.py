@@ -43,7 +43,7 @@ class Plan(NamedTuple):
     covariances: Array
 
 
-class Stages(NamedTuple):
+class LinearizedStages(NamedTuple):
     """K affine stage models: K = H along a plan, or K = 1 that is held over the horizon.
 
     Attributes:
@@ -112,7 +112,9 @@ class StageLinearizer:
             return states[:, :n], states[:, n:, None] ** 2 * np.eye(n)
         return states, covariances
 
-    def __call__(self, states: Array, inputs: Array, covariances: Array, disturbance: Array | None = None) -> Stages:
+    def __call__(
+        self, states: Array, inputs: Array, covariances: Array, disturbance: Array | None = None
+    ) -> LinearizedStages:
         """The stage models at K points.
 
         Args:
@@ -126,7 +128,7 @@ class StageLinearizer:
             after = after.copy()
             after[:, : self._n] += disturbance
         c = after - (A @ states[..., None] + B @ inputs[..., None])[..., 0]
-        return Stages(A, B, c, after, V)
+        return LinearizedStages(A, B, c, after, V)
 
     def _points(self, states: Array, inputs: Array, _: Array) -> tuple[Array, ...]:
         found = linearize(self.model, states, inputs, self.covariance == "zero_order")

@@ -155,11 +155,7 @@ def concluded(
 
 
 def check_policy(on_failure: str) -> None:
-    """Raises unless there is such a policy.
-
-    Raises:
-        SettingError: There is none.
-    """
+    """Raises ``SettingError`` unless there is such a policy."""
     if on_failure not in POLICIES:
         raise SettingError("on_failure", f"must be one of {', '.join(map(repr, POLICIES))}; got {on_failure!r}")
 

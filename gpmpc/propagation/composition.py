@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.residual import Affine, ResidualModel
+from gpmpc.gp.posterior import AffineForm
 from gpmpc.propagation.sensitivity import Sensitivity
 
 
@@ -49,36 +48,17 @@ class Latent(NamedTuple):
     dJ_du: Tensor | None = None
 
 
-class Composition(NamedTuple):
-    """The affine part around f; None stands for A = 0, no nominal, B = I, or a selection of everything.
+class Composition:
+    """The affine part of a model around its latent functions ``f``; see ``gpmpc.gp.posterior.AffineForm``."""
 
-    Attributes:
-        f: The latent functions.
-        A: (n, n).
-        nominal: A x + G u + c.
-        B: (n, k).
-        states: Which states f sees.
-        inputs: Which inputs f sees.
-    """
-
-    f: GPPosterior
-    A: Tensor | None = None
-    nominal: Affine | None = None
-    B: Tensor | None = None
-    states: list[int] | None = None
-    inputs: list[int] | None = None
+    def __init__(self, form: AffineForm):
+        self.f, self.A, self.G, self.c, self.B, self.states, self.inputs = form
 
     @classmethod
     def of(cls, model: Any) -> "Composition | None":
-        """A model taken apart; None where it has no such form."""
-        if isinstance(model, GPPosterior):
-            if model.predicts == "difference":
-                return cls(model, torch.eye(model.state_dim, dtype=model.dtype, device=model.device))
-            return cls(model)
-        if isinstance(model, ResidualModel) and isinstance(model.nominal, Affine):
-            nominal, states, inputs = model.nominal, list(model.states), list(model.inputs)
-            return cls(model.residual, nominal.A, nominal, model.B, states, inputs)
-        return None
+        """The composition of a model; None where it has no affine form."""
+        form = getattr(model, "affine_form", None)
+        return None if form is None else cls(form)
 
     def seen(self, belief: Gaussian, input: Tensor) -> tuple[Gaussian, Tensor]:
         """What f sees of a belief and an input."""
@@ -96,7 +76,7 @@ class Composition(NamedTuple):
         if A is None:
             return M, V, cross
         half = A @ cross
-        M = M + (belief.mean if self.nominal is None else self.nominal(belief.mean, input))
+        M = M + (belief.mean if self.G is None else belief.mean @ A.mT + input @ self.G.mT + self.c)
         return M, A @ S @ A.mT + half + half.mT + V, S @ A.mT + cross
 
     def sensitivity(self, S: Tensor, f: Latent) -> Sensitivity:
@@ -122,7 +102,7 @@ class Composition(NamedTuple):
         return Sensitivity(
             A + J,
             dM_dS,
-            dM_du if self.nominal is None else self.nominal.B + dM_du,
+            dM_du if self.G is None else self.G + dM_du,
             dV_dmu + by_mean,
             dV_dS + by_covariance + (outer + outer.mT) / 2,
             dV_du + by_input,
@@ -155,6 +135,6 @@ class Composition(NamedTuple):
     def _by_input(self, derivative: Tensor) -> Tensor:
         if self.inputs is None:
             return derivative
-        full = derivative.new_zeros(*derivative.shape[:-1], self.nominal.B.shape[1])
+        full = derivative.new_zeros(*derivative.shape[:-1], self.G.shape[1])
         full[..., self.inputs] = derivative
         return full

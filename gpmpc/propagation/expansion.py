@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.evaluation import host_arrays
+from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import GPPosterior
 
 
@@ -58,11 +58,11 @@ def _by_torch(model: GPPosterior, state: Tensor, input: Tensor) -> list[Tensor]:
     difference = (model.features - torch.cat([state, input], dim=-1)[..., None, :])[..., None, :, :]
     z = difference * inverse_squares[:, None, :]  # (*batch, k, N, d)
     k = model.signal_variance[:, None] * torch.exp(-(z * difference).sum(-1) / 2)
-    weighted, explained_by = model.weights * k, model.solved(k)
+    weighted, explained_by = model.weights * k, model.solve(k)
     jacobian = (weighted[..., None, :] @ z)[..., 0, :]
     variance_by = -2 * ((explained_by * k)[..., None, :] @ z)[..., 0, :]
     own = torch.diag_embed(inverse_squares)[:, :n]
     second = (weighted[..., None] * z[..., :n]).mT @ z - weighted.sum(-1)[..., None, None] * own
-    variance = (model.signal_variance - model.explained(k)).clamp_min(0)
+    variance = (model.signal_variance - model.variance_reduction(k)).clamp_min(0)
     parts = [half for whole in (jacobian, variance_by, second) for half in (whole[..., :n], whole[..., n:])]
     return [weighted.sum(-1), variance, *parts]

@@ -20,7 +20,7 @@ from torch import Tensor
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors, square_root_differential
-from gpmpc.gp.evaluation import host_arrays
+from gpmpc.gp.backend import host_arrays
 from gpmpc.propagation.propagator import Propagator
 from gpmpc.propagation.sensitivity import Sensitivity, differentiate
 

@@ -65,12 +65,12 @@ def moments_with_jacobian(
     c = seen.control * model.lengthscales[:, None, n:] ** -2  # c_ai (*batch, k, N, m)
     G, A = seen.inverse, seen.inverse.mT * seen.D[:, None, :]  # A = G' D, symmetric
     f = _Sums.of(model.weights * seen.q, seen.z, c)
-    e = _Sums.of(seen.q * model.solved(seen.q), seen.z, c)
+    e = _Sums.of(seen.q * model.solve(seen.q), seen.z, c)
     J = _transposed(G, f.first)
     dM_dS = _symmetric(G.mT @ f.second @ G - f.total[..., None, None] * A) / 2
     dJ_dS, dJ_du = _slopes(model.weights * seen.q, seen, c, J, A) if cross else (None, None)
 
-    explained, entries = model.explained(seen.q), []
+    explained, entries = model.variance_reduction(seen.q), []
     for p, (a, b) in enumerate(zip(pairs.a, pairs.b, strict=True)):  # one N x N matrix at a time
         U, moment = _products(f.at(a), f.at(b))
         weights = model.weights[a][:, None] * model.weights[b]

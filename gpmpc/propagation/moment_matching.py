@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
-from gpmpc.gp.evaluation import host_arrays
+from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation.composition import Composition, Latent
 from gpmpc.propagation.propagator import Propagation, checked_input, unsupported
@@ -171,7 +171,7 @@ def moments(
     weighted = model.weights * seen.q
     mean = weighted.sum(-1) + model.offset
     slope = (weighted[..., None, :] @ seen.z @ seen.inverse)[..., 0, :]
-    explained = model.explained(seen.q)
+    explained = model.variance_reduction(seen.q)
     entries = []
     for p, (i, j) in enumerate(zip(pairs.a, pairs.b, strict=True)):  # one at a time: (N, N) fits the cache
         centred = centred_products(seen, pairs, p)

@@ -15,7 +15,7 @@ from torch import Tensor
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.residual import Affine, ResidualModel
+from gpmpc.models import Affine, ResidualModel
 from gpmpc.propagation import Propagation, Propagator, differentiate, linearize
 from gpmpc.testing.promise import require, require_close, require_covariance
 

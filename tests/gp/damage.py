@@ -18,8 +18,9 @@ import numpy as np
 import torch
 
 from gpmpc.exceptions import GpmpcError
-from gpmpc.gp import GPPosterior, ResidualModel, Transitions
-from tests.gp.small_models import posterior, residual_model
+from gpmpc.gp import Transitions, load_posterior
+from gpmpc.models import load_residual_model
+from tests.gp.small_models import SAVE, posterior, residual_model
 
 MEMORY, SECONDS = 300 * 2**20, 5.0
 
@@ -152,10 +153,86 @@ def a_bomb(members, rng):
     members[name] = written.getvalue()
 
 
+def reheaded(change):
+    """A damage of the JSON header of a safetensors file, whose stated length is then right again."""
+
+    def damage(content, rng):
+        length = int.from_bytes(content[:8], "little")
+        header = json.loads(content[8 : 8 + length])
+        text = change(header, rng)
+        text = json.dumps(header).encode() if text is None else text
+        return len(text).to_bytes(8, "little") + text + content[8 + length :]
+
+    damage.__name__ = change.__name__
+    return damage
+
+
+def a_tensor(header, rng):
+    return header[rng.choice([name for name in header if name != "__metadata__"])]
+
+
+@reheaded
+def a_tensor_elsewhere(header, rng):
+    a_tensor(header, rng)["data_offsets"] = rng.choice([[0, 8], [8, 0], [0, 2**62], [-8, 0], [2**63, 2**64 - 1], []])
+
+
+@reheaded
+def tensors_swapped(header, rng):
+    one, other = a_tensor(header, rng), a_tensor(header, rng)
+    one["data_offsets"], other["data_offsets"] = other["data_offsets"], one["data_offsets"]
+
+
+@reheaded
+def a_tensor_of_another_shape(header, rng):
+    a_tensor(header, rng)["shape"] = rng.choice([[10**9, 3], [2**31, 2**31], [], [0], [2**62, 4], [-1], [1] * 70])
+
+
+@reheaded
+def a_tensor_of_another_type(header, rng):
+    a_tensor(header, rng)["dtype"] = rng.choice(["F32", "I64", "BF16", "U8", "F8_E4M3", "x", None, 3])
+
+
+@reheaded
+def a_tensor_renamed(header, rng):
+    name = rng.choice([name for name in header if name != "__metadata__"])
+    header[rng.choice(["a", "../features", "weights", ""])] = header.pop(name)
+
+
+@reheaded
+def a_tensor_dropped(header, rng):
+    del header[rng.choice([name for name in header if name != "__metadata__"])]
+
+
+@reheaded
+def a_header_edited_in_place(header, rng):
+    said = json.loads(header["__metadata__"]["gpmpc"])
+    key = rng.choice([key for key in said if key != "checksum"])
+    said[key] = rng.choice([None, 0, -1, 3, 10**9, 1.5, True, "value", [], [0, 1], {}, {"features": [0, 0]}, "x" * 999])
+    header["__metadata__"]["gpmpc"] = json.dumps(said)
+
+
+@reheaded
+def metadata_of_garbage(header, rng):
+    header["__metadata__"] = rng.choice([{}, {"gpmpc": "[" * 100_000}, {"gpmpc": "null"}, {"gpmpc": "x" * 2**21}, 3])
+
+
+@reheaded
+def a_whole_header_of_garbage(header, rng):
+    return rng.choice([b"", b"[" * 100_000, b"null", b"{}", b"\xff\xfe", b"{" * 9000, b'{"a": {}}'])
+
+
+def a_huge_header(content, rng):
+    return rng.choice([2**27, 2**40, 2**63, 2**64 - 1]).to_bytes(8, "little") + content[8:]
+
+
 BYTES = [flipped, cut, without_a_piece, overwritten, repeated]
-PARTS = [
+ZIP = [
     members_swapped, a_member_dropped, a_member_renamed, a_header_edited, a_header_of_garbage, an_array_of_another_kind,
     a_huge_shape, a_bomb,
+]  # fmt: skip
+SAFETENSORS = [
+    a_tensor_elsewhere, tensors_swapped, a_tensor_of_another_shape, a_tensor_of_another_type, a_tensor_renamed,
+    a_tensor_dropped, a_header_edited_in_place, metadata_of_garbage, a_whole_header_of_garbage, a_huge_header,
 ]  # fmt: skip
 
 
@@ -180,8 +257,8 @@ def main(kind, count, seed):
     makers = {"model": posterior, "residual": residual_model, "transitions": transitions, "csv": transitions}
     made = makers[kind]()
     load = {
-        "model": GPPosterior.load,
-        "residual": ResidualModel.load,
+        "model": load_posterior,
+        "residual": load_residual_model,
         "transitions": Transitions.load,
         "csv": from_csv,
     }[kind]
@@ -191,13 +268,16 @@ def main(kind, count, seed):
         if kind == "csv":
             rows = [",".join(map(repr, row)) for row in made.states.tolist()]
             path.write_text("\n".join(["a,b,c", *rows]))
-        else:
+        elif kind == "transitions":
             made.save(path)
+        else:
+            SAVE[type(made)](made, path)
+        parts = ZIP if kind == "transitions" else SAFETENSORS
         whole, same = path.read_bytes(), content(load(path))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         for _ in range(count):
-            damage = rng.choice(BYTES if kind == "csv" or rng.random() < 0.5 else PARTS)
+            damage = rng.choice(BYTES if kind == "csv" or rng.random() < 0.5 else parts)
             damaged = damage(whole, rng)
             path.write_bytes(damaged)
             resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, resource.RLIM_INFINITY))

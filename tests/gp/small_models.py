@@ -2,7 +2,11 @@
 
 import torch
 
-from gpmpc.gp import Affine, GPPosterior, ResidualModel
+from gpmpc.gp import GPPosterior, load_posterior, save_posterior
+from gpmpc.models import Affine, ResidualModel, load_residual_model, save_residual_model
+
+SAVE = {GPPosterior: save_posterior, ResidualModel: save_residual_model}
+LOAD = {GPPosterior: load_posterior, ResidualModel: load_residual_model}
 
 
 def posterior(size=12, n=2, m=1, predicts="next_state", seed=0):

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from gpmpc.exceptions import UnsupportedModel
-from gpmpc.gp import GPPosterior, ResidualModel
+from gpmpc.gp import GPPosterior
 from gpmpc.gp.casadi_ import casadi_function
+from gpmpc.models import ResidualModel
 from tests.gp.small_models import posterior, residual_model
 
 CASES = {

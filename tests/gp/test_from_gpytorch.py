@@ -19,9 +19,9 @@ from gpytorch.means import ConstantMean, LinearMean, ZeroMean
 
 from gpmpc.exceptions import SettingError, ShapeError, TrainingError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import GPPosterior, KernelPosterior, fit
-from gpmpc.gp.collapsed_bound import collapsed_bound
-from gpmpc.gp.model import exact_inference
+from gpmpc.gp import Hyperparameters, KernelPosterior, fit, from_gpytorch
+from gpmpc.gp.gpytorch_ import exact_inference
+from gpmpc.gp.sparse import collapsed_bound
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, differentiate
 
 
@@ -100,19 +100,19 @@ SE_ARD = {
 
 @pytest.mark.parametrize("kind", SE_ARD)
 @pytest.mark.parametrize("size", [10, 189])
-@pytest.mark.parametrize("frozen", [GPPosterior, KernelPosterior])
-def test_a_frozen_model_predicts_what_gpytorch_does(kind, size, frozen):
-    assert_equal(SE_ARD[kind](size), frozen)
+@pytest.mark.parametrize("freeze", [from_gpytorch, KernelPosterior.from_gpytorch])
+def test_a_frozen_model_predicts_what_gpytorch_does(kind, size, freeze):
+    assert_equal(SE_ARD[kind](size), freeze)
 
 
-@pytest.mark.parametrize("frozen", [GPPosterior, KernelPosterior])
+@pytest.mark.parametrize("freeze", [from_gpytorch, KernelPosterior.from_gpytorch])
 @pytest.mark.parametrize("size", [900, 2000])
-def test_a_frozen_model_is_exact_where_gpytorch_by_itself_is_not(size, frozen):
-    assert_equal(SE_ARD["single"](size), frozen)
+def test_a_frozen_model_is_exact_where_gpytorch_by_itself_is_not(size, freeze):
+    assert_equal(SE_ARD["single"](size), freeze)
 
 
-def assert_equal(model, frozen):
-    gp = frozen.from_gpytorch(model, input_dim=1, predicts="value")
+def assert_equal(model, freeze):
+    gp = freeze(model, input_dim=1, predicts="value")
     query = data(7, seed=5)[0]
     belief, by_state, by_input = gp.predict_with_jacobian(query[:, :2], query[:, 2:])
     mean, variance = theirs(model, query)
@@ -229,7 +229,7 @@ def with_transform():
         (
             lambda: one_output(10, ScaleKernel(MaternKernel())),
             UnsupportedModel,
-            "got MaternKernel. KernelPosterior.from_gpytorch takes any kernel",
+            "got MaternKernel. KernelPosterior takes any kernel",
         ),
         (lambda: one_output(10, RBFKernel(active_dims=[0])), UnsupportedModel, "got RBFKernel on some dimensions"),
         (lambda: one_output(10, RBFKernel(), mean=LinearMean(3)), UnsupportedModel, "zero or constant; got LinearMean"),
@@ -250,7 +250,7 @@ def with_transform():
 )
 def test_models_that_cannot_be_frozen_are_refused_with_the_reason(make, error, message):
     with pytest.raises(error, match=message):
-        GPPosterior.from_gpytorch(make(), input_dim=0, predicts="value")
+        from_gpytorch(make(), input_dim=0, predicts="value")
 
 
 def test_numbers_that_do_not_go_together_are_refused():
@@ -279,7 +279,7 @@ def test_a_frozen_sparse_model_predicts_what_gpytorch_does(corrected, method):
     model, query = sgpr(), data(7, seed=5)[0]
     with gpytorch.settings.sgpr_diagonal_correction(corrected):
         mean, variance = theirs(model, query)
-        gp = GPPosterior.from_gpytorch(model, input_dim=1, predicts="value")
+        gp = from_gpytorch(model, input_dim=1, predicts="value")
     belief = gp.predict(query[:, :2], query[:, 2:])
     if method == "sgpr":  # GPyTorch leaves out what the inducing points do not explain: kxx - qxx
         kernel, Z = model.covar_module.base_kernel, model.covar_module.inducing_points.detach()
@@ -288,7 +288,7 @@ def test_a_frozen_sparse_model_predicts_what_gpytorch_does(corrected, method):
             variance = variance + gp.signal_variance
             variance -= (across * torch.linalg.solve(kernel(Z).to_dense(), across)).sum(-2).mT
     assert len(gp) == 12
-    assert not gp.exact
+    assert not gp.has_observation_noise
     assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-8)
     assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-8)
 
@@ -300,9 +300,11 @@ def test_the_bound_is_gpytorchs():
         model.covar_module.inducing_points.detach(),
         x[0],
         y.mT,
-        kernel.base_kernel.lengthscale.detach()[:, 0],
-        kernel.outputscale.detach(),
-        model.likelihood.noise.detach()[:, 0],
+        Hyperparameters(
+            kernel.base_kernel.lengthscale.detach()[:, 0],
+            kernel.outputscale.detach(),
+            model.likelihood.noise.detach()[:, 0],
+        ),
         jitter=0.0,
     )
     likelihood = gpytorch.mlls.ExactMarginalLogLikelihood(model.likelihood.train(), model.train())
@@ -319,8 +321,8 @@ def test_sparse_models_over_other_points_are_refused():
         kernel = InducingPointKernel(RBFKernel(), x[a : a + 5].clone(), likelihood)
         models.append(Model(x, y[a], kernel, likelihood=likelihood).double().eval())
     with pytest.raises(ShapeError, match="the same inducing points"):
-        GPPosterior.from_gpytorch(models, input_dim=1)
-    with pytest.raises(UnsupportedModel, match="freeze it by GPPosterior.from_gpytorch"):
+        from_gpytorch(models, input_dim=1)
+    with pytest.raises(UnsupportedModel, match="freeze it by from_gpytorch"):
         KernelPosterior.from_gpytorch(models[0], input_dim=1, predicts="value")
 
 

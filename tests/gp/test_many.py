@@ -4,7 +4,7 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError
 from gpmpc.gp import Trainer, Transitions, standardize, train_many
-from gpmpc.gp.many import PROCESS, _workers_that_fit
+from gpmpc.gp.training import _PROCESS, _workers_that_fit
 
 
 def transitions(rows, n=2, seed=0):
@@ -49,11 +49,11 @@ def test_misuse_is_refused_before_any_work(monkeypatch):
 
 
 def test_there_are_as_many_workers_as_memory_holds(monkeypatch):
-    monkeypatch.setattr("gpmpc.gp.many.cores", lambda: 8)
-    monkeypatch.setattr("gpmpc.gp.many.available_memory", lambda: 3.5 * PROCESS)
+    monkeypatch.setattr("gpmpc.gp.training.cores", lambda: 8)
+    monkeypatch.setattr("gpmpc.gp.training.available_memory", lambda: 3.5 * _PROCESS)
     assert _workers_that_fit([(100, 6)], "closed_form", 6) == 3
     assert _workers_that_fit([(100, 2)], "closed_form", 2) == 2
-    monkeypatch.setattr("gpmpc.gp.many.available_memory", lambda: None)
+    monkeypatch.setattr("gpmpc.gp.training.available_memory", lambda: None)
     assert _workers_that_fit([(100, 6)], "closed_form", 6) == 6
 
 

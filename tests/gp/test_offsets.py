@@ -11,22 +11,24 @@ import torch
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import (
     GPPosterior,
+    Hyperparameters,
     SparseTrainer,
     Trainer,
     Transitions,
-    evaluation,
+    append_points,
+    backend,
     identity,
     min_max,
+    remove_points,
     sparse_posterior,
     standardize,
 )
 from gpmpc.gp.casadi_ import casadi_function
-from gpmpc.gp.collapsed_bound import collapsed_bound
-from gpmpc.gp.evidence import LogEvidence
-from gpmpc.gp.evidence_in_place import InPlaceEvidence
-from gpmpc.gp.hyperparameter_search import constant_columns, spread
-from gpmpc.gp.model import BatchExactGP, GPyTorchEvidence
+from gpmpc.gp.gpytorch_ import GPyTorchLikelihood
+from gpmpc.gp.likelihood import NegativeLogMarginalLikelihood
 from gpmpc.gp.module import PosteriorModule
+from gpmpc.gp.search import column_std, constant_columns
+from gpmpc.gp.sparse import collapsed_bound
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, linearize
 from gpmpc.propagation.sensitivity import differentiate
 
@@ -77,7 +79,7 @@ def test_training_does_not_see_where_the_features_lie(name, by):
 
 @pytest.mark.parametrize("by", FEATURES, ids=str)
 def test_training_in_place_does_not_see_where_the_features_lie(by, monkeypatch):
-    monkeypatch.setattr("gpmpc.gp.hyperparameter_search.IN_PLACE", 1)
+    monkeypatch.setattr("gpmpc.gp.likelihood._IN_PLACE", 1)
     assert_same_training(Trainer(restarts=0), *data(), by)
 
 
@@ -97,25 +99,25 @@ def test_every_evidence_is_that_of_the_shifted_features(by):
     x, y = data(60)
     theta = np.array([0.2, 0.5, 0.1, 0.3, np.log(1e3)])
     shifted = x + by
-    for kind in (LogEvidence, InPlaceEvidence):
-        value, gradient = kind(x.numpy(), y[:, 0].numpy())(theta)
-        there, slopes = kind(shifted.numpy(), y[:, 0].numpy())(theta)
+    for in_place in (False, True):
+        value, gradient = NegativeLogMarginalLikelihood(x.numpy(), y[:, 0].numpy(), in_place)(theta)
+        there, slopes = NegativeLogMarginalLikelihood(shifted.numpy(), y[:, 0].numpy(), in_place)(theta)
         assert there == pytest.approx(value, rel=1e-10)
         assert np.allclose(slopes, gradient, rtol=1e-7)
-    here, there = (GPyTorchEvidence(BatchExactGP(p, y[:, :1]))(theta[None])[0] for p in (x, shifted))
+    here, there = (GPyTorchLikelihood(p.numpy(), y[:, 0].numpy())(theta)[0] for p in (x, shifted))
     assert there == pytest.approx(here, abs=0.01)  # GPyTorch divides by the length-scales first: round-off remains
     kernel = [torch.tensor(theta[None, :3]).exp(), torch.ones(1), torch.full((1,), 1e-4)]
-    bounds = [collapsed_bound(p[:20], p, y[:, :1], *kernel) for p in (x, shifted)]
+    bounds = [collapsed_bound(p[:20], p, y[:, :1], Hyperparameters(*kernel)) for p in (x, shifted)]
     assert torch.allclose(*bounds, rtol=1e-10)
 
 
 def test_a_column_around_a_large_value_moves_and_one_at_rest_does_not():
     x = data()[0].numpy()
-    assert np.array_equal(spread(x + 1e8), spread(x))
+    assert np.array_equal(column_std(x + 1e8), column_std(x))
     assert not constant_columns(x + 1e8).any()
     rest = 0.5 + 1e-10 * x
     assert constant_columns(rest).all()
-    assert np.allclose(spread(rest), np.abs(rest).max(axis=0))
+    assert np.allclose(column_std(rest), np.abs(rest).max(axis=0))
 
 
 def posterior(by=0.0, targets_by=0.0, sparse=False, predicts="next_state"):
@@ -129,7 +131,8 @@ def posterior(by=0.0, targets_by=0.0, sparse=False, predicts="next_state"):
         "offset": torch.full((2,), 0.25) + targets_by,
     }
     if sparse:
-        return sparse_posterior(x[:10] + by, x + by, y + targets_by, **kernel)
+        hyperparameters = Hyperparameters(*(kernel.pop(name) for name in Hyperparameters._fields))
+        return sparse_posterior(x[:10] + by, x + by, y + targets_by, hyperparameters, **kernel)
     return GPPosterior.from_hyperparameters(x + by, y + targets_by, **kernel)
 
 
@@ -156,7 +159,7 @@ def everything(gp, by):
 @pytest.mark.parametrize("choice", ["compiled", "torch"])
 @pytest.mark.parametrize("sparse", [False, True], ids=["exact", "sparse"])
 def test_predictions_and_exports_are_those_of_the_shifted_model(by, choice, sparse):
-    with evaluation(choice):
+    with backend(choice):
         here, there = everything(posterior(sparse=sparse), 0.0), everything(posterior(by, sparse=sparse), by)
     for ours, theirs in zip(here, there, strict=True):
         assert torch.allclose(ours, theirs, rtol=1e-7, atol=1e-8 if sparse else 1e-10)
@@ -181,7 +184,7 @@ def test_propagations_are_those_of_the_shifted_model(propagator, atol, choice):
     said = []
     for shift in (torch.zeros(3), by):
         x, u = query(shift)
-        with evaluation(choice):
+        with backend(choice):
             moved = propagator.propagate(posterior(shift), Gaussian(x[0], covariance), u[0])
             derivatives = differentiate(propagator, posterior(shift), Gaussian(x[0], covariance), u[0])[1]
         said.append([moved.belief.mean, moved.belief.covariance, moved.cross_covariance, *vars(derivatives).values()])
@@ -207,8 +210,8 @@ def test_the_local_model_of_a_shifted_state_is_shifted(predicts):
 def test_points_come_and_go_around_a_large_value_as_around_zero():
     x, y = data(28)
     new = slice(25, 28)
-    here = posterior().condition_on_targets(x[new], y[new]).drop([0, 7])
-    there = posterior(1e8, -1e8).condition_on_targets(x[new] + 1e8, y[new] - 1e8).drop([0, 7])
+    here = remove_points(append_points(posterior(), x[new], y[new]), [0, 7])
+    there = remove_points(append_points(posterior(1e8, -1e8), x[new] + 1e8, y[new] - 1e8), [0, 7])
     (a, u), (b, v) = query(), query(1e8)
     assert torch.allclose(here.predict(a, u).mean, there.predict(b, v).mean + 1e8, rtol=0, atol=1e-6)
     assert torch.allclose(here.predict(a, u).variance, there.predict(b, v).variance, atol=1e-9)

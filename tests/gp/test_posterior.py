@@ -4,7 +4,7 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gp import GPPosterior, Scaling
-from gpmpc.gp.model import BatchExactGP, exact_inference
+from gpmpc.gp.gpytorch_ import BatchExactGP, exact_inference
 
 
 def posterior(size=30, n=2, m=1, predicts="next_state", seed=0):
@@ -144,7 +144,7 @@ def test_a_posterior_of_scaled_data_speaks_physical_units_after_unscaling():
     )
     assert torch.allclose(physical.cholesky, fresh.cholesky, rtol=1e-9, atol=1e-9)
     assert torch.allclose(physical.weights, fresh.weights, rtol=1e-8, atol=1e-10)
-    assert physical.exact
+    assert physical.has_observation_noise
 
 
 def test_a_value_model_may_have_any_number_of_outputs():

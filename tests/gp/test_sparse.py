@@ -8,9 +8,20 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import Budget, GPPosterior, SparseTrainer, Trainer, Transitions, sparse_posterior, standardize
-from gpmpc.gp.collapsed_bound import collapsed_bound, collapsed_bound_with_gradient
+from gpmpc.gp import (
+    GPPosterior,
+    Hyperparameters,
+    SlidingWindow,
+    SparseTrainer,
+    Trainer,
+    Transitions,
+    append_transitions,
+    remove_points,
+    sparse_posterior,
+    standardize,
+)
 from gpmpc.gp.kernel import kernel_matrix
+from gpmpc.gp.sparse import collapsed_bound, collapsed_bound_with_gradient
 from gpmpc.gp.sparse_training import greedy_points
 from gpmpc.propagation import MomentMatching, MonteCarlo
 
@@ -48,7 +59,7 @@ def textbook(Z, x, y, query, method, lengthscales, signal_variance, noise_varian
 @pytest.mark.parametrize("noise", [1e-5, 1e-1])
 def test_the_frozen_posterior_has_the_textbooks_mean_and_variance(method, noise):
     x, y, settings = problem(noise=noise)
-    gp = sparse_posterior(x[:25], x, y, **settings, input_dim=1, predicts="value", method=method)
+    gp = sparse_posterior(x[:25], x, y, Hyperparameters(**settings), input_dim=1, predicts="value", method=method)
     query = problem(40, seed=1)[0]
     mean, variance = textbook(x[:25], x, y, query, method, **settings)
     belief = gp.predict(query[:, :2], query[:, 2:])
@@ -64,21 +75,22 @@ def test_with_every_point_as_inducing_point_it_is_the_exact_gp(method):
     offset, query = torch.tensor([0.5, -1.0]), problem(40, seed=1)[0]
     more = settings | {"input_dim": 1, "predicts": "value", "offset": offset}
     exact = GPPosterior.from_hyperparameters(x, y, **more).predict(query[:, :2], query[:, 2:])
-    sparse = sparse_posterior(x, x, y, **more, method=method).predict(query[:, :2], query[:, 2:])
+    frozen = sparse_posterior(x, x, y, Hyperparameters(**settings), 1, "value", offset, method)
+    sparse = frozen.predict(query[:, :2], query[:, 2:])
     assert torch.allclose(sparse.mean, exact.mean, rtol=0, atol=1e-8)
     assert torch.allclose(sparse.variance, exact.variance, rtol=0, atol=1e-8)
 
 
 def test_points_that_are_nearly_the_same_get_the_jitter_they_need():
     x, y, settings = problem(100, spread=20.0)
-    gp = sparse_posterior(x, x, y, **settings, input_dim=1, predicts="value")
+    gp = sparse_posterior(x, x, y, Hyperparameters(**settings), input_dim=1, predicts="value")
     exact = GPPosterior.from_hyperparameters(x, y, **settings, input_dim=1, predicts="value")
     query = problem(40, seed=1)[0]
     ours, theirs = (model.predict(query[:, :2], query[:, 2:]) for model in (gp, exact))
     assert torch.allclose(ours.mean, theirs.mean, rtol=0, atol=1e-4)
     assert torch.allclose(ours.variance, theirs.variance, rtol=0, atol=1e-5)
     with pytest.raises(SettingError, match="inducing: their kernel matrix of output . is not positive definite"):
-        sparse_posterior(x, x, y, **settings, input_dim=1, predicts="value", jitter=0.0)
+        sparse_posterior(x, x, y, Hyperparameters(**settings), input_dim=1, predicts="value", jitter=0.0)
 
 
 def test_the_bound_is_below_the_evidence_and_reaches_it_with_every_point():
@@ -86,11 +98,13 @@ def test_the_bound_is_below_the_evidence_and_reaches_it_with_every_point():
     gp = GPPosterior.from_hyperparameters(x, y, **settings, input_dim=1, predicts="value")
     prior = torch.distributions.MultivariateNormal(torch.zeros(60), scale_tril=gp.cholesky)
     evidence = prior.log_prob(y.mT)
-    few, more = (collapsed_bound(x[:count], x, y, **settings) for count in (10, 40))
+    few, more = (collapsed_bound(x[:count], x, y, Hyperparameters(**settings)) for count in (10, 40))
     assert (few < more).all()
     assert (more < evidence).all()
-    assert torch.allclose(collapsed_bound(x, x, y, **settings, jitter=1e-12), evidence, atol=1e-5)
-    assert torch.allclose(collapsed_bound(x, x, y, **settings, method="fitc", jitter=1e-12), evidence, atol=1e-5)
+    assert torch.allclose(collapsed_bound(x, x, y, Hyperparameters(**settings), jitter=1e-12), evidence, atol=1e-5)
+    assert torch.allclose(
+        collapsed_bound(x, x, y, Hyperparameters(**settings), method="fitc", jitter=1e-12), evidence, atol=1e-5
+    )
 
 
 def test_the_bounds_gradient_is_right():
@@ -99,19 +113,19 @@ def test_the_bounds_gradient_is_right():
     for method in ("sgpr", "fitc"):
 
         def bound(Z, *hyperparameters, method=method):
-            return collapsed_bound(Z, x, y, *hyperparameters, method=method)
+            return collapsed_bound(Z, x, y, Hyperparameters(*hyperparameters), method=method)
 
         assert torch.autograd.gradcheck(bound, [leaf.clone().requires_grad_() for leaf in leaves], atol=1e-4)
 
 
 @pytest.mark.parametrize("method", ["sgpr", "fitc"])
 def test_the_bound_and_its_gradient_in_blocks_are_those_in_one_piece(method, monkeypatch):
-    monkeypatch.setattr("gpmpc.gp.collapsed_bound.ENTRIES", 1)  # 64 points at a time
+    monkeypatch.setattr("gpmpc.gp.sparse._ENTRIES", 1)  # 64 points at a time
     x, y, settings = problem(150)
     leaves = [leaf.clone().requires_grad_() for leaf in (x[:12], *settings.values())]
-    whole = collapsed_bound(leaves[0], x, y, *leaves[1:], method=method)
+    whole = collapsed_bound(leaves[0], x, y, Hyperparameters(*leaves[1:]), method=method)
     slopes = torch.autograd.grad(whole.sum(), leaves)
-    value, gradients = collapsed_bound_with_gradient(x[:12], x, y, *settings.values(), method=method)
+    value, gradients = collapsed_bound_with_gradient(x[:12], x, y, Hyperparameters(**settings), method=method)
     assert torch.allclose(value, whole.detach(), rtol=1e-12)
     for ours, theirs in zip(gradients, slopes, strict=True):
         assert torch.allclose(ours, theirs, rtol=1e-8, atol=1e-8 * float(theirs.abs().max()))
@@ -120,13 +134,13 @@ def test_the_bound_and_its_gradient_in_blocks_are_those_in_one_piece(method, mon
 @pytest.mark.parametrize("method", ["sgpr", "fitc"])
 def test_a_frozen_sparse_model_is_conditioned_and_moment_matched_like_any_other(method):
     x, y, settings = problem(200, noise=1e-3)
-    gp = sparse_posterior(x[:40], x, y, **settings, input_dim=1, method=method)
+    gp = sparse_posterior(x[:40], x, y, Hyperparameters(**settings), input_dim=1, method=method)
     new = Transitions(x[:3, :2] + 0.1, x[:3, 2:], y[:3])
-    grown = gp.condition_on(new)
+    grown = append_transitions(gp, new)
     assert (grown.predict(new.states, new.inputs).variance < gp.predict(new.states, new.inputs).variance).all()
-    back, query = grown.drop([40, 41, 42]), torch.rand(5, 2)
+    back, query = remove_points(grown, [40, 41, 42]), torch.rand(5, 2)
     assert torch.allclose(back.predict(query, query[:, :1]).mean, gp.predict(query, query[:, :1]).mean, atol=1e-8)
-    assert len(Budget(40, "least_informative")(gp, new)) == 40
+    assert len(SlidingWindow(40, "least_informative")(gp, new)) == 40
     at, control = Gaussian(torch.tensor([0.3, -0.2]), 0.05 * torch.eye(2)), torch.zeros(1)
     matched, sampled = MomentMatching()(gp, at, control), MonteCarlo(20_000)(gp, at, control)
     error = (sampled.covariance.diagonal() / 20_000).sqrt()
@@ -138,11 +152,13 @@ def test_a_frozen_sparse_model_is_conditioned_and_moment_matched_like_any_other(
 
 def test_greedy_points_differ_and_stop_where_nothing_is_left():
     x, _, settings = problem(100)
-    chosen = greedy_points(torch.cat([x, x]), *settings.values(), count=30)
+    chosen = greedy_points(torch.cat([x, x]), Hyperparameters(**settings), 30)
     assert len(torch.unique(chosen, dim=0)) == 30
-    assert len(greedy_points(x[[0, 1, 0, 1, 0]], *settings.values(), count=5)) == 2
-    random = [collapsed_bound(x[i : i + 30], x, problem(100)[1], **settings).sum() for i in range(0, 70, 10)]
-    assert collapsed_bound(chosen, x, problem(100)[1], **settings).sum() > max(random)
+    assert len(greedy_points(x[[0, 1, 0, 1, 0]], Hyperparameters(**settings), 5)) == 2
+    random = [
+        collapsed_bound(x[i : i + 30], x, problem(100)[1], Hyperparameters(**settings)).sum() for i in range(0, 70, 10)
+    ]
+    assert collapsed_bound(chosen, x, problem(100)[1], Hyperparameters(**settings)).sum() > max(random)
 
 
 def transitions(rows, noise=1e-2, seed=0):
@@ -204,16 +220,17 @@ def test_misuse_of_the_trainer_is_refused_with_the_rule(setting, message):
 )
 def test_misuse_is_refused_with_the_rule(change, error, message):
     x, y, settings = problem(10)
-    good = {"inducing": x[:4], "features": x, "targets": y, **settings, "input_dim": 1, "predicts": "value"}
+    settings = {name: change.pop(name, value) for name, value in settings.items()}
+    good = {"inducing": x[:4], "features": x, "targets": y, "hyperparameters": Hyperparameters(**settings)}
     with pytest.raises(error, match=message):
-        sparse_posterior(**(good | change))
+        sparse_posterior(**(good | {"input_dim": 1, "predicts": "value"} | change))
 
 
 def test_the_bound_itself_refuses_a_method_that_it_does_not_know():
     z, one = torch.zeros(1, 2, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
     for bound in (collapsed_bound, collapsed_bound_with_gradient):
         with pytest.raises(SettingError, match="method: must be 'sgpr' or 'fitc'; got 'foo'"):
-            bound(z, z, z[:, :1], torch.ones_like(z), one, one, "foo")
+            bound(z, z, z[:, :1], Hyperparameters(torch.ones_like(z), one, one), "foo")
 
 
 def sines(rows, d, noise, seed):

@@ -14,10 +14,11 @@ from gpmpc.gp import (
     Transitions,
     identity,
     standardize,
+    to_gpytorch,
     train,
     train_many,
 )
-from gpmpc.gp.hyperparameter_search import spread
+from gpmpc.gp.search import column_std
 
 
 def pendulum(rows=60, noise=1e-3, seed=0):
@@ -62,7 +63,7 @@ def test_gpytorchs_likelihood_leads_to_the_same_optimum():
 def test_the_gpytorch_model_of_a_training_predicts_the_same():
     training, states, inputs = train(pendulum(30)), torch.rand(4, 2), torch.rand(4, 1)
     with torch.no_grad():
-        theirs = training.gpytorch_model()(torch.cat([states, inputs], dim=1).expand(2, -1, -1))
+        theirs = to_gpytorch(training.posterior)(torch.cat([states, inputs], dim=1).expand(2, -1, -1))
     assert torch.allclose(training.posterior.predict(states, inputs).mean, theirs.mean.T, atol=1e-8)
 
 
@@ -72,7 +73,7 @@ def test_the_penalty_keeps_signal_to_noise_and_lengthscales_within_its_limits():
     assert (free[:, -1] > np.log(200)).all()
     assert (limited[:, -1] < 1.2 * np.log(50)).all()
     near = train(data, penalty=SoftLimits(lengthscale_factor=2.0)).theta
-    assert (np.abs(near[:, :-2] - np.log(spread(data.features.numpy()))) < 1.3 * np.log(2)).all()
+    assert (np.abs(near[:, :-2] - np.log(column_std(data.features.numpy()))) < 1.3 * np.log(2)).all()
 
 
 def test_the_penalty_is_the_papers_and_its_gradient_is_right():
@@ -100,8 +101,8 @@ def test_a_constant_input_has_no_influence_and_a_constant_target_is_predicted():
 
 def test_the_spread_of_a_constant_column_is_its_magnitude_or_one():
     columns = np.column_stack([[1.0, 2.0, 3.0], [-4.0] * 3, [0.0] * 3, [0.5, 0.5 + 1e-12, 0.5]])
-    assert np.allclose(spread(columns), [1, 4, 1, 0.5])
-    assert np.allclose(spread(np.array([[2.0, 0.0]])), [2, 1])
+    assert np.allclose(column_std(columns), [1, 4, 1, 0.5])
+    assert np.allclose(column_std(np.array([[2.0, 0.0]])), [2, 1])
 
 
 def test_the_prior_mean_is_what_the_scaling_maps_to_zero():

@@ -9,7 +9,8 @@ import torch
 from gpmpc.dynamics import Linearized, linearize, linearize_by_autograd
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import Affine, GPPosterior, ResidualModel
+from gpmpc.gp import GPPosterior
+from gpmpc.models import Affine, ResidualModel
 
 N, M = 3, 2
 

@@ -9,7 +9,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import evaluation
+from gpmpc.gp import backend
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.stages import StageLinearizer
@@ -60,7 +60,7 @@ def assert_same(many, alone, tolerance=1e-9):
 )
 def test_many_questions_get_the_answers_that_each_gets_alone(form, covariance, propagator, choice):
     asked = controller(form, covariance, propagator)
-    with evaluation(choice):
+    with backend(choice):
         first = asked.control_many(beliefs(4), [REFERENCE] * 4, [None] * 4)
         assert_same(first, [asked.control(b, REFERENCE) for b in beliefs(4)])
         again = beliefs(4, seed=1)
@@ -85,7 +85,7 @@ def test_compiled_and_torch_answer_alike():
     for covariance, propagator in MODES:
         asked = controller("trajectory", covariance, propagator)
         compiled = asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3)
-        with evaluation("torch"):
+        with backend("torch"):
             assert_same(asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3), compiled)
 
 
@@ -119,7 +119,7 @@ def test_stages_stay_on_the_device_of_the_model(covariance, propagator):
     linearizer = StageLinearizer(GP, propagator, covariance)
     covariances = np.repeat(belief.covariance.numpy()[None], 2, axis=0)
     states = linearizer.state(np.repeat(belief.mean.numpy()[None], 2, axis=0), covariances)
-    with torch.device("meta"), evaluation("torch"):  # a tensor made without saying where lands there, and is noticed
+    with torch.device("meta"), backend("torch"):  # a tensor made without saying where lands there, and is noticed
         stages = linearizer(states, np.ones((2, 3)), covariances)
     assert all(np.isfinite(part).all() for part in stages)
 
@@ -166,7 +166,7 @@ def test_no_question_takes_more_memory_than_it_is_said_to(covariance, propagator
     gp, T = quadrotor_gp(size), 6
     _ = gp.precision  # belongs to the model
     asked, held = controller("trajectory", covariance, propagator, gp), Held()
-    with evaluation("torch"):
+    with backend("torch"):
         said = asked.bytes_per_question
         with held:
             asked.control_many(beliefs(T), [REFERENCE] * T, [None] * T)

@@ -8,7 +8,7 @@ import torch
 
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import evaluation
+from gpmpc.gp import backend
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.state_form import StateFormMPC
@@ -109,7 +109,7 @@ def test_compiled_torch_batched_and_state_form_agree(covariance):
     answer = asked.control(belief, AT_REST, before)
     in_cvxpy = controller(StateFormMPC, covariance=covariance, disturbance_gain=0.7)
     others = [in_cvxpy.control(belief, AT_REST, before)]
-    with evaluation("torch"):
+    with backend("torch"):
         others += [asked.control(belief, AT_REST, before), *asked.control_many([belief], [AT_REST], [before])]
     for other, tolerance in zip(others, (1e-6, 1e-9, 1e-9), strict=True):
         assert np.allclose(other.disturbance, answer.disturbance, rtol=0, atol=1e-12)

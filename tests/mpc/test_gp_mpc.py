@@ -8,7 +8,7 @@ import torch
 
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import evaluation
+from gpmpc.gp import backend
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.nmpc import NMPC
@@ -394,7 +394,7 @@ def test_the_compiled_rollout_is_the_one_stage_by_stage(covariance, feedback, ob
     compiled, by_torch = GPMPC(*arguments, feedback=feedback), GPMPC(*arguments, feedback=feedback)
     belief = Gaussian(torch.full((6,), 0.2), 1e-3 * torch.eye(6))
     first = compiled.control(belief, at_origin(H))
-    with evaluation("torch"):
+    with backend("torch"):
         expected = by_torch.control(belief, at_origin(H), first)
     found = compiled.control(belief, at_origin(H), first)
     assert np.allclose(found.inputs, expected.inputs, atol=1e-9)
@@ -409,6 +409,6 @@ def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_reque
     for noise in (False, True):
         how = Linearization(observation_noise=noise)
         controller = GPMPC(gp(), how, quadrotor_problem(), 3, HOVER, form, covariance, feedback=False)
-        with evaluation(evaluated):
+        with backend(evaluated):
             found.append(controller.control(state, at_origin(3)).covariances[1])
     assert np.allclose(found[1] - found[0], gp().noise_covariance, atol=1e-6)  # of 1e-4; the plans differ a little

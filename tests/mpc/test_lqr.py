@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
 
+from gpmpc.dynamics import linearize_by_autograd
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.gp_mpc import NonlinearGPMPC
-from gpmpc.mpc.lqr import LQR, lqr_gain
+from gpmpc.mpc.linear_quadratic import dlqr, finite_horizon_lqr
+from gpmpc.mpc.lqr import LQR
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import MeanEquivalence
 from gpmpc.status import Status
@@ -33,7 +35,7 @@ def test_without_bounds_it_is_the_optimum_of_a_linear_model(penalized, rng):
 
 
 def test_the_stationary_gain_solves_the_riccati_equation():
-    K = lqr_gain(A, B, Q, R)
+    K = dlqr(A, B, Q, R)
     moved = A - B @ K
     P = sum(
         np.linalg.matrix_power(moved.T, i) @ (Q + K.T @ R @ K) @ np.linalg.matrix_power(moved, i) for i in range(400)
@@ -45,18 +47,18 @@ def test_the_stationary_gain_solves_the_riccati_equation():
 def test_a_long_horizon_gives_the_stationary_gain(rng):
     controller, state = LQR(double_integrator(), TrackingProblem(Q, R), 60, [0.0]), rng.normal(size=2)
     decision = controller.control(Gaussian.certain(state), Reference(np.zeros((61, 2))))
-    assert np.allclose(decision.input, -lqr_gain(A, B, Q, R) @ state, atol=1e-9)
+    assert np.allclose(decision.input, -dlqr(A, B, Q, R) @ state, atol=1e-9)
 
 
 def test_an_unweighted_mode_on_the_unit_circle_falls_back_to_the_recursion():
-    K = lqr_gain(np.diag([1.0, 0.5]), np.array([[0.0], [1.0]]), np.diag([0.0, 1.0]), np.eye(1))
+    K = dlqr(np.diag([1.0, 0.5]), np.array([[0.0], [1.0]]), np.diag([0.0, 1.0]), np.eye(1))
     assert K[0, 0] == pytest.approx(0, abs=1e-12)
-    assert K[0, 1] == pytest.approx(lqr_gain([[0.5]], [[1.0]], [[1.0]], [[1.0]])[0, 0])
+    assert K[0, 1] == pytest.approx(dlqr([[0.5]], [[1.0]], [[1.0]], [[1.0]])[0, 0])
 
 
 def test_a_growing_mode_out_of_reach_has_no_gain():
     with pytest.raises(SettingError, match="do not reach a growing mode"):
-        lqr_gain(np.diag([1.2, 0.5]), np.array([[0.0], [1.0]]), np.eye(2), np.eye(1))
+        dlqr(np.diag([1.2, 0.5]), np.array([[0.0], [1.0]]), np.eye(2), np.eye(1))
 
 
 def test_reference_inputs_feed_forward():
@@ -130,10 +132,10 @@ class Watched(LinearGaussian):
         super().__init__(*arguments)
         self.factor = factor
 
-    def predict_with_jacobian(self, state, input=None):
-        self.seen = state.numpy(), input.numpy()
-        moved, dynamics, effect = super().predict_with_jacobian(state, input)
-        return moved, self.factor * dynamics, effect
+    def linearize(self, states, inputs, covariance=True):
+        self.seen = states, inputs
+        at = linearize_by_autograd(self, states, inputs, covariance)
+        return at._replace(A=at.A * self.factor if np.isfinite(self.factor) else at.A + self.factor)
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["reference inputs", "no reference inputs"])
@@ -159,3 +161,14 @@ def test_a_state_that_is_part_of_a_graph_is_answered_like_any_other():
     state = torch.tensor([0.3, -0.2], requires_grad=True)
     ours = controller.control(Gaussian(2 * state, torch.zeros(2, 2)), reference)
     assert np.array_equal(ours.inputs, controller.control(Gaussian.certain([0.6, -0.4]), reference).inputs)
+
+
+def test_the_gain_over_a_long_horizon_is_stationary_and_exists_for_any_system(rng):
+    A, B, Q, R = rng.normal(size=(1, 4, 4)), rng.normal(size=(1, 4, 2)), np.eye(4), np.eye(2)
+    gains, hessians = finite_horizon_lqr(A, B, Q, R, Q, 500)
+    varying, same = finite_horizon_lqr(np.repeat(A, 500, axis=0), np.repeat(B, 500, axis=0), Q, R, Q, 500)
+    assert np.allclose(gains[0], dlqr(A[0], B[0], Q, R), atol=1e-7)
+    assert np.allclose(gains, varying, atol=1e-7)
+    assert np.allclose(hessians, same, atol=1e-6)
+    unreachable, _ = finite_horizon_lqr(2 * np.eye(4)[None], np.zeros((1, 4, 2)), Q, R, Q, 20)
+    assert np.array_equal(unreachable, np.zeros((20, 2, 4)))

@@ -8,7 +8,7 @@ import torch
 from benchmarks.kkt import Instance, kkt_residual
 from benchmarks.pendulums import pendulum_gp
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import GPPosterior, evaluation
+from gpmpc.gp import GPPosterior, backend
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
@@ -143,7 +143,7 @@ def test_compiled_and_torch_and_another_solver_iterate_alike(quadrotor, covarian
         belief = Gaussian(torch.tensor(0.4 * random.uniform(-1, 1, 6)), 1e-4 * torch.eye(6))
         reference = Reference(np.tile(0.5 * random.uniform(-1, 1, 6), (6, 1)))
         last = ours.control(belief, reference, last)
-        with evaluation("torch"):
+        with backend("torch"):
             before = other.control(belief, reference, before)
         assert last.status is before.status
         assert last.iterations == before.iterations

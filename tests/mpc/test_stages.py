@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from gpmpc.gaussian import Gaussian, square_root
-from gpmpc.gp import Affine, GPPosterior, ResidualModel
-from gpmpc.mpc.stages import StageLinearizer, Stages
+from gpmpc.gp import GPPosterior
+from gpmpc.models import Affine, ResidualModel
+from gpmpc.mpc.stages import LinearizedStages, StageLinearizer
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from tests.mpc.small_models import double_integrator, pendulum_posterior
 
@@ -34,7 +35,7 @@ def stage_at(mode, propagator, model, belief, input, disturbance=None):
     linearizer = StageLinearizer(model, propagator, mode)
     covariances = belief.covariance.numpy()[None]
     s = linearizer.state(belief.mean.numpy()[None], covariances)
-    return s[0], Stages(*(part[0] for part in linearizer(s, input.numpy()[None], covariances, disturbance)))
+    return s[0], LinearizedStages(*(part[0] for part in linearizer(s, input.numpy()[None], covariances, disturbance)))
 
 
 @pytest.mark.parametrize("noise", [False, True])

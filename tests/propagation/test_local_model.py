@@ -5,7 +5,7 @@ import torch
 
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, square_root
-from gpmpc.gp.evaluation import evaluation
+from gpmpc.gp import backend
 from gpmpc.propagation import MomentMatching, linearize, linearize_along, rollout
 from gpmpc.propagation.local_model import extended_state
 from tests.propagation.test_propagators import ALL, DETERMINISTIC, belief, gp, linear
@@ -79,7 +79,7 @@ def test_the_compiled_local_model_is_that_of_torch(name):
     covariances = torch.stack([belief(scale=scale).covariance for scale in (0.0, 0.1, 0.4)])
     at, inputs = Gaussian(torch.randn(3, 2), covariances), torch.tensor([0.3])  # one input for all
     compiled = linearize(propagator, model, at, inputs)
-    with evaluation("torch"):
+    with backend("torch"):
         other = linearize(propagator, model, at, inputs)
     for part in ("A", "B", "c"):
         assert torch.allclose(getattr(compiled, part), getattr(other, part), atol=1e-9)

@@ -5,7 +5,8 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import Affine, GPPosterior, ResidualModel
+from gpmpc.gp import GPPosterior
+from gpmpc.models import Affine, ResidualModel
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, differentiate
 from tests.mpc.systems import linear_gaussian
 

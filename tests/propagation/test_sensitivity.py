@@ -5,7 +5,8 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import Affine, GPPosterior, ResidualModel, evaluation
+from gpmpc.gp import GPPosterior, backend, remove_points
+from gpmpc.models import Affine, ResidualModel
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented, differentiate, linearize
 from gpmpc.propagation.sensitivity import by_autograd
 from tests.propagation.test_moment_matching import belief, model
@@ -50,9 +51,9 @@ def test_closed_forms_are_autograds_derivatives(propagator, name, batch, choice)
     gp, at = MODELS[name], belief(3)
     at = Gaussian(at.mean + 0.3 * draw(*batch, 3), at.covariance.expand(*batch, 3, 3).clone())
     control = draw(*batch, gp.input_dim)
-    with evaluation(choice):
+    with backend(choice):
         moved, closed_form = differentiate(propagator, gp, at, control)
-    with evaluation("torch"):
+    with backend("torch"):
         expected, automatic = by_autograd(propagator, gp, at, control)
     pairs = [(getattr(closed_form, part), getattr(automatic, part)) for part in vars(automatic)]
     pairs += [
@@ -94,7 +95,7 @@ def test_a_root_without_derivative_counts_as_constant_in_closed_form_too():
 
 def test_nobody_has_derivatives_too():
     nobody = Gaussian(draw(0, 3), draw(0, 3, 3))
-    with evaluation("torch"):
+    with backend("torch"):
         for propagator in PROPAGATORS:
             _, d = differentiate(propagator, MODELS["difference"], nobody, draw(0, 2))
             assert d.covariance_by_covariance.shape == (0, 3, 3, 3, 3)
@@ -102,16 +103,16 @@ def test_nobody_has_derivatives_too():
 
 def test_the_evaluation_can_be_forced_and_refuses_what_it_cannot_do():
     gp, state, control = MODELS["next state"], torch.zeros(3), torch.zeros(2)
-    with evaluation("torch"):
+    with backend("torch"):
         by_torch = gp.predict_with_jacobian(state, control)
-    with evaluation("compiled"):
+    with backend("compiled"):
         compiled = gp.predict_with_jacobian(state, control)
         with pytest.raises(SettingError, match="part of a graph"):
             gp.predict_with_jacobian(state.requires_grad_(), control)
     for mine, other in zip(compiled[1:], by_torch[1:], strict=True):
         assert torch.allclose(mine, other, rtol=1e-12, atol=1e-13)
     assert torch.allclose(compiled[0].covariance, by_torch[0].covariance, atol=1e-13)
-    with pytest.raises(SettingError, match="must be 'auto', 'compiled' or 'torch'; got 'numba'"), evaluation("numba"):
+    with pytest.raises(SettingError, match="must be 'auto', 'compiled' or 'torch'; got 'numba'"), backend("numba"):
         pass
 
 
@@ -171,7 +172,7 @@ def test_beliefs_and_inputs_belong_together_or_are_refused(propagator, choice):
     gp, at = MODELS["next state"], belief(3)
     batch = Gaussian(at.mean + draw(2, 3, 3), at.covariance.expand(2, 3, 3, 3))
     control = draw(2)
-    with evaluation(choice):
+    with backend(choice):
         one_for_all = propagator(gp, batch, control)
         assert torch.allclose(one_for_all.mean, propagator(gp, batch, control.expand(2, 3, 2)).mean, atol=1e-13)
         for wrong in (draw(3, 2, 2), draw(6, 2), draw(1, 2)):
@@ -195,7 +196,7 @@ def test_models_whose_hyperparameters_carry_gradients_are_answered_by_torch():
 
     def mean(scale):
         gp = GPPosterior.from_hyperparameters(features, targets, scale.exp(), torch.ones(2), 0.1 * torch.ones(2), 1)
-        dropped = gp.drop([1])
+        dropped = remove_points(gp, [1])
         at = Gaussian(torch.zeros(2), 0.1 * torch.eye(2))
         answers = gp.predict_with_jacobian(at.mean, torch.zeros(1))[1].sum()
         return (

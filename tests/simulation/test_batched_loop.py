@@ -6,7 +6,7 @@ import torch
 
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import evaluation
+from gpmpc.gp import backend
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
@@ -59,7 +59,7 @@ def assert_same(ours, theirs, tolerance=1e-9):
 )
 def test_a_trial_gives_the_same_numbers_in_a_crowd_and_alone(covariance, propagator, choice):
     asked = controller(covariance, propagator)
-    with evaluation(choice):
+    with backend(choice):
         for trial in fly(asked):
             assert trial.error is None
             assert_same(trial.result, alone(asked, trial.seed))
@@ -176,7 +176,7 @@ def test_many_plants_step_as_one_does(plant, rng):
 
 
 def test_chunks_keep_within_the_memory_that_is_given():
-    with evaluation("torch"):
+    with backend("torch"):
         asked = controller("full", MomentMatching())
         each = asked.bytes_per_question
         for memory, size in ((10 * each, 10), (10.5 * each, 10), (each // 2, 1), (10**15, 200)):

@@ -7,7 +7,8 @@ import torch
 
 from gpmpc.dynamics import batched_jacobian
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import Affine, GPPosterior, ResidualModel
+from gpmpc.gp import GPPosterior
+from gpmpc.models import Affine, ResidualModel
 from gpmpc.testing import check_model
 
 

@@ -5,9 +5,8 @@ import pytest
 import torch
 from scipy.optimize import approx_fprime
 
-from gpmpc.gp.evidence import LogEvidence
-from gpmpc.gp.evidence_in_place import InPlaceEvidence
-from gpmpc.gp.model import BatchExactGP, GPyTorchEvidence
+from gpmpc.gp.gpytorch_ import GPyTorchLikelihood
+from gpmpc.gp.likelihood import NegativeLogMarginalLikelihood
 
 
 def problem(size, d=4, outputs=2, seed=0):
@@ -25,18 +24,18 @@ def problem(size, d=4, outputs=2, seed=0):
 @pytest.mark.parametrize("size", [1, 2, 10, 64, 65, 189, 300])
 def test_the_closed_form_is_gpytorchs_marginal_likelihood(size):
     x, y, theta = problem(size)
-    values, gradients = GPyTorchEvidence(BatchExactGP(torch.from_numpy(x), torch.from_numpy(y)))(theta)
     for a in range(2):
-        value, gradient = LogEvidence(x, y[:, a])(theta[a])
-        assert value == pytest.approx(values[a], rel=1e-10, abs=1e-9)
-        assert np.allclose(gradient, gradients[a], rtol=1e-7, atol=1e-8 * (1 + np.abs(gradients[a]).max()))
+        expected, slopes = GPyTorchLikelihood(x, y[:, a])(theta[a])
+        value, gradient = NegativeLogMarginalLikelihood(x, y[:, a])(theta[a])
+        assert value == pytest.approx(expected, rel=1e-10, abs=1e-9)
+        assert np.allclose(gradient, slopes, rtol=1e-7, atol=1e-8 * (1 + np.abs(slopes).max()))
 
 
 def test_the_gradient_is_that_of_the_value():
     x, y, theta = problem(40)
-    evidence = LogEvidence(x, y[:, 0])
-    numeric = approx_fprime(theta[0], lambda t: evidence(t)[0], 1e-6)
-    assert np.allclose(evidence(theta[0])[1], numeric, rtol=2e-5, atol=1e-4)
+    likelihood = NegativeLogMarginalLikelihood(x, y[:, 0], in_place=False)
+    numeric = approx_fprime(theta[0], lambda t: likelihood(t)[0], 1e-6)
+    assert np.allclose(likelihood(theta[0])[1], numeric, rtol=2e-5, atol=1e-4)
 
 
 def test_the_value_is_minus_the_log_of_the_gaussian_density():
@@ -45,40 +44,49 @@ def test_the_value_is_minus_the_log_of_the_gaussian_density():
     squares = (((x[:, None] - x[None]) / length) ** 2).sum(-1)
     covariance = sf2 * np.exp(-squares / 2) + np.exp(2 * (theta[0, 4] - theta[0, 5])) * np.eye(15)
     density = torch.distributions.MultivariateNormal(torch.zeros(15), torch.from_numpy(covariance))
-    assert LogEvidence(x, y[:, 0])(theta[0])[0] == pytest.approx(-float(density.log_prob(torch.from_numpy(y[:, 0]))))
+    assert NegativeLogMarginalLikelihood(x, y[:, 0], in_place=False)(theta[0])[0] == pytest.approx(
+        -float(density.log_prob(torch.from_numpy(y[:, 0])))
+    )
 
 
-def test_a_kernel_matrix_that_is_not_positive_definite_has_infinite_evidence():
+def test_a_kernel_matrix_that_is_not_positive_definite_has_infinite_likelihood():
     x = np.zeros((5, 2))
-    value, gradient = LogEvidence(x, np.ones(5))(np.array([0.0, 0.0, 0.0, 20.0]))  # five equal points without noise
+    value, gradient = NegativeLogMarginalLikelihood(x, np.ones(5))(
+        np.array([0.0, 0.0, 0.0, 20.0])
+    )  # five equal points without noise
     assert value == np.inf
     assert not gradient.any()
 
 
 @pytest.mark.parametrize("size", [1, 2, 255, 256, 257, 600])
-def test_the_evidence_in_place_is_the_evidence_call_after_call(size):
+def test_the_likelihood_in_place_is_the_likelihood_call_after_call(size):
     x, y, theta = problem(size)
-    in_place, separate = InPlaceEvidence(x, y[:, 0]), LogEvidence(x, y[:, 0])
+    in_place, separate = (
+        NegativeLogMarginalLikelihood(x, y[:, 0], in_place=True),
+        NegativeLogMarginalLikelihood(x, y[:, 0], in_place=False),
+    )
     for point in (theta[0], theta[1], theta[0]):
         (value, gradient), (expected, slopes) = in_place(point), separate(point)
         assert value == pytest.approx(expected, rel=1e-10, abs=1e-9)
         assert np.allclose(gradient, slopes, rtol=1e-8, atol=1e-8 * (1 + np.abs(slopes).max()))
 
 
-def test_the_evidence_in_place_is_infinite_where_the_matrix_is_not_positive_definite_and_recovers():
+def test_the_likelihood_in_place_is_infinite_where_the_matrix_is_not_positive_definite_and_recovers():
     x, y, theta = problem(30)
     x[1] = x[0]
-    evidence = InPlaceEvidence(x, y[:, 0])
-    value, gradient = evidence(np.append(theta[0][:-1], 40.0))
+    likelihood = NegativeLogMarginalLikelihood(x, y[:, 0], in_place=True)
+    value, gradient = likelihood(np.append(theta[0][:-1], 40.0))
     assert value == np.inf
     assert not gradient.any()
-    assert evidence(theta[0])[0] == pytest.approx(LogEvidence(x, y[:, 0])(theta[0])[0], rel=1e-10)
+    assert likelihood(theta[0])[0] == pytest.approx(
+        NegativeLogMarginalLikelihood(x, y[:, 0], in_place=False)(theta[0])[0], rel=1e-10
+    )
 
 
-def test_the_evidence_in_place_takes_one_matrix_and_a_few_blocks():
+def test_the_likelihood_in_place_takes_one_matrix_and_a_few_blocks():
     x, y, theta = problem(1500)
     tracemalloc.start()
-    InPlaceEvidence(x, y[:, 0])(theta[0])
+    NegativeLogMarginalLikelihood(x, y[:, 0], in_place=True)(theta[0])
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert 1.0 < peak / (8 * 1500**2) < 1.8

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
-from gpmpc.gp import Budget, GPPosterior, Transitions
-from gpmpc.gp.budget import information, least_informative
+from gpmpc.gp import GPPosterior, SlidingWindow, Transitions, append_transitions, remove_points
+from gpmpc.gp.online import _divergence, _noise_variances, least_informative
 from tests.gp.small_models import residual_model
 
 
@@ -45,9 +45,13 @@ def divergence_over_functions(one, other, points):
     return total
 
 
+def information(gp):
+    return _divergence(gp.precision.diagonal(dim1=-2, dim2=-1), gp.weights, _noise_variances(gp))
+
+
 def test_the_information_of_a_point_is_the_divergence_of_the_posteriors_with_and_without_it():
     gp = posterior(transitions(6))
-    expected = [divergence_over_functions(gp, gp.drop(i), gp.features) for i in range(6)]
+    expected = [divergence_over_functions(gp, remove_points(gp, i), gp.features) for i in range(6)]
     assert information(gp).tolist() == pytest.approx(expected, rel=1e-5)
 
 
@@ -57,22 +61,22 @@ def test_points_are_chosen_one_after_the_other_as_if_each_was_dropped():
     for chosen in least_informative(gp, 12):
         position = int(information(left).argmin())
         assert names.pop(position) == chosen
-        left = left.drop(position)
+        left = remove_points(left, position)
 
 
 def test_of_two_equal_points_one_is_the_first_to_go():
     data = transitions(20)
-    twice = posterior(data).condition_on(data[7:8])
+    twice = append_transitions(posterior(data), data[7:8])
     assert least_informative(twice, 1)[0] in (7, 20)
     assert least_informative(twice, 1, candidates=20) == [7]
 
 
 @pytest.mark.parametrize("rule", ["oldest", "least_informative"])
-def test_a_budget_is_held_and_what_just_came_stays(rule):
-    data, gp, budget = transitions(60), posterior(transitions(60)[:20]), Budget(30, rule)
+def test_a_window_is_held_and_what_just_came_stays(rule):
+    data, gp, window = transitions(60), posterior(transitions(60)[:20]), SlidingWindow(30, rule)
     for first in range(20, 60, 4):
         new = data[first : first + 4]
-        gp = budget(gp, new)
+        gp = window(gp, new)
         assert len(gp) == min(first + 4, 30)
         assert torch.equal(gp.features[-4:], new.features)
     fresh = posterior(Transitions(gp.features[:, :2], gp.features[:, 2:], gp.targets))
@@ -81,42 +85,44 @@ def test_a_budget_is_held_and_what_just_came_stays(rule):
 
 def test_the_oldest_points_go_first():
     data = transitions(30)
-    assert torch.equal(Budget(12)(posterior(data[:10]), data[10:]).features, data.features[18:])
+    assert torch.equal(SlidingWindow(12)(posterior(data[:10]), data[10:]).features, data.features[18:])
 
 
 def test_least_informative_points_are_a_better_loss_than_the_oldest():
     data, held_out = transitions(150), transitions(200, seed=1)
     errors = {}
     for rule in ("oldest", "least_informative"):
-        gp, budget = posterior(data[:40]), Budget(40, rule)
+        gp, window = posterior(data[:40]), SlidingWindow(40, rule)
         for i in range(40, 150):
-            gp = budget(gp, data[i : i + 1])
+            gp = window(gp, data[i : i + 1])
         off = gp.predict(held_out.states, held_out.inputs).mean - held_out.next_states
         errors[rule] = float((off / torch.tensor([1.0, 100.0])).square().mean().sqrt())
     assert errors["least_informative"] < 0.8 * errors["oldest"]
 
 
 @pytest.mark.parametrize("rule", ["oldest", "least_informative"])
-def test_a_batch_larger_than_the_budget_is_cut_and_the_log_says_so(rule, caplog):
+def test_a_batch_larger_than_the_window_is_cut_and_the_log_says_so(rule, caplog):
     data = transitions(30)
     with caplog.at_level(logging.WARNING, "gpmpc"):
-        gp = Budget(8, rule)(posterior(data[:10]), data[10:])
+        gp = SlidingWindow(8, rule)(posterior(data[:10]), data[10:])
     assert len(gp) == 8
-    assert "20 new points exceed the budget of 8" in caplog.text
+    assert "20 new points exceed the window of 8" in caplog.text
     assert all((data.features[10:] == row).all(1).any() for row in gp.features)
 
 
 def test_misuse_is_refused_with_the_rule():
     with pytest.raises(SettingError, match="points: must be a whole number, 1 or more; got 0"):
-        Budget(0)
+        SlidingWindow(0)
     with pytest.raises(SettingError, match="'oldest' or 'least_informative'; got 'random'"):
-        Budget(5, "random")
+        SlidingWindow(5, "random")
     with pytest.raises(ShapeError, match="2 states and 1 inputs; got transitions with 1 and 1"):
-        Budget(5)(posterior(transitions(3)), Transitions(torch.zeros(1, 1), torch.zeros(1, 1), torch.zeros(1, 1)))
+        SlidingWindow(5)(
+            posterior(transitions(3)), Transitions(torch.zeros(1, 1), torch.zeros(1, 1), torch.zeros(1, 1))
+        )
 
 
-def test_a_budget_of_another_model_says_what_takes_one():
-    with pytest.raises(UnsupportedModel, match="ResidualModel.condition_on takes one.; got ResidualModel"):
-        Budget(3)(residual_model(), transitions(2))
+def test_a_window_of_another_model_says_what_takes_one():
+    with pytest.raises(UnsupportedModel, match="ResidualModel.append takes one.; got ResidualModel"):
+        SlidingWindow(3)(residual_model(), transitions(2))
     with pytest.raises(SettingError, match=r"transitions: must be Transitions\(...\); got Tensor"):
-        Budget(3)(posterior(transitions(5)), torch.zeros(2, 3))
+        SlidingWindow(3)(posterior(transitions(5)), torch.zeros(2, 3))

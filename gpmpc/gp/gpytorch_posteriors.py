@@ -1,13 +1,12 @@
-"""Problem: predict from any exact GP that was trained in GPyTorch, whatever its kernel and mean.
+"""Posteriors of models that were trained in GPyTorch.
 
-``GPPosterior`` knows the SE-ARD kernel only. Here GPyTorch evaluates the prior (so sums, products, Matern, periodic
-kernels, any mean, and features of the inputs), and the rest is ours: one exact Cholesky factorisation of K + sn2 I, and
+``from_gpytorch`` freezes SE-ARD models to a ``GPPosterior``. ``KernelPosterior`` takes any kernel and mean: GPyTorch
+evaluates the prior, and the rest is one exact Cholesky factorisation of K + sn2 I and
 
     mean = m(x~) + k' (K + sn2 I)^-1 (y - m(X)),   variance = k(x~, x~) - |L^-1 k|^2
 
 (Rasmussen and Williams, 2006, Algorithm 2.1), because GPyTorch's own prediction turns to an iterative solver above 800
-points without a word, takes no leading batch dimensions of queries, and fails under ``torch.func``. Derivatives are
-those of plain torch autograd.
+points without a word, takes no leading batch dimensions of queries, and fails under ``torch.func``.
 """
 
 import copy
@@ -28,9 +27,82 @@ from gpmpc.dynamics import (
 )
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.kernel import PREDICTS
-from gpmpc.gp.model import exact_inference, members
-from gpmpc.gp.posterior import Predicts
+from gpmpc.gp.gpytorch_ import exact_inference, members
+from gpmpc.gp.kernel import PREDICTS, Hyperparameters, Predicts
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp.sparse import sparse_posterior
+
+
+def from_gpytorch(
+    model: Any, likelihood: Any = None, *, input_dim: int, predicts: Predicts = "next_state"
+) -> GPPosterior:
+    """Freezes trained SE-ARD ExactGPs of GPyTorch: one, a batch (one batch dimension, an output each), or a list.
+
+    A sparse one (``InducingPointKernel``) becomes its pseudo-observations; see ``gp.sparse``. Its method is the one by
+    which GPyTorch would predict: FITC, unless its setting ``sgpr_diagonal_correction`` is off. (Then its means are
+    those of SGPR; its variances lack kxx - qxx and vanish far from Z, ours do not.)
+
+    Args:
+        model: An ``ExactGP`` with a zero or constant mean and an ``RBFKernel``, scaled by a ``ScaleKernel`` or
+            not; an ``IndependentModelList``; or a sequence of models over the same inputs.
+        likelihood: Its ``GaussianLikelihood``, or a list of them; the models' own by default.
+        input_dim: m.
+        predicts: What the training targets mean.
+
+    Raises:
+        UnsupportedModel: The kernel, mean or likelihood is another one, or transforms are attached.
+        ShapeError: The models of a list have other training inputs or inducing points, or there is more than one batch
+            dimension.
+    """
+    rows: dict[str, list[Tensor]] = {}
+    first, inducing = None, []
+    for one, own in members(model, likelihood):
+        inputs, targets = one.train_inputs[0], one.train_targets
+        inputs = inputs[:, None] if inputs.dim() == 1 else inputs
+        if targets.dim() > 2:
+            raise ShapeError(f"a batch of models has one batch dimension; got targets {tuple(targets.shape)}")
+        outputs, shared = targets[None] if targets.dim() == 1 else targets, inputs.reshape(-1, *inputs.shape[-2:])
+        first = shared[0] if first is None else first
+        if any(each.shape != first.shape or not torch.equal(each, first) for each in shared):
+            raise ShapeError("all outputs must have the same training inputs (N, d); got different ones")
+        scale, kernel = 1.0, one.covar_module
+        if isinstance(kernel, gpytorch.kernels.InducingPointKernel) and kernel.active_dims is None:
+            inducing += kernel.inducing_points.detach().reshape(-1, *kernel.inducing_points.shape[-2:])
+            kernel = kernel.base_kernel
+        if isinstance(kernel, gpytorch.kernels.ScaleKernel):
+            scale, kernel = kernel.outputscale, kernel.base_kernel
+        if type(kernel) is not gpytorch.kernels.RBFKernel or kernel.active_dims is not None:
+            name = type(kernel).__name__ + (" on some dimensions" if kernel.active_dims is not None else "")
+            raise UnsupportedModel(
+                f"GPPosterior has the SE-ARD kernel: RBFKernel, in a ScaleKernel or not; got {name}. "
+                "KernelPosterior takes any kernel"
+            )
+        if isinstance(one.mean_module, gpytorch.means.ConstantMean):
+            constant = one.mean_module.constant
+        elif isinstance(one.mean_module, gpytorch.means.ZeroMean):
+            constant = torch.zeros((), dtype=torch.float64)
+        else:
+            raise UnsupportedModel(f"the mean must be zero or constant; got {type(one.mean_module).__name__}")
+        k, d = len(outputs), first.shape[1]
+        found = {
+            "targets": outputs,
+            "lengthscales": kernel.lengthscale.reshape(-1, kernel.lengthscale.shape[-1]).expand(k, d),
+            "signal_variance": torch.as_tensor(scale, dtype=torch.float64).reshape(-1).expand(k),
+            "noise_variance": own.noise.reshape(-1).expand(k),
+            "offset": constant.reshape(-1).expand(k),
+        }
+        for name, value in found.items():
+            rows.setdefault(name, []).append(value.detach().to(first.device))
+    joined = {name: torch.cat(values).clone() for name, values in rows.items()}
+    joined = {"inputs": first.detach().clone(), **joined, "targets": joined["targets"].T.contiguous()}
+    if not inducing:
+        return GPPosterior.from_hyperparameters(**joined, input_dim=input_dim, predicts=predicts)
+    if len(inducing) not in (1, joined["targets"].shape[1]) or any(not torch.equal(Z, inducing[0]) for Z in inducing):
+        raise ShapeError("all outputs must be sparse, with the same inducing points (M, d); got different ones")
+    method = "fitc" if gpytorch.settings.sgpr_diagonal_correction.on() else "sgpr"
+    kernel = Hyperparameters(*(joined[name] for name in Hyperparameters._fields))
+    data = joined["inputs"], joined["targets"]
+    return sparse_posterior(inducing[0].clone(), *data, kernel, input_dim, predicts, joined["offset"], method)
 
 
 @dataclass(frozen=True)
@@ -167,7 +239,7 @@ class _Part:
         if targets.dim() > 2:
             raise ShapeError(f"a batch of models has one batch dimension; got targets {tuple(targets.shape)}")
         if isinstance(getattr(model, "covar_module", None), gpytorch.kernels.InducingPointKernel):
-            raise UnsupportedModel("the model is sparse (InducingPointKernel): freeze it by GPPosterior.from_gpytorch")
+            raise UnsupportedModel("the model is sparse (InducingPointKernel): freeze it by from_gpytorch")
         copied = copy.deepcopy(model).eval().requires_grad_(False)
         copied.prediction_strategy = None
         batch, inputs = targets.shape[:-1], copied.train_inputs[0].detach()

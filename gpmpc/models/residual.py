@@ -1,4 +1,4 @@
-"""Problem: where part of the dynamics is known, only what it gets wrong has to be learned.
+"""Residual models: a known nominal model and GPs that learn its error.
 
     x[k+1] = f0(x[k], u[k]) + B d(x_s[k], u_s[k])
 
@@ -6,7 +6,7 @@ f0 is the nominal model, d a GP over a selection of the states and inputs, and B
 Kabzan and Zeilinger, 2020, eq. (3)).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,52 +25,15 @@ from gpmpc.dynamics import (
     tensors_for,
     to_array,
 )
-from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.gp.budget import Budget
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp.archive import existing_file, new_file
+from gpmpc.gp.online import SlidingWindow, append_points
+from gpmpc.gp.posterior import AffineForm, GPPosterior
+from gpmpc.gp.storage import posterior_of_parts, posterior_parts, read_model, write_model
 from gpmpc.gp.training import Trainer
 from gpmpc.gp.transitions import Transitions, check_transitions
-
-
-@dataclass(frozen=True)
-class Affine:
-    """A nominal model x+ = A x + B u + c, through which uncertainty goes exactly.
-
-    Attributes:
-        A: (n, n).
-        B: (n, m).
-        c: (n,).
-
-    Raises:
-        ShapeError: The shapes do not belong together.
-        SettingError: One of the three is no tensor.
-    """
-
-    A: Tensor
-    B: Tensor
-    c: Tensor
-
-    def __post_init__(self) -> None:
-        check_tensors(A=self.A, B=self.B, c=self.c)
-        shapes = [tuple(part.shape) for part in (self.A, self.B, self.c)]
-        n = len(self.A) if self.A.dim() else 0
-        if shapes[0] != (n, n) or self.B.dim() != 2 or len(self.B) != n or shapes[2] != (n,):
-            raise ShapeError(f"A, B and c must be (n, n), (n, m) and (n,); got {', '.join(map(str, shapes))}")
-
-    def __call__(self, state: Tensor, input: Tensor) -> Tensor:
-        """The nominal next state (*batch, n)."""
-        return state @ self.A.mT + input @ self.B.mT + self.c
-
-    def linearize(self, states: Array, inputs: Array) -> tuple[Array, Array, Array]:
-        """The nominal next states (K, n) and their constant derivatives (K, n, n) and (K, n, m)."""
-        A, B, c = self._arrays
-        K = len(states)
-        return states @ A.T + inputs @ B.T + c, np.tile(A, (K, 1, 1)), np.tile(B, (K, 1, 1))
-
-    @cached_property
-    def _arrays(self) -> tuple[Array, Array, Array]:
-        return to_array(self.A), to_array(self.B), to_array(self.c)
+from gpmpc.models.nominal import Affine
 
 
 @dataclass(frozen=True)
@@ -134,7 +97,7 @@ class ResidualModel:
         B: Tensor | None = None,
         states: Sequence[int] | None = None,
         inputs: Sequence[int] | None = None,
-        trainer: Trainer | None = None,
+        trainer: Any = None,
         seed: int = 0,
     ) -> "ResidualModel":
         """Learns d from transitions: the part of x[k+1] - f0(x[k], u[k]) that B reaches (least squares).
@@ -145,7 +108,7 @@ class ResidualModel:
             B: Where d acts (n, k); on every state by default.
             states: Which states d sees; all by default.
             inputs: Which inputs d sees; all by default.
-            trainer: How the GPs are trained; what they learn is no difference, so it must not ask for one.
+            trainer: A ``Trainer`` or ``SparseTrainer`` that does not learn differences.
             seed: Of the random starts.
 
         Raises:
@@ -169,12 +132,12 @@ class ResidualModel:
         if int(torch.linalg.matrix_rank(B)) < B.shape[1]:
             raise SettingError("B", "must have linearly independent columns: what acts alike cannot be told apart")
         _check_chosen(states, n, inputs, m)
-        features, targets = _learned(nominal, B, states, inputs, transitions)
+        features, targets = _residuals(nominal, B, states, inputs, transitions)
         training = trainer.fit(features, targets, len(inputs), "value", seed)
         return cls(nominal, training.posterior, B, states, inputs, m)
 
-    def condition_on(self, transitions: Transitions, budget: Budget | None = None) -> "ResidualModel":
-        """The model whose residual GP has seen more transitions, held to a number of points if a budget is given.
+    def append(self, transitions: Transitions, window: SlidingWindow | None = None) -> "ResidualModel":
+        """Appends transitions to the data of the residual GP, held to a number of points where a window is given.
 
         Raises:
             ShapeError: The transitions have other dimensions.
@@ -184,9 +147,9 @@ class ResidualModel:
                 f"the model has {self.state_dim} states and {self.input_dim} inputs; "
                 f"got transitions with {transitions.state_dim} and {transitions.input_dim}"
             )
-        seen = _learned(self.nominal, self.B, self.states, self.inputs, transitions)
-        residual = budget.condition(self.residual, *seen) if budget else self.residual.condition_on_targets(*seen)
-        return replace(self, residual=residual)
+        points = _residuals(self.nominal, self.B, self.states, self.inputs, transitions)
+        add = append_points if window is None else window.append
+        return replace(self, residual=add(self.residual, *points))
 
     @property
     def state_dim(self) -> int:
@@ -217,7 +180,7 @@ class ResidualModel:
         """The next state's distribution at a certain state and input: mean (*batch, n), covariance (*batch, n, n)."""
         input = state[..., :0] if input is None else input
         check_query(self, state, input)
-        d = self.residual.predict(*self.selected(state, input))
+        d = self.residual.predict(state[..., list(self.states)], input[..., list(self.inputs)])
         return self._combined(_nominal(self.nominal, state, input), d)
 
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
@@ -257,19 +220,24 @@ class ResidualModel:
         """``predict``, and its mean's derivatives by the state (*batch, n, n) and by the input (*batch, n, m)."""
         input = state[..., :0] if input is None else input
         check_query(self, state, input)
-        d, by_state, by_input = self.residual.predict_with_jacobian(*self.selected(state, input))
+        states, inputs = list(self.states), list(self.inputs)
+        d, by_state, by_input = self.residual.predict_with_jacobian(state[..., states], input[..., inputs])
         if isinstance(self.nominal, Affine):
             nominal, A, G = self.nominal(state, input), self.nominal.A, self.nominal.B
             A, G = A.expand(*state.shape[:-1], *A.shape), G.expand(*state.shape[:-1], *G.shape)
         else:
             (nominal,), (A, G) = batched_jacobian(lambda x, u: (_nominal(self.nominal, x, u),), (state, input))
-        A = A.index_add(-1, self._index(self.states), self.B @ by_state)
-        G = G.index_add(-1, self._index(self.inputs), self.B @ by_input)
+        places = [torch.tensor(chosen, dtype=torch.long, device=self.device) for chosen in (states, inputs)]
+        A, G = A.index_add(-1, places[0], self.B @ by_state), G.index_add(-1, places[1], self.B @ by_input)
         return self._combined(nominal, d), A, G
 
-    def selected(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
-        """What the residual sees of x (*batch, n) and u (*batch, m)."""
-        return state[..., list(self.states)], input[..., list(self.inputs)]
+    @property
+    def affine_form(self) -> AffineForm | None:
+        """The model as moments are composed of it; None where the nominal model is not ``Affine``."""
+        nominal = self.nominal
+        if not isinstance(nominal, Affine):
+            return None
+        return AffineForm(self.residual, nominal.A, nominal.B, nominal.c, self.B, list(self.states), list(self.inputs))
 
     def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "ResidualModel":
         """The same on another device or in another type; a nominal that is no ``Affine`` is taken as it is."""
@@ -280,32 +248,57 @@ class ResidualModel:
         residual, B = self.residual.to(device, dtype), self.B.to(device=device, dtype=dtype)
         return ResidualModel(nominal, residual, B, self.states, self.inputs, self.input_dim)
 
-    def save(self, path: str | Path) -> None:
-        """Writes one file without pickle, in one piece or not at all; see ``gpmpc.gp.storage``.
-
-        Raises:
-            UnsupportedModel: The nominal model is no ``Affine`` one.
-        """
-        from gpmpc.gp.storage import save_residual_model  # which knows this class
-
-        save_residual_model(self, path)
-
-    @classmethod
-    def load(cls, path: str | Path) -> "ResidualModel":
-        """Reads what ``save`` wrote; the predictions are the same, bit by bit.
-
-        Raises:
-            DataError: The file is missing, damaged, of another kind or of a newer format.
-        """
-        from gpmpc.gp.storage import load_residual_model
-
-        return load_residual_model(path)
-
     def _combined(self, nominal: Tensor, d: Gaussian) -> Gaussian:
         return Gaussian(nominal + d.mean @ self.B.mT, self.B @ d.covariance @ self.B.mT)
 
-    def _index(self, chosen: Sequence[int]) -> Tensor:
-        return torch.tensor(list(chosen), dtype=torch.long, device=self.device)
+
+def save_residual_model(model: ResidualModel, path: str | Path, metadata: Mapping[str, Any] | None = None) -> None:
+    """Writes a residual model of an ``Affine`` nominal model to one file, in one piece or not at all.
+
+    Args:
+        model: On any device; float64 or float32.
+        path: The file; ``.safetensors`` by convention.
+        metadata: Kept in the header, such as names and units; what JSON can hold.
+
+    Raises:
+        UnsupportedModel: The nominal model is code, which a file of numbers cannot hold.
+        SettingError: A tensor is neither float64 nor float32, or the metadata are no JSON.
+        DataError: The folder does not exist.
+    """
+    path = new_file(path)
+    if not isinstance(model.nominal, Affine):
+        raise UnsupportedModel(
+            f"only an Affine nominal model is numbers and can be saved; got {type(model.nominal).__name__}. Save the "
+            "part that was learned (save_posterior(model.residual, ...)) and give ResidualModel the nominal model again"
+        )
+    header: dict[str, Any] = {
+        "input_dim": model.input_dim,
+        "states": [int(i) for i in model.states],
+        "inputs": [int(i) for i in model.inputs],
+    }
+    header["residual"], residual = posterior_parts(path, model.residual)
+    tensors = {"B": model.B, **{f"nominal/{name}": getattr(model.nominal, name) for name in ("A", "B", "c")}}
+    tensors |= {f"residual/{name}": value for name, value in residual.items()}
+    write_model(path, "ResidualModel", header, tensors, metadata)
+
+
+def load_residual_model(path: str | Path) -> ResidualModel:
+    """Reads a file of ``save_residual_model``, into host memory.
+
+    Raises:
+        DataError: The file is missing, damaged, of another kind or of a newer format.
+    """
+    path = existing_file(path, "a saved ResidualModel")
+    header, tensors = read_model(path, "ResidualModel")
+    residual = {name.partition("/")[2]: value for name, value in tensors.items() if name.startswith("residual/")}
+    gp = posterior_of_parts(path, header.get("residual"), residual)
+    try:
+        B, *nominal = (tensors[name] for name in ("B", "nominal/A", "nominal/B", "nominal/c"))
+        if not all(bool(torch.isfinite(part).all()) for part in (B, *nominal)):
+            raise DataError("B and the nominal model must be finite")
+        return ResidualModel(Affine(*nominal), gp, B, header["states"], header["inputs"], header["input_dim"])
+    except (GpmpcError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: not a consistent residual model ({error})") from error
 
 
 def _check_chosen(states: Sequence[int], n: int, inputs: Sequence[int], m: int) -> None:
@@ -327,14 +320,14 @@ def _nominal(nominal: Callable[[Tensor, Tensor], Tensor], state: Tensor, input: 
     return value
 
 
-def _learned(
+def _residuals(
     nominal: Callable[[Tensor, Tensor], Tensor],
     B: Tensor,
     states: Sequence[int],
     inputs: Sequence[int],
     transitions: Transitions,
 ) -> tuple[Tensor, Tensor]:
-    """What d sees and is to be, of N transitions: the features, and the least-squares part of what f0 missed (N, k)."""
+    """Features (N, d) and targets (N, k) of the residual GP: the least-squares part of the error of f0."""
     to_B = {"device": B.device, "dtype": B.dtype}
     x, u, after = (t.to(**to_B) for t in (transitions.states, transitions.inputs, transitions.next_states))
     targets = torch.linalg.lstsq(B, (after - _nominal(nominal, x, u)).mT).solution.mT

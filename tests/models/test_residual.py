@@ -5,7 +5,8 @@ import torch
 
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import Affine, Budget, GPPosterior, ResidualModel, SparseTrainer, Trainer, Transitions
+from gpmpc.gp import GPPosterior, SlidingWindow, SparseTrainer, Trainer, Transitions
+from gpmpc.models import Affine, ResidualModel
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented
 
 A = torch.tensor([[1.0, 0.1, 0.0], [0.0, 0.9, 0.1], [0.2, 0.0, 0.8]])
@@ -118,16 +119,16 @@ def test_by_default_every_state_has_a_residual_of_all_states_and_inputs():
 def test_a_residual_model_learns_while_it_runs():
     data = transitions(60)
     known = ResidualModel.train(AFFINE, data[:20], ACTS, states=[0], inputs=[], trainer=Trainer(restarts=0))
-    grown = known.condition_on(data[20:])
+    grown = known.append(data[20:])
     assert len(grown.residual) == 60
     x, u = transitions(20, seed=1).states, transitions(20, seed=1).inputs
     assert (grown.predict(x, u).covariance[:, 2, 2] < known.predict(x, u).covariance[:, 2, 2]).all()
     held = known
     for i in range(20, 60):
-        held = held.condition_on(data[i : i + 1], Budget(25, "least_informative"))
+        held = held.append(data[i : i + 1], SlidingWindow(25, "least_informative"))
     assert len(held.residual) == 25
     with pytest.raises(ShapeError, match="3 states and 2 inputs; got transitions with 3 and 1"):
-        known.condition_on(Transitions(torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1, 3)))
+        known.append(Transitions(torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1, 3)))
 
 
 def test_a_residual_model_can_be_moved_to_single_precision():

@@ -1,0 +1,64 @@
+"""The choice between compiled loops and torch, in which the closed forms of a posterior both exist.
+
+The loops of ``gpmpc.kernels`` are many times faster, on one thread, for float64 numbers in host memory. Torch evaluates
+everything else: other devices and types, and whatever autograd or a function transform follows. The two give the same
+numbers; ``backend`` forces one of them.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Literal
+
+import numpy as np
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from gpmpc.exceptions import SettingError
+
+Backend = Literal["auto", "compiled", "torch"]
+
+_chosen: ContextVar[Backend] = ContextVar("backend", default="auto")
+
+
+@contextmanager
+def backend(choice: Backend) -> Iterator[None]:
+    """Forces ``"compiled"`` or ``"torch"`` within a ``with`` block; ``"auto"`` leaves the choice to each call.
+
+    Raises:
+        SettingError: Another word; within the block, ``"compiled"`` where only torch can evaluate.
+    """
+    if choice not in ("auto", "compiled", "torch"):
+        raise SettingError("backend", f"must be 'auto', 'compiled' or 'torch'; got {choice!r}")
+    token = _chosen.set(choice)
+    try:
+        yield
+    finally:
+        _chosen.reset(token)
+
+
+def chosen_backend() -> Backend:
+    """The choice of ``backend`` that is in force."""
+    return _chosen.get()
+
+
+def host_arrays(*tensors: Tensor) -> list[np.ndarray] | None:
+    """Returns the tensors as arrays for the compiled loops; None where torch has to evaluate."""
+    choice = _chosen.get()
+    if choice == "torch":
+        return None
+    reason = ""
+    try:
+        arrays = [tensor.numpy() for tensor in tensors]
+    except (RuntimeError, TypeError):
+        reason = "a tensor is on another device, part of a graph, or inside a function transform"
+    else:
+        if any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors):
+            reason = "forward-mode differentiation is under way"
+        elif any(array.dtype != np.float64 for array in arrays):
+            reason = "a tensor is not float64"
+    if not reason:
+        return arrays
+    if choice == "compiled":
+        raise SettingError("backend", f"the compiled loops cannot evaluate this: {reason}")
+    return None

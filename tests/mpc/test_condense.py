@@ -1,0 +1,208 @@
+"""Condensing against the matrices of the stacked problem, the paper's formulas, and itself in other coordinates."""
+
+import numpy as np
+import pytest
+
+from gpmpc.exceptions import ShapeError
+from gpmpc.mpc.condense import Condenser, StateRows, condense_with_feedback
+from gpmpc.mpc.linear_quadratic import References, Stages, expand, tracking_cost
+from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.qp import DualActiveSet, SoftRows
+from gpmpc.status import Status
+
+PENALIZED = ("inputs", "deviations", "increments")
+
+
+def spd(rng, n):
+    root = rng.normal(size=(n, n))
+    return root @ root.T + 0.1 * np.eye(n)
+
+
+def random_stages(rng, p, m, H, held):
+    K = 1 if held else H
+    return Stages(rng.normal(size=(K, p, p)) / np.sqrt(p), rng.normal(size=(K, p, m)), rng.normal(size=(K, p)))
+
+
+def random_references(rng, H, n, m):
+    return References(rng.normal(size=(H, n)), rng.normal(size=(H, m)), 0.1 * rng.normal(size=m))
+
+
+def weights(blocks, *matrices):
+    return [np.tile(matrix, (blocks, 1, 1)) for matrix in matrices]
+
+
+def no_rows(p, H):
+    return StateRows(np.zeros((1, 0, p)), np.empty((H, 0)), np.empty((H, 0)))
+
+
+def at(array, k):
+    return array[min(k, len(array) - 1)]
+
+
+def stacked_response(stages, start, H):
+    """Gamma (H, p, H, m) and s^0 (H, p), a product at a time."""
+    p, m = stages.B.shape[1:]
+    gamma, free, s = np.zeros((H, p, H, m)), np.zeros((H, p)), start
+    for k in range(H):
+        free[k] = s = at(stages.A, k) @ s + at(stages.c, k)
+        if k:
+            gamma[k] = np.tensordot(at(stages.A, k), gamma[k - 1], 1)
+        gamma[k, :, k, :] += at(stages.B, k)
+    return gamma, free
+
+
+@pytest.mark.parametrize("terminal", ["own", "the same"])
+def test_constant_stages_are_stages_that_vary_and_do_not(terminal, rng):
+    n, m, r, blocks, H = 3, 2, 2, 4, 9
+    Q, R = spd(rng, n), spd(rng, m)
+    T = spd(rng, n) if terminal == "own" else Q
+    condenser = Condenser(TrackingProblem(Q, R, terminal=T), H, *weights(blocks, Q, T))
+    stages, start = random_stages(rng, n * blocks, m, H, held=True), rng.normal(size=n * blocks)
+    references = random_references(rng, H, n, m)
+    rows = StateRows(rng.normal(size=(1, r, n * blocks)), -np.ones((H, r)), np.ones((H, r)))
+    repeated = Stages(*(np.repeat(part, H, axis=0) for part in stages))
+    held = condenser.condense(stages, start, references, rows)
+    varying = condenser.condense(repeated, start, references, rows._replace(E=np.repeat(rows.E, H, axis=0)))
+    for one, other in zip(held[:5], varying[:5], strict=True):
+        assert np.allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(other[np.isfinite(other)]).max(initial=0.0))
+
+
+@pytest.mark.parametrize("H", [1, 2, 7])
+@pytest.mark.parametrize("blocks", [1, 2, 4])
+@pytest.mark.parametrize("held", [True, False], ids=["held", "varying"])
+@pytest.mark.parametrize("penalized", PENALIZED)
+def test_the_condensed_problem_is_the_stacked_one(H, blocks, held, penalized, rng):
+    n, m, r, p = 3, 2, 4, 3 * blocks
+    Q, T, R = spd(rng, n), spd(rng, n), spd(rng, m)
+    problem = TrackingProblem(Q, R, penalized, T, rate_lower=[-1.0, -2.0], rate_upper=[1.0, np.inf])
+    condenser = Condenser(problem, H, *weights(blocks, Q, T))
+    stages, start, references = random_stages(rng, p, m, H, held), rng.normal(size=p), random_references(rng, H, n, m)
+    rows = StateRows(rng.normal(size=(len(stages.A), r, p)), np.zeros((H, r)), np.ones((H, r)))
+    targets, wanted, last = references
+    P, q, G, lower, upper, feedback = condenser.condense(stages, start, references, rows)
+
+    gamma, free = stacked_response(stages, start, H)
+    gamma = gamma.reshape(-1, H * m)
+    reference = np.zeros_like(free)
+    reference[:, :n] = targets
+    weight = np.kron(np.eye(H * blocks), Q)
+    weight[-p:, -p:] = np.kron(np.eye(blocks), T)
+    D = np.eye(H * m) - np.eye(H * m, k=-m)
+    first = np.concatenate([last, np.zeros((H - 1) * m)])
+    T_u, centre = {
+        "inputs": (np.eye(H * m), np.zeros(H * m)),
+        "deviations": (np.eye(H * m), wanted.ravel()),
+        "increments": (D, first),
+    }[penalized]
+    stacked_R = np.kron(np.eye(H), R)
+    E = np.zeros((H * r, H * p))
+    for k in range(H):
+        E[k * r : (k + 1) * r, k * p : (k + 1) * p] = at(rows.E, k)
+    assert np.allclose(P, 2 * (gamma.T @ weight @ gamma + T_u.T @ stacked_R @ T_u), rtol=1e-12, atol=1e-11)
+    gradient = gamma.T @ weight @ (free - reference).ravel() - T_u.T @ stacked_R @ centre
+    assert np.allclose(q, 2 * gradient, rtol=1e-12, atol=1e-11)
+    assert np.allclose(G, np.vstack([D, E @ gamma]), atol=1e-12)
+    assert np.array_equal(P, P.T)
+    assert np.linalg.eigvalsh(P)[0] > 0
+    assert np.allclose(upper[-H * r :] - lower[-H * r :], 1.0)
+    assert np.allclose(lower[-H * r :], -E @ free.ravel(), atol=1e-12)
+    assert lower[H * m : H * m + m] == pytest.approx([last[0] - 1, last[1] - 2])
+    assert upper[H * m] == pytest.approx(last[0] + 1)
+    assert len(lower) == len(upper) == H * m + len(G)
+
+    unknowns = rng.normal(size=H * m)
+    inputs, states = expand(stages, start, feedback, last, unknowns)
+    assert np.array_equal(inputs.ravel(), unknowns)
+    assert np.allclose(states[1:].ravel(), gamma @ unknowns + free.ravel(), atol=1e-12)
+    rest, at_rest = expand(stages, start, feedback, last, np.zeros(H * m))
+    difference = tracking_cost(condenser.cost, states, inputs, references)
+    difference -= tracking_cost(condenser.cost, at_rest, rest, references)
+    assert difference == pytest.approx(unknowns @ P @ unknowns / 2 + q @ unknowns, rel=1e-10, abs=1e-9)
+
+
+def test_in_increments_it_is_the_papers_problem(rng):
+    """Cao, Lai and Alam (2017), (38)-(39) with the missing factor 2, on s = [mu; vec S] of three states."""
+    n, m, H = 3, 2, 5
+    p = n + n * n
+    Q, R = spd(rng, n), spd(rng, m)
+    A, B, _ = random_stages(rng, p, m, H, held=True)
+    A[0, :, n:] = 0.0  # as at a measured state
+    s0, before, last = rng.normal(size=p), rng.normal(size=p), rng.normal(size=m)
+    targets = rng.normal(size=(H, n))
+    condenser = Condenser(TrackingProblem(Q, R), H, *weights(n + 1, Q, Q))
+    c = s0 - A[0] @ before - B[0] @ last
+    references = References(targets, np.zeros((H, m)), last)
+    P, q, *_ = condenser.condense(Stages(A, B, c[None]), s0, references, no_rows(p, H))
+
+    Qbar = np.zeros((p, p))
+    Qbar[:n, :n], Qbar[n:, n:] = Q, np.kron(np.eye(n), Q)
+    powers = [np.linalg.matrix_power(A[0], k) for k in range(H + 1)]
+    A_tilde = np.vstack(powers[1:])
+    zeros = np.zeros((p, m))
+    B_tilde = np.block([[powers[i - j] @ B[0] if i >= j else zeros for j in range(H)] for i in range(H)])
+    T_z, T_u = np.kron(np.tri(H), np.eye(p)), np.kron(np.tri(H), np.eye(m))
+    Q_tilde, R_tilde = np.kron(np.eye(H), Qbar), np.kron(np.eye(H), R)
+    r = np.zeros((H, p))
+    r[:, :n] = targets
+    paper_P = 2 * (B_tilde.T @ T_z.T @ Q_tilde @ T_z @ B_tilde + T_u.T @ R_tilde @ T_u)
+    offset = np.tile(s0, H) + T_z @ A_tilde @ (s0 - before) - r.ravel()
+    paper_q = 2 * (B_tilde.T @ T_z.T @ Q_tilde @ offset + T_u.T @ R_tilde @ np.tile(last, H))
+    increments = np.linalg.solve(paper_P, -paper_q)
+    assert np.allclose(T_u.T @ P @ T_u, paper_P, rtol=1e-11, atol=1e-10)
+    assert np.allclose(np.linalg.solve(P, -q), np.tile(last, H) + T_u @ increments, atol=1e-9)
+
+
+@pytest.mark.parametrize("rated", [True, False], ids=["rates", "no rates"])
+@pytest.mark.parametrize("held", [True, False], ids=["held", "varying"])
+@pytest.mark.parametrize("penalized", PENALIZED)
+def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
+    n, m, r, blocks, H = 3, 2, 2, 2, 8
+    p, solver = n * blocks, DualActiveSet()
+    Q, T, R = spd(rng, n), spd(rng, n), spd(rng, m)
+    rates = {"rate_lower": [-0.4, -0.3], "rate_upper": [0.4, np.inf]} if rated else {}
+    problem = TrackingProblem(Q, R, penalized, T, input_lower=[-0.5, -0.3], input_upper=[np.inf, 0.4], **rates)
+    condenser = Condenser(problem, H, *weights(blocks, Q, T))
+    stages, start, references = random_stages(rng, p, m, H, held), rng.normal(size=p), random_references(rng, H, n, m)
+    rows = StateRows(rng.normal(size=(len(stages.A), r, p)), np.full((H, r), -3.0), np.full((H, r), 4.0))
+    price = np.full(H * r, 2.0)
+    found, plain = [], condenser.condense(stages, start, references, rows)
+    assert len(plain.feedback) == 0
+    other = condense_with_feedback(condenser.cost, condenser.bounds, stages, start, references, rows)
+    for program in (plain, other):
+        soft = SoftRows(np.concatenate([np.full(len(program.G) - H * r, np.inf), price]))
+        solution = solver.solve_stacked(*program[:5], soft=soft)
+        assert solution.status is Status.SOLVED
+        inputs, states = expand(stages, start, program.feedback, references.previous_input, solution.x)
+        z = solution.multipliers[-(len(problem.input_lower) * H * (2 if rated else 1) + H * r) :]
+        found.append((inputs, states, z))
+    assert np.count_nonzero(found[0][2]) > 3
+    for one, same in zip(*found, strict=True):
+        assert np.allclose(one, same, rtol=0, atol=1e-8)
+    assert len(other.feedback) == H
+    assert np.array_equal(other.P * np.kron(np.eye(H), np.ones((m, m))), other.P)
+    assert not other.q.any()
+
+
+def test_an_unstable_plant_is_condensed_in_feedback_coordinates_and_the_plan_is_found(rng):
+    """x+ = 2 x + u over 50 stages: 2^100 stands beside R in P, and nothing of R is left."""
+    H, cost = 50, TrackingProblem([1.0], [1.0], input_lower=[-3.0], input_upper=[3.0])
+    condenser = Condenser(cost, H, *weights(1, cost.Q, cost.terminal))
+    stages = Stages(np.array([[[2.0]]]), np.array([[[1.0]]]), np.zeros((1, 1)))
+    references = References(np.zeros((H, 1)), np.zeros((H, 1)), np.zeros(1))
+    program = condenser.condense(stages, np.array([2.5]), references, no_rows(1, H))
+    assert len(program.feedback) == H
+    solution = DualActiveSet().solve_stacked(*program[:5])
+    inputs, states = expand(stages, np.array([2.5]), program.feedback, references.previous_input, solution.x)
+    assert solution.status is Status.SOLVED
+    assert inputs.min() == pytest.approx(-3.0, abs=1e-9)
+    assert np.abs(states[-20:]).max() < 1e-6
+    assert np.allclose(states[1:], 2 * states[:-1] + inputs, atol=1e-12)
+
+
+def test_arrays_that_are_not_contiguous_are_refused(rng):
+    condenser = Condenser(TrackingProblem([1.0, 1.0], [1.0]), 3, *weights(1, np.eye(2), np.eye(2)))
+    stages = random_stages(rng, 2, 1, 3, held=False)
+    with pytest.raises(ShapeError, match="contiguous"):
+        condenser.condense(
+            stages._replace(A=stages.A.swapaxes(1, 2)), np.zeros(2), random_references(rng, 3, 2, 1), no_rows(2, 3)
+        )
