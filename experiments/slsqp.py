@@ -30,7 +30,6 @@ from gpmpc.status import Status
 Array = np.ndarray
 
 ROUNDS = 8  # restarts with a fresh scaling
-INCOMPATIBLE = 4  # SciPy's word for constraints that contradict each other
 FEASIBLE = 1e-6  # violation of a margin, in its unit
 
 
@@ -155,13 +154,17 @@ class SLSQP:
             last, result = found, self._round(found, T, scale, lower, upper, request, self.iterations - used)
             found = self.evaluate((last.plan + T @ result.x).clip(lower, upper), request)
             used += int(result.nit)
-            if result.status == INCOMPATIBLE:
-                return found, Status.INFEASIBLE, used
-            if abs(last.cost - found.cost) <= self.tolerance**2 * scale and (found.margins <= FEASIBLE).all():
+            settled = abs(last.cost - found.cost) <= self.tolerance**2 * scale
+            if settled and (found.margins <= FEASIBLE).all() and self._keeps_rates(found.plan, request):
                 return found, Status.SOLVED, used
             if used >= self.iterations:
                 return min(found, last, key=_rank), Status.ITERATION_LIMIT, used
-        return found, Status.INFEASIBLE if (found.margins > FEASIBLE).any() else Status.NUMERICAL_TROUBLE, used
+        kept = (found.margins <= FEASIBLE).all() and self._keeps_rates(found.plan, request)
+        return found, Status.NUMERICAL_TROUBLE if kept else Status.INFEASIBLE, used
+
+    def _keeps_rates(self, plan: Array, request: Request) -> bool:
+        rates = (self._differences @ plan - self._first(request.last)).reshape(self.horizon, -1)
+        return bool((np.maximum(rates - self.problem.rate_upper, self.problem.rate_lower - rates) <= FEASIBLE).all())
 
     def _round(
         self, start: Evaluation, T: Array, scale: float, lower: Array, upper: Array, request: Request, limit: int

@@ -54,12 +54,14 @@ class ChanceConstraints:
         moves = covariance == "full" and self.per_stage > 0
         self._constant = None if moves else self._rows(np.zeros((1, state_dim, state_dim)))
 
-    def at(self, covariances: Array) -> StateRows:
-        """The rows, tightened, at covariances of the states Sigma_0 .. Sigma_H (H + 1, n, n)."""
+    def at(self, covariances: Array, stages: int) -> StateRows:
+        """The rows, tightened, at covariances of the states Sigma_0 .. Sigma_H (H + 1, n, n), of H stages or one."""
         lower, upper = np.empty((2, self._horizon, len(self._bound)))
         if len(self._bound):
             _tighten(self._state, self._sign, self._bound, self._margin, covariances, lower, upper)
-        return StateRows(self._rows(covariances[1:]) if self._constant is None else self._constant, lower, upper)
+        return StateRows(
+            self._rows(covariances[1 : stages + 1]) if self._constant is None else self._constant, lower, upper
+        )
 
     def softness(self, hard_rows: int) -> SoftRows | None:
         """The prices of all rows of a program's G, after ``hard_rows`` that have none; None where all are hard."""

@@ -199,7 +199,7 @@ class PredictionModel:
             covariances[0] = request.covariance
         if self.form == "velocity" and previous is not None and previous.applicable:
             stages = self._increments(plan, stages, request, previous)
-        return Prediction(plan, stages, covariances, self.constraints.at(covariances))
+        return Prediction(plan, stages, covariances, self.constraints.at(covariances, self.points))
 
     def _increments(
         self, plan: Plan, stages: LinearizedStages, request: Request, previous: Decision
@@ -212,8 +212,8 @@ class PredictionModel:
             c[n:] = stages.c[0, n:]
         return stages._replace(c=c[None])
 
-    def roll_out(self, towards: Plan, prediction: Prediction, feedback: Array, request: Request) -> Plan:
-        """The plan that obeys the dynamics under the feedback towards another one, within box and rates.
+    def roll_out(self, towards: Plan, prediction: Prediction, feedback: Array, request: Request) -> Prediction:
+        """The prediction at the plan that obeys the dynamics under a feedback towards another one, within its bounds.
 
         Args:
             towards: Whose states are followed.
@@ -221,7 +221,7 @@ class PredictionModel:
             feedback: Of the program, F_k (H, m, p + m + 1), or nothing (0, m, p + m + 1).
             request: Of the step.
         """
-        problem, n = self.problem, self.problem.state_dim
+        problem, n, parts = self.problem, self.problem.state_dim, []
         gains = np.broadcast_to(-self.gain(prediction.stages), (self.horizon, problem.input_dim, n))
         gains = feedback[:, :, :n] if len(feedback) else gains
         states, inputs, covariances = (part.copy() for part in towards)
@@ -230,10 +230,12 @@ class PredictionModel:
             input = towards.inputs[k] + gains[k] @ (states[k, :n] - towards.states[k, :n])
             input = np.clip(input, last + problem.rate_lower, last + problem.rate_upper)
             last = inputs[k] = np.clip(input, problem.input_lower, problem.input_upper)
-            after = self.linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance).next
-            states[k + 1] = after[0]
-            covariances[k + 1] = self.linearizer.moments(after, covariances[k + 1 : k + 2])[1][0]
-        return Plan(states, inputs, covariances)
+            stage = self.linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance)
+            states[k + 1] = stage.next[0]
+            covariances[k + 1] = self.linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
+            parts.append(stage)
+        stages = LinearizedStages(*map(np.concatenate, zip(*parts, strict=True)))
+        return self.predict(Plan(states, inputs, covariances), stages, request)
 
     def gain(self, stages: LinearizedStages) -> Array:
         """K (m, n) of the feedback u = u_k - K (x - mu_k); zero without feedback."""

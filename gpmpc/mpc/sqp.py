@@ -144,11 +144,16 @@ class Globalization:
         return at, Status.NUMERICAL_TROUBLE
 
     def _candidates(self, at: Prediction, towards: Plan, feedback: Array) -> Iterator[Prediction]:
-        """Predictions at a plan, and at the plan that obeys the dynamics under the feedback towards it."""
-        for rolled_out in (False, True) if self._model.feedback else (False,):
+        """Predictions at a plan, and at the plan that obeys the dynamics under the feedback towards it.
+
+        Linearised moments overshoot, so where they are part of the state the second comes first.
+        """
+        for rolled_out in (False, True) if self._model.linearizer.at_points else (True, False):
             try:
-                plan = self._model.roll_out(towards, at, feedback, self._request) if rolled_out else towards
-                yield self._model.linearize(self._model.canonical(plan), self._request)
+                if rolled_out:
+                    yield self._model.roll_out(towards, at, feedback, self._request)
+                else:
+                    yield self._model.linearize(self._model.canonical(towards), self._request)
             except FAILURES:  # a trial plan may lead the model out of its numbers
                 continue
 

@@ -23,7 +23,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.prediction import Form, Prediction, PredictionModel
 from gpmpc.mpc.request import Request
-from gpmpc.mpc.sqp import FEASIBLE
+from gpmpc.mpc.sqp import FAILURES, FEASIBLE
 from gpmpc.mpc.stages import Covariance
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Propagator
@@ -86,10 +86,12 @@ class StateFormMPC:
         try:
             plan = self.prediction.initial_guess(request, previous)
             prediction = self.prediction.linearize(plan, request, previous)
-            modelled = perf_counter()
-            self._program.set(prediction, request)
-        except (DataError, ValueError):  # the stages are not finite, which CVXPY's Parameters do not take
+            if not all(np.isfinite(part).all() for part in prediction.stages):
+                raise DataError("the stages are not finite")
+        except FAILURES:
             return request.unanswered(Status.NUMERICAL_TROUBLE, timing=Timing(perf_counter() - began, 0.0, 0.0))
+        modelled = perf_counter()
+        self._program.set(prediction, request)
         built, program = perf_counter(), self._program.problem
         try:
             with warnings.catch_warnings():  # that a solution is inaccurate is said by its status

@@ -42,10 +42,9 @@ def nmpc(monkeypatch):
 STOPPED = {
     "two programs": lambda _: convex(iterations=2, tolerance=1e-12),
     "five programs": lambda _: convex(iterations=5, tolerance=1e-12),
-    "no step lowers the cost": lambda _: convex(iterations=50, tolerance=1e-300),
     "two, of the whole belief": lambda _: convex(iterations=2, tolerance=1e-12, covariance="diagonal"),
     "two, of another solver": lambda _: convex(iterations=2, tolerance=1e-12, solver=PrimalActiveSet()),
-    "a primal solver": lambda _: convex(solver=PrimalActiveSet(iteration_limit=2)),
+    "a primal solver": lambda _: convex(solver=PrimalActiveSet(iteration_limit=3)),
     "a state form": lambda _: StateFormMPC(GP, Linearization(), PROBLEM, H, HOVER, options={"max_iter": 3}),
     "nonlinear": lambda _: NonlinearGPMPC(GP, Linearization(), PROBLEM, H, HOVER, iterations=2, tolerance=1e-9),
     "slsqp": lambda _: SLSQP(GP, Linearization(), PROBLEM, 4, HOVER, iterations=3, tolerance=1e-9),
