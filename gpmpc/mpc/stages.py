@@ -80,7 +80,7 @@ class StageLinearizer:
         self.model, self.propagator, self.covariance, self._n = model, propagator, covariance, model.state_dim
         first_order = getattr(propagator, "first_order", False)
         self.at_points = covariance == "none" or (covariance == "zero_order" and first_order)
-        noisy = covariance == "zero_order" and getattr(propagator, "observation_noise", False)
+        noisy = covariance == "zero_order" and getattr(propagator, "process_noise", False)
         self._noise = to_array(model.noise_covariance) if noisy else None
         moments = {"full": self._full, "diagonal": self._diagonal, "zero_order": self._zero_order}
         self._linearize = self._points if self.at_points else moments[covariance]

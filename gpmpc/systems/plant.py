@@ -1,6 +1,6 @@
-"""Problem: a right-hand side f(x, u) has to become a discrete-time plant that controllers and simulations can step.
+"""Discrete-time plants made from right-hand sides f(x, u), for controllers and simulations to step.
 
-There are two readings, and an experiment has to say which one it means. ``Map`` takes the next state to *be* the
+There are two readings. ``Map`` takes the next state to *be* the
 right-hand side, x[k+1] = f(x[k], u[k]); this is what the data of Cao, Lai and Alam (2017) obey to 1e-6. ``Integrated``
 integrates the same right-hand side over the sampling time with the input held constant, which is the physical system.
 
@@ -23,23 +23,34 @@ class Dynamics(Protocol):
     @property
     def state_names(self) -> tuple[str, ...]:
         """Names of the n states, in order."""
+        ...
 
     @property
     def input_names(self) -> tuple[str, ...]:
         """Names of the m inputs, in order."""
+        ...
 
     def derivative(self, x: Any, u: Any) -> Sequence[Any]:
         """The n entries of f(x, u), from anything that is indexed from 0 and knows arithmetic."""
+        ...
 
 
 class Plant(Protocol):
     """A discrete-time system."""
 
-    dynamics: Dynamics
-    time_step: float  # [s]
+    @property
+    def dynamics(self) -> Dynamics:
+        """Right-hand side, with the names of states and inputs."""
+        ...
+
+    @property
+    def time_step(self) -> float:
+        """Time of one step [s]."""
+        ...
 
     def successor(self, x: Any, u: Any) -> Sequence[Any]:
         """The n entries of x[k+1], symbolic or numeric, like ``Dynamics.derivative``."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -47,8 +47,8 @@ def test_the_shortcut_gives_the_same_stage(model, noise):
         Gaussian(torch.tensor([0.3, -0.2], dtype=torch.float64), root @ root.mT),
         0.4 * torch.ones(1).double(),
     )
-    _, short = stage_at("zero_order", Linearization(observation_noise=noise), model, belief, input)
-    _, long = stage_at("zero_order", ByDifferentiation(observation_noise=noise), model, belief, input)
+    _, short = stage_at("zero_order", Linearization(process_noise=noise), model, belief, input)
+    _, long = stage_at("zero_order", ByDifferentiation(process_noise=noise), model, belief, input)
     for mine, theirs in zip(short, long, strict=True):
         assert np.allclose(mine, theirs, rtol=0, atol=1e-12)
 
@@ -126,7 +126,7 @@ def test_what_a_stage_adds_is_what_does_not_pass_through():
     model, input = pendulum_posterior(), torch.tensor([0.4])
     root = torch.tensor([[0.1, 0.02], [0.02, 0.15]])
     belief = Gaussian(torch.tensor([0.3, -0.2]), root @ root)
-    propagator = Linearization(observation_noise=True)
+    propagator = Linearization(process_noise=True)
     _, stage = stage_at("zero_order", propagator, model, belief, input)
     after = propagator(model, belief, input).covariance.numpy()
     assert np.allclose(stage.A @ belief.covariance.numpy() @ stage.A.T + stage.V, after, atol=1e-14)

@@ -46,7 +46,7 @@ STOPPED = {
     "two, of another solver": lambda _: convex(iterations=2, tolerance=1e-12, solver=PrimalActiveSet()),
     "a primal solver": lambda _: convex(solver=PrimalActiveSet(iteration_limit=3)),
     "a state form": lambda _: StateFormMPC(GP, Linearization(), PROBLEM, H, HOVER, options={"max_iter": 3}),
-    "nonlinear": lambda _: NonlinearGPMPC(GP, Linearization(), PROBLEM, H, HOVER, iterations=2, tolerance=1e-9),
+    "nonlinear": lambda _: NonlinearGPMPC(GP, Linearization(), PROBLEM, H, HOVER, iterations=3, tolerance=1e-9),
     "slsqp": lambda _: SLSQP(GP, Linearization(), PROBLEM, 4, HOVER, iterations=3, tolerance=1e-9),
     "nmpc": nmpc,
 }
