@@ -58,7 +58,7 @@ def ways(gp: GPPosterior, horizon: int) -> list[dict]:
     Whoever comes after a rival finds the caches full of it; so they take turns apart, each with the paper's form.
     """
     exact, asked = MomentMatching(), (problem(), horizon, HOVER)
-    paper = {"paper's form": GPMPC(gp, exact, *asked, form="increment", covariance="full")}
+    paper = {"paper's form": GPMPC(gp, exact, *asked, form="velocity", covariance="full")}
     convex = {
         "trajectory, linearised": GPMPC(gp, Linearization(), *asked),
         "trajectory, mean": GPMPC(gp, Linearization(), *asked, covariance="none"),

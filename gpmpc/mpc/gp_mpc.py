@@ -228,14 +228,13 @@ class GPMPC:
         return self._condenser.condense(stages, prediction.plan.states[0], references, prediction.rows)
 
     def _solve(self, program: CondensedProgram, warm: QPSolution | None) -> QPSolution:
-        P, q, G, lower, upper, feedback = program
         if isinstance(self.solver, DualActiveSet):
             soft = self.soft
-            if soft is not None and len(feedback):  # there the bounds of inputs are rows, too
-                soft = self.prediction.constraints.softness(len(G) - len(soft.linear) + self._rates)
-            return self.solver.solve_stacked(P, q, G, lower, upper, warm, soft)
-        fits = warm is not None and len(warm.q) == len(q) and len(warm.lower) == len(lower)
-        return self.solver.solve(QuadraticProgram.from_stacked(P, q, G, lower, upper), warm if fits else None)
+            if soft is not None and len(program.feedback):  # there the bounds of inputs are rows, too
+                soft = self.prediction.constraints.softness(len(program.G) - len(soft.linear) + self._rates)
+            return self.solver.solve(QuadraticProgram.unchecked(*program[:5]), warm, soft)
+        fits = warm is not None and len(warm.q) == len(program.q) and len(warm.lower) == len(program.lower)
+        return self.solver.solve(QuadraticProgram.from_stacked(*program[:5]), warm if fits else None)
 
     def _proposed(self, prediction: Prediction, program: CondensedProgram, solution: QPSolution, last: Array) -> Plan:
         """The plan of a program's solution: its inputs, and the states that the stages lead to."""
