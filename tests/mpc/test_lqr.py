@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 
 from gpmpc.dynamics import linearize_by_autograd
 from gpmpc.exceptions import SettingError, ShapeError
