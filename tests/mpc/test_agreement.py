@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.slsqp import SLSQP
+from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 
 from gpmpc.dynamics import linearize_by_autograd
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.mpc.linear_quadratic import dlqr, finite_horizon_lqr
 from gpmpc.mpc.lqr import LQR
 from gpmpc.mpc.tracking import TrackingProblem

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.slsqp import SLSQP
 from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
