@@ -5,7 +5,7 @@
 One process, one thread, process CPU time, GPs on 189 transitions. Instances are recorded on a flight with the plant in
 the loop, with the plans that the one controller made, and then put to each controller in turns, warm-started from its
 own last decision, shifted. ``nonlinear, sqp`` stops at a relative offset of 1e-6 (``gpmpc.mpc.sqp``), ``slsqp`` where a
-round lowers the cost by less than 1e-12 of it (``gpmpc.experiments.slsqp``); one program of the convex ones asks for neither.
+round lowers the cost by less than 1e-12 of it; one program of the convex ones asks for neither.
 ``cold`` are the same instances without a plan, from the last input held. ``plain slsqp`` is what comes to mind first:
 SciPy's SLSQP on the inputs as they are, from hover, with the same compiled derivatives. ``jacobian`` is one call of
 ``differentiate`` with moment matching. Ratios are paired. Writes ``outputs/benchmarks/controllers.json``.
