@@ -132,7 +132,7 @@ def test_one_subsystem_alone_is_flown_and_drawn(subsystem, tmp_path):
     ("changes", "message"),
     [
         ({"loop": "wind"}, "loop: must be one of model, plant; got 'wind'"),
-        ({"controller": "pid"}, "controller: must be one of nmpc, nonlinear, convex; got 'pid'"),
+        ({"controller": "pid"}, "controller: must be one of nmpc, nonlinear, slsqp, convex; got 'pid'"),
         ({"controller": "nmpc"}, "controller: nmpc knows the true plant"),
         ({"horizon": [1, 0]}, "horizon: must be a whole number, 1 or more; got 0"),
     ],
