@@ -128,7 +128,7 @@ class GPPosterior:
         return cls(inputs, targets, *hyperparameters, cholesky, weights, input_dim, predicts)
 
     def unscaled(self, features: Scaling, targets: Scaling) -> "GPPosterior":
-        """The same GPs in physical units, where these were trained on scaled data.
+        """Converts GPs that were trained on scaled data to physical units.
 
         Args:
             features: The scaling of x~ = (x, u), (n + m,).
@@ -206,7 +206,7 @@ class GPPosterior:
         return bool((error <= torch.finfo(self.dtype).eps ** 0.75 * diagonal).all())
 
     def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "GPPosterior":
-        """The same on another device, or in another type: float32 or float64."""
+        """Copies the posterior to another device, or to another type: float32 or float64."""
         check_destination(device, dtype)
         tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
         return replace(self, **{name: value.to(device=device, dtype=dtype) for name, value in tensors.items()})
