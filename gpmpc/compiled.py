@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable
 from functools import cache, partial
 from threading import Lock
+from typing import Any
 
 import numba
 from llvmlite import ir
@@ -240,6 +241,19 @@ def unchecked_entry_point(kernel: Callable) -> Callable:
 
 
 direct = unchecked_entry_point  # former name
+
+
+def call_unchecked(kernel: Callable, *arguments: Any) -> None:
+    """Calls a kernel whose callers always pass arguments of the same types, without looking at them from then on."""
+    entry = _entry_points.get(kernel)
+    if entry is not None:
+        entry(*arguments)
+    else:
+        kernel(*arguments)
+        _entry_points[kernel] = unchecked_entry_point(kernel)
+
+
+_entry_points: dict[Callable, Callable] = {}
 
 
 @intrinsic
