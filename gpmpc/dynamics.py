@@ -169,6 +169,23 @@ def batched_jacobian(
     return values, jacobians
 
 
+def predict_with_jacobian(model: Any, state: Tensor, input: Tensor) -> tuple[Gaussian, Tensor, Tensor]:
+    """Predicts, with the mean's derivatives by state (*batch, k, n) and input (*batch, k, m).
+
+    By the model's own method of this name, which torch can differentiate further, or by autograd where it has none.
+    """
+    method = getattr(model, "predict_with_jacobian", None)
+    if method is not None:
+        return method(state, input)
+
+    def prediction(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        belief = model.predict(x, u)
+        return belief.mean, belief.covariance
+
+    (mean, covariance), (A, B) = batched_jacobian(prediction, (state, input))
+    return Gaussian(mean, covariance), A, B
+
+
 def check_query(model: Any, state: Tensor, input: Tensor) -> None:
     """Raises unless a state (*batch, n) and an input (*batch, m) fit a model in shape, type and device.
 

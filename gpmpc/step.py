@@ -1,16 +1,13 @@
-"""Problem: what one time step of a closed loop was like has to reach whoever keeps, counts or draws it.
-
-A simulation makes one ``Step`` per time step and hands it to a recorder (any object with ``record(step)``). It stands
-below ``simulation`` and above ``control``, so that the loop needs to know no file format, and a file format no loop.
-"""
+"""One time step of a closed loop, as loops make it and recorders keep it."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:  # a recorder's writer needs this file without torch
+if TYPE_CHECKING:  # recordings are read without torch
     from gpmpc.mpc.controller import Decision
+    from gpmpc.status import Status
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,15 +18,18 @@ class Step:
         time: Time since the start of the run [s].
         k: Number of the step, from 0.
         reference: What the state was to be (n,).
-        state: The plant's true state (n,).
+        state: The plant's true state, or the mean of a model's belief (n,).
         measured: What the controller was told of it (n,).
         input: The input that was applied (m,); after a failure not the decision's.
-        decision: What the controller decided, with its plan, status, timing and quadratic program.
+        decision: What the controller decided, with its plan, status, timing and quadratic program; None where it was
+            not called, or returned inputs of another shape.
         innovation: Measured minus predicted one step ago (n,); NaN at the first step.
-        belief_covariance: Covariance of the controller's belief of the state (n, n).
+        belief_covariance: Covariance of the belief of the state (n, n); zero with a plant in the loop.
         gp_size: Transitions that the model holds; 0 without a Gaussian process.
         gp_version: How often the model has changed since the start.
         failed: The decision was not applied; ``input`` comes from the policy for failures.
+        status: How the solve ended; the decision's if omitted.
+        next_state: State at the end of the step (n,), where it is known.
     """
 
     time: float  # [s]
@@ -38,9 +38,11 @@ class Step:
     state: np.ndarray
     measured: np.ndarray
     input: np.ndarray
-    decision: "Decision"
+    decision: "Decision | None"
     innovation: np.ndarray
     belief_covariance: np.ndarray
     gp_size: int = 0
     gp_version: int = 0
     failed: bool = False
+    status: "Status | None" = None
+    next_state: np.ndarray | None = None

@@ -22,9 +22,11 @@ class Trajectory(Protocol):
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., 3) [m] at times (...) [s]."""
+        ...
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
         """Velocities (..., 3) [m/s] at times (...) [s]."""
+        ...
 
 
 @dataclass(frozen=True)

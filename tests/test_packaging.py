@@ -20,10 +20,11 @@ def wheel(tmp_path_factory):
     return path
 
 
-def test_the_wheel_carries_the_settings_and_the_printed_figures(wheel):
+def test_the_wheel_carries_the_settings_the_printed_figures_and_its_types(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     settings = {str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml")}
     assert {f"gpmpc/{name}" for name in settings} <= set(names)
+    assert "gpmpc/py.typed" in names
     assert "gpmpc/experiments/paper_tables.csv" in names
     assert "gpmpc/experiments/paper_timings.csv" in names
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/"))]

@@ -45,14 +45,13 @@ def _info(given: argparse.Namespace) -> None:
     from rich.table import Table
 
     from gpmpc.recording import read_run
-    from gpmpc.recording.reader import RECOVERED
 
     run, console = read_run(given.file), Console()
 
     def plain(text: str) -> str:  # nothing that a terminal, or rich, would obey
         return escape("".join(sign if sign.isprintable() or sign == "\n" else "\ufffd" for sign in text))
 
-    hint = "" if RECOVERED in run.metadata else " (gpmpc log recover makes it readable for other tools)"
+    hint = "" if "recovered" in run.metadata else " (gpmpc log recover makes it readable for other tools)"
     state = "finished" if run.finished else f"{CUT}{hint}"
     console.print(f"{given.file}: {state}", soft_wrap=True, highlight=False, markup=False)
     channels = Table("topic", "schema", "messages")

@@ -14,20 +14,19 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc.exceptions import DataError, GpmpcError, RecordingError, SettingError, ShapeError, check_number
+from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, check_number
 
 if TYPE_CHECKING:
     from gpmpc.experiments.run import Experiment
     from gpmpc.experiments.run_folder import RunFolder
 
-ASIDE = ("launcher", "folder")  # settings that a result does not depend on
+ASIDE = ("launcher", "folder", "live")  # settings that a result does not depend on
 GROUPS = ("data", "trajectory", "subsystem", "plant", "model", "controller", "propagation", "solver")
 UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s") | {"ux": "1", "uy": "1"}
 UNITS |= dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys("pqr", "rad/s")
 UNITS |= dict.fromkeys(("U1", "U2", "U3", "U4"), "N")
 MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
 LOST = 3  # exit code of a run that is finished, and whose flight was lost
-PATIENCE = 10.0  # with the writer of a recording whose run was killed a moment ago [s]
 
 
 def run(config: DictConfig) -> None:
@@ -73,7 +72,7 @@ def fly_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
     try:
         with folder.claimed(wait):
             settings = plain_settings(config, HydraConfig.get().runtime.choices)
-            if folder.finished:
+            if folder.finished and not config.live:
                 return outcome | {"skipped": True, "result": check_same(folder, settings)}
             about = record(choices(overrides), settings, command_of(overrides))
             torch.set_num_threads(1)  # the same sums in the same order, whatever the launcher
@@ -93,7 +92,7 @@ def fly_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
 def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
     """Trains, flies and records; the metrics."""
     from gpmpc.experiments.run import fly, metrics
-    from gpmpc.simulation import tell
+    from gpmpc.simulation import recording_callback
 
     if config.recorder != "mcap":
         return metrics(experiment, fly(experiment))
@@ -101,10 +100,22 @@ def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, abou
 
         def prepared(controller: Any, training: Any) -> Callable:
             recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller.problem, training))
-            return tell(recorder, 0 if training is None else len(training.posterior))
+            callback = recording_callback(recorder, 0 if training is None else len(training.posterior))
+            return _in_real_time(callback, experiment.plant.time_step) if config.live else callback
 
         flight = fly(experiment, prepared)
     return metrics(experiment, flight)
+
+
+def _in_real_time(callback: Callable, time_step: float) -> Callable:
+    """Makes every step last as long as the plant's, so that a viewer can follow."""
+    started = time.monotonic()
+
+    def on_step(step: Any) -> None:
+        callback(step)
+        time.sleep(max(0.0, started + step.time + time_step - time.monotonic()))
+
+    return on_step
 
 
 def _recorder(
@@ -112,32 +123,27 @@ def _recorder(
 ) -> Any:
     from gpmpc.experiments.run import unplanned_noise
     from gpmpc.experiments.run_folder import RECORDING
-    from gpmpc.recording import McapRecorder
+    from gpmpc.recording import McapRecorder, RecordedSystem
 
-    dynamics, deadline = experiment.plant.dynamics, time.monotonic() + PATIENCE
-    while True:
-        try:
-            return McapRecorder(
-                folder.path / RECORDING,
-                dynamics.state_names,
-                dynamics.input_names,
-                time_step=experiment.plant.time_step,
-                units={
-                    name: unit for name, unit in UNITS.items() if name in dynamics.state_names + dynamics.input_names
-                },
-                config=OmegaConf.to_yaml(config, resolve=True),
-                metadata={
-                    "seed": experiment.seed,
-                    "command": about["provenance"]["command"],
-                    "noise_std": " ".join(map(str, unplanned_noise(experiment, training).tolist())),
-                },
-                input_bounds=[problem.input_lower, problem.input_upper],
-            )
-        except RecordingError as error:
-            # The folder is ours, so only the orphaned writer of a killed run can still hold the file.
-            if "another process" not in str(error) or time.monotonic() > deadline:
-                raise
-            time.sleep(0.1)
+    dynamics = experiment.plant.dynamics
+    names = (*dynamics.state_names, *dynamics.input_names)
+    system = RecordedSystem(
+        dynamics.state_names,
+        dynamics.input_names,
+        time_step=experiment.plant.time_step,
+        units={name: unit for name, unit in UNITS.items() if name in names},
+        input_bounds=[problem.input_lower, problem.input_upper],
+    )
+    metadata = {
+        "seed": experiment.seed,
+        "command": about["provenance"]["command"],
+        "noise_std": " ".join(map(str, unplanned_noise(experiment, training).tolist())),
+    }
+    path, text = folder.path / RECORDING, OmegaConf.to_yaml(config, resolve=True)
+    recorder = McapRecorder(path, system, config=text, metadata=metadata, live=config.live)
+    if recorder.address:
+        print(f"live view: open {recorder.address} in Foxglove or Lichtblick", file=sys.stderr, flush=True)
+    return recorder
 
 
 def experiment_of(config: DictConfig) -> "Experiment":
@@ -158,6 +164,10 @@ def experiment_of(config: DictConfig) -> "Experiment":
         raise SettingError("disturbances", f"must be a list; got {config.disturbances!r}")
     if config.recorder not in ("mcap", "none", None):
         raise SettingError("recorder", f"must be 'mcap' or 'none'; got {config.recorder!r}")
+    if config.live not in (True, False):
+        raise SettingError("live", f"must be true or false; got {config.live!r}")
+    if config.live and config.recorder != "mcap":
+        raise SettingError("live", f"needs recorder=mcap; got recorder={config.recorder}")
     for group in ("data", "trajectory", "subsystem", "plant", "model", "controller"):
         if not config.get(group):
             raise SettingError(group, "choose one")

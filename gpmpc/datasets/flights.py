@@ -28,10 +28,14 @@ SUBSYSTEMS = ("translational", "rotational")
 class DataSource(Protocol):
     """Transitions by the names of a trajectory and a subsystem."""
 
-    note: str  # what a reader has to know who compares results on these data with the paper's
+    @property
+    def note(self) -> str:
+        """What a reader has to know who compares results on these data with the paper's."""
+        ...
 
     def transitions(self, name: str, trajectory: Trajectory, subsystem: str) -> Transitions:
         """The transitions of one subsystem ("translational" or "rotational") along the trajectory called ``name``."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ class Row:
         bounded: Whether the inputs are bounded.
         horizon: H, or several.
         propagation: ``"moment_matching"`` or ``"linearization"``: how the controller's belief moves.
-        observation_noise: Whether the learned noise counts as part of the predicted state; chance constraints with a
+        process_noise: Whether the learned noise counts as part of the predicted state; chance constraints with a
             noisy plant in the loop need it.
         data: What the GP learned from: a name in ``Flights.data``.
         size: Training transitions, or several; 0 for all.
@@ -73,7 +73,7 @@ class Row:
     bounded: bool = True
     horizon: Any = 1
     propagation: str = "moment_matching"
-    observation_noise: bool = False
+    process_noise: bool = False
     data: str = "data"
     size: Any = ALL
     confidence: Any = None
@@ -175,7 +175,7 @@ def controller_of(row: Row, task: Task) -> Controller:
     at_first = np.clip(at_first, problem.input_lower, problem.input_upper)
     if row.controller == "nmpc":
         return NMPC(task.plant, problem, row.horizon, at_first, **settings)
-    model, propagator = _loaded(task.posterior), PROPAGATIONS[row.propagation](observation_noise=row.observation_noise)
+    model, propagator = _loaded(task.posterior), PROPAGATIONS[row.propagation](process_noise=row.process_noise)
     return CONTROLLERS[row.controller](model, propagator, problem, row.horizon, at_first, **settings)
 
 

@@ -250,7 +250,7 @@ def unplanned_noise(experiment: Experiment, training: Training | None) -> np.nda
     It is what the model has learned of it; a controller that knows the plant knows its noise as well.
     """
     n = len(experiment.plant.dynamics.state_names)
-    if getattr(experiment.propagator, "observation_noise", False) or experiment.loop == "model":
+    if getattr(experiment.propagator, "process_noise", False) or experiment.loop == "model":
         return np.zeros(n)
     if training is not None:
         return training.posterior.noise_covariance.diagonal().sqrt().numpy()

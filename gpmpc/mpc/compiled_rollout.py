@@ -52,14 +52,14 @@ class CompiledRollout:
         problem: Weights of the feedback, and the inputs' bounds.
         feedback: Whether there is any.
         uncertain: Predicts covariances; they are zero otherwise.
-        observation_noise: Adds the model's noise to every predicted covariance.
+        process_noise: Adds the model's noise to every predicted covariance.
     """
 
     def __init__(
-        self, model: GPPosterior, problem: TrackingProblem, feedback: bool, uncertain: bool, observation_noise: bool
+        self, model: GPPosterior, problem: TrackingProblem, feedback: bool, uncertain: bool, process_noise: bool
     ):
         packed, n = model.packed, model.state_dim
-        noise = model.noise_covariance.numpy() if observation_noise else np.zeros((n, n))
+        noise = model.noise_covariance.numpy() if process_noise else np.zeros((n, n))
         self.known = (
             uncertain,
             feedback,

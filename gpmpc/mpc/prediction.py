@@ -141,7 +141,7 @@ class Predictor:
     def rollout(self) -> CompiledRollout:
         """The compiled loop, where ``compiled`` says that there is one."""
         uncertain = self.covariance == "zero_order"
-        noisy = uncertain and self.propagator.observation_noise
+        noisy = uncertain and self.propagator.process_noise
         return CompiledRollout(self.model, self.problem, self.feedback, uncertain, noisy)
 
     def extended(self, weight: Array) -> Array:
@@ -286,7 +286,7 @@ class Predictor:
             S = belief.covariance
         else:
             mean, A, B, V = (part[0] for part in self.model.linearize(x[None], u[None]))
-            if self.propagator.observation_noise:
+            if self.propagator.process_noise:
                 V += _array(self.model.noise_covariance)
             S = self._tensor(A @ _array(belief.covariance) @ A.T + V)
         A, B = np.ascontiguousarray(A), np.ascontiguousarray(B)

@@ -86,7 +86,7 @@ def _zero_order(propagator: Propagator, model: DynamicsModel, belief: Gaussian, 
     if is_first_order(propagator):
         at_mean, A, B = model.predict_with_jacobian(belief.mean, input)
         mean, V = at_mean.mean, at_mean.covariance
-        V = V + model.noise_covariance if propagator.observation_noise else V
+        V = V + model.noise_covariance if propagator.process_noise else V
         after = Gaussian(mean, A @ belief.covariance @ A.mT + V)
     else:
         moved, d = differentiate(propagator, model, belief, input)

@@ -1,8 +1,7 @@
 """Gaussian beliefs pushed through learned models, and the local models that control needs of that."""
 
-from gpmpc.propagation.linearization import Linearization
-from gpmpc.propagation.local_model import LocalModel, linearize, linearize_along, rollout
-from gpmpc.propagation.mean_equivalence import MeanEquivalence
+from gpmpc.propagation.linearization import Linearization, MeanEquivalence
+from gpmpc.propagation.local_model import LocalModel, linearize, rollout
 from gpmpc.propagation.moment_matching import MomentMatching
 from gpmpc.propagation.monte_carlo import MonteCarlo
 from gpmpc.propagation.propagator import Propagation, Propagator
@@ -21,6 +20,5 @@ __all__ = [
     "Unscented",
     "differentiate",
     "linearize",
-    "linearize_along",
     "rollout",
 ]

@@ -1,4 +1,4 @@
-"""Problem: from the moments of latent functions f to those of the next state, with all derivatives.
+"""From the moments of latent functions f to those of the next state, with all derivatives.
 
     x+ = A x + G u + c + B f(x_s, u_s)
 
@@ -21,7 +21,7 @@ from gpmpc.propagation.sensitivity import Sensitivity
 
 
 class Latent(NamedTuple):
-    """Moments of f at x_s ~ N(mu_s, S_s), with derivatives by mu_s, S_s and u_s where they were asked for.
+    """Moments of f at x_s ~ N(mu_s, S_s), with derivatives by mu_s, S_s and u_s where they are wanted.
 
     Attributes:
         M: E[f] (*batch, k).

@@ -1,47 +1,105 @@
-"""Problem: propagate through the model's first-order expansion at the belief's mean, as an extended Kalman filter does.
+"""Propagation through a model's expansion at the belief's mean, as in an extended Kalman filter.
 
 With A = dm/dx, H_a = d2m_a/dx2 at (mu, u) and the model's own variance there,
 
     mu+ = m(mu, u) (+ 1/2 tr(H_a S)),   Sigma+ = A S A' + Var[f(mu, u)] (+ 1/2 tr(H_a S H_b S)),   Cov[x, x+] = S A'
 
 The terms in brackets are those of the second-order filter (Jazwinski, 1970, section 9.3; Girard, Rasmussen, Quinonero
-Candela and Murray-Smith, 2003, for GPs). The model's variance is taken at the mean.
+Candela and Murray-Smith, 2003, for GPs). Mean equivalence leaves A S A' out (Hewing, Kabzan and Zeilinger, 2020).
 """
+
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import DynamicsModel
-from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
+from gpmpc.dynamics import predict_with_jacobian
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp.backend import host_arrays
+from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation.composition import Composition
-from gpmpc.propagation.expansion import expand
-from gpmpc.propagation.propagator import Propagation, checked_input
+from gpmpc.propagation.propagator import Propagation, Propagator, checked_input, projected
 from gpmpc.propagation.sensitivity import Sensitivity
 
 
-class Linearization:
+class Expansion(NamedTuple):
+    """The model around a certain state and input.
+
+    Attributes:
+        belief: The prediction there.
+        A: The mean's derivative by the state (*batch, k, n).
+        B: By the input (*batch, k, m).
+        variance_by_state: (*batch, k, n).
+        variance_by_input: (*batch, k, m).
+        mean_by_state2: Second derivatives (*batch, k, n, n).
+        mean_by_state_input: (*batch, k, n, m).
+    """
+
+    belief: Gaussian
+    A: Tensor
+    B: Tensor
+    variance_by_state: Tensor
+    variance_by_input: Tensor
+    mean_by_state2: Tensor
+    mean_by_state_input: Tensor
+
+
+def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:
+    """The expansion of GPs alone, compiled or by torch; None for other models."""
+    form = getattr(model, "affine_form", None)
+    if form is None or form.B is not None:
+        return None
+    gp = form.f
+    if (arrays := host_arrays(gp.weights, state, input)) is None:
+        parts = _by_torch(gp, state, input)
+    else:
+        from gpmpc import kernels  # loads numba
+
+        batch = state.shape[:-1]
+        flat = arrays[1].reshape(-1, gp.state_dim)
+        found = kernels.point_with_jacobian(gp.packed, flat, arrays[2].reshape(len(flat), gp.input_dim))
+        parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found[:8]]
+    mean, A = parts[0] + gp.offset, parts[2]
+    if form.A is not None:
+        mean, A = mean + state, A + form.A
+    return Expansion(Gaussian(mean, torch.diag_embed(parts[1])), A, *parts[3:])
+
+
+def _by_torch(model: GPPosterior, state: Tensor, input: Tensor) -> list[Tensor]:
+    """The first eight entries of ``kernels.Expansion``."""
+    n, inverse_squares = model.state_dim, model.lengthscales**-2
+    difference = (model.features - torch.cat([state, input], dim=-1)[..., None, :])[..., None, :, :]
+    z = difference * inverse_squares[:, None, :]  # (*batch, k, N, d)
+    k = model.signal_variance[:, None] * torch.exp(-(z * difference).sum(-1) / 2)
+    weighted, explained_by = model.weights * k, model.solve(k)
+    jacobian = (weighted[..., None, :] @ z)[..., 0, :]
+    variance_by = -2 * ((explained_by * k)[..., None, :] @ z)[..., 0, :]
+    own = torch.diag_embed(inverse_squares)[:, :n]
+    second = (weighted[..., None] * z[..., :n]).mT @ z - weighted.sum(-1)[..., None, None] * own
+    variance = (model.signal_variance - model.variance_reduction(k)).clamp_min(0)
+    parts = [half for whole in (jacobian, variance_by, second) for half in (whole[..., :n], whole[..., n:])]
+    return [weighted.sum(-1), variance, *parts]
+
+
+class Linearization(Propagator):
     """First order, or with the Hessian terms second.
 
     Args:
         hessian: Adds the second-order terms.
-        observation_noise: Adds the model's noise covariance.
+        process_noise: Adds the model's noise covariance.
     """
 
-    def __init__(self, hessian: bool = False, observation_noise: bool = False):
-        self.hessian, self.observation_noise = hessian, observation_noise
+    def __init__(self, hessian: bool = False, process_noise: bool = False):
+        self.hessian, self.process_noise = hessian, process_noise
 
-    def __call__(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Gaussian:
-        """The next state's belief; see ``propagate``."""
-        return self.propagate(model, belief, input).belief
-
-    def propagate(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+    def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``."""
         input = checked_input(model, belief, input)
-        at_mean, A, _ = model.predict_with_jacobian(belief.mean, input)
+        at_mean, A, _ = predict_with_jacobian(model, belief.mean, input)
         return self._propagation(model, belief, input, at_mean, A)
 
     def differentiate(
-        self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None
+        self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity] | None:
         """``propagate`` with all derivatives in closed form; None where there is none (always with ``hessian``)."""
         input = checked_input(model, belief, input)
@@ -63,23 +121,54 @@ class Linearization:
         )
         return self._propagation(model, belief, input, expansion.belief, A), sensitivity
 
-    def _propagation(
-        self, model: DynamicsModel, belief: Gaussian, input: Tensor, at_mean: Gaussian, A: Tensor
-    ) -> Propagation:
+    def _propagation(self, model: Any, belief: Gaussian, input: Tensor, at_mean: Gaussian, A: Tensor) -> Propagation:
         S = belief.covariance
         mean, covariance = at_mean.mean, at_mean.covariance + A @ S @ A.mT
         if self.hessian:
-            H = mean_hessian(model, belief.mean, input)
+            H = _mean_hessian(model, belief.mean, input)
             HS = H @ S[..., None, :, :]
             mean = mean + HS.diagonal(dim1=-2, dim2=-1).sum(-1) / 2
             covariance = covariance + (HS[..., :, None, :, :] * HS[..., None, :, :, :].mT).sum((-2, -1)) / 2
-        if self.observation_noise:
-            covariance = covariance + model.noise_covariance
-        covariance, deficit = nearest_positive_semidefinite(covariance)
-        return Propagation(Gaussian(mean, covariance), S @ A.mT, deficit)
+        return projected((mean, covariance, S @ A.mT), model.noise_covariance if self.process_noise else None)
 
 
-def mean_hessian(model: DynamicsModel, state: Tensor, input: Tensor) -> Tensor:
+class MeanEquivalence(Propagator):
+    """The prediction at the belief's mean: the uncertainty of the state is dropped.
+
+    Args:
+        process_noise: Adds the model's noise covariance.
+    """
+
+    def __init__(self, process_noise: bool = False):
+        self.process_noise = process_noise
+
+    def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+        """Moves a belief one step on; see ``Propagator.propagate``. State and next state come out uncorrelated."""
+        return self._propagation(model, belief, model.predict(belief.mean, checked_input(model, belief, input)))
+
+    def differentiate(
+        self, model: Any, belief: Gaussian, input: Tensor | None = None
+    ) -> tuple[Propagation, Sensitivity] | None:
+        """``propagate`` with all derivatives in closed form; None where the model has none."""
+        expansion = expand(model, belief.mean, checked_input(model, belief, input))
+        if expansion is None:
+            return None
+        sensitivity = Sensitivity(
+            expansion.A,
+            torch.zeros_like(expansion.mean_by_state2),
+            expansion.B,
+            torch.diag_embed(expansion.variance_by_state.mT).movedim(-3, -1),
+            torch.zeros_like(expansion.mean_by_state2)[..., None, :, :].repeat_interleave(expansion.belief.dim, -3),
+            torch.diag_embed(expansion.variance_by_input.mT).movedim(-3, -1),
+        )
+        return self._propagation(model, belief, expansion.belief), sensitivity
+
+    def _propagation(self, model: Any, belief: Gaussian, moved: Gaussian) -> Propagation:
+        cross = torch.zeros_like(belief.mean[..., :, None].expand(*belief.mean.shape, moved.dim))
+        return projected((moved.mean, moved.covariance, cross), model.noise_covariance if self.process_noise else None)
+
+
+def _mean_hessian(model: Any, state: Tensor, input: Tensor) -> Tensor:
     """d2m/dx2 (*batch, k, n, n): in closed form for SE-ARD GPs, else by torch autograd."""
     composition = Composition.of(model)
     if composition is not None:  # an affine part has no second derivative
@@ -88,7 +177,7 @@ def mean_hessian(model: DynamicsModel, state: Tensor, input: Tensor) -> Tensor:
     again = torch.is_grad_enabled() and (state.requires_grad or input.requires_grad)
     with torch.inference_mode(False), torch.enable_grad():
         x = state if state.requires_grad and again else state.detach().clone().requires_grad_()
-        _, A, _ = model.predict_with_jacobian(x, input)
+        _, A, _ = predict_with_jacobian(model, x, input)
         if not A.requires_grad:  # the model is linear in the state
             return A.new_zeros(*A.shape, A.shape[-1])
         rows = [

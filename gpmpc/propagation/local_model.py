@@ -1,4 +1,4 @@
-"""Problem: a convex controller needs the belief's dynamics as a linear system in the state and the input.
+"""The belief's dynamics as a linear system in an extended state and the input, for convex controllers.
 
 With the extended state s = [mu; vec(S)], S = Sigma^(1/2) the symmetric root, p = n + n^2 (Cao, Lai and Alam, 2017,
 section 4.1),
@@ -12,12 +12,12 @@ the null space.
 """
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors, square_root_differential
 from gpmpc.gp.backend import host_arrays
@@ -54,16 +54,14 @@ def extended_state(belief: Gaussian) -> tuple[Tensor, Tensor, Tensor]:
     return torch.cat([belief.mean, S.flatten(-2)], dim=-1), r, U
 
 
-def linearize(
-    propagator: Propagator, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None
-) -> LocalModel:
+def linearize(propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None) -> LocalModel:
     """The local model at a belief and an input, or along a plan when both have a leading dimension H.
 
     A local model is a constant: no gradient flows through it, and torch's function transforms do not apply.
 
     Args:
         propagator: How the belief moves.
-        model: What was learned.
+        model: A ``DynamicsModel``.
         belief: Mean (*batch, n), covariance (*batch, n, n).
         input: (*batch, m); may be left out where m = 0.
     """
@@ -114,46 +112,22 @@ def _extended(belief: Gaussian, input: Tensor, after: Gaussian, d: Sensitivity) 
     return A, B, c
 
 
-def rollout(propagator: Propagator, model: DynamicsModel, belief: Gaussian, inputs: Tensor) -> Gaussian:
+def rollout(propagator: Propagator, model: Any, belief: Gaussian, inputs: Tensor) -> Gaussian:
     """The beliefs at steps 1 to H: mean (*batch, H, n), covariance (*batch, H, n, n).
 
     Args:
         propagator: How the belief moves.
-        model: What was learned.
+        model: A ``DynamicsModel``.
         belief: At step 0 (*batch).
         inputs: (*batch, H, m); an autonomous model takes (*batch, H, 0).
     """
+    check_tensors(inputs=inputs)
+    if inputs.dim() < 2 or not inputs.shape[-2]:
+        raise ShapeError(f"inputs must be (*batch, H, m) with H of 1 or more; got {tuple(inputs.shape)}")
     beliefs = []
-    for control in _steps(inputs):
+    for control in inputs.unbind(-2):
         belief = propagator(model, belief, control)
         beliefs.append(belief)
     return Gaussian(
         torch.stack([b.mean for b in beliefs], dim=-2), torch.stack([b.covariance for b in beliefs], dim=-3)
     )
-
-
-def linearize_along(propagator: Propagator, model: DynamicsModel, belief: Gaussian, inputs: Tensor) -> LocalModel:
-    """The local models (*batch, H, ...) along the rollout of inputs (*batch, H, m) from a belief (*batch).
-
-    Stage k is linearised at the belief that stage k - 1 led to; ``next`` is the rollout. Where the beliefs are known
-    before (a plan of the previous step), ``linearize`` takes all stages as one batch.
-    """
-    stages = []
-    for control in _steps(inputs):
-        stages.append(linearize(propagator, model, belief, control))
-        belief = stages[-1].next
-    A, B, c = (
-        torch.stack([getattr(stage, name) for stage in stages], dim=d) for name, d in (("A", -3), ("B", -3), ("c", -2))
-    )
-    beliefs = Gaussian(
-        torch.stack([stage.next.mean for stage in stages], dim=-2),
-        torch.stack([stage.next.covariance for stage in stages], dim=-3),
-    )
-    return LocalModel(A, B, c, beliefs)
-
-
-def _steps(inputs: Tensor) -> tuple[Tensor, ...]:
-    check_tensors(inputs=inputs)
-    if inputs.dim() < 2 or not inputs.shape[-2]:
-        raise ShapeError(f"inputs must be (*batch, H, m) with H of 1 or more; got {tuple(inputs.shape)}")
-    return inputs.unbind(-2)

@@ -1,19 +1,20 @@
-"""Problem: move a Gaussian belief over the state one step on through a learned model, behind one call."""
+"""The protocol of propagation: a Gaussian belief over the state moved one step on through a model."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from gpmpc.dynamics import DynamicsModel, check_query
+from gpmpc.dynamics import check_query
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
-from gpmpc.gaussian import Gaussian, check_tensors
+from gpmpc.gaussian import Gaussian, check_tensors, nearest_positive_semidefinite
 
 
 @dataclass(frozen=True)
 class Propagation:
-    """A belief moved one step on, with what else is known of the step.
+    """A belief moved one step on.
 
     Attributes:
         belief: N(mean, covariance) of the next state; the covariance is symmetric positive semidefinite.
@@ -28,16 +29,17 @@ class Propagation:
 
 
 class Propagator(Protocol):
-    """One way to push a Gaussian through a model."""
+    """One way to move a Gaussian through a model; called, it gives the next belief alone.
 
-    def __call__(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Gaussian:
-        """The next state's belief from the state's belief and a certain control (*batch, m)."""
+    A propagator with closed-form derivatives for a model has a method ``differentiate`` with the arguments of
+    ``propagate``, which returns the ``Propagation`` and its ``Sensitivity``, or None where it has none.
+    """
 
-    def propagate(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Propagation:
-        """The same with the input-output covariance and the size of the projection.
+    def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+        """Moves a belief one step on.
 
         Args:
-            model: What was learned.
+            model: A ``DynamicsModel``.
             belief: Over the state: mean (*batch, n), covariance (*batch, n, n).
             input: The certain control (*batch, m); may be left out where m = 0.
 
@@ -45,13 +47,32 @@ class Propagator(Protocol):
             ShapeError: Belief or input do not fit the model.
             SettingError: Their dtype or device is another one.
             DataError: An entry is not finite, or the covariance is not positive semidefinite.
+            UnsupportedModel: There is no formula for this model.
         """
+        ...
+
+    def __call__(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Gaussian:
+        """The next state's belief; see ``propagate``."""
+        return self.propagate(model, belief, input).belief
 
 
-def checked_input(model: DynamicsModel, belief: Gaussian, input: Tensor | None) -> Tensor:
-    """The control (*batch, m), after belief and control were held against the rules of ``Propagator.propagate``.
+def projected(
+    moments: tuple[Tensor, Tensor, Tensor], process_noise: Tensor | None, diagonal: bool = False
+) -> Propagation:
+    """Adds the process noise, if any, to mean, covariance and Cov[x, x+], and projects the covariance."""
+    mean, covariance, cross = moments
+    if process_noise is not None:
+        covariance = covariance + process_noise
+    if diagonal:
+        covariance = torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1))
+    covariance, deficit = nearest_positive_semidefinite(covariance)
+    return Propagation(Gaussian(mean, covariance), cross, deficit)
 
-    Values are looked at where that is free: in host memory, outside torch's transforms.
+
+def checked_input(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
+    """Checks belief and control by the rules of ``Propagator.propagate``; returns the control (*batch, m).
+
+    Values are checked where that is free: in host memory, outside torch's transforms.
     """
     if not isinstance(belief, Gaussian):
         raise SettingError("belief", f"must be a Gaussian; got {type(belief).__name__}")
@@ -78,7 +99,7 @@ def _check_semidefinite(covariance: np.ndarray) -> None:
     if not largest:
         return
     round_off = np.finfo(covariance.dtype).eps ** 0.5 * largest
-    gap = np.abs(covariance - covariance.mT).max()
+    gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max()
     if gap > round_off:
         raise DataError(f"the belief's covariance must be symmetric; got entries that differ by {float(gap):.3g}")
     try:

@@ -1,15 +1,16 @@
-"""Problem: control needs to know how the next belief answers to the belief and the input it started from.
+"""The derivatives of the next belief by the belief and the input it started from.
 
-``differentiate`` gives all six derivatives of (mu+, Sigma+) by (mu, Sigma, u). A propagator that has them in closed
-form for a model says so by a method ``differentiate``; any other is differentiated by torch autograd.
+``differentiate`` gives all six derivatives of (mu+, Sigma+) by (mu, Sigma, u): by the propagator's own method
+``differentiate`` where it has closed forms for the model, else by torch autograd.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import DynamicsModel, batched_jacobian
+from gpmpc.dynamics import batched_jacobian
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation.propagator import Propagation, Propagator, checked_input
 
@@ -38,7 +39,7 @@ class Sensitivity:
     covariance_by_input: Tensor
 
     def of_variances(self) -> "Sensitivity":
-        """The same where of the next covariance only the diagonal is kept."""
+        """The derivatives where only the diagonal of the next covariance is kept."""
         k = self.covariance_by_mean.shape[-2]
         keep = torch.eye(k, dtype=self.mean_by_mean.dtype, device=self.mean_by_mean.device)
         return replace(
@@ -50,13 +51,13 @@ class Sensitivity:
 
 
 def differentiate(
-    propagator: Propagator, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None
+    propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None
 ) -> tuple[Propagation, Sensitivity]:
     """Moves a belief one step on, with its derivatives.
 
     Args:
         propagator: How.
-        model: What was learned.
+        model: A ``DynamicsModel``.
         belief: Mean (*batch, n), covariance (*batch, n, n).
         input: (*batch, m); may be left out where m = 0.
 
@@ -71,7 +72,7 @@ def differentiate(
 
 
 def by_autograd(
-    propagator: Propagator, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None
+    propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None
 ) -> tuple[Propagation, Sensitivity]:
     """``differentiate`` by torch autograd, for any propagator and model that torch can follow."""
     input, n, k = checked_input(model, belief, input), belief.dim, model.output_dim
@@ -80,7 +81,7 @@ def by_autograd(
 
 
 def _by_autograd(
-    propagator: Propagator, model: DynamicsModel, belief: Gaussian, input: Tensor, n: int, k: int
+    propagator: Propagator, model: Any, belief: Gaussian, input: Tensor, n: int, k: int
 ) -> tuple[Propagation, Sensitivity]:
     rows, columns = torch.tril_indices(k, k, device=belief.mean.device)
     batch = belief.mean.shape[:-1]

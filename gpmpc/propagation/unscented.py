@@ -1,4 +1,4 @@
-"""Problem: propagate through any model without its derivatives, by a few points that carry the belief's moments.
+"""Propagation through any model without its derivatives, by a few points that carry the belief's moments.
 
 With n states and lambda = alpha^2 (n + kappa) - n, the points are mu and mu +- sqrt(n + lambda) times the columns of
 the symmetric root of Sigma; the next state's covariance is theirs plus the mean of the model's own (Julier and Uhlmann,
@@ -7,49 +7,45 @@ whose weights are positive, so that no covariance can come out indefinite.
 """
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, check_number
-from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite, square_root, square_root_differential
-from gpmpc.propagation.expansion import expand
-from gpmpc.propagation.propagator import Propagation, checked_input
+from gpmpc.gaussian import Gaussian, square_root, square_root_differential
+from gpmpc.propagation.linearization import expand
+from gpmpc.propagation.propagator import Propagation, Propagator, checked_input, projected
 from gpmpc.propagation.sensitivity import Sensitivity
 
 
-class Unscented:
+class Unscented(Propagator):
     """The unscented transform.
 
     Args:
         alpha: Spread of the points.
         beta: Weight of the centre in the covariance; 2 is best for Gaussians of small alpha.
         kappa: Secondary spread.
-        observation_noise: Adds the model's noise covariance.
+        process_noise: Adds the model's noise covariance.
 
     Raises:
         SettingError: alpha is not positive, or (at the first step) n + kappa is not.
     """
 
-    def __init__(self, alpha: float = 1.0, beta: float = 0.0, kappa: float = 0.0, observation_noise: bool = False):
+    def __init__(self, alpha: float = 1.0, beta: float = 0.0, kappa: float = 0.0, process_noise: bool = False):
         check_number("alpha", alpha, above=0)
         check_number("beta", beta)
         check_number("kappa", kappa)
-        self.alpha, self.beta, self.kappa, self.observation_noise = alpha, beta, kappa, observation_noise
+        self.alpha, self.beta, self.kappa, self.process_noise = alpha, beta, kappa, process_noise
 
-    def __call__(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Gaussian:
-        """The next state's belief; see ``propagate``."""
-        return self.propagate(model, belief, input).belief
-
-    def propagate(self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+    def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``."""
         input = checked_input(model, belief, input)
         steps, points, controls = self._points(belief, square_root(belief.covariance), input)
-        return self._gathered(model, belief, steps, model.predict(points, controls))
+        return self._moments(model, belief, steps, model.predict(points, controls))
 
     def differentiate(
-        self, model: DynamicsModel, belief: Gaussian, input: Tensor | None = None
+        self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity] | None:
         """``propagate`` with all derivatives, by those of the model at every point; None where it has no closed ones.
 
@@ -90,7 +86,7 @@ class Unscented:
             return by[..., :n], by_covariance.reshape(by_root.shape), by[..., n + n * n :]
 
         of_means, of_covariances = parts(mean_by), parts(covariance_by)
-        return self._gathered(model, belief, steps, expansion.belief), Sensitivity(*of_means, *of_covariances)
+        return self._moments(model, belief, steps, expansion.belief), Sensitivity(*of_means, *of_covariances)
 
     def _spread(self, n: int) -> float:
         """The square of the distance of the points in units of the root: n + lambda."""
@@ -113,13 +109,13 @@ class Unscented:
         points = belief.mean[..., None, :] + steps
         return steps, points, input[..., None, :].expand(*points.shape[:-1], input.shape[-1])
 
-    def _gathered(self, model: DynamicsModel, belief: Gaussian, steps: Tensor, moved: Gaussian) -> Propagation:
+    def _moments(self, model: Any, belief: Gaussian, steps: Tensor, moved: Gaussian) -> Propagation:
         of_mean, of_covariance = self._weights(belief)
         mean = of_mean @ moved.mean
         centred = moved.mean - mean[..., None, :]
         covariance = centred.mT @ (of_covariance[:, None] * centred)
         covariance = covariance + (of_mean[:, None, None] * moved.covariance).sum(-3)
-        if self.observation_noise:
-            covariance = covariance + model.noise_covariance
-        covariance, deficit = nearest_positive_semidefinite(covariance)
-        return Propagation(Gaussian(mean, covariance), steps.mT @ (of_mean[1] * centred), deficit)
+        return projected(
+            (mean, covariance, steps.mT @ (of_mean[1] * centred)),
+            model.noise_covariance if self.process_noise else None,
+        )

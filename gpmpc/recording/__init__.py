@@ -1,9 +1,20 @@
-"""Recordings of runs in MCAP files: writing, reading, replaying, recovering; the only importer of mcap and protobuf."""
+"""Recordings of runs in MCAP files: writing, live view, reading, replaying, recovering."""
 
+from gpmpc.recording._messages import RecordedSystem
 from gpmpc.recording.layout import layout
-from gpmpc.recording.reader import RecordedProblem, Run, read_run, replay
+from gpmpc.recording.reader import RecordedProblem, Recovery, Run, read_run, recover, replay
 from gpmpc.recording.recorder import McapRecorder
-from gpmpc.recording.recovery import Recovery, recover
 from gpmpc.step import Step
 
-__all__ = ["McapRecorder", "RecordedProblem", "Recovery", "Run", "Step", "layout", "read_run", "recover", "replay"]
+__all__ = [
+    "McapRecorder",
+    "RecordedProblem",
+    "RecordedSystem",
+    "Recovery",
+    "Run",
+    "Step",
+    "layout",
+    "read_run",
+    "recover",
+    "replay",
+]

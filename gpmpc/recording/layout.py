@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc.recording._messages import PLAN, STEP, TIMING
+from gpmpc.recording._scene import ATTITUDE, DISPLAY, POSITION, VEHICLE
 from gpmpc.recording.reader import Run
-from gpmpc.recording.scene import ATTITUDE, DISPLAY, POSITION, VEHICLE
-from gpmpc.recording.schemas import TIMING
-from gpmpc.recording.writer import PLAN, STEP
 
 GREY, BLUE, ORANGE, RED = "#7f7f7f", "#1f77b4", "#ff7f0e", "#d62728"
 COLOURS = (BLUE, "#2ca02c", ORANGE, "#9467bd", "#8c564b", "#17becf")

@@ -1,28 +1,28 @@
-"""Problem: a recorded run has to come back as arrays, and any of its decisions has to be repeatable.
+"""Reads recorded runs as arrays, solves a recorded quadratic program again, and rescues unfinished files.
 
-``read_run`` reads finished files and unfinished ones alike (all that is whole, see ``records``). A message whose
-checksum is right may still come from another program, so the sizes of its arrays are checked. A plan belongs to the
-step of its number, wherever it stands. ``replay`` solves a step's quadratic program again: its minimiser is unique, so
-any exact solver finds the recorded plan.
+A message whose checksum is right may still come from another program, so the sizes of its arrays are checked. A plan
+belongs to the step of its number, wherever it stands.
 """
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Channel, Footer, Message, Metadata, Schema
+from mcap.writer import CompressionType, Writer
 
 from gpmpc.exceptions import GpmpcError, RecordingError, SettingError
-from gpmpc.recording import schemas
-from gpmpc.recording.records import room, whole_records
-from gpmpc.recording.writer import CONFIG, PLAN, QP, STEP
+from gpmpc.files import whole_file
+from gpmpc.recording import _messages
+from gpmpc.recording._messages import PLAN, QP, QP_ARRAYS, STEP
+from gpmpc.recording._records import CONFIG, RECOVERED, room, whole_records
 from gpmpc.status import Status
 
 if TYPE_CHECKING:
@@ -31,74 +31,59 @@ if TYPE_CHECKING:
     from gpmpc.qp import QPSolution, QPSolver
 
 Array = np.ndarray
-RECOVERED = "recovered"  # metadata of a file that holds what was left of another
+
+
+class RecordedProblem(NamedTuple):
+    """A quadratic program as it was solved; letters as in ``gpmpc.qp``."""
+
+    P: Array  # (n, n)
+    q: Array  # (n,)
+    G: Array  # (m, n)
+    lower: Array  # (M,) bounds of the stacked constraints [x; Gx]
+    upper: Array  # (M,)
+    softness: Array  # (2, M) 1/rho and the cap of the multiplier of every stacked constraint
+    x: Array  # (n,) the solution found then; empty where there was none
+    multipliers: Array  # (M,) its multipliers; empty where there was none
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """K recorded steps; n states, m inputs, horizon H (the longest; NaN beyond a shorter one).
-
-    Attributes:
-        path: The file.
-        finished: The run was recorded to its end, and every checksum is right; otherwise this is what was saved of it.
-        state_names: n names.
-        input_names: m names.
-        steps: Numbers k of the steps (K,).
-        times: [s] (K,).
-        references: (K, n).
-        states: True states (K, n).
-        measured: Measured states (K, n).
-        inputs: Applied inputs (K, m).
-        input_bounds: Lower and upper bounds (2, m); infinite where none were given.
-        innovations: (K, n).
-        belief_covariances: (K, n, n).
-        plan_inputs: (K, H, m).
-        plan_means: (K, H + 1, n).
-        plan_stds: (K, H + 1, n).
-        plan_covariances: (K, H + 1, n, n).
-        statuses: K of them.
-        iterations: (K,).
-        active_set_sizes: (K,).
-        residuals: Primal and dual residual and duality gap of the quadratic program (K, 3); NaN without one.
-        timings: Model, build, solve, total [s] (K, 4).
-        gp_sizes: (K,).
-        gp_versions: (K,).
-        failed: Whether the decision was not applied (K,).
-        channels: Number of messages and schema by topic.
-        metadata: Metadata records by name.
-        config: Text of the resolved configuration.
-        problems: Messages ``gpmpc.QuadraticProgram`` by k; see ``replay``.
-    """
+    """K recorded steps; n states, m inputs, horizon H (the longest; NaN beyond a shorter one)."""
 
     path: Path
-    finished: bool
+    finished: bool  # recorded to its end, every checksum is right; otherwise this is what was saved of it
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
-    steps: Array
-    times: Array
-    references: Array
-    states: Array
-    measured: Array
-    inputs: Array
-    input_bounds: Array
-    innovations: Array
-    belief_covariances: Array
-    plan_inputs: Array
-    plan_means: Array
-    plan_stds: Array
-    plan_covariances: Array
+    steps: Array  # (K,) their numbers k
+    times: Array  # (K,) [s]
+    references: Array  # (K, n)
+    states: Array  # (K, n) true states
+    measured: Array  # (K, n)
+    inputs: Array  # (K, m) applied inputs
+    input_bounds: Array  # (2, m) lower and upper; infinite where none were given
+    innovations: Array  # (K, n)
+    belief_covariances: Array  # (K, n, n)
+    plan_inputs: Array  # (K, H, m)
+    plan_means: Array  # (K, H + 1, n)
+    plan_stds: Array  # (K, H + 1, n)
+    plan_covariances: Array  # (K, H + 1, n, n)
     statuses: tuple[Status, ...]
-    iterations: Array
-    active_set_sizes: Array
-    residuals: Array
-    timings: Array
-    gp_sizes: Array
-    gp_versions: Array
-    failed: Array
-    channels: dict[str, tuple[int, str]]
+    iterations: Array  # (K,)
+    active_set_sizes: Array  # (K,)
+    timings: Array  # (K, 4) model, build, solve, total [s]
+    gp_sizes: Array  # (K,)
+    gp_versions: Array  # (K,)
+    failed: Array  # (K,) whether the decision was not applied
+    channels: dict[str, tuple[int, str]]  # number of messages and schema by topic
     metadata: dict[str, dict[str, str]]
-    config: str
-    problems: dict[int, "RecordedProblem"]
+    config: str  # text of the resolved configuration
+    problems: dict[int, RecordedProblem]  # by k; see ``replay``
+
+    @cached_property
+    def residuals(self) -> Array:
+        """Primal and dual residual and duality gap of every recorded solution (K, 3); NaN without one."""
+        nothing = (np.nan, np.nan, np.nan)
+        return np.array([_residuals(self.problems[k]) if k in self.problems else nothing for k in self.steps.tolist()])
 
     @cached_property
     def columns(self) -> dict[str, Array]:
@@ -113,52 +98,22 @@ class Run:
             table |= {f"{group}.{name}": values[:, i] for i, name in enumerate(names)}
         table |= {"status": np.array([status.name for status in self.statuses], dtype=object)}
         table |= {"iterations": self.iterations, "active_set_size": self.active_set_sizes}
-        table |= {f"timing.{name}": self.timings[:, i] for i, name in enumerate(schemas.TIMING)}
-        table |= {f"residuals.{name}": self.residuals[:, i] for i, name in enumerate(schemas.RESIDUALS)}
+        table |= {f"timing.{name}": self.timings[:, i] for i, name in enumerate(_messages.TIMING)}
+        residuals = self.residuals.reshape(-1, 3)
+        table |= {f"residuals.{name}": residuals[:, i] for i, name in enumerate(("primal", "dual", "gap"))}
         return table | {"gp_size": self.gp_sizes, "gp_version": self.gp_versions, "failed": self.failed}
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """``columns`` as a data frame, units in its ``attrs``.
+        """Returns ``columns`` as a data frame, units in its ``attrs``."""
+        import pandas
 
-        Raises:
-            RecordingError: pandas is not installed.
-        """
-        try:
-            import pandas
-        except ImportError as error:
-            raise RecordingError("data frames need pandas: pip install 'gpmpc[report]'") from error
         frame = pandas.DataFrame(self.columns)
         frame.attrs["units"] = self.metadata.get("units", {})
         return frame
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedProblem:
-    """A quadratic program as it was solved; letters as in ``gpmpc.qp``.
-
-    Attributes:
-        P: (n, n).
-        q: (n,).
-        G: (m, n).
-        lower: Bounds of the stacked constraints ``[x; Gx]`` (M,).
-        upper: (M,).
-        softness: 1/rho and the cap of the multiplier of every stacked constraint (2, M).
-        x: The solution found then (n,); empty where there was none.
-        multipliers: Its multipliers (M,); empty where there was none.
-    """
-
-    P: Array
-    q: Array
-    G: Array
-    lower: Array
-    upper: Array
-    softness: Array
-    x: Array
-    multipliers: Array
-
-
 def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
-    """Solves the quadratic program of step k again.
+    """Solves the quadratic program of step k again; its minimiser is unique, so any exact solver finds the same plan.
 
     Args:
         run: A run recorded with its problems.
@@ -176,7 +131,7 @@ def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
     solver = solver if solver is not None else DualActiveSet()
     inverse, caps = recorded.softness[:, len(recorded.q) :]
     try:
-        problem = QuadraticProgram.from_stacked(recorded.P, recorded.q, recorded.G, recorded.lower, recorded.upper)
+        problem = QuadraticProgram.from_stacked(*recorded[:5])
         if not inverse.any() and np.isinf(caps).all():
             return solver.solve(problem)
         with np.errstate(divide="ignore"):
@@ -186,10 +141,7 @@ def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
 
 
 def read_run(path: str | Path) -> Run:
-    """Reads a recording.
-
-    Args:
-        path: A file that ``McapRecorder`` wrote, finished or not.
+    """Reads a recording, finished or not.
 
     Raises:
         RecordingError: There is no such file, or it is no recording of a run.
@@ -221,14 +173,13 @@ def read_run(path: str | Path) -> Run:
             config = record.data.decode(errors="replace")
         finished = finished or isinstance(record, Footer)
     decoder = decoder or _Decoder(path, metadata)
-    states, inputs = decoder.states, decoder.inputs
     return Run(
         path=path,
         finished=finished and RECOVERED not in metadata,
-        state_names=states,
-        input_names=inputs,
-        **_steps(messages[STEP], states, inputs),
-        **_plans(path, messages[PLAN], messages[STEP], states, inputs),
+        state_names=decoder.states,
+        input_names=decoder.inputs,
+        **_steps(messages[STEP], decoder.states, decoder.inputs),
+        **_plans(path, messages[PLAN], messages[STEP], decoder.states, decoder.inputs),
         channels={channel.topic: (counts[i], names.get(channel.schema_id, "")) for i, channel in channels.items()},
         metadata=metadata,
         config=config,
@@ -237,14 +188,10 @@ def read_run(path: str | Path) -> Run:
 
 
 class _Decoder:
-    """Turns messages into what they say, if it fits the names of states and inputs.
-
-    Args:
-        path: The file.
-        metadata: Its records.
+    """Parses messages, and checks that they fit the names of states and inputs.
 
     Raises:
-        RecordingError: They do not tell of a run.
+        RecordingError: The metadata do not tell of a run.
     """
 
     def __init__(self, path: Path, metadata: dict[str, dict[str, str]]):
@@ -252,15 +199,16 @@ class _Decoder:
         if not {"state_names", "input_names"} <= about.keys():
             raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
         try:
-            self.states = schemas.check_names("state_names", about["state_names"].split())
-            self.inputs = schemas.check_names("input_names", about["input_names"].split())
-            classes = schemas.message_classes(self.states, self.inputs, schemas.READ)
+            self.states = _messages.check_names("state_names", about["state_names"].split())
+            self.inputs = _messages.check_names("input_names", about["input_names"].split())
+            described = _messages.descriptor(self.states, self.inputs, _messages.READ)
+            classes = _messages.message_classes(described)
         except SettingError as error:
             raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
-        self._classes = {STEP: classes[schemas.STEP], PLAN: classes[schemas.PLAN], QP: classes[schemas.QP]}
+        self._classes = {topic: classes[name.removeprefix("gpmpc.")] for topic, name in _messages.TOPICS.items()}
 
     def decode(self, topic: str, record: Message) -> Any:
-        """The message; of a quadratic program its step's number k and itself.
+        """Parses a message; of a quadratic program it returns its step's number k and itself.
 
         Raises:
             RecordingError: It does not parse, or its arrays do not belong together.
@@ -284,10 +232,10 @@ class _Decoder:
 
 
 def _numbers(message: Any, field: str, *shape: int) -> Array:
-    """A field's numbers.
+    """Reads a packed array.
 
     Raises:
-        ValueError: There are more or fewer.
+        ValueError: It has more or fewer numbers.
     """
     data = getattr(message, field)
     if min(shape) < 0 or len(data) != 8 * math.prod(shape):
@@ -295,7 +243,7 @@ def _numbers(message: Any, field: str, *shape: int) -> Array:
     return np.frombuffer(data).reshape(shape)
 
 
-def _table(messages: list, fields: tuple[str, ...]) -> Array:
+def _table(messages: Sequence[Any], fields: tuple[str, ...]) -> Array:
     numbers = attrgetter(*fields)
     return np.array([numbers(message) for message in messages], dtype=float).reshape(len(messages), len(fields))
 
@@ -307,28 +255,23 @@ def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dic
     integers = {"steps": "k", "iterations": "iterations", "active_set_sizes": "active_set_size"}
     integers |= {"gp_sizes": "gp_size", "gp_versions": "gp_version"}
     arrays |= {name: np.array([getattr(step, field) for step in steps], int) for name, field in integers.items()}
-    covariances = b"".join(step.belief_covariance for step in steps)
+    if steps and steps[0].HasField("input_lower"):  # they are equal in all steps
+        bounds = _table([steps[0].input_lower, steps[0].input_upper], inputs)
+    else:
+        bounds = np.tile([[-np.inf], [np.inf]], len(inputs))
     return arrays | {
         "times": np.array([step.time for step in steps], dtype=float),
         "inputs": _table([step.input for step in steps], inputs),
-        "input_bounds": _bounds(steps[:1], inputs),
-        "belief_covariances": np.frombuffer(covariances).reshape(len(steps), n, n),
+        "input_bounds": bounds,
+        "belief_covariances": np.frombuffer(b"".join(s.belief_covariance for s in steps)).reshape(len(steps), n, n),
         "statuses": tuple(statuses[step.status] for step in steps),
-        "residuals": _table([step.residuals for step in steps], schemas.RESIDUALS),
-        "timings": _table([step.timing for step in steps], schemas.TIMING),
+        "timings": _table([step.timing for step in steps], _messages.TIMING),
         "failed": np.array([step.failed for step in steps], dtype=bool),
     }
 
 
-def _bounds(steps: list, inputs: tuple[str, ...]) -> Array:
-    """Of the first step: they are the same in all."""
-    if not steps or not steps[0].HasField("input_lower"):
-        return np.tile([[-np.inf], [np.inf]], len(inputs))
-    return np.concatenate([_table([steps[0].input_lower], inputs), _table([steps[0].input_upper], inputs)])
-
-
 def _numbered(messages: list) -> Iterator[tuple[int, int]]:
-    """Of every message its step's number k and, where a number comes again, the how many'th time it is."""
+    """Yields of every message its step's number k and, where a number comes again, the how many'th time it is."""
     seen: Counter[int] = Counter()
     for message in messages:
         seen[message.k] += 1
@@ -339,12 +282,8 @@ def _plans(path: Path, plans: list, steps: list, states: tuple[str, ...], inputs
     H, n, m = max((len(plan.stages) - 1 for plan in plans), default=0), len(states), len(inputs)
     if (needed := 8 * len(steps) * (H + 1) * (n * n + 2 * n + m)) > room(path):
         raise RecordingError(f"{path}: a plan of {H} stages would make arrays of {needed / 1e6:.0f} MB with the others")
-    arrays = {
-        "plan_inputs": np.full((len(steps), H, m), np.nan),
-        "plan_means": np.full((len(steps), H + 1, n), np.nan),
-        "plan_stds": np.full((len(steps), H + 1, n), np.nan),
-        "plan_covariances": np.full((len(steps), H + 1, n, n), np.nan),
-    }
+    shapes = {"inputs": (H, m), "means": (H + 1, n), "stds": (H + 1, n), "covariances": (H + 1, n, n)}
+    arrays = {f"plan_{name}": np.full((len(steps), *shape), np.nan) for name, shape in shapes.items()}
     rows = {key: row for row, key in enumerate(_numbered(steps))}
     for key, plan in zip(_numbered(plans), plans, strict=True):
         if (row := rows.get(key)) is None:
@@ -359,10 +298,79 @@ def _plans(path: Path, plans: list, steps: list, states: tuple[str, ...], inputs
 
 
 def _problem(message: Any) -> RecordedProblem:
-    n, M = message.variables, message.variables + message.rows
-    shapes = {"P": (n, n), "q": (n,), "G": (message.rows, n), "lower": (M,), "upper": (M,), "softness": (2, M)}
-    if message.x or message.multipliers:
-        shapes |= {"x": (n,), "multipliers": (M,)}
-    else:
-        shapes |= {"x": (0,), "multipliers": (0,)}
-    return RecordedProblem(**{name: _numbers(message, name, *shape) for name, shape in shapes.items()})
+    n, m = message.variables, message.rows
+    M, has_solution = n + m, bool(message.x or message.multipliers)
+    shapes = ((n, n), (n,), (m, n), (M,), (M,), (2, M), (n * has_solution,), (M * has_solution,))
+    return RecordedProblem(*(_numbers(message, name, *s) for name, s in zip(QP_ARRAYS, shapes, strict=True)))
+
+
+def _residuals(problem: RecordedProblem) -> tuple[float, float, float]:
+    """Judges a recorded solution; NaN where there is none."""
+    from gpmpc.qp import record
+    from gpmpc.qp.solution import QPSolution, Terms
+
+    if not len(problem.x):
+        return np.nan, np.nan, np.nan
+    P, q, G, lower, upper, softness, x, multipliers = problem
+    values = np.concatenate([np.zeros(record.HEADER), x, multipliers])
+    return QPSolution(x, Terms(P, G, softness), q, lower, upper, values, 0.0, 0.0).residuals()
+
+
+class Recovery(NamedTuple):
+    """What was found in a file."""
+
+    messages: int
+    seconds: float  # [s] between the first and the last of them
+    finished: bool  # the run had been recorded to its end; nothing was missing
+
+
+def recover(path: str | Path, output: str | Path) -> Recovery:
+    """Writes everything whole in a recording to a new file with index and footer, which says that it was recovered.
+
+    Args:
+        path: A file that a crash left without footer; an MCAP reader takes it for empty.
+        output: The new file; it appears when it is complete and has been read once.
+
+    Raises:
+        RecordingError: There is no run to recover, or the output cannot be written.
+    """
+    path, output = Path(path), Path(output)
+    try:
+        if output.exists() and path.exists() and output.samefile(path):
+            raise RecordingError(f"{output}: a file cannot be recovered into itself; name another output")
+        with whole_file(output) as file:
+            times = _copy(path, file)
+            file.flush()
+            try:
+                finished = read_run(file.name).finished
+            except RecordingError as error:
+                raise RecordingError(str(error).replace(file.name, str(path), 1)) from error
+    except OSError as error:
+        raise RecordingError(f"{output}: cannot be written: {error.strerror or error}") from error
+    return Recovery(len(times), (max(times) - min(times)) / 1e9 if times else 0.0, finished)
+
+
+def _copy(path: Path, file: BinaryIO) -> list[int]:
+    """Copies whole records; returns the time stamps of the messages [ns]."""
+    writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
+    writer.start(profile="gpmpc", library="gpmpc")
+    schemas, channels, times, finished = {0: 0}, {}, [], False
+    for record in whole_records(path):
+        if isinstance(record, Schema) and record.id not in schemas:
+            schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+        elif isinstance(record, Channel) and record.id not in channels:
+            about = (record.topic, record.message_encoding, schemas[record.schema_id], record.metadata)
+            channels[record.id] = writer.register_channel(*about)
+        elif isinstance(record, Message):
+            channel = channels[record.channel_id]
+            writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
+            times.append(record.log_time)
+        elif isinstance(record, Metadata):
+            writer.add_metadata(record.name, record.metadata)
+        elif isinstance(record, Attachment):
+            writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+        finished = isinstance(record, Footer)
+    if not finished:
+        writer.add_metadata(RECOVERED, {"messages": str(len(times))})
+    writer.finish()
+    return times

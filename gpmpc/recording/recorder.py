@@ -1,12 +1,10 @@
-"""Problem: keep every step of a run in a file that explains itself and survives a crash, without slowing the loop down.
+"""Records every step of a run in a file that explains itself and survives a crash, and shows it live.
 
-``record(step)`` copies the step's numbers into memory that it shares with another process (``writer``), which does the
-rest: some ten or twenty microseconds. If that memory is full, ``record`` waits for the writer, so memory is bounded and
-nothing is lost. A writer that fails (a full disk) is reported by one of the next calls of ``record``, at the latest by
-``close``.
+``record`` keeps a copy of the step, some ten microseconds; at every ``CHUNK`` bytes or ``INTERVAL`` seconds the steps
+kept are serialised and written as one compressed chunk. A run killed at any moment loses at most that last chunk.
 
 Before the first step the file holds where it comes from (commit, versions, host, command, the caller's metadata), the
-resolved configuration, units and frames, flushed to the disk. An unfinished file has no footer; see ``recovery``.
+resolved configuration, units and frames, flushed to the disk. An unfinished file has no footer; see ``recover``.
 """
 
 import contextlib
@@ -14,23 +12,25 @@ import fcntl
 import json
 import os
 import platform
-import subprocess
-import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-import numpy as np
+import foxglove
+from foxglove.channels import LogChannel
+from foxglove.mcap import MCAPWriteOptions
 
-from gpmpc.exceptions import RecordingError, ShapeError, check_number
+from gpmpc.exceptions import RecordingError, check_number
 from gpmpc.provenance import provenance
-from gpmpc.recording import schemas, wire
-from gpmpc.recording.ring import BATCH, CAPACITY, PAUSE, POSITION, Ring, open_memory
+from gpmpc.recording._messages import RecordedSystem, units_by_field
+from gpmpc.recording._records import CONFIG, LARGEST
+from gpmpc.recording._scene import Scene
+from gpmpc.recording._steps import Encoder, Kept, failure_log, keep
 from gpmpc.step import Step
 
-_WRITER = "import sys; sys.path[:] = {path!r}; from gpmpc.recording.writer import main; main({file}, {memory})"
-_WAIT = 0.0005  # between two looks whether there is room [s]
+_INTERVAL = 1.0  # [s] after which the next step ends a chunk
+_PORT = 8765  # of the live view, if it is free
 
 
 class McapRecorder:
@@ -38,87 +38,92 @@ class McapRecorder:
 
     Args:
         path: The file, such as ``run.mcap``; its folder is made, an older file is replaced.
-        state_names: Names of the n states; they become field names. x, y, z and phi, theta, psi are drawn in space.
-        input_names: Names of the m inputs.
-        time_step: Of the plant [s]; it dates the stages of a plan.
-        units: By name of state or input, such as ``{"x": "m"}``.
+        system: What is recorded.
         config: The resolved configuration, as YAML text or as plain data (written as JSON, which is YAML).
         metadata: More to know of the run, such as its seed.
-        input_bounds: Lower and upper bounds of the input (2, m), repeated in every step for plots.
-        frame: Name of the frame that positions are in.
-        z_down: Whether that frame's z axis points downwards, as the quadrotor's does.
         start_time_ns: Time stamp of the run's time 0 [ns since 1970]. With 0, equal runs give equal files.
         record_problems: Keep every step's quadratic program, so that it can be replayed.
+        chunk_size: Numbers [bytes] that wait in memory at most, if more than one step does; what a killed run loses.
+        live: Serve every step to viewers as well, at ``address``.
+
+    Attributes:
+        address: Where a viewer finds the live view, such as ``ws://127.0.0.1:8765``; None without one.
 
     Raises:
-        SettingError: Names that cannot be fields, units of unknown names, a time step that is not positive.
-        ShapeError: Bounds that are not (2, m).
         RecordingError: The file cannot be written, or another process is writing it.
     """
 
     def __init__(
         self,
         path: str | Path,
-        state_names: Sequence[str],
-        input_names: Sequence[str],
+        system: RecordedSystem,
         *,
-        time_step: float,
-        units: Mapping[str, str] | None = None,
         config: Mapping[str, Any] | str = "",
         metadata: Mapping[str, Any] | None = None,
-        input_bounds: Any = None,
-        frame: str = "world",
-        z_down: bool = True,
         start_time_ns: int = 0,
         record_problems: bool = True,
+        chunk_size: int = 256 * 1024,
+        live: bool = False,
     ):
-        self.path = Path(path)
-        states, inputs = (
-            schemas.check_names("state_names", state_names),
-            schemas.check_names("input_names", input_names),
-        )
-        self._n, self._m = len(states), len(inputs)
-        check_number("time_step", time_step, above=0, unit="[s]")
         check_number("start_time_ns", start_time_ns, least=0, whole=True, unit="[ns]")
-        if input_bounds is not None and np.shape(input_bounds) != (2, len(inputs)):
-            raise ShapeError(f"input bounds must be (2, {len(inputs)}); got {np.shape(input_bounds)}")
-        about = provenance() | {"host": platform.node()} | dict(metadata or {})
-        setup = {
-            "state_names": states,
-            "input_names": inputs,
-            "time_step": float(time_step),
-            "units": schemas.units_by_field(dict(units or {}), states, inputs),
-            "frames": {"positions": frame, "z axis": "down" if z_down else "up", "display": "z axis up"},
-            "run": _flat(about) | {"state_names": " ".join(states), "input_names": " ".join(inputs)},
-            "config": config if isinstance(config, str) else json.dumps(config, indent=2, default=str),
-            "input_bounds": None if input_bounds is None else np.asarray(input_bounds, dtype=float).tolist(),
-            "frame": frame,
-            "z_down": z_down,
-            "start_time_ns": start_time_ns,
-            "record_problems": record_problems,
-        }
+        check_number("chunk_size", chunk_size, least=1, whole=True, unit="[bytes]")
+        states, inputs = system.state_names, system.input_names
+        about = _flat(provenance() | {"host": platform.node()} | dict(metadata or {}))
+        about |= {"state_names": " ".join(states), "input_names": " ".join(inputs)}
+        units = units_by_field(system.units, states, inputs)
+        frames = {"positions": system.frame, "z axis": "down" if system.z_down else "up", "display": "z axis up"}
+        config = config if isinstance(config, str) else json.dumps(config, indent=2, default=str)
+
+        self.path, self.address = Path(path), None
+        self._n, self._m = len(states), len(inputs)
+        self._start, self._record_problems, self._chunk_size = start_time_ns, record_problems, chunk_size
+        self._encoder = Encoder(system)
+        self._waiting: list[Kept] = []
+        self._bytes, self._steps, self._last = 0, 0, time.perf_counter()
         self._error: str | None = None
-        self._closed = self._failed = False
-        self._announced, self._rung = 0, 0.0  # position and time [s] of the doorbell
-        self._start()
-        self._send(wire.frame(wire.SETUP, json.dumps(setup).encode()), ring=True)
-        answer = self._answer()
-        if answer != "ready":
-            self._fail(answer)
+        self._server: Any = None
+        self._file = _File(self.path)
+        self._context = context = foxglove.Context()  # its channels live as long as it does
+        options = MCAPWriteOptions(
+            profile="gpmpc",
+            chunk_size=None,  # ``_flush`` ends them
+            disable_seeking=True,  # a chunk is written in one piece
+            compression_threads=0,
+            compression_level=1,
+        )
+        self._writer = foxglove.open_mcap(self._file, context=context, writer_options=options)
+        with self._writing(sync=True):
+            for name, pairs in (("run", about), ("units", units), ("frames", frames)):
+                self._writer.write_metadata(name, pairs)
+            stamps = {"log_time": start_time_ns, "create_time": start_time_ns}
+            self._writer.attach(name=CONFIG, media_type="application/yaml", data=config.encode(), **stamps)
+        self._channels, self._log = self._encoder.channels(context), LogChannel("/log", context=context)
+        self._scene = Scene(context, states, system.frame, system.z_down)
+        if live:
+            self._serve(context)
 
     def record(self, step: Step) -> None:
         """Takes a copy of a step.
 
         Raises:
             ShapeError: An array does not fit the names of states and inputs.
-            RecordingError: The writer has failed at an earlier step, the recorder is closed, or a step is too large.
+            RecordingError: An earlier step could not be written, the recorder is closed, or a step is too large.
         """
         if self._error is not None:
             raise RecordingError(self._error)
-        self._send(*wire.pack(step, self._n, self._m))
+        kept = keep(step, self._n, self._m, self._record_problems)
+        if 4 * kept.size > LARGEST:
+            raise RecordingError(f"{self.path}: a step of {kept.size} bytes is too large; at most {LARGEST // 4}")
+        self._waiting.append(kept)
+        self._bytes += kept.size
+        if self._server is not None:
+            self._serialise()
+        if self._bytes > self._chunk_size or time.perf_counter() - self._last > _INTERVAL:
+            with self._writing():
+                self._serialise()
 
     def close(self, outcome: str = "complete") -> None:
-        """Waits until everything is on the disk and the file finished.
+        """Writes what waits and finishes the file.
 
         Args:
             outcome: How the run ended; kept as metadata.
@@ -126,16 +131,17 @@ class McapRecorder:
         Raises:
             RecordingError: It could not be written; the file is left unfinished.
         """
-        if self._failed:
+        if self._file.error is not None:
             raise RecordingError(self._error)
-        if self._closed:
+        if self._error is not None:
             return
-        self._send(wire.frame(wire.END, outcome.encode()), ring=True)
-        answer = self._answer()
-        if answer != "done":
-            self._fail(answer)
-        self._end()
-        self._error = f"{self.path}: the recording is closed"
+        with self._writing():
+            self._serialise()
+        with self._writing(sync=True):
+            self._writer.write_metadata("end", {"steps": str(self._steps), "outcome": outcome})
+        with self._writing(sync=True, last=True):
+            pass
+        self._end("the recording is closed")
 
     def __enter__(self) -> "McapRecorder":
         return self
@@ -147,95 +153,121 @@ class McapRecorder:
         with contextlib.suppress(RecordingError):  # most likely the same error
             self.close(f"{kind.__name__}: {error}")  # a run that ended in an error has been recorded up to there
 
-    def _open(self) -> int:
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT, 0o666)
-        except OSError as error:
-            raise RecordingError(f"{self.path}: cannot be written: {error.strerror}") from error
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held until the writer has ended
-            os.ftruncate(descriptor, 0)
-        except OSError as error:
-            os.close(descriptor)
-            raise RecordingError(f"{self.path}: another process is recording to this file") from error
-        return descriptor
+    def _serialise(self) -> None:
+        """Logs the steps that wait: into the open chunk, and to viewers."""
+        if not self._waiting:
+            return
+        stamps = [self._start + round(kept.step.time * 1e9) for kept in self._waiting]
+        for topic, row, message in self._encoder.encode(self._waiting):
+            self._channels[topic].log(message, log_time=stamps[row])
+        self._scene.log(self._waiting, stamps)
+        for kept, nanoseconds in zip(self._waiting, stamps, strict=True):
+            if kept.step.failed or not kept.status.solved:
+                self._log.log(failure_log(kept, nanoseconds), log_time=nanoseconds)
+        self._steps += len(self._waiting)
+        self._waiting.clear()
 
-    def _start(self) -> None:
-        file = self._open()
-        memory = None
+    @contextlib.contextmanager
+    def _writing(self, sync: bool = False, last: bool = False) -> Iterator[None]:
+        """Ends the chunk, or the whole file: what it holds is safe from now on if this process dies.
+
+        Args:
+            sync: Put it on the disk as well.
+            last: Finish the file.
+
+        Raises:
+            RecordingError: It could not be written.
+        """
+        with self._file.accepting(sync):
+            yield
+            self._writer.close() if last else self._writer.flush()
+        if self._file.error is not None:
+            self._end(f"the recording stopped and is unfinished: {self._file.error.strerror}")
+            raise RecordingError(self._error) from self._file.error
+        self._bytes, self._last = 0, time.perf_counter()
+
+    def _end(self, reason: str) -> None:
+        self._error = f"{self.path}: {reason}"
+        if self._server is not None:
+            self._server.stop()
+        self._file.close()
+
+    def _serve(self, context: foxglove.Context) -> None:
         try:
-            memory = open_memory()
-            self._ring = Ring(memory)
-            self._ring.touch()
-            code = _WRITER.format(path=[entry or os.getcwd() for entry in sys.path], file=file, memory=memory)
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", code],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                bufsize=0,
-                pass_fds=[file, memory],
-                start_new_session=True,  # an interrupt from the keyboard ends the loop, which then closes the file
-            )
+            self._server = foxglove.start_server(name=self.path.name, port=_PORT, context=context)
+        except RuntimeError:  # the port is taken
+            self._server = foxglove.start_server(name=self.path.name, port=0, context=context)
+        self.address = f"ws://127.0.0.1:{self._server.port}"
+
+
+class _File:
+    """The file that the library writes to; takes nothing after an error, nor outside of ``accepting``.
+
+    (A writer that is not closed adds a footer when it is collected, and the file would look finished.)
+
+    Raises:
+        RecordingError: The file cannot be written, or another process is writing it.
+    """
+
+    def __init__(self, path: Path):
+        self.error: OSError | None = None
+        self._position = self._whole = 0
+        self._accepts = True
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o666)
         except OSError as error:
-            raise RecordingError(f"{self.path}: its writer cannot be started: {error.strerror}") from error
+            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.ftruncate(self._descriptor, 0)
+        except OSError as error:
+            os.close(self._descriptor)
+            raise RecordingError(f"{path}: another process is recording to this file") from error
+
+    @contextlib.contextmanager
+    def accepting(self, sync: bool) -> Iterator[None]:
+        """Takes what is written; where that fails, the file is cut to what it held before."""
+        self._accepts = True
+        try:
+            yield
+            if sync and self.error is None:
+                os.fsync(self._descriptor)
+        except OSError as error:
+            self.error = error
         finally:
-            for descriptor in (file, memory):
-                if descriptor is not None:
-                    os.close(descriptor)
-        self._doorbell = self._process.stdin.fileno()
-        os.set_blocking(self._doorbell, False)
+            self._accepts = False
+            if self.error is None:
+                self._whole = self._position
+            else:
+                os.ftruncate(self._descriptor, self._whole)
 
-    def _send(self, head: bytes, arrays: Sequence[np.ndarray] = (), length: int = 0, ring: bool = False) -> None:
-        """Puts a frame into the shared memory, and rings if enough has come together or enough time has passed."""
-        if 2 * (size := len(head) + length) > CAPACITY:
-            raise RecordingError(f"{self.path}: a step of {size} bytes is too large; at most {CAPACITY // 2}")
-        while not self._ring.give(head, arrays, length):
-            self._announce()
-            if self._process.poll() is not None:
-                self._fail(self._answer())
-            time.sleep(_WAIT)
-        now = time.perf_counter()
-        if ring or self._ring.given - self._announced > BATCH or now - self._rung > PAUSE:
-            self._rung = now
-            self._announce()
-
-    def _announce(self) -> None:
-        self._announced = self._ring.given
+    def write(self, data: bytes) -> int:
+        """Writes all of the data."""
+        left = memoryview(data)
         try:
-            os.write(self._doorbell, POSITION.pack(self._announced))
-        except BlockingIOError:  # thousands of unheard rings: this one has to be heard as well
-            os.set_blocking(self._doorbell, True)
-            os.write(self._doorbell, POSITION.pack(self._announced))
-            os.set_blocking(self._doorbell, False)
-        except BrokenPipeError:
-            self._fail(self._answer())
+            while left and self._accepts and self.error is None:
+                left = left[os.write(self._descriptor, left) :]
+        except OSError as error:
+            self.error = error
+        self._position += len(data)
+        return len(data)
 
-    def _answer(self) -> str:
-        """The writer's next line; empty if it has died."""
-        return self._process.stdout.readline().decode().strip()
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Tells the position; the library is told not to seek, but asks for it."""
+        return self._position
 
-    def _fail(self, answer: str) -> NoReturn:
-        self._end()
-        self._failed = True
-        reason = answer or "the process that writes it died"
-        self._error = f"{self.path}: the recording stopped and is unfinished: {reason}"
-        raise RecordingError(self._error)
+    def flush(self) -> None:
+        """Does nothing: nothing is held back."""
 
-    def _end(self) -> None:
-        self._closed = True
-        del self._ring
-        self._process.stdin.close()
-        self._process.wait()
-        self._process.stdout.close()
+    def close(self) -> None:
+        """Lets other processes write the file."""
+        os.close(self._descriptor)
 
 
 def _flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Nested data as the text pairs that a metadata record holds, keys dotted."""
+    """Flattens nested data to the text pairs that a metadata record holds, keys dotted."""
     pairs: dict[str, str] = {}
     for key, value in data.items():
-        if isinstance(value, Mapping):
-            pairs |= _flat(value, f"{prefix}{key}.")
-        else:
-            pairs[f"{prefix}{key}"] = str(value)
+        pairs |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": str(value)}
     return pairs

@@ -23,23 +23,34 @@ class Dynamics(Protocol):
     @property
     def state_names(self) -> tuple[str, ...]:
         """Names of the n states, in order."""
+        ...
 
     @property
     def input_names(self) -> tuple[str, ...]:
         """Names of the m inputs, in order."""
+        ...
 
     def derivative(self, x: Any, u: Any) -> Sequence[Any]:
         """The n entries of f(x, u), from anything that is indexed from 0 and knows arithmetic."""
+        ...
 
 
 class Plant(Protocol):
     """A discrete-time system."""
 
-    dynamics: Dynamics
-    time_step: float  # [s]
+    @property
+    def dynamics(self) -> Dynamics:
+        """Right-hand side, with the names of states and inputs."""
+        ...
+
+    @property
+    def time_step(self) -> float:
+        """Time of one step [s]."""
+        ...
 
     def successor(self, x: Any, u: Any) -> Sequence[Any]:
         """The n entries of x[k+1], symbolic or numeric, like ``Dynamics.derivative``."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ def check_propagator(
     *,
     linear: bool = True,
     diagonal: bool = False,
-    observation_noise: bool = False,
+    process_noise: bool = False,
     samples: int | None = None,
     belief: Gaussian | None = None,
     input: Tensor | None = None,
@@ -67,7 +67,7 @@ def check_propagator(
         linear: It claims to be exact where the model is linear, and first-order accurate in its input-output
             covariance. All methods of this package but mean equivalence do.
         diagonal: It claims the variances only, and predicts no correlation of the outputs.
-        observation_noise: It adds the model's noise covariance.
+        process_noise: It adds the model's noise covariance.
         samples: How many states it draws, if it does; its own standard error is then allowed for.
         belief: Where to ask (n,), with a positive definite covariance; by default near the default models' data.
         input: Likewise (m,).
@@ -77,7 +77,7 @@ def check_propagator(
     """
     models = [_small_gp("next_state"), _small_gp("difference")] if model is None else [model]
     for each in models:
-        case = _case(propagator, each, belief, input, diagonal, observation_noise, samples)
+        case = _case(propagator, each, belief, input, diagonal, process_noise, samples)
         _check_result(case)
         _check_without_covariance(case)
         _check_batch(case)
@@ -89,17 +89,17 @@ def check_propagator(
         _check_derivatives(case)
         _check_local_model(case)
     if linear:
-        _check_linear(_case(propagator, _linear_model(), None, None, diagonal, observation_noise, samples))
+        _check_linear(_case(propagator, _linear_model(), None, None, diagonal, process_noise, samples))
 
 
-def _case(propagator, model, belief, input, diagonal, observation_noise, samples) -> _Case:
+def _case(propagator, model, belief, input, diagonal, process_noise, samples) -> _Case:
     n, m = model.state_dim, model.input_dim
     like = {"dtype": model.dtype, "device": model.device}
     if belief is None:
         root = 0.2 * torch.eye(n, **like) + 0.05 * torch.ones(n, n, **like).tril(-1)
         belief = Gaussian(torch.linspace(0.3, -0.4, n, **like), root @ root.mT)
     input = torch.full((m,), 0.2, **like) if input is None else input
-    noise = model.noise_covariance if observation_noise else torch.zeros_like(model.noise_covariance)
+    noise = model.noise_covariance if process_noise else torch.zeros_like(model.noise_covariance)
     return _Case(propagator, model, belief, input, diagonal, noise, samples)
 
 

@@ -65,7 +65,7 @@ def test_the_band_of_the_figure_holds_as_many_positions_as_two_deviations_promis
 
 def test_noise_that_the_plan_holds_already_is_not_counted_twice(tmp_path):
     stds = []
-    for propagation in ([], ["propagation=linearization", "propagation.observation_noise=true"]):
+    for propagation in ([], ["propagation=linearization", "propagation.process_noise=true"]):
         assert forked("run", *TINY, *propagation, "steps=2", cwd=tmp_path).returncode in (0, 3)
     for path in sorted(tmp_path.glob("tree/*/run.mcap")):
         stds.append(expected(read_run(path), [0, 2, 4])[1][1:])

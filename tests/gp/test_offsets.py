@@ -167,7 +167,7 @@ def test_predictions_and_exports_are_those_of_the_shifted_model(by, choice, spar
 
 PROPAGATORS = [
     (MomentMatching(), 1e-10),
-    (MomentMatching(diagonal=True, observation_noise=True), 1e-10),
+    (MomentMatching(diagonal=True, process_noise=True), 1e-10),
     (Linearization(), 1e-10),
     (Linearization(hessian=True), 1e-10),
     (MeanEquivalence(), 1e-10),

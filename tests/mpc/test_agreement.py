@@ -66,10 +66,10 @@ def test_a_bound_that_takes_a_large_step_of_the_inputs_is_kept_by_iterated_progr
     belief, reference = Gaussian.certain(start), Reference(np.stack([start, [0.2, 0.4, 0.0, 0.0, 0.3, 0.5]]))
     reached = []
     for iterations in (1, 30):
-        asked = (gp, Linearization(observation_noise=True), bounded, 1, HOVER)
+        asked = (gp, Linearization(process_noise=True), bounded, 1, HOVER)
         plan = ConvexMPC(*asked, iterations=iterations, tolerance=1e-6).control(belief, reference)
         assert plan.status.solved
-        after = Linearization(observation_noise=True)(gp, belief, torch.tensor(plan.input))
+        after = Linearization(process_noise=True)(gp, belief, torch.tensor(plan.input))
         reached.append(float(after.mean[0] + bounded.state_bounds.kappa * after.covariance[0, 0].sqrt()) - limit)
     assert abs(reached[0]) > 0.01  # [m]
     assert abs(reached[1]) < 1e-5

@@ -8,7 +8,7 @@ from gpmpc.metrics import tracking_error
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.tracking import TrackingProblem
-from gpmpc.simulation import Dropout, Gust, Noise, Replaced, cascade_loop, tell_cascade
+from gpmpc.simulation import Dropout, Gust, Noise, Replaced, cascade_loop, cascade_recording_callback
 from gpmpc.status import Status
 from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational, step, thrust_direction
 from gpmpc.trajectories import Elliptical, Lorenz, states_along
@@ -57,7 +57,7 @@ def test_each_loop_is_told_to_a_recorder_at_its_own_rate():
         record = list.append
 
     outer, inner = Kept(), Kept()
-    flight = fly(Elliptical(), 3, noise=NOISE, on_step=tell_cascade(outer, inner, (10, 20)))
+    flight = fly(Elliptical(), 3, noise=NOISE, on_step=cascade_recording_callback(outer, inner, (10, 20)))
     for told, loop, size in ((outer, flight.outer, 10), (inner, flight.inner, 20)):
         assert [step.k for step in told] == list(range(len(loop.inputs)))
         assert [step.time for step in told] == pytest.approx(loop.time_step * np.arange(len(loop.inputs)))

@@ -24,7 +24,7 @@ GP = quadrotor_gp(15)
 REFERENCE = Reference(np.zeros((H + 1, 6)), np.tile(HOVER, (H, 1)))
 MODES = [
     ("none", Linearization()),
-    ("zero_order", Linearization(observation_noise=True)),
+    ("zero_order", Linearization(process_noise=True)),
     ("zero_order", MomentMatching()),
     ("diagonal", MomentMatching(diagonal=True)),
     ("full", Linearization()),

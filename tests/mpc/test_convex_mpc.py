@@ -423,11 +423,11 @@ def test_a_reference_that_does_not_belong_is_refused():
         controller.control(Gaussian.certain(np.zeros(5)), at_origin(3))
 
 
-@pytest.mark.parametrize("observation_noise", [False, True])
+@pytest.mark.parametrize("process_noise", [False, True])
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("covariance", ["zero_order", "none"])
-def test_the_compiled_rollout_is_the_one_stage_by_stage(covariance, feedback, observation_noise):
-    H, propagator = 6, Linearization(observation_noise=observation_noise)
+def test_the_compiled_rollout_is_the_one_stage_by_stage(covariance, feedback, process_noise):
+    H, propagator = 6, Linearization(process_noise=process_noise)
     arguments = (gp(), propagator, quadrotor_problem(), H, HOVER, "trajectory", covariance)
     compiled, by_torch = ConvexMPC(*arguments, feedback=feedback), ConvexMPC(*arguments, feedback=feedback)
     belief = Gaussian(torch.full((6,), 0.2), 1e-3 * torch.eye(6))
@@ -445,7 +445,7 @@ def test_the_compiled_rollout_is_the_one_stage_by_stage(covariance, feedback, ob
 def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_request(form, covariance, evaluated):
     state, found = Gaussian.certain(np.array([0.3, 0.0, -0.2, 0.1, 0.2, 0.0])), []
     for noise in (False, True):
-        how = Linearization(observation_noise=noise)
+        how = Linearization(process_noise=noise)
         controller = ConvexMPC(gp(), how, quadrotor_problem(), 3, HOVER, form, covariance, feedback=False)
         with backend(evaluated):
             found.append(controller.control(state, at_origin(3)).covariances[1])

@@ -36,8 +36,8 @@ def test_the_shortcut_gives_the_same_stage(model, noise):
         Gaussian(torch.tensor([0.3, -0.2], dtype=torch.float64), root @ root.mT),
         0.4 * torch.ones(1).double(),
     )
-    short = stage_model("zero_order", Linearization(observation_noise=noise), model, belief, input)
-    long = stage_model("zero_order", ByDifferentiation(observation_noise=noise), model, belief, input)
+    short = stage_model("zero_order", Linearization(process_noise=noise), model, belief, input)
+    long = stage_model("zero_order", ByDifferentiation(process_noise=noise), model, belief, input)
     for mine, theirs in zip(
         [*short[:3], *vars(short.next).values(), short.V], [*long[:3], *vars(long.next).values(), long.V], strict=True
     ):
@@ -97,7 +97,7 @@ def test_what_a_stage_adds_is_what_does_not_pass_through():
     model, input = pendulum_posterior(), torch.tensor([0.4])
     root = torch.tensor([[0.1, 0.02], [0.02, 0.15]])
     belief = Gaussian(torch.tensor([0.3, -0.2]), root @ root)
-    stage = stage_model("zero_order", Linearization(observation_noise=True), model, belief, input)
+    stage = stage_model("zero_order", Linearization(process_noise=True), model, belief, input)
     assert torch.allclose(stage.A @ belief.covariance @ stage.A.T + stage.V, stage.next.covariance, atol=1e-14)
     certain = Gaussian.certain(belief.mean)
     own = model.predict(belief.mean, input).covariance

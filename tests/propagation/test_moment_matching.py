@@ -8,7 +8,7 @@ from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.propagation import MomentMatching
-from gpmpc.propagation.moment_matching import moments
+from gpmpc.propagation.moments import moments
 
 
 def model(size=20, n=2, m=1, noise=1e-3, lengthscale=1.0, predicts="next_state", seed=0):
@@ -239,7 +239,7 @@ def test_wide_beliefs_far_from_the_data_neither_overflow_nor_lose_the_prior():
 
 def test_the_result_is_semidefinite_and_observation_noise_is_added_on_request():
     gp, at, control = model(noise=1e-8), belief(spread=1e-3), torch.tensor([0.1])
-    latent, noisy = MomentMatching()(gp, at, control), MomentMatching(observation_noise=True)(gp, at, control)
+    latent, noisy = MomentMatching()(gp, at, control), MomentMatching(process_noise=True)(gp, at, control)
     assert float(torch.linalg.eigvalsh(latent.covariance).min()) >= -1e-18
     assert torch.allclose(noisy.covariance - latent.covariance, torch.diag(gp.noise_variance), atol=1e-14)
 

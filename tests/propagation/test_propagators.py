@@ -49,12 +49,12 @@ def belief(n=2, scale=1.0):
 
 
 @pytest.mark.parametrize("name", [name for name in DETERMINISTIC if name != "mean equivalence"])
-@pytest.mark.parametrize("observation_noise", [False, True])
-def test_a_linear_gaussian_system_is_propagated_exactly(name, observation_noise):
+@pytest.mark.parametrize("process_noise", [False, True])
+def test_a_linear_gaussian_system_is_propagated_exactly(name, process_noise):
     model, at, u = linear(), belief(), torch.tensor([0.7])
     A, B, c = model.nominal.A, model.nominal.B, model.nominal.c
-    Q = torch.diag(torch.tensor([0.03, 0.05])) + observation_noise * 0.04 * torch.eye(2)
-    result = DETERMINISTIC[name](observation_noise=observation_noise).propagate(model, at, u)
+    Q = torch.diag(torch.tensor([0.03, 0.05])) + process_noise * 0.04 * torch.eye(2)
+    result = DETERMINISTIC[name](process_noise=process_noise).propagate(model, at, u)
     assert torch.allclose(result.belief.mean, A @ at.mean + B @ u + c, atol=1e-12)
     assert torch.allclose(result.belief.covariance, A @ at.covariance @ A.T + Q, atol=1e-12)
     assert torch.allclose(result.cross_covariance, at.covariance @ A.T, atol=1e-12)
@@ -158,7 +158,7 @@ def test_an_autonomous_model_takes_no_input_or_one_of_no_columns(name, predicts)
 @pytest.mark.parametrize("name", ALL)
 def test_observation_noise_is_added_on_request_and_only_then(name):
     model, at, u = gp(noise=0.02), belief(), torch.tensor([0.3])
-    latent, noisy = ALL[name]().propagate(model, at, u), ALL[name](observation_noise=True).propagate(model, at, u)
+    latent, noisy = ALL[name]().propagate(model, at, u), ALL[name](process_noise=True).propagate(model, at, u)
     assert torch.equal(latent.belief.mean, noisy.belief.mean)
     assert torch.equal(latent.cross_covariance, noisy.cross_covariance)
     assert torch.allclose(noisy.belief.covariance - latent.belief.covariance, 0.02 * torch.eye(2), atol=1e-13)
@@ -169,7 +169,7 @@ def test_noise_of_a_residual_model_acts_where_the_residual_does(name):
     d = gp(n=1, m=1, predicts="value")
     nominal = Affine(torch.eye(2), torch.ones(2, 1), torch.zeros(2))
     model = ResidualModel(nominal, d, torch.tensor([[0.5], [2.0]]), [1], [0], 1)
-    latent, noisy = (ALL[name](observation_noise=noise)(model, belief(), torch.zeros(1)) for noise in (False, True))
+    latent, noisy = (ALL[name](process_noise=noise)(model, belief(), torch.zeros(1)) for noise in (False, True))
     B = torch.tensor([[0.5], [2.0]])
     assert torch.allclose(noisy.covariance - latent.covariance, 0.01 * B @ B.T, atol=1e-12)
 

@@ -34,12 +34,12 @@ MODELS = {
 PROPAGATORS = [
     MeanEquivalence(),
     Linearization(),
-    Linearization(observation_noise=True),
+    Linearization(process_noise=True),
     MomentMatching(),
     MomentMatching(diagonal=True),
-    MomentMatching(observation_noise=True),
+    MomentMatching(process_noise=True),
     Unscented(),
-    Unscented(alpha=0.5, beta=2.0, kappa=1.0, observation_noise=True),
+    Unscented(alpha=0.5, beta=2.0, kappa=1.0, process_noise=True),
 ]
 
 

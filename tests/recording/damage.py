@@ -13,7 +13,7 @@ import numpy as np
 import zstandard
 from mcap.writer import Writer
 
-from gpmpc.recording import schemas
+from gpmpc.recording import _messages
 from tests.recording import runs
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -231,13 +231,13 @@ def renumber(data, rng):
 
 def edit_message(data, rng):
     """Fields of a message that no longer belong together."""
-    classes = schemas.message_classes(runs.STATES, runs.INPUTS, schemas.READ)
+    classes = _messages.message_classes(_messages.descriptor(runs.STATES, runs.INPUTS, _messages.READ))
 
     def change(found):
         messages = [i for i, (opcode, content) in enumerate(found) if opcode == MESSAGE and content[0] in (1, 2, 3)]
         i = _pick(rng, messages)
         head, content = found[i][1][:22], found[i][1][22:]
-        message = classes[(schemas.STEP, schemas.PLAN, schemas.QP)[head[0] - 1]].FromString(content)
+        message = classes[("Step", "Plan", "QuadraticProgram")[head[0] - 1]].FromString(content)
         field = _pick(rng, list(message.DESCRIPTOR.fields))
         kind = rng.integers(3)
         if kind == 0 or field.message_type is not None:
@@ -333,12 +333,12 @@ def bomb(data, rng, largest=2**31):
 
 def well_formed_bomb(data, rng):
     """Plans and quadratic programs of zeros: every number in its place, and far too many of them."""
-    classes = schemas.message_classes(runs.STATES, runs.INPUTS)
+    classes = _messages.message_classes(_messages.descriptor(runs.STATES, runs.INPUTS))
     n, found = len(runs.STATES), section(data)
     kind, many = rng.integers(3), int(rng.choice([3, 40]))
     if kind == 0:
         stages = int(rng.choice([3000, 30000]))
-        plan = classes[schemas.PLAN](k=int(rng.integers(20)), covariances=[0.0] * (stages * n * n))
+        plan = classes["Plan"](k=int(rng.integers(20)), covariances=[0.0] * (stages * n * n))
         for _ in range(stages):
             plan.stages.add()
         message = 2, plan.SerializeToString()
@@ -346,9 +346,9 @@ def well_formed_bomb(data, rng):
         size = int(rng.choice([300, 1000]))
         program = {"P": size * size, "q": size, "lower": size, "upper": size, "softness": 2 * size}
         fields = {name: [0.0] * length for name, length in program.items()}
-        message = 3, classes[schemas.QP](k=1, variables=size, **fields).SerializeToString()
+        message = 3, classes["QuadraticProgram"](k=1, variables=size, **fields).SerializeToString()
     else:
-        step = classes[schemas.STEP](k=1, belief_covariance=[0.0] * (n * n))
+        step = classes["Step"](k=1, belief_covariance=[0.0] * (n * n))
         message, many = (1, step.SerializeToString()), many * 1000
     content = struct.pack("<HIQQ", message[0], 0, 0, 0) + message[1]
     chunks = [

@@ -4,7 +4,7 @@ import numpy as np
 
 from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.qp import DualActiveSet, QuadraticProgram
-from gpmpc.recording import McapRecorder, Step
+from gpmpc.recording import McapRecorder, RecordedSystem, Step
 from gpmpc.status import Status
 
 STATES, INPUTS = ("x", "vx", "y", "vy", "z", "vz"), ("U1", "ux", "uy")
@@ -55,8 +55,13 @@ def make_step(k, rng, horizon=5, status=Status.SOLVED, failed=False, qp=True, so
 
 
 def recorder(path, **settings):
-    given = {"time_step": TIME_STEP, "units": UNITS, "config": {"seed": 7}, "metadata": {"seed": 7}}
-    return McapRecorder(path, STATES, INPUTS, **(given | {"input_bounds": BOUNDS} | settings))
+    """A recorder of small chunks, so that a short run has several."""
+    given = {"chunk_size": 20_000, "time_step": TIME_STEP, "units": UNITS, "input_bounds": BOUNDS} | settings
+    of_system = {
+        key: given.pop(key) for key in ("time_step", "units", "input_bounds", "frame", "z_down") if key in given
+    }
+    system = RecordedSystem(STATES, INPUTS, **of_system)
+    return McapRecorder(path, system, **({"config": {"seed": 7}, "metadata": {"seed": 7}} | given))
 
 
 def record_run(path, steps=8, **settings):

@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from gpmpc.mpc.controller import Decision, Timing
-from gpmpc.recording import McapRecorder, Step, layout, read_run
+from gpmpc.recording import McapRecorder, RecordedSystem, Step, layout, read_run
 from gpmpc.status import Status
 from gpmpc.systems import Coupled, Rotational
 from tests.recording import runs
@@ -27,7 +27,7 @@ FLOWN = {
 def record(path, states, inputs, steps=3, **settings):
     n, m, H = len(states), len(inputs), 2
     rng = np.random.default_rng(0)
-    with McapRecorder(path, states, inputs, time_step=0.1, **settings) as recorder:
+    with McapRecorder(path, RecordedSystem(states, inputs, time_step=0.1, **settings)) as recorder:
         for k in range(steps):
             means, covariances = rng.standard_normal((H + 1, n)), np.tile(np.eye(n), (H + 1, 1, 1))
             decision = Decision(

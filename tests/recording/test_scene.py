@@ -7,7 +7,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
 from gpmpc.mpc.controller import Decision, Timing
-from gpmpc.recording import McapRecorder, Step
+from gpmpc.recording import McapRecorder, RecordedSystem, Step
 from gpmpc.status import Status
 from gpmpc.systems import Coupled
 
@@ -23,7 +23,7 @@ def spreads(n, rng):
 def record(path, states, outcomes, rng, **settings):
     """A step a second, of the statuses and of whether they count as failed; the steps."""
     n, steps = len(states), []
-    with McapRecorder(path, states, ("u",), time_step=1.0, **settings) as recorder:
+    with McapRecorder(path, RecordedSystem(states, ("u",), time_step=1.0, **settings)) as recorder:
         for k, (status, failed) in enumerate(outcomes):
             decision = Decision(
                 np.zeros(1), np.zeros((H, 1)), rng.uniform(-3, 3, (H + 1, n)), spreads(n, rng),

@@ -21,12 +21,10 @@ OWN = {
 }
 
 
-@pytest.mark.parametrize("observation_noise", [False, True])
+@pytest.mark.parametrize("process_noise", [False, True])
 @pytest.mark.parametrize(("kind", "settings", "claims"), OWN.values(), ids=OWN.keys())
-def test_the_packages_own_propagators_pass(kind, settings, claims, observation_noise):
-    check_propagator(
-        kind(**settings, observation_noise=observation_noise), **claims, observation_noise=observation_noise
-    )
+def test_the_packages_own_propagators_pass(kind, settings, claims, process_noise):
+    check_propagator(kind(**settings, process_noise=process_noise), **claims, process_noise=process_noise)
 
 
 @pytest.mark.parametrize(("kind", "settings", "claims"), OWN.values(), ids=OWN.keys())

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from gpmpc import step as recorded
-from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.simulation.cascade_loop import CascadeStep
 from gpmpc.simulation.loop import Step
 
 
-def tell(recorder: Any, gp_size: int = 0) -> Callable[[Step], None]:
+def recording_callback(recorder: Any, gp_size: int = 0) -> Callable[[Step], None]:
     """What ``closed_loop`` takes as ``on_step`` to have every step recorded.
 
     Args:
@@ -36,7 +35,8 @@ def tell(recorder: Any, gp_size: int = 0) -> Callable[[Step], None]:
                 state=step.state,
                 measured=step.measured,
                 input=np.asarray(step.input, dtype=float),
-                decision=_unasked(step) if decision is None else decision,
+                decision=decision,
+                status=step.command.status,
                 innovation=nothing if expected is None else step.measured - expected,
                 belief_covariance=step.covariance,
                 gp_size=gp_size,
@@ -48,7 +48,9 @@ def tell(recorder: Any, gp_size: int = 0) -> Callable[[Step], None]:
     return on_step
 
 
-def tell_cascade(outer: Any, inner: Any, gp_sizes: tuple[int, int] = (0, 0)) -> Callable[[CascadeStep], None]:
+def cascade_recording_callback(
+    outer: Any, inner: Any, gp_sizes: tuple[int, int] = (0, 0)
+) -> Callable[[CascadeStep], None]:
     """What ``cascade_loop`` takes as ``on_step`` to have both loops recorded, each at its own rate.
 
     Args:
@@ -56,7 +58,7 @@ def tell_cascade(outer: Any, inner: Any, gp_sizes: tuple[int, int] = (0, 0)) -> 
         inner: The same of phi .. r and U2, U3, U4, once an inner step.
         gp_sizes: Transitions that the outer model holds, and the inner one.
     """
-    tell_outer, tell_inner = tell(outer, gp_sizes[0]), tell(inner, gp_sizes[1])
+    tell_outer, tell_inner = recording_callback(outer, gp_sizes[0]), recording_callback(inner, gp_sizes[1])
     begun = 0  # outer steps
 
     def on_step(step: CascadeStep) -> None:
@@ -67,17 +69,3 @@ def tell_cascade(outer: Any, inner: Any, gp_sizes: tuple[int, int] = (0, 0)) -> 
         tell_inner(step.of_inner())
 
     return on_step
-
-
-def _unasked(step: Step) -> Decision:
-    """A decision that says nothing: the controller was not asked, or what it said has another shape."""
-    H, n, m = step.reference.horizon, len(step.state), len(step.input)
-    return Decision(
-        input=step.input,
-        inputs=np.full((H, m), np.nan),
-        means=np.full((H + 1, n), np.nan),
-        covariances=np.full((H + 1, n, n), np.nan),
-        status=step.command.status,
-        iterations=0,
-        timing=Timing(0.0, 0.0, 0.0),
-    )

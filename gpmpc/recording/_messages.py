@@ -1,0 +1,190 @@
+"""Defines the protobuf messages of a recording and serialises many of them at a time.
+
+States and inputs become scalar fields with the plant's own names (``state.x``, ``input.U1``), because a plot tool draws
+an array as one line. The descriptors are therefore built at run time and travel in the file. A descriptor loses
+comments, so units stand in the file's metadata record ``units``, by field path.
+
+Packed ``repeated double`` has the wire format of ``bytes`` that hold the little-endian float64 values, and a nested
+message that of ``bytes`` that hold it serialised. The reader and the recorder use twins of the declared messages with
+``bytes`` in these places (``READ``, ``WRITTEN``): a thousand numbers then cost one copy.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+
+from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.status import Status
+
+STEP, PLAN, QP = "/step", "/plan", "/qp"
+TOPICS = {STEP: "gpmpc.Step", PLAN: "gpmpc.Plan", QP: "gpmpc.QuadraticProgram"}
+TIMING = ("model", "build", "solve", "total")
+READ = {"repeated double": "bytes"}
+WRITTEN = READ | dict.fromkeys(("State", "Input", "Timing"), "bytes") | {"repeated Stage": "repeated bytes"}
+QP_ARRAYS = ("P", "q", "G", "lower", "upper", "softness", "x", "multipliers")
+
+_FIELDS = {
+    "Step": {
+        "time": "double",
+        "k": "int64",
+        "reference": "State",
+        "state": "State",
+        "measured": "State",
+        "input": "Input",
+        "input_lower": "Input",
+        "input_upper": "Input",
+        "innovation": "State",
+        "belief_std": "State",
+        "belief_covariance": "repeated double",
+        "status": "Status",
+        "iterations": "int64",
+        "active_set_size": "int64",
+        "timing": "Timing",
+        "residuals": "",  # of the first edition; the reader computes them
+        "gp_size": "int64",
+        "gp_version": "int64",
+        "failed": "bool",
+    },
+    "Stage": {"time": "double", "mean": "State", "std": "State", "input": "Input"},
+    "Plan": {"time": "double", "k": "int64", "stages": "repeated Stage", "covariances": "repeated double"},
+    "QuadraticProgram": {"time": "double", "k": "int64", "variables": "int64", "rows": "int64"}
+    | dict.fromkeys(QP_ARRAYS, "repeated double"),
+}
+_SCALARS = {
+    "double": FieldDescriptorProto.TYPE_DOUBLE,
+    "int64": FieldDescriptorProto.TYPE_INT64,
+    "bool": FieldDescriptorProto.TYPE_BOOL,
+    "bytes": FieldDescriptorProto.TYPE_BYTES,
+}
+_LARGEST = 1000  # states or inputs
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+
+@dataclass(frozen=True)
+class RecordedSystem:
+    """Describes the system whose steps are recorded.
+
+    Attributes:
+        state_names: Names of the n states; they become field names. x, y, z and phi, theta, psi are drawn in space.
+        input_names: Names of the m inputs.
+        time_step: Of the plant [s]; it dates the stages of a plan.
+        units: By name of state or input, such as ``{"x": "m"}``.
+        input_bounds: Lower and upper bounds of the input (2, m), repeated in every step for plots.
+        frame: Name of the frame that positions are in.
+        z_down: Whether that frame's z axis points downwards, as the quadrotor's does.
+
+    Raises:
+        SettingError: Names that cannot be fields, units of unknown names, a time step that is not positive.
+        ShapeError: Bounds that are not (2, m).
+    """
+
+    state_names: Sequence[str]
+    input_names: Sequence[str]
+    time_step: float  # [s]
+    units: Mapping[str, str] = field(default_factory=dict)
+    input_bounds: Any = None
+    frame: str = "world"
+    z_down: bool = True
+
+    def __post_init__(self) -> None:
+        for key in ("state_names", "input_names"):
+            object.__setattr__(self, key, check_names(key, getattr(self, key)))
+        check_number("time_step", self.time_step, above=0, unit="[s]")
+        if self.input_bounds is not None and np.shape(self.input_bounds) != (2, len(self.input_names)):
+            raise ShapeError(f"input bounds must be (2, {len(self.input_names)}); got {np.shape(self.input_bounds)}")
+        units_by_field(self.units, self.state_names, self.input_names)
+
+
+def check_names(kind: str, names: Sequence[str]) -> tuple[str, ...]:
+    """Returns the names, if each can be a field of a message and none comes twice.
+
+    Raises:
+        SettingError: They cannot.
+    """
+    names = tuple(names)
+    if not 1 <= len(names) <= _LARGEST:
+        raise SettingError(kind, f"must be 1 to {_LARGEST} names; got {len(names)}")
+    for name in names:
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise SettingError(kind, f"a name must be letters, digits and _, a letter first; got {name!r}")
+        if names.count(name) > 1:
+            raise SettingError(kind, f"a name must be unique; {name!r} comes {names.count(name)} times")
+    return names
+
+
+def descriptor(
+    states: Sequence[str], inputs: Sequence[str], twin: Mapping[str, str] = MappingProxyType({})
+) -> FileDescriptorProto:
+    """Describes all messages.
+
+    Args:
+        states: Names of the n states.
+        inputs: Names of the m inputs.
+        twin: Kinds of fields to replace by others with equal wire format: ``READ`` or ``WRITTEN``.
+    """
+    file = FileDescriptorProto(name="gpmpc/recording.proto", package="gpmpc", syntax="proto3")
+    status = file.enum_type.add(name="Status")
+    for number, value in enumerate(Status):
+        status.value.add(name=value.name, number=number)
+    named = {"State": states, "Input": inputs, "Timing": TIMING}
+    for name, fields in ({k: dict.fromkeys(v, "double") for k, v in named.items()} | _FIELDS).items():
+        message = file.message_type.add(name=name)
+        for number, (key, kind) in enumerate(fields.items(), start=1):
+            if kind:
+                *repeated, kind = twin.get(kind, kind).split()
+                label = FieldDescriptorProto.LABEL_REPEATED if repeated else FieldDescriptorProto.LABEL_OPTIONAL
+                added = message.field.add(name=key, number=number, label=label)
+                if kind in _SCALARS:
+                    added.type = _SCALARS[kind]
+                else:
+                    is_enum = kind == "Status"
+                    added.type = FieldDescriptorProto.TYPE_ENUM if is_enum else FieldDescriptorProto.TYPE_MESSAGE
+                    added.type_name = f".gpmpc.{kind}"
+    return file
+
+
+def message_classes(file: FileDescriptorProto) -> dict[str, Any]:
+    """Builds the message classes by their short name.
+
+    Raises:
+        SettingError: Two names are one to protobuf, such as x_1 and x1.
+    """
+    pool = DescriptorPool()
+    try:
+        pool.Add(file)
+    except TypeError as error:
+        raise SettingError("state_names", f"and input_names cannot be fields of a message: {error}") from error
+    return {m.name: GetMessageClass(pool.FindMessageTypeByName(f"gpmpc.{m.name}")) for m in file.message_type}
+
+
+def schema_data(file: FileDescriptorProto) -> bytes:
+    """Serialises the descriptor as the schema of an MCAP file."""
+    return FileDescriptorSet(file=[file]).SerializeToString()
+
+
+def units_by_field(units: Mapping[str, str], states: Sequence[str], inputs: Sequence[str]) -> dict[str, str]:
+    """Finds the unit of every scalar field by its path: of ``gpmpc.Step``, and of ``gpmpc.Plan`` after ``stages``.
+
+    Args:
+        units: By name of state or input; a name without unit gets "?".
+        states: Names of the n states.
+        inputs: Names of the m inputs.
+
+    Raises:
+        SettingError: A unit for a name that is neither.
+    """
+    if unknown := set(units) - set(states) - set(inputs):
+        raise SettingError("units", f"must be of {', '.join([*states, *inputs])}; got {', '.join(sorted(unknown))}")
+    fields = {"time": "s", "stages.time": "s"}
+    for message, prefix in (("Step", ""), ("Stage", "stages.")):
+        for key, kind in _FIELDS[message].items():
+            names = {"State": states, "Input": inputs}.get(kind, ())
+            fields |= {f"{prefix}{key}.{name}": units.get(name, "?") for name in names}
+    return fields | {f"timing.{name}": "s" for name in TIMING}
