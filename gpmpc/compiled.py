@@ -203,20 +203,6 @@ def _read_source(path: str | None) -> tuple[bytes, list[str]]:
     return hashlib.sha256(source).digest(), imported
 
 
-@njit_noalloc
-def copy(x, y):
-    """Writes a vector to one of its length. For ``y[:] = x`` numba compiles an error's words: a second a kernel."""
-    for i in range(len(y)):
-        y[i] = x[i]
-
-
-@njit_noalloc
-def copy_matrix(X, Y):
-    """Writes a matrix to one of its shape."""
-    for r in range(len(Y)):
-        copy(X[r], Y[r])
-
-
 def compile_for(kernel: Callable, signature: str) -> None:
     """Compiles ``kernel`` for one signature and no other: it then refuses other types with ``TypeError``.
 

@@ -1,6 +1,6 @@
 """The local model s+ = A s + B u + c of the extended state s = [mu; vec S], S = Sigma^(1/2), for H beliefs.
 
-``gpmpc.propagation.local_model`` states the mathematics. With dSigma = E S + S E for a change E of the root, derivatives
+Mathematics: ``gpmpc.propagation.local_model``. With dSigma = E S + S E for a change E of the root, derivatives
 D by Sigma become 2 D S; the next root's derivative X solves X S+ + S+ X = dSigma+, entry by entry in the basis of S+.
 """
 

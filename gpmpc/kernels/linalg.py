@@ -1,7 +1,7 @@
-"""Dense linear algebra for compiled loops: small vectors and matrices, where calls of a library cost more.
+"""Dense linear algebra for compiled loops: small vectors and matrices, for which a library call costs too much.
 
-The functions write into arrays of their caller and allocate nothing, but for ``aligned`` and ``square_root``. Sizes come
-from the arrays; where rows are padded, a caller passes the number of entries that count.
+All but ``aligned`` and ``square_root`` write into arrays of their caller and allocate nothing. Sizes come from the
+arrays; where rows are padded, a caller passes the number of entries that count.
 """
 
 import math

@@ -11,7 +11,8 @@ the inputs hold for u_k, not for what K adds to it.
 
 import numpy as np
 
-from gpmpc.compiled import borrowing, compiled, copy_matrix
+from gpmpc.compiled import borrowing, compiled
+from gpmpc.kernels.linalg import copy_matrix
 
 
 @compiled

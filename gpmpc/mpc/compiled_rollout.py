@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpmpc.compiled import compiled, copy, copy_matrix
+from gpmpc.compiled import compiled, njit_noalloc
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.kernels.point import expand_at
-from gpmpc.kernels.point_rows import aligned_rows, explain_several
+from gpmpc.kernels.gp_point import _write_kernel, _write_offsets
+from gpmpc.kernels.linalg import aligned_rows, copy, copy_matrix
+from gpmpc.kernels.rows import project, reduce_variances
 from gpmpc.mpc.ancillary_feedback import step_spread
 from gpmpc.mpc.linear_quadratic import finite_horizon_lqr
 from gpmpc.mpc.tracking import TrackingProblem
@@ -63,7 +64,7 @@ class CompiledRollout:
         self.known = (
             uncertain,
             feedback,
-            (packed.points, packed.inverse_squares, packed.log_signal, packed.weights),
+            tuple(packed.arrays[:4]),
             packed.columns if uncertain else NOTHING[None],
             (model.offset.numpy(), model.predicts == "difference"),
             (problem.Q, problem.R, problem.terminal),
@@ -88,6 +89,24 @@ class CompiledRollout:
         follow = NOTHING if follow is None else follow
         roll_out(self.known, start, covariance, disturbance, follow, tuple(found))
         return found
+
+
+@njit_noalloc
+def expand_at(gp, x, u, memory, kept, place, M, J, J_u):
+    """Writes M, J (k, n) and J_u (k, m) at one point; the k_a stay in ``kept[:, place]``."""
+    points, inverse_squares, log_signal, beta = gp
+    d, n = len(points), len(x)
+    offsets, squares, weighted = memory[:d], memory[d : 2 * d], memory[2 * d]
+    _write_offsets(points, x, u, offsets, squares)
+    for a in range(len(beta)):
+        D = inverse_squares[a]
+        M[a] = _write_kernel(log_signal[a], D, squares, beta[a], kept[a, place], weighted)
+        project(weighted, offsets[:n], J[a])
+        project(weighted, offsets[n:], J_u[a])
+        for c in range(n):
+            J[a, c] *= D[c]
+        for c in range(d - n):
+            J_u[a, c] *= D[n + c]
 
 
 @compiled
@@ -134,7 +153,7 @@ def roll_out(known, start, covariance, disturbance, follow, out):
         kept[:, H:] = 0.0
         explained = np.zeros((n, places))
         for a in range(n):
-            explain_several(columns[a], kept[a], explained[a])
+            reduce_variances(columns[a], kept[a], explained[a])
         V = noise.copy()
         for k in range(H):
             for i in range(n):

@@ -30,8 +30,7 @@ from numba import types
 
 from gpmpc.compiled import compile_for, compiled, njit_inner, njit_noalloc, unchecked_entry_point
 from gpmpc.exceptions import ShapeError
-from gpmpc.kernels.linalg import copy, copy_matrix, dot
-from gpmpc.kernels.point_rows import aligned_rows
+from gpmpc.kernels.linalg import aligned_rows, copy, copy_matrix, dot
 from gpmpc.mpc.linear_quadratic import (
     DEVIATIONS,
     INCREMENTS,

@@ -35,7 +35,7 @@ from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.backend import chosen_backend, host_arrays
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.kernels.extended import roots
+from gpmpc.kernels.extended_state import square_roots
 from gpmpc.mpc.ancillary_feedback import spread
 from gpmpc.mpc.compiled_rollout import CompiledRollout
 from gpmpc.mpc.controller import Decision
@@ -157,7 +157,7 @@ class Predictor:
         """The vectors s (*batch, p) of beliefs."""
         if self.covariance == "full":
             S = np.empty(covariance.shape)
-            roots(np.ascontiguousarray(covariance).reshape(-1, *S.shape[-2:]), S.reshape(-1, *S.shape[-2:]))
+            square_roots(np.ascontiguousarray(covariance).reshape(-1, *S.shape[-2:]), S.reshape(-1, *S.shape[-2:]))
             return np.concatenate((mean, S.reshape(*mean.shape[:-1], -1)), axis=-1)
         if self.covariance == "diagonal":
             variance = np.diagonal(covariance, axis1=-2, axis2=-1)

@@ -9,7 +9,8 @@ import math
 import numpy as np
 from numba import types
 
-from gpmpc.compiled import borrowing, clock, compiled, copy, copy_matrix
+from gpmpc.compiled import borrowing, clock, compiled
+from gpmpc.kernels.linalg import copy, copy_matrix
 from gpmpc.mpc.chance_constraints import tighten, violation_price
 from gpmpc.mpc.compiled_rollout import roll_out
 from gpmpc.mpc.condense import (
