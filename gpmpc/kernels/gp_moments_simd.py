@@ -43,87 +43,45 @@ from gpmpc.kernels.rows import (
     second_moments,
     transform,
 )
-from gpmpc.kernels.simd import (
-    NEAR_ZERO,
-    exp,
-    expm1,
-    expm1_near_zero,
-    load,
-    store,
-    total,
-    use_widest_registers,
-    zeros,
-)
+from gpmpc.kernels.simd import NEAR_ZERO, exp, expm1, expm1_near_zero, load, store, total, use_widest_registers, zeros
 
 
 class _Belief(NamedTuple):
-    """A belief, and the points relative to its mean and input.
+    """A belief, and the points relative to its mean and input."""
 
-    Attributes:
-        S: (n, n).
-        x: x_i - mu (n, P).
-        u: u_i - u (m, P).
-    """
-
-    S: ndarray
-    x: ndarray
-    u: ndarray
+    S: ndarray  # (n, n)
+    x: ndarray  # x_i - mu (n, P)
+    u: ndarray  # u_i - u (m, P)
 
 
 class _OutputTerms(NamedTuple):
-    """What each output has alone: vectors over the points, matrices, and sums over the points.
+    """What each output has alone: vectors over the points, matrices, and sums over the points."""
 
-    Attributes:
-        z: (k, n, P).
-        Tz: T_a z_ai (k, n, P).
-        q: (k, P).
-        weighted: beta q (k, P).
-        G: (k, n, n).
-        T: (k, n, n).
-        half_logdet: 1/2 log|I + S D_a| (k,).
-        M: sum_i beta_i q_i (k,).
-        first: sum_i beta_i q_i z_i (k, n).
-        second: sum_i beta_i q_i z_i z_i' (k, n, n).
-        e: sum_i e_i (k,), e_i = q_i [(K + sn2 I)^-1 q]_i.
-        e_first: sum_i e_i z_i (k, n).
-        e_second: sum_i e_i z_i z_i' (k, n, n).
-    """
-
-    z: ndarray
-    Tz: ndarray
-    q: ndarray
-    weighted: ndarray
-    G: ndarray
-    T: ndarray
-    half_logdet: ndarray
-    M: ndarray
-    first: ndarray
-    second: ndarray
-    e: ndarray
-    e_first: ndarray
-    e_second: ndarray
+    z: ndarray  # (k, n, P)
+    Tz: ndarray  # T_a z_ai (k, n, P)
+    q: ndarray  # (k, P)
+    weighted: ndarray  # beta q (k, P)
+    G: ndarray  # (k, n, n)
+    T: ndarray  # (k, n, n)
+    half_logdet: ndarray  # 1/2 log|I + S D_a| (k,)
+    M: ndarray  # sum_i beta_i q_i (k,)
+    first: ndarray  # sum_i beta_i q_i z_i (k, n)
+    second: ndarray  # sum_i beta_i q_i z_i z_i' (k, n, n)
+    e: ndarray  # sum_i e_i (k,), e_i = q_i [(K + sn2 I)^-1 q]_i
+    e_first: ndarray  # sum_i e_i z_i (k, n)
+    e_second: ndarray  # sum_i e_i z_i z_i' (k, n, n)
 
 
 class _PairTerms(NamedTuple):
-    """What the sum over pairs of points reads and writes.
+    """What the sum over pairs of points reads, and the sums."""
 
-    Attributes:
-        rise: (P,).
-        fall: (P,).
-        left: (n, P).
-        weighted_z: weight_i z_i (n, P).
-        p_i: Out: row sums (P,).
-        p_j: Out: column sums (P,).
-        g: Out: (n, P).
-    """
-
-    rise: ndarray
-    fall: ndarray
-    left: ndarray
-    weighted_z: ndarray
-    p_i: ndarray
-    p_j: ndarray
-    g: ndarray
+    rise: ndarray  # (P,)
+    fall: ndarray  # (P,)
+    left: ndarray  # (n, P)
+    weighted_z: ndarray  # weight_i z_i (n, P)
+    p_i: ndarray  # row sums (P,)
+    p_j: ndarray  # column sums (P,)
+    g: ndarray  # (n, P)
 
 
 class _Scratch(NamedTuple):
@@ -144,7 +102,7 @@ def evaluate_moments(order, diagonal, gp, precision, mu, S, u, out):
     use_widest_registers()
     (k, padded), n, m = gp.weights.shape, mu.shape[1], u.shape[1]
     rows = aligned_rows(n + m + 2, padded)
-    terms, pair = _make_output_terms(k, n, padded), _make_pair_terms(n, padded)
+    terms, pair = _make_terms(k, n, padded)
     matrices = np.empty((5, n, n))
     scratch = _Scratch(matrices[0], matrices[1], matrices[2], matrices[3], matrices[4], rows[n + m], rows[n + m + 1])
     for h in range(len(mu)):
@@ -181,19 +139,14 @@ def evaluate_moments(order, diagonal, gp, precision, mu, S, u, out):
 
 
 @njit_inner
-def _make_output_terms(k, n, padded):
-    vectors, matrices = aligned_rows(2 * k * n, padded).reshape(2, k, n, padded), np.zeros((4, k, n, n))
-    rows, sums, numbers = aligned_rows(2 * k, padded).reshape(2, k, padded), np.zeros((2, k, n)), np.zeros((3, k))
-    return _OutputTerms(
-        vectors[0], vectors[1], rows[0], rows[1], matrices[0], matrices[1], numbers[0],
-        numbers[1], sums[0], matrices[2], numbers[2], sums[1], matrices[3],
-    )  # fmt: skip
-
-
-@njit_inner
-def _make_pair_terms(n, padded):
-    rows = aligned_rows(3 * n + 4, padded)
-    return _PairTerms(rows[0], rows[1], rows[4 : 4 + n], rows[4 + n : 4 + 2 * n], rows[2], rows[3], rows[4 + 2 * n :])
+def _make_terms(k, n, padded):
+    vectors, rows = aligned_rows(2 * k * n, padded).reshape(2, k, n, padded), aligned_rows(2 * k, padded)
+    squares, sums, numbers = np.zeros((4, k, n, n)), np.zeros((2, k, n)), np.zeros((3, k))
+    G, T, second, e_second = squares[0], squares[1], squares[2], squares[3]
+    single = vectors[0], vectors[1], rows[:k], rows[k:], G, T, numbers[0], numbers[1]
+    pair = aligned_rows(3 * n + 4, padded)
+    blocks = pair[4 : 4 + n], pair[4 + n : 4 + 2 * n], pair[2], pair[3], pair[4 + 2 * n :]
+    return _OutputTerms(*single, sums[0], second, numbers[2], sums[1], e_second), _PairTerms(pair[0], pair[1], *blocks)
 
 
 @njit_inner
