@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,7 +93,6 @@ def fly_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
 def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
     """Trains, flies and records; the metrics."""
     from gpmpc.experiments.run import fly, metrics
-    from gpmpc.simulation import recording_callback
 
     if config.recorder != "mcap":
         return metrics(experiment, fly(experiment))
@@ -100,7 +100,7 @@ def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, abou
 
         def prepared(controller: Any, training: Any) -> Callable:
             recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller.problem, training))
-            callback = recording_callback(recorder, 0 if training is None else len(training.posterior))
+            callback = partial(recorder.record, gp_size=0 if training is None else len(training.posterior))
             return _in_real_time(callback, experiment.plant.time_step) if config.live else callback
 
         flight = fly(experiment, prepared)

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 
-SEARCH = "gpmpc.gp.search"  # tells of single evaluations, where a bar says how far the work is
+SEARCH = "gpmpc.gp._search"  # tells of single evaluations, where a bar says how far the work is
 
 
 def told_console() -> "Console":

@@ -24,8 +24,7 @@ from gpmpc.metrics import NEAR, ViolationRate, find_loss, time_quantiles, tracki
 from gpmpc.mpc.controller import Controller, Reference
 from gpmpc.mpc.supervision import OnFailure, check_policy
 from gpmpc.propagation import MomentMatching, Propagator
-from gpmpc.simulation import Disturbance, ModelLoop, Noise, Rollout, Step, closed_loop, rehearse
-from gpmpc.simulation.systems import RunningPlant
+from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
 from gpmpc.systems import Coupled, Map, Plant, Rotational, Translational
 from gpmpc.trajectories import Trajectory, states_along
 
@@ -99,11 +98,11 @@ class Experiment:
         if self.loop == "model" and not self.learns:
             raise SettingError("loop", "a model loop needs a controller that learns a model; this one knows the plant")
         for disturbance in self.disturbances:
-            if not hasattr(disturbance, "acting"):
+            if not hasattr(disturbance, "disturb_plant"):
                 what = "must each name what it is, such as {_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}}"
                 raise SettingError("disturbances", f"{what}; got {disturbance!r}")
         if self.loop == "plant":  # noise and disturbances that do not fit it are found out before the training
-            RunningPlant(self.plant, np.zeros(len(names)), self.disturbances, self.noise, self.seed)
+            PlantSimulator(self.plant, np.zeros(len(names)), self.disturbances, self.noise, self.seed)
 
     @property
     def learns(self) -> bool:

@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from gpmpc.compiled import inline_njit, njit_inner, njit_noalloc
+from gpmpc.kernels.simd import load, store, zeros
 
 
 @njit_inner
@@ -72,6 +73,44 @@ def multiply(A, count, x, size, out):
     while i < count:
         out[i] = dot(A[i], x, size)
         i += 1
+
+
+@inline_njit
+def combine_rows(rows, count, factors, start, width, out):
+    """Writes sum_j factors[j] rows[j] over ``count`` rows, columns from ``start`` on, ``width`` of them.
+
+    Rows and ``out`` are padded: what lies between the last and the next whole register is written too. Several sums
+    at a time hide the latency of one.
+    """
+    at, end = start, start + width
+    while at + 8 < end:
+        a = b = c = d = e = f = g = h = zeros()
+        j = 0
+        while j + 4 <= count:
+            r0, r1, r2, r3 = rows[j], rows[j + 1], rows[j + 2], rows[j + 3]
+            f0, f1, f2, f3 = factors[j], factors[j + 1], factors[j + 2], factors[j + 3]
+            a, b = a + f0 * load(r0, at), b + f0 * load(r0, at + 8)
+            c, d = c + f1 * load(r1, at), d + f1 * load(r1, at + 8)
+            e, f = e + f2 * load(r2, at), f + f2 * load(r2, at + 8)
+            g, h = g + f3 * load(r3, at), h + f3 * load(r3, at + 8)
+            j += 4
+        while j < count:
+            a, b = a + factors[j] * load(rows[j], at), b + factors[j] * load(rows[j], at + 8)
+            j += 1
+        store(out, at, (a + c) + (e + g))
+        store(out, at + 8, (b + d) + (f + h))
+        at += 16
+    if at < end:
+        a = b = c = d = zeros()
+        j = 0
+        while j + 4 <= count:
+            a, b = a + factors[j] * load(rows[j], at), b + factors[j + 1] * load(rows[j + 1], at)
+            c, d = c + factors[j + 2] * load(rows[j + 2], at), d + factors[j + 3] * load(rows[j + 3], at)
+            j += 4
+        while j < count:
+            a = a + factors[j] * load(rows[j], at)
+            j += 1
+        store(out, at, (a + b) + (c + d))
 
 
 @njit_noalloc

@@ -177,28 +177,6 @@ def clip(typing_context, values, low, high):
 
 
 @intrinsic
-def limit_size(typing_context, values, limit, beyond):
-    """The entries below ``limit`` in size; ``beyond``, with the entry's sign, in place of the others. NaN stays."""
-
-    def generate(context, builder, signature, arguments):
-        values, limit, beyond = arguments
-        inside = builder.fcmp_unordered("<", _call(builder, "llvm.fabs.v8f64", values), _spread(builder, limit))
-        return builder.select(inside, values, _call(builder, "llvm.copysign.v8f64", _spread(builder, beyond), values))
-
-    return LANES(LANES, types.float64, types.float64), generate
-
-
-@intrinsic
-def is_negative(typing_context, values):
-    """One where an entry is negative or NaN, zero elsewhere."""
-
-    def generate(context, builder, signature, arguments):
-        return builder.uitofp(builder.fcmp_unordered("<", arguments[0], _constant(0.0)), _VECTOR)
-
-    return LANES(LANES), generate
-
-
-@intrinsic
 def any_nonzero(typing_context, values):
     """Whether an entry is not zero, as NaN is not."""
 

@@ -19,7 +19,7 @@ from gpmpc.mpc.prediction import Prediction, Predictor
 from gpmpc.mpc.request import Request
 from gpmpc.mpc.stage_models import StageModel, disturbed, stage_model
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
-from gpmpc.propagation.composition import Composition
+from gpmpc.propagation._composition import Composition
 
 Array = np.ndarray
 

@@ -249,7 +249,7 @@ class ConvexMPC:
         if prepared is not None:
             return prepared.solve(q, lower, upper, warm)
         if isinstance(self.solver, DualActiveSet):
-            return self.solver.solve_stacked(P, q, G, lower, upper, warm, soft)
+            return self.solver.solve(QuadraticProgram.unchecked(P, q, G, lower, upper), warm, soft)
         warm = warm if warm is not None and len(warm.q) == len(q) and len(warm.lower) == len(lower) else None
         return self.solver.solve(QuadraticProgram.from_stacked(P, q, G, lower, upper), warm)
 

@@ -30,7 +30,7 @@ from scipy.optimize import minimize
 from gpmpc.exceptions import DataError
 from gpmpc.mpc.request import Request
 from gpmpc.mpc.shooting import Shooting, Shot
-from gpmpc.qp import DualActiveSet, QPSolution, SoftRows
+from gpmpc.qp import DualActiveSet, QPSolution, QuadraticProgram, SoftRows
 from gpmpc.status import Status
 
 HALVINGS = 20  # of a step, before the line search gives up
@@ -158,10 +158,12 @@ class Program:
         solver, soft, consistent = DualActiveSet(), None, True
         if self.soft and len(margins):
             soft = self._softened(self._prices)
-        solution = solver.solve_stacked(P, q, G, lower, upper, last, soft)
+        solution = solver.solve(QuadraticProgram.unchecked(P, q, G, lower, upper), last, soft)
         if solution.status is Status.INFEASIBLE and not self.soft and len(margins):
             consistent = False
-            solution = solver.solve_stacked(P, q, G, lower, upper, None, self._softened([(ELASTIC * scale, np.inf)]))
+            solution = solver.solve(
+                QuadraticProgram.unchecked(P, q, G, lower, upper), None, self._softened([(ELASTIC * scale, np.inf)])
+            )
         if not solution.status.solved:
             consistent = consistent and solution.status is not Status.INFEASIBLE
             return Step(np.zeros_like(unit), math.inf, 0.0, 0.0, 0.0, np.zeros(len(shot.margins)), consistent, None)

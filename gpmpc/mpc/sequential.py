@@ -30,9 +30,8 @@ from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.mpc.flat_arrays import Layout, flattened
 from gpmpc.mpc.prediction import Predictor
 from gpmpc.mpc.request import Request
-from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
+from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram, SoftRows
 from gpmpc.qp import record as layout
-from gpmpc.qp.soft_rows import SoftRows
 from gpmpc.qp.solution import Terms
 from gpmpc.status import Status
 
@@ -201,7 +200,7 @@ class SequentialPrograms:
 
     def _solve(self, program: tuple[Array, ...], warm: QPSolution | None) -> QPSolution:
         if self._ours:
-            return self._solver.solve_stacked(*program, warm, self._soft)
+            return self._solver.solve(QuadraticProgram.unchecked(*program), warm, self._soft)
         _, q, _, lower, _ = program
         fits = warm is not None and len(warm.q) == len(q) and len(warm.lower) == len(lower)
         return self._solver.solve(QuadraticProgram.from_stacked(*program), warm if fits else None)

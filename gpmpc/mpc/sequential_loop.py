@@ -25,7 +25,7 @@ from gpmpc.mpc.flat_arrays import part
 from gpmpc.mpc.linear_quadratic import References, Stages, TrackingCost, expand, tracking_cost
 from gpmpc.mpc.quasi_newton import MEMORY, correct
 from gpmpc.qp import record as layout
-from gpmpc.qp.dual_kernels import solve_lazy
+from gpmpc.qp.dual_kernels import solve
 
 MODEL, GUIDED, PROGRAM = 1, 2, 3  # what is asked for
 SOLVED, ITERATION_LIMIT, NUMERICAL_TROUBLE = layout.SOLVED, layout.ITERATION_LIMIT, layout.NUMERICAL_TROUBLE
@@ -65,11 +65,11 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
 
     Args:
         compiled: Whether the rollout is.
-        ours: Whether ``solve_lazy`` solves the programs.
+        ours: Whether ``solve`` solves the programs.
         columns: Of the Cholesky factors, where the compiled rollout takes them.
         known: What stays, flat.
         places: Its table.
-        work: Workspace of ``solve_lazy``.
+        work: Workspace of ``solve``.
         question: s_0, and covariance, disturbance, targets, reference inputs, last input and shifted plan of a
             ``Request``.
         follow: Means that the first rollout follows, or nothing.
@@ -143,7 +143,7 @@ def sequence(compiled, ours, columns, known, places, work, question, follow, gue
                 q[i] = slope[i] - scratch[i]
         then = clock()
         outcome[BUILD] += then - now
-        ended = solve_lazy(P, q, G, lower, upper, warm, work, record) if ours else NUMERICAL_TROUBLE
+        ended = solve(P, q, G, lower, upper, warm, work, record) if ours else NUMERICAL_TROUBLE
         if ended != SOLVED:
             yield PROGRAM
             ended = int(record[RECORD_STATUS])

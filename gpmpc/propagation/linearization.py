@@ -17,7 +17,7 @@ from gpmpc.dynamics import predict_with_jacobian
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.propagation.composition import Composition
+from gpmpc.propagation._composition import Composition
 from gpmpc.propagation.propagator import Propagation, Propagator, checked_input, projected
 from gpmpc.propagation.sensitivity import Sensitivity
 

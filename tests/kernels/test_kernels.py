@@ -18,7 +18,7 @@ from gpmpc.kernels.gp_moments import CROSS
 from gpmpc.kernels.packed import pack
 from gpmpc.kernels.rows import largest_size, largest_square, reduce_variance, reduce_variances
 from gpmpc.kernels.simd import NEAR_ZERO, load, store
-from gpmpc.propagation.moment_matching import moments
+from gpmpc.propagation._moments import moments
 from tests.propagation.test_moment_matching import belief, by_mpmath, model
 
 

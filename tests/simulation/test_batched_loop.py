@@ -12,7 +12,7 @@ from gpmpc.mpc.convex_mpc import ConvexMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
-from gpmpc.simulation.batched_loop import chunk_size
+from gpmpc.simulation.trials import chunk_size
 from gpmpc.status import Status
 from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational, step, step_many
 from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
@@ -186,11 +186,6 @@ def test_chunks_keep_within_the_memory_that_is_given():
     assert chunk_size(Proportional(), 200, 1) == 200
 
 
-def test_one_bar_counts_the_trials(capsys):
-    fly(controller("none"), 3, progress=True)
-    assert "3/3" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
@@ -198,7 +193,6 @@ def test_one_bar_counts_the_trials(capsys):
         ({"seeds": 0}, SettingError, "seeds: must be a whole number, 1 or more; got 0"),
         ({"seeds": [1, 1]}, SettingError, "different whole numbers"),
         ({"chunk": 0}, SettingError, "chunk: must be a whole number, 1 or more; got 0"),
-        ({"memory": 0}, SettingError, r"memory: must be .* \[bytes\]; got 0"),
         ({"on_failure": "ignore"}, SettingError, "on_failure: must be one of"),
         ({"initial": np.zeros(3)}, ShapeError, r"the initial state must have shape \(6,\); got \(3,\)"),
         ({"noise": Noise(process=[0.1])}, ShapeError, "noise.process must have 6 standard deviations; got 1"),

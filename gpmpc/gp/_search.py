@@ -22,9 +22,9 @@ from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import check_tensors
+from gpmpc.gp._kernel import IGNORED, check_posterior
+from gpmpc.gp._likelihood import FAILED, NegativeLogMarginalLikelihood, Objective
 from gpmpc.gp.gpytorch_ import GPyTorchLikelihood
-from gpmpc.gp.kernel import IGNORED, check_posterior
-from gpmpc.gp.likelihood import FAILED, NegativeLogMarginalLikelihood, Objective
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.scaling import Scaling
 

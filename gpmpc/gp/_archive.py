@@ -25,9 +25,9 @@ import numpy as np
 from gpmpc.exceptions import DataError, SettingError
 
 HEADER = "header.json"
-EXPANSION = 20  # times its size is what a compressed file may hold: measured numbers shrink to a half, or a tenth
-LONGEST = 2**20  # bytes of a header
-READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+_EXPANSION = 20  # times its size is what a compressed file may hold: measured numbers shrink to a half, or a tenth
+_LONGEST = 2**20  # bytes of a header
+_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def existing_file(path: str | Path, expected: str) -> Path:
@@ -77,15 +77,15 @@ def read_header(path: Path) -> Any:
     with _opened(path) as (archive, _):
         if HEADER not in archive.namelist():
             return None
-        if archive.getinfo(HEADER).file_size > LONGEST:
-            raise ValueError(f"{HEADER} is longer than {LONGEST} bytes")
+        if archive.getinfo(HEADER).file_size > _LONGEST:
+            raise ValueError(f"{HEADER} is longer than {_LONGEST} bytes")
         return json.loads(archive.read(HEADER))
 
 
 def read_arrays(path: Path, names: Collection[str] | None = None) -> Iterator[tuple[str, np.ndarray]]:
     """Names and read-only arrays of real numbers, one after another; all of them, or those of the given names."""
     with _opened(path) as (archive, size):
-        left = EXPANSION * size // 8  # numbers
+        left = _EXPANSION * size // 8  # numbers
         for info in archive.infolist():
             name = info.filename.removesuffix(".npy")
             if name != info.filename and (names is None or name in names):
@@ -130,7 +130,7 @@ def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, int]]:
             if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise ValueError(f"{info.filename} is compressed in a way that is not read; write it uncompressed")
         declared = sum(info.file_size for info in archive.infolist())
-        if declared > EXPANSION * size:
+        if declared > _EXPANSION * size:
             raise ValueError(f"declares {declared} bytes, more than a file of {size} bytes can hold")
         yield archive, size
 
@@ -138,9 +138,9 @@ def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, int]]:
 def _array(name: str, data: bytes, most: int) -> np.ndarray:
     file = io.BytesIO(data)
     version = np.lib.format.read_magic(file)
-    if version not in READERS:
+    if version not in _READERS:
         raise ValueError(f"{name} is in version {version} of the .npy format")
-    shape, by_columns, dtype = READERS[version](file)
+    shape, by_columns, dtype = _READERS[version](file)
     if dtype.kind not in "fiu":
         raise ValueError(f"{name} must hold real numbers; got {dtype}")
     rest, count = len(data) - file.tell(), math.prod(shape)

@@ -19,6 +19,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp.posterior import AffineForm
 from gpmpc.propagation.sensitivity import Sensitivity
 
+_NOT_WANTED: Any = None
+
 
 class Latent(NamedTuple):
     """Moments of f at x_s ~ N(mu_s, S_s), with derivatives by mu_s, S_s and u_s where they are wanted.
@@ -39,17 +41,20 @@ class Latent(NamedTuple):
     M: Tensor
     V: Tensor
     J: Tensor
-    dM_dS: Tensor | None = None
-    dM_du: Tensor | None = None
-    dV_dmu: Tensor | None = None
-    dV_dS: Tensor | None = None
-    dV_du: Tensor | None = None
-    dJ_dS: Tensor | None = None
-    dJ_du: Tensor | None = None
+    dM_dS: Tensor = _NOT_WANTED
+    dM_du: Tensor = _NOT_WANTED
+    dV_dmu: Tensor = _NOT_WANTED
+    dV_dS: Tensor = _NOT_WANTED
+    dV_du: Tensor = _NOT_WANTED
+    dJ_dS: Tensor = _NOT_WANTED
+    dJ_du: Tensor = _NOT_WANTED
 
 
 class Composition:
     """The affine part of a model around its latent functions ``f``; see ``gpmpc.gp.posterior.AffineForm``."""
+
+    B: Any
+    G: Any
 
     def __init__(self, form: AffineForm):
         self.f, self.A, self.G, self.c, self.B, self.states, self.inputs = form

@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from gpmpc.gp.kernel import centred
+from gpmpc.gp._kernel import centred
 
 FAILED = 1e12  # objective where the kernel matrix is not positive definite: finite, so that a line search steps back
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
@@ -45,7 +45,8 @@ class NegativeLogMarginalLikelihood:
     def __call__(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
         """Value and gradient (d + 2,)."""
         d = self._x.shape[1]
-        z, sf2, sn2 = self._x * np.exp(-theta[:d]), np.exp(2 * theta[d]), np.exp(2 * (theta[d] - theta[d + 1]))
+        z = self._x * np.exp(-theta[:d])
+        sf2, sn2 = float(np.exp(2 * theta[d])), float(np.exp(2 * (theta[d] - theta[d + 1])))
         found = self._small(z, sf2, sn2) if self._square is None else self._large(self._square, z, sf2, sn2)
         return (np.inf, np.zeros_like(theta)) if found is None else found
 

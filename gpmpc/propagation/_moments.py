@@ -35,7 +35,7 @@ from torch import Tensor
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.propagation.composition import Latent
+from gpmpc.propagation._composition import Latent
 
 
 class _OutputTerms(NamedTuple):
@@ -91,14 +91,14 @@ def moments(
     weighted = model.weights * terms.q
     mean = weighted.sum(-1) + model.offset
     slope = (weighted[..., None, :] @ terms.z @ terms.inverse)[..., 0, :]
-    reduction_of_variance = model.variance_reduction(terms.q)
+    reductions = model.variance_reduction(terms.q)
     entries = []
     for p, (i, j) in enumerate(zip(pairs.a, pairs.b, strict=True)):  # one at a time: (N, N) fits the cache
         centred = _centred_products(terms, pairs, p)
         entry = ((centred @ model.weights[j]) * model.weights[i]).sum(-1)
         if i == j:
             reduction = (model.precision[i] * centred).sum((-2, -1))
-            entry = entry + model.signal_variance[i] - reduction_of_variance[..., i] - reduction
+            entry = entry + model.signal_variance[i] - reductions[..., i] - reduction
         entries.append(entry)
     return mean, _symmetric_from_pairs(entries, pairs, model.output_dim), slope
 
@@ -230,26 +230,26 @@ def moments_with_jacobian(
     e = _Sums.of(terms.q * model.solve(terms.q), terms.z, c)
     J = _transposed(G, f.first)
     dM_dS = _symmetric(G.mT @ f.second @ G - f.total[..., None, None] * A) / 2
-    dJ_dS, dJ_du = _slopes(model.weights * terms.q, terms, c, J, A) if cross else (None, None)
+    slopes = _slopes(model.weights * terms.q, terms, c, J, A) if cross else ()
 
-    reduction_of_variance, entries = model.variance_reduction(terms.q), []
+    reductions, entries = model.variance_reduction(terms.q), []
     for p, (a, b) in enumerate(zip(pairs.a, pairs.b, strict=True)):  # one N x N matrix at a time
         U, moment = _products(f.at(a), f.at(b))
         weights = model.weights[a][:, None] * model.weights[b]
+        own, G_a = e.at(a), G[..., a, :, :]
         if a == b:
-            own, G_a = e.at(a), G[..., a, :, :]
             weighted = terms.q[..., a, :, None] * terms.z[..., a, :, :]
             U = [_Sums(*(part - less for part, less in zip(side, own, strict=True))) for side in U]
             moment = moment - weighted.mT @ (model.precision[a] @ weighted)
             weights = weights - model.precision[a]
         total, by_mu, by_S, by_u = _pair(weights * _centred_products(terms, pairs, p), U, moment, p, pairs, terms, c)
         if a == b:  # sf2 - |L^-1 q|^2, whose derivative is -2 sum_i e_i dlog q_i
-            total = total + model.signal_variance[a] - reduction_of_variance[..., a]
+            total = total + model.signal_variance[a] - reductions[..., a]
             by_mu, by_u = by_mu - 2 * _transposed(G_a, own.first), by_u - 2 * own.control
             by_S = by_S - _symmetric(G_a.mT @ own.second @ G_a - own.total[..., None, None] * A[..., a, :, :])
         entries.append((total, by_mu, by_S, by_u))
     V, dV_dmu, dV_dS, dV_du = (_symmetric_from_pairs(part, pairs, k) for part in zip(*entries, strict=True))
-    return Latent(f.total + model.offset, V, J, dM_dS, f.control, dV_dmu, dV_dS, dV_du, dJ_dS, dJ_du)
+    return Latent(f.total + model.offset, V, J, dM_dS, f.control, dV_dmu, dV_dS, dV_du, *slopes)
 
 
 def _products(f_a: _Sums, f_b: _Sums) -> tuple[list[_Sums], Tensor]:

@@ -1,8 +1,8 @@
-"""Problem: two things can stand at the other end of a loop, and a result has to say which one did.
+"""Simulates what stands at the other end of a control loop: a plant, or the learned model itself.
 
-The plant: a state that is stepped, pushed about and measured with noise. Or the learned model itself, as in the figures
-of Cao, Lai and Alam (2017): every next state is the model's own prediction, mean and covariance carried on, and the
-true plant never enters. The second says how a controller and a model get on with each other, not how a vehicle flies.
+A plant has a state that is stepped, disturbed and measured with noise. A model loop, as in the figures of Cao, Lai and
+Alam (2017), takes the model's own prediction for the next state, mean and covariance carried on; the true plant never
+enters. It shows how a controller and a model get on with each other, not how a vehicle flies.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,9 @@ from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number, c
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation.propagator import Propagator
 from gpmpc.simulation.disturbances import Disturbance
-from gpmpc.systems import Plant, step
+from gpmpc.systems import Plant, step, step_many
+
+Array = np.ndarray
 
 
 @dataclass(frozen=True)
@@ -74,26 +76,35 @@ class Noise:
                 check_numbers(f"noise.{key}", values, len(values), least=0)
 
 
-class Running(Protocol):
+class Simulator(Protocol):
     """A system under way."""
 
-    mean: np.ndarray  # the state, or what is believed of it (n,)
-    covariance: np.ndarray  # (n, n), zero for a plant's
+    @property
+    def mean(self) -> Array:
+        """The state, or the mean of its belief (n,)."""
+
+    @property
+    def covariance(self) -> Array:
+        """Of the belief (n, n); zero for a plant's state."""
 
     def measure(self, time: float) -> Gaussian:
-        """What a controller is told at a time [s]."""
+        """Measures the state at a time [s]."""
 
-    def apply(self, time: float, input: np.ndarray) -> np.ndarray:
-        """Takes one step from a time [s] on; the input that acted (m,)."""
+    def step(self, time: float, input: Array) -> Array:
+        """Takes one step from a time [s] on; returns the input that was applied (m,).
+
+        Raises:
+            Diverged: The next state is not finite.
+        """
 
 
-class RunningPlant:
-    """A plant under way, with disturbances and noise.
+class PlantSimulator:
+    """Simulates a plant with disturbances and noise.
 
     Args:
         plant: What the controller believes in, and what is there where no disturbance says otherwise.
         initial: The state (n,), or a belief that it is drawn from.
-        disturbances: Each is handed the plant, and the measurement, that the one before left.
+        disturbances: Each changes the plant, and the measurement, that the one before left.
         noise: On states, measurements and inputs.
         seed: Of all random numbers.
 
@@ -113,10 +124,8 @@ class RunningPlant:
     ):
         check_number("seed", seed, least=0, whole=True)
         if not hasattr(plant, "dynamics"):
-            got = type(plant).__name__
-            raise SettingError(
-                "system", f"must be a plant, such as Integrated(dynamics, 0.1), or a ModelLoop; got {got}"
-            )
+            what = "must be a plant, such as Integrated(dynamics, 0.1), or a ModelLoop"
+            raise SettingError("system", f"{what}; got {type(plant).__name__}")
         if not isinstance(noise, Noise | None):
             raise SettingError("noise", f"must be Noise(...); got {noise!r}")
         if not isinstance(disturbances, Sequence):
@@ -129,89 +138,73 @@ class RunningPlant:
                 raise ShapeError(f"noise.{key} must have {length} standard deviations; got {len(values)}")
         # One stream a source: whether states are measured with noise changes nothing about the wind.
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
-        self._sources = dict(zip(("initial", "process", "measurement", "input"), streams, strict=True))
+        self._streams = dict(zip(("initial", "process", "measurement", "input"), streams, strict=True))
         self.plant, self.disturbances, self.noise = plant, tuple(disturbances), noise
         mean, covariance = (initial.mean, initial.covariance) if isinstance(initial, Gaussian) else (initial, None)
-        self.mean = checked_state(mean, n)
+        self.mean = _check_state(mean, n)
         if covariance is not None:
-            self.mean = self._sources["initial"].multivariate_normal(self.mean, np.asarray(covariance, dtype=float))
+            self.mean = self._streams["initial"].multivariate_normal(self.mean, np.asarray(covariance, dtype=float))
         self.covariance = np.zeros((n, n))
         self._steps = 0
-        self._acting(0.0)  # a disturbance that does not fit is found out before the first step
+        self._disturbed_plant(0.0)  # a disturbance that does not fit is found before the first step
 
     def measure(self, time: float) -> Gaussian:
-        """The state as it is measured, taken for certain: the controllers of this package filter nothing."""
-        measured = self._noisy("measurement", self.mean)
+        """Measures the state; the measurement is taken for certain: controllers of this package filter nothing."""
+        measured = self._add_noise("measurement", self.mean)
         for disturbance in self.disturbances:
-            measured = disturbance.measured(measured, time)
+            measured = disturbance.disturb_measurement(measured, time)
         return Gaussian.certain(measured)
 
-    def apply(self, time: float, input: np.ndarray) -> np.ndarray:
-        """Steps the plant that is there at this time.
-
-        Raises:
-            Diverged: The next state is not finite.
-        """
-        plant, input = self.act(time, input)
-        with np.errstate(over="ignore", invalid="ignore"):
-            state = step(plant, self.mean, input)
-        self.arrive(state, input)
-        return input
-
-    def act(self, time: float, input: np.ndarray) -> tuple[Plant, np.ndarray]:
-        """The first half of ``apply``: the plant that is there at this time, and the input that acts on it (m,).
+    def step(self, time: float, input: Array) -> Array:
+        """Steps the plant that is there at a time [s]; returns the input that was applied (m,).
 
         Raises:
             ShapeError: The plant has another number of inputs.
+            Diverged: The next state is not finite.
         """
+        applied = self._applied_input(input)
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._arrive(step(self._disturbed_plant(time), self.mean, applied), applied)
+        return applied
+
+    def _disturbed_plant(self, time: float) -> Plant:
+        plant = self.plant
+        for disturbance in self.disturbances:
+            plant = disturbance.disturb_plant(plant, time)
+        return plant
+
+    def _applied_input(self, input: Array) -> Array:
         m = len(self.plant.dynamics.input_names)
         if np.shape(input) != (m,):
             raise ShapeError(f"the plant takes inputs of shape ({m},); got {np.shape(input)}")
-        return self._acting(time), self._noisy("input", input)
+        return self._add_noise("input", input)
 
-    def arrive(self, state: np.ndarray, input: np.ndarray) -> None:
-        """The second half: where that plant went under that input.
-
-        Raises:
-            Diverged: The state is not finite.
-        """
+    def _arrive(self, state: Array, applied: Array) -> None:
         if not np.isfinite(state).all():
-            raise Diverged(self._steps, f"the plant's state is not finite any more; it was {self.mean}, input {input}")
-        self.mean = self._noisy("process", state)
+            before = f"it was {self.mean}, input {applied}"
+            raise Diverged(self._steps, f"the plant's state is not finite any more; {before}")
+        self.mean = self._add_noise("process", state)
         self._steps += 1
 
-    def _acting(self, time: float) -> Plant:
-        plant = self.plant
-        for disturbance in self.disturbances:
-            plant = disturbance.acting(plant, time)
-        return plant
-
-    def _noisy(self, source: str, value: np.ndarray) -> np.ndarray:
+    def _add_noise(self, source: str, value: Array) -> Array:
         deviations = getattr(self.noise, source)
         if deviations is None:
             return value
-        return value + np.asarray(deviations, dtype=float) * self._sources[source].standard_normal(len(value))
+        return value + np.asarray(deviations, dtype=float) * self._streams[source].standard_normal(len(value))
 
 
-class RunningModel:
-    """A model loop under way.
+class ModelSimulator:
+    """Simulates a model loop.
 
     Args:
         loop: Model and propagator.
         initial: Mean (n,) with covariance ``initial_std``^2 I, or a belief.
-        disturbances: None are possible.
-        noise: None is possible.
-
-    Raises:
-        SettingError: A disturbance or noise is given: nothing of the kind enters a model loop.
     """
 
-    def __init__(self, loop: ModelLoop, initial: Any, disturbances: Sequence[Disturbance], noise: Noise | None):
-        if disturbances or noise is not None:
-            raise SettingError("disturbances, noise", "need a plant in the loop; got a ModelLoop")
+    def __init__(self, loop: ModelLoop, initial: Any):
         self.loop, model = loop, loop.model
         mean, covariance = (initial.mean, initial.covariance) if isinstance(initial, Gaussian) else (initial, None)
-        mean = torch.as_tensor(checked_state(mean, model.state_dim)).to(model.device, model.dtype)
+        mean = torch.as_tensor(_check_state(mean, model.state_dim)).to(model.device, model.dtype)
         if covariance is None:
             covariance = loop.initial_std**2 * torch.eye(model.state_dim, dtype=model.dtype, device=model.device)
         else:
@@ -220,21 +213,21 @@ class RunningModel:
         self._steps = 0
 
     @property
-    def mean(self) -> np.ndarray:
+    def mean(self) -> Array:
         """Of the belief (n,)."""
         return self._belief.mean.cpu().numpy().astype(float)
 
     @property
-    def covariance(self) -> np.ndarray:
+    def covariance(self) -> Array:
         """Of the belief (n, n)."""
         return self._belief.covariance.cpu().numpy().astype(float)
 
     def measure(self, time: float) -> Gaussian:
-        """The belief."""
+        """Returns the belief."""
         return self._belief
 
-    def apply(self, time: float, input: np.ndarray) -> np.ndarray:
-        """Carries the belief one step on.
+    def step(self, time: float, input: Array) -> Array:
+        """Carries the belief one step on; returns the input.
 
         Raises:
             Diverged: The next belief is not finite.
@@ -248,8 +241,31 @@ class RunningModel:
         return input
 
 
-def checked_state(value: Any, n: int) -> np.ndarray:
-    """A finite state (n,) as an array of its own.
+def step_together(simulators: Sequence[Any], time: float, inputs: Sequence[Array]) -> list[Array | Diverged]:
+    """Steps simulators of one plant from a time [s] on; returns the inputs that were applied, or why one cannot go on.
+
+    Several plants are stepped in one evaluation.
+    """
+    outcomes: list[Array | Diverged] = []
+    if len(simulators) > 1:
+        applied = [simulator._applied_input(input) for simulator, input in zip(simulators, inputs, strict=True)]
+        plant = simulators[0]._disturbed_plant(time)  # disturbances look at the time, not at a trial
+        with np.errstate(over="ignore", invalid="ignore"):
+            states = step_many(plant, np.array([s.mean for s in simulators]), np.array(applied))
+    for i, simulator in enumerate(simulators):
+        try:
+            if len(simulators) == 1:
+                outcomes.append(simulator.step(time, inputs[0]))
+            else:
+                simulator._arrive(states[i], applied[i])
+                outcomes.append(applied[i])
+        except Diverged as error:
+            outcomes.append(error)
+    return outcomes
+
+
+def _check_state(value: Any, n: int) -> Array:
+    """Returns a finite state (n,) as an array of its own.
 
     Raises:
         ShapeError: Another shape.
