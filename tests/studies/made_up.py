@@ -4,11 +4,12 @@ import json
 
 import numpy as np
 
-from gpmpc.experiments.run import Experiment, Flight, metrics
-from gpmpc.experiments.run_folder import PLAN, RunFolder, folder_name, record
 from gpmpc.mpc.controller import Timing
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
+from gpmpc.studies.flight import Experiment, Flown, metrics
+from gpmpc.studies.report_document import report_document
+from gpmpc.studies.run_folder import PLAN, RunFolder, folder_name, record
 from gpmpc.systems import Integrated, Translational
 
 SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
@@ -35,7 +36,7 @@ def metrics_of(error, steps=20, failing=0):
         np.full((steps, 6, 6), np.nan), statuses, np.ones(steps, int), (timing,) * steps, 1.0,
     )  # fmt: skip
     experiment = Experiment(None, None, PLANT, None, lambda plant: None, steps=steps)
-    return metrics(experiment, Flight(rollout, Steering, None))
+    return metrics(experiment, Flown(rollout, Steering, None))
 
 
 def made_up_run(tree, choices, settings, result=None, error=None):
@@ -60,3 +61,9 @@ def chosen(controller, seed, **more):
 
 def add(tree, controller, seed, error, **how):
     made_up_run(tree, *chosen(controller, seed), result=metrics_of(error, **how))
+
+
+def documents(found, comparison=()):
+    """Every file of a report, by name."""
+    document = report_document(found, comparison)
+    return document.files("report") | {"report.html": document.html()}

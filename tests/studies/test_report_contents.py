@@ -8,19 +8,26 @@ import re
 import pytest
 from rich.console import Console
 
-from gpmpc.experiments.comparison import compare, sentences
-from gpmpc.experiments.report import report
-from gpmpc.experiments.report_documents import comma_separated, documents, latex, markdown, page, render
-from gpmpc.experiments.run_folder import ERROR, METRICS, folder_name
-from tests.experiments.made_up import SETTINGS, add, chosen, made_up_run, metrics_of, plan
+from gpmpc.studies.comparison import compare, sentences
+from gpmpc.studies.document import terminal
+from gpmpc.studies.report import read_report as report
+from gpmpc.studies.report_document import report_document, terminal_table
+from gpmpc.studies.run_folder import ERROR, METRICS, folder_name
+from tests.studies.made_up import SETTINGS, add, chosen, documents, made_up_run, metrics_of, plan
 
 RESULT = ("rmse", "steps", "failures", "violations", "times", "unit")  # what a failed run need not have
+
+
+def written_of(found):
+    """Markdown, HTML, CSV and LaTeX without the figures, which take their time."""
+    document = report_document(found, images={})
+    return {"md": document.markdown(), "html": document.html(), "csv": document.csv(), "tex": document.tex()}
 
 
 def shown(found):
     """The table as a terminal shows it."""
     console = Console(file=io.StringIO(), width=100)
-    console.print(render(found))
+    console.print(terminal([terminal_table(found)]))
     return console.file.getvalue()
 
 
@@ -75,7 +82,7 @@ def test_one_damaged_run_is_skipped_with_its_reason_and_takes_no_other_with_it(d
     assert len(found.skipped) == (0 if reads_it else 1)
     assert all(line.startswith(f"{folder / name}: is not what a run writes: ") for line in found.skipped)
     assert sum(len(cell.runs) for cell in found.cells) == 2
-    for text in (markdown(found), page(found, {}), comma_separated(found), latex(found), shown(found)):
+    for text in (*written_of(found).values(), shown(found)):
         assert "0.1" in text
 
 
@@ -109,7 +116,7 @@ def test_what_a_user_chose_is_text_in_every_document(nasty, tmp_path):
     made_up_run(tmp_path, [f"controller={nasty}", "seed=0"], settings, result=lost)
     made_up_run(tmp_path, [f"controller={nasty}", "seed=1"], settings, error=nasty)
     found = report(tmp_path)
-    written = {"md": markdown(found), "html": page(found, {}), "csv": comma_separated(found), "tex": latex(found)}
+    written = written_of(found)
     for text in (*written.values(), shown(found)):
         text.encode()
         assert not set(text) & set("\x00\x1b\t\u202e")
@@ -149,12 +156,13 @@ def test_a_flight_that_was_lost_is_called_so(tmp_path):
     found = report(tmp_path)
     assert [len(cell.lost) for cell in found.cells] == [0, 2]
     assert [len(cell.numbers("rmse")) for cell in found.cells] == [6, 5]
-    for text in (markdown(found), page(found, {})):
+    written = written_of(found)
+    for text in (written["md"], written["html"]):
         for words in ("of those finished, 2 lost", "2 lost", "step 13, reason 14600 m away"):
             assert words in text
     assert "2 lost" in shown(found)
-    assert "2 lost" in latex(found)
-    assert [row["lost"] for row in csv.DictReader(io.StringIO(comma_separated(found)))] == ["0", "2"]
+    assert "2 lost" in written["tex"]
+    assert [row["lost"] for row in csv.DictReader(io.StringIO(written_of(found)["csv"]))] == ["0", "2"]
 
 
 @pytest.mark.parametrize("outlier", [1.0, 1e3, 1e150])
@@ -162,11 +170,11 @@ def test_what_stands_before_quartiles_lies_between_them(outlier, tmp_path):
     for seed, error in enumerate([0.1, 0.11, 0.12, 0.13, 0.14, outlier]):
         add(tmp_path, "lqr", seed, error)
     found = report(tmp_path)
-    (row,) = csv.DictReader(io.StringIO(comma_separated(found)))
+    (row,) = csv.DictReader(io.StringIO(written_of(found)["csv"]))
     low, median, high = (float(row[f"rmse_{part} [m]"]) for part in ("q25", "median", "q75"))
     assert low <= median <= high <= 0.14
     assert not any("mean" in name for name in row)
-    for text in (markdown(found), latex(found), page(found, {}), shown(found)):
+    for text in (*(written_of(found)[name] for name in ("md", "tex", "html")), shown(found)):
         assert "0.125" in text
         assert "Mean" not in text
 

@@ -5,9 +5,10 @@ import io
 import pytest
 from rich.console import Console
 
-from gpmpc.experiments.run_folder import record
-from gpmpc.experiments.run_summary import summary
-from tests.experiments.made_up import metrics_of
+from gpmpc.studies.document import terminal
+from gpmpc.studies.flight import summary
+from gpmpc.studies.run_folder import record
+from tests.studies.made_up import metrics_of
 
 OPTIONS = {"trajectory": "lorenz", "subsystem": "translational", "controller": "convex"}
 
@@ -15,7 +16,7 @@ OPTIONS = {"trajectory": "lorenz", "subsystem": "translational", "controller": "
 def said(result, **options):
     stream = io.StringIO()
     about = record([], {"seed": 0, "options": OPTIONS | options}, "gpmpc run")
-    Console(file=stream, width=200).print(summary(about | result))
+    Console(file=stream, width=200).print(terminal([summary(about | result)]))
     lines = [line.strip() for line in stream.getvalue().splitlines()]
     return {line.split("  ")[0]: line.partition("  ")[2].strip() for line in lines if "  " in line}
 

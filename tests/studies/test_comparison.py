@@ -8,9 +8,9 @@ import pytest
 from scipy import stats
 
 from gpmpc.exceptions import DataError
-from gpmpc.experiments.comparison import compare, sentences
-from gpmpc.experiments.report import report
-from tests.experiments.made_up import made_up_run, metrics_of
+from gpmpc.studies.comparison import compare, sentences
+from gpmpc.studies.report import read_report as report
+from tests.studies.made_up import made_up_run, metrics_of
 
 SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
 GROUPS = "controller=lqr", "controller=convex"

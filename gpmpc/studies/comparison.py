@@ -1,4 +1,4 @@
-"""Problem: two groups of runs differ, and it has to be said whether that is more than luck.
+"""Tests whether two groups of runs differ by more than luck.
 
 Runs of one seed share their training rows and their noise, so they are compared in pairs: what else was varied is
 averaged within a seed first, and a seed counts once. So that every seed is an average over the same, seeds and other
@@ -11,17 +11,17 @@ did meanwhile is no property of either.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from scipy import stats
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.experiments.report import MEASURES, SEED, Cell, Report, in_order
+from gpmpc.studies.report import MEASURES, SEED, Cell, Report, in_order
 
-LEVEL = 0.05
-FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
+_LEVEL = 0.05
+_FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
 
 
 @dataclass(frozen=True)
@@ -58,24 +58,19 @@ class Comparison:
     left_out: tuple[str, ...] = ()
 
     @property
-    def copies(self) -> bool:
-        """Whether every pair differs by exactly the same."""
-        return self.difference != 0 and self.interval[0] == self.interval[1]
-
-    @property
     def verdict(self) -> str:
         """In words."""
-        if self.pairs < FEWEST:
-            return f"undecided: {self.pairs} pairs cannot show anything at 5 %; fly {FEWEST} seeds or more"
-        if self.copies:
+        if self.pairs < _FEWEST:
+            return f"undecided: {self.pairs} pairs cannot show anything at 5 %; fly {_FEWEST} seeds or more"
+        if self.difference != 0 and self.interval[0] == self.interval[1]:
             return "undecided: every seed gave the same, so all are one; vary what the seed draws (data.size, noise)"
-        if self.wilcoxon < LEVEL:
+        if self.wilcoxon < _LEVEL:
             return f"A is {'larger' if self.rank_biserial > 0 else 'smaller'} than B"
         return "no difference shown"
 
 
 def compare(report: Report, a: str, b: str) -> list[Comparison]:
-    """Holds two groups of a report's runs against each other, seed by seed, in every measure.
+    """Compares two groups of a report's runs, seed by seed, in every measure.
 
     Args:
         report: All runs.
@@ -92,12 +87,19 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         raise SettingError("compare", "errors in m and in rad have no common mean; add subsystem=... to both groups")
     comparisons = []
     for measure in (name for name in report.measures() if not MEASURES[name].wall_time):
-        first, second = (_by_pair(report, group, measure) for group in groups)
-        settings, seeds, left_out = _complete(first, second)
-        if len(seeds) >= 2:
-            values = np.array([[[side[rest, seed] for side in (first, second)] for rest in settings] for seed in seeds])
-            names = [name for name in report.variables if name not in groups[0]]
-            comparisons.append(replace(_tested(measure, values.mean(axis=1)), left_out=_named(left_out, names)))
+        first, second = (_by_seed(report, group, measure) for group in groups)
+        first, second = first.align(second)
+        left_out, both = [], first.notna() & second.notna()
+        while both.size and not both.to_numpy().all():  # what lacks the largest share of its runs is left out
+            lacking = [(~both).mean(axis=1), (~both).mean(axis=0)]
+            axis = int(lacking[1].max() >= lacking[0].max())
+            name = lacking[axis].idxmax()
+            left_out.append(name)
+            both = both.drop(name, axis=axis)
+        pairs = [side.loc[both.index, both.columns].mean(axis=0).to_numpy() for side in (first, second)]
+        if len(pairs[0]) >= 2:
+            seeds = sorted((n for n in left_out if n.startswith(f"{SEED}=")), key=lambda name: in_order(name[5:]))
+            comparisons.append(_test(measure, *pairs, (*(n for n in left_out if n not in seeds), *seeds)))
     if not comparisons:
         raise DataError(f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common")
     return comparisons
@@ -117,82 +119,58 @@ def _group(report: Report, key: str, text: str) -> dict[str, str]:
     return group
 
 
-def _by_pair(report: Report, group: Mapping[str, str], measure: str) -> dict[tuple[tuple, str], float]:
-    """Values by what a partner has to share: the other settings and the seed."""
-    found = {}
-    for cell in _cells(report, group):
-        rest = tuple(v for name, v in zip(report.variables, cell.values, strict=True) if name not in group)
-        for seed, run in cell.runs.items():
-            if (value := run.numbers[measure]) is not None:
-                found[rest, seed] = value
-    return found
-
-
-def _complete(first: Mapping[tuple, float], second: Mapping[tuple, float]) -> tuple[list, list, list]:
-    """Other settings and seeds of which both groups have every combination, and those that were left out for that.
-
-    Of what lacks a run, that is left out which lacks the largest share.
-    """
-    settings, seeds = (list(dict.fromkeys(key[i] for key in [*first, *second])) for i in (0, 1))
-    both = np.array([[(rest, seed) in first and (rest, seed) in second for seed in seeds] for rest in settings])
-    left_out = []
-    while not both.all():
-        lacking = (~both).mean(axis=1), (~both).mean(axis=0)
-        axis = int(lacking[1].max() >= lacking[0].max())
-        place = int(lacking[axis].argmax())
-        left_out.append((axis, (settings, seeds)[axis].pop(place)))
-        both = np.delete(both, place, axis)
-    return settings, seeds, left_out
-
-
-def _named(left_out: Sequence[tuple[int, Any]], names: Sequence[str]) -> tuple[str, ...]:
-    """In words, settings before seeds."""
-    settings = [value for axis, value in left_out if axis == 0]
-    seeds = sorted((value for axis, value in left_out if axis == 1), key=in_order)
-    told = [", ".join(f"{name}={v}" for name, v in zip(names, value, strict=True)) for value in settings]
-    return (*told, *(f"{SEED}={value}" for value in seeds))
-
-
 def _cells(report: Report, group: Mapping[str, str]) -> list[Cell]:
-    """Those of a group."""
-    places = [(report.variables.index(name), value) for name, value in group.items()]
-    return [cell for cell in report.cells if all(cell.values[i] == value for i, value in places)]
+    """Returns those of a group."""
+    return [
+        cell for cell in report.cells if group.items() <= dict(zip(report.variables, cell.values, strict=True)).items()
+    ]
 
 
-def _tested(measure: str, pairs: np.ndarray) -> Comparison:
-    """Of pairs (n, 2)."""
-    differences = pairs[:, 0] - pairs[:, 1]
-    n, mean, spread = len(differences), float(differences.mean()), float(differences.std(ddof=1))
+def _by_seed(report: Report, group: Mapping[str, str], measure: str) -> pd.DataFrame:
+    """Returns the values of a group, a row a combination of the other settings and a column a seed."""
+    rows = {}
+    for cell in _cells(report, group):
+        others = zip(report.variables, cell.values, strict=True)
+        name = ", ".join(f"{key}={value}" for key, value in others if key not in group)
+        rows[name] = {f"{SEED}={seed}": run.numbers[measure] for seed, run in cell.runs.items()}
+    return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
+
+
+def _test(measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...]) -> Comparison:
+    """Compares paired values (n,)."""
+    differences = a - b
+    n, mean, deviation = len(differences), float(differences.mean()), float(differences.std(ddof=1))
     if not np.ptp(differences):  # not even by rounding
-        mean, spread = float(differences[0]), 0.0
+        mean, deviation = float(differences[0]), 0.0
     nothing = not differences.any()
-    half = float(stats.t.ppf(0.975, n - 1)) * spread / np.sqrt(n)
+    half = float(stats.t.ppf(0.975, n - 1)) * deviation / np.sqrt(n)
     ranks = stats.rankdata(np.abs(differences[differences != 0]))
     signed = float((ranks * np.sign(differences[differences != 0])).sum())
     return Comparison(
         measure=measure,
-        medians=tuple(np.median(pairs, axis=0).tolist()),
+        medians=(float(np.median(a)), float(np.median(b))),
         quartiles=tuple(np.quantile(differences, [0.25, 0.5, 0.75]).tolist()),
-        means=(float(pairs[:, 0].mean()), float(pairs[:, 1].mean())),
+        means=(float(a.mean()), float(b.mean())),
         difference=mean,
         interval=(mean - half, mean + half),
         wilcoxon=1.0 if nothing else float(stats.wilcoxon(differences).pvalue),
-        t_test=1.0 if nothing else 0.0 if spread == 0 else float(stats.ttest_rel(pairs[:, 0], pairs[:, 1]).pvalue),
+        t_test=1.0 if nothing else 0.0 if deviation == 0 else float(stats.ttest_rel(a, b).pvalue),
         rank_biserial=signed / float(ranks.sum()) if len(ranks) else 0.0,
-        standardised=mean / spread if spread > 0 else 0.0 if mean == 0 else float(np.copysign(np.inf, mean)),
+        standardised=mean / deviation if deviation > 0 else 0.0 if mean == 0 else float(np.copysign(np.inf, mean)),
         pairs=n,
+        left_out=left_out,
     )
 
 
 def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str) -> list[str]:
-    """A line a measure, with everything that a reader needs to doubt it."""
+    """Returns a line a measure, with everything that a reader needs to doubt it."""
     lines = [
         f"A: {a}; B: {b}; pairs are seeds, what else was varied is averaged within a seed. Times are not compared."
     ]
     everywhere = set.intersection(*(set(c.left_out) for c in comparisons))
     if everywhere:
-        told = "; ".join(name for name in comparisons[0].left_out if name in everywhere)
-        lines[0] += f" Left out, since A or B lacks runs of it: {told}."
+        names = "; ".join(name for name in comparisons[0].left_out if name in everywhere)
+        lines[0] += f" Left out, since A or B lacks runs of it: {names}."
     for c in comparisons:
         others = "; ".join(name for name in c.left_out if name not in everywhere)
         low, median, high = c.quartiles

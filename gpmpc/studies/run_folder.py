@@ -1,8 +1,8 @@
-"""Problem: a run's folder has to say by itself whether the run is finished, what came of it and what made it.
+"""Keeps a run in a folder that says whether the run is finished, what its results are and what made it.
 
     config.yaml    the resolved settings
     run.mcap       every step
-    metrics.json   what came of it; written last and in one piece: where it is, the run is finished
+    metrics.json   the results; written last and in one piece: where it is, the run is finished
     error.json     why it failed, where it did
 
 Runs of a sweep share nothing but the tree of such folders, so any number of processes can work on one tree: who works
@@ -21,13 +21,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gpmpc.exceptions import DataError, GpmpcError
+from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.files import remove_partial, write_whole
 from gpmpc.provenance import provenance
 
 METRICS, ERROR, CONFIG, RECORDING = "metrics.json", "error.json", "config.yaml", "run.mcap"
-PLAN = "sweep-"  # begins the name of the files that say which runs a sweep asked for
-LONGEST_NAME = 150  # of a folder, in characters; file systems take 255 bytes
+PLAN = "sweep-"  # begins the names of the files that say which runs a sweep asked for
+LONGEST_NAME = 150  # characters of a folder's name; file systems take 255 bytes
 
 
 class Busy(GpmpcError):
@@ -58,8 +58,8 @@ class RunFolder:
             return None
 
     @contextmanager
-    def claimed(self, wait: bool = True) -> Iterator[None]:
-        """Keeps other processes from working on this run meanwhile; makes the folder, clears it of half-written files.
+    def locked(self, wait: bool = True) -> Iterator[None]:
+        """Makes the folder, clears it of half-written files and keeps other processes from working on it meanwhile.
 
         Args:
             wait: Until another process is done with it.
@@ -97,40 +97,42 @@ class RunFolder:
         }
         write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")
 
-    def result(self) -> dict[str, Any]:
-        """What came of the finished run.
+    def result(self, settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """Reads the result of the finished run.
+
+        Args:
+            settings: Those that are asked for now; None takes any.
 
         Raises:
-            DataError: What is there is not what a run writes.
+            DataError: The file is not what a run writes.
+            SettingError: The run was flown with other settings: those of a file have changed meanwhile.
         """
         path = self.path / METRICS
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            content["settings"]
+            before = content["settings"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DataError(f"{path}: is not what a run writes: {type(error).__name__}: {error}") from error
+        if settings is not None and (differs := difference(before, settings)):
+            reason = f"{self.path} holds a finished run of other settings ({differs})"
+            raise SettingError("folder", f"{reason}; choose another folder, or remove that one to fly it again")
         return content
 
 
 def record(choices: Sequence[str], settings: Mapping[str, Any], command: str) -> dict[str, Any]:
-    """What metrics.json and error.json begin with: what was asked for and what made it.
+    """Returns the beginning of metrics.json and error.json: what was asked for and what made it.
 
     Args:
         choices: What the user chose, ``key=value`` each.
-        settings: The resolved configuration, with the chosen options by group under ``choices``.
+        settings: The resolved configuration, with the chosen options by group under ``options``.
         command: What makes this run again.
     """
-    return {
-        "schema": 1,
-        "choices": list(choices),
-        "settings": dict(settings),
-        "seed": settings.get("seed"),
-        "provenance": provenance() | {"command": command},
-    }
+    about = {"schema": 1, "choices": list(choices), "settings": dict(settings), "seed": settings.get("seed")}
+    return about | {"provenance": provenance() | {"command": command}}
 
 
 def folder_name(choices: Sequence[str]) -> str:
-    """A name for a run of these choices, ``key=value`` each; runs of other choices have other names."""
+    """Returns a name for a run of these choices, ``key=value`` each; runs of other choices have other names."""
     text = ",".join(sorted(choices)) or "default"
     name = re.sub(r"[^\w=.,+\-\[\]@]", "_", text, flags=re.ASCII)[:LONGEST_NAME]
     # Equal up to upper and lower case is equal on some file systems; a comma in a choice could be one between two.
@@ -141,7 +143,7 @@ def folder_name(choices: Sequence[str]) -> str:
 
 
 def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """In what two settings differ, in words: the first three of their leaves; empty where in nothing."""
+    """Returns in words where two settings differ, the first three of their leaves; empty where they are equal."""
     differing = _differing(then, now)
     first = ", ".join(f"{key}: {a!r} then, {b!r} now" for key, a, b in differing[:3])
     return first + (f", and {len(differing) - 3} more" if len(differing) > 3 else "")

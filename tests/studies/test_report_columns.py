@@ -2,9 +2,9 @@
 
 import pytest
 
-from gpmpc.experiments.report import report
-from gpmpc.experiments.report_documents import documents, render
-from tests.experiments.made_up import made_up_run, metrics_of
+from gpmpc.studies.report import read_report as report
+from gpmpc.studies.report_document import terminal_table
+from tests.studies.made_up import documents, made_up_run, metrics_of
 
 SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
 
@@ -18,7 +18,7 @@ def test_failed_solves_have_a_column_if_any_run_has_some(failing, tmp_path):
             choices = [f"controller={controller}", f"seed={seed}"]
             made_up_run(tmp_path, choices, settings, result=metrics_of(0.1, failing=some))
     found = report(tmp_path)
-    header = " ".join(str(column.header) for column in render(found).columns)
+    header = " ".join(terminal_table(found).header)
     for words in (header, documents(found)["report.tex"]):
         assert ("failed" in words) == bool(failing)
         assert "RMSE" in words

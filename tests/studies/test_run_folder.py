@@ -4,7 +4,7 @@ from itertools import combinations
 
 import pytest
 
-from gpmpc.experiments.run_folder import difference, folder_name
+from gpmpc.studies.run_folder import difference, folder_name
 
 
 def test_other_choices_have_another_folder_even_where_capitals_count_for_nothing():

@@ -12,9 +12,6 @@ from hydra import compose, initialize_config_dir
 from gpmpc.cli.run import experiment_of
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import Diverged, SettingError
-from gpmpc.experiments import run
-from gpmpc.experiments.run import Experiment, fly, metrics, training_rows
-from gpmpc.experiments.run_folder import Busy, RunFolder, folder_name
 from gpmpc.gp import Trainer
 from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.mpc.convex_mpc import ConvexMPC
@@ -23,6 +20,9 @@ from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise
 from gpmpc.status import Status
+from gpmpc.studies import flight as studied
+from gpmpc.studies.flight import Experiment, metrics, run_trial
+from gpmpc.studies.run_folder import Busy, RunFolder, folder_name
 from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational
 from gpmpc.trajectories import Elliptical, Hover, Lorenz, Step
 
@@ -65,7 +65,7 @@ def experiment(**changes):
 
 
 def numbers(experiment):
-    found = metrics(experiment, fly(experiment))
+    found = metrics(experiment, run_trial(experiment))
     assert found.pop("times")["total"]["median"] >= 0
     return found
 
@@ -79,8 +79,8 @@ def test_the_same_seed_gives_the_same_numbers_and_another_one_others():
 
 
 def test_the_rows_of_a_seed_are_nested_and_in_the_order_of_the_flight():
-    everything = training_rows(experiment(size=None)).features.numpy()
-    small, large = (training_rows(experiment(size=size, seed=1)).features.numpy() for size in (5, 12))
+    everything = experiment(size=None).training_rows().features.numpy()
+    small, large = (experiment(size=size, seed=1).training_rows().features.numpy() for size in (5, 12))
     assert len(everything) == 25
     places = [[int(np.flatnonzero((everything == row).all(axis=1))[0]) for row in rows] for rows in (small, large)]
     assert places[1] == sorted(places[1])
@@ -88,9 +88,9 @@ def test_the_rows_of_a_seed_are_nested_and_in_the_order_of_the_flight():
 
 
 def test_a_model_loop_never_meets_the_plant_and_the_true_model_needs_no_data():
-    flown = fly(experiment(loop="model"))
+    flown = run_trial(experiment(loop="model"))
     assert np.trace(flown.rollout.covariances[-1]) > 0
-    known = fly(experiment(controller=ON_THE_PLANT, data=None))
+    known = run_trial(experiment(controller=ON_THE_PLANT, data=None))
     assert known.training is None
     assert metrics(experiment(controller=ON_THE_PLANT), known)["rmse"]["total"] < 0.01
 
@@ -124,7 +124,7 @@ def test_the_rotational_subsystem_follows_the_attitudes_of_the_trajectory_at_its
         subsystem="rotational", plant=plant, trajectory=Lorenz(), data=ExcitedData(EXCITED, excited, samples=60),
         controller=partial(ConvexMPC, **settings), size=None, steps=100,
     )  # fmt: skip
-    flight = fly(turning)
+    flight = run_trial(turning)
     found = metrics(turning, flight)
     assert flight.rollout.time_step == 0.05
     assert np.ptp(flight.rollout.references[:, 0]) > 0.03  # [rad]: there was something to follow
@@ -137,7 +137,7 @@ def test_the_rotational_subsystem_follows_the_attitudes_of_the_trajectory_at_its
 @pytest.mark.parametrize("law", [lambda x: [0, 0, 0], lambda x: [100, 0, 0], lambda x: [7.26, 0.6, 0]])
 def test_a_flight_that_no_longer_follows_is_lost_and_says_since_when(trajectory, law):
     lost = blind(law, trajectory=trajectory)
-    flight = fly(lost)
+    flight = run_trial(lost)
     found = metrics(lost, flight)["lost"]
     away = np.linalg.norm((flight.rollout.states - flight.rollout.references)[:, ::2], axis=1)
     assert found["time"] == found["step"]
@@ -154,7 +154,7 @@ def test_an_offset_and_a_short_flight_are_no_loss(trajectory):
         trajectory=trajectory, data=None, controller=lambda plant: ON_THE_PLANT(PLANT, problem=problem), plant=heavy,
         steps=20,
     )  # fmt: skip
-    found = metrics(sagging, fly(sagging))
+    found = metrics(sagging, run_trial(sagging))
     assert found["rmse"]["z"] > 3
     assert found["lost"] is None
     for steps in (1, 2):
@@ -170,7 +170,7 @@ def growing(rate):
 def test_a_flight_that_diverges_ends_in_metrics_that_can_be_written_and_say_so(growth):
     told = []
     diverging = blind(growing(growth), trajectory=Hover((0, 0, -5)))
-    flight = fly(diverging, lambda controller, training: told.append)
+    flight = run_trial(diverging, lambda controller, training: told.append)
     found = metrics(diverging, flight)
     json.dumps(found, allow_nan=False)
     assert found["lost"]["step"] == 1
@@ -179,13 +179,13 @@ def test_a_flight_that_diverges_ends_in_metrics_that_can_be_written_and_say_so(g
     assert found["steps"] == flight.diverged.step == len(told) < 30
     assert found["violations"]["inputs"]["steps"] == found["steps"]
     with pytest.raises(Diverged):  # nothing was flown
-        fly(blind(growing(1e308), trajectory=Hover((0, 0, -5))))
+        run_trial(blind(growing(1e308), trajectory=Hover((0, 0, -5))))
 
 
 def test_what_the_first_calls_take_is_no_part_of_the_times():
     slow = iter([40.0, 20.0])
     measured = blind(lambda x: HOVER, steps=5, seconds=lambda: next(slow, 0.001))
-    assert metrics(measured, fly(measured))["times"]["total"]["largest"] == 0.001
+    assert metrics(measured, run_trial(measured))["times"]["total"]["largest"] == 0.001
 
 
 def composed():
@@ -205,7 +205,7 @@ def learned():
 
     def of(settings):
         if settings.subsystem not in kept:
-            rows = training_rows(settings)
+            rows = settings.training_rows()
             kept[settings.subsystem] = rows, settings.train(rows, seed=0)
         rows, training = kept[settings.subsystem]
 
@@ -226,9 +226,9 @@ def test_the_rehearsal_changes_no_bit(choice, learned, monkeypatch):
         tiny = ["data.samples=20", "model.restarts=0", "steps=4", "horizon=3"]
         noise = [] if choice == "loop=model" else [f"noise.process={[1e-3] * 6}", f"noise.measurement={[1e-3] * 6}"]
         settings = learned(experiment_of(compose("run", overrides=[choice, *tiny, *noise])))
-    rehearsed = fly(settings).rollout
-    monkeypatch.setattr(run, "rehearse", lambda *_: None)
-    at_once = fly(settings).rollout
+    rehearsed = run_trial(settings).rollout
+    monkeypatch.setattr(studied, "rehearse", lambda *_: None)
+    at_once = run_trial(settings).rollout
     for name in (
         "states",
         "covariances",
@@ -244,13 +244,13 @@ def test_the_rehearsal_changes_no_bit(choice, learned, monkeypatch):
 
 def test_more_rows_than_there_are_are_refused():
     with pytest.raises(SettingError, match="data.size: must be at most 25, the rows of the data; got 26"):
-        fly(experiment(size=26))
+        run_trial(experiment(size=26))
 
 
 def test_a_folder_is_finished_when_its_metrics_are_there_and_one_process_works_on_it(tmp_path):
     folder = RunFolder(tmp_path / "run")
-    with folder.claimed():
-        with pytest.raises(Busy), RunFolder(tmp_path / "run").claimed(wait=False):
+    with folder.locked():
+        with pytest.raises(Busy), RunFolder(tmp_path / "run").locked(wait=False):
             pass
         folder.fail(ValueError("no\nluck"), {})
         assert not folder.finished
@@ -260,7 +260,7 @@ def test_a_folder_is_finished_when_its_metrics_are_there_and_one_process_works_o
         folder.finish({"rmse": 1, "settings": {}})
     assert folder.finished
     assert folder.result() == {"rmse": 1, "settings": {}}
-    with folder.claimed(wait=False):
+    with folder.locked(wait=False):
         pass
     assert sorted(path.name for path in folder.path.iterdir()) == ["config.yaml", "metrics.json"]
 
