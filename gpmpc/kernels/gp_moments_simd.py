@@ -120,9 +120,8 @@ def evaluate_moments(order, diagonal, gp, precision, mu, S, u, out):
             if order == CROSS:
                 _differentiate_J(belief, gp, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a])
         for a in range(k):
-            out.V[h, a, a] = np.exp(gp.log_signal[a]) - reduce_variance(
-                precision.inverse_cholesky[a], terms.q[a], scratch.row
-            )
+            reduction = reduce_variance(precision.inverse_cholesky[a], terms.q[a], scratch.row)
+            out.V[h, a, a] = np.exp(gp.log_signal[a]) - reduction
             if order >= JACOBIAN:
                 to = out.dV_dmu[h, a, a], out.dV_dS[h, a, a], out.dV_du[h, a, a]
                 _differentiate_reduction(belief, gp, a, terms, scratch, to)
@@ -133,9 +132,7 @@ def evaluate_moments(order, diagonal, gp, precision, mu, S, u, out):
                 if order >= JACOBIAN:
                     to = out.dV_dmu[h, a, b], out.dV_dS[h, a, b], out.dV_du[h, a, b]
                     _differentiate_pair(belief, gp, a, b, terms, pair, P_sum, scratch, to)
-                    if a != b:
-                        out.dV_dmu[h, b, a], out.dV_du[h, b, a] = to[0], to[2]
-                        out.dV_dS[h, b, a] = to[1]
+                    out.dV_dmu[h, b, a], out.dV_dS[h, b, a], out.dV_du[h, b, a] = to
 
 
 @njit_inner
@@ -362,14 +359,10 @@ def _differentiate_pair(belief, gp, a, b, terms, pair, P_sum, scratch, to):
         for d in range(n):
             H[c, d] -= P_sum * G_ab[d, c] * (D_a[d] + D_b[d])
     # U_ij = beta_ai beta_bj q_ai q_bj, or E_ij q_ai q_aj: what F_a and F_b make of the sums of each output alone
-    if same:
-        U_sum = terms.M[a] * terms.M[a] - terms.e[a]
-        _add_difference(dmu, H, terms, a, U_sum, terms.M[a], 1.0, D_a, D_b, scratch)
-        _add_difference(dmu, H, terms, a, U_sum, terms.M[a], 1.0, D_a, D_b, scratch)
-    else:
-        U_sum = terms.M[a] * terms.M[b]
-        _add_difference(dmu, H, terms, a, U_sum, terms.M[b], 0.0, D_a, D_b, scratch)
-        _add_difference(dmu, H, terms, b, U_sum, terms.M[a], 0.0, D_b, D_a, scratch)
+    e_share = 1.0 if same else 0.0
+    U_sum = terms.M[a] * terms.M[b] - e_share * terms.e[a]
+    _add_difference(dmu, H, terms, a, U_sum, terms.M[b], e_share, D_a, D_b, scratch)
+    _add_difference(dmu, H, terms, b, U_sum, terms.M[a], e_share, D_b, D_a, scratch)
     project(pair.p_i, belief.u, controls[0])
     project(pair.p_j, belief.u, controls[1])
     for c in range(len(du)):
