@@ -100,7 +100,7 @@ def closed_loops(
 
     Args:
         plant: What is steered; its right-hand side is evaluated on arrays, an entry a trial.
-        controller: Its feedback law, of all trials; a ``ConvexMPC`` decides for them together, any other one by one.
+        controller: Its feedback law, of all trials; a ``GPMPC`` decides for them together, any other one by one.
         references: Of all trials; see ``closed_loop``.
         initial: The state (n,), or the ``Gaussian`` that every trial's is drawn from.
         steps: K.
