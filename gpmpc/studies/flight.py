@@ -13,16 +13,17 @@ import inspect
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from gpmpc.datasets import DataSource, rotational_states_along
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
-from gpmpc.gp import Training, Transitions
+from gpmpc.gp import GPPosterior, Training, Transitions
 from gpmpc.metrics import NEAR, find_loss, time_quantiles, tracking_error, violation_rate
 from gpmpc.mpc.controller import Controller, Reference
 from gpmpc.mpc.supervision import OnFailure, check_policy
+from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import MomentMatching, Propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
 from gpmpc.studies.document import Table
@@ -44,7 +45,7 @@ class Experiment:
         trajectory: What is followed, from its beginning.
         plant: What flies, and the true model of a controller that takes one.
         train: From transitions and a ``seed`` to a ``Training``.
-        controller: From a model, or from a ``plant`` where its first argument is called so, to a ``Controller``.
+        controller: From a model, or from a ``plant`` where its first argument is called so, to a ``TrackingController``.
         subsystem: Which of the two is learned and flown.
         name: Of the trajectory, which data from files are filed under.
         size: Rows drawn for the training; None takes all.
@@ -66,7 +67,7 @@ class Experiment:
     trajectory: Trajectory
     plant: Plant
     train: Callable[..., Training]
-    controller: Callable[..., Controller]
+    controller: Callable[..., TrackingController]
     subsystem: Literal["translational", "rotational"] = "translational"
     name: str = "elliptical"
     size: int | None = None
@@ -148,6 +149,20 @@ class Experiment:
         return np.zeros(n) if noise is None else np.array(noise, dtype=float)
 
 
+class TrackingController(Controller, Protocol):
+    """A controller that says what it makes small and which input it starts from."""
+
+    @property
+    def problem(self) -> TrackingProblem:
+        """Weights and bounds."""
+        ...
+
+    @property
+    def initial_input(self) -> Sequence[float] | np.ndarray:
+        """The input before the first step (m,)."""
+        ...
+
+
 @dataclass(frozen=True)
 class Flown:
     """An experiment that was flown.
@@ -160,13 +175,15 @@ class Flown:
     """
 
     rollout: Rollout
-    controller: Controller
+    controller: TrackingController
     training: Training | None
     diverged: Diverged | None = None
 
 
 def run_trial(
-    experiment: Experiment, prepare: Callable[[Controller, Training | None], Callable[[Step], None]] | None = None
+    experiment: Experiment,
+    prepare: Callable[[TrackingController, Training | None], Callable[[Step], None]] | None = None,
+    model: GPPosterior | None = None,
 ) -> Flown:
     """Trains and flies.
 
@@ -174,6 +191,7 @@ def run_trial(
         experiment: All of it.
         prepare: Called before the first step with the controller and the training; what it returns is called with
             every step.
+        model: Trained before; None trains one where the controller needs it.
 
     Raises:
         SettingError: More rows are asked for than there are, or settings that do not fit each other.
@@ -183,14 +201,13 @@ def run_trial(
         Diverged: The system left the finite numbers in its first step.
     """
     plant, training = experiment.plant, None
-    if experiment.learns:
+    if experiment.learns and model is None:
         training = experiment.train(experiment.training_rows(), seed=experiment.seed)
-        controller = experiment.controller(training.posterior)
-    else:
-        controller = experiment.controller(plant)
+        model = training.posterior
+    controller = experiment.controller(model if experiment.learns else plant)
     system: Plant | ModelLoop = plant
-    if experiment.loop == "model":
-        system = ModelLoop(training.posterior, experiment.propagator or MomentMatching(), time_step=plant.time_step)
+    if experiment.loop == "model" and model is not None:
+        system = ModelLoop(model, experiment.propagator or MomentMatching(), time_step=plant.time_step)
     states = experiment.references(experiment.steps + controller.horizon + 1)
     resting = np.asarray(controller.initial_input)  # falls back on it where the very first solve fails
     reference = Reference(states, np.tile(resting, (len(states) - 1, 1)))
