@@ -25,12 +25,12 @@ import torch
 from gpmpc.datasets import DataSource, Subsystem
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.experiments import figures_tables as tables
+from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gp import Scaling, Transitions
 from gpmpc.metrics import tracking_error, violation_rate
 from gpmpc.mpc.controller import Controller, Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import ModelLoop, Noise, Rollout, closed_loop, rehearse
@@ -51,7 +51,7 @@ from gpmpc.trajectories import Trajectory, states_along
 ROOMS = ("gp", "models", "propagation", "kernels", "qp", "mpc", "simulation", "datasets", "systems")
 CODE = ("gaussian.py", "metrics.py", *(f"{room}/*.py" for room in ROOMS), __file__)
 PROPAGATIONS = {"moment_matching": MomentMatching, "linearization": Linearization}
-CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "convex": ConvexMPC}
+CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "slsqp": SLSQP, "convex": GPMPC}
 LOOPS = ("model", "plant")
 SUBSYSTEMS = ("translational", "rotational")
 PENALTIES = ("l1", "l2")  # of state bounds that cannot be kept, among a row's settings

@@ -20,7 +20,6 @@ from torch import Tensor
 from gpmpc.dynamics import (
     Array,
     Linearized,
-    batched_jacobian,
     check_destination,
     check_query,
     linearize_by_autograd,
@@ -203,15 +202,6 @@ class KernelPosterior:
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
         """Linearises the mean at K points (K, n), (K, m) by torch autograd."""
         return linearize_by_autograd(self, states, inputs, covariance)
-
-    def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
-        """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""
-        input = state[..., :0] if input is None else input
-        check_query(self, state, input)
-        batch = torch.broadcast_shapes(state.shape[:-1], input.shape[:-1])
-        arguments = (state.expand(*batch, -1), input.expand(*batch, -1))
-        (mean, covariance), (by_state, by_input) = batched_jacobian(self._moments, arguments)
-        return Gaussian(mean, covariance), by_state, by_input
 
     def _moments(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
         batch = torch.broadcast_shapes(state.shape[:-1], input.shape[:-1])

@@ -272,29 +272,6 @@ class GPPosterior:
         total = weighted.sum(-1)[..., None, None] * torch.diag_embed(self.lengthscales[:, : self.state_dim] ** -2)
         return (weighted[..., None] * z).mT @ z - total
 
-    def sample(
-        self,
-        state: Tensor,
-        input: Tensor | None = None,
-        samples: int = 1,
-        generator: torch.Generator | None = None,
-        observation_noise: bool = False,
-    ) -> Tensor:
-        """Independent draws of the next state (samples, *batch, k).
-
-        Args:
-            state: x (*batch, n).
-            input: u (*batch, m).
-            samples: How many.
-            generator: Of the random numbers; torch's global one by default.
-            observation_noise: Adds the noise variance.
-        """
-        belief = self.predict(state, input)
-        variance = belief.variance + self.noise_variance if observation_noise else belief.variance
-        shape = (samples, *belief.mean.shape)
-        normal = torch.randn(shape, generator=generator, dtype=self.dtype, device=self.device)
-        return belief.mean + variance.sqrt() * normal
-
     def variance_reduction(self, k: Tensor) -> Tensor:
         """|L_a^-1 k_a|^2 (*batch, k) of correlations k (*batch, k, N): by how much the data reduce the variance.
 

@@ -18,8 +18,8 @@ from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.interrupts import interrupts_after
 from gpmpc.mpc.controller import Decision, Reference, Timing
-from gpmpc.mpc.convergence import FEASIBLE
 from gpmpc.mpc.request import Request, check_controller
+from gpmpc.mpc.sqp import FEASIBLE
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.status import Status
 from gpmpc.systems import Plant

@@ -92,6 +92,11 @@ class Linearization(Propagator):
     def __init__(self, hessian: bool = False, process_noise: bool = False):
         self.hessian, self.process_noise = hessian, process_noise
 
+    @property
+    def first_order(self) -> bool:
+        """Whether mean, derivatives and variance of the model at the belief's mean are all that it takes."""
+        return not self.hessian
+
     def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``."""
         input = checked_input(model, belief, input)

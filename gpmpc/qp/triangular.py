@@ -127,7 +127,7 @@ def factorise(P, L):
     multiple of eight; its upper triangle is undefined.
     """
     n = len(P)
-    if not is_symmetric(P):
+    if not _is_symmetric(P):
         return False
     top = n // _BLOCK * _BLOCK
     if top < n and not _finish_last_rows(P, L, top):
@@ -140,7 +140,7 @@ def factorise(P, L):
 
 
 @inline_njit
-def is_symmetric(P):
+def _is_symmetric(P):
     """Returns whether P equals its transpose but for rounding; reads blocks that stay in the cache."""
     n, largest, squares, skewed = len(P), 0.0, 0.0, 0
     for i in range(n):

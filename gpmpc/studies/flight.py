@@ -13,7 +13,7 @@ import inspect
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,9 +21,8 @@ from gpmpc.datasets import DataSource, rotational_states_along
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
 from gpmpc.gp import GPPosterior, Training, Transitions
 from gpmpc.metrics import NEAR, find_loss, time_quantiles, tracking_error, violation_rate
-from gpmpc.mpc.controller import Controller, Reference
+from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.supervision import OnFailure, check_policy
-from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import MomentMatching, Propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
 from gpmpc.studies.document import Table
@@ -45,7 +44,7 @@ class Experiment:
         trajectory: What is followed, from its beginning.
         plant: What flies, and the true model of a controller that takes one.
         train: From transitions and a ``seed`` to a ``Training``.
-        controller: From a model, or from a ``plant`` where its first argument is called so, to a ``TrackingController``.
+        controller: From a model, or from a ``plant`` where its first argument is called so, to a ``Controller``.
         subsystem: Which of the two is learned and flown.
         name: Of the trajectory, which data from files are filed under.
         size: Rows drawn for the training; None takes all.
@@ -67,7 +66,7 @@ class Experiment:
     trajectory: Trajectory
     plant: Plant
     train: Callable[..., Training]
-    controller: Callable[..., TrackingController]
+    controller: Callable[..., Any]
     subsystem: Literal["translational", "rotational"] = "translational"
     name: str = "elliptical"
     size: int | None = None
@@ -149,40 +148,26 @@ class Experiment:
         return np.zeros(n) if noise is None else np.array(noise, dtype=float)
 
 
-class TrackingController(Controller, Protocol):
-    """A controller that says what it makes small and which input it starts from."""
-
-    @property
-    def problem(self) -> TrackingProblem:
-        """Weights and bounds."""
-        ...
-
-    @property
-    def initial_input(self) -> Sequence[float] | np.ndarray:
-        """The input before the first step (m,)."""
-        ...
-
-
 @dataclass(frozen=True)
 class Flown:
     """An experiment that was flown.
 
     Attributes:
         rollout: Every step, as arrays.
-        controller: What steered.
+        controller: The ``Controller`` that steered, with its ``problem``.
         training: What was learned; None where the controller knows the plant.
         diverged: Where and why the system left the finite numbers, and the rollout ends; None where it did not.
     """
 
     rollout: Rollout
-    controller: TrackingController
+    controller: Any
     training: Training | None
     diverged: Diverged | None = None
 
 
 def run_trial(
     experiment: Experiment,
-    prepare: Callable[[TrackingController, Training | None], Callable[[Step], None]] | None = None,
+    prepare: Callable[[Any, Training | None], Callable[[Step], None]] | None = None,
     model: GPPosterior | None = None,
 ) -> Flown:
     """Trains and flies.

@@ -18,7 +18,7 @@ from gpmpc.experiments.figures import Figures, Row
 from gpmpc.experiments.figures_tables import LOOPS, paper_seconds, summarise
 from gpmpc.gp import SoftLimits, identity, train
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.propagation import MomentMatching
 from gpmpc.systems import Integrated, Translational
 from gpmpc.trajectories import Elliptical, Lorenz
@@ -132,7 +132,7 @@ def test_one_subsystem_alone_is_flown_and_drawn(subsystem, tmp_path):
     ("changes", "message"),
     [
         ({"loop": "wind"}, "loop: must be one of model, plant; got 'wind'"),
-        ({"controller": "pid"}, "controller: must be one of nmpc, nonlinear, convex; got 'pid'"),
+        ({"controller": "pid"}, "controller: must be one of nmpc, nonlinear, slsqp, convex; got 'pid'"),
         ({"controller": "nmpc"}, "controller: nmpc knows the true plant"),
         ({"horizon": [1, 0]}, "horizon: must be a whole number, 1 or more; got 0"),
     ],

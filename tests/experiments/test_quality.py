@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from gpmpc.cli.run import experiment_of
 from gpmpc.exceptions import SettingError
 from gpmpc.experiments.quality import FAMILIES, TRUTH, Family, Quality, pareto_front, stage_cost
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.plotting import quality
 from gpmpc.propagation import Linearization
@@ -83,7 +83,7 @@ def astray(model, horizon):
     problem = TrackingProblem(
         [1] * 6, [1e12] * 3, "increments", input_lower=[0, -0.7, -0.7], input_upper=[20, 0.7, 0.7]
     )
-    return ConvexMPC(model, Linearization(), problem, horizon, [7.26, 0, 0])
+    return GPMPC(model, Linearization(), problem, horizon, [7.26, 0, 0])
 
 
 @pytest.fixture(scope="module")

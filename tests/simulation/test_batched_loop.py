@@ -8,7 +8,7 @@ from gpmpc.exceptions import Diverged, SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc.controller import Decision, Reference, Timing
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
@@ -30,7 +30,7 @@ def controller(covariance="zero_order", propagator=None, model=GP, bound=2.0, **
     problem = TrackingProblem(
         [1] * 6, [0.1] * 3, penalized="increments", state_bounds=StateBounds([-bound] * 6, [bound] * 6), **box
     )
-    return ConvexMPC(model, propagator or Linearization(), problem, H, HOVER, covariance=covariance, **settings)
+    return GPMPC(model, propagator or Linearization(), problem, H, HOVER, covariance=covariance, **settings)
 
 
 def fly(asked, seeds=4, plant=QUADROTOR, initial=START, **settings):

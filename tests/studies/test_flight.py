@@ -14,7 +14,7 @@ from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import Diverged, SettingError
 from gpmpc.gp import Trainer
 from gpmpc.mpc.controller import Decision, Timing
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization
@@ -33,7 +33,7 @@ PROBLEM = TrackingProblem(
 )
 HOVER = [7.26, 0, 0]
 EXCITED = Excitation(PLANT, [1] * 6, [1] * 3, HOVER, [0.3, 0.03, 0.03], [0.01] * 6)
-CONVEX = partial(ConvexMPC, propagator=Linearization(), problem=PROBLEM, horizon=2, initial_input=HOVER)
+CONVEX = partial(GPMPC, propagator=Linearization(), problem=PROBLEM, horizon=2, initial_input=HOVER)
 ON_THE_PLANT = partial(NMPC, problem=PROBLEM, horizon=2, initial_input=HOVER)
 
 
@@ -122,7 +122,7 @@ def test_the_rotational_subsystem_follows_the_attitudes_of_the_trajectory_at_its
     settings = {"propagator": Linearization(), "problem": problem, "horizon": 5, "initial_input": [0] * 3}
     turning = experiment(
         subsystem="rotational", plant=plant, trajectory=Lorenz(), data=ExcitedData(EXCITED, excited, samples=60),
-        controller=partial(ConvexMPC, **settings), size=None, steps=100,
+        controller=partial(GPMPC, **settings), size=None, steps=100,
     )  # fmt: skip
     flight = run_trial(turning)
     found = metrics(turning, flight)

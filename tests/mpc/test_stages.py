@@ -1,18 +1,21 @@
 """To first order a stage needs the model at one point, whoever wrote the model."""
 
+import numpy as np
 import pytest
 import torch
 
 from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc.stage_models import disturbed, stage_model
+from gpmpc.mpc.stages import LinearizedStages, StageLinearizer
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from tests.mpc.small_models import double_integrator, pendulum_posterior
 
 
 class ByDifferentiation(Linearization):
-    """The same by way of the propagator's own derivatives, which say more than is needed."""
+    """Linearisation by way of the propagator's own derivatives, which say more than is needed."""
+
+    first_order = False
 
 
 def residual():
@@ -27,6 +30,14 @@ def residual():
     return ResidualModel(affine, gp, torch.tensor([[0.1], [0.3]], dtype=torch.float64), [1], [0], 1)
 
 
+def stage_at(mode, propagator, model, belief, input, disturbance=None):
+    """s and the stage at one point, as arrays without the leading dimension."""
+    linearizer = StageLinearizer(model, propagator, mode)
+    covariances = belief.covariance.numpy()[None]
+    s = linearizer.state(belief.mean.numpy()[None], covariances)
+    return s[0], LinearizedStages(*(part[0] for part in linearizer(s, input.numpy()[None], covariances, disturbance)))
+
+
 @pytest.mark.parametrize("noise", [False, True])
 @pytest.mark.parametrize("model", [residual, double_integrator, pendulum_posterior])
 def test_the_shortcut_gives_the_same_stage(model, noise):
@@ -36,12 +47,24 @@ def test_the_shortcut_gives_the_same_stage(model, noise):
         Gaussian(torch.tensor([0.3, -0.2], dtype=torch.float64), root @ root.mT),
         0.4 * torch.ones(1).double(),
     )
-    short = stage_model("zero_order", Linearization(process_noise=noise), model, belief, input)
-    long = stage_model("zero_order", ByDifferentiation(process_noise=noise), model, belief, input)
-    for mine, theirs in zip(
-        [*short[:3], *vars(short.next).values(), short.V], [*long[:3], *vars(long.next).values(), long.V], strict=True
-    ):
-        assert torch.allclose(mine, theirs, rtol=0, atol=1e-12)
+    _, short = stage_at("zero_order", Linearization(process_noise=noise), model, belief, input)
+    _, long = stage_at("zero_order", ByDifferentiation(process_noise=noise), model, belief, input)
+    for mine, theirs in zip(short, long, strict=True):
+        assert np.allclose(mine, theirs, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("mode", ["full", "diagonal", "zero_order", "none"])
+def test_stages_of_many_points_are_those_of_each(mode):
+    model, rng = pendulum_posterior(), np.random.default_rng(0)
+    means, inputs, roots = rng.normal(size=(5, 2)), rng.normal(size=(5, 1)), 0.2 * rng.normal(size=(5, 2, 2))
+    covariances = roots @ roots.mT
+    linearizer = StageLinearizer(model, MomentMatching(), mode)
+    states = linearizer.state(means, covariances)
+    together = linearizer(states, inputs, covariances)
+    for k in range(5):
+        alone = linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1])
+        for all_of_them, one in zip(together, alone, strict=True):
+            assert np.array_equal(all_of_them[k], one[0])
 
 
 def extended(mode, belief):
@@ -71,7 +94,7 @@ def test_a_stage_is_the_derivative_of_its_own_map_and_goes_through_its_point(mod
     propagator = MeanEquivalence() if mode == "none" else propagator
     root = torch.tensor([[0.2, 0.05], [0.05, 0.3]])
     s = extended(mode, Gaussian(torch.tensor([0.3, -0.2]), root @ root))
-    stage = stage_model(mode, propagator, model, belief_at(mode, s, root @ root), input)
+    _, stage = stage_at(mode, propagator, model, belief_at(mode, s, root @ root), input)
 
     def after(s, input):
         return extended(mode, propagator(model, belief_at(mode, s, root @ root), input))
@@ -79,17 +102,23 @@ def test_a_stage_is_the_derivative_of_its_own_map_and_goes_through_its_point(mod
     def by_differences(function, at):
         return torch.stack([(function(at + h * e) - function(at - h * e)) / (2 * h) for e in torch.eye(len(at))], -1)
 
-    A = stage.A
+    A, (s_next, by_s, by_u) = (
+        stage.A.copy(),
+        (
+            part.numpy()
+            for part in (
+                after(s, input),
+                by_differences(lambda s: after(s, input), s),
+                by_differences(lambda u: after(s, u), input),
+            )
+        ),
+    )
     if mode == "full":  # S is symmetric: only changes that keep it so mean anything
-        A = A.clone()
         A[:, 3] = A[:, 4] = (A[:, 3] + A[:, 4]) / 2
-    if mode == "zero_order":  # how the mean depends on the covariance is left out, not how it depends on the mean
-        assert torch.allclose(
-            stage.next.covariance, propagator(model, belief_at(mode, s, root @ root), input).covariance
-        )
-    assert torch.allclose(A, by_differences(lambda s: after(s, input), s), atol=1e-6)
-    assert torch.allclose(stage.B, by_differences(lambda u: after(s, u), input), atol=1e-6)
-    assert torch.allclose(stage.A @ s + stage.B @ input + stage.c, after(s, input), atol=1e-12)
+    assert np.allclose(A, by_s, atol=1e-6)
+    assert np.allclose(stage.B, by_u, atol=1e-6)
+    assert np.allclose(stage.A @ s.numpy() + stage.B @ input.numpy() + stage.c, s_next, atol=1e-12)
+    assert np.allclose(stage.next, s_next, atol=1e-14)
 
 
 def test_what_a_stage_adds_is_what_does_not_pass_through():
@@ -97,24 +126,27 @@ def test_what_a_stage_adds_is_what_does_not_pass_through():
     model, input = pendulum_posterior(), torch.tensor([0.4])
     root = torch.tensor([[0.1, 0.02], [0.02, 0.15]])
     belief = Gaussian(torch.tensor([0.3, -0.2]), root @ root)
-    stage = stage_model("zero_order", Linearization(process_noise=True), model, belief, input)
-    assert torch.allclose(stage.A @ belief.covariance @ stage.A.T + stage.V, stage.next.covariance, atol=1e-14)
+    propagator = Linearization(process_noise=True)
+    _, stage = stage_at("zero_order", propagator, model, belief, input)
+    after = propagator(model, belief, input).covariance.numpy()
+    assert np.allclose(stage.A @ belief.covariance.numpy() @ stage.A.T + stage.V, after, atol=1e-14)
     certain = Gaussian.certain(belief.mean)
-    own = model.predict(belief.mean, input).covariance
+    own = model.predict(belief.mean, input).covariance.numpy()
     for propagator in (Linearization(), MomentMatching(), Unscented()):
-        stage = stage_model("zero_order", propagator, model, certain, input)
-        assert torch.allclose(stage.V, own, atol=1e-12)
+        _, stage = stage_at("zero_order", propagator, model, certain, input)
+        assert np.allclose(stage.V, own, atol=1e-12)
 
 
 @pytest.mark.parametrize("mode", ["full", "diagonal", "zero_order", "none"])
 def test_a_disturbance_moves_the_mean_and_nothing_else(mode):
     model, input = pendulum_posterior(), torch.tensor([0.4])
     propagator = MeanEquivalence() if mode == "none" else Linearization()
-    belief = Gaussian(torch.tensor([0.3, -0.2]), 0.04 * torch.eye(2))
-    before, pushed = stage_model(mode, propagator, model, belief, input), torch.tensor([0.1, -0.3])
-    after = disturbed(before, pushed)
-    assert torch.equal(after.next.mean, before.next.mean + pushed)
-    assert torch.allclose((after.c - before.c)[:2], pushed, atol=1e-15)
-    assert torch.equal(after.c[2:], before.c[2:])
-    assert torch.equal(after.next.covariance, before.next.covariance)
-    assert torch.equal(after.A, before.A)
+    belief, pushed = Gaussian(torch.tensor([0.3, -0.2]), 0.04 * torch.eye(2)), np.array([0.1, -0.3])
+    _, before = stage_at(mode, propagator, model, belief, input)
+    _, after = stage_at(mode, propagator, model, belief, input, pushed)
+    for name in ("c", "next"):
+        moved = getattr(after, name) - getattr(before, name)
+        assert np.allclose(moved[:2], pushed, atol=1e-15)
+        assert np.allclose(moved[2:], 0.0, atol=1e-15)
+    assert np.array_equal(after.A, before.A)
+    assert np.array_equal(after.V, before.V)

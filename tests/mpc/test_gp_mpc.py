@@ -10,9 +10,10 @@ from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.prediction import COVARIANCES, FORMS
+from gpmpc.mpc.prediction import FORMS
+from gpmpc.mpc.stages import COVARIANCES
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, rollout
 from gpmpc.qp import CvxpySolver, DualActiveSet
@@ -66,9 +67,7 @@ def test_on_a_linear_model_all_forms_are_the_nonlinear_benchmark(penalized, rng)
         [2.0, 1.0, 0.5], [0.3, 0.2], penalized, [5.0, 5.0, 1.0], [-0.7, -0.5], [0.7, 0.4], [-0.5] * 2, [0.5] * 2, bounds
     )  # fmt: skip
     controllers = [
-        ConvexMPC(model, propagator(c), problem, H, [0.0, 0.0], f, c)
-        for f, c in PAIRS
-        if f != "increment" or c != "full"
+        GPMPC(model, propagator(c), problem, H, [0.0, 0.0], f, c) for f, c in PAIRS if f != "velocity" or c != "full"
     ]
     benchmark = NMPC(LinearPlant(model), problem, H, [0.0, 0.0])
     state, last, worked = np.array([0.4, -0.3, 0.2]), None, 0
@@ -105,7 +104,7 @@ def test_it_is_the_exact_least_squares_solution_and_predicts_the_exact_covarianc
     for _ in range(H):
         S = A @ S @ A.T + V
     for covariance in ("full", "zero_order"):
-        controller = ConvexMPC(model, Linearization(), problem, H, [0.0], covariance=covariance, feedback=False)
+        controller = GPMPC(model, Linearization(), problem, H, [0.0], covariance=covariance, feedback=False)
         decision = controller.control(Gaussian.certain(state), reference)
         assert np.allclose(decision.inputs[:, 0], best, atol=1e-9)
         assert np.allclose(decision.covariances[-1], S, atol=1e-12)
@@ -115,29 +114,16 @@ def test_it_is_the_exact_least_squares_solution_and_predicts_the_exact_covarianc
         assert decision.timing.total > 0
 
 
-def test_a_model_that_stays_is_prepared_once_and_gives_the_same_inputs(rng):
-    model, H = linear_gaussian(3, 2), 8
-    problem = TrackingProblem([1.0] * 3, [0.1] * 2, input_lower=[-0.3] * 2, input_upper=[0.3] * 2)
-    held = ConvexMPC(model, Linearization(), problem, H, [0.0] * 2, "deviation", "none")
-    last = None
-    for k in range(4):
-        state, reference = rng.normal(size=3), Reference(rng.normal(size=(H + 1, 3)), np.zeros((H, 2)))
-        last = held.control(Gaussian.certain(state), reference, last)
-        fresh = ConvexMPC(model, Linearization(), problem, H, [0.0] * 2, "deviation", "none")
-        assert np.allclose(last.inputs, fresh.control(Gaussian.certain(state), reference).inputs, atol=1e-9)
-        assert (held._held.prepared is not None) == (k > 0)
-
-
 # On a GP.
 
 
 @pytest.mark.parametrize(("form", "covariance"), PAIRS)
 def test_bounds_and_rates_are_kept_for_thirty_steps(form, covariance):
     problem, H = quadrotor_problem(rate_lower=[-2, -0.1, -0.1], rate_upper=[2, 0.1, 0.1]), 4
-    controller = ConvexMPC(gp(), propagator(covariance), problem, H, HOVER, form, covariance)
-    steps = 30
+    moves = propagator(covariance)
     if covariance in ("full", "diagonal") and form == "trajectory":
-        controller.predictor.propagator = MeanEquivalence()  # half the time; the bounds do not care
+        moves = MeanEquivalence()  # half the time; the bounds do not care
+    controller, steps = GPMPC(gp(), moves, problem, H, HOVER, form, covariance), 30
     states, inputs, decisions = fly(controller, [0.8, 0.0, -0.6, 0.0, 0.5, 0.0], at_origin(H), steps)
     rates = np.diff(inputs, axis=0, prepend=HOVER[None])
     plans = np.concatenate([d.inputs for d in decisions])
@@ -183,17 +169,9 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
     state = np.array([0.8, -0.1, -0.4, 0.1, 0.3, 0.0])
     model = gp(20 if isinstance(moves, MomentMatching) else 60)
 
-    class Watched:
-        def solve(self, problem, warm_start=None):
-            solution = DualActiveSet().solve(problem, warm_start)
-            plans.append(trials[-1])  # the trial that ended the search
-            prices.append(2 * np.abs(solution.z[H * 3 :]).max())
-            return solution
-
-    settings = {"solver": Watched(), "iterations": 30, "tolerance": 1e-8}
-    controller = ConvexMPC(model, moves, problem, H, HOVER, "trajectory", covariance, **settings)
+    settings = {"iterations": 40, "tolerance": 1e-8}
+    controller = GPMPC(model, moves, problem, H, HOVER, "trajectory", covariance, **settings)
     kappa = 0.0 if covariance == "none" else limits.kappa
-    trials, plans, prices, along = [], [], [], controller.predictor.along
 
     def exact(inputs):
         cost, means, variances, u = expected_cost(problem, model, moves, state, inputs, reference, covariance)
@@ -202,20 +180,9 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
         outside = (rows[:, :3] - 0.9).clamp_min(0).sum() + (-0.35 - rows[:, 3:]).clamp_min(0).sum()
         return cost, rows, outside, u, means
 
-    def watched(request, inputs, follow=None):
-        found = along(request, inputs, follow)
-        trials.append(found.inputs)
-        return found
-
-    controller.predictor.along = watched
-    with backend("torch"):  # which the loop has to ask
-        decision = controller.control(Gaussian.certain(state), reference)
+    decision = controller.control(Gaussian.certain(state), reference)
     assert decision.status is Status.SOLVED
     assert 2 < decision.iterations < 25
-    for k in range(1, len(plans) - 1):  # the first guess breaks the rates
-        (before, _, out_before, _, _), (after, _, out_after, _, _) = exact(plans[k]), exact(plans[k + 1])
-        price = max(prices[: k + 1])
-        assert after + price * out_after <= (before + price * out_before) * (1 + 1e-8)
     cost, rows, outside, u, means = exact(decision.inputs)
     assert outside < 1e-6
     assert np.allclose(decision.means[1:], means.detach(), atol=1e-7)
@@ -232,7 +199,7 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
 def test_zero_order_ends_where_its_own_tightening_holds():
     H, limits = 4, StateBounds([-np.inf, -0.5] * 3, [np.inf, 0.9] * 3, confidence=0.9)
     problem, state = quadrotor_problem(state_bounds=limits), np.array([0.8, -0.1, -0.4, 0.1, 0.3, 0.0])
-    controller = ConvexMPC(gp(), Linearization(), problem, H, HOVER, iterations=30, tolerance=1e-7)
+    controller = GPMPC(gp(), Linearization(), problem, H, HOVER, iterations=30, tolerance=1e-7)
     decision = controller.control(Gaussian.certain(state), at_origin(H))
     assert decision.status is Status.SOLVED
     sd = np.sqrt(np.diagonal(decision.covariances[1:], axis1=1, axis2=2))
@@ -241,7 +208,7 @@ def test_zero_order_ends_where_its_own_tightening_holds():
 
 
 def test_too_few_iterations_say_so():
-    controller = ConvexMPC(gp(), MeanEquivalence(), quadrotor_problem(), 4, HOVER, "trajectory", "none", iterations=2)
+    controller = GPMPC(gp(), MeanEquivalence(), quadrotor_problem(), 4, HOVER, "trajectory", "none", iterations=2)
     decision = controller.control(Gaussian.certain(np.array([0.8, 0, 0.8, 0, 0.8, 0])), at_origin(4))
     assert decision.status is Status.ITERATION_LIMIT
     assert decision.iterations == 2
@@ -256,7 +223,7 @@ def test_a_higher_confidence_keeps_further_from_the_bound(form, covariance):
         limits = StateBounds([-np.inf] * 6, [0.9, np.inf, np.inf, np.inf, np.inf, np.inf], confidence)
         problem = quadrotor_problem(Q=[10.0, 10.0, 1, 1, 1, 1], state_bounds=limits)
         count = 25 if form == "trajectory" else 1
-        controller = ConvexMPC(
+        controller = GPMPC(
             gp(), propagator(covariance), problem, H, HOVER, form, covariance, iterations=count, tolerance=1e-5
         )
         last = controller.control(Gaussian.certain(state), reference)
@@ -272,7 +239,7 @@ def test_a_higher_confidence_keeps_further_from_the_bound(form, covariance):
 def test_a_horizon_of_fifty_with_state_bounds_stays_feasible(form, price):
     H, limits = 50, StateBounds([-1.5, -0.8] * 3, [1.5, 0.8] * 3, confidence=0.95, l1=price)
     covariance = "zero_order"
-    controller = ConvexMPC(gp(), MeanEquivalence(), quadrotor_problem(state_bounds=limits), H, HOVER, form, covariance)
+    controller = GPMPC(gp(), MeanEquivalence(), quadrotor_problem(state_bounds=limits), H, HOVER, form, covariance)
     states, _, decisions = fly(controller, [0.8, 0.0, -0.6, 0.0, 0.5, 0.0], at_origin(H), 2)
     assert np.isfinite(states).all()
     assert decisions[-1].inputs.shape == (50, 3)
@@ -283,13 +250,13 @@ def test_feedback_keeps_a_long_horizon_feasible_where_open_loop_is_not():
     model = replace(model, A=torch.tensor([[1.0, 0.2], [0.0, 1.0]]), B=torch.tensor([[0.02], [0.2]]), c=torch.zeros(2))
     problem = TrackingProblem([1.0, 0.1], [0.1], state_bounds=StateBounds([-1.5, -2.0], [1.5, 2.0]))
     belief, reference = Gaussian.certain(np.array([0.3, 0.0])), Reference(np.zeros((H + 1, 2)))
-    closed, opened = (ConvexMPC(model, Linearization(), problem, H, [0.0], feedback=f) for f in (True, False))
+    closed, opened = (GPMPC(model, Linearization(), problem, H, [0.0], feedback=f) for f in (True, False))
     assert closed.control(belief, reference).status is Status.SOLVED
     decision = opened.control(belief, reference)
     assert decision.status is Status.INFEASIBLE
     assert "soften" in decision.status.advice
     priced = replace(problem, state_bounds=replace(problem.state_bounds, l1=10.0, l2=1.0))
-    softened = ConvexMPC(model, Linearization(), priced, H, [0.0], feedback=False).control(belief, reference)
+    softened = GPMPC(model, Linearization(), priced, H, [0.0], feedback=False).control(belief, reference)
     assert softened.status is Status.SOLVED
 
 
@@ -298,7 +265,7 @@ def test_soft_bounds_cost_what_they_are_said_to_cost():
     limits = StateBounds([-0.2] * 3, [0.2] * 3, kappa=0.0, l1=0.3, l2=2.0)
     problem = TrackingProblem([1.0] * 3, [0.3] * 2, input_lower=[-0.3] * 2, input_upper=[0.3] * 2, state_bounds=limits)
     belief, reference = Gaussian.certain(np.array([1.0, -0.5, 0.3])), Reference(np.zeros((H + 1, 3)))
-    convex = ConvexMPC(model, Linearization(), problem, H, [0.0] * 2).control(belief, reference)
+    convex = GPMPC(model, Linearization(), problem, H, [0.0] * 2).control(belief, reference)
     benchmark = NMPC(LinearPlant(model), problem, H, [0.0] * 2).control(belief, reference)
     assert np.abs(convex.means[1:]).max() > 0.25
     assert np.allclose(convex.inputs, benchmark.inputs, atol=1e-6)
@@ -307,7 +274,7 @@ def test_soft_bounds_cost_what_they_are_said_to_cost():
 @pytest.mark.parametrize("form", FORMS)
 def test_a_warm_start_changes_the_time_and_not_the_answer(form):
     limits = StateBounds([-np.inf, -0.4] * 3, [np.inf, 0.4] * 3)
-    controller = ConvexMPC(
+    controller = GPMPC(
         gp(), MeanEquivalence(), quadrotor_problem(state_bounds=limits), 6, HOVER, form, "none", DualActiveSet()
     )
     _, _, decisions = fly(controller, [0.8, 0, -0.6, 0, 0.5, 0], at_origin(6), 5)
@@ -320,7 +287,7 @@ def test_a_warm_start_changes_the_time_and_not_the_answer(form):
 
 
 def test_build_is_the_problem_that_control_solves():
-    controller = ConvexMPC(gp(), Linearization(), quadrotor_problem(), 3, HOVER)
+    controller = GPMPC(gp(), Linearization(), quadrotor_problem(), 3, HOVER)
     belief = Gaussian.certain(np.full(6, 0.3))
     program, decision = controller.build(belief, at_origin(3)), controller.control(belief, at_origin(3))
     assert np.allclose(program.P, decision.problem.P)
@@ -334,9 +301,7 @@ def test_build_is_the_problem_that_control_solves():
 
 @pytest.mark.parametrize("iterations", [1, 5])
 def test_a_measurement_that_is_not_finite_is_not_given_to_the_solver(iterations):
-    controller = ConvexMPC(
-        gp(), MeanEquivalence(), quadrotor_problem(), 3, HOVER, "trajectory", "none", None, iterations
-    )
+    controller = GPMPC(gp(), MeanEquivalence(), quadrotor_problem(), 3, HOVER, "trajectory", "none", None, iterations)
     for bad in (np.nan, np.inf):
         decision = controller.control(Gaussian.certain(np.array([0, 0, bad, 0, 0, 0])), at_origin(3))
         assert decision.status is Status.INVALID_MEASUREMENT
@@ -345,7 +310,7 @@ def test_a_measurement_that_is_not_finite_is_not_given_to_the_solver(iterations)
 
 
 def test_a_decision_that_was_not_solved_is_no_warm_start():
-    controller = ConvexMPC(gp(), MeanEquivalence(), quadrotor_problem(), 3, HOVER, "trajectory", "none")
+    controller = GPMPC(gp(), MeanEquivalence(), quadrotor_problem(), 3, HOVER, "trajectory", "none")
     belief = Gaussian.certain(np.full(6, 0.3))
     fresh = controller.control(belief, at_origin(3))
     nothing = {"inputs": np.full((3, 3), np.nan), "status": Status.NUMERICAL_TROUBLE, "solution": None}
@@ -355,7 +320,7 @@ def test_a_decision_that_was_not_solved_is_no_warm_start():
 
 def test_what_was_applied_at_a_failed_step_is_where_the_next_increment_starts():
     problem = quadrotor_problem(rate_lower=[-0.05] * 3, rate_upper=[0.05] * 3)
-    controller = ConvexMPC(gp(), MeanEquivalence(), problem, 3, HOVER, "trajectory", "none")
+    controller = GPMPC(gp(), MeanEquivalence(), problem, 3, HOVER, "trajectory", "none")
     decision = controller.control(Gaussian.certain(np.full(6, 0.3)), at_origin(3))
     for _ in range(3):
         decision = controller.control(Gaussian.certain(np.full(6, 0.3)), at_origin(3), decision)
@@ -369,7 +334,7 @@ def test_what_was_applied_at_a_failed_step_is_where_the_next_increment_starts():
 @pytest.mark.parametrize("iterations", [1, 10])
 def test_bounds_that_cannot_be_kept_are_reported(iterations):
     limits = StateBounds([-np.inf] * 6, [0.1] + [np.inf] * 5)
-    controller = ConvexMPC(
+    controller = GPMPC(
         gp(),
         MeanEquivalence(),
         quadrotor_problem(state_bounds=limits),
@@ -391,10 +356,10 @@ def test_bounds_that_cannot_be_kept_are_reported(iterations):
         ({"horizon": 0}, "horizon: must be a whole number, 1 or more; got 0"),
         ({"problem": TrackingProblem([1.0] * 5, [1.0] * 3)}, "must weigh 6 states and 3 inputs; got 5 and 3"),
         ({"initial_input": [0.0]}, "initial_input: must be a list of 3 numbers"),
-        ({"form": "ltv"}, "form: must be one of 'increment', 'deviation', 'trajectory'; got 'ltv'"),
+        ({"form": "ltv"}, "form: must be one of 'trajectory', 'velocity'; got 'ltv'"),
         ({"covariance": "some"}, "covariance: must be one of 'full', 'diagonal', 'zero_order', 'none'; got 'some'"),
         ({"iterations": 0}, "iterations: must be a whole number, 1 or more; got 0"),
-        ({"iterations": 2, "form": "increment"}, "iterations: form 'increment' is one quadratic program, so 1; got 2"),
+        ({"iterations": 2, "form": "velocity"}, "iterations: form 'velocity' is one quadratic program, so 1; got 2"),
         ({"tolerance": 0.0}, "tolerance: must be a number above 0"),
         ({"feedback": "yes"}, "feedback: must be true or false; got 'yes'"),
         (
@@ -406,15 +371,12 @@ def test_bounds_that_cannot_be_kept_are_reported(iterations):
 def test_misuse_is_refused_at_construction(changes, message):
     good = {"problem": quadrotor_problem(), "horizon": 3, "initial_input": HOVER}
     with pytest.raises(SettingError, match=message):
-        ConvexMPC(gp(), Linearization(), **(good | changes))
+        GPMPC(gp(), Linearization(), **(good | changes))
 
 
 def test_a_reference_that_does_not_belong_is_refused():
     belief = Gaussian.certain(np.zeros(6))
-    controller = ConvexMPC(gp(), Linearization(), quadrotor_problem(penalized="inputs"), 3, HOVER, "deviation")
-    with pytest.raises(ShapeError, match=r"form 'deviation' needs reference inputs \(3, 3\); got none"):
-        controller.control(belief, Reference(np.zeros((4, 6))))
-    controller = ConvexMPC(gp(), Linearization(), quadrotor_problem(), 3, HOVER)
+    controller = GPMPC(gp(), Linearization(), quadrotor_problem(), 3, HOVER)
     with pytest.raises(ShapeError, match=r"penalized 'deviations' needs reference inputs \(3, 3\); got none"):
         controller.control(belief, Reference(np.zeros((4, 6))))
     with pytest.raises(ShapeError, match=r"\(4, 6\); got \(6,\) and \(3, 6\)"):
@@ -429,7 +391,7 @@ def test_a_reference_that_does_not_belong_is_refused():
 def test_the_compiled_rollout_is_the_one_stage_by_stage(covariance, feedback, process_noise):
     H, propagator = 6, Linearization(process_noise=process_noise)
     arguments = (gp(), propagator, quadrotor_problem(), H, HOVER, "trajectory", covariance)
-    compiled, by_torch = ConvexMPC(*arguments, feedback=feedback), ConvexMPC(*arguments, feedback=feedback)
+    compiled, by_torch = GPMPC(*arguments, feedback=feedback), GPMPC(*arguments, feedback=feedback)
     belief = Gaussian(torch.full((6,), 0.2), 1e-3 * torch.eye(6))
     first = compiled.control(belief, at_origin(H))
     with backend("torch"):
@@ -446,7 +408,7 @@ def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_reque
     state, found = Gaussian.certain(np.array([0.3, 0.0, -0.2, 0.1, 0.2, 0.0])), []
     for noise in (False, True):
         how = Linearization(process_noise=noise)
-        controller = ConvexMPC(gp(), how, quadrotor_problem(), 3, HOVER, form, covariance, feedback=False)
+        controller = GPMPC(gp(), how, quadrotor_problem(), 3, HOVER, form, covariance, feedback=False)
         with backend(evaluated):
             found.append(controller.control(state, at_origin(3)).covariances[1])
     assert np.allclose(found[1] - found[0], gp().noise_covariance, atol=1e-6)  # of 1e-4; the plans differ a little
