@@ -86,9 +86,10 @@ def test_a_run_killed_at_twenty_random_moments_is_recovered_every_time(start, tm
     for i in range(20):
         path = tmp_path / f"{i}.mcap"
         process = start(path)
-        while not path.exists() or not path.stat().st_size:
+        size = rng.choice([1, rng.uniform(1, 300_000)])  # soon after the start, or in the middle of some chunk
+        while not path.exists() or path.stat().st_size < size:
             time.sleep(0.001)
-        time.sleep(rng.uniform(0, 0.05))
+        time.sleep(rng.uniform(0, 0.02))
         os.kill(process, signal.SIGKILL)
         run = read_run(path)
         assert not run.finished
