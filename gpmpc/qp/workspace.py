@@ -7,9 +7,6 @@ Threads may share it, since a solve keeps the interpreter's lock. It is one matr
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba.core import types
-from numba.extending import intrinsic
-from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
 
 from gpmpc.compiled import inline_njit
@@ -135,23 +132,6 @@ def round_end(end, n):
     return min(n, (end + _END_STEP - 1) // _END_STEP * _END_STEP)
 
 
-@intrinsic
-def matrix(typing_context, memory, start, rows, columns):
-    """The entries of a contiguous array from ``start`` on as (rows, columns); numba's reshape takes 20 ns more."""
-    kind = types.Array(types.float64, 2, "C")
-
-    def generate(context, builder, signature, arguments):
-        source, start, rows, columns = arguments
-        data = builder.gep(context.make_array(memory)(context, builder, source).data, [start])
-        step = context.get_constant(types.intp, 8)
-        view = context.make_array(kind)(context, builder)
-        strides = builder.mul(columns, step), step
-        populate_array(view, data=data, shape=(rows, columns), strides=strides, itemsize=step, meminfo=None)
-        return view._getvalue()
-
-    return kind(memory, types.intp, types.intp, types.intp), generate
-
-
 @inline_njit
 def open_workspace(P, q, G, memory, out):
     """Returns the workspace and the working set in ``memory`` and the record ``out``."""
@@ -159,8 +139,10 @@ def open_workspace(P, q, G, memory, out):
     settings, real, whole = memory[0], memory[_REALS:_INTEGERS], memory[_INTEGERS:_REST].view(np.int64)
     soft = settings[SOFT] != 0.0
     capacity = _most_working(n, M, soft)
-    factor, rest = memory[_REST : _REST + capacity + 1], memory[_REST + capacity + 1 :]
-    L, rows = matrix(rest, 0, n, padded(n)), matrix(rest, n * padded(n), M, n)
+    factor, rest = memory[_REST : _REST + capacity + 1], memory[_REST + capacity + 1 :].reshape(-1)
+    count = M if settings[PREPARED] != 0.0 else capacity + 1
+    size = n * padded(n)
+    L, rows = rest[:size].reshape(n, padded(n)), rest[size : size + count * n].reshape(count, n)
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     work = Workspace(
         P, q, G, L, rows, real[0], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2], memory[3],
