@@ -13,6 +13,7 @@ import numpy as np
 
 from gpmpc.compiled import compiled, inline_njit
 from gpmpc.kernels.linalg import dot, multiply
+from gpmpc.kernels.simd import any_nonzero, load, load_some, total, zeros
 from gpmpc.qp.dual_iteration import (
     NEGLIGIBLE,
     add_constraints,
@@ -22,7 +23,6 @@ from gpmpc.qp.dual_iteration import (
     iterate,
     multiply_constraints,
 )
-from gpmpc.qp.lanes import any_nonzero, lanes, no_lanes, plus, plus_product, product, some_lanes, total
 from gpmpc.qp.record import (
     CONSTRAINTS,
     HEADER,
@@ -178,20 +178,20 @@ def _measure_rows(work):
         units[i] = 0.0
     undefined, end = 0.0, 0
     for p in range(len(G)):
-        row, near, far = G[p], no_lanes(), no_lanes()
+        row, near, far = G[p], zeros(), zeros()
         head, tail, rest = row[:end], row[end:], units[end:]
         for j in range(0, end, 8):
-            values = product(some_lanes(head, j), lanes(units, j))
-            near = plus_product(near, values, values)
+            values = load_some(head, j) * load(units, j)
+            near = near + values * values
         for j in range(0, n - end, 8):
-            values = product(some_lanes(tail, j), lanes(rest, j))
-            far = plus_product(far, values, values)
+            values = load_some(tail, j) * load(rest, j)
+            far = far + values * values
         if any_nonzero(far):  # longer than the row before
             end = n
             while end > 0 and row[end - 1] == 0.0:
                 end -= 1
             end = round_end(end, n)
-        length = math.sqrt(total(plus(near, 1.0, far)))
+        length = math.sqrt(total(near + far))
         undefined += length * 0.0
         scale[n + p], work.end[n + p] = (length if length > 0.0 else 1.0), end
     return undefined == 0.0
