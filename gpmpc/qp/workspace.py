@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpmpc.compiled import inline_njit
+from gpmpc.kernels.linalg import aligned_rows
 from gpmpc.qp.record import HEADER
 
 Array = NDArray[np.float64]
@@ -85,7 +86,8 @@ def new_memory(softness: Array, n: int, limit: int, tolerance: float, soft: bool
     capacity = _most_working(n, M, soft)
     wide = padded(max(M, capacity + 2, SETTINGS)) + 8  # kernels write whole lanes
     own = n * padded(n) + n * (M if prepared else capacity + 1)
-    memory = aligned(_REST + capacity + 1 - (-own // wide), wide)
+    memory = aligned_rows(_REST + capacity + 1 - (-own // wide), wide)  # loads across cache lines take twice the time
+    memory[:] = 0.0
     box = np.arange(M) < n
     memory[0, :SETTINGS] = limit, tolerance, soft, False
     memory[1, :M], memory[2:4, :M] = box, softness
@@ -105,13 +107,6 @@ def factor_and_rows(memory: Array, n: int, m: int) -> tuple[Array, Array]:
     L = np.tril(start[: n * padded(n)].reshape(n, padded(n))[:, :n])
     np.fill_diagonal(L, 1.0 / np.diagonal(L))
     return L, start[n * padded(n) :][: (n + m) * n].reshape(n + m, n)
-
-
-def aligned(rows: int, columns: int) -> Array:
-    """Returns zeros that begin where a cache line does: loads of eight numbers across two lines take twice the time."""
-    memory = np.zeros(rows * columns + 8)
-    start = -memory.ctypes.data // 8 % 8
-    return memory[start : start + rows * columns].reshape(rows, columns)
 
 
 @inline_njit
