@@ -85,7 +85,7 @@ def new_memory(softness: Array, n: int, limit: int, tolerance: float, soft: bool
     M = softness.shape[1]
     capacity = _most_working(n, M, soft)
     wide = padded(max(M, capacity + 2, SETTINGS)) + 8  # kernels write whole lanes
-    own = n * padded(n) + n * (M if prepared else capacity + 1)
+    own = n * padded(n) + n * max(M if prepared else 0, capacity + 1)
     memory = aligned_rows(_REST + capacity + 1 - (-own // wide), wide)  # loads across cache lines take twice the time
     memory[:] = 0.0
     box = np.arange(M) < n
