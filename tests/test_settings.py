@@ -42,7 +42,6 @@ def excited(**settings):
 
 CASES = [
     (nmpc, "tolerance", (0.0, -1e-6, math.nan)),
-    (nmpc, "first_guess", ("warm", None)),
     (convex, "iterations", (0, 1.5, -1)),
     (convex, "tolerance", (0.0, math.inf, "small")),
     (convex, "disturbance_gain", (-0.1, math.nan)),

@@ -2,8 +2,8 @@
 
 A failed iterate is never applied and never handed on: the next call gets the last plan that was applicable, shifted as
 if it had been made one step ago, with what was really applied as its first input. A plan that is used up holds its last
-input. Whatever is applied is finite and within the box and the rates of the controller's problem, whatever the status of
-a decision says: inputs beyond a bound by rounding are put onto it, others count as failed.
+input. Whatever is applied is finite and within the box and the rates of the controller's problem, even where the status
+of a decision says otherwise: inputs beyond a bound by rounding are put onto it, others count as failed.
 """
 
 from collections.abc import Sequence

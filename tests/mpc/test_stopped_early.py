@@ -36,7 +36,7 @@ def nmpc(monkeypatch):
     with monkeypatch.context() as patch:
         few = lambda *known: build(*known[:-1], known[-1] | {"ipopt": known[-1]["ipopt"] | {"max_iter": 8}})  # noqa: E731
         patch.setattr(casadi, "nlpsol", few)
-        return NMPC(QUADROTOR, PROBLEM, H, HOVER, first_guess="shift")
+        return NMPC(QUADROTOR, PROBLEM, H, HOVER)
 
 
 STOPPED = {
