@@ -21,8 +21,7 @@ import torch
 
 from benchmarks.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
 from benchmarks.timing import write_results
-from gpmpc.mpc.convex_mpc import ConvexMPC
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import StateBounds
 from gpmpc.propagation import Linearization, MomentMatching
@@ -55,10 +54,10 @@ def optimality(posteriors: dict, propagation: str, arguments: argparse.Namespace
     propagator, gaps, times, failed = PROPAGATIONS[propagation], [], [[], []], {"convex": 0, "nonlinear": 0}
     for trajectory, gp in posteriors.items():
         asked = (problem(), arguments.horizon, HOVER)
-        convex = ConvexMPC(gp, propagator, *asked, form="trajectory", covariance="full", iterations=100, tolerance=1e-7)
+        convex = GPMPC(gp, propagator, *asked, form="trajectory", covariance="full", iterations=100, tolerance=1e-7)
         nonlinear = NonlinearGPMPC(gp, propagator, *asked, tolerance=1e-6, max_iterations=300)
         count = arguments.steps // len(posteriors)
-        flown = recorded(ConvexMPC(gp, Linearization(), *asked), trajectory, count, std=0.01)
+        flown = recorded(GPMPC(gp, Linearization(), *asked), trajectory, count, std=0.01)
         for step in flown:
             plans = []
             for controller, spent in zip((convex, nonlinear), times, strict=True):
@@ -97,10 +96,10 @@ def solvers(posteriors: dict, count: int) -> dict:
         hard = (replace(problem(tilt=tilt), rate_lower=np.negative(rate), rate_upper=rate), 10, HOVER)
         soft = (problem(bounds), 10, HOVER)
         for asked, kinds, steps in ((hard, tuple(found), count // 2), (soft, ("state_form",), count // 4)):
-            ours = ConvexMPC(gp, Linearization(), *asked)
+            ours = GPMPC(gp, Linearization(), *asked)
             others = {
-                "primal_active_set": lambda a=asked, g=gp: ConvexMPC(g, Linearization(), *a, solver=PrimalActiveSet()),
-                "clarabel": lambda a=asked, g=gp: ConvexMPC(g, Linearization(), *a, solver=CvxpySolver()),
+                "primal_active_set": lambda a=asked, g=gp: GPMPC(g, Linearization(), *a, solver=PrimalActiveSet()),
+                "clarabel": lambda a=asked, g=gp: GPMPC(g, Linearization(), *a, solver=CvxpySolver()),
                 "state_form": lambda a=asked, g=gp: StateFormMPC(g, Linearization(), *a),
             }
             others = {kind: others[kind]() for kind in kinds}
@@ -131,7 +130,7 @@ def solvers(posteriors: dict, count: int) -> dict:
 def long_horizon(gp, trajectory: str, l1: float | None) -> dict:
     """H = 50 with state bounds that the reference breaks, hard or at a price."""
     limits = StateBounds(*STATE_BOUNDS[trajectory], l1=l1)
-    flown = recorded(ConvexMPC(gp, Linearization(), problem(limits), 50, HOVER), trajectory, 189)
+    flown = recorded(GPMPC(gp, Linearization(), problem(limits), 50, HOVER), trajectory, 189)
     statuses = [step.decision.status.name for step in flown]
     times = [step.decision.timing.total for step in flown]
     result = {

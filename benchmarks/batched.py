@@ -23,7 +23,7 @@ import torch
 from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
 from benchmarks.timing import write_results
 from gpmpc.gp import GPPosterior, backend
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import closed_loop, closed_loops
 from gpmpc.trajectories import states_along
@@ -33,7 +33,7 @@ TORCH_LIMIT = 2_000_000  # T N^2 of exact moments above which torch on the CPU i
 MODES = {
     "mean": {"propagator": Linearization(), "covariance": "none"},
     "linearised": {"propagator": Linearization(), "covariance": "zero_order"},
-    "moment-matched": {"propagator": MomentMatching(), "covariance": "full", "form": "increment"},
+    "moment-matched": {"propagator": MomentMatching(), "covariance": "full", "form": "velocity"},
 }
 
 
@@ -70,11 +70,11 @@ def measured(gp: GPPosterior, mode: dict, trials: int, arguments: argparse.Names
     """Trials a second and ratios to those alone at one number of trials."""
     states = states_along(TRAJECTORIES["elliptical"], np.arange(arguments.steps + HORIZON + 1.0))
     flight = {"references": states, "initial": states[0], "steps": arguments.steps, "noise": NOISE}
-    here = ConvexMPC(gp, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
+    here = GPMPC(gp, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
     there = here
     if arguments.device != "cpu":
         moved = gp.to(arguments.device)
-        there = ConvexMPC(moved, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
+        there = GPMPC(moved, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
 
     def alone() -> float:
         flown = range(min(trials, arguments.alone))

@@ -19,7 +19,7 @@ from benchmarks.timing import write_results
 from gpmpc.exceptions import GpmpcError
 from gpmpc.metrics import tracking_error
 from gpmpc.mpc.cascade import Cascade
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization
@@ -53,9 +53,9 @@ def main() -> None:
                 NMPC(OUTER, problem(), 1, HOVER), NMPC(INNER, INNER_PROBLEM, 1, [0.0] * 3, tolerance=1e-8)
             ),
         }
-        inner_gp = ConvexMPC(inner, Linearization(), INNER_PROBLEM, 1, [0.0] * 3, covariance="none")
+        inner_gp = GPMPC(inner, Linearization(), INNER_PROBLEM, 1, [0.0] * 3, covariance="none")
         for name, gain in (("GP", 0.0), ("GP, error estimated", 1.0)):
-            outer_gp = ConvexMPC(outer, Linearization(), problem(), 1, HOVER, disturbance_gain=gain)
+            outer_gp = GPMPC(outer, Linearization(), problem(), 1, HOVER, disturbance_gain=gain)
             cascades[name] = Cascade(outer_gp, inner_gp)
         for case in CASES:
             flown = {name: flights(cascade, trajectory, case, arguments) for name, cascade in cascades.items()}

@@ -2,13 +2,13 @@
 
     .venv/bin/python -m benchmarks.controllers [--steps 14] [--horizons 1 10 20 50] [--rivals 1 10]
 
-One process, one thread, process CPU time, GPs on 189 transitions. Questions are recorded on a flight with the plant in
+One process, one thread, process CPU time, GPs on 189 transitions. Instances are recorded on a flight with the plant in
 the loop, with the plans that the one controller made, and then put to each controller in turns, warm-started from its
-own last answer, shifted. The nonlinear ones stop at a projected gradient of 1e-6, in the norm of the inverse
-Gauss-Newton Hessian and relative to the cost (``gpmpc.mpc.descent``), which one program of the convex ones does not
-ask for; ``cold`` are the same instances without a plan, from the last input held. ``plain slsqp`` is what comes to mind
-first: SciPy's SLSQP on the inputs as they are, from hover, with the same compiled derivatives. ``jacobian`` is one call
-of ``differentiate`` with moment matching. Ratios are paired. Writes ``outputs/benchmarks/controllers.json``.
+own last decision, shifted. ``nonlinear, sqp`` stops at a relative offset of 1e-6 (``gpmpc.mpc.sqp``), ``slsqp`` where a
+round lowers the cost by less than 1e-12 of it; one program of the convex ones asks for neither.
+``cold`` are the same instances without a plan, from the last input held. ``plain slsqp`` is what comes to mind first:
+SciPy's SLSQP on the inputs as they are, from hover, with the same compiled derivatives. ``jacobian`` is one call of
+``differentiate`` with moment matching. Ratios are paired. Writes ``outputs/benchmarks/controllers.json``.
 """
 
 import argparse
@@ -21,13 +21,11 @@ from scipy.optimize import minimize
 
 from benchmarks.quadrotor import HOVER, TRAJECTORIES, Asked, problem, recorded, trained
 from benchmarks.timing import write_results
+from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc.controller import Decision, Timing
-from gpmpc.mpc.convex_mpc import ConvexMPC
-from gpmpc.mpc.descent import Program
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.request import Request
-from gpmpc.mpc.shooting import Shooting
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.status import Status
 
@@ -60,46 +58,46 @@ def ways(gp: GPPosterior, horizon: int) -> list[dict]:
     Whoever comes after a rival finds the caches full of it; so they take turns apart, each with the paper's form.
     """
     exact, asked = MomentMatching(), (problem(), horizon, HOVER)
-    paper = {"paper's form": ConvexMPC(gp, exact, *asked, form="increment", covariance="full")}
+    paper = {"paper's form": GPMPC(gp, exact, *asked, form="velocity", covariance="full")}
     convex = {
-        "trajectory, linearised": ConvexMPC(gp, Linearization(), *asked),
-        "trajectory, mean": ConvexMPC(gp, Linearization(), *asked, covariance="none"),
+        "trajectory, linearised": GPMPC(gp, Linearization(), *asked),
+        "trajectory, mean": GPMPC(gp, Linearization(), *asked, covariance="none"),
     }
-    rivals = {
-        f"nonlinear, {method}{start}": NonlinearGPMPC(gp, exact, *asked, method, tolerance=1e-6, max_iterations=300)
-        for method in ("sqp", "slsqp")
-        for start in ("", COLD)
-    }
+    rivals = {}
+    for start in ("", COLD):
+        rivals[f"nonlinear, sqp{start}"] = NonlinearGPMPC(gp, exact, *asked, iterations=300, tolerance=1e-6)
+        rivals[f"nonlinear, slsqp{start}"] = SLSQP(gp, exact, *asked, tolerance=1e-6)
     rivals[f"nonlinear, plain slsqp{COLD}"] = PlainSLSQP(gp, exact, *asked)
     return [paper | convex, paper | rivals]
 
 
-class PlainSLSQP(NonlinearGPMPC):
-    """The same objective and derivatives, minimised as SciPy's manual shows it."""
+class PlainSLSQP(SLSQP):
+    """Minimises the same objective with the same derivatives as SciPy's manual shows it."""
 
     def control(self, belief, reference, previous=None) -> Decision:
         """From hover, until the cost changes by less than a millionth of that of hovering."""
         began = time.perf_counter()
         request = Request.read(self.problem, self.horizon, self.initial_input, belief, reference, previous)
-        program = Program(Shooting(self.model, self.propagator, self.problem, self.horizon), request)
-        start, box = np.tile(HOVER, self.horizon), list(zip(program.lower, program.upper, strict=True))
-        cost = program(start).cost
-        found = minimize(
-            lambda U: program(U).cost,
-            start,
-            jac=lambda U: program(U).gradient,
-            method="SLSQP",
-            bounds=box,
-            options={"ftol": 1e-6 * cost, "maxiter": 300},
-        )
-        shot, status = program(found.x), Status.SOLVED if found.success else Status.ITERATION_LIMIT
-        inputs, spent = found.x.reshape(self.horizon, -1), Timing(0.0, 0.0, time.perf_counter() - began)
-        return Decision(inputs[0], inputs, shot.means, shot.covariances, status, found.nit, spent)
+        memory = [self.evaluate(np.tile(HOVER, self.horizon), request)]
+        start, cost = memory[0].plan, memory[0].cost
+
+        def at(plan):
+            if not np.array_equal(plan, memory[0].plan):
+                memory[0] = self.evaluate(plan, request)
+            return memory[0]
+
+        box = list(zip(self.problem.input_lower, self.problem.input_upper, strict=True)) * self.horizon
+        options = {"ftol": 1e-6 * cost, "maxiter": 300}
+        gradient = {"jac": lambda U: at(U).gradient, "bounds": box, "options": options}
+        result = minimize(lambda U: at(U).cost, start, method="SLSQP", **gradient)
+        found, status = at(result.x), Status.SOLVED if result.success else Status.ITERATION_LIMIT
+        inputs, spent = result.x.reshape(self.horizon, -1), Timing(0.0, 0.0, time.perf_counter() - began)
+        return Decision(inputs[0], inputs, found.means, found.covariances, status, result.nit, spent)
 
 
 def measured(gp: GPPosterior, controllers: dict, trajectory: str, horizon: int, steps: int) -> dict:
     """Median times [ms] and ratios of some controllers at one horizon."""
-    flown: list[Asked] = recorded(ConvexMPC(gp, Linearization(), problem(), horizon, HOVER), trajectory, steps, STD)
+    flown: list[Asked] = recorded(GPMPC(gp, Linearization(), problem(), horizon, HOVER), trajectory, steps, STD)
     exact = MomentMatching()
     taken = {name: [] for name in ["jacobian", *controllers]}
     unsolved, last = dict.fromkeys(controllers, 0), dict.fromkeys(controllers)

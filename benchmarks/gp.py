@@ -21,7 +21,7 @@ from gpmpc import kernels
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
-from gpmpc.propagation.moments import moments
+from gpmpc.propagation._moments import moments
 
 STATES, INPUTS = 6, 3
 Group = dict[str, Callable[[], list | tuple]]

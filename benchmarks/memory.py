@@ -71,7 +71,7 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
     from gpmpc.gaussian import Gaussian
     from gpmpc.gp import load_posterior
     from gpmpc.mpc.controller import Reference
-    from gpmpc.mpc.convex_mpc import ConvexMPC
+    from gpmpc.mpc.gp_mpc import GPMPC
     from gpmpc.mpc.tracking import TrackingProblem
     from gpmpc.propagation import Linearization
 
@@ -81,7 +81,7 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
     n, m = gp.state_dim, gp.input_dim
     box = {"input_lower": [-1] * m, "input_upper": [1] * m}
     problem = TrackingProblem([1] * n, [1] * m, penalized="increments", **box)
-    controller = ConvexMPC(gp, Linearization(), problem, horizon, [0.0] * m, covariance=covariance)
+    controller = GPMPC(gp, Linearization(), problem, horizon, [0.0] * m, covariance=covariance)
     reference = Reference(np.zeros((horizon + 1, n)))
     eye, generator = torch.eye(n, dtype=torch.float64), torch.Generator().manual_seed(0)
     decision, steady, risen, peak = None, 0, 0.0, 0.0

@@ -41,7 +41,7 @@ from benchmarks.timing import (
 )
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc.controller import Controller, Decision, Timing
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
@@ -96,7 +96,7 @@ def peers_problem() -> TrackingProblem:
 
 def record_instances(gp: GPPosterior, task: TrackingProblem, horizon: int, steps: int) -> list[Instance]:
     """Flies with one program per step and returns the optimal control problems of the flight."""
-    flown = recorded(ConvexMPC(gp, Linearization(), task, horizon, HOVER, covariance="none"), TRAJECTORY, steps)
+    flown = recorded(GPMPC(gp, Linearization(), task, horizon, HOVER, covariance="none"), TRAJECTORY, steps)
     before = [np.array(HOVER) if step.previous is None else step.previous.input for step in flown]
     return [Instance(step.belief, step.reference, last) for step, last in zip(flown, before, strict=True)]
 
@@ -106,7 +106,7 @@ def converged(gp: GPPosterior, task: TrackingProblem, horizon: int) -> Cases:
 
     def ours() -> Solve:
         settings = {"covariance": "none", "iterations": 50, "tolerance": OURS}
-        return by_controller(ConvexMPC(gp, Linearization(), task, horizon, HOVER, **settings))
+        return by_controller(GPMPC(gp, Linearization(), task, horizon, HOVER, **settings))
 
     def do_mpc() -> Solve:
         return peer_do_mpc.DoMpc(gp, task, horizon, IPOPT)
@@ -138,9 +138,9 @@ def one_program(gp: GPPosterior, task: TrackingProblem, horizon: int) -> Cases:
     for name, covariance in (("mean only", "none"), ("zero order", "zero_order")):
         settings: dict[str, Any] = {"covariance": covariance}
         common = (gp, Linearization(), task, horizon, HOVER)
-        cases[f"gpmpc, {name}"] = lambda a=common, s=settings: by_controller(ConvexMPC(*a, **s))
+        cases[f"gpmpc, {name}"] = lambda a=common, s=settings: by_controller(GPMPC(*a, **s))
         daqp = settings | {"solver": peer_daqp.Daqp()} if peer_daqp.installed() else None
-        cases[f"gpmpc, {name}, DAQP inside"] = daqp and (lambda a=common, s=daqp: by_controller(ConvexMPC(*a, **s)))
+        cases[f"gpmpc, {name}, DAQP inside"] = daqp and (lambda a=common, s=daqp: by_controller(GPMPC(*a, **s)))
     return cases
 
 

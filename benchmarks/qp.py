@@ -54,10 +54,11 @@ def ours(changing: bool) -> Callable[[SequenceProblem], Solve]:
 
         def solve(problem: SequenceProblem):
             nonlocal last
+            P, q, G, lower, upper = problem.P, problem.q, problem.G, problem.lower, problem.upper
             if changing:
-                last = solver.solve_stacked(problem.P, problem.q, problem.G, problem.lower, problem.upper, last)
+                last = solver.solve(QuadraticProgram.unchecked(P, q, G, lower, upper), last)
             else:
-                last = prepared.solve(problem.q, problem.lower, problem.upper, last)
+                last = prepared.solve(q, lower, upper, last)
             return last.x, last
 
         return solve
@@ -150,7 +151,7 @@ def measure_cell(horizon: int, mode: str, rows: int, settings: argparse.Namespac
     closing = DualActiveSet()
 
     def close_loop(p: SequenceProblem) -> np.ndarray:
-        return closing.solve_stacked(p.P, p.q, p.G, p.lower, p.upper).x
+        return closing.solve(QuadraticProgram.unchecked(*vars(p).values())).x
 
     problems = list(quadrotor_sequence(horizon, changing, settings.length, close_loop, positions_only=rows == 3))
     fast = {OURS: ours(changing), DAQP_WARM: daqp_warm(changing), DAQP_COLD: daqp_cold}

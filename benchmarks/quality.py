@@ -32,10 +32,9 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.metrics import tracking_error
 from gpmpc.mpc.controller import Controller, Decision, Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.lqr import LQR
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.plotting import png, quality
@@ -53,8 +52,8 @@ PROPAGATIONS = {
     "unscented": Unscented(),
 }
 CONTROLLERS = {  # by their names in conf/controller: class, propagation, and what else is set there
-    "convex": (ConvexMPC, "linearization", {}),
-    "paper": (ConvexMPC, "moment_matching", {"form": "increment", "covariance": "full"}),
+    "convex": (GPMPC, "linearization", {}),
+    "paper": (GPMPC, "moment_matching", {"form": "velocity", "covariance": "full"}),
     "state_form": (StateFormMPC, "linearization", {}),
     "nonlinear": (NonlinearGPMPC, "moment_matching", {}),
     "lqr": (LQR, None, {}),
@@ -92,22 +91,20 @@ class Family(NamedTuple):
 
 
 TRUTH = Family("NMPC, true model", "controller=nmpc")
-INCREMENTS, DEVIATIONS, STATES = "increments (paper)", "deviations", "state form, Clarabel"
+INCREMENTS, STATES = "increments (paper)", "state form, Clarabel"
 MEAN, ZERO_ORDER = "trajectory, mean only", "trajectory, zero order"
 SPREAD, CONVERGED = "trajectory, diagonal or full", "trajectory, converged"
 NONLINEAR = "nonlinear GP-MPC"
 CONVEX, FULL, DIAGONAL = "controller=convex", "controller.covariance=full", "controller.covariance=diagonal"
 NONE, EXACT, POINTS = "controller.covariance=none", "propagation=moment_matching", "propagation=unscented"
 MORE = "controller.iterations=100 controller.tolerance=1e-6"
-FIRST_ORDER, SLSQP = "propagation=linearization", "controller.optimizer=slsqp"
+FIRST_ORDER = "propagation=linearization"
 FAMILIES = (
     TRUTH,
     Family("LQR", "controller=lqr"),
     Family(INCREMENTS, "controller=paper"),
     Family(INCREMENTS, f"controller=paper {DIAGONAL}"),
     Family(INCREMENTS, f"controller=paper {NONE}"),
-    Family(DEVIATIONS, f"{CONVEX} controller.form=deviation"),
-    Family(DEVIATIONS, f"{CONVEX} controller.form=deviation {FULL} {EXACT}"),
     Family(MEAN, f"{CONVEX} {NONE}"),
     Family(ZERO_ORDER, CONVEX),
     Family(ZERO_ORDER, f"{CONVEX} propagation=mean_equivalence"),
@@ -120,12 +117,9 @@ FAMILIES = (
     Family(SPREAD, f"{CONVEX} {FULL} {POINTS}"),
     Family(CONVERGED, f"{CONVEX} {NONE} {MORE}"),
     Family(CONVERGED, f"{CONVEX} {MORE}"),
-    Family(CONVERGED, f"{CONVEX} {FULL} {EXACT} {MORE}", longest=10),
     Family(STATES, "controller=state_form"),
     Family(NONLINEAR, f"controller=nonlinear {FIRST_ORDER}"),
     Family(NONLINEAR, "controller=nonlinear"),
-    Family(NONLINEAR, f"controller=nonlinear {FIRST_ORDER} {SLSQP}", longest=10),
-    Family(NONLINEAR, f"controller=nonlinear {SLSQP}", longest=10),
 )
 
 

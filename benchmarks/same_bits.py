@@ -22,10 +22,9 @@ import torch
 from benchmarks.quadrotor import HOVER, INNER, NOISE, OUTER, STATE_BOUNDS, TRAJECTORIES, problem, trained
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.controller import Controller
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.lqr import LQR
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
@@ -37,17 +36,17 @@ STEPS, H, PATH = 8, 6, TRAJECTORIES["lorenz"]
 BOUNDS = StateBounds(*STATE_BOUNDS["lorenz"], l1=10.0, l2=10.0)
 MATCHED, LINEARIZED = MomentMatching(), Linearization()
 CONTROLLERS: dict[str, Callable[[], Controller | Cascade]] = {
-    "convex": lambda: ConvexMPC(trained("lorenz"), LINEARIZED, problem(), H, HOVER),
-    "paper": lambda: ConvexMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, "increment", "diagonal"),
-    "full": lambda: ConvexMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, covariance="full"),
-    "iterated": lambda: ConvexMPC(trained("lorenz"), LINEARIZED, problem(BOUNDS), H, HOVER, iterations=30),
+    "convex": lambda: GPMPC(trained("lorenz"), LINEARIZED, problem(), H, HOVER),
+    "paper": lambda: GPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, "velocity", "diagonal"),
+    "full": lambda: GPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, covariance="full"),
+    "iterated": lambda: GPMPC(trained("lorenz"), LINEARIZED, problem(BOUNDS), H, HOVER, iterations=30),
     "nonlinear": lambda: NonlinearGPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
     "state form": lambda: StateFormMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
     "lqr": lambda: LQR(trained("lorenz"), problem(), H, HOVER),
     "nmpc": lambda: NMPC(OUTER, problem(), H, HOVER),
     "cascade": lambda: Cascade(
-        ConvexMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
-        ConvexMPC(trained("lorenz", "rotational"), LINEARIZED, TrackingProblem([1] * 6, [1] * 3), H, [0.0] * 3),
+        GPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
+        GPMPC(trained("lorenz", "rotational"), LINEARIZED, TrackingProblem([1] * 6, [1] * 3), H, [0.0] * 3),
     ),
 }
 

@@ -22,7 +22,7 @@ from benchmarks.timing import RESULTS, describe, machine, markdown_table, time_i
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc.controller import Controller, Decision, Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
@@ -65,9 +65,9 @@ def controllers(gp: GPPosterior, horizon: int) -> dict[str, Controller]:
     problem = TrackingProblem([10.0, 1.0] * m, [0.1] * m, input_lower=[-6.0] * m, input_upper=[6.0] * m)
     common = (problem, horizon, [0.0] * m)
     return {
-        "paper's form": ConvexMPC(gp, MomentMatching(), *common, form="increment", covariance="full"),
-        "zero order": ConvexMPC(gp, Linearization(), *common),
-        "mean only": ConvexMPC(gp, Linearization(), *common, covariance="none"),
+        "paper's form": GPMPC(gp, MomentMatching(), *common, form="velocity", covariance="full"),
+        "zero order": GPMPC(gp, Linearization(), *common),
+        "mean only": GPMPC(gp, Linearization(), *common, covariance="none"),
     }
 
 

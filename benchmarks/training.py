@@ -20,6 +20,7 @@ from benchmarks.timing import write_results
 from gpmpc.cli.configuration import config_folder
 from gpmpc.experiments.tables import Tables
 from gpmpc.gp import Trainer
+from gpmpc.studies.study import random_rows
 
 PAPER_SECONDS = {10: 1.12, 189: 4.01}  # stated by Cao, Lai and Alam (2017)
 
@@ -42,28 +43,28 @@ def main() -> None:
     results = []
     print("six GPs, one thread; process time in seconds; ratio: GPyTorch's likelihood over the closed form")
     print(f"{'data':28}{'N':>5}{'median':>9}{'p99':>9}{'GPyTorch':>10}{'ratio':>8}{'paper':>8}")
-    for fit in experiment.fits():
-        rows = np.sort(np.random.default_rng(fit.seed).permutation(len(fit.cell.data))[: fit.size]).tolist()
-        data = fit.cell.data[rows]
+    for trial in experiment.trials():
+        everything, size = trial.condition.data, trial.labels["size"]
+        data = everything[random_rows(len(everything), size, trial.seed)]
         trainer(data, seed=0)
         seconds = [process_seconds(trainer, data, seed) for seed in range(arguments.repeats)]
         other = [process_seconds(reference, data, seed) for seed in range(min(3, arguments.repeats))]
         ratio = float(np.median([b / a for a, b in zip(seconds, other, strict=False)]))
-        name = f"{fit.cell.trajectory} {fit.cell.subsystem}"
+        name = f"{trial.labels['trajectory']} {trial.labels['subsystem']}"
         result = {
             "data": name,
-            "size": fit.size,
+            "size": size,
             "median": float(np.median(seconds)),
             "p99": float(np.quantile(seconds, 0.99)),
             "max": max(seconds),
             "gpytorch_median": float(np.median(other)),
             "ratio": ratio,
-            "paper": PAPER_SECONDS.get(fit.size),
+            "paper": PAPER_SECONDS.get(size),
         }
         results.append(result)
-        paper = PAPER_SECONDS.get(fit.size, "")
+        paper = PAPER_SECONDS.get(size, "")
         print(
-            f"{name:28}{fit.size:5}{result['median']:9.3f}{result['p99']:9.3f}"
+            f"{name:28}{size:5}{result['median']:9.3f}{result['p99']:9.3f}"
             f"{result['gpytorch_median']:10.2f}{ratio:8.1f}{paper:>8}",
             flush=True,
         )

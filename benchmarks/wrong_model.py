@@ -20,7 +20,7 @@ from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, tra
 from benchmarks.timing import write_results
 from gpmpc.files import write_whole
 from gpmpc.metrics import tracking_error
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.plotting.image import png
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Replaced, Rollout, closed_loop
@@ -39,7 +39,7 @@ WAYS = {
     "trajectory, L = 0": {},
     "trajectory, L = 0.3": {"disturbance_gain": 0.3},
     "trajectory, L = 1": {"disturbance_gain": 1.0},
-    "increment": {"form": "increment", "covariance": "none"},
+    "velocity": {"form": "velocity", "covariance": "none"},
 }
 COLOURS = ("tab:red", "tab:orange", "tab:blue", "tab:gray")
 
@@ -58,7 +58,7 @@ def main() -> None:
     for trajectory in TRAJECTORIES:
         model = trained(trajectory)
         for way, settings in WAYS.items():
-            controller = ConvexMPC(model, Linearization(), problem(), HORIZON, HOVER, **settings)
+            controller = GPMPC(model, Linearization(), problem(), HORIZON, HOVER, **settings)
             row = []
             for mass in MASSES:
                 for noise in NOISES:
@@ -74,9 +74,7 @@ def main() -> None:
     print(f"written to {arguments.figure}")
 
 
-def flights(
-    controller: ConvexMPC, trajectory: str, mass: str, noise: str, arguments: argparse.Namespace
-) -> list[Rollout]:
+def flights(controller: GPMPC, trajectory: str, mass: str, noise: str, arguments: argparse.Namespace) -> list[Rollout]:
     """One a seed."""
     references = states_along(TRAJECTORIES[trajectory], np.arange(arguments.steps + HORIZON + 1.0))
     return [
@@ -102,7 +100,7 @@ def altitudes(shown: dict[tuple, Rollout]) -> Figure:
         for way, colour in zip(WAYS, COLOURS, strict=True):
             flight = shown[trajectory, way, "20 % heavier", "process 0.01"]
             away = (flight.states - flight.references)[:41, ALTITUDE]
-            dashes = "--" if way == "increment" else "-"
+            dashes = "--" if way == "velocity" else "-"
             axis.plot(np.arange(len(away)), away, color=colour, linestyle=dashes, label=way)
         axis.axhline(0, color="black", linewidth=0.5)
         axis.set(title=trajectory, xlabel="time [s]")

@@ -9,7 +9,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context, resource_tracker
@@ -22,7 +22,9 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 LOOK = 0.5  # between two looks at whether the parent lives [s]
 
 
-def in_processes(function: Callable[[J], R], jobs: Sequence[J], workers: int | None = None) -> Iterator[tuple[int, R]]:
+def in_processes(
+    function: Callable[[J], R], jobs: Sequence[J], workers: int | None = None
+) -> Generator[tuple[int, R], None, None]:
     """Yields (index of a job, its result), in the order in which they finish.
 
     Args:

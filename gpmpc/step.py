@@ -29,7 +29,6 @@ class Step:
         gp_version: How often the model has changed since the start.
         failed: The decision was not applied; ``input`` comes from the policy for failures.
         status: How the solve ended; the decision's if omitted.
-        next_state: State at the end of the step (n,), where it is known.
     """
 
     time: float  # [s]
@@ -45,4 +44,3 @@ class Step:
     gp_version: int = 0
     failed: bool = False
     status: "Status | None" = None
-    next_state: np.ndarray | None = None

@@ -1,4 +1,4 @@
-"""Problem: the position that a vehicle is to follow, as a function of time.
+"""Positions that a vehicle is to follow, as functions of time.
 
 Every trajectory is called with times t [s] of any shape and returns positions (..., 3) [m]; ``velocity`` returns their
 time derivative (..., 3) [m/s]. ``Elliptical`` and ``Lorenz`` are those of Cao, Lai and Alam (2017), section 5, decoded
@@ -138,9 +138,9 @@ class Lorenz:
         """Lorenz time at flight times, and its rate of change."""
         t = np.asarray(time, dtype=float)
         if np.any(t < 0) or np.any(t > self.duration):
-            asked = f"{t.min():g} to {t.max():g}"
+            got = f"{t.min():g} to {t.max():g}"
             raise SettingError(
-                "duration", f"this Lorenz trajectory is defined from 0 to {self.duration:g} s; got {asked} s"
+                "duration", f"this Lorenz trajectory is defined from 0 to {self.duration:g} s; got {got} s"
             )
         samples, _ = self._integration
         position = t / self.sampling_time

@@ -49,11 +49,11 @@ def test_recordings_are_written_and_read_without_torch_and_without_compilers():
         ("omegaconf", ["cli"]),
         ("matplotlib", ["plotting"]),
         ("casadi", ["mpc", "gp/casadi_.py"]),
-        ("rich", ["cli", "experiments", "simulation/trials.py"]),
+        ("rich", ["cli", "studies", "simulation/trials.py"]),
         ("mcap", ["recording"]),
         ("google.protobuf", ["recording"]),
         ("foxglove", ["recording"]),
-        ("pandas", ["recording", "cli"]),
+        ("pandas", ["recording", "cli", "studies"]),
     ],
 )
 def test_a_heavy_library_has_one_door(library, rooms):

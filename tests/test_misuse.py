@@ -10,8 +10,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, Transitions, append_points, train
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching, rollout
@@ -57,7 +56,7 @@ class Short(Oscillator):
         return [x[1]]
 
 
-def controller(kind=ConvexMPC, **changed):
+def controller(kind=GPMPC, **changed):
     given = {
         "model": posterior(),
         "propagator": Linearization(),
@@ -202,7 +201,7 @@ def test_an_affine_model_checks_its_shapes():
         Affine(torch.eye(2), torch.zeros(1, 2), torch.zeros(2))
 
 
-@pytest.mark.parametrize("kind", [ConvexMPC, NonlinearGPMPC])
+@pytest.mark.parametrize("kind", [GPMPC, NonlinearGPMPC])
 def test_a_controller_says_what_it_takes(kind):
     asked, reference = controller(kind), np.zeros((4, 2))
     for given in ((belief(), reference), (np.zeros(2), Reference(reference))):

@@ -25,8 +25,10 @@ def test_the_wheel_carries_the_settings_the_printed_figures_and_its_types(wheel)
     settings = {str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml")}
     assert {f"gpmpc/{name}" for name in settings} <= set(names)
     assert "gpmpc/py.typed" in names
-    assert "gpmpc/experiments/paper_tables.csv" in names
-    assert "gpmpc/experiments/paper_timings.csv" in names
+    results = {path.name for path in (ROOT / "experiments").iterdir() if path.is_file()}
+    assert {"paper_tables.csv", "paper_timings.csv", "tables.py", "figures.py"} <= results
+    assert {f"gpmpc/experiments/{name}" for name in results} <= set(names)
+    assert not [name for name in names if "__pycache__" in name]
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/"))]
 
 

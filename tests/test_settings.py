@@ -8,7 +8,7 @@ import pytest
 from gpmpc.datasets import Excitation, Tracking
 from gpmpc.exceptions import SettingError
 from gpmpc.mpc.cascade import Cascade
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization
@@ -28,7 +28,7 @@ def nmpc(**settings):
 def convex(**settings):
     problem = TrackingProblem([1.0, 1.0], [1.0])
     given = {"propagator": Linearization(), "problem": problem, "horizon": 2, "initial_input": [0.0]}
-    return ConvexMPC(double_integrator(), **(given | settings))
+    return GPMPC(double_integrator(), **(given | settings))
 
 
 def flown(**settings):

@@ -31,7 +31,7 @@ def main() -> None:
         signal.signal(signal.SIGINT, interrupt)
     sys.unraisablehook = interrupt_again
     try:
-        from gpmpc.cli.streams import usable_streams
+        from gpmpc.cli.terminal import usable_streams
 
         with usable_streams():
             from gpmpc.cli.command import main as command

@@ -15,24 +15,34 @@ from functools import partial
 from typing import Any, NoReturn
 
 import hydra
-from hydra._internal.utils import get_args_parser
 from hydra.errors import HydraException, OverrideParseException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 import gpmpc
-from gpmpc.cli.completion import complete
-from gpmpc.cli.configuration import config_folder, find_modules_here
-from gpmpc.cli.figures import figures
+from gpmpc.cli.arguments import Parser
+from gpmpc.cli.configuration import complete, config_folder, find_modules_here, settings_of
 from gpmpc.cli.log import log
-from gpmpc.cli.plot import plot
-from gpmpc.cli.report import report
-from gpmpc.cli.run import run
-from gpmpc.cli.streams import tell
-from gpmpc.cli.tables import tables
+from gpmpc.cli.reports import plot, report
+from gpmpc.cli.run import one_line, own_error, run
+from gpmpc.cli.study import figures, tables
+from gpmpc.cli.terminal import print_error
 from gpmpc.exceptions import GpmpcError
 
 EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher
+OPTIONS: dict[str, dict[str, Any]] = {  # of Hydra, without --experimental-rerun, which runs whatever a file holds
+    "--help -h": {},
+    "--hydra-help": {},
+    "--cfg -c": {"choices": ["job", "hydra", "all"]},
+    "--resolve": {},
+    "--package -p": {"metavar": "PACKAGE"},
+    "--run -r": {},
+    "--multirun -m": {},
+    "--config-path -cp": {"metavar": "DIR"},
+    "--config-name -cn": {"metavar": "NAME"},
+    "--config-dir -cd": {"metavar": "DIR"},
+    "--info -i": {"nargs": "?", "const": "all", "metavar": "WHAT"},
+}
 HELP = ("-h", "--help", "help")
 SHOW_TRACEBACK = bool(os.environ.get("HYDRA_FULL_ERROR"))
 USAGE = f"""gpmpc {gpmpc.__version__}: Gaussian process model predictive control
@@ -79,7 +89,7 @@ def main() -> None:
         known = [*COMMANDS, *PLAIN]
         _fail(f"unknown command {command!r}{_nearest(command, known)}; gpmpc --help lists the commands")
     task, config_name = COMMANDS[command]
-    given = _options(command, arguments[1:])
+    given = _guarded("", _options, command, arguments[1:])
     _guarded(config_name, find_modules_here)
     sys.argv = [f"gpmpc {command}", *arguments[1:]]
     # Guarded inside as well, where Hydra would add a line of its own to a task's error.
@@ -99,24 +109,24 @@ def main() -> None:
 
 
 def _options(command: str, arguments: list[str]) -> argparse.Namespace:
-    """The options given; one that does not exist is answered in one line, where Hydra would print all that do."""
-    parser = get_args_parser()
-    parser.error = lambda message: _fail(f"{message}; gpmpc {command} --help lists the settings")
+    """Parses Hydra's options; one that does not exist is one line, where Hydra would print all that do."""
+    parser = Parser(prog=f"gpmpc {command}", add_help=False)
+    for names, settings in OPTIONS.items():
+        parser.add_argument(*names.split(), **({} if settings else {"action": "store_true"}), **settings)
+    parser.add_argument("overrides", nargs="*")
     given, unknown = parser.parse_known_args(arguments)
-    if given.experimental_rerun:
-        unknown = ["--experimental-rerun"]  # it runs whatever a file holds
     if unknown:
-        known = [option for action in parser._actions for option in action.option_strings]
-        _fail(f"unknown option {unknown[0]!r}{_nearest(unknown[0], known)}; gpmpc {command} --help lists the settings")
+        near = _nearest(unknown[0], [name for names in OPTIONS for name in names.split()])
+        raise GpmpcError(f"unknown option {unknown[0]!r}{near}; gpmpc {command} --help lists the settings")
     if given.multirun and command != "run":
-        _fail("-m: only gpmpc run sweeps")
+        raise GpmpcError("-m: only gpmpc run sweeps")
     return given
 
 
-def _guarded(config_name: str, function: Callable, *arguments: Any) -> None:
-    """Calls a function; a user's mistake ends with one line, or with its traceback for who asks."""
+def _guarded(config_name: str, function: Callable, *arguments: Any) -> Any:
+    """Calls a function; a user's mistake ends with one line, or with its traceback where that is asked for."""
     try:
-        function(*arguments)
+        return function(*arguments)
     except (GpmpcError, HydraException, OmegaConfBaseException) as error:
         if SHOW_TRACEBACK:
             raise
@@ -133,21 +143,18 @@ def _guarded(config_name: str, function: Callable, *arguments: Any) -> None:
 
 
 def _fail(message: str) -> NoReturn:
-    tell(f"gpmpc: {message}")
+    print_error(message)
     sys.exit(2)
 
 
 def _one_line(error: Exception, config_name: str) -> str:
     """The user's mistake in one line: which setting, what was got, what was expected."""
-    ours: BaseException | None = error
-    while ours is not None and not isinstance(ours, GpmpcError):
-        ours = ours.__cause__
-    if ours is not None:
-        return " ".join(str(ours).split())
+    if own_error(error):
+        return one_line(error)
     text = str(error)
     unknown = re.match(r"Could not override '([^']+)'", text)
     if unknown:
-        return f"unknown setting {unknown[1]!r}{_nearest(unknown[1], _settings(config_name))}"
+        return f"unknown setting {unknown[1]!r}{_nearest(unknown[1], settings_of(config_name))}"
     option = re.search(r"Could not find '([^'/]+)/([^']+)'\s+Available options in '[^']+':\n((?:\t.*\n)+)", text)
     if option and option[2].removeprefix("launcher/") in EXTRAS:
         extra = EXTRAS[option[2].removeprefix("launcher/")]
@@ -173,26 +180,6 @@ def _one_line(error: Exception, config_name: str) -> str:
         return f"{listed}; a sweep takes -m" if config_name == "run" else listed
     lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc" not in line]
     return "; ".join(line.rstrip(".:;") for line in lines) or type(error).__name__
-
-
-def _settings(config_name: str) -> list[str]:
-    """Every setting of a command, dotted."""
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder())):
-        config = hydra.compose(config_name)
-
-    def keys(node: DictConfig, prefix: str = "") -> list[str]:
-        found = []
-        for key in node:
-            found.append(prefix + str(key))
-            if (
-                OmegaConf.is_dict(node)
-                and not OmegaConf.is_missing(node, key)
-                and OmegaConf.is_dict(node._get_node(key))
-            ):
-                found += keys(node[key], f"{prefix}{key}.")
-        return found
-
-    return keys(config)
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:

@@ -1,11 +1,11 @@
-"""``gpmpc run``: one flight, from its settings to its folder; ``gpmpc run -m`` (``sweep``) flies many of them so."""
+"""``gpmpc run``: one flight, from its settings to its folder; ``gpmpc run -m`` (``sweep``) flies many of them."""
 
 import shlex
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -14,11 +14,12 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+from gpmpc.cli.arguments import folder_of, writing
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, check_number
 
 if TYPE_CHECKING:
-    from gpmpc.experiments.run import Experiment
-    from gpmpc.experiments.run_folder import RunFolder
+    from gpmpc.studies.flight import Experiment
+    from gpmpc.studies.run_folder import RunFolder
 
 ASIDE = ("launcher", "folder", "live")  # settings that a result does not depend on
 GROUPS = ("data", "trajectory", "subsystem", "plant", "model", "controller", "propagation", "solver")
@@ -30,28 +31,29 @@ LOST = 3  # exit code of a run that is finished, and whose flight was lost
 
 
 def run(config: DictConfig) -> None:
-    """The task behind ``conf/run.yaml``: flies, prints what came of it, and says where it is kept."""
+    """Flies, prints the results and where they are kept; the task behind ``conf/run.yaml``."""
     from rich.console import Console
 
     from gpmpc.compiling import tell_of_compiling
-    from gpmpc.experiments.run_summary import summary
+    from gpmpc.studies.document import terminal
+    from gpmpc.studies.flight import summary
 
     console = Console()
     with console.status("flying"), tell_of_compiling():
-        experiment_of(config)  # what a user can get wrong is found out before anything is written
-        outcome = fly_one(config)
+        experiment_of(config)  # what a user can get wrong is found before anything is written
+        outcome = run_one(config)
     if "error" in outcome:
         print(f"gpmpc: {outcome['error']} (traceback: {outcome['folder']}/error.json)", file=sys.stderr)
         sys.exit(2 if outcome["mistake"] else 1)
-    console.print(summary(outcome["result"]))
+    console.print(terminal([summary(outcome["result"])]))
     state = "finished before" if outcome["skipped"] else "written to"
     console.print(f"{state}: {outcome['folder']}", soft_wrap=True, highlight=False, markup=False)
     if outcome["result"].get("lost"):
         sys.exit(LOST)
 
 
-def fly_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
-    """One run; what goes wrong in it is kept in its folder and returned as ``error``.
+def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
+    """Flies one run; an error is kept in its folder and returned as ``error``.
 
     Args:
         config: The composed settings.
@@ -61,50 +63,43 @@ def fly_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
         Busy: Another process works on it, and ``wait`` is false.
         SettingError: The folder cannot be written, or holds a finished run of other settings.
     """
-    import torch
-    from threadpoolctl import threadpool_limits
+    from gpmpc.studies.run_folder import RunFolder, folder_name, record
+    from gpmpc.studies.study import one_thread
 
-    from gpmpc.experiments.run_folder import RunFolder, folder_name, record
-
-    overrides = HydraConfig.get().overrides.task
-    folder = RunFolder(Path(checked_folder(config)) / folder_name(choices(overrides)))
+    overrides = choices(HydraConfig.get().overrides.task)
+    folder = RunFolder(folder_of(config.folder) / folder_name(overrides))
     outcome = {"folder": str(folder.path), "skipped": False}
-    try:
-        with folder.claimed(wait):
-            settings = plain_settings(config, HydraConfig.get().runtime.choices)
-            if folder.finished and not config.live:
-                return outcome | {"skipped": True, "result": check_same(folder, settings)}
-            about = record(choices(overrides), settings, command_of(overrides))
-            torch.set_num_threads(1)  # the same sums in the same order, whatever the launcher
-            try:
-                folder.begin(OmegaConf.to_yaml(config, resolve=True))
-                with threadpool_limits(1):
-                    result = about | _fly(experiment_of(config), folder, config, about)
-                folder.finish(result)
-            except Exception as error:
-                folder.fail(error, about)
-                return outcome | {"error": reason_of(error), "mistake": isinstance(error, MISTAKES)}
-    except OSError as error:
-        raise SettingError("folder", f"cannot write to {folder.path}: {error.strerror or error}") from error
+    with writing(folder.path), folder.locked(wait):
+        settings = plain_settings(config, HydraConfig.get().runtime.choices)
+        if folder.finished and not config.live:
+            return outcome | {"skipped": True, "result": folder.result(settings)}
+        about = record(overrides, settings, shlex.join(["gpmpc", "run", *overrides]))
+        try:
+            folder.begin(OmegaConf.to_yaml(config, resolve=True))
+            with one_thread():  # the same sums in the same order, whatever the launcher
+                result = about | _fly(experiment_of(config), folder, config, about)
+            folder.finish(result)
+        except Exception as error:
+            folder.fail(error, about)
+            return outcome | {"error": one_line(error), "mistake": isinstance(error, MISTAKES)}
     return outcome | {"result": result}
 
 
 def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
-    """Trains, flies and records; the metrics."""
-    from gpmpc.experiments.run import fly, metrics
-    from gpmpc.simulation import recording_callback
+    """Trains, flies and records; returns the metrics."""
+    from gpmpc.studies.flight import metrics, run_trial
 
     if config.recorder != "mcap":
-        return metrics(experiment, fly(experiment))
+        return metrics(experiment, run_trial(experiment))
     with ExitStack() as stack:
 
-        def prepared(controller: Any, training: Any) -> Callable:
+        def prepare(controller: Any, training: Any) -> Callable:
             recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller.problem, training))
-            callback = recording_callback(recorder, 0 if training is None else len(training.posterior))
+            callback = partial(recorder.record, gp_size=0 if training is None else len(training.posterior))
             return _in_real_time(callback, experiment.plant.time_step) if config.live else callback
 
-        flight = fly(experiment, prepared)
-    return metrics(experiment, flight)
+        flown = run_trial(experiment, prepare)
+    return metrics(experiment, flown)
 
 
 def _in_real_time(callback: Callable, time_step: float) -> Callable:
@@ -121,9 +116,8 @@ def _in_real_time(callback: Callable, time_step: float) -> Callable:
 def _recorder(
     experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict, problem: Any, training: Any
 ) -> Any:
-    from gpmpc.experiments.run import unplanned_noise
-    from gpmpc.experiments.run_folder import RECORDING
     from gpmpc.recording import McapRecorder, RecordedSystem
+    from gpmpc.studies.run_folder import RECORDING
 
     dynamics = experiment.plant.dynamics
     names = (*dynamics.state_names, *dynamics.input_names)
@@ -137,7 +131,7 @@ def _recorder(
     metadata = {
         "seed": experiment.seed,
         "command": about["provenance"]["command"],
-        "noise_std": " ".join(map(str, unplanned_noise(experiment, training).tolist())),
+        "noise_std": " ".join(map(str, experiment.unplanned_noise(training).tolist())),
     }
     path, text = folder.path / RECORDING, OmegaConf.to_yaml(config, resolve=True)
     recorder = McapRecorder(path, system, config=text, metadata=metadata, live=config.live)
@@ -147,18 +141,18 @@ def _recorder(
 
 
 def experiment_of(config: DictConfig) -> "Experiment":
-    """The settings as objects.
+    """Makes the objects that the settings describe.
 
     Raises:
         GpmpcError: A setting is wrong.
     """
     from hydra.utils import instantiate
 
-    from gpmpc.experiments.run import Experiment
     from gpmpc.simulation import Noise
+    from gpmpc.studies.flight import Experiment
 
     config = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-    checked_folder(config)
+    folder_of(config.folder)
     check_number("horizon", config.horizon, least=1, whole=True)
     if not OmegaConf.is_list(config.disturbances):
         raise SettingError("disturbances", f"must be a list; got {config.disturbances!r}")
@@ -182,43 +176,29 @@ def experiment_of(config: DictConfig) -> "Experiment":
     with open_dict(config):
         size = config.data.pop("size")
     ((name, trajectory),) = config.trajectory.items()
-    controller = instantiate(config.controller, _convert_="all")
+    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "plant", "controller", "disturbances")}
     return Experiment(
-        data=instantiate(config.data, _convert_="all"),
+        **parts,
         trajectory=instantiate(trajectory, _convert_="all"),
-        plant=instantiate(config.plant, _convert_="all"),
         train=instantiate(config.model, _convert_="all"),
-        controller=controller,
         subsystem=next(iter(config.subsystem)),
         name=name,
         size=size,
-        propagator=getattr(controller, "keywords", {}).get("propagator"),
+        propagator=getattr(parts["controller"], "keywords", {}).get("propagator"),
         noise=Noise(**config.noise) if any(config.noise.values()) else None,
-        disturbances=instantiate(config.disturbances, _convert_="all"),
         **{key: config[key] for key in ("steps", "seed", "loop", "on_failure")},
     )
 
 
 def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, Any]:
-    """All that a result depends on, as plain data: the settings, and the chosen option by group."""
+    """Returns all that a result depends on, as plain data: the settings, and the chosen option by group."""
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     options = {group: chosen.get(group) for group in GROUPS}
     return {key: value for key, value in settings.items() if key not in ASIDE} | {"options": options}
 
 
-def checked_folder(config: DictConfig) -> str:
-    """The tree of the runs.
-
-    Raises:
-        SettingError: It is no path.
-    """
-    if not isinstance(config.folder, str) or not config.folder.strip():
-        raise SettingError("folder", f"must be the path of a folder; got {config.folder!r}")
-    return config.folder
-
-
 def choices(overrides: Sequence[str]) -> list[str]:
-    """What distinguishes a run, ``key=value`` each in Hydra's own spelling; of a key given twice, the last counts."""
+    """Returns what distinguishes a run, ``key=value`` each in Hydra's own spelling; of a key given twice, the last."""
     found = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
@@ -227,32 +207,14 @@ def choices(overrides: Sequence[str]) -> list[str]:
     return sorted(found.values())
 
 
-def command_of(overrides: Sequence[str]) -> str:
-    """What makes one run again."""
-    return shlex.join(["gpmpc", "run", *choices(overrides)])
+def own_error(error: BaseException | None) -> GpmpcError | None:
+    """Returns the error of this package that another one was raised from, or is; None where there is none."""
+    while error is not None and not isinstance(error, GpmpcError):
+        error = error.__cause__
+    return error
 
 
-def reason_of(error: BaseException) -> str:
-    """One line."""
-    ours: BaseException | None = error
-    while ours is not None and not isinstance(ours, GpmpcError):
-        ours = ours.__cause__
-    if ours is not None:
-        return " ".join(str(ours).split())
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
-
-
-def check_same(folder: "RunFolder", settings: dict[str, Any]) -> dict[str, Any]:
-    """The result of a finished run, if it is the one that is asked for now.
-
-    Raises:
-        SettingError: It was flown with other settings: those of a file have changed meanwhile.
-        DataError: What is there is not what a run writes.
-    """
-    from gpmpc.experiments.run_folder import difference
-
-    result = folder.result()
-    if differs := difference(result["settings"], settings):
-        reason = f"{folder.path} holds a finished run of other settings ({differs})"
-        raise SettingError("folder", f"{reason}; choose another folder, or remove that one to fly it again")
-    return result
+def one_line(error: BaseException) -> str:
+    """Returns the reason of an error in one line."""
+    ours = own_error(error)
+    return " ".join((str(ours) if ours else f"{type(error).__name__}: {error}").split())

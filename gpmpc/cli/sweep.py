@@ -1,4 +1,4 @@
-"""Problem: many flights at once, on one machine or on a cluster, that may be stopped at any moment and go on later.
+"""``gpmpc run -m``: many flights, on one machine or on a cluster, that may be stopped at any moment and go on later.
 
 Hydra composes every run's settings and its launcher plugins start the runs; what is kept, and whether it is finished,
 is in the runs' folders alone. So a sweep is resumed by the same command: finished runs are not launched again, failed
@@ -8,6 +8,7 @@ may share a tree: a run that another process works on is left to it, and looked 
 """
 
 import hashlib
+import itertools
 import json
 import os
 import sys
@@ -15,30 +16,25 @@ from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
-from hydra import version
-from hydra._internal.callbacks import Callbacks
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_config_search_path
-from hydra.core.config_search_path import SearchPathQuery
+import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, open_dict
 
-from gpmpc.cli.run import check_same, checked_folder, choices, experiment_of, fly_one, plain_settings
-from gpmpc.cli.screen import progress_bar
+from gpmpc.cli.arguments import folder_of, writing
+from gpmpc.cli.run import choices, experiment_of, plain_settings, run_one
+from gpmpc.cli.terminal import print_error, progress_bar
 from gpmpc.compiling import tell_of_compiling
 from gpmpc.exceptions import GpmpcError, SettingError
-from gpmpc.experiments.run_folder import PLAN, Busy, RunFolder, folder_name
 from gpmpc.files import write_whole
 from gpmpc.parallel import THREADS, children_ignore_interrupts, end_with
+from gpmpc.studies.run_folder import PLAN, Busy, RunFolder, folder_name
 
 LOOK = 0.5  # between two looks at the folders [s]
 
@@ -57,6 +53,32 @@ class Job:
         return self.folder.finished or self.folder.failed_at not in (None, self.failed_before)
 
 
+@dataclass(frozen=True)
+class Composer:
+    """Composes the settings of runs: Hydra's loader, and the settings of one run with those of the launcher."""
+
+    context: HydraContext
+    config: DictConfig
+
+    def settings(self, job: Job) -> tuple[DictConfig, Mapping[str, Any]]:
+        """Returns a run's settings, and the chosen option by group."""
+        composed = self.context.config_loader.load_sweep_config(self.config, job.overrides)
+        options = composed.hydra.runtime.choices
+        with open_dict(composed):
+            del composed["hydra"]
+        return composed, options
+
+
+class NoCallbacks:
+    """Hydra calls these around every job; none are used here."""
+
+    def on_job_start(self, **_: Any) -> None:
+        """Does nothing."""
+
+    def on_job_end(self, **_: Any) -> None:
+        """Does nothing."""
+
+
 def sweep(given: Namespace, conf: Path) -> None:
     """Runs every combination of the choices that is not finished; the command line after ``gpmpc run -m``.
 
@@ -73,48 +95,46 @@ def sweep(given: Namespace, conf: Path) -> None:
 
     for name in THREADS:  # before the libraries load, here and in the processes that are started from here
         os.environ[name] = "1"
-    console = Console()
-    try:
-        context, config = _composed(given, conf)
-        jobs = _jobs(given.overrides, config)
-        waiting, finished = [], []
-        for job in jobs:
-            (finished if job.folder.finished else waiting).append(job)
+    console, combinations = Console(), _combinations(given.overrides)
+    conf = Path(given.config_path or conf).absolute()
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf)):
+        composer = _composer(given, combinations[0])
+        jobs = _jobs(combinations, folder_of(composer.config.folder))
+        finished, waiting = ([job for job in jobs if job.folder.finished is state] for state in (True, False))
         with tell_of_compiling():
-            _check(waiting, context, config)
+            _check(waiting, composer)
         with console.status(f"comparing the settings of {len(finished)} finished runs"):
-            _check_finished(finished, context, config)
-        _keep_plan(jobs, Path(config.folder))
+            for job in finished:
+                job.folder.result(plain_settings(*composer.settings(job)))
+        _keep_plan(jobs, Path(composer.config.folder))
         with _progress(jobs, console):
-            outcomes = _launch(waiting, False, context, config)
-            left = [job for job, outcome in zip(waiting, outcomes, strict=True) if "busy" in outcome]
-            again = _launch(left, True, context, config)
-    finally:
-        GlobalHydra.instance().clear()
-    failed = [outcome for outcome in chain(outcomes, again) if "error" in outcome]
+            outcomes = _launch(waiting, False, composer)
+            busy = [job for job, outcome in zip(waiting, outcomes, strict=True) if "busy" in outcome]
+            outcomes += _launch(busy, True, composer)
+    failed = [outcome for outcome in outcomes if "error" in outcome]
     runs = "1 run" if len(jobs) == 1 else f"{len(jobs)} runs"
-    text = f"{runs}: {len(waiting) - len(failed)} flown, {len(finished)} finished before"
-    console.print(f"{text}, {len(failed)} failed; in {config.folder}", soft_wrap=True, highlight=False, markup=False)
+    text = f"{runs}: {len(waiting) - len(failed)} flown, {len(finished)} finished before, {len(failed)} failed"
+    console.print(f"{text}; in {composer.config.folder}", soft_wrap=True, highlight=False, markup=False)
     for outcome in failed:
-        print(f"gpmpc: failed: {outcome['folder']}: {outcome['error']}", file=sys.stderr)
+        print_error(f"failed: {outcome['folder']}: {outcome['error']}")
     if failed:
         sys.exit(1)
 
 
-def fly(config: DictConfig) -> dict[str, Any]:
-    """One run of a sweep, in whichever process a launcher started; leaves alone what another process works on."""
+def run_job(config: DictConfig) -> dict[str, Any]:
+    """Flies one run of a sweep, in whichever process a launcher started, unless another process works on it."""
     return _outcome(config, wait=False)
 
 
-def fly_after_others(config: DictConfig) -> dict[str, Any]:
-    """The same, after the process that worked on it."""
+def run_job_after_others(config: DictConfig) -> dict[str, Any]:
+    """Flies one run of a sweep, after the process that works on it."""
     return _outcome(config, wait=True)
 
 
 @tell_of_compiling()
 def _outcome(config: DictConfig, wait: bool) -> dict[str, Any]:
     try:
-        outcome = fly_one(config, wait)
+        outcome = run_one(config, wait)
     except Busy:
         return {"busy": True}
     except GpmpcError as error:  # of this run; the others go on
@@ -122,76 +142,62 @@ def _outcome(config: DictConfig, wait: bool) -> dict[str, Any]:
     return {key: outcome[key] for key in ("folder", "error") if key in outcome}
 
 
-def _composed(given: Namespace, conf: Path) -> tuple[HydraContext, DictConfig]:
-    """What ``hydra.main`` makes before it sweeps."""
-    version.setbase("1.3")
-    folders = create_config_search_path(given.config_path or str(conf))
+def _combinations(overrides: Sequence[str]) -> list[list[str]]:
+    """Returns the overrides of every run; of a key given twice, the last one counts."""
+    values = {}
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key, swept = override.get_key_element(), override.is_sweep_override()
+        found = [f"{key}={value}" for value in override.sweep_string_iterator()] if swept else [override.input_line]
+        if not found:
+            raise SettingError(key, "holds no value to sweep over")
+        values[key] = found
+    return [list(combination) for combination in itertools.product(*values.values())]
+
+
+def _composer(given: Namespace, overrides: Sequence[str]) -> Composer:
+    """Composes the first run with Hydra's own settings, which say what the launcher is."""
+    searched = []
     if given.config_dir is not None:
         if not Path(given.config_dir).is_dir():
             raise SettingError("--config-dir", f"{given.config_dir}: no such folder")
-        own = f"file://{Path(given.config_dir).absolute()}"
-        folders.prepend(provider="command-line", path=own, anchor=SearchPathQuery(provider="schema"))
-    hydra = Hydra.create_main_hydra2("run", folders)
-    name, overrides = given.config_name or "run", list(given.overrides)
-    config = hydra.compose_config(name, overrides, run_mode=RunMode.MULTIRUN, with_log_configuration=False)
+        searched = [f"hydra.searchpath=['file://{Path(given.config_dir).absolute()}']"]
+    config = hydra.compose(given.config_name or "run", [*overrides, *searched], return_hydra_config=True)
     config.hydra.mode = RunMode.MULTIRUN
-    return HydraContext(config_loader=hydra.config_loader, callbacks=Callbacks(config)), config
+    return Composer(HydraContext(GlobalHydra.instance().config_loader(), NoCallbacks()), config)
 
 
-def _jobs(overrides: Sequence[str], config: DictConfig) -> list[Job]:
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    for override in parsed:
-        if override.is_sweep_override() and not list(override.sweep_iterator()):
-            raise SettingError(override.get_key_element(), "holds no value to sweep over")
-    ((*combinations,),) = BasicSweeper.split_arguments(parsed, None)
-    tree, jobs = Path(checked_folder(config)), {}
+def _jobs(combinations: Sequence[list[str]], tree: Path) -> list[Job]:
+    jobs = {}
     for combination in combinations:
         folder = RunFolder(tree / folder_name(choices(combination)))
         jobs[folder.path] = Job(combination, folder, folder.failed_at)
     return list(jobs.values())
 
 
-def _check(jobs: Sequence[Job], context: HydraContext, config: DictConfig) -> None:
+def _check(jobs: Sequence[Job], composer: Composer) -> None:
     """Makes the objects once for every value that occurs: a mistake is found before anything is launched."""
     seen: set[str] = set()
     for job in jobs:
         if not seen.issuperset(job.overrides):
-            experiment_of(_settings(job, context, config)[0])
+            experiment_of(composer.settings(job)[0])
             seen.update(job.overrides)
-
-
-def _check_finished(jobs: Sequence[Job], context: HydraContext, config: DictConfig) -> None:
-    """Raises where a finished run is another one than is asked for now."""
-    for job in jobs:
-        check_same(job.folder, plain_settings(*_settings(job, context, config)))
-
-
-def _settings(job: Job, context: HydraContext, config: DictConfig) -> tuple[DictConfig, Mapping[str, Any]]:
-    """A run's composed settings, and the chosen option by group."""
-    composed = context.config_loader.load_sweep_config(config, job.overrides)
-    options = composed.hydra.runtime.choices
-    with open_dict(composed):
-        del composed["hydra"]
-    return composed, options
 
 
 def _keep_plan(jobs: Sequence[Job], tree: Path) -> None:
     """Writes what was asked for, so that a report knows what is missing; equal sweeps write the same file."""
-    plan = [choices(job.overrides) for job in jobs]
-    text = json.dumps({"runs": plan}, indent=1) + "\n"
-    try:
+    text = json.dumps({"runs": [choices(job.overrides) for job in jobs]}, indent=1) + "\n"
+    with writing(tree):
         tree.mkdir(parents=True, exist_ok=True)
         write_whole(tree / f"{PLAN}{hashlib.sha256(text.encode()).hexdigest()[:10]}.json", text)
-    except OSError as error:
-        raise SettingError("folder", f"cannot write to {tree}: {error.strerror or error}") from error
 
 
-def _launch(jobs: Sequence[Job], wait: bool, context: HydraContext, config: DictConfig) -> list[dict[str, Any]]:
-    """What came of every job."""
+def _launch(jobs: Sequence[Job], wait: bool, composer: Composer) -> list[dict[str, Any]]:
+    """Runs jobs by the chosen launcher and returns the outcome of each."""
     if not jobs:
         return []
+    task = run_job_after_others if wait else run_job
     launcher = Plugins.instance().instantiate_launcher(
-        hydra_context=context, task_function=fly_after_others if wait else fly, config=config
+        hydra_context=composer.context, task_function=task, config=composer.config
     )
     workers, quiet = getattr(launcher, "joblib", None), nullcontext()  # the joblib launcher has joblib's own arguments
     if workers is not None:
@@ -199,20 +205,20 @@ def _launch(jobs: Sequence[Job], wait: bool, context: HydraContext, config: Dict
         from joblib.externals.loky.backend import resource_tracker
 
         resource_tracker.ensure_running()  # as in ``children_ignore_interrupts``
-        quiet = children_ignore_interrupts()  # the thread of the progress bar still hears Ctrl-C
+        quiet = children_ignore_interrupts()  # the thread of the progress bar still receives Ctrl-C
     try:
         with quiet:
             returns = launcher.launch([job.overrides for job in jobs], initial_job_idx=0)
         return [each.return_value for each in returns]
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        print(f"gpmpc: the launcher broke down: {reason}; the same command goes on where it stopped", file=sys.stderr)
+        print_error(f"the launcher broke down: {reason}; the same command goes on where it stopped")
         sys.exit(1)
 
 
 @contextmanager
 def _progress(jobs: Sequence[Job], console: Any) -> Iterator[None]:
-    """One bar for the whole sweep, drawn by a thread that looks at the folders."""
+    """Shows one bar for the whole sweep, drawn by a thread that looks at the folders."""
     with progress_bar(console) as bar:
         task, over, open_jobs = bar.add_task("flying", total=len(jobs)), Event(), list(jobs)
 

@@ -2,7 +2,7 @@
 
 from gpmpc.datasets.attitudes import rotational_states_along
 from gpmpc.datasets.excitation import Excitation, ExcitedData
-from gpmpc.datasets.flights import SUBSYSTEMS, DataSource, NMPCData, PaperData, Tracking
+from gpmpc.datasets.flights import SUBSYSTEMS, DataSource, NMPCData, PaperData, Subsystem, Tracking
 
 __all__ = [
     "SUBSYSTEMS",
@@ -11,6 +11,7 @@ __all__ = [
     "ExcitedData",
     "NMPCData",
     "PaperData",
+    "Subsystem",
     "Tracking",
     "rotational_states_along",
 ]

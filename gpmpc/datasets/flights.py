@@ -6,16 +6,17 @@ the rotational one. ``PaperData`` reads the four files that the authors publishe
 and one subsystem at a time.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gpmpc.exceptions import DataError, SettingError, check_number, check_numbers
-from gpmpc.gp.transitions import Transitions
+from gpmpc.gp import Scaling, Transitions
 from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.simulation import Rollout, closed_loop
@@ -23,6 +24,29 @@ from gpmpc.systems import ATTITUDES, Plant, attitude_for_thrust_direction
 from gpmpc.trajectories import Trajectory
 
 SUBSYSTEMS = ("translational", "rotational")
+
+
+@dataclass(frozen=True)
+class Subsystem:
+    """Columns of a subsystem's data.
+
+    Attributes:
+        columns: Names of the columns x (n), u (m), x+ (n).
+        reported: The states whose variance is averaged in tables.
+        scaling: From columns (N, d) and their names to the scaling in whose units the model works.
+
+    Raises:
+        SettingError: A reported state that is no column.
+    """
+
+    columns: Sequence[str]
+    reported: Sequence[str]
+    scaling: Callable[[Tensor, Sequence[str]], Scaling]
+
+    def __post_init__(self) -> None:
+        for name in self.reported:
+            if name not in self.columns:
+                raise SettingError("reported", f"must be among {', '.join(self.columns)}; got {name!r}")
 
 
 class DataSource(Protocol):

@@ -1,13 +1,13 @@
 """Gaussian process models of dynamics: data, training, and the frozen posterior that predicts."""
 
+from gpmpc.gp._kernel import Hyperparameters
+from gpmpc.gp._search import SoftLimits
 from gpmpc.gp.backend import backend
 from gpmpc.gp.gpytorch_ import fit, to_gpytorch
 from gpmpc.gp.gpytorch_posteriors import KernelPosterior, from_gpytorch
-from gpmpc.gp.kernel import Hyperparameters
 from gpmpc.gp.online import SlidingWindow, append_points, append_transitions, remove_points
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.scaling import Scaling, centre, identity, min_max, standardize
-from gpmpc.gp.search import SoftLimits
 from gpmpc.gp.sparse import sparse_posterior
 from gpmpc.gp.sparse_training import SparseTrainer, SparseTraining
 from gpmpc.gp.storage import load_metadata, load_posterior, save_posterior

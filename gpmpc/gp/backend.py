@@ -16,13 +16,13 @@ from torch.autograd import forward_ad
 
 from gpmpc.exceptions import SettingError
 
-Backend = Literal["auto", "compiled", "torch"]
+_Backend = Literal["auto", "compiled", "torch"]
 
-_chosen: ContextVar[Backend] = ContextVar("backend", default="auto")
+_chosen: ContextVar[_Backend] = ContextVar("backend", default="auto")
 
 
 @contextmanager
-def backend(choice: Backend) -> Iterator[None]:
+def backend(choice: _Backend) -> Iterator[None]:
     """Forces ``"compiled"`` or ``"torch"`` within a ``with`` block; ``"auto"`` leaves the choice to each call.
 
     Raises:
@@ -37,7 +37,7 @@ def backend(choice: Backend) -> Iterator[None]:
         _chosen.reset(token)
 
 
-def chosen_backend() -> Backend:
+def chosen_backend() -> _Backend:
     """The choice of ``backend`` that is in force."""
     return _chosen.get()
 
@@ -47,7 +47,7 @@ def host_arrays(*tensors: Tensor) -> list[np.ndarray] | None:
     choice = _chosen.get()
     if choice == "torch":
         return None
-    reason = ""
+    reason, arrays = "", []
     try:
         arrays = [tensor.numpy() for tensor in tensors]
     except (RuntimeError, TypeError):

@@ -18,8 +18,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError, TrainingError, UnsupportedModel, check_number
-from gpmpc.gp.kernel import centred
-from gpmpc.gp.likelihood import FAILED
+from gpmpc.gp._kernel import centred
+from gpmpc.gp._likelihood import FAILED
 from gpmpc.gp.posterior import GPPosterior
 
 
@@ -266,7 +266,7 @@ class _Objective:
                     -self.likelihood(self.model(*self.model.train_inputs), self.model.train_targets).sum() * self.size
                 )
                 value.backward()
-        except (gpytorch.utils.errors.NotPSDError, gpytorch.utils.errors.NanError, torch.linalg.LinAlgError):
+        except (gpytorch.utils.errors.NotPSDError, gpytorch.utils.errors.NanError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
             return FAILED, np.zeros_like(vector)
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.parameters]
         gradient = torch.cat([g.reshape(-1) for g in gradients]).to("cpu", torch.float64).numpy()

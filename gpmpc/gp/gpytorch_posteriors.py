@@ -27,8 +27,8 @@ from gpmpc.dynamics import (
 )
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
 from gpmpc.gp.gpytorch_ import exact_inference, members
-from gpmpc.gp.kernel import PREDICTS, Hyperparameters, Predicts
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.sparse import sparse_posterior
 
@@ -55,15 +55,16 @@ def from_gpytorch(
             dimension.
     """
     rows: dict[str, list[Tensor]] = {}
-    first, inducing = None, []
+    data: Any = None
+    inducing: list[Tensor] = []
     for one, own in members(model, likelihood):
         inputs, targets = one.train_inputs[0], one.train_targets
         inputs = inputs[:, None] if inputs.dim() == 1 else inputs
         if targets.dim() > 2:
             raise ShapeError(f"a batch of models has one batch dimension; got targets {tuple(targets.shape)}")
         outputs, shared = targets[None] if targets.dim() == 1 else targets, inputs.reshape(-1, *inputs.shape[-2:])
-        first = shared[0] if first is None else first
-        if any(each.shape != first.shape or not torch.equal(each, first) for each in shared):
+        data = shared[0] if data is None else data
+        if any(each.shape != data.shape or not torch.equal(each, data) for each in shared):
             raise ShapeError("all outputs must have the same training inputs (N, d); got different ones")
         scale, kernel = 1.0, one.covar_module
         if isinstance(kernel, gpytorch.kernels.InducingPointKernel) and kernel.active_dims is None:
@@ -83,7 +84,7 @@ def from_gpytorch(
             constant = torch.zeros((), dtype=torch.float64)
         else:
             raise UnsupportedModel(f"the mean must be zero or constant; got {type(one.mean_module).__name__}")
-        k, d = len(outputs), first.shape[1]
+        k, d = len(outputs), data.shape[1]
         found = {
             "targets": outputs,
             "lengthscales": kernel.lengthscale.reshape(-1, kernel.lengthscale.shape[-1]).expand(k, d),
@@ -92,17 +93,18 @@ def from_gpytorch(
             "offset": constant.reshape(-1).expand(k),
         }
         for name, value in found.items():
-            rows.setdefault(name, []).append(value.detach().to(first.device))
+            rows.setdefault(name, []).append(value.detach().to(targets.device))
     joined = {name: torch.cat(values).clone() for name, values in rows.items()}
-    joined = {"inputs": first.detach().clone(), **joined, "targets": joined["targets"].T.contiguous()}
+    joined = {"inputs": data.detach().clone(), **joined, "targets": joined["targets"].T.contiguous()}
     if not inducing:
         return GPPosterior.from_hyperparameters(**joined, input_dim=input_dim, predicts=predicts)
     if len(inducing) not in (1, joined["targets"].shape[1]) or any(not torch.equal(Z, inducing[0]) for Z in inducing):
         raise ShapeError("all outputs must be sparse, with the same inducing points (M, d); got different ones")
     method = "fitc" if gpytorch.settings.sgpr_diagonal_correction.on() else "sgpr"
     kernel = Hyperparameters(*(joined[name] for name in Hyperparameters._fields))
-    data = joined["inputs"], joined["targets"]
-    return sparse_posterior(inducing[0].clone(), *data, kernel, input_dim, predicts, joined["offset"], method)
+    return sparse_posterior(
+        inducing[0].clone(), joined["inputs"], joined["targets"], kernel, input_dim, predicts, joined["offset"], method
+    )
 
 
 @dataclass(frozen=True)

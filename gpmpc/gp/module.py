@@ -24,6 +24,13 @@ class PosteriorModule(torch.nn.Module):
         UnsupportedModel: It is no ``GPPosterior``.
     """
 
+    features: Tensor
+    inverse_lengthscales: Tensor
+    signal_variance: Tensor
+    offset: Tensor
+    weights: Tensor
+    inverse_factor: Tensor
+
     def __init__(self, posterior: GPPosterior):
         super().__init__()
         if not isinstance(posterior, GPPosterior):

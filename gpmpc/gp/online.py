@@ -35,7 +35,7 @@ from torch import Tensor
 from gpmpc.compiled import compiled
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel, check_number
 from gpmpc.gaussian import check_tensors
-from gpmpc.gp.kernel import kernel_matrix
+from gpmpc.gp._kernel import kernel_matrix
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.transitions import Transitions, check_transitions
 

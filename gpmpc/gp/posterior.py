@@ -18,8 +18,8 @@ from torch import Tensor
 
 from gpmpc.dynamics import Array, Linearized, check_destination, check_query, tensors_for, to_array
 from gpmpc.gaussian import Gaussian, check_tensors
+from gpmpc.gp._kernel import Predicts, check_posterior, factorize
 from gpmpc.gp.backend import host_arrays
-from gpmpc.gp.kernel import Predicts, check_posterior, factorize
 from gpmpc.gp.scaling import Scaling
 
 if TYPE_CHECKING:
@@ -189,7 +189,8 @@ class GPPosterior:
         from gpmpc.kernels import pack  # loads numba
 
         parts = (self.features, self.lengthscales, self.signal_variance, self.cholesky, self.weights)
-        return pack(*(part.numpy() for part in parts), self.state_dim)
+        features, lengthscales, signal_variance, cholesky, weights = (part.numpy() for part in parts)
+        return pack(features, lengthscales, signal_variance, cholesky, weights, self.state_dim)
 
     @property
     def affine_form(self) -> AffineForm:
@@ -247,7 +248,8 @@ class GPPosterior:
 
     def mean_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """``predict_with_jacobian`` without the covariance, which costs most: mean (*batch, k), derivatives."""
-        return self._expanded(state, input, covariance=False)[:3]
+        mean, A, B, _ = self._expanded(state, input, covariance=False)
+        return mean, A, B
 
     def _expanded(self, state: Tensor, input: Tensor | None, covariance: bool) -> tuple[Tensor, ...]:
         input = state[..., :0] if input is None else input
@@ -258,7 +260,8 @@ class GPPosterior:
             return self._mean(k, state), *self._jacobian(k, difference), V
         batch, count = state.shape[:-1], state.shape[:-1].numel()
         x, u = state.numpy().reshape(count, self.state_dim), input.numpy().reshape(count, self.input_dim)
-        found = [part for part in self.linearize(x, u, covariance) if part is not None]
+        mean, A, B, V = self.linearize(x, u, covariance)
+        found = (mean, A, B, mean if V is None else V)
         return tuple(torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found)
 
     def mean_hessian(self, state: Tensor, input: Tensor | None = None) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import check_tensors
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -105,5 +105,5 @@ def _constant(columns: Tensor, names: Sequence[str], resolution: float) -> Tenso
     constant = moved <= resolution
     if bool(constant.any()):
         which = ", ".join(f"{name} (moves by {m:.0e})" for name, m, c in zip(names, moved, constant, strict=True) if c)
-        log.info("constant columns are centred, not scaled: %s", which)
+        _log.info("constant columns are centred, not scaled: %s", which)
     return constant

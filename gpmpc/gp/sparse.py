@@ -33,7 +33,7 @@ from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import check_tensors
-from gpmpc.gp.kernel import Hyperparameters, Predicts, kernel_matrix
+from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
 from gpmpc.gp.posterior import GPPosterior
 
 Method = Literal["sgpr", "fitc"]
@@ -175,7 +175,7 @@ def collapsed_bound_with_gradient(
         for block in _blocks(len(features), len(inducing)):
             with torch.enable_grad():
                 part = _block_sums(cut, Z, features[block], y[block], kernel, method)
-                total = sum((w * s).sum() for w, s in zip(weights, part, strict=True))
+                total = torch.stack([(w * s).sum() for w, s in zip(weights, part, strict=True)]).sum()
                 found = torch.autograd.grad(total, [cut, *variables])
             by_factor += found[0]
             for gradient, more in zip(gradients, found[1:], strict=True):
@@ -186,7 +186,8 @@ def collapsed_bound_with_gradient(
         values.append(value.detach())
         by_inducing += gradients[0]
         by_others.append(gradients[1:])
-    return torch.cat(values), (by_inducing, *(torch.cat(of_one) for of_one in zip(*by_others, strict=True)))
+    by_lengthscales, by_signal, by_noise = (torch.cat(of_one) for of_one in zip(*by_others, strict=True))
+    return torch.cat(values), (by_inducing, by_lengthscales, by_signal, by_noise)
 
 
 def _data_sums(

@@ -19,11 +19,11 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, TrainingError, check_number
-from gpmpc.gp.kernel import Hyperparameters, Predicts, kernel_matrix
-from gpmpc.gp.likelihood import FAILED
+from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
+from gpmpc.gp._likelihood import FAILED
+from gpmpc.gp._search import column_std, log_hyperparameters, training_data
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.scaling import Scaling, centre, identity
-from gpmpc.gp.search import column_std, log_hyperparameters, training_data
 from gpmpc.gp.sparse import (
     JITTER,
     Method,
@@ -135,7 +135,7 @@ class SparseTrainer:
         chosen = np.random.default_rng(seed).permutation(len(x))[: self.subset]
         exact = self._exact().fit(features[chosen], y[chosen], input_dim, "value", seed)
         theta = log_hyperparameters(exact.posterior, feature_scaling, identity(y))
-        Z = greedy_points(x, Hyperparameters.from_theta(torch.from_numpy(theta)), self.inducing)
+        Z = _greedy_points(x, Hyperparameters.from_theta(torch.from_numpy(theta)), self.inducing)
         _log.info(
             "sparse training: %d inducing points chosen among %d after %.1f s",
             len(Z),
@@ -211,7 +211,7 @@ def _noise_alone(targets: Tensor) -> np.ndarray:
     return (len(targets) / 2 * (2 * math.pi * math.e * targets.square().mean(0)).log()).numpy()
 
 
-def greedy_points(features: Tensor, hyperparameters: Hyperparameters, count: int) -> Tensor:
+def _greedy_points(features: Tensor, hyperparameters: Hyperparameters, count: int) -> Tensor:
     """Inducing points (M, d) among the features (N, d): each where most is unexplained by those before it.
 
     A pivoted Cholesky factorisation of sum_a K_a / sn2_a's diagonal. Fewer than ``count`` come back where nothing is
@@ -284,7 +284,7 @@ class _Bound:
             tensors = (Z, *Hyperparameters.from_theta(theta))
         try:
             bounds, slopes = self._bounds(tuple(t.detach() for t in tensors))
-        except (SettingError, torch.linalg.LinAlgError):
+        except (SettingError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
             return FAILED, np.zeros_like(vector)
         chain = [(t, -slope) for t, slope in zip(tensors, slopes, strict=True) if t.requires_grad]
         (gradient,) = torch.autograd.grad([t for t, _ in chain], variables, [slope for _, slope in chain])
@@ -301,7 +301,7 @@ class _Bound:
         theta, Z = self.parts(torch.from_numpy(vector))
         try:
             return -self._bounds((Z, *Hyperparameters.from_theta(theta)))[0].numpy()
-        except (SettingError, torch.linalg.LinAlgError):
+        except (SettingError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
             return np.full(self.shape[0], np.inf)
 
     def report(self, _: np.ndarray) -> None:

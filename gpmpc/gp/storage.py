@@ -26,8 +26,8 @@ from torch import Tensor
 
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, UnsupportedModel
 from gpmpc.files import write_whole
-from gpmpc.gp import archive
-from gpmpc.gp.kernel import check_posterior
+from gpmpc.gp import _archive as archive
+from gpmpc.gp._kernel import check_posterior
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.provenance import now, versions
 

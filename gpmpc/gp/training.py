@@ -1,8 +1,8 @@
 """Training of one exact GP per output by maximum marginal likelihood (Cao, Lai and Alam, 2017, eq. (9)).
 
 Each output is fitted on its own, over theta = (log length-scales, log sf, log(sf / sn)) inside a wide box; see
-``gpmpc.gp.search``. Exact GPs are cubic in time and square in memory over the points: one factor of 200 MB an output at
-N = 5000. What cannot fit is refused before the work.
+``gpmpc.gp._search``. Exact GPs are cubic in time and square in memory over the points: one factor of 200 MB an output
+at N = 5000. What cannot fit is refused before the work.
 
 Many sets are trained side by side on every core (``train_many``), one output of one set a job, with bitwise the numbers
 of each training alone on one thread.
@@ -20,12 +20,9 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError, UnsupportedModel, check_number
-from gpmpc.gp.kernel import PREDICTS, Predicts
-from gpmpc.gp.likelihood import FAILED
-from gpmpc.gp.online import targets_of
-from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.scaling import Scaling, centre
-from gpmpc.gp.search import (
+from gpmpc.gp._kernel import PREDICTS, Predicts
+from gpmpc.gp._likelihood import FAILED
+from gpmpc.gp._search import (
     Penalty,
     SearchProblem,
     SearchResult,
@@ -36,6 +33,9 @@ from gpmpc.gp.search import (
     log_hyperparameters,
     training_data,
 )
+from gpmpc.gp.online import targets_of
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp.scaling import Scaling, centre
 from gpmpc.gp.transitions import Transitions, check_transitions
 from gpmpc.memory import GIB, available_memory
 from gpmpc.parallel import cores, in_processes

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, UnsupportedModel, check_number
 from gpmpc.files import write_whole
-from gpmpc.gp.archive import check_whole, existing_file, new_file, pack, read_arrays, read_header
+from gpmpc.gp._archive import check_whole, existing_file, new_file, pack, read_arrays, read_header
 
 FORMAT, VERSION = "gpmpc transitions", 1
 NAMES = ("states", "inputs", "next_states")
-EXPECTED = "a file of transitions"
+_EXPECTED = "a file of transitions"
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Transitions:
         Raises:
             DataError: The file is missing, damaged, or not such a file.
         """
-        path = existing_file(path, EXPECTED)
+        path = existing_file(path, _EXPECTED)
         try:
             header = read_header(path)
             if header is not None:
@@ -144,7 +144,7 @@ class Transitions:
         """
         check_number("state_dim", state_dim, least=1, whole=True)
         check_number("input_dim", input_dim, least=0, whole=True)
-        path = existing_file(path, EXPECTED)
+        path = existing_file(path, _EXPECTED)
         columns = 2 * state_dim + input_dim
         rows = []
         for line, text in enumerate(_text(path).splitlines(), start=1):
@@ -184,7 +184,7 @@ class Transitions:
             if isinstance(names, str) or not (isinstance(names, Iterable) or (key == "next_states" and names is None)):
                 single = "the single name " if isinstance(names, str) else ""
                 raise SettingError(key, f"must be a list of column names; got {single}{names!r}")
-        path = existing_file(path, EXPECTED)
+        path = existing_file(path, _EXPECTED)
         text = _text(path)
         header = text.partition("\n")[0]
         delimiter = max(",;\t", key=header.count)
@@ -260,7 +260,7 @@ def _number(path: Path, row: int, column: int | str, field: str) -> float:
     return value
 
 
-def _with_path(path: Path, states: np.ndarray, inputs: np.ndarray, next_states: np.ndarray) -> Transitions:
+def _with_path(path: Path, states: Any, inputs: Any, next_states: Any) -> Transitions:
     try:
         return Transitions(states, inputs, next_states)
     except GpmpcError as error:

@@ -82,9 +82,9 @@ class CasadiNominal:
 
     def linearize(self, states: Array, inputs: Array) -> tuple[Array, Array, Array]:
         """The nominal next states (K, n) and their derivatives (K, n, n) and (K, n, m)."""
-        K, n, m = len(states), states.shape[1], inputs.shape[1]
+        K, n = states.shape
         if K not in self._mapped:
             self._mapped[K] = self._expansion.map(K)
         mean, A, B = (part.full() for part in self._mapped[K](states.T, inputs.T))
-        by_point = (A.reshape(n, K, n), B.reshape(n, K, m))
-        return np.ascontiguousarray(mean.T), *(np.ascontiguousarray(part.transpose(1, 0, 2)) for part in by_point)
+        A, B = (part.reshape(n, K, -1).transpose(1, 0, 2) for part in (A, B))
+        return np.ascontiguousarray(mean.T), np.ascontiguousarray(A), np.ascontiguousarray(B)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gpmpc.dynamics import (
@@ -27,7 +28,7 @@ from gpmpc.dynamics import (
 )
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.gp.archive import existing_file, new_file
+from gpmpc.gp._archive import existing_file, new_file
 from gpmpc.gp.online import SlidingWindow, append_points
 from gpmpc.gp.posterior import AffineForm, GPPosterior
 from gpmpc.gp.storage import posterior_of_parts, posterior_parts, read_model, write_model
@@ -186,18 +187,18 @@ class ResidualModel:
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
         """Linearises the model at K points (K, n), (K, m): the nominal model's expansion plus B times the GP's.
 
-        A nominal model with a method ``linearize(states, inputs)``, such as ``Affine`` or ``CasadiFunction``, is
+        A nominal model with a method ``linearize(states, inputs)``, such as ``Affine`` or ``CasadiNominal``, is
         linearised by it; any other by one batched call of torch autograd.
         """
         mean, A, G = self._linearize_nominal(states, inputs)
         states_seen, inputs_seen = self._columns
         d = self.residual.linearize(states[:, states_seen], inputs[:, inputs_seen], covariance)
         B = self._acts_on
-        mean += d.mean @ B.T
+        A, G = np.array(A), np.array(G)
         A[:, :, states_seen] += B @ d.A
         G[:, :, inputs_seen] += B @ d.B
         V = None if d.covariance is None else B @ d.covariance @ B.T
-        return Linearized(mean, A, G, V)
+        return Linearized(mean + d.mean @ B.T, A, G, V)
 
     @cached_property
     def _linearize_nominal(self) -> Callable[[Array, Array], tuple[Array, Array, Array]]:
@@ -209,8 +210,8 @@ class ResidualModel:
         return to_array(mean), to_array(A), to_array(G)
 
     @cached_property
-    def _columns(self) -> tuple[Array, Array]:
-        return np.array(self.states, dtype=int), np.array(self.inputs, dtype=int)
+    def _columns(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        return np.array(self.states, dtype=np.intp), np.array(self.inputs, dtype=np.intp)
 
     @cached_property
     def _acts_on(self) -> Array:

@@ -1,101 +1,86 @@
-"""Problem: a convex controller sees the belief's future as affine stage models; which ones is its *form*.
+"""What a controller predicts with: the first guess of a plan, the stages at it, their covariances, the tightened rows.
 
-    s_{k+1} = A_k s_k + B_k u_k + c_k
+Its *form* says where the dynamics are linearised:
 
-* ``increment``: ds_{k+1} = A ds_k + B du_k with A and B from the current belief and the last input, held (Cao, Lai and
-  Alam, 2017, section 4). Summed up that is an affine model again, c = s_0 - A s_{-1} - B u_{-1}. Between two measured
-  states S does not change, which says nothing of how it will grow: there the rows of S take the local model's c.
-* ``deviation``: the local model about the current belief and the reference input u*_0, held.
-* ``trajectory``: the belief is rolled out along the last plan, shifted, and linearised at every stage (linear
-  time-varying). The rollout follows what the plan predicted by an ancillary feedback; the first one, the reference.
+* ``trajectory``: at every stage of the last plan, one step on; before the first plan, of the reference. Plans need not
+  obey the dynamics (multiple shooting): what they miss, the defects, is part of the stages.
+* ``velocity``: at the current belief and the last input, one linearisation held over the horizon (Cao, Lai and Alam,
+  2017, section 4): ds_{k+1} = A ds_k + B du_k, which summed up is affine again, c = s_0 - A s_{-1} - B u_{-1}. Between
+  two measured states S does not change, which says nothing of how it will grow: there the rows of S take the c of the
+  linearisation itself.
 
-What s holds of the belief is its *covariance* mode. ``full``: s = [mu; vec S], S = Sigma^(1/2), as in the paper.
-``diagonal``: s = [mu; standard deviations], correlations are dropped at every stage. ``zero_order``: s = mu, and the
-covariances are predicted beside the optimisation as if the inputs did not change them (Hewing, Kabzan and Zeilinger,
-2020; Zanelli, Frey, Messerer and Diehl, 2021). ``none``: s = mu, through the model's mean at a certain state.
-
-A constant error of the model leaves an offset between reference and state. ``increment`` has none: the error is in
-both of two steps, and not in their difference. The other forms may add an estimate of it to every mean, a
-*disturbance* (Pannocchia and Rawlings, 2003), which moves by a gain L towards what the last step showed:
+A constant error of the model leaves an offset between reference and state. ``velocity`` has none: the error is in both
+of two steps, and not in their difference. To ``trajectory`` an estimate of it may be added (Pannocchia and Rawlings,
+2003), which an observer moves by its gain L towards what the last step showed:
 
     d_k = (1 - L) d_{k-1} + L (mu_k - f(mu_{k-1}, u_{k-1}))
 
-Torch ends here: what comes out is NumPy float64.
+Covariances of ``zero_order`` are predicted under a feedback u = u_k - K (x - mu_k),
+
+    Sigma_{k+1} = (A_k - B_k K) Sigma_k (A_k - B_k K)' + V_k
+
+because without it the uncertainty grows over a long horizon until no input satisfies the bounds, while the next solves
+will see the next states and correct what went wrong (Hewing, Kabzan and Zeilinger, 2020). K is the gain of the
+finite-horizon LQR at the first stage. It is part of the covariances only: the bounds of the inputs hold for u_k.
 """
 
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Literal
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
-import torch
 
-from gpmpc.dynamics import DynamicsModel
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc.compiled import compiled
+from gpmpc.dynamics import DynamicsModel, linearize
+from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.backend import chosen_backend, host_arrays
-from gpmpc.gp.posterior import GPPosterior
-from gpmpc.kernels.extended import roots
-from gpmpc.mpc.ancillary_feedback import spread
-from gpmpc.mpc.compiled_rollout import CompiledRollout
-from gpmpc.mpc.controller import Decision
-from gpmpc.mpc.linear_quadratic import Stages, expand, finite_horizon_lqr
-from gpmpc.mpc.request import Request, check_method
-from gpmpc.mpc.stage_models import disturbed, is_first_order, stage_model
+from gpmpc.kernels.linalg import copy_matrix, product
+from gpmpc.mpc.condense import StateRows
+from gpmpc.mpc.constraints import ChanceConstraints
+from gpmpc.mpc.controller import Decision, Reference
+from gpmpc.mpc.linear_quadratic import finite_horizon_lqr
+from gpmpc.mpc.request import Request, check_controller, check_dynamics, check_method
+from gpmpc.mpc.stages import Covariance, LinearizedStages, Plan, StageLinearizer
 from gpmpc.mpc.tracking import TrackingProblem
-from gpmpc.propagation import Propagator
+from gpmpc.propagation import Linearization, Propagator
 
 Array = np.ndarray
 
-Form = Literal["increment", "deviation", "trajectory"]
-Covariance = Literal["full", "diagonal", "zero_order", "none"]
-FORMS = ("increment", "deviation", "trajectory")
-COVARIANCES = ("full", "diagonal", "zero_order", "none")
+Form = Literal["trajectory", "velocity"]
+FORMS = ("trajectory", "velocity")
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """Affine stage models from a current state on, K = H of them or K = 1 that is held.
+class Prediction(NamedTuple):
+    """A plan, the stages linearised at it, the covariances of its states, and the rows tightened by them.
 
     Attributes:
-        A: (K, p, p).
-        B: (K, p, m).
-        c: (K, p).
-        start: s_0 (p,).
-        covariances: Sigma_0 .. Sigma_H that the models were made at (H + 1, n, n); a held model has one of its own for
-            the stages 1 to H.
-        inputs: The inputs that they were made at (H, m).
+        plan: Where the stages were linearised; with ``velocity`` its first stage only.
+        stages: Of it.
+        covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
+        rows: Of the bounded states.
     """
 
-    A: Array
-    B: Array
-    c: Array
-    start: Array
+    plan: Plan
+    stages: LinearizedStages
     covariances: Array
-    inputs: Array
-
-    def states(self, inputs: Array) -> Array:
-        """s_0 .. s_H (H + 1, p) under inputs (H, m), as the stage models have it."""
-        (_, p, m), stages = self.B.shape, Stages(self.A, self.B, self.c)
-        return expand(stages, self.start, np.empty((0, m, p + m + 1)), np.zeros(m), inputs.ravel())[1]
+    rows: StateRows
 
 
-class Predictor:
-    """Makes the stage models of one form and covariance mode.
+class PredictionModel:
+    """Predicts beliefs for one tracking problem.
 
     Args:
         model: What was learned.
         propagator: How the belief moves.
-        problem: Its weights give the ancillary feedback.
+        problem: Weights of the feedback, and bounds.
         horizon: H.
+        initial_input: The input before the first step (m,).
         form: See the module's text.
-        covariance: See the module's text.
-        feedback: Rolls out, and predicts the covariances of ``zero_order``, under an ancillary feedback; see
-            ``gpmpc.mpc.ancillary_feedback``.
+        covariance: See ``gpmpc.mpc.stages``.
+        feedback: Whether covariances of ``zero_order`` are predicted under a feedback.
         disturbance_gain: L, from 0 (no disturbance is estimated) to 1 (it is what the last step showed).
 
     Raises:
-        SettingError: An unknown form or covariance mode, no propagator, a gain out of range, or one with ``increment``.
+        SettingError: An unknown form or covariance mode, no propagator, a gain out of range, or one with ``velocity``.
     """
 
     def __init__(
@@ -104,209 +89,205 @@ class Predictor:
         propagator: Propagator,
         problem: TrackingProblem,
         horizon: int,
+        initial_input: Array,
         form: Form,
         covariance: Covariance,
         feedback: bool,
-        disturbance_gain: float = 0.0,
+        disturbance_gain: float,
     ):
-        for key, value, possible in (("form", form, FORMS), ("covariance", covariance, COVARIANCES)):
-            if value not in possible:
-                raise SettingError(key, f"must be one of {', '.join(map(repr, possible))}; got {value!r}")
+        self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
+        if form not in FORMS:
+            raise SettingError("form", f"must be one of {', '.join(map(repr, FORMS))}; got {form!r}")
         if not isinstance(feedback, bool):
             raise SettingError("feedback", f"must be true or false; got {feedback!r}")
-        self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
         check_method("propagator", propagator, "propagate", "Linearization()")
         check_number("disturbance_gain", disturbance_gain, least=0)
-        if disturbance_gain > (form != "increment"):
-            rule = "be 0 for form 'increment', which needs none" if form == "increment" else "lie between 0 and 1"
+        if disturbance_gain > (form != "velocity"):
+            rule = "be 0 for form 'velocity', which needs none" if form == "velocity" else "lie between 0 and 1"
             raise SettingError("disturbance_gain", f"must {rule}; got {disturbance_gain}")
-        self.form, self.covariance, self.feedback = form, covariance, feedback
-        self.disturbance_gain = disturbance_gain
-        at_points = covariance == "none" or (covariance == "zero_order" and is_first_order(propagator))
-        exact = isinstance(model, GPPosterior) and model.predicts in ("next_state", "difference")
-        self._compiles = exact and at_points
+        self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
+        self.form, self.feedback, self.disturbance_gain = form, feedback, disturbance_gain
+        self.points = horizon if form == "trajectory" else 1
+        self.linearizer = StageLinearizer(model, propagator, covariance)
+        self.constraints = ChanceConstraints(problem.state_bounds, problem.state_dim, horizon, covariance)
+        self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
 
-    @property
-    def compiled(self) -> bool:
-        """Whether compiled loops answer: a rollout takes microseconds, and many of them go one by one."""
-        if chosen_backend() == "auto":
-            return self._compiles and self._in_host_memory
-        return self._compiles and host_arrays(self.model.weights) is not None
+    def read(self, belief: Gaussian, reference: Reference, previous: Decision | None) -> Request:
+        """The checked arguments of a controller's ``control``, with the disturbance estimate.
 
-    @cached_property
-    def _in_host_memory(self) -> bool:
-        return host_arrays(self.model.weights) is not None
+        Raises:
+            ShapeError: Belief or reference have other dimensions, or reference inputs are missing.
+        """
+        problem, H = self.problem, self.horizon
+        request = Request.read(problem, H, self.initial_input, belief, reference, previous)
+        if reference.inputs is None and problem.penalized == "deviations":
+            raise ShapeError(f"penalized 'deviations' needs reference inputs ({H}, {problem.input_dim}); got none")
+        if self.disturbance_gain and request.finite:
+            return request._replace(disturbance=self._disturbance(request, previous))
+        return request
 
-    @cached_property
-    def rollout(self) -> CompiledRollout:
-        """The compiled loop, where ``compiled`` says that there is one."""
-        uncertain = self.covariance == "zero_order"
-        noisy = uncertain and self.propagator.process_noise
-        return CompiledRollout(self.model, self.problem, self.feedback, uncertain, noisy)
+    def initial_guess(self, request: Request, previous: Decision | None) -> Plan:
+        """The last plan, shifted by a stage; without one the reference, under its inputs where R weighs deviations.
 
-    def extended(self, weight: Array) -> Array:
-        """The weight of s that belongs to a weight of x (n, n): the blocks on its diagonal (p / n, n, n)."""
-        n = self.problem.state_dim
-        if self.covariance == "full":  # tr(Q Sigma) = |vec S|^2 in I_n kron Q
-            return np.tile(weight, (n + 1, 1, 1))
-        if self.covariance == "diagonal":
-            return np.stack([weight, np.diag(np.diag(weight))])
-        return weight[None]
+        Covariances are those of the last plan, unshifted: they depend on the time since the last measurement.
+        """
+        H, n, problem = self.horizon, self.problem.state_dim, self.problem
+        means, covariances = np.empty((H + 1, n)), np.zeros((H + 1, n, n))
+        means[0] = request.state
+        if self.linearizer.covariance != "none":
+            covariances[0] = request.covariance
+        if self.form == "velocity":
+            means[1:], covariances[1:] = request.state, covariances[0]
+            return Plan(self.linearizer.state(means, covariances), np.tile(request.last, (H, 1)), covariances)
+        inputs, known = request.shifted, previous is not None and previous.applicable
+        known = known and len(previous.means) == H + 1
+        if known:
+            means[1:H], means[H] = previous.means[2:], previous.means[H]
+        else:
+            means[1:] = request.targets
+            if problem.penalized == "deviations":
+                inputs = request.wanted.clip(problem.input_lower, problem.input_upper)
+        if problem.rate_limited:
+            inputs = inputs.copy()
+            _keep_rates(inputs, request.last, problem.rate_lower, problem.rate_upper)
+        if not self.linearizer.at_points:
+            covariances[1:] = previous.covariances[1:] if known else self._first_covariances(means, inputs, request)
+        return Plan(self.linearizer.state(means, covariances), inputs, covariances)
 
-    def state(self, mean: Array, covariance: Array) -> Array:
-        """The vectors s (*batch, p) of beliefs."""
-        if self.covariance == "full":
-            S = np.empty(covariance.shape)
-            roots(np.ascontiguousarray(covariance).reshape(-1, *S.shape[-2:]), S.reshape(-1, *S.shape[-2:]))
-            return np.concatenate((mean, S.reshape(*mean.shape[:-1], -1)), axis=-1)
-        if self.covariance == "diagonal":
-            variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-            return np.concatenate([mean, np.sqrt(np.clip(variance, 0, None))], axis=-1)
-        return mean
-
-    def beliefs(self, prediction: Prediction, inputs: Array) -> tuple[Array, Array]:
-        """Predicted means (H + 1, n) and covariances (H + 1, n, n) under inputs (H, m), by the stage models."""
-        return self.moments(prediction.states(inputs), prediction.covariances)
-
-    def moments(self, states: Array, covariances: Array) -> tuple[Array, Array]:
-        """Means and covariances of the states s (K, p); ``covariances`` where s does not hold them."""
-        n = self.problem.state_dim
-        if self.covariance == "full":
-            roots = states[:, n:].reshape(-1, n, n)
-            return states[:, :n], roots @ roots.mT
-        if self.covariance == "diagonal":
-            return states[:, :n], states[:, n:, None] ** 2 * np.eye(n)
-        return states, covariances
-
-    def predict(self, request: Request, previous: Decision | None) -> Prediction:
-        """The stage models of a step: about its request, and for ``increment`` about the step before."""
-        if self.form == "trajectory":
-            return self.along(request, request.shifted, self.followed(request, previous))
-        prediction = self.held(request, self.about(request))
-        if self.form == "deviation" or previous is None or not previous.applicable:
-            return prediction  # no step before: the increment that the local model itself predicts
-        return self.incremented(request, prediction, self.state(previous.means[0], previous.covariances[0]))
-
-    def about(self, request: Request) -> Array:
-        """The input (m,) that a held model is made at."""
-        return request.wanted[0] if self.form == "deviation" else request.last
-
-    def incremented(self, request: Request, prediction: Prediction, before: Array) -> Prediction:
-        """A held model as that of the increments since s_{-1}, ``before`` (p,)."""
-        c = prediction.start - prediction.A[0] @ before - prediction.B[0] @ request.last
-        if not request.covariance.any():
-            n = self.problem.state_dim
-            c[n:] = prediction.c[0, n:]
-        return replace(prediction, c=c[None])
-
-    def along(self, request: Request, inputs: Array, follow: Array | None = None) -> Prediction:
-        """The stage models along the rollout of a plan.
+    def linearize(self, plan: Plan, request: Request, previous: Decision | None = None) -> Prediction:
+        """The stages of a plan, linearised in one call, with covariances and rows.
 
         Args:
-            request: Where it starts.
-            inputs: The plan (H, m).
-            follow: Means (H, n) that the rollout is to follow by the ancillary feedback, which changes the plan within
-                box and rates: u_k + K (mu_k - follow_k) for k = 1 .. H-1.
+            plan: Where.
+            request: Of the step.
+            previous: The last decision, from which ``velocity`` counts its increments.
         """
-        if self.compiled:
-            found = self.rollout(request.state, request.covariance, request.disturbance, inputs, follow)
-            return Prediction(found.A, found.B, found.c, request.state, found.covariances, found.inputs)
-        belief, gain, stages, plan = self._belief(request.state, request.covariance), None, [], np.array(inputs)
-        covariances, n = [_array(belief.covariance)], self.problem.state_dim
-        for k, input in enumerate(plan):
-            if follow is not None and k:
-                moved, problem = input + gain @ (_array(belief.mean) - follow[k]), self.problem
-                moved = np.clip(moved, plan[k - 1] + problem.rate_lower, plan[k - 1] + problem.rate_upper)
-                input[:] = np.clip(moved, problem.input_lower, problem.input_upper)
-            A, B, c, belief, V = self._linearise(belief, self._tensor(input), request.disturbance)
-            if self.feedback and gain is None and (follow is not None or V is not None):
-                gain = self.gain(np.ascontiguousarray(A[:n, :n]), np.ascontiguousarray(B[:n]))
-            if self.feedback and V is not None:
-                belief = Gaussian(belief.mean, self._tensor(spread(A + B @ gain, V, covariances[-1], 1)[1]))
-            covariances.append(_array(belief.covariance))
-            stages.append((A, B, c))
-        A, B, c = (np.array(part) for part in zip(*stages, strict=True))
-        return Prediction(A, B, c, self.state(request.state, covariances[0]), np.array(covariances), plan)
+        K = self.points
+        disturbance = request.disturbance if len(request.disturbance) else None
+        stages = self.linearizer(plan.states[:K], plan.inputs[:K], plan.covariances[:K], disturbance)
+        return self.predict(plan, stages, request, previous)
 
-    def held(self, request: Request, input: Array) -> Prediction:
-        """The local model about the belief and an input (m,), for all stages."""
-        belief = self._belief(request.state, request.covariance)
-        A, B, c, after, V = self._linearise(belief, self._tensor(input), request.disturbance)
-        now = _array(belief.covariance)
-        return self.hold(self.state(request.state, now), input, A, B, c, now, _array(after.covariance), V)
+    def linearize_many(self, requests: Sequence[Request], previous: Sequence[Decision | None]) -> list[Prediction]:
+        """``linearize`` at the first guesses of many requests, all stages of all of them in one call."""
+        if not requests:
+            return []
+        K, T = self.points, len(requests)
+        plans = [self.initial_guess(*question) for question in zip(requests, previous, strict=True)]
+        points = [np.concatenate([part[:K] for part in parts]) for parts in zip(*plans, strict=True)]
+        disturbances = [np.broadcast_to(r.disturbance, (K, len(r.state))) for r in requests if len(r.disturbance)]
+        disturbance = np.concatenate(disturbances) if disturbances else None
+        stages = self.linearizer(*points, disturbance)
+        parts = zip(*(part.reshape(T, K, *part.shape[1:]) for part in stages), strict=True)
+        asked = zip(plans, map(LinearizedStages._make, parts), requests, previous, strict=True)
+        return [self.predict(*question) for question in asked]
 
-    def hold(
-        self, start: Array, input: Array, A: Array, B: Array, c: Array, now: Array, after: Array, V: Array | None
+    def canonical(self, plan: Plan) -> Plan:
+        """A plan whose s are those of its beliefs: with roots that are positive semidefinite."""
+        means, covariances = self.linearizer.moments(plan.states, plan.covariances)
+        return Plan(self.linearizer.state(means, covariances), plan.inputs, covariances)
+
+    def predict(
+        self, plan: Plan, stages: LinearizedStages, request: Request, previous: Decision | None = None
     ) -> Prediction:
-        """One stage, made at s_0 = ``start``, Sigma_0 = ``now`` and an input, for all of them."""
-        H = self.horizon
-        if V is None:
-            covariances = np.empty((H + 1, *now.shape))
-            covariances[0], covariances[1:] = now, after
-        else:
-            covariances = spread(A + B @ self.gain(A, B) if self.feedback else A, V, now, H)
-        return Prediction(A[None], B[None], c[None], start, covariances, np.tile(input, (H, 1)))
+        """Covariances and rows for stages that were linearised at a plan; see ``linearize``."""
+        covariances, mode = plan.covariances, self.linearizer.covariance
+        if mode == "zero_order":
+            covariances, K = np.empty_like(covariances), self.gain(stages)
+            _predict_covariances(stages.A, stages.B, stages.V, request.covariance, K, covariances)
+        elif self.form == "velocity" and mode != "none":
+            covariances = np.repeat(self.linearizer.moments(stages.next, covariances)[1], self.horizon + 1, axis=0)
+            covariances[0] = request.covariance
+        if self.form == "velocity" and previous is not None and previous.applicable:
+            stages = self._increments(plan, stages, request, previous)
+        return Prediction(plan, stages, covariances, self.constraints.at(covariances, self.points))
 
-    def followed(self, request: Request, previous: Decision | None) -> Array | None:
-        """What the rollout of a shifted plan has to follow: its own means, or without one the reference.
+    def _increments(
+        self, plan: Plan, stages: LinearizedStages, request: Request, previous: Decision
+    ) -> LinearizedStages:
+        """A held linearisation as that of the increments since s_{-1}, the state that the last decision began at."""
+        before = self.linearizer.state(previous.means[:1], previous.covariances[:1])[0]
+        c = plan.states[0] - stages.A[0] @ before - stages.B[0] @ request.last
+        if not request.covariance.any():
+            n = self.problem.state_dim
+            c[n:] = stages.c[0, n:]
+        return stages._replace(c=c[None])
 
-        Open-loop, over a long horizon, the smallest error leads the rollout out of the data and the bounds.
+    def roll_out(self, towards: Plan, prediction: Prediction, feedback: Array, request: Request) -> Prediction:
+        """The prediction at the plan that obeys the dynamics under a feedback towards another one, within its bounds.
+
+        Args:
+            towards: Whose states are followed.
+            prediction: Its first stage gives the feedback, where a program has none.
+            feedback: Of the program, F_k (H, m, p + m + 1), or nothing (0, m, p + m + 1).
+            request: Of the step.
         """
-        if not self.feedback:
-            return None
-        if previous is not None and previous.applicable and len(previous.means) == self.horizon + 1:
-            return previous.means[1:]
-        return np.concatenate([request.state[None], request.targets[:-1]])
+        problem, n, parts = self.problem, self.problem.state_dim, []
+        gains = np.broadcast_to(-self.gain(prediction.stages), (self.horizon, problem.input_dim, n))
+        gains = feedback[:, :, :n] if len(feedback) else gains
+        states, inputs, covariances = (part.copy() for part in towards)
+        last, disturbance = request.last, request.disturbance if len(request.disturbance) else None
+        for k in range(self.horizon):
+            input = towards.inputs[k] + gains[k] @ (states[k, :n] - towards.states[k, :n])
+            input = np.clip(input, last + problem.rate_lower, last + problem.rate_upper)
+            last = inputs[k] = np.clip(input, problem.input_lower, problem.input_upper)
+            stage = self.linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance)
+            states[k + 1] = stage.next[0]
+            covariances[k + 1] = self.linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
+            parts.append(stage)
+        stages = LinearizedStages(*map(np.concatenate, zip(*parts, strict=True)))
+        return self.predict(Plan(states, inputs, covariances), stages, request)
 
-    def disturbance(self, request: Request, previous: Decision | None) -> Array:
-        """d_k (n,), from the estimate of the last decision and what came of its input; zero before the first step."""
+    def gain(self, stages: LinearizedStages) -> Array:
+        """K (m, n) of the feedback u = u_k - K (x - mu_k); zero without feedback."""
+        problem, n = self.problem, self.problem.state_dim
+        if not self.feedback:
+            return np.zeros((problem.input_dim, n))
+        A, B = np.ascontiguousarray(stages.A[:1, :n, :n]), np.ascontiguousarray(stages.B[:1, :n])
+        return finite_horizon_lqr(A, B, problem.Q, problem.R, problem.terminal, self.horizon)[0][0]
+
+    def _first_covariances(self, means: Array, inputs: Array, request: Request) -> Array:
+        """Sigma_1 .. Sigma_H (H, n, n) along a first guess, linearised at its points."""
+        stages = self._at_points(means[:-1], inputs, np.zeros((self.horizon, *request.covariance.shape)))
+        covariances = np.empty((self.horizon + 1, *request.covariance.shape))
+        gain = self.gain(stages)
+        _predict_covariances(stages.A, stages.B, stages.V, request.covariance, gain, covariances)
+        return covariances[1:]
+
+    def _disturbance(self, request: Request, previous: Decision | None) -> Array:
+        """d_k (n,), from the estimate of the last decision and the state that its input led to; at first zero."""
         if previous is None or not previous.applicable:
             return np.zeros(self.problem.state_dim)
         before = np.zeros_like(request.state) if previous.disturbance is None else previous.disturbance
-        x, u = self._tensor(previous.means[0]), self._tensor(request.last)
-        if isinstance(self.model, GPPosterior):
-            predicted = _array(self.model.mean_with_jacobian(x, u)[0])
-        else:
-            predicted = _array(self.model.predict(x, u).mean)
+        predicted = linearize(self.model, previous.means[:1], request.last[None], covariance=False).mean[0]
         return before + self.disturbance_gain * (request.state - predicted - before)
 
-    def _linearise(
-        self, belief: Gaussian, input: torch.Tensor, disturbance: Array
-    ) -> tuple[Array, Array, Array, Gaussian, Array | None]:
-        """One ``StageModel``; compiled where a point is all that it needs."""
-        if not self.compiled:
-            stage = stage_model(self.covariance, self.propagator, self.model, belief, input)
-            stage = disturbed(stage, self._tensor(disturbance)) if len(disturbance) else stage
-            A, B, c = (_array(part) for part in stage[:3])
-            return A, B, c, stage.next, None if stage.V is None else _array(stage.V)
-        x, u = _array(belief.mean), _array(input)
-        if self.covariance == "none":
-            mean, A, B = (part[0] for part in self.model.linearize(x[None], u[None], covariance=False)[:3])
-            V = None
-            S = belief.covariance
-        else:
-            mean, A, B, V = (part[0] for part in self.model.linearize(x[None], u[None]))
-            if self.propagator.process_noise:
-                V += _array(self.model.noise_covariance)
-            S = self._tensor(A @ _array(belief.covariance) @ A.T + V)
-        A, B = np.ascontiguousarray(A), np.ascontiguousarray(B)
-        if len(disturbance):
-            mean += disturbance
-        return A, B, mean - A @ x - B @ u, Gaussian(self._tensor(mean), S), V
 
-    def gain(self, A: Array, B: Array) -> Array:
-        """K (m, n) of the ancillary feedback, from dmu+/dmu (n, n) and dmu+/du (n, m)."""
-        problem = self.problem
-        return -finite_horizon_lqr(A[None], B[None], problem.Q, problem.R, problem.terminal, self.horizon)[0][0]
-
-    def _belief(self, mean: Array, covariance: Array) -> Gaussian:
-        known = np.zeros_like(covariance) if self.covariance == "none" else covariance
-        return Gaussian(self._tensor(mean), self._tensor(known))
-
-    def _tensor(self, array: Array) -> torch.Tensor:
-        return torch.as_tensor(array, dtype=self.model.dtype, device=self.model.device)
+@compiled
+def _predict_covariances(A, B, V, start, K, covariances):
+    """Writes Sigma_0 .. Sigma_H (H + 1, n, n) of H stages, or of one that is held."""
+    n, m, held = B.shape[1], B.shape[2], len(A) - 1
+    closed, moved = np.empty((n, n)), np.empty((n, n))
+    copy_matrix(start, covariances[0])
+    for k in range(len(covariances) - 1):
+        at, after = min(k, held), covariances[k + 1]
+        for i in range(n):
+            for j in range(n):
+                closed[i, j] = A[at, i, j]
+                for r in range(m):
+                    closed[i, j] -= B[at, i, r] * K[r, j]
+        product(closed, covariances[k], moved)
+        for i in range(n):
+            for j in range(i + 1):
+                total = (V[at, i, j] + V[at, j, i]) / 2.0
+                for c in range(n):
+                    total += moved[i, c] * closed[j, c]
+                after[i, j] = after[j, i] = total
 
 
-def _array(tensor: Any) -> Array:
-    """A tensor as a contiguous float64 array in host memory."""
-    return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float64)
+@compiled
+def _keep_rates(inputs, last, lower, upper):
+    """Moves inputs (H, m), one after the other, to within their rates from the one before."""
+    for k in range(len(inputs)):
+        for j in range(len(last)):
+            before = inputs[k - 1, j] if k > 0 else last[j]
+            inputs[k, j] = min(max(inputs[k, j], before + lower[j]), before + upper[j])

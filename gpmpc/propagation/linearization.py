@@ -17,7 +17,7 @@ from gpmpc.dynamics import predict_with_jacobian
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.propagation.composition import Composition
+from gpmpc.propagation._composition import Composition
 from gpmpc.propagation.propagator import Propagation, Propagator, checked_input, projected
 from gpmpc.propagation.sensitivity import Sensitivity
 
@@ -91,6 +91,11 @@ class Linearization(Propagator):
 
     def __init__(self, hessian: bool = False, process_noise: bool = False):
         self.hessian, self.process_noise = hessian, process_noise
+
+    @property
+    def first_order(self) -> bool:
+        """Whether mean, derivatives and variance of the model at the belief's mean are all that it takes."""
+        return not self.hessian
 
     def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``."""

@@ -83,7 +83,8 @@ def linearize(propagator: Propagator, model: Any, belief: Gaussian, input: Tenso
     arrays = [np.ascontiguousarray(array.reshape(H, *array.shape[len(batch) :])) for array in arrays]
     out = np.empty((H, p, p)), np.empty((H, p, m)), np.empty((H, p))
     extended_models(*arrays[:5], tuple(arrays[5:]), *out)
-    return LocalModel(*(torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in out), moved.belief)
+    A, B, c = (torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in out)
+    return LocalModel(A, B, c, moved.belief)
 
 
 def _extended(belief: Gaussian, input: Tensor, after: Gaussian, d: Sensitivity) -> tuple[Tensor, Tensor, Tensor]:

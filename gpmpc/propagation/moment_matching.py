@@ -9,8 +9,8 @@ from torch import Tensor
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.propagation.composition import Composition, Latent
-from gpmpc.propagation.moments import moments, moments_with_jacobian
+from gpmpc.propagation._composition import Composition, Latent
+from gpmpc.propagation._moments import moments, moments_with_jacobian
 from gpmpc.propagation.propagator import Propagation, Propagator, checked_input, projected, unsupported
 from gpmpc.propagation.sensitivity import Sensitivity
 
@@ -84,6 +84,6 @@ class MomentMatching(Propagator):
             found = kernels.moments(f.packed, *flat, self.diagonal)
         else:
             found = kernels.moments_with_jacobian(f.packed, *flat, self.diagonal, cross)
-        parts = [p if p is None else torch.from_numpy(p.reshape(*batch, *p.shape[1:])) for p in found]
+        parts: list[Any] = [p if p is None else torch.from_numpy(p.reshape(*batch, *p.shape[1:])) for p in found]
         parts[0] += f.offset
         return Latent(*parts)

@@ -13,10 +13,10 @@ _MODULES = {
     "Prepared": "dual_active_set",
     "PrimalActiveSet": "primal_active_set",
     "QPSolution": "solution",
-    "QPSolver": "solver",
+    "QPSolver": "solution",
     "QuadraticProgram": "problem",
     "Residuals": "solution",
-    "SoftRows": "soft_rows",
+    "SoftRows": "problem",
     "make_solution": "solution",
 }
 

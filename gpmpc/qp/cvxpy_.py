@@ -30,8 +30,7 @@ from gpmpc.qp import record as layout
 from gpmpc.qp.dual_rescue import rescue
 from gpmpc.qp.primal_active_set import LAST_CHANGES, farkas_ray
 from gpmpc.qp.problem import ABSENT, QuadraticProgram
-from gpmpc.qp.solution import QPSolution, make_solution
-from gpmpc.qp.solver import WarmStart
+from gpmpc.qp.solution import QPSolution, WarmStart, make_solution
 from gpmpc.status import Status
 
 Array = NDArray[np.float64]

@@ -1,49 +1,41 @@
-"""The package's QP solver: which bounds of a strictly convex QP hold with equality, given a good guess?
+"""The package's QP solver: the dual active-set method of Goldfarb and Idnani (1983), warm-started.
 
 In model predictive control one QP follows another and little changes in between, so the working set of the last
 solution is nearly that of the next. A dual method can start from any guess: it needs no feasible point, only
-multipliers of the right sign. ``DualActiveSet`` is the method of Goldfarb and Idnani (1983), warm-started
-(``gpmpc.qp.dual_iteration``), in two modes that the caller chooses by what stays the same:
+multipliers of the right sign (``gpmpc.qp.dual_iteration``). What depends on P and G only can be done beforehand:
+``prepared = solver.prepare(P, G)`` once, then ``prepared.solve(q, lower, upper, last_solution)``.
 
-* P and G stay: ``prepared = solver.prepare(P, G)`` once, then ``prepared.solve(q, lower, upper, last_solution)``.
-* P and G change: ``solver.solve(problem, last_solution)``, or ``solver.solve_stacked(...)`` without building a problem.
-
-An answer that its own residuals do not bear out, one whose factors lost too many digits to say, and an infeasibility
-without Farkas' proof are tried again with a new factor, then with doubled digits (``gpmpc.qp.dual_rescue``); what still
-fails is reported as ``Status.NUMERICAL_TROUBLE``.
+A solution that its own residuals do not support, one whose factors lost too many digits, and an infeasibility without
+Farkas' proof are tried again with doubled digits (``gpmpc.qp.dual_rescue``); what still fails is reported as
+``Status.NUMERICAL_TROUBLE``.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import count
 from time import perf_counter
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import solve_triangular
 
-from gpmpc.compiled import compile_for, direct
+from gpmpc.compiled import compile_for, unchecked_entry_point
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import record as layout
-from gpmpc.qp.dual_kernels import GRAM_SIGNATURE, LAZY_SIGNATURE, solve_gram, solve_lazy
+from gpmpc.qp.dual_kernels import SIGNATURE, solve
 from gpmpc.qp.dual_rescue import rescue
-from gpmpc.qp.farkas import proves_infeasibility
-from gpmpc.qp.gram_system import gram_system
-from gpmpc.qp.problem import QuadraticProgram
-from gpmpc.qp.soft_rows import SoftRows, stack_softness
-from gpmpc.qp.solution import QPSolution, Terms
-from gpmpc.qp.solver import WarmStart
-from gpmpc.qp.workspace import SHARE, gram_workspace, lazy_workspace
+from gpmpc.qp.problem import QuadraticProgram, SoftRows, stack_softness
+from gpmpc.qp.solution import QPSolution, Terms, WarmStart, proves_infeasibility
+from gpmpc.qp.workspace import PREPARED, factor_and_rows, new_memory, softness_in
 
 Array = NDArray[np.float64]
 
-FLOAT = np.dtype(np.float64)
-empty = np.empty  # a local name saves a look-up
-new = tuple.__new__  # half the time of a named tuple's own constructor
+_NO_RECORD = layout.NO_RECORD
+_FLOAT = np.dtype(np.float64)
+_empty = np.empty  # a local name saves a look-up
+_new = tuple.__new__  # half the time of a named tuple's own constructor
 
-run_gram, run_lazy = solve_gram, solve_lazy  # until they are compiled
-_tags = count(1)  # next() of a count is atomic
-ITERATIONS_PER_CONSTRAINT = 10  # default limit, beyond which the iteration is taken to cycle
-ITERATIONS_PER_LOOK = 25  # iterations between two looks at the clock
+_run = solve  # until it is compiled
+_ITERATIONS_PER_CONSTRAINT = 10  # default limit, beyond which the iteration is taken to cycle
+_ITERATIONS_PER_LOOK = 25  # iterations between two looks at the clock
 
 
 @dataclass(frozen=True)
@@ -69,9 +61,9 @@ class DualActiveSet:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ProblemError(f"{name} must be positive; got {value}")
-        global run_lazy
-        compile_for(solve_lazy, LAZY_SIGNATURE)
-        run_lazy = direct(solve_lazy)
+        global _run
+        compile_for(solve, SIGNATURE)
+        _run = unchecked_entry_point(solve)
 
     def solve(
         self, problem: QuadraticProgram, warm_start: WarmStart = None, soft: SoftRows | None = None
@@ -79,69 +71,24 @@ class DualActiveSet:
         """Solves one problem.
 
         Args:
-            problem: The QP.
+            problem: The QP. ``QuadraticProgram.unchecked`` builds it in a fraction of a microsecond; its arrays are
+                checked here.
             warm_start: The solution of a similar problem, or an active set; any guess is safe.
             soft: Weights of the rows that may be violated.
 
         Returns:
             The minimiser with status ``SOLVED``, or ``INFEASIBLE`` (the multipliers are then Farkas' proof),
             ``ITERATION_LIMIT``, ``TIME_LIMIT`` (the best dual iterate) or ``NUMERICAL_TROUBLE``.
-        """
-        return self.solve_stacked(problem.P, problem.q, problem.G, problem.lower, problem.upper, warm_start, soft)
-
-    def solve_stacked(
-        self,
-        P: Array,
-        q: Array,
-        G: Array,
-        lower: Array,
-        upper: Array,
-        warm_start: WarmStart = None,
-        soft: SoftRows | None = None,
-    ) -> QPSolution:
-        """Solves ``min 1/2 x'Px + q'x``, ``lower <= [x; Gx] <= upper``, the fast way when P and G change.
-
-        Args:
-            P: (n, n) symmetric positive definite.
-            q: (n,).
-            G: (m, n).
-            lower: (n + m,) bounds of x, then of the rows.
-            upper: (n + m,).
-            warm_start: As for ``solve``.
-            soft: As for ``solve``.
 
         Raises:
-            ProblemError: As for ``QuadraticProgram``.
+            ProblemError: The problem was not checked and breaks a rule of ``QuadraticProgram``.
         """
-        began = perf_counter()
         try:
-            plan = self._plans.get(G.shape) if soft is None else None
-            softness, work, size, where = plan or self._plan(*G.shape, soft)
-            record = empty(size)
-            warm = layout.NO_RECORD if warm_start is None else warm_start.record
-            if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is FLOAT:
-                status = run_lazy(P, q, G, lower, upper, warm, work, record)
-            else:  # may still be float64: a dtype that was pickled is another object
-                status = solve_lazy(P, q, G, lower, upper, warm, work, record)
-        except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
-            status = layout.MISUSE
-        if status == layout.MISUSE:
-            problem = QuadraticProgram.from_stacked(P, q, G, lower, upper)  # raises if it is misuse indeed
-            P, q, G, lower, upper = problem.P, problem.q, problem.G, problem.lower, problem.upper
-            n, m = len(P), len(G)
-            softness, work, size, where = self._plan(m, n, soft)
-            record, warm = np.empty(size), _as_record(warm_start, n, n + m)
-            status = solve_lazy(P, q, G, lower, upper, warm, work, record)
-            if status == layout.MISUSE:
-                _write_trouble(record, n, n + m)
-        terms = new(Terms, (P, G, softness))
-        if status != layout.SOLVED:
-
-            def again(guess: Array, record: Array) -> int:
-                return solve_lazy(P, q, G, lower, upper, guess, work, record)
-
-            record = self._settle(again, terms, q, lower, upper, record, began)
-        return new(QPSolution, (record[where], terms, q, lower, upper, record, 0.0, perf_counter() - began))
+            plan = self._plans[problem.G.shape] if soft is None else self._plan(*problem.G.shape, soft)
+        except (AttributeError, KeyError, TypeError):  # the first of its shape, or an unchecked one without a shape
+            problem = QuadraticProgram.from_stacked(*problem)
+            plan = self._plan(*problem.G.shape, soft)
+        return _solve(problem, warm_start, plan, self)
 
     def prepare(self, P: ArrayLike, G: ArrayLike | None = None, soft: SoftRows | None = None) -> "Prepared":
         """Does once what depends on P, G and soft weights only.
@@ -154,80 +101,46 @@ class DualActiveSet:
         Raises:
             ProblemError: As for ``QuadraticProgram``.
         """
-        problem = QuadraticProgram(P, np.zeros(len(np.atleast_1d(P))), G)
-        n, m = len(problem.P), len(problem.G)
-        terms = Terms(problem.P, problem.G, stack_softness(soft, n, m))
-        return Prepared(self, terms, self._settings(n, n + m, soft is not None, float(next(_tags))))
+        return Prepared(self, QuadraticProgram(P, np.zeros(len(np.atleast_1d(P))), G), soft)
 
     def workspace(self, rows: int, variables: int, soft: SoftRows | None = None) -> tuple[Array, Array]:
-        """Softness and the memory that ``solve_lazy`` takes in kernels that call it themselves, holding the lock."""
+        """Returns softness and memory for kernels that call ``dual_kernels.solve`` themselves, holding the lock."""
         return self._plan(rows, variables, soft)[:2]
 
-    def _plan(self, m: int, n: int, soft: SoftRows | None) -> tuple[Array, Array, int, slice]:
-        """For a shape of G, softness, workspace, the record's length, and where x is in it."""
-        softness, settings = stack_softness(soft, n, m), self._settings(n, n + m, soft is not None)
-        work, where = lazy_workspace(settings, softness), slice(layout.HEADER, layout.HEADER + n)
-        plan = softness, work, layout.record_size(n, n + m), where
-        if soft is None:
+    def _plan(self, m: int, n: int, soft: SoftRows | None, prepared: bool = False) -> tuple[Array, Array, int, slice]:
+        """Returns softness, memory, the record's length, and where x is in it, for a shape of G."""
+        softness, M, limit = stack_softness(soft, n, m), n + m, self._limit(n + m)
+        if self.time_limit is not None:
+            limit = min(limit, _ITERATIONS_PER_LOOK)
+        memory = new_memory(softness, n, limit, self.tolerance, soft is not None, prepared)
+        plan = softness, memory, layout.record_size(n, M), slice(layout.HEADER, layout.HEADER + n)
+        if soft is None and not prepared:
             self._plans[m, n] = plan
         return plan
 
     def _limit(self, M: int) -> int:
-        return self.iteration_limit or 100 + ITERATIONS_PER_CONSTRAINT * M
-
-    def _settings(self, n: int, M: int, soft: bool, tag: float = layout.NO_TAG) -> Array:
-        limit = self._limit(M) if self.time_limit is None else min(self._limit(M), ITERATIONS_PER_LOOK)
-        return np.array([limit, self.tolerance, soft, n, M, tag, 1.0])
-
-    def _settle(self, again: Callable, terms: Terms, q: Array, lower: Array, upper: Array, record: Array, began: float):
-        """Decides on a solve that did not end as ``SOLVED``: go on, believe it, or try again; returns the record."""
-        done, limit = record[layout.ITERATIONS], self._limit(len(lower))
-
-        def late() -> bool:
-            return self.time_limit is not None and perf_counter() - began > self.time_limit
-
-        while record[layout.STATUS] == layout.ITERATION_LIMIT and self.time_limit is not None:
-            if late() or done >= limit:
-                record[layout.STATUS] = layout.TIME_LIMIT if late() else layout.ITERATION_LIMIT
-                break
-            guess, record = record, np.empty_like(record)
-            again(guess, record)
-            done += record[layout.ITERATIONS]
-        record[layout.ITERATIONS] = done
-        stopped = record[layout.STATUS] == layout.ITERATION_LIMIT and self.iteration_limit is not None
-        if stopped or _is_certain(record, terms.G, lower, upper):
-            return record
-        guess, record = record, np.empty_like(record)
-        guess[layout.TAG] = layout.NO_TAG  # the factor is made anew
-        if again(guess, record) == layout.MISUSE:
-            record = guess
-        record[layout.ITERATIONS] += done
-        if _is_certain(record, terms.G, lower, upper):
-            return record
-        return rescue(terms, q, lower, upper, record, limit, late)
+        return self.iteration_limit or 100 + _ITERATIONS_PER_CONSTRAINT * M
 
 
 class Prepared:
     """A problem whose P and G stay; made by ``DualActiveSet.prepare``. Read-only, and may serve many threads.
 
     Attributes:
-        terms: P, G and softness of the rows.
         build_seconds: Time that the preparation took [s].
     """
 
-    __slots__ = ("_settings", "_size", "_solver", "_system", "_traits", "_work", "_x", "build_seconds", "terms")
-
-    def __init__(self, solver: DualActiveSet, terms: Terms, settings: Array):
-        global run_gram
-        compile_for(solve_gram, GRAM_SIGNATURE)
-        run_gram = direct(solve_gram)
+    def __init__(self, solver: DualActiveSet, problem: QuadraticProgram, soft: SoftRows | None):
         began = perf_counter()
-        self.terms, self._solver, self._settings = terms, solver, settings
-        self._system, self._traits, settings[SHARE] = gram_system(terms)
-        self._work = gram_workspace(settings, self._traits)
-        n, M = len(terms.P), sum(terms.G.shape)
-        self._size = layout.record_size(n, M) + layout.factor_size(n, M)
-        self._x = slice(layout.HEADER, layout.HEADER + n)
+        self._P, self._G, self._solver = problem.P, problem.G, solver
+        m, n = problem.G.shape
+        self._plan = solver._plan(m, n, soft, prepared=True)
+        _, memory, size, _ = self._plan
+        status = solve(*problem, layout.NO_RECORD, memory, np.empty(size))  # factorises P, measures the rows of G
+        if status == layout.SOLVED:  # else numbers overflow, and every solve is to find that out by itself
+            L, rows = factor_and_rows(memory, n, m)
+            C = np.vstack([np.eye(n), problem.G])
+            rows[:] = solve_triangular(L, C.T, lower=True, trans="T", check_finite=False).T  # L^-T c_p
+            memory[0, PREPARED] = True
         self.build_seconds = perf_counter() - began
 
     def solve(self, q: Array, lower: Array, upper: Array, warm_start: WarmStart = None) -> QPSolution:
@@ -242,55 +155,86 @@ class Prepared:
         Raises:
             ProblemError: Shapes that do not match, NaN, crossed bounds.
         """
-        began = perf_counter()
-        record = empty(self._size)
-        try:
-            warm = layout.NO_RECORD if warm_start is None else warm_start.record
-            if q.dtype is lower.dtype is upper.dtype is FLOAT:
-                status = run_gram(q, lower, upper, warm, self._system, self._work, record)
-            else:  # may still be float64: a dtype that was pickled is another object
-                status = solve_gram(q, lower, upper, warm, self._system, self._work, record)
-        except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
-            status = layout.MISUSE
-        if status:
-            return self._solve_carefully(q, lower, upper, warm_start, record, status, began)
-        return new(QPSolution, (record[self._x], self.terms, q, lower, upper, record, 0.0, perf_counter() - began))
+        return _solve((self._P, q, self._G, lower, upper), warm_start, self._plan, self._solver)
 
-    def _solve_carefully(self, q, lower, upper, warm_start, record, status, began) -> QPSolution:
-        """The rest of ``solve`` for whatever is not plain sailing."""
-        P, G, _ = self.terms
-        if status == layout.MISUSE:
-            problem = QuadraticProgram.from_stacked(P, q, G, lower, upper)  # raises if it is misuse indeed
-            q, lower, upper = problem.q, problem.lower, problem.upper
 
-        def again(guess: Array, record: Array) -> int:
-            return solve_gram(q, lower, upper, guess, self._system, self._work, record)
+def _solve(problem: tuple[Array, ...], warm_start: WarmStart, plan: tuple, solver: DualActiveSet) -> QPSolution:
+    """Solves (P, q, G, lower, upper) in the memory of ``plan``."""
+    began = perf_counter()
+    P, q, G, lower, upper = problem
+    softness, memory, size, where = plan
+    record = _empty(size)
+    try:
+        guess = _NO_RECORD if warm_start is None else warm_start.record
+        if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
+            status = _run(P, q, G, lower, upper, guess, memory, record)
+        else:  # may still be float64: a dtype that was pickled is another object
+            status = solve(P, q, G, lower, upper, guess, memory, record)
+    except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
+        status = layout.MISUSE
+    if status:
+        problem, record = _solve_again(problem, warm_start, memory, solver, status, record, began)
+        P, q, G, lower, upper = problem
+    return _new(
+        QPSolution, (record[where], _new(Terms, (P, G, softness)), q, lower, upper, record, 0.0, perf_counter() - began)
+    )
 
-        if status == layout.MISUSE:
-            status = again(_as_record(warm_start, len(q), len(lower)), record)
-            if status == layout.MISUSE:
-                _write_trouble(record, len(q), len(lower))
-        if status != layout.SOLVED:
-            record = self._solver._settle(again, self.terms, q, lower, upper, record, began)
-        return QPSolution(record[self._x], self.terms, q, lower, upper, record, 0.0, perf_counter() - began)
+
+def _solve_again(problem, warm_start, memory, solver, status, record, began) -> tuple[tuple[Array, ...], Array]:
+    """Continues a solve that did not end as ``SOLVED``: checks the problem, goes on, accepts the status or tries again.
+
+    Returns:
+        The problem's arrays as the kernel takes them, and the record.
+
+    Raises:
+        ProblemError: The problem breaks a rule of ``QuadraticProgram``.
+    """
+    if status == layout.MISUSE:
+        problem = QuadraticProgram.from_stacked(*problem)  # raises if it is misuse indeed
+        n, M = len(problem.q), len(problem.lower)
+        status = solve(*problem, _as_record(warm_start, n, M), memory, record)
+        if status == layout.MISUSE:  # a proper problem: rows that overflow, P at the edge of definiteness
+            record[:] = 0.0
+            record[[layout.STATUS, layout.VARIABLES, layout.CONSTRAINTS]] = layout.NUMERICAL_TROUBLE, n, M
+        elif status == layout.SOLVED:
+            return problem, record
+    P, q, G, lower, upper = problem
+    done, limit = record[layout.ITERATIONS], solver._limit(len(lower))
+
+    def late() -> bool:
+        return solver.time_limit is not None and perf_counter() - began > solver.time_limit
+
+    while record[layout.STATUS] == layout.ITERATION_LIMIT and solver.time_limit is not None:
+        if late() or done >= limit:
+            record[layout.STATUS] = layout.TIME_LIMIT if late() else layout.ITERATION_LIMIT
+            break
+        guess, record = record, np.empty_like(record)
+        solve(*problem, guess, memory, record)
+        done += record[layout.ITERATIONS]
+    record[layout.ITERATIONS] = done
+    stopped = record[layout.STATUS] == layout.ITERATION_LIMIT and solver.iteration_limit is not None
+    if stopped or _is_certain(record, G, lower, upper):
+        return problem, record
+    guess, record = record, np.empty_like(record)
+    if solve(*problem, guess, memory, record) == layout.MISUSE:
+        record = guess
+    record[layout.ITERATIONS] += done
+    if not _is_certain(record, G, lower, upper):
+        terms = Terms(P, G, softness_in(memory, len(lower)))
+        record = rescue(terms, q, lower, upper, record, limit, late)
+    return problem, record
 
 
 def _is_certain(record: Array, G: Array, lower: Array, upper: Array) -> bool:
-    """Whether a record needs no second look; an infeasibility needs Farkas' proof."""
+    """Returns whether a record needs no second look; an infeasibility needs Farkas' proof."""
     if record[layout.STATUS] == layout.INFEASIBLE:
         start = layout.HEADER + G.shape[1]
         return proves_infeasibility(record[start : start + len(lower)], G, lower, upper)
     return record[layout.STATUS] in (layout.SOLVED, layout.TIME_LIMIT)
 
 
-def _write_trouble(record: Array, n: int, M: int) -> None:
-    """Fills the record of a kernel that refused a proper problem: rows that overflow, P at the edge of definiteness."""
-    record[:] = 0.0
-    record[layout.STATUS], record[layout.VARIABLES], record[layout.CONSTRAINTS] = layout.NUMERICAL_TROUBLE, n, M
-
-
 def _as_record(warm_start: WarmStart, n: int, M: int) -> Array:
-    """Whatever can be used of a warm start; nothing if it belongs to a problem of another size."""
+    """Returns whatever can be used of a warm start; nothing if it belongs to a problem of another size."""
     if warm_start is None:
         return layout.NO_RECORD
     if isinstance(warm_start, QPSolution):

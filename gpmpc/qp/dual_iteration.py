@@ -1,184 +1,343 @@
-"""The dual active-set iteration: which constraints hold with equality at the minimum of a strictly convex QP?
+"""The dual active-set method: which constraints hold with equality at the minimum of a strictly convex QP?
 
 For a working set W the minimiser over ``c_p'x = b_p, p in W`` is x = x_u - P^-1 C_W' mu with K_WW mu = y_W - b_W, where
 x_u is the unconstrained minimiser, y = C x_u and K = C P^-1 C'. The method of Goldfarb and Idnani (Math. Programming
 27, 1983, algorithm 1) keeps every multiplier in its range and moves to the most violated constraint p until none is
-violated: with r = K_WW^-1 K_Wp and d = K_pp - K_pW r, a step t changes mu_p by t, mu_W by -t r and y_p by -t d. It
-ends at t = violation / d (p joins W), or where a multiplier reaches the end of its range (that constraint leaves W),
-or never (d = 0: the constraints contradict each other, and (r, -1) is Farkas' proof).
+violated. Where rows are soft, 1/rho is added to K_pp, and a multiplier at its cap leaves with a constraint that stays
+violated; then mu_p is not zero outside the working set.
+
+The functions take a ``Workspace``, a ``WorkingSet`` and the number k of its constraints; those that change k return it.
 """
 
 import numpy as np
 
-from gpmpc.compiled import woven
-from gpmpc.qp.factor import append_row, backward_solve, dot, forward_solve, subtract_rows
-from gpmpc.qp.working_set import (
-    BOUND,
-    END,
-    FLOOR,
-    HIGH_WATCH,
-    LEAST,
-    LOW_WATCH,
-    LOWER,
-    MOST,
-    NAME,
-    PLACE,
-    SOFTNESS,
-    UPPER,
-    admit,
-    couple,
-    evict,
-    find_row,
-    free_value,
-    ignore,
-    watch,
+from gpmpc.compiled import inline_njit
+from gpmpc.kernels.linalg import dot, four_dots
+from gpmpc.qp.record import INFEASIBLE, ITERATION_LIMIT, SOLVED
+from gpmpc.qp.triangular import (
+    append_row,
+    delete_row,
+    multiply_rows,
+    solve_lower,
+    solve_transposed,
+    subtract_rows,
+)
+from gpmpc.qp.violations import (
+    choose_bad,
+    count_bad,
+    ignore_violations,
+    keep_violated,
+    list_violated,
+    most_violated,
+    restore_limits,
 )
 
-REACHED, CONTRADICTION = 0, 1
-DEPENDENT = 1e-12  # d below this share of K_pp: the constraint depends on the working ones
-ROUNDING = 1e-15  # share of the bounds of a contradiction by which it may be their rounding
-DOUBTFUL = 1e-4  # d below this share of K_pp is computed again without cancellation (lazy mode)
+NEGLIGIBLE = 1e-26  # share of the length of q below which x, and a violation of a bound of zero, is none
+_GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
+_DEPENDENT = 1e-12  # d below this share of K_pp: the constraint depends on the working ones
+_DOUBTFUL = 1e-4  # d below this share of K_pp is computed again without cancellation
+_ROUNDING = 1e-15  # share of the bounds of a contradiction by which it may be their rounding
+_HOPELESS = 1e-7  # violation of a dependent constraint that is taken for a contradiction
+_BATCHES = 4  # times that all badly violated constraints enter at once
+_BAD = 0.5  # those violated by more than this share of the worst
 
 
-@woven
-def list_violated(y, margin, scales, bounds, excess, listed):
-    """Lists the constraints outside their watch by more than ``margin``, and by how much more, in units of ``scales``.
-
-    Returns how many there are.
-    """
-    lo, hi = bounds[LOW_WATCH], bounds[HIGH_WATCH]
-    violated = 0
-    for p in range(len(y)):
-        excess[p] = max(y[p] - hi[p], lo[p] - y[p]) - margin * scales[p]
-        violated += excess[p] > 0.0
-    if violated > 0:
-        count = 0
-        for p in range(len(y)):
-            if excess[p] > 0.0:
-                excess[p] /= scales[p]
-                listed[count] = p
-                count += 1
-    return violated
-
-
-@woven
-def keep_violated(now, margin, scales, bounds, excess, listed, count):
-    """The same for the listed constraints, which stay listed if they are still outside their watch."""
-    kept = 0
-    for i in range(count):
-        p = listed[i]
-        excess[p] = max(now[p] - bounds[HIGH_WATCH, p], bounds[LOW_WATCH, p] - now[p]) / scales[p] - margin
-        if excess[p] > 0.0:
-            listed[kept] = p
-            kept += 1
-    return kept
-
-
-@woven
-def most_violated(excess, listed, count):
-    """The one of the listed constraints with the largest excess."""
-    worst = listed[0]
-    for i in range(1, count):
-        if excess[listed[i]] > excess[worst]:
-            worst = listed[i]
-    return worst
-
-
-@woven
-def step_to(lazy, p, value, k, capacity, n, q, v, rows, L, G, traits, bounds, mu, slots, members, R, scratch):
-    """Changes multipliers until constraint p, whose value is given, is satisfied.
+@inline_njit
+def iterate(work, active, k, count, margin, iterations, batches):
+    """Changes the working set until no constraint is violated; ``count`` are, and listed.
 
     Returns:
-        The outcome, the size of the working set, and the number of constraints that entered or left.
+        ``SOLVED``, ``INFEASIBLE`` or ``ITERATION_LIMIT``, the size of the working set, iterations and batches so far,
+        and whether a constraint was passed over because it contradicts others by what may be rounding.
     """
-    changes = 0
-    above = mu[p] > 0.0 or (mu[p] == 0.0 and value > bounds[UPPER, p])
-    sense = 1.0 if above == (mu[p] == 0.0) else -1.0  # from a cap the multiplier comes back
-    violation = (value - bounds[UPPER if above else LOWER, p]) * sense
-    place = find_row(lazy, p, k, n, rows, L, G, traits, members)
-    row, size = rows[place], int(traits[END, p])
-    free = free_value(lazy, row, v, q, n)
-    diagonal = (dot(row, row, size) if lazy else row[p]) + traits[SOFTNESS, p]
-    solved, r = scratch[1], scratch[2]
-    couple(lazy, row, k, size, rows, members, solved)
-    forward_solve(R, k, solved)
+    complete, passed = True, False  # whether y and the list are those of all constraints
+    while count > 0:
+        if iterations >= work.limit:
+            return ITERATION_LIMIT, k, iterations, batches, passed
+        p = most_violated(work, count)
+        before = k
+        if complete and batches < _BATCHES and count_bad(work, _BAD * work.excess[p], count) > 1:
+            batches += 1
+            chosen = choose_bad(work, _BAD * work.excess[p], count, work.capacity - k)
+            k = add_constraints(work, active, k, chosen)
+            iterations += k - before
+        several = k > before
+        if several:
+            k = drop_wrong_multipliers(work, active, k)
+        else:
+            mu_p, scale = work.mu[p], work.scale[p]
+            satisfied, k, changes = satisfy_constraint(work, active, k, p)
+            iterations += changes
+            if not satisfied:
+                size = max(abs(work.y[p]), work.negligible[p] / NEGLIGIBLE)
+                if work.excess[p] * scale > _HOPELESS * size:
+                    write_ray(work, active, k, p)
+                    return INFEASIBLE, k, iterations, batches, passed
+                work.mu[p], passed = mu_p, True  # what it gained on the way belongs to no working set
+                ignore_violations(work, p)
+                if not work.soft:  # else refinement has to do
+                    k = drop_wrong_multipliers(work, active, k)
+            if work.soft:
+                batches = _BATCHES  # caps may have changed x_u
+        complete = several or work.soft or count == 1 or iterations >= work.limit
+        if not complete:  # first satisfy those that were seen to be violated, then look at all
+            minimise(work, active, k)
+            count = keep_violated(work, margin, count)
+            complete = count == 0
+        if complete:
+            evaluate(work, active, k)
+            count = list_violated(work, margin)
+    for i in range(k):  # rounding can take multipliers out of their ranges
+        p = abs(active.name[i]) - 1
+        work.mu[p] = min(max(work.mu[p], active.least[i]), active.most[i])
+    return SOLVED, k, iterations, batches, passed
+
+
+@inline_njit
+def satisfy_constraint(work, active, k, p):
+    """Moves multipliers until constraint p is satisfied: steps 1 and 2 of Goldfarb and Idnani's algorithm.
+
+    Returns:
+        False if it contradicts the working ones, the size of the working set, and how many entered or left.
+    """
+    mu, r, solved, changes = work.mu, work.r, work.solved, 0
+    above = mu[p] > 0.0 or (mu[p] == 0.0 and work.y[p] > work.upper[p])
+    sense = 1.0 if above == (mu[p] == 0.0) else -1.0  # the direction of mu_p, which comes back from a cap
+    violation = (work.y[p] - (work.upper[p] if above else work.lower[p])) * sense
+    place = make_row(work, active, k, p)
+    row, size = work.rows[place], int(work.end[p])
+    free_value = dot(row, work.v, len(work.x))
+    K_pp = dot(row, row, size) + work.softness[p]
+    multiply_rows(work.rows, active.place, k, row, size, solved)  # K_Wp
+    solve_lower(active.factor, k, solved)
     while True:
-        admit(k, p, above, place, diagonal, traits, free, bounds, slots, members)
+        write_slot(work, active, k, p, above)
+        active.place[k], active.free_value[k], active.diagonal[k] = place, free_value, K_pp
+        # step direction:  r = K_WW^-1 K_Wp,  d = K_pp - K_pW r;  mu_p moves by t, mu_W by -t r and y_p by -t d
         for i in range(k):
             r[i] = solved[i]
-        backward_solve(R, k, r)
-        d = diagonal - dot(solved, solved, k)
-        if lazy and d < DOUBTFUL * diagonal:
-            d = distance_to_span(row, k, n, rows, members, r, scratch[3]) + traits[SOFTNESS, p]
+        solve_transposed(active.factor, k, r)
+        d = K_pp - dot(solved, solved, k)
+        if d < _DOUBTFUL * K_pp:
+            d = distance_to_span(work, active, k, p, row)
+        # ratio test:  t = min(t1, t2);  t2 = violation / d makes p hold,  t1 takes a multiplier to the end of its range
+        step = max(0.0, violation) / d if d > _DEPENDENT * K_pp and k < work.capacity else np.inf
+        room = active.most[k] - mu[p] if sense > 0.0 else mu[p] - active.least[k]
+        capped = room < step
+        step, blocking = first_blocking(work, active, k, sense, room if capped else step)
+        if step == np.inf:  # no step ends: (r, -1) is Farkas' proof, unless rounding made the violation
             for i in range(k):
-                d += traits[SOFTNESS, abs(members[NAME, i]) - 1] * r[i] * r[i]
-        movable = d > DEPENDENT * diagonal and k < capacity
-        step = max(0.0, violation) / d if movable else np.inf
-        own_room = slots[MOST, k] - mu[p] if sense > 0.0 else mu[p] - slots[LEAST, k]
-        capped = own_room < step
-        if capped:
-            step = own_room
-        step, blocking = first_block(step, sense, k, mu, slots, members, r)
-        if step == np.inf:
-            for i in range(k):
-                bounds[FLOOR, p] += ROUNDING * abs(r[i] * slots[BOUND, i])
-            return CONTRADICTION, k, changes
+                work.negligible[p] += _ROUNDING * abs(r[i] * active.bound[i])
+            return False, k, changes
+        # take the step
         for i in range(k):
-            mu[abs(members[NAME, i]) - 1] -= sense * step * r[i]
+            mu[abs(active.name[i]) - 1] -= sense * step * r[i]
         mu[p] += sense * step
         changes += 1
-        if blocking < k:
-            leaving = abs(members[NAME, blocking]) - 1
-            mu[leaving] = slots[LEAST if sense * r[blocking] > 0.0 else MOST, blocking]
-            evict(k, blocking, slots, members, R, solved, scratch[0])
+        if blocking < k:  # partial step: the blocking constraint leaves, and p is tried again
+            leaving = abs(active.name[blocking]) - 1
+            mu[leaving] = active.least[blocking] if sense * r[blocking] > 0.0 else active.most[blocking]
+            drop_constraint(work, active, k, blocking)
             k -= 1
-            members[PLACE, k + 1] = members[PLACE, k]  # the entering row keeps its place in slot k
-            watch(leaving, mu, bounds)
+            active.place[k + 1] = active.place[k]  # the entering row keeps its place in slot k
+            restore_limits(work, leaving)
             violation -= step * d
-            continue
-        if capped:
-            mu[p] = slots[MOST if sense > 0.0 else LEAST, k]
-            watch(p, mu, bounds)
-        else:
-            append_row(R, k, solved, d)
-            ignore(p, bounds)
-            k += 1
-        return REACHED, k, changes
+        elif capped:  # a soft row that stays violated
+            mu[p] = active.most[k] if sense > 0.0 else active.least[k]
+            restore_limits(work, p)
+            return True, k, changes
+        else:  # full step: p enters
+            append_row(active.factor, k, solved, d)
+            ignore_violations(work, p)
+            return True, k + 1, changes
 
 
-@woven
-def distance_to_span(row, k, n, rows, members, r, rest):
-    """|row - sum r_i row_i|^2: what is left of a row outside the span of the working ones (lazy mode)."""
-    for j in range(n):
-        rest[j] = row[j]
-    subtract_rows(rest, rows, members[PLACE], r, k, n)
-    return dot(rest, rest, n)
-
-
-@woven
-def first_block(step, sense, k, mu, slots, members, r):
-    """The longest step, up to ``step``, that keeps the multipliers in range, and the slot that ends it (or k)."""
-    size = 0.0
+@inline_njit
+def first_blocking(work, active, k, sense, step):
+    """Returns the longest step up to ``step`` that keeps the multipliers in range, and the slot that ends it (or k)."""
+    r, size = work.r, 0.0
     for i in range(k):
         size = max(size, abs(r[i]))
     blocking = k
     for i in range(k):
         rate = sense * r[i]
         if abs(rate) > 1e-12 * size:
-            room = (mu[abs(members[NAME, i]) - 1] - slots[LEAST if rate > 0.0 else MOST, i]) / rate
+            room = (work.mu[abs(active.name[i]) - 1] - (active.least[i] if rate > 0.0 else active.most[i])) / rate
             if room < step:
                 step, blocking = max(room, 0.0), i
     return step, blocking
 
 
-@woven
-def write_ray(p, above, k, bounds, members, r, mu):
-    """Farkas' proof that constraint p contradicts the working ones, ``C' ray = 0`` and ``ray' bounds < 0``, into mu."""
-    sense = 1.0 if above else -1.0
-    mu[:] = 0.0
+@inline_njit
+def distance_to_span(work, active, k, p, row):
+    """Returns ``d = |w_p - sum r_i w_i|^2``, softness included, as a sum of squares, which cannot cancel."""
+    rest, n = work.scratch, len(work.x)
+    for j in range(n):
+        rest[j] = row[j]
+    subtract_rows(rest, work.rows, active.place, work.r, k, n)
+    d = dot(rest, rest, n) + work.softness[p]
     for i in range(k):
-        at = abs(members[NAME, i]) - 1
-        mu[at] = -sense * r[i]
-        if mu[at] * members[NAME, i] < 0.0 and bounds[LOWER, at] < bounds[UPPER, at]:
-            mu[at] = 0.0  # rounding: this bound cannot pull that way
-    mu[p] = sense
+        d += work.softness[abs(active.name[i]) - 1] * work.r[i] * work.r[i]
+    return d
+
+
+@inline_njit
+def write_ray(work, active, k, p):
+    """Writes Farkas' proof that p contradicts the working constraints to mu: ``C' ray = 0``, ``ray' bounds < 0``."""
+    sense = 1.0 if work.y[p] > work.upper[p] else -1.0
+    for i in range(len(work.mu)):
+        work.mu[i] = 0.0
+    for i in range(k):
+        w = abs(active.name[i]) - 1
+        ray = -sense * work.r[i]
+        if ray * active.name[i] >= 0.0 or work.lower[w] == work.upper[w]:  # else rounding: it cannot pull that way
+            work.mu[w] = ray
+    work.mu[p] = sense
+
+
+@inline_njit
+def add_constraints(work, active, k, count):
+    """Adds the first ``count`` candidates to the working set, but for those that depend on others; returns its size."""
+    first, solved = k, work.solved
+    for i in range(count):
+        p = abs(work.candidates[i]) - 1
+        place = make_row(work, active, first + i, p)
+        row, size = work.rows[place], int(work.end[p])
+        multiply_rows(work.rows, active.place, k, row, size, solved)
+        solve_lower(active.factor, k, solved)
+        K_pp = dot(row, row, size) + work.softness[p]
+        pivot = K_pp - dot(solved, solved, k)
+        if pivot > _GUESSED_PIVOT * K_pp:
+            active.place[first + i] = active.place[k]
+            write_slot(work, active, k, p, work.candidates[i] > 0)
+            active.place[k], active.free_value[k], active.diagonal[k] = place, dot(row, work.v, len(work.x)), K_pp
+            append_row(active.factor, k, solved, pivot)
+            k += 1
+        else:
+            restore_limits(work, p)
+    return k
+
+
+@inline_njit
+def make_row(work, active, slot, p):
+    """Returns the place of ``w_p = L^-T c_p``, computed in the place that the slot has free if it is not known."""
+    if work.prepared:
+        return p
+    place, n = active.place[slot], len(work.x)
+    row = work.rows[place]
+    if p >= n:
+        c = work.G[p - n]
+        for i in range(n):
+            row[i] = c[i]
+    else:
+        for i in range(n):
+            row[i] = 0.0
+        row[p] = 1.0
+    solve_transposed(work.L, int(work.end[p]), row)
+    return place
+
+
+@inline_njit
+def write_slot(work, active, k, p, above):
+    """Writes constraint p, at its upper bound (``above``) or its lower one, and its multiplier's range to slot k."""
+    cap, equality = work.cap[p], work.lower[p] == work.upper[p]
+    active.name[k] = p + 1 if above else -(p + 1)
+    active.bound[k] = work.upper[p] if above else work.lower[p]
+    active.least[k] = -cap if equality or not above else 0.0
+    active.most[k] = cap if equality or above else 0.0
+
+
+@inline_njit
+def drop_constraint(work, active, k, slot):
+    """Drops the constraint in a slot from the working set of k, and from ``work.solved``; its place becomes free."""
+    delete_row(active.factor, k, slot, work.solved, work.cosines, work.sines)
+    place = active.place[slot]
+    for i in range(slot, k - 1):
+        active.name[i], active.place[i], active.bound[i] = active.name[i + 1], active.place[i + 1], active.bound[i + 1]
+        active.least[i], active.most[i] = active.least[i + 1], active.most[i + 1]
+        active.free_value[i], active.diagonal[i] = active.free_value[i + 1], active.diagonal[i + 1]
+    active.place[k - 1] = place
+
+
+@inline_njit
+def drop_wrong_multipliers(work, active, k):
+    """Solves ``K_WW mu = y_W - b_W``; drops the most wrong multiplier until all are in range. Returns the size.
+
+    Any working set is a valid start of a dual method once this is done.
+    """
+    solved, trial = work.solved, work.r
+    for i in range(k):
+        solved[i] = active.free_value[i] - active.bound[i]
+    solve_lower(active.factor, k, solved)
+    while True:
+        for i in range(k):
+            trial[i] = solved[i]
+        solve_transposed(active.factor, k, trial)
+        worst, slot = 0.0, k
+        for i in range(k):
+            outside = max(trial[i] - active.most[i], active.least[i] - trial[i])
+            if outside > worst:
+                worst, slot = outside, i
+        if slot == k:
+            break
+        p = abs(active.name[slot]) - 1
+        drop_constraint(work, active, k, slot)
+        k -= 1
+        work.mu[p] = 0.0
+        restore_limits(work, p)
+    for i in range(k):
+        work.mu[abs(active.name[i]) - 1] = trial[i]
+    return k
+
+
+@inline_njit
+def minimise(work, active, k):
+    """Writes the minimiser of the Lagrangian, ``P x = -(q + C'mu)``, to the first n entries of y."""
+    n, y = len(work.x), work.y
+    if work.soft:  # constraints at their caps have multipliers, too
+        add_multipliers(work, active, k)
+        for i in range(n):
+            y[i] = -work.slope[i]
+        solve_transposed(work.L, n, y)
+    else:  # L x = v - sum mu_i w_i
+        for i in range(n):
+            y[i] = work.v[i]
+        for i in range(k):
+            work.scratch[i] = work.mu[abs(active.name[i]) - 1]
+        subtract_rows(y, work.rows, active.place, work.scratch, k, n)
+    solve_lower(work.L, n, y)
+
+
+@inline_njit
+def evaluate(work, active, k):
+    """Writes ``y = C x`` for the minimiser x of the Lagrangian."""
+    minimise(work, active, k)
+    multiply_constraints(work)
+
+
+@inline_njit
+def multiply_constraints(work):
+    """Writes ``y[n:] = G y[:n]``, four rows at a time, as far as they may not be zero."""
+    n, y, G = len(work.x), work.y, work.G
+    product, end, p = y[n:], work.end[n:], 0
+    while p + 4 <= len(G):
+        size = int(max(max(end[p], end[p + 1]), max(end[p + 2], end[p + 3])))
+        four_dots((G[p], G[p + 1], G[p + 2], G[p + 3]), y, size, product[p:])
+        p += 4
+    while p < len(G):
+        product[p] = dot(G[p], y, n)
+        p += 1
+
+
+@inline_njit
+def add_multipliers(work, active, k):
+    """Writes ``slope = q + C' mu``; only where rows are soft can others than the working ones have a multiplier."""
+    n, mu, slope = len(work.x), work.mu, work.slope
+    for i in range(n):
+        slope[i] = work.q[i] + mu[i]
+    for i in range(len(work.G) if work.soft else k):
+        p = n + i if work.soft else abs(active.name[i]) - 1
+        if p >= n and mu[p] != 0.0:
+            weight, row = mu[p], work.G[p - n]
+            for j in range(int(work.end[p])):
+                slope[j] += weight * row[j]

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
 from gpmpc.qp import record as layout
-from gpmpc.qp.farkas import proves_infeasibility, zero_row_size
 from gpmpc.qp.problem import ABSENT
-from gpmpc.qp.solution import Terms
+from gpmpc.qp.solution import Terms, proves_infeasibility, zero_row_size
 
 Array = NDArray[np.float64]
 
@@ -47,7 +46,6 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, li
         late: Whether it is time for ``TIME_LIMIT``.
     """
     result = record.copy()
-    result[layout.TAG] = layout.NO_TAG
     try:
         lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
         for dependent in DEPENDENT:

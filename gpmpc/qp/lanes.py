@@ -9,7 +9,7 @@ from numba.core import cgutils, types
 from numba.core.errors import TypingError
 from numba.extending import intrinsic, models, register_model
 
-from gpmpc.compiled import woven
+from gpmpc.compiled import inline_njit
 
 WIDTH = 8
 VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
@@ -41,11 +41,6 @@ def _spread(builder, number, kind=VECTOR):
 def _place(context, builder, array_type, array, index):
     data = context.make_array(array_type)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), VECTOR.as_pointer())
-
-
-def _call(builder, name, *vectors):
-    kind = ir.FunctionType(VECTOR, [VECTOR] * len(vectors))
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), vectors)
 
 
 @intrinsic
@@ -140,33 +135,10 @@ def plus_product(typing_context, values, ones, others):
     return LANES(LANES, LANES, LANES), generate
 
 
-@woven
+@inline_njit
 def product(values, others):
     """``values others``, entry by entry."""
     return plus_product(no_lanes(), values, others)
-
-
-@intrinsic
-def bounded(typing_context, values, limit, beyond):
-    """The entries below ``limit`` in size; ``beyond``, with the entry's sign, in place of the others. NaN stays."""
-
-    def generate(context, builder, signature, arguments):
-        values, limit, beyond = arguments
-        inside = builder.fcmp_unordered("<", _call(builder, "llvm.fabs.v8f64", values), _spread(builder, limit))
-        return builder.select(inside, values, _call(builder, "llvm.copysign.v8f64", _spread(builder, beyond), values))
-
-    return LANES(LANES, types.float64, types.float64), generate
-
-
-@intrinsic
-def negative(typing_context, values):
-    """One where an entry is negative or undefined, zero elsewhere."""
-
-    def generate(context, builder, signature, arguments):
-        below = builder.fcmp_unordered("<", arguments[0], ir.Constant(VECTOR, [0.0] * WIDTH))
-        return builder.uitofp(below, VECTOR)
-
-    return LANES(LANES), generate
 
 
 @intrinsic
@@ -178,17 +150,6 @@ def any_nonzero(typing_context, values):
         return builder.icmp_unsigned("!=", builder.bitcast(nonzero, ir.IntType(WIDTH)), ir.IntType(WIDTH)(0))
 
     return types.boolean(LANES), generate
-
-
-@intrinsic
-def larger(typing_context, values, others):
-    """Entry by entry the larger one of ``values`` and ``|others|``; NaN in ``others`` is passed over."""
-
-    def generate(context, builder, signature, arguments):
-        size = _call(builder, "llvm.fabs.v8f64", arguments[1])
-        return builder.select(builder.fcmp_ordered(">", size, arguments[0]), size, arguments[0])
-
-    return LANES(LANES, LANES), generate
 
 
 @intrinsic
@@ -215,15 +176,7 @@ def folded(typing_context, values, distance):
     return LANES(LANES, distance), generate
 
 
-@woven
-def largest(values):
-    """The largest size among eight numbers."""
-    values = larger(values, folded(values, 4))
-    values = larger(values, folded(values, 2))
-    return max(lane(values, 0), lane(values, 1))
-
-
-@woven
+@inline_njit
 def total(values):
     """The sum of eight numbers."""
     values = plus(values, 1.0, folded(values, 4))
@@ -231,7 +184,7 @@ def total(values):
     return lane(values, 0) + lane(values, 1)
 
 
-@woven
+@inline_njit
 def combine(rows, count, factors, start, width, target):
     """``target[start:][:width] = sum_j factors[j] rows[j, start:][:width]`` over ``count`` rows, in whole lanes.
 

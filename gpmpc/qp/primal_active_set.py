@@ -30,10 +30,8 @@ from scipy.optimize import linprog
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import record as layout
 from gpmpc.qp.dual_rescue import rescue
-from gpmpc.qp.farkas import proves_infeasibility
 from gpmpc.qp.problem import ABSENT, QuadraticProgram
-from gpmpc.qp.solution import QPSolution, make_solution
-from gpmpc.qp.solver import WarmStart
+from gpmpc.qp.solution import QPSolution, WarmStart, make_solution, proves_infeasibility
 from gpmpc.status import Status
 
 Array = NDArray[np.float64]

@@ -1,18 +1,14 @@
-"""One flat array holds the whole result of a solve.
+"""The layout of the one flat array that holds the whole result of a solve.
 
 At two microseconds a solve, every array that crosses between Python and compiled code costs a tenth of the time. The
 dual active set therefore writes all it found into a single record, which the next solve reads as its warm start:
 
-    [status, iterations, n, M, number of working constraints, tag, age | x (n) | multipliers (M) | working set (M) |
-    factor]
+    [status, iterations, n, M, number of working constraints | x (n) | multipliers (M) | working set (M)]
 
 Constraints are stacked, box first: ``C = [I; G]``, M = n + m. A multiplier is positive at an upper and negative at a
 lower bound, so that ``P x + q + C' multipliers = 0``. The working set lists signed numbers: ``+(p + 1)`` for
 constraint p at its upper bound, ``-(p + 1)`` at its lower one. Entries past the number of working constraints are
 undefined.
-
-In Gram mode the factor of the working set's matrix comes along, if the working set is no larger than ``FACTOR_ROOM``,
-with the tag of the prepared problem that it belongs to and its age: the number of changes since it was computed anew.
 """
 
 import numpy as np
@@ -20,9 +16,7 @@ from numpy.typing import NDArray
 
 from gpmpc.status import Status
 
-STATUS, ITERATIONS, VARIABLES, CONSTRAINTS, WORKING, TAG, AGE, HEADER = 0, 1, 2, 3, 4, 5, 6, 7
-FACTOR_ROOM = 96  # working constraints; of 150 variables rarely half work
-NO_TAG = 0.0
+STATUS, ITERATIONS, VARIABLES, CONSTRAINTS, WORKING, HEADER = 0, 1, 2, 3, 4, 5
 
 SOLVED, INFEASIBLE, ITERATION_LIMIT, TIME_LIMIT, NUMERICAL_TROUBLE = 0, 1, 2, 3, 4
 STATUSES = (
@@ -38,18 +32,12 @@ NO_RECORD: NDArray[np.float64] = np.zeros(0)
 
 
 def record_size(variables: int, constraints: int) -> int:
-    """Length of a record without factor, of a problem with M = ``constraints`` stacked constraints."""
+    """Returns the length of the record of a problem with M = ``constraints`` stacked constraints."""
     return HEADER + variables + 2 * constraints
 
 
-def factor_size(variables: int, constraints: int) -> int:
-    """Length of the factor that a record of Gram mode has room for."""
-    largest = min(variables, constraints, FACTOR_ROOM)
-    return largest * (largest + 1) // 2
-
-
 def warm_record(active_set: NDArray, variables: int) -> NDArray[np.float64]:
-    """A record that carries nothing but a working set.
+    """Returns a record that carries nothing but a working set.
 
     Args:
         active_set: (M,) -1 at a lower bound, +1 at an upper bound, 0 otherwise.

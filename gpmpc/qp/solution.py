@@ -1,22 +1,23 @@
-"""What a solver hands back, and how good it is.
+"""The solution of a quadratic program, its residuals, and the protocol of a solver.
 
-A solution is judged by its residuals, which it computes from the problem's own data; a solver's flag is a claim, not a
-proof. With the stacked constraints C = [I; G] and multipliers y (positive at upper, negative at lower bounds) the
-conditions of Karush, Kuhn and Tucker are P x + q + C'y = 0, lower <= C x <= upper, and a zero duality gap.
+A solution is judged by its residuals, which it computes from the problem's own data; a solver's flag proves nothing.
+With the stacked constraints C = [I; G] and multipliers y (positive at upper, negative at lower bounds) the conditions
+of Karush, Kuhn and Tucker are P x + q + C'y = 0, lower <= C x <= upper, and a zero duality gap.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import record as layout
-from gpmpc.qp.farkas import zero_row_size
 from gpmpc.qp.problem import ABSENT, QuadraticProgram
 from gpmpc.status import Status
 
 Array = NDArray[np.float64]
+
+_ROUNDING = 4e-15  # share of a sum's terms that counts as rounding
 
 
 class Terms(NamedTuple):
@@ -24,7 +25,7 @@ class Terms(NamedTuple):
 
     P: Array  # (n, n)
     G: Array  # (m, n)
-    softness: Array  # (2, M), see gpmpc.qp.soft_rows
+    softness: Array  # (2, M), see gpmpc.qp.problem.SoftRows
 
 
 class Residuals(NamedTuple):
@@ -170,6 +171,18 @@ class QPSolution(NamedTuple):
         return float(0.5 * np.sum(violation[soft] ** 2 / softness[soft]) + np.sum(caps[linear] * violation[linear]))
 
 
+WarmStart = QPSolution | NDArray[np.number] | None
+"""The solution of a similar problem, or an active set: (M,) -1 at a lower bound, +1 at an upper one, 0 elsewhere."""
+
+
+class QPSolver(Protocol):
+    """Solves strictly convex quadratic programs; ``gpmpc.testing.check_qp_solver`` checks whether an object does."""
+
+    def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
+        """Returns the minimiser, or the status that says why there is none: the same from any warm start."""
+        ...
+
+
 def _largest_ratio(rest: ArrayLike, own: ArrayLike) -> float:
     """The largest of ``rest / own``, zero where both are."""
     return float(np.max(np.divide(rest, own, out=np.zeros(np.shape(rest)), where=np.not_equal(rest, 0.0))))
@@ -225,3 +238,32 @@ def make_solution(
         build_seconds,
         solve_seconds,
     )
+
+
+@np.errstate(all="ignore")  # what is not finite proves nothing
+def proves_infeasibility(ray: Array, G: Array, lower: Array, upper: Array) -> bool:
+    """Returns whether ``ray`` (M,) is Farkas' proof that no x satisfies ``lower <= [x; Gx] <= upper``.
+
+    There is none if a ray y satisfies C'y = 0 and sum(y+ upper) + sum(y- lower) < 0: summing the constraints with these
+    weights gives 0 < 0. In floating point C'y is not zero. Where a variable has a bound, what is left is moved onto it;
+    where it has none, what is left must be the rounding of its own sum, for else a large x may satisfy the constraints.
+    """
+    n = G.shape[1]
+    rest = ray[:n] + ray[n:] @ G
+    rounding = _ROUNDING * (np.abs(ray[:n]) + np.abs(ray[n:]) @ np.abs(G))
+    repaired = ray.copy()
+    repaired[:n] -= np.where(np.abs(rest) > rounding, rest, 0.0)
+    bounds = np.where(repaired > 0, upper, lower)
+    used = repaired != 0
+    products = repaired[used] * bounds[used]
+    if (np.abs(bounds[used]) >= ABSENT).any() or not np.isfinite(products).all():
+        return False
+    sizes = np.abs(products).sum() + np.abs(ray[n:])[~G.any(axis=1)].sum() * zero_row_size(G, lower, upper)
+    return bool(products.sum() < -_ROUNDING * sizes)
+
+
+def zero_row_size(G: Array, lower: Array, upper: Array) -> float:
+    """Returns the size of the numbers that cancelled in a zero row: that of other bounds, one at most."""
+    others = np.append(np.ones(G.shape[1], dtype=bool), G.any(axis=1))
+    sizes = np.abs(np.concatenate([lower[others], upper[others]]))
+    return float(min(1.0, sizes[sizes < ABSENT].max(initial=0.0) or 1.0))

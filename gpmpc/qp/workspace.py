@@ -1,13 +1,10 @@
-"""The memory that a solve works in, besides the record that it writes.
+"""The memory that the dual active-set kernels work in, besides the record that a solve writes.
 
-To ask the system for it costs as much as a small solve, so each prepared problem or shape keeps it. Threads may share
-it, since a solve keeps the interpreter's lock. It is one matrix, whose rows have an entry per constraint; to slice it
-costs nothing. Its first rows stay the same from solve to solve, the others are otherwise undefined:
-
-    iteration limit, tolerance, whether rows are soft, n, M, tag, smallest share of a pivot of P's factor in P_ii
-    traits (4 rows, see ``gpmpc.qp.working_set``; lazy mode fills in the scales, and the ends of the rows of G)
-    vectors, members (integers), R, and in lazy mode L and rows
+Asking the system for memory costs as much as a small solve, so each shape (and each prepared problem) keeps its own.
+Threads may share it, since a solve keeps the interpreter's lock. It is one matrix, whose rows ``open_workspace`` names.
 """
+
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba.core import types
@@ -15,62 +12,127 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
 
-from gpmpc.compiled import woven
+from gpmpc.compiled import inline_njit
+from gpmpc.qp.record import HEADER
 
 Array = NDArray[np.float64]
 
-LIMIT, TOLERANCE, SOFT, VARIABLES, CONSTRAINTS, TAG, SHARE, SETTINGS = 0, 1, 2, 3, 4, 5, 6, 7
-TRAITS, VECTORS, MEMBERS = 4, 24, 4  # rows of each
-END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
+LIMIT, TOLERANCE, SOFT, PREPARED, SETTINGS = 0, 1, 2, 3, 4
+_REALS, _INTEGERS = 5, 26  # rows of ``memory`` at which vectors begin, after settings and traits,
+_REST = 30  # then integers, the factor of the working set, L and rows
+_END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
 
 
-def gram_workspace(settings: Array, traits: Array) -> Array:
-    """Memory for solves in Gram mode with these settings (7,) and traits (4, M)."""
-    return _workspace(settings, traits, 0)
+class Workspace(NamedTuple):
+    """A quadratic program as the kernels see it, its point, and scratch; C = [I; G], M = n + m.
+
+    A constraint p is represented by its *row* w_p = L^-T c_p, so that K_pq = c_p'P^-1 c_q = w_p . w_q.
+    """
+
+    P: Any  # (n, n)
+    q: Any  # (n,)
+    G: Any  # (m, n)
+    L: Any  # (n, n) with P = L'L
+    rows: Any  # (capacity + 1, n) the w_p of the working set, by place; all M of a prepared problem
+    v: Any  # (n,) -L^-T q: L x = v without working constraints
+    lower: Any  # (M,) bounds, infinite where absent
+    upper: Any
+    allowed_low: Any  # (M,) outside these a constraint is violated; infinite for a working one
+    allowed_high: Any
+    negligible: Any  # (M,) violation of a bound of zero that is none
+    scale: Any  # (M,) length of c_p in the metric of the inverse of P's diagonal
+    softness: Any  # (M,) 1/rho of a quadratic price: added to K_pp
+    cap: Any  # (M,) linear price: the largest size of a multiplier
+    end: Any  # (M,) leading entries of c_p that may not be zero
+    record: Any  # what the solve returns, see ``gpmpc.qp.record``; in it
+    x: Any  # (n,) the point and
+    mu: Any  # (M,) its multipliers
+    y: Any  # (M,) C x
+    excess: Any  # (M,) violations in units of ``scale``
+    violated: Any  # (M,) integers: the constraints with one
+    candidates: Any  # (M,) integers
+    slope: Any  # (n,) q + C'mu
+    gradient: Any  # (n,) P x + q + C'mu
+    rest: Any  # (k,) residual of the working constraints
+    solved: Any  # (k,) L_K^-1 K_Wp
+    r: Any  # (k,) K_WW^-1 K_Wp
+    cosines: Any  # (k,)
+    sines: Any  # (k,)
+    scratch: Any  # (n,) or (k,)
+    capacity: int  # how many constraints can work at once
+    limit: int  # changes of the working set
+    tolerance: float
+    soft: bool  # whether rows are soft
+    prepared: bool  # whether L, scale, end and rows are there
 
 
-def lazy_workspace(settings: Array, softness: Array) -> Array:
-    """Memory for solves in lazy mode with these settings (7,) and softness (2, M)."""
-    n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
-    box = np.arange(M) < n
-    ends = np.minimum(n, (np.arange(M) // END_STEP + 1) * END_STEP)
-    traits = np.vstack([box, softness, box * ends])
-    return _workspace(settings, traits, n * (padded(n) + most_working(n, M, bool(settings[SOFT])) + 2))
+class WorkingSet(NamedTuple):
+    """The constraints that are held at a bound, one to a slot; the kernels pass their number k."""
+
+    name: Any  # integers: p + 1 at the upper bound, -(p + 1) at the lower one
+    place: Any  # integers: which of ``Workspace.rows``; free places from k on
+    bound: Any  # b_p
+    free_value: Any  # c_p'x at the unconstrained minimiser
+    least: Any  # range of the multiplier: [0, cap] at an upper bound,
+    most: Any  # [-cap, 0] at a lower one, [-cap, cap] for an equality
+    diagonal: Any  # K_pp + softness
+    factor: Any  # L_K of K_WW + softness = L_K L_K'
 
 
-def _workspace(settings: Array, traits: Array, own: int) -> Array:
-    n, M = int(settings[VARIABLES]), int(settings[CONSTRAINTS])
-    capacity = most_working(n, M, bool(settings[SOFT]))
+def new_memory(softness: Array, n: int, limit: int, tolerance: float, soft: bool, prepared: bool) -> Array:
+    """Returns memory for programs of n variables with these softness and caps (2, M).
+
+    ``prepared`` makes room for the rows of all constraints.
+    """
+    M = softness.shape[1]
+    capacity = most_working(n, M, soft)
     wide = padded(max(M, capacity + 2, SETTINGS)) + 8  # kernels write whole lanes
-    work = aligned(1 + TRAITS + VECTORS + MEMBERS + capacity + 1 + -(-own // wide), wide)
-    work[0, :SETTINGS] = settings
-    work[1 : 1 + TRAITS, :M] = traits
-    return work
+    own = n * padded(n) + n * (M if prepared else capacity + 1)
+    memory = aligned(_REST + capacity + 1 - (-own // wide), wide)
+    box = np.arange(M) < n
+    memory[0, :SETTINGS] = limit, tolerance, soft, False
+    memory[1, :M], memory[2:4, :M] = box, softness
+    memory[4, :M] = box * np.minimum(n, (np.arange(M) // _END_STEP + 1) * _END_STEP)
+    return memory
+
+
+def softness_in(memory: Array, M: int) -> Array:
+    """Returns softness and caps (2, M), a view."""
+    return memory[2:4, :M]
+
+
+def factor_and_rows(memory: Array, n: int, m: int) -> tuple[Array, Array]:
+    """Returns L of P = L'L, a copy, and the rows w_p (M, n) of prepared memory, a view."""
+    settings, rest = memory[0], memory[_REST:]
+    start = rest[most_working(n, n + m, settings[SOFT] != 0.0) + 1 :].reshape(-1)
+    L = np.tril(start[: n * padded(n)].reshape(n, padded(n))[:, :n])
+    np.fill_diagonal(L, 1.0 / np.diagonal(L))
+    return L, start[n * padded(n) :][: (n + m) * n].reshape(n + m, n)
 
 
 def aligned(rows: int, columns: int) -> Array:
-    """Zeros that begin where a cache line does: a load of eight numbers that spans two lines takes twice the time."""
+    """Returns zeros that begin where a cache line does: loads of eight numbers across two lines take twice the time."""
     memory = np.zeros(rows * columns + 8)
     start = -memory.ctypes.data // 8 % 8
     return memory[start : start + rows * columns].reshape(rows, columns)
 
 
-@woven
+@inline_njit
 def most_working(n, M, soft):
-    """How many constraints can work at once."""
+    """Returns how many constraints can work at once."""
     return M if soft else min(n, M)
 
 
-@woven
+@inline_njit
 def padded(size):
-    """The next multiple of eight."""
+    """Returns the next multiple of eight."""
     return (size + 7) // 8 * 8
 
 
-@woven
+@inline_njit
 def round_end(end, n):
-    """The number of leading entries that are looked at where ``end`` may not be zero."""
-    return min(n, (end + END_STEP - 1) // END_STEP * END_STEP)
+    """Returns the number of leading entries that are read where ``end`` may not be zero."""
+    return min(n, (end + _END_STEP - 1) // _END_STEP * _END_STEP)
 
 
 @intrinsic
@@ -90,34 +152,42 @@ def matrix(typing_context, memory, start, rows, columns):
     return kind(memory, types.intp, types.intp, types.intp), generate
 
 
-@woven
-def carve(work):
-    """The kernels' arrays: settings, traits, vectors, members, R, and the rest of the memory."""
-    settings = work[0]
-    capacity = most_working(int(settings[VARIABLES]), int(settings[CONSTRAINTS]), settings[SOFT] != 0.0)
-    a = 1 + TRAITS
-    b = a + VECTORS
-    c = b + MEMBERS
-    d = c + capacity + 1
-    return settings, work[1:a], work[a:b], work[b:c].view(np.int64), work[c:d], work[d:]
+@inline_njit
+def open_workspace(P, q, G, memory, out):
+    """Returns the workspace and the working set in ``memory`` and the record ``out``."""
+    n, M = len(q), len(q) + len(G)
+    settings, real, whole = memory[0], memory[_REALS:_INTEGERS], memory[_INTEGERS:_REST].view(np.int64)
+    soft = settings[SOFT] != 0.0
+    capacity = most_working(n, M, soft)
+    factor, rest = memory[_REST : _REST + capacity + 1], memory[_REST + capacity + 1 :]
+    L, rows = matrix(rest, 0, n, padded(n)), matrix(rest, n * padded(n), M, n)
+    x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
+    work = Workspace(
+        P, q, G, L, rows, real[0], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2], memory[3],
+        memory[4], out, x, mu, real[6][:M], real[7], whole[0], whole[1], real[8], real[9], real[10], real[11], real[12],
+        real[13], real[14], real[15], capacity, int(settings[LIMIT]), settings[TOLERANCE], soft,
+        settings[PREPARED] != 0.0,
+    )  # fmt: skip
+    active = WorkingSet(whole[2], whole[3], real[16], real[17], real[18], real[19], real[20], factor)
+    return work, active
 
 
-@woven
+@inline_njit
 def is_dense(vector):
-    """Whether a vector is as contiguous as its type claims: ``gpmpc.compiled.direct`` does not ask."""
+    """Returns whether a vector is as contiguous as its type claims: an unchecked entry point does not look."""
     return vector.strides[0] == vector.itemsize or len(vector) <= 1
 
 
-@woven
+@inline_njit
 def is_dense_matrix(A):
-    """The same for a matrix."""
+    """Returns whether a matrix is as contiguous as its type claims."""
     rows, columns = A.shape
     return (A.strides[0] == columns * A.itemsize and A.strides[1] == A.itemsize) or rows * columns == 0
 
 
-@woven
+@inline_njit
 def all_finite(vector):
-    """Whether no entry is infinite or NaN."""
+    """Returns whether no entry is infinite or NaN."""
     undefined = 0.0
     for value in vector:
         undefined += value * 0.0

@@ -36,7 +36,7 @@ _OBJECT = 2000  # [bytes] that a message takes besides its content
 _HEAD = struct.Struct("<BQ")  # kind and length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CLASSES = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.ATTACHMENT: Attachment, Opcode.METADATA: Metadata}
-_BROKEN = (McapError, struct.error, UnicodeDecodeError, OverflowError, zstandard.ZstdError, RuntimeError)
+_BROKEN = (McapError, struct.error, UnicodeDecodeError, OverflowError, zstandard.ZstdError)
 
 
 def room(path: Path) -> int:
@@ -174,7 +174,10 @@ def _unfold(chunk: Chunk) -> bytes:
             raise EndOfFile
         data = zstandard.decompress(data, max_output_size=size)
     elif chunk.compression == "lz4":
-        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
+        try:
+            data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
+        except RuntimeError as error:
+            raise EndOfFile from error
     if len(data) != size or not _agree(chunk.uncompressed_crc, zlib.crc32(data)):
         raise EndOfFile
     return data

@@ -37,6 +37,7 @@ class Kept(NamedTuple):
     """A step with copies of its arrays."""
 
     step: Step  # its numbers hold; its arrays may have changed since
+    gp_size: int
     reference: Array
     state: Array
     measured: Array
@@ -54,7 +55,7 @@ class Kept(NamedTuple):
         return self.step.decision.status if self.step.status is None else self.step.status
 
 
-def keep(step: Step, n: int, m: int, record_problems: bool) -> Kept:
+def keep(step: Step, gp_size: int | None, n: int, m: int, record_problems: bool) -> Kept:
     """Copies a step.
 
     Raises:
@@ -84,7 +85,8 @@ def keep(step: Step, n: int, m: int, record_problems: bool) -> Kept:
         given = [np.array(array, dtype=float) for array in given]
     else:
         given = None
-    return Kept(step, *copies[:6], tuple(copies[6:]) or None, given, solution, size)
+    gp_size = step.gp_size if gp_size is None else gp_size
+    return Kept(step, gp_size, *copies[:6], tuple(copies[6:]) or None, given, solution, size)
 
 
 class Encoder:
@@ -142,7 +144,7 @@ class Encoder:
                     iterations=0 if decision is None else decision.iterations,
                     active_set_size=0 if solution is None else np.count_nonzero(solution.active_set),
                     timing=timings[row],
-                    gp_size=about.gp_size,
+                    gp_size=step.gp_size,
                     gp_version=about.gp_version,
                     failed=about.failed,
                     **self._bounds,

@@ -102,8 +102,12 @@ class McapRecorder:
         if live:
             self._serve(context)
 
-    def record(self, step: Step) -> None:
+    def record(self, step: Step, gp_size: int | None = None) -> None:
         """Takes a copy of a step.
+
+        Args:
+            step: As a closed loop makes it.
+            gp_size: Transitions that the model holds, where the step does not say.
 
         Raises:
             ShapeError: An array does not fit the names of states and inputs.
@@ -111,7 +115,7 @@ class McapRecorder:
         """
         if self._error is not None:
             raise RecordingError(self._error)
-        kept = keep(step, self._n, self._m, self._record_problems)
+        kept = keep(step, gp_size, self._n, self._m, self._record_problems)
         if 4 * kept.size > LARGEST:
             raise RecordingError(f"{self.path}: a step of {kept.size} bytes is too large; at most {LARGEST // 4}")
         self._waiting.append(kept)

@@ -1,7 +1,7 @@
-"""Problem: what is there is not always what the controller believes in: wind, another payload, a sensor that drops out.
+"""Disturbs what a controller believes in: wind, another payload, a sensor that drops out.
 
-A ``Disturbance`` is asked, step by step, for the plant that really acts and for what is really measured. Times are
-those at which a step begins: a window that opens within a step acts from the next one on.
+A ``Disturbance`` says, step by step, which plant really acts and what is really measured. Times are those at which a
+step begins: a window that opens within a step acts from the next one on.
 """
 
 import math
@@ -16,17 +16,19 @@ from gpmpc.systems import Dynamics, Plant
 
 
 class Disturbance(Protocol):
-    """Something that a controller is not told of."""
+    """Something that a controller does not know of."""
 
-    def acting(self, plant: Plant, time: float) -> Plant:
-        """The plant that acts in the step from a time [s] on, in the place of the given one."""
+    def disturb_plant(self, plant: Plant, time: float) -> Plant:
+        """Returns the plant that acts in the step from a time [s] on, in the place of the given one."""
+        return plant
 
-    def measured(self, state: np.ndarray, time: float) -> np.ndarray:
-        """What is measured of a state (n,) at a time [s], in the place of the given one."""
+    def disturb_measurement(self, state: np.ndarray, time: float) -> np.ndarray:
+        """Returns what is measured of a state (n,) at a time [s], in the place of the given one."""
+        return state
 
 
 @dataclass(frozen=True)
-class Gust:
+class Gust(Disturbance):
     """A constant push on single states over a time window, integrated by the plant like any other force.
 
     (On a ``Map``, whose right-hand side is the next state, it is added to that.)
@@ -52,8 +54,8 @@ class Gust:
         for name, rate in self.rates.items():
             check_number(f"rates.{name}", rate)
 
-    def acting(self, plant: Plant, time: float) -> Plant:
-        """The plant with the push, inside the window.
+    def disturb_plant(self, plant: Plant, time: float) -> Plant:
+        """Returns the plant with the push, inside the window.
 
         Raises:
             SettingError: The plant has no such state.
@@ -72,13 +74,9 @@ class Gust:
             )
         return replace(plant, dynamics=_Pushed(plant.dynamics, tuple(float(self.rates.get(s, 0.0)) for s in names)))
 
-    def measured(self, state: np.ndarray, time: float) -> np.ndarray:
-        """The state: a gust is felt, not measured."""
-        return state
-
 
 @dataclass(frozen=True)
-class Replaced:
+class Replaced(Disturbance):
     """Another plant over a time window: another mass, a broken arm.
 
     Attributes:
@@ -97,8 +95,8 @@ class Replaced:
     def __post_init__(self) -> None:
         _check_window(self.start, self.stop)
 
-    def acting(self, plant: Plant, time: float) -> Plant:
-        """The other plant, inside the window.
+    def disturb_plant(self, plant: Plant, time: float) -> Plant:
+        """Returns the other plant, inside the window.
 
         Raises:
             ShapeError: The two have other states, inputs or time steps.
@@ -110,13 +108,9 @@ class Replaced:
             raise ShapeError(f"a plant must be replaced by one of the same states, inputs, step {ours}; got {theirs}")
         return self.plant if self.start <= time < self.stop else plant
 
-    def measured(self, state: np.ndarray, time: float) -> np.ndarray:
-        """The state."""
-        return state
-
 
 @dataclass(frozen=True)
-class Dropout:
+class Dropout(Disturbance):
     """Nothing is measured over a time window: entries of the state are NaN.
 
     Attributes:
@@ -140,8 +134,8 @@ class Dropout:
                 check_number("entries", entry, least=0, whole=True)
             object.__setattr__(self, "entries", tuple(entries))
 
-    def acting(self, plant: Plant, time: float) -> Plant:
-        """The plant.
+    def disturb_plant(self, plant: Plant, time: float) -> Plant:
+        """Returns the plant.
 
         Raises:
             SettingError: The plant has no such entry.
@@ -152,8 +146,8 @@ class Dropout:
                 raise SettingError("entries", f"must be indices of states, 0 to {n - 1}; got {entry!r}")
         return plant
 
-    def measured(self, state: np.ndarray, time: float) -> np.ndarray:
-        """NaN inside the window."""
+    def disturb_measurement(self, state: np.ndarray, time: float) -> np.ndarray:
+        """Returns NaN inside the window."""
         if not self.start <= time < self.stop:
             return state
         lost = state.copy()

@@ -1,93 +1,54 @@
-"""Problem: let a controller steer a system along references, and keep what happened.
+"""Closes the loop: a controller steers a plant, or a learned model, along references.
 
-    measure -> ask the controller -> fall back by the policy where it failed -> apply -> record
+    measure -> decide (by the policy where the controller fails) -> step -> record
 
-The loop knows neither file formats nor figures: who wants every step as it happens gives ``on_step``, which is called
-after the step and outside of everything that is timed.
+``fly`` is the only loop; one flight, a cascade and many trials differ in what decides.
 """
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from gpmpc.exceptions import Diverged, GpmpcError, ShapeError, check_number
+from gpmpc.exceptions import Diverged, GpmpcError, SettingError, ShapeError, SolverFailure, check_number
+from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Controller, Reference, Timing
 from gpmpc.mpc.supervision import Command, OnFailure, check_policy, command
 from gpmpc.simulation.disturbances import Disturbance
-from gpmpc.simulation.systems import ModelLoop, Noise, Running, RunningModel, RunningPlant
+from gpmpc.simulation.simulator import ModelLoop, ModelSimulator, Noise, PlantSimulator, Simulator, step_together
 from gpmpc.status import Status
+from gpmpc.step import Step
 from gpmpc.systems import Plant
 
-
-@dataclass(frozen=True)
-class Step:
-    """One step of a loop.
-
-    Attributes:
-        index: k.
-        time: When it began [s].
-        state: x[k], or the mean of the belief (n,).
-        covariance: Of the belief (n, n); zero with a plant in the loop.
-        measured: What the controller was told of it (n,).
-        reference: What it was to follow.
-        command: What it decided, and what came of it.
-        input: What acted (m,).
-        next_state: x[k+1] (n,).
-    """
-
-    index: int
-    time: float  # [s]
-    state: np.ndarray
-    covariance: np.ndarray
-    measured: np.ndarray
-    reference: Reference
-    command: Command
-    input: np.ndarray
-    next_state: np.ndarray
+Array = np.ndarray
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """K steps of a closed loop.
+    """K steps of a closed loop."""
 
-    Attributes:
-        states: x[0] .. x[K], or the means of the beliefs (K + 1, n).
-        covariances: Of the beliefs (K + 1, n, n); zero with a plant in the loop.
-        measured: What the controller was told of x[0] .. x[K-1] (K, n).
-        inputs: What acted, u[0] .. u[K-1] (K, m).
-        references: r[0] .. r[K] (K + 1, n); the last one is r[K-1] once more where no r[K] was given.
-        predicted_means: What the controller expected of x[1] .. x[K] (K, n); NaN where its plan was not applied.
-        predicted_covariances: The same (K, n, n).
-        statuses: How every solve ended, K.
-        iterations: Of the solver (K,).
-        timings: Where the wall time of every decision went, K.
-        time_step: Of one step [s].
-        suboptimal: The steps at which a plan was applied whose solve had stopped short of its tolerance.
-    """
-
-    states: np.ndarray
-    covariances: np.ndarray
-    measured: np.ndarray
-    inputs: np.ndarray
-    references: np.ndarray
-    predicted_means: np.ndarray
-    predicted_covariances: np.ndarray
-    statuses: tuple[Status, ...]
-    iterations: np.ndarray
-    timings: tuple[Timing, ...]
+    states: Array  # (K + 1, n) x[0] .. x[K], or the means of the beliefs
+    covariances: Array  # (K + 1, n, n) of the beliefs; zero with a plant in the loop
+    measured: Array  # (K, n) what the controller was told of x[0] .. x[K-1]
+    inputs: Array  # (K, m) that were applied, u[0] .. u[K-1]
+    references: Array  # (K + 1, n) r[0] .. r[K]; the last one is r[K-1] again where no r[K] was given
+    predicted_means: Array  # (K, n) that the controller expected of x[1] .. x[K]; NaN where its plan was not applied
+    predicted_covariances: Array  # (K, n, n)
+    statuses: tuple[Status, ...]  # K, how every solve ended
+    iterations: Array  # (K,) of the solver
+    timings: tuple[Timing, ...]  # K, where the wall time of every decision went
     time_step: float  # [s]
-    suboptimal: tuple[int, ...] = ()
+    suboptimal: tuple[int, ...] = ()  # steps at which a plan was applied whose solve stopped short of its tolerance
 
     @property
-    def times(self) -> np.ndarray:
+    def times(self) -> Array:
         """When x[0] .. x[K] were (K + 1,) [s]."""
         return self.time_step * np.arange(len(self.states))
 
     @property
-    def seconds(self) -> np.ndarray:
+    def seconds(self) -> Array:
         """Wall time of every decision (K,) [s]."""
         return np.array([timing.total for timing in self.timings])
 
@@ -101,7 +62,7 @@ class Rollout:
 def closed_loop(
     system: Plant | ModelLoop,
     controller: Controller,
-    references: Reference | np.ndarray,
+    references: Reference | Array,
     initial: Any,
     steps: int,
     *,
@@ -122,11 +83,11 @@ def closed_loop(
             drawn from.
         steps: K.
         noise: On a plant's states, measurements and inputs.
-        disturbances: Gusts, other plants, dropouts: what the controller is not told of.
+        disturbances: Gusts, other plants, dropouts: what the controller does not know of.
         on_failure: What is applied where a solve fails: ``"previous_plan"``, ``"hold"`` or ``"raise"``; see
             ``gpmpc.mpc.supervision``.
-        seed: Of all random numbers; the same seed gives the same numbers.
-        on_step: Called with every step.
+        seed: Of all random numbers; equal seeds give equal numbers.
+        on_step: Called after every step and outside of everything that is timed, such as a recorder's ``record``.
 
     Raises:
         ShapeError: Too few references for the steps and the horizon, or a state of the wrong length.
@@ -136,118 +97,204 @@ def closed_loop(
     """
     check_number("steps", steps, least=1, whole=True)
     check_policy(on_failure)
-    references = checked_references(references, steps, controller.horizon)
-    if isinstance(system, ModelLoop):
-        running: Running = RunningModel(system, initial, disturbances, noise)
+    references = check_references(references, steps, controller.horizon)
+    if not isinstance(system, ModelLoop):
+        simulator: Simulator = PlantSimulator(system, initial, disturbances, noise, seed)
+    elif disturbances or noise is not None:
+        raise SettingError("disturbances, noise", "need a plant in the loop; got a ModelLoop")
     else:
-        running = RunningPlant(system, initial, disturbances, noise, seed)
-    taken, last = [], None
-    for k in range(steps):
-        ahead = window(references, k, controller.horizon)
-        try:
-            step = one_step(running, controller, ahead, last, on_failure, k, round(k * system.time_step, 9))
-        except Diverged as error:
-            if taken:
-                error.flown = rollout(taken, references, system.time_step, running.mean, running.covariance)
-            raise
-        taken.append(kept(step))
-        last = step.command
-        if on_step is not None:
-            on_step(step)
-    return rollout(taken, references, system.time_step, running.mean, running.covariance)
+        simulator = ModelSimulator(system, initial)
+    history = History(on_step)
+
+    def decide(k: int, beliefs: Sequence[Gaussian], last: Sequence[Command | None]) -> list[Command]:
+        return [command(controller, beliefs[0], window(references, k, controller.horizon), last[0], on_failure, k)]
+
+    flight = Flight(simulator, history.recording(references))
+    fly([flight], decide, steps, system.time_step)
+    rollout = history.rollout(simulator, references, system.time_step) if history.steps else None
+    if isinstance(flight.error, Diverged):
+        flight.error.flown = rollout
+        raise flight.error
+    return rollout
 
 
 def rehearse(system: Plant | ModelLoop, controller: Controller, references: Reference, initial: Any) -> None:
     """Flies the first two steps, without noise, and forgets them: a flight's times then hold no compiling and loading.
 
-    Two, since the second one starts from a plan. What fails here fails again in the flight, and is told there.
+    Two, since the second one starts from a plan. What fails here fails again in the flight, and is raised there.
     """
     with suppress(GpmpcError):
         closed_loop(system, controller, references, initial, 2, on_failure="previous_plan")
 
 
-def one_step(
-    running: Running,
-    controller: Controller,
-    reference: Reference,
-    last: Command | None,
-    on_failure: OnFailure,
-    k: int,
-    time: float,
-) -> Step:
-    """Measures, asks, applies."""
-    state, covariance, belief = running.mean, running.covariance, running.measure(time)
-    asked = command(controller, belief, reference, last, on_failure, k)
-    acted = running.apply(time, asked.input)
-    measured = belief.mean.cpu().numpy().astype(float)
-    return Step(k, time, state, covariance, measured, reference, asked, acted, running.mean)
+class Decided(Protocol):
+    """What one step applies."""
+
+    @property
+    def input(self) -> Array:
+        """(m,)."""
 
 
-class Kept(NamedTuple):
-    """What a ``Rollout`` keeps of a step: none of its quadratic program, and one row of its plan."""
+class Moment(NamedTuple):
+    """Where a step began, and what was applied."""
 
-    state: np.ndarray
-    covariance: np.ndarray
-    measured: np.ndarray
-    input: np.ndarray
-    expected: np.ndarray  # mean of the next state; NaN where no plan was applied
-    expected_covariance: np.ndarray
+    k: int
+    time: float  # [s]
+    state: Array  # (n,)
+    covariance: Array  # (n, n)
+    measured: Array  # (n,)
+    input: Array  # (m,)
+
+    def part(self, k: int, states: slice, input: Array) -> "Moment":
+        """Selects some states, of a step numbered k that applied an input."""
+        covariance = self.covariance[states, states]
+        return Moment(k, self.time, self.state[states], covariance, self.measured[states], input)
+
+
+class Flight:
+    """One simulator under way.
+
+    Args:
+        simulator: At its initial state.
+        record: Called after every step with its ``Moment`` and what was decided.
+    """
+
+    def __init__(self, simulator: Simulator, record: Callable[[Moment, Any], None]):
+        self.simulator, self.record = simulator, record
+        self.last: Any = None
+        self.error: SolverFailure | Diverged | None = None
+
+
+def fly(
+    flights: Sequence[Flight],
+    decide: Callable[[int, Sequence[Gaussian], Sequence[Any]], Sequence[Decided | SolverFailure]],
+    steps: int,
+    time_step: float,
+) -> None:
+    """Runs the loop of all flights in step; one that fails ends with its error, and the others go on.
+
+    Args:
+        flights: Of one plant.
+        decide: From the number of the step, what is known of the states, and what was decided one step ago (None at the
+            first), to what is to be applied.
+        steps: K.
+        time_step: [s].
+    """
+    for k in range(steps):
+        time, moving = round(k * time_step, 9), []
+        flying = [flight for flight in flights if flight.error is None]
+        beliefs = [flight.simulator.measure(time) for flight in flying]
+        decisions = decide(k, beliefs, [flight.last for flight in flying]) if flying else ()
+        for flight, belief, decided in zip(flying, beliefs, decisions, strict=True):
+            if isinstance(decided, SolverFailure):
+                flight.error = decided
+            else:
+                moving.append((flight, belief, decided, flight.simulator.mean, flight.simulator.covariance))
+        applied = step_together([flight.simulator for flight, *_ in moving], time, [each[2].input for each in moving])
+        for (flight, belief, decided, state, covariance), input in zip(moving, applied, strict=True):
+            if isinstance(input, Diverged):
+                flight.error = input
+            else:
+                measured = belief.mean.cpu().numpy().astype(float)
+                flight.last = decided
+                flight.record(Moment(k, time, state, covariance, measured, input), decided)
+
+
+class StepSummary(NamedTuple):
+    """What a ``Rollout`` holds of a step: nothing of its quadratic program, and one row of its plan."""
+
+    state: Array
+    covariance: Array
+    measured: Array
+    input: Array
+    reference: Array
+    expected: Array  # mean of the next state; NaN where no plan was applied
+    expected_covariance: Array
     status: Status
     failed: bool
     iterations: int
     timing: Timing
 
 
-def kept(step: Step) -> Kept:
-    """See ``Kept``."""
-    decision, n = step.command.decision, len(step.state)
-    expected, covariance = np.full(n, np.nan), np.full((n, n), np.nan)
-    iterations, timing = 0, Timing(0.0, 0.0, 0.0)
-    if decision is not None:
-        iterations, timing = decision.iterations, decision.timing
-        if not step.command.failed:
-            expected, covariance = np.array(decision.means[1]), np.array(decision.covariances[1])
-    taken = (step.state, step.covariance, step.measured, step.input, expected, covariance)
-    return Kept(*taken, step.command.status, step.command.failed, iterations, timing)
+class History:
+    """Collects the steps of one loop for its ``Rollout``.
 
+    Args:
+        on_step: Called with every step.
+    """
 
-def rollout(
-    steps: Sequence[Kept],
-    references: Reference,
-    time_step: float,
-    final: np.ndarray,
-    final_covariance: np.ndarray | None = None,
-) -> Rollout:
-    """The arrays of all steps, and the last state (n,); its covariance (n, n) is zero by default."""
-    n = len(final)
-    final_covariance = np.zeros((n, n)) if final_covariance is None else final_covariance
-    rows = references.states[: len(steps) + 1]
-    if len(rows) == len(steps):
-        rows = np.concatenate([rows, rows[-1:]])
-    return Rollout(
-        states=np.array([*(step.state for step in steps), final]),
-        covariances=np.array([*(step.covariance for step in steps), final_covariance]),
-        measured=np.array([step.measured for step in steps]),
-        inputs=np.array([step.input for step in steps]),
-        references=np.array(rows, dtype=float),
-        predicted_means=np.array([step.expected for step in steps]),
-        predicted_covariances=np.array([step.expected_covariance for step in steps]),
-        statuses=tuple(step.status for step in steps),
-        iterations=np.array([step.iterations for step in steps]),
-        timings=tuple(step.timing for step in steps),
-        time_step=time_step,
-        suboptimal=tuple(k for k, step in enumerate(steps) if not (step.failed or step.status.solved)),
-    )
+    def __init__(self, on_step: Callable[[Step], None] | None = None):
+        self.steps: list[StepSummary] = []
+        self._on_step = on_step
+
+    def recording(self, references: Reference) -> Callable[[Moment, Command], None]:
+        """Makes the ``record`` of a flight along references."""
+        return lambda moment, decided: self.add(moment, references.states[moment.k], decided)
+
+    def add(self, moment: Moment, reference: Array, decided: Command) -> None:
+        """Adds a step that was to be at a reference state (n,)."""
+        decision, n = decided.decision, len(moment.state)
+        expected, covariance = np.full(n, np.nan), np.full((n, n), np.nan)
+        iterations, timing = 0, Timing(0.0, 0.0, 0.0)
+        if decision is not None:
+            iterations, timing = decision.iterations, decision.timing
+            if not decided.failed:
+                expected, covariance = np.array(decision.means[1]), np.array(decision.covariances[1])
+        if self._on_step is not None:
+            before = self.steps[-1].expected if self.steps else np.nan
+            self._on_step(
+                Step(
+                    time=moment.time,
+                    k=moment.k,
+                    reference=np.asarray(reference, dtype=float),
+                    state=moment.state,
+                    measured=moment.measured,
+                    input=np.asarray(moment.input, dtype=float),
+                    decision=decision,
+                    innovation=moment.measured - before,
+                    belief_covariance=moment.covariance,
+                    failed=decided.failed,
+                    status=decided.status,
+                )
+            )
+        at = (moment.state, moment.covariance, moment.measured, moment.input, reference)
+        self.steps.append(StepSummary(*at, expected, covariance, decided.status, decided.failed, iterations, timing))
+
+    def rollout(self, end: Simulator, references: Reference, time_step: float, states: slice = slice(None)) -> Rollout:
+        """Makes the arrays of all steps.
+
+        Args:
+            end: Where the flight ended.
+            references: The last reference state is the one of the end, where it has so many.
+            time_step: [s].
+            states: Which of the simulator's states these are.
+        """
+        steps = self.steps
+        last = references.states[min(len(steps), len(references.states) - 1)]
+        return Rollout(
+            states=np.array([*(step.state for step in steps), end.mean[states]]),
+            covariances=np.array([*(step.covariance for step in steps), end.covariance[states, states]]),
+            measured=np.array([step.measured for step in steps]),
+            inputs=np.array([step.input for step in steps]),
+            references=np.array([*(step.reference for step in steps), last], dtype=float),
+            predicted_means=np.array([step.expected for step in steps]),
+            predicted_covariances=np.array([step.expected_covariance for step in steps]),
+            statuses=tuple(step.status for step in steps),
+            iterations=np.array([step.iterations for step in steps]),
+            timings=tuple(step.timing for step in steps),
+            time_step=time_step,
+            suboptimal=tuple(k for k, step in enumerate(steps) if not (step.failed or step.status.solved)),
+        )
 
 
 def window(references: Reference, k: int, horizon: int) -> Reference:
-    """What a controller is to follow over its horizon from step k on."""
+    """Selects what a controller is to follow over its horizon from step k on."""
     inputs = None if references.inputs is None else references.inputs[k : k + horizon]
     return Reference(references.states[k : k + horizon + 1], inputs)
 
 
-def checked_references(references: Reference | np.ndarray, steps: int, horizon: int) -> Reference:
-    """References for all steps.
+def check_references(references: Reference | Array, steps: int, horizon: int) -> Reference:
+    """Returns references for all steps.
 
     Raises:
         ShapeError: Too few, or no table.

@@ -1,8 +1,9 @@
-"""Problem: one flight is an anecdote; an experiment has to be flown with many seeds, and none may stop the others.
+"""Runs many seeds: any trial in parallel processes, or closed loops together in one.
 
-Seeds are independent, so they run in parallel processes. A trial is a callable of its seed that a fresh process can
-import: a function of a module, or a frozen dataclass with ``__call__`` that builds its controller itself. (A script
-that calls ``trials`` does so under ``if __name__ == "__main__":``.)
+In processes, a trial is a callable of its seed that a fresh process can import: a function of a module, or a frozen
+dataclass with ``__call__`` that builds its controller itself. Together, all trials are measured, the controller decides
+for all at once (``control_many``, where it has that), and the plant steps all at once. A trial's numbers are those of
+``closed_loop`` with its seed, however many fly beside it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -15,25 +16,25 @@ from typing import Any
 import numpy as np
 import torch
 
-from gpmpc.exceptions import GpmpcError, SettingError, check_number
+from gpmpc.exceptions import GpmpcError, SettingError, SolverFailure, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.controller import Controller, Reference
+from gpmpc.mpc.supervision import Command, OnFailure, check_policy, commands
 from gpmpc.parallel import cores, in_processes
+from gpmpc.simulation.disturbances import Disturbance
+from gpmpc.simulation.loop import Flight, History, check_references, fly, window
+from gpmpc.simulation.simulator import ModelLoop, Noise, PlantSimulator
+from gpmpc.systems import Plant
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of one seed.
+    """The result of one seed."""
 
-    Attributes:
-        name: Of the trial, such as "seed 3".
-        seed: Its seed.
-        result: What it returned; None where it failed.
-        error: Why it failed, with the kind of the error; None where it did not.
-    """
-
-    name: str
+    name: str  # such as "seed 3"
     seed: int
-    result: Any
-    error: str | None
+    result: Any  # what the trial returned; None where it failed
+    error: str | None  # why it failed, with the kind of the error; None where it did not
 
 
 def trials(
@@ -62,13 +63,13 @@ def trials(
         SettingError: No seeds, a seed twice, or a worker count below 1.
         GpmpcError: A worker process died.
     """
-    seeds = checked_seeds(seeds)
+    seeds = _check_seeds(seeds)
     if workers is not None:
         check_number("workers", workers, least=1, whole=True)
     run = partial(_run, trial)
     serial = (workers or cores()) == 1 or len(seeds) == 1
     found: dict[int, Trial] = {}
-    with progress_bar(label, len(seeds), progress) as advance:
+    with _progress_bar(label, len(seeds), progress) as advance:
         try:
             with closing(_here(run, seeds) if serial else in_processes(run, seeds, workers)) as finished:
                 for index, outcome in finished:
@@ -82,8 +83,96 @@ def trials(
     return [found[index] for index in range(len(seeds))]
 
 
-def checked_seeds(seeds: int | Sequence[int]) -> list[int]:
-    """The seeds one by one.
+def closed_loops(
+    plant: Plant,
+    controller: Controller,
+    references: Reference | np.ndarray,
+    initial: Any,
+    steps: int,
+    seeds: int | Sequence[int],
+    *,
+    noise: Noise | None = None,
+    disturbances: Sequence[Disturbance] = (),
+    on_failure: OnFailure = "raise",
+    chunk: int | None = None,
+) -> list[Trial]:
+    """Flies a controller on a plant with many seeds at once.
+
+    Args:
+        plant: What is steered; its right-hand side is evaluated on arrays, an entry a trial.
+        controller: Its feedback law, of all trials; a ``GPMPC`` decides for them together, any other one by one.
+        references: Of all trials; see ``closed_loop``.
+        initial: The state (n,), or the ``Gaussian`` that every trial's is drawn from.
+        steps: K.
+        seeds: One a trial; a number stands for 0 .. seeds - 1.
+        noise: On states, measurements and inputs; a trial's draws are those of ``closed_loop`` with its seed.
+        disturbances: Of all trials.
+        on_failure: What a trial applies where its solve fails; see ``closed_loop``. With ``"raise"`` that trial ends,
+            and the others fly on.
+        chunk: How many trials fly at a time; as many as the controller has a gigabyte for by default.
+
+    Returns:
+        One ``Trial`` a seed with its ``Rollout``, in the order of the seeds. Trials whose solve failed, by the policy,
+        and whose plant diverged have an error instead.
+
+    Raises:
+        ShapeError: As for ``closed_loop``.
+        SettingError: As for ``closed_loop`` and ``trials``; a model loop, in which a seed changes nothing; or no
+            ``chunk`` where the controller cannot say how much memory a trial takes.
+    """
+    if isinstance(plant, ModelLoop):
+        raise SettingError("plant", "a model loop draws no random numbers, all seeds are one flight; take closed_loop")
+    check_number("steps", steps, least=1, whole=True)
+    check_policy(on_failure)
+    seeds, horizon = _check_seeds(seeds), controller.horizon
+    references = check_references(references, steps, horizon)
+    size = chunk_size(controller, len(seeds), chunk=chunk)
+
+    def decide(k: int, beliefs: Sequence[Gaussian], last: Sequence[Command | None]) -> list[Command | SolverFailure]:
+        return commands(controller, beliefs, window(references, k, horizon), last, on_failure, k)
+
+    finished: list[Trial] = []
+    for start in range(0, len(seeds), size):
+        some, flights, histories = seeds[start : start + size], [], []
+        for seed in some:
+            histories.append(History())
+            simulator = PlantSimulator(plant, initial, disturbances, noise, seed)
+            flights.append(Flight(simulator, histories[-1].recording(references)))
+        fly(flights, decide, steps, plant.time_step)
+        for seed, flight, history in zip(some, flights, histories, strict=True):
+            if flight.error is not None:
+                finished.append(_failed(seed, flight.error))
+            else:
+                rollout = history.rollout(flight.simulator, references, plant.time_step)
+                finished.append(Trial(f"seed {seed}", seed, rollout, None))
+    return finished
+
+
+def chunk_size(controller: Controller, trials: int, memory: int = 2**30, chunk: int | None = None) -> int:
+    """Says how many trials fly at a time.
+
+    Args:
+        controller: It says what a question takes (``bytes_per_question``); one that decides one by one need not.
+        trials: How many there are.
+        memory: That may be taken for all that fly at a time [bytes].
+        chunk: The result, where it is given.
+
+    Raises:
+        SettingError: A number below 1, or the controller cannot say what a question takes.
+    """
+    if chunk is not None:
+        check_number("chunk", chunk, least=1, whole=True)
+        return min(chunk, trials)
+    if not hasattr(controller, "control_many"):
+        return trials
+    each = controller.bytes_per_question
+    if each is None:
+        raise SettingError("chunk", "the memory that this model takes is not known: say how many trials fly at a time")
+    return min(trials, max(1, int(memory // each)))
+
+
+def _check_seeds(seeds: int | Sequence[int]) -> list[int]:
+    """Returns the seeds one by one.
 
     Raises:
         SettingError: There are none, or one is there twice or is no whole number from 0 on.
@@ -99,19 +188,19 @@ def checked_seeds(seeds: int | Sequence[int]) -> list[int]:
     return seeds
 
 
-def failed(seed: int, error: Exception) -> Trial:
-    """The trial of a seed that came to nothing."""
+def _failed(seed: int, error: Exception) -> Trial:
+    """Makes the trial of a seed that failed."""
     return Trial(f"seed {seed}", seed, None, f"{type(error).__name__}: {error}")
 
 
 def _run(trial: Callable[[int], Any], seed: int) -> Trial:
-    """One trial; its error is a result like any other, so that the others go on."""
+    """Runs one trial; its error is a result like any other, so that the others go on."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         return Trial(f"seed {seed}", seed, trial(seed), None)
     except Exception as error:
-        return failed(seed, error)
+        return _failed(seed, error)
     finally:
         torch.set_num_threads(threads)
 
@@ -122,8 +211,8 @@ def _here(run: Callable[[int], Trial], seeds: Sequence[int]) -> Iterator[tuple[i
 
 
 @contextmanager
-def progress_bar(label: str, total: int, shown: bool) -> Iterator[Callable[[], None]]:
-    """One progress bar, or none; gives the function to call after every trial."""
+def _progress_bar(label: str, total: int, shown: bool) -> Iterator[Callable[[], None]]:
+    """Shows one progress bar, or none; yields the function to call after every trial."""
     if not shown:
         yield lambda: None
         return

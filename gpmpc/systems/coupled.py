@@ -1,4 +1,4 @@
-"""Problem: the whole quadrotor at once, its attitude deciding where its thrust goes.
+"""Right-hand side of the whole quadrotor, whose attitude decides where its thrust points.
 
 The translational and the rotational subsystem of Cao, Lai and Alam (2017), joined by their eq. (2): with roll phi,
 pitch theta and yaw psi the thrust U1 points along

@@ -1,6 +1,6 @@
-"""Problem: a right-hand side f(x, u) has to become a discrete-time plant that controllers and simulations can step.
+"""Discrete-time plants made from right-hand sides f(x, u), for controllers and simulations to step.
 
-There are two readings, and an experiment has to say which one it means. ``Map`` takes the next state to *be* the
+There are two readings. ``Map`` takes the next state to *be* the
 right-hand side, x[k+1] = f(x[k], u[k]); this is what the data of Cao, Lai and Alam (2017) obey to 1e-6. ``Integrated``
 integrates the same right-hand side over the sampling time with the input held constant, which is the physical system.
 

@@ -1,4 +1,4 @@
-"""Problem: the right-hand sides of a quadrotor, split into its translational and its rotational subsystem.
+"""Right-hand sides of a quadrotor, split into its translational and its rotational subsystem.
 
 The model of Cao, Lai and Alam (2017), with the parameters decoded from their data. The z axis points downwards. The
 translational subsystem is driven by the total thrust U1 and by the direction (ux, uy) of the thrust, which the attitude

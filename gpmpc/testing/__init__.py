@@ -1,4 +1,4 @@
-"""Checks for those who bring their own part: does it keep the promises that the rest of gpmpc relies on?"""
+"""Checks of your own models, propagators and QP solvers against the protocols that the rest of gpmpc relies on."""
 
 from gpmpc.testing.model import check_model
 from gpmpc.testing.propagator import check_propagator

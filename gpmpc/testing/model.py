@@ -1,80 +1,39 @@
-"""Does a dynamics model keep its promises?
+"""Check of a dynamics model of your own: ``check_model``."""
 
-``check_model(model)`` queries it alone and in batches, twice, with arrays in awkward layouts, and holds its Jacobians
-against finite differences. It raises an ``AssertionError`` that names the broken promise and the numbers, and
-returns nothing if all is well.
-"""
-
-from collections.abc import Callable
-
+import numpy as np
 import torch
 from torch import Tensor
 
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.testing.promise import require, require_close, require_covariance
+from gpmpc.testing._promise import require, require_close, require_covariance
 
 
 def check_model(
     model: DynamicsModel, states: Tensor | None = None, inputs: Tensor | None = None, seed: int = 0
 ) -> None:
-    """Checks ``model`` against the protocol ``gpmpc.dynamics.DynamicsModel``.
+    """Checks a model against the protocol ``gpmpc.dynamics.DynamicsModel``.
+
+    ``predict`` is called alone and in batches, twice, with arrays in awkward layouts; ``linearize`` is compared with it
+    and with its finite differences.
 
     Args:
         model: The object to check.
-        states: Where to query it (B, n), B of 2 or more; standard normal numbers by default, so give some of yours
+        states: Where to evaluate it (K, n), K of 2 or more; standard normal numbers by default, so give some of yours
             where the states are of another size.
-        inputs: Likewise (B, m).
-        seed: Of the default queries.
+        inputs: Likewise (K, m).
+        seed: Of the default states and inputs.
 
     Raises:
-        AssertionError: The model breaks a promise; the message says which.
+        AssertionError: The model breaks a promise; the message says which, and by how much.
     """
     _check_attributes(model)
-    n, m, k = model.state_dim, model.input_dim, model.output_dim
-    generator = torch.Generator().manual_seed(seed)
-    like = {"dtype": model.dtype, "device": model.device}
-    states = torch.randn(4, n, generator=generator) if states is None else states
-    inputs = torch.randn(len(states), m, generator=generator) if inputs is None else inputs
-    states, inputs = states.to(**like), inputs.to(**like)
-    single = torch.finfo(model.dtype).eps > 1e-10
-    exact, numeric = (1e-4, 3e-2) if single else (1e-9, 1e-5)
-
-    one = _untouched(model.predict, "predict", states[0], inputs[0])
-    _check_belief("predict at one state", model, one, ())
-    together = _untouched(model.predict, "predict", states, inputs)
-    _check_belief("predict at a batch", model, together, (len(states),))
-    require(
-        torch.equal(model.predict(states, inputs).mean, together.mean)
-        and torch.equal(model.predict(states, inputs).covariance, together.covariance),
-        "predict: the same query has the same answer",
-        "the second answer differs from the first",
-    )
-    alone = [model.predict(x, u) for x, u in zip(states, inputs, strict=True)]
-    _check_same("predict: a batch is the loop over its members", together, _stacked(alone), exact)
-    nested = model.predict(states[None, :, None], inputs[None, :, None])
-    _check_belief("predict at two more batch dimensions", model, nested, (1, len(states), 1))
-    flat = Gaussian(nested.mean[0, :, 0], nested.covariance[0, :, 0])
-    _check_same("predict: more batch dimensions change nothing", flat, together, exact)
-    strided = (torch.stack([states, states + 1], dim=-1)[..., 0], torch.stack([inputs, inputs + 1], dim=-1)[..., 0])
-    _check_same("predict: every other element of a larger array will do", model.predict(*strided), together, exact)
-    if m == 0:
-        _check_same("predict: without inputs u may be left out", model.predict(states), together, exact)
-
-    at, by_state, by_input = _untouched(model.predict_with_jacobian, "predict_with_jacobian", states, inputs)
-    _check_same("predict_with_jacobian: its prediction is predict's", at, together, exact)
-    for name, got, columns in (("state", by_state, n), ("input", by_input, m)):
-        promise = f"predict_with_jacobian: the derivative by the {name} is (*batch, k, {'n' if columns == n else 'm'})"
-        shape, expected = tuple(got.shape), (len(states), k, columns)
-        require(shape == expected and got.dtype == model.dtype, promise, f"got {got.dtype} {shape}, not {expected}")
-    expected = _numeric_jacobian(model, states, inputs)
-    for name, got, numbers in (("state", by_state, expected[..., :n]), ("input", by_input, expected[..., n:])):
-        promise = f"predict_with_jacobian: the derivative by the {name} agrees with finite differences of predict"
-        require_close(promise, got, numbers, numeric)
-    single_out = model.predict_with_jacobian(states[1], inputs[1])
-    for name, got, whole in (("state", single_out[1], by_state), ("input", single_out[2], by_input)):
-        promise = f"predict_with_jacobian: a batch is the loop over its members (derivative by the {name})"
-        require_close(promise, got, whole[1], exact)
+    generator, like = torch.Generator().manual_seed(seed), {"dtype": model.dtype, "device": model.device}
+    x = (torch.randn(4, model.state_dim, generator=generator) if states is None else states).to(**like)
+    u = (torch.randn(len(x), model.input_dim, generator=generator) if inputs is None else inputs).to(**like)
+    exact, numeric = (1e-4, 3e-2) if torch.finfo(model.dtype).eps > 1e-10 else (1e-9, 1e-5)
+    _check_predict(model, x, u, exact)
+    _check_linearize(model, x, u, exact, numeric)
 
 
 def _check_attributes(model: DynamicsModel) -> None:
@@ -85,63 +44,92 @@ def _check_attributes(model: DynamicsModel) -> None:
     require(isinstance(getattr(model, "dtype", None), torch.dtype), "dtype is a torch.dtype", "it is missing or not")
     require(hasattr(model, "device"), "device says where the model lives", "it is missing")
     noise, k = getattr(model, "noise_covariance", None), model.output_dim
-    require(
-        isinstance(noise, Tensor) and tuple(noise.shape) == (k, k) and noise.dtype == model.dtype,
-        f"noise_covariance is a {model.dtype} tensor of shape ({k}, {k})",
-        f"got {type(noise).__name__} {getattr(noise, 'dtype', '')} {tuple(getattr(noise, 'shape', ()))}",
-    )
-    require_covariance("noise_covariance", noise)
+    right = isinstance(noise, Tensor) and tuple(noise.shape) == (k, k) and noise.dtype == model.dtype
+    got = f"got {type(noise).__name__} {getattr(noise, 'dtype', '')} {tuple(getattr(noise, 'shape', ()))}"
+    require(right, f"noise_covariance is a {model.dtype} tensor of shape ({k}, {k})", got)
+    require_covariance("noise_covariance", model.noise_covariance)
 
 
-def _untouched(function: Callable, name: str, state: Tensor, control: Tensor):
-    x, u = state.clone(), control.clone()
-    result = function(state, control)
-    unchanged = torch.equal(x, state) and torch.equal(u, control)
-    require(unchanged, f"{name}: the caller's state and input are left as they are", "one was modified")
-    return result
+def _check_predict(model: DynamicsModel, x: Tensor, u: Tensor, exact: float) -> None:
+    before = x.clone(), u.clone()
+    together = model.predict(x, u)
+    same = torch.equal(before[0], x) and torch.equal(before[1], u)
+    require(same, "predict: the caller's state and input are left as they are", "one was modified")
+    _check_belief("predict at a batch", model, together, (len(x),))
+    again = model.predict(x, u)
+    same = torch.equal(again.mean, together.mean) and torch.equal(again.covariance, together.covariance)
+    require(same, "predict: the same arguments give the same result", "the second differs from the first")
+
+    alone = [model.predict(state, input) for state, input in zip(x, u, strict=True)]
+    _check_belief("predict at one state", model, alone[0], ())
+    stacked = Gaussian(torch.stack([b.mean for b in alone]), torch.stack([b.covariance for b in alone]))
+    _check_same("predict: a batch is the loop over its members", together, stacked, exact)
+    nested = model.predict(x[None, :, None], u[None, :, None])
+    _check_belief("predict at two more batch dimensions", model, nested, (1, len(x), 1))
+    flat = Gaussian(nested.mean[0, :, 0], nested.covariance[0, :, 0])
+    _check_same("predict: more batch dimensions change nothing", flat, together, exact)
+    strided = [torch.stack([part, part + 1], dim=-1)[..., 0] for part in (x, u)]
+    _check_same("predict: every other element of a larger array will do", model.predict(*strided), together, exact)
+
+
+def _check_linearize(model: DynamicsModel, x: Tensor, u: Tensor, exact: float, numeric: float) -> None:
+    n, m, k = model.state_dim, model.input_dim, model.output_dim
+    states, inputs = (part.double().cpu().numpy().copy() for part in (x, u))
+    before = states.copy(), inputs.copy()
+    found = model.linearize(states, inputs)
+    same = np.array_equal(before[0], states) and np.array_equal(before[1], inputs)
+    require(same, "linearize: the caller's states and inputs are left as they are", "one was modified")
+    shapes = {"mean": (k,), "A": (k, n), "B": (k, m), "covariance": (k, k)}
+    for name, shape in shapes.items():
+        got, expected = getattr(found, name), (len(x), *shape)
+        right = isinstance(got, np.ndarray) and got.dtype == np.float64 and got.flags.c_contiguous
+        promise = f"linearize: {name} is a C-contiguous float64 array of shape {expected}"
+        require(right and got.shape == expected, promise, f"got {getattr(got, 'dtype', type(got))} {np.shape(got)}")
+    means = model.linearize(states, inputs, covariance=False)
+    require(means.covariance is None, "linearize: no covariance where it is not wanted", f"got {means.covariance}")
+    together = model.predict(x, u)
+    mean, A, B, covariance = (torch.from_numpy(getattr(found, name)) for name in shapes)
+    _check_same("linearize: its mean and covariance are predict's", Gaussian(mean, covariance), together, exact)
+    differences = _numeric_jacobian(model, x, u)
+    for name, got, expected in (("A", A, differences[..., :n]), ("B", B, differences[..., n:])):
+        require_close(f"linearize: {name} agrees with finite differences of predict", got, expected, numeric)
+        promise = f"linearize: {name} is the same without the covariance"
+        require_close(promise, torch.from_numpy(getattr(means, name)), got, exact)
+    one = model.linearize(states[1:2], inputs[1:2])
+    for name in shapes:
+        promise = f"linearize: K points are the loop over them ({name})"
+        require_close(
+            promise, torch.from_numpy(getattr(one, name)[0]), torch.from_numpy(getattr(found, name)[1]), exact
+        )
 
 
 def _check_belief(name: str, model: DynamicsModel, belief: Gaussian, batch: tuple[int, ...]) -> None:
     k = model.output_dim
-    require(isinstance(belief, Gaussian), f"{name}: the answer is a gpmpc.gaussian.Gaussian", f"got {type(belief)}")
+    require(isinstance(belief, Gaussian), f"{name}: the result is a gpmpc.gaussian.Gaussian", f"got {type(belief)}")
     expected = (*batch, k), (*batch, k, k)
     got = tuple(belief.mean.shape), tuple(belief.covariance.shape)
-    require(
-        got == expected, f"{name}: mean (*batch, k) and covariance (*batch, k, k)", f"got {got}, should be {expected}"
-    )
+    promise = f"{name}: mean (*batch, k) and covariance (*batch, k, k)"
+    require(got == expected, promise, f"got {got}, should be {expected}")
     for part in (belief.mean, belief.covariance):
-        require(
-            part.dtype == model.dtype and part.device == torch.zeros(0, device=model.device).device,
-            f"{name}: type and device are the model's, {model.dtype} on {model.device}",
-            f"got {part.dtype} on {part.device}",
-        )
+        right = part.dtype == model.dtype and part.device == torch.zeros(0, device=model.device).device
+        promise = f"{name}: type and device are the model's, {model.dtype} on {model.device}"
+        require(right, promise, f"got {part.dtype} on {part.device}")
     require(bool(torch.isfinite(belief.mean).all()), f"{name}: the mean is finite", f"got {belief.mean.tolist()}")
     require_covariance(name, belief.covariance)
 
 
 def _check_same(promise: str, got: Gaussian, expected: Gaussian, tolerance: float) -> None:
     require_close(promise, got.mean, expected.mean, tolerance, "the mean")
-    require_close(
-        promise,
-        got.covariance,
-        expected.covariance,
-        tolerance,
-        "the covariance",
-        floor=1e-4 if tolerance < 1e-6 else 1.0,
-    )
+    floor = 1e-4 if tolerance < 1e-6 else 1.0
+    require_close(promise, got.covariance, expected.covariance, tolerance, "the covariance", floor)
 
 
-def _stacked(beliefs: list[Gaussian]) -> Gaussian:
-    return Gaussian(torch.stack([b.mean for b in beliefs]), torch.stack([b.covariance for b in beliefs]))
-
-
-def _numeric_jacobian(model: DynamicsModel, states: Tensor, inputs: Tensor) -> Tensor:
-    """Central differences of the mean by (x, u) (B, k, n + m)."""
-    joint, n = torch.cat([states, inputs], dim=1), model.state_dim
-    step = torch.finfo(model.dtype).eps ** (1 / 3)
+def _numeric_jacobian(model: DynamicsModel, x: Tensor, u: Tensor) -> Tensor:
+    """Central differences of the mean by (x, u) (K, k, n + m)."""
+    joint, n = torch.cat([x, u], dim=1), model.state_dim
     columns = []
     for j in range(joint.shape[1]):
-        size = step * max(1.0, float(joint[:, j].abs().max()))
+        size = torch.finfo(model.dtype).eps ** (1 / 3) * max(1.0, float(joint[:, j].abs().max()))
         shift = size * torch.eye(joint.shape[1], dtype=joint.dtype, device=joint.device)[j]
         above, below = (model.predict(moved[:, :n], moved[:, n:]).mean for moved in (joint + shift, joint - shift))
         columns.append((above - below) / (2 * size))

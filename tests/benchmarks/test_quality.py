@@ -15,7 +15,7 @@ from benchmarks.quality import FAMILIES, TRUTH, Contender, Field, contenders, pa
 from gpmpc.cli.run import experiment_of
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.plotting import png, quality
 from gpmpc.propagation import Linearization
@@ -32,7 +32,7 @@ class Astray(Contender):
     """Hardly ever moves an input."""
 
     def controller(self, model):
-        return ConvexMPC(model, Linearization(), replace(problem(), R=[1e12] * 3), self.horizon, HOVER)
+        return GPMPC(model, Linearization(), replace(problem(), R=[1e12] * 3), self.horizon, HOVER)
 
 
 def model(N=60):

@@ -16,8 +16,8 @@ IMPORTED = [
     "gpmpc.cli.command",
     "gpmpc.recording",
 ]
-IMPORTED += ["gpmpc.cli.sweep", "gpmpc.experiments.flights_report", "gpmpc.experiments.tables_report"]
-IMPORTED += ["gpmpc.experiments.report_documents", "gpmpc.experiments.run", "gpmpc.plotting.recorded"]
+IMPORTED += ["gpmpc.cli.sweep", "gpmpc.experiments.figures", "gpmpc.experiments.tables"]
+IMPORTED += ["gpmpc.studies.report_document", "gpmpc.studies.flight", "gpmpc.plotting.recorded"]
 SECONDS = 300  # a command may take
 
 _copies = multiprocessing.get_context("forkserver")

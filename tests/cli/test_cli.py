@@ -116,7 +116,7 @@ def test_a_run_writes_every_document_and_prints_the_tables(small_run):
     cwd, _, result = small_run
     assert result.returncode == 0, result.stderr
     folder = cwd / RESULTS
-    expected = ["config.yaml", "fits.jsonl", "tables.csv", "tables.json", "tables.md", "tables.png", "tables.tex"]
+    expected = ["config.yaml", "tables.csv", "tables.json", "tables.md", "tables.png", "tables.tex", "trials.jsonl"]
     assert sorted(path.name for path in folder.iterdir()) == expected
     assert "Table 1: elliptical trajectory" in result.stdout
     assert "psi" in result.stdout  # the note on constant columns

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from gpmpc.cli.streams import Output
+from gpmpc.cli.terminal import Output
 from tests.cli.command import PATH, SECONDS, forked
 
 TINY = ["data.samples=25", "model.restarts=0", "steps=2", "horizon=1", "recorder=none"]

@@ -2,27 +2,27 @@
 
 import csv
 import io
-import json
 from decimal import Decimal
 from functools import partial
 
 import pytest
 import torch
 
-from gpmpc.datasets import PaperData
+from gpmpc.datasets import PaperData, Subsystem
 from gpmpc.exceptions import DataError, SettingError, TrainingError
-from gpmpc.experiments.tables import FitStore, Subsystem, Tables, predict_all
-from gpmpc.experiments.tables_report import (
+from gpmpc.experiments.tables import (
     CALIBRATION,
     MEASURES,
     Statistic,
+    Tables,
     differences,
-    documents,
-    number,
     paper_figures,
+    predict_all,
     summarise,
 )
 from gpmpc.gp import SoftLimits, Transitions, identity, min_max, train
+from gpmpc.studies.document import number
+from gpmpc.studies.study import TrialStore, run_study
 from gpmpc.trajectories import Hover
 
 TRANSLATIONAL = ["x", "vx", "y", "vy", "z", "vz", "U1", "ux", "uy", "x+", "vx+", "y+", "vy+", "z+", "vz+"]
@@ -35,6 +35,8 @@ SUBSYSTEMS = {
 
 class Wave:
     """Small smooth data of six states and three inputs."""
+
+    note = "a note on the data"
 
     def transitions(self, name, trajectory, subsystem):
         t = torch.arange(25.0)[:, None]
@@ -63,9 +65,9 @@ def without_times(records):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    store = FitStore(tmp_path_factory.mktemp("tables") / "fits.jsonl")
+    store = TrialStore(tmp_path_factory.mktemp("tables") / "trials.jsonl")
     experiment = tables()
-    return experiment, store, experiment.run(store, experiment.fits(), lambda record: None)
+    return experiment, store, run_study(experiment.run_trial, experiment.trials(), store, workers=experiment.workers)
 
 
 def test_there_is_one_record_a_draw_with_every_measure(finished):
@@ -84,7 +86,7 @@ def test_draws_have_their_own_seed_and_subset_and_the_full_set_is_its_own_test_s
     small = [r for r in records if r["size"] == 5 and r["subsystem"] == "translational"]
     assert small[0]["test_mse"] != small[1]["test_mse"]
     full = next(r for r in records if r["size"] == 25)
-    cell = finished[0].fits()[0].cell
+    cell = finished[0].trials()[0].condition
     gp = train(cell.data, seed=full["seed"], penalty=SoftLimits(), restarts=0).posterior
     error = predict_all(gp, cell.data, 0.1)[0] - cell.data.next_states
     assert full["training_mse"] == full["test_mse"] == pytest.approx(float(error.square().sum(-1).mean()), rel=1e-2)
@@ -93,32 +95,32 @@ def test_draws_have_their_own_seed_and_subset_and_the_full_set_is_its_own_test_s
 def test_the_same_seed_gives_the_same_numbers_whatever_the_number_of_workers(finished, tmp_path):
     _, _, records = finished
     again = tables(workers=2)
-    repeated = again.run(FitStore(tmp_path / "fits.jsonl"), again.fits(), lambda record: None)
+    repeated = run_study(again.run_trial, again.trials(), TrialStore(tmp_path / "trials.jsonl"), again.workers)
     assert without_times(repeated) == without_times(records)
-    assert tables(seed=1).fits()[0].seed != again.fits()[0].seed
+    assert tables(seed=1).trials()[0].seed != again.trials()[0].seed
 
 
 def test_a_run_goes_on_from_the_finished_fits_and_passes_over_a_torn_line(finished, tmp_path):
     experiment, store, records = finished
     lines = store.path.read_text().splitlines(keepends=True)
-    torn = tmp_path / "fits.jsonl"
+    torn = tmp_path / "trials.jsonl"
     torn.write_text("".join(lines[:3]) + lines[3][: len(lines[3]) // 2])
-    resumed = FitStore(torn)
+    resumed = TrialStore(torn)
     assert len(resumed.records) == 3
     known = set(resumed.records)
     called = []
-    repeated = experiment.run(resumed, experiment.fits(), called.append)
+    repeated = run_study(experiment.run_trial, experiment.trials(), resumed, 1, called.append)
     assert without_times(repeated) == without_times(records)
     assert len(called) == len(records)
     assert [store.records[f] for f in known] == [resumed.records[f] for f in known]  # times too: not computed again
-    assert len(FitStore(torn).records) == len(records)
+    assert len(TrialStore(torn).records) == len(records)
 
 
 def test_more_draws_reuse_the_first_ones_and_another_model_reuses_none():
-    few, more = ([fit.fingerprint for fit in tables(draws=d).fits()] for d in (2, 3))
+    few, more = ([fit.fingerprint for fit in tables(draws=d).trials()] for d in (2, 3))
     assert set(few) < set(more)
-    assert set(few).isdisjoint(fit.fingerprint for fit in tables(model_settings={"restarts": 1}).fits())
-    assert set(few).isdisjoint(fit.fingerprint for fit in tables(state_std=0.2).fits())
+    assert set(few).isdisjoint(fit.fingerprint for fit in tables(model_settings={"restarts": 1}).trials())
+    assert set(few).isdisjoint(fit.fingerprint for fit in tables(state_std=0.2).trials())
 
 
 def failing(transitions, seed):
@@ -127,11 +129,13 @@ def failing(transitions, seed):
 
 def test_a_fit_that_fails_is_kept_counted_and_does_not_stop_the_others(tmp_path):
     experiment = tables(model=failing)
-    records = experiment.run(FitStore(tmp_path / "fits.jsonl"), experiment.fits(), lambda record: None)
+    records = run_study(
+        experiment.run_trial, experiment.trials(), TrialStore(tmp_path / "trials.jsonl"), workers=experiment.workers
+    )
     assert [record["error"] for record in records] == ["no start led anywhere"] * 8
     rows = summarise(records)
     assert [row.failed for row in rows] == [2, 2, 2, 2]
-    assert "(2 failed)" in documents(rows, records, {}, "")["tables.md"]
+    assert "(2 failed)" in experiment.document(records).markdown()
 
 
 @pytest.mark.parametrize(
@@ -156,7 +160,7 @@ def test_misuse_is_refused_with_the_rule(changes, message):
 
 def test_a_size_beyond_the_data_is_refused_with_the_data_named():
     with pytest.raises(SettingError, match="sizes: must be at most 25, the rows of hover translational; got 26"):
-        tables(sizes=[26]).fits()
+        tables(sizes=[26]).trials()
 
 
 def test_an_unknown_state_to_report_is_refused():
@@ -167,11 +171,11 @@ def test_an_unknown_state_to_report_is_refused():
 def test_data_of_other_columns_than_the_subsystem_has_are_refused():
     narrow = {"translational": Subsystem(TRANSLATIONAL[:12], ["x"], identity)}
     with pytest.raises(DataError, match="15 columns; the subsystem names 12"):
-        tables(subsystems=narrow).fits()
+        tables(subsystems=narrow).trials()
 
 
 def test_the_first_prediction_gets_the_given_covariance_and_each_later_one_the_last_predicted(finished):
-    cell = finished[0].fits()[0].cell
+    cell = finished[0].trials()[0].condition
     gp = train(cell.data, penalty=SoftLimits(), restarts=0).posterior
     _, fed, projected = predict_all(gp, cell.data, 0.1)
     assert torch.allclose(fed[0], torch.full((6,), 0.01))
@@ -213,23 +217,20 @@ def test_numbers_are_short(value, text):
 
 
 def test_every_document_tells_the_same_numbers(finished):
-    _, _, records = finished
+    experiment, _, records = finished
     named = [record | {"trajectory": "lorenz", "size": {5: 10, 25: 189}[record["size"]]} for record in records]
     rows = summarise(named)
-    written = documents(rows, named, {"seed": 0}, "a note on the data")
-    data = json.loads(written["tables.json"])
-    assert data["meta"] == {"seed": 0}
-    assert data["draws"] == named
+    written = experiment.document(named).files("tables")
     lines = list(csv.DictReader(io.StringIO(written["tables.csv"])))
     assert len(lines) == len(rows) == 4
     for line, row in zip(lines, rows, strict=True):
         for name in [*MEASURES, *CALIBRATION]:
             if name in row.statistics:
-                assert float(line[f"{name}_median"]) == row.statistics[name].median
+                assert float(line[f"{name}_median"]) == row.statistics[name].range[1]
         printed = row.statistics["test_mse"]
         assert float(line["test_mse_paper"]) == float(printed.paper)
         assert line["test_mse_paper_is"] == printed.position
-        assert number(printed.median) in written["tables.md"]
+        assert number(printed.range[1]) in written["tables.md"]
         assert f"| {row.size} |" in written["tables.md"]
     assert "a note on the data" in written["tables.md"]
     assert written["tables.tex"].count("\\toprule") == 1
@@ -249,7 +250,9 @@ def test_the_full_rows_are_the_papers_on_the_authors_data(paper_data, tmp_path, 
         sizes=[189],
         draws=1,
     )
-    (record,) = experiment.run(FitStore(tmp_path / "fits.jsonl"), experiment.fits(), lambda record: None)
+    (record,) = run_study(
+        experiment.run_trial, experiment.trials(), TrialStore(tmp_path / "trials.jsonl"), workers=experiment.workers
+    )
     for name, printed in paper_figures()[trajectory, subsystem, 189].items():
         assert record[name] == pytest.approx(float(printed), rel=0.05)
 
@@ -279,7 +282,9 @@ def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row
         sizes=[189],
         draws=1,
     )
-    (record,) = experiment.run(FitStore(tmp_path / "fits.jsonl"), experiment.fits(), lambda record: None)
+    (record,) = run_study(
+        experiment.run_trial, experiment.trials(), TrialStore(tmp_path / "trials.jsonl"), workers=experiment.workers
+    )
     for name, printed in paper_figures()["elliptical", "rotational", 189].items():
         assert record[name] == pytest.approx(float(printed), rel=1e-3)
 
@@ -289,7 +294,7 @@ def test_the_measures_of_a_fit_are_those_of_its_predictions_in_the_units_of_the_
     """Worked out anew from the posterior of all rows, by torch's own normal distribution."""
     experiment, _, records = finished
     full = next(r for r in records if (r["subsystem"], r["size"]) == (subsystem, 25))
-    cell = next(fit.cell for fit in experiment.fits() if fit.cell.subsystem == subsystem)
+    cell = next(trial.condition for trial in experiment.trials() if trial.labels["subsystem"] == subsystem)
     gp = train(cell.data, seed=full["seed"], penalty=SoftLimits(), restarts=0).posterior
     plain = gp.predict(cell.data.states, cell.data.inputs)
     raw, factor = Wave().transitions("hover", Hover(), subsystem).next_states, cell.scaling.factor

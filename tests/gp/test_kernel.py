@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from gpmpc.exceptions import SettingError
-from gpmpc.gp.kernel import factorize
+from gpmpc.gp._kernel import factorize
 
 
 def arguments(size=150, outputs=3, d=4):
@@ -13,14 +13,14 @@ def arguments(size=150, outputs=3, d=4):
 def test_factors_made_in_place_are_the_same_bit_by_bit(monkeypatch):
     given = arguments()
     at_once = factorize(*given)
-    monkeypatch.setattr("gpmpc.gp.kernel._MANY", 10)
+    monkeypatch.setattr("gpmpc.gp._kernel._MANY", 10)
     in_place = factorize(*given)
     assert torch.equal(in_place, at_once)
     assert in_place.stride() == at_once.stride()
 
 
 def test_of_factors_made_in_place_the_output_that_fails_is_named(monkeypatch):
-    monkeypatch.setattr("gpmpc.gp.kernel._MANY", 10)
+    monkeypatch.setattr("gpmpc.gp._kernel._MANY", 10)
     points, scales, signal, noise = arguments(size=100)
     points[50:] = points[:50]
     noise[2] = 1e-300
@@ -29,7 +29,7 @@ def test_of_factors_made_in_place_the_output_that_fails_is_named(monkeypatch):
 
 
 def test_gradients_pass_through_factors_of_any_size(monkeypatch):
-    monkeypatch.setattr("gpmpc.gp.kernel._MANY", 10)
+    monkeypatch.setattr("gpmpc.gp._kernel._MANY", 10)
     points, scales, signal, noise = arguments(size=20, outputs=1)
     noise.requires_grad_()
     factorize(points, scales, signal, noise).diagonal(dim1=-2, dim2=-1).log().sum().backward()

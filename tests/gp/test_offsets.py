@@ -23,11 +23,11 @@ from gpmpc.gp import (
     sparse_posterior,
     standardize,
 )
+from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
+from gpmpc.gp._search import column_std, constant_columns
 from gpmpc.gp.casadi_ import casadi_function
 from gpmpc.gp.gpytorch_ import GPyTorchLikelihood
-from gpmpc.gp.likelihood import NegativeLogMarginalLikelihood
 from gpmpc.gp.module import PosteriorModule
-from gpmpc.gp.search import column_std, constant_columns
 from gpmpc.gp.sparse import collapsed_bound
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, linearize
 from gpmpc.propagation.sensitivity import differentiate
@@ -79,7 +79,7 @@ def test_training_does_not_see_where_the_features_lie(name, by):
 
 @pytest.mark.parametrize("by", FEATURES, ids=str)
 def test_training_in_place_does_not_see_where_the_features_lie(by, monkeypatch):
-    monkeypatch.setattr("gpmpc.gp.likelihood._IN_PLACE", 1)
+    monkeypatch.setattr("gpmpc.gp._likelihood._IN_PLACE", 1)
     assert_same_training(Trainer(restarts=0), *data(), by)
 
 

@@ -20,9 +20,9 @@ from gpmpc.gp import (
     sparse_posterior,
     standardize,
 )
-from gpmpc.gp.kernel import kernel_matrix
+from gpmpc.gp._kernel import kernel_matrix
 from gpmpc.gp.sparse import collapsed_bound, collapsed_bound_with_gradient
-from gpmpc.gp.sparse_training import greedy_points
+from gpmpc.gp.sparse_training import _greedy_points
 from gpmpc.propagation import MomentMatching, MonteCarlo
 
 
@@ -152,9 +152,9 @@ def test_a_frozen_sparse_model_is_conditioned_and_moment_matched_like_any_other(
 
 def test_greedy_points_differ_and_stop_where_nothing_is_left():
     x, _, settings = problem(100)
-    chosen = greedy_points(torch.cat([x, x]), Hyperparameters(**settings), 30)
+    chosen = _greedy_points(torch.cat([x, x]), Hyperparameters(**settings), 30)
     assert len(torch.unique(chosen, dim=0)) == 30
-    assert len(greedy_points(x[[0, 1, 0, 1, 0]], Hyperparameters(**settings), 5)) == 2
+    assert len(_greedy_points(x[[0, 1, 0, 1, 0]], Hyperparameters(**settings), 5)) == 2
     random = [
         collapsed_bound(x[i : i + 30], x, problem(100)[1], Hyperparameters(**settings)).sum() for i in range(0, 70, 10)
     ]

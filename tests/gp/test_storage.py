@@ -12,7 +12,8 @@ import safetensors.numpy
 import torch
 
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
-from gpmpc.gp import GPPosterior, Trainer, Transitions, archive, load_metadata, load_posterior, save_posterior, storage
+from gpmpc.gp import GPPosterior, Trainer, Transitions, load_metadata, load_posterior, save_posterior, storage
+from gpmpc.gp import _archive as archive
 from gpmpc.models import ResidualModel, save_residual_model
 from tests.gp.small_models import LOAD, SAVE, posterior, residual_model
 

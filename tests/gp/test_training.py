@@ -18,7 +18,7 @@ from gpmpc.gp import (
     train,
     train_many,
 )
-from gpmpc.gp.search import column_std
+from gpmpc.gp._search import column_std
 
 
 def pendulum(rows=60, noise=1e-3, seed=0):

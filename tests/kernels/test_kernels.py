@@ -18,7 +18,7 @@ from gpmpc.kernels.block import add_to_columns, expm1, expm1_near_zero, outer_su
 from gpmpc.kernels.exponential import NEAR_ZERO
 from gpmpc.kernels.packed import aligned_zeros, pack
 from gpmpc.kernels.pair_sums import Side
-from gpmpc.propagation.moments import moments
+from gpmpc.propagation._moments import moments
 from tests.propagation.test_moment_matching import belief, by_mpmath, model
 
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.request import Request
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
@@ -35,19 +36,20 @@ def questions(count, std):
 @pytest.mark.parametrize("propagator", [Linearization(), MomentMatching()], ids=["linearisation", "moment matching"])
 def test_iterated_programs_reach_the_optimum_of_the_nonlinear_method(propagator):
     gp = quadrotor_gp()
-    convex = ConvexMPC(gp, propagator, problem(0.5), H, HOVER, covariance="full", iterations=100, tolerance=1e-7)
-    nonlinear = NonlinearGPMPC(gp, propagator, problem(0.5), H, HOVER, tolerance=1e-6)
+    convex = GPMPC(gp, propagator, problem(0.5), H, HOVER, covariance="full", iterations=100, tolerance=1e-7)
+    generic = SLSQP(gp, propagator, problem(0.5), H, HOVER, tolerance=1e-6)
     for belief, reference in questions(4, 0.05):
-        plans = [controller.control(belief, reference) for controller in (convex, nonlinear)]
+        plans = [controller.control(belief, reference) for controller in (convex, generic)]
         assert all(plan.status.solved for plan in plans)
-        reached, least = (nonlinear.objective(plan.inputs, belief, reference, HOVER)[0] for plan in plans)
+        request = Request.read(problem(0.5), H, HOVER, belief, reference, None)
+        reached, least = (generic.evaluate(plan.inputs, request).cost for plan in plans)
         assert reached <= least * (1 + 1e-4)
 
 
 def test_dual_primal_and_state_form_give_the_same_inputs():
     gp, active = quadrotor_gp(), 0
     asked = (gp, Linearization(), problem(0.02), H, HOVER)
-    ours, primal, state_form = ConvexMPC(*asked), ConvexMPC(*asked, solver=PrimalActiveSet()), StateFormMPC(*asked)
+    ours, primal, state_form = GPMPC(*asked), GPMPC(*asked, solver=PrimalActiveSet()), StateFormMPC(*asked)
     for belief, reference in questions(5, 0.0):
         plan = ours.control(belief, reference)
         active += len(plan.solution.active_set)
@@ -67,7 +69,7 @@ def test_a_bound_that_takes_a_large_step_of_the_inputs_is_kept_by_iterated_progr
     reached = []
     for iterations in (1, 30):
         asked = (gp, Linearization(process_noise=True), bounded, 1, HOVER)
-        plan = ConvexMPC(*asked, iterations=iterations, tolerance=1e-6).control(belief, reference)
+        plan = GPMPC(*asked, iterations=iterations, tolerance=1e-6).control(belief, reference)
         assert plan.status.solved
         after = Linearization(process_noise=True)(gp, belief, torch.tensor(plan.input))
         reached.append(float(after.mean[0] + bounded.state_bounds.kappa * after.covariance[0, 0].sqrt()) - limit)

@@ -8,7 +8,7 @@ from gpmpc.metrics import tracking_error
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.tracking import TrackingProblem
-from gpmpc.simulation import Dropout, Gust, Noise, Replaced, cascade_loop, cascade_recording_callback
+from gpmpc.simulation import Dropout, Gust, Noise, Replaced, cascade_loop
 from gpmpc.status import Status
 from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational, step, thrust_direction
 from gpmpc.trajectories import Elliptical, Lorenz, states_along
@@ -53,12 +53,9 @@ def test_the_rollouts_are_two_views_of_one_flight():
 
 
 def test_each_loop_is_told_to_a_recorder_at_its_own_rate():
-    class Kept(list):
-        record = list.append
-
-    outer, inner = Kept(), Kept()
-    flight = fly(Elliptical(), 3, noise=NOISE, on_step=cascade_recording_callback(outer, inner, (10, 20)))
-    for told, loop, size in ((outer, flight.outer, 10), (inner, flight.inner, 20)):
+    steps = {"outer": [], "inner": []}
+    flight = fly(Elliptical(), 3, noise=NOISE, on_step=lambda loop, step: steps[loop].append(step))
+    for told, loop in ((steps["outer"], flight.outer), (steps["inner"], flight.inner)):
         assert [step.k for step in told] == list(range(len(loop.inputs)))
         assert [step.time for step in told] == pytest.approx(loop.time_step * np.arange(len(loop.inputs)))
         for name, expected in (("state", loop.states[:-1]), ("measured", loop.measured), ("input", loop.inputs)):
@@ -66,7 +63,6 @@ def test_each_loop_is_told_to_a_recorder_at_its_own_rate():
         assert np.array_equal([step.reference for step in told], loop.references[: len(told)])
         expected = [step.measured - before.decision.means[1] for before, step in pairwise(told)]
         assert np.array_equal([step.innovation for step in told[1:]], expected)
-        assert {step.gp_size for step in told} == {size}
 
 
 def test_the_attitude_comes_to_where_the_outer_plan_points_the_thrust():
@@ -115,12 +111,14 @@ def test_without_any_measurement_for_a_moment_both_plans_go_on():
 def test_the_same_seed_gives_the_same_flight_and_every_inner_step_is_told():
     told = []
     first, again = (
-        fly(Elliptical(), 2, noise=NOISE, seed=1, on_step=told.append),
+        fly(Elliptical(), 2, noise=NOISE, seed=1, on_step=lambda *step: told.append(step)),
         fly(Elliptical(), 2, noise=NOISE, seed=1),
     )
     assert np.array_equal(first.states, again.states)
-    assert [(s.whole.index, s.phase) for s in told] == [(j, j % 20) for j in range(40)]
-    assert np.array_equal([s.whole.state for s in told], first.states[:-1])
+    inner = [step for loop, step in told if loop == "inner"]
+    assert [step.k for step in inner] == list(range(40))
+    assert [i for i, (loop, _) in enumerate(told) if loop == "outer"] == [0, 21]
+    assert np.array_equal([step.state for step in inner], first.states[:-1, 6:])
 
 
 def test_the_attitudes_asked_for_change_with_the_plan_and_are_approached_at_first_order():

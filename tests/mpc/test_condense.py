@@ -9,7 +9,7 @@ from gpmpc.exceptions import ShapeError
 from gpmpc.mpc.condense import Condenser, StateRows, condense_with_feedback
 from gpmpc.mpc.linear_quadratic import References, Stages, expand, tracking_cost
 from gpmpc.mpc.tracking import TrackingProblem
-from gpmpc.qp import DualActiveSet, SoftRows
+from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
 from gpmpc.status import Status
 from tests.mpc.double_pendulum import ACROBOT, PENDUBOT, UPRIGHT, DoublePendulum
 
@@ -173,7 +173,7 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
     other = condense_with_feedback(condenser.cost, condenser.bounds, stages, start, references, rows)
     for program in (plain, other):
         soft = SoftRows(np.concatenate([np.full(len(program.G) - H * r, np.inf), price]))
-        solution = solver.solve_stacked(*program[:5], soft=soft)
+        solution = solver.solve(QuadraticProgram.unchecked(*program[:5]), soft=soft)
         assert solution.status is Status.SOLVED
         inputs, states = expand(stages, start, program.feedback, references.previous_input, solution.x)
         z = solution.multipliers[-(len(problem.input_lower) * H * (2 if rated else 1) + H * r) :]
@@ -194,7 +194,7 @@ def test_an_unstable_plant_is_condensed_in_feedback_coordinates_and_the_plan_is_
     references = References(np.zeros((H, 1)), np.zeros((H, 1)), np.zeros(1))
     program = condenser.condense(stages, np.array([2.5]), references, no_rows(1, H))
     assert len(program.feedback) == H
-    solution = DualActiveSet().solve_stacked(*program[:5])
+    solution = DualActiveSet().solve(QuadraticProgram.unchecked(*program[:5]))
     inputs, states = expand(stages, np.array([2.5]), program.feedback, references.previous_input, solution.x)
     assert solution.status is Status.SOLVED
     assert inputs.min() == pytest.approx(-3.0, abs=1e-9)

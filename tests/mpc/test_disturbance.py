@@ -10,7 +10,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.supervision import command
 from gpmpc.mpc.tracking import TrackingProblem
@@ -25,7 +25,7 @@ AT_REST = Reference(np.tile([0.4, 0.0], (H + 1, 1)), np.zeros((H, 1)))
 UNKNOWN = np.array([0.0, 0.08])  # what the plant does that its model does not say [rad, rad/s]
 
 
-def controller(kind=ConvexMPC, model=PENDULUM, propagator=None, **settings):
+def controller(kind=GPMPC, model=PENDULUM, propagator=None, **settings):
     return kind(model, propagator or Linearization(), PROBLEM, H, [0.0], **settings)
 
 
@@ -47,20 +47,18 @@ def flown(asked, model=PENDULUM, unknown=UNKNOWN, steps=40):
 @pytest.mark.parametrize(
     "settings",
     [
-        {"form": "increment", "covariance": "none"},
+        {"form": "velocity", "covariance": "none"},
         {"disturbance_gain": 1.0},
         {"disturbance_gain": 0.5, "covariance": "none"},
         {"disturbance_gain": 0.5, "covariance": "none", "iterations": 30},
         {"disturbance_gain": 0.5, "covariance": "full", "propagator": MomentMatching()},
         {"disturbance_gain": 0.5, "covariance": "diagonal"},
-        {"disturbance_gain": 0.5, "form": "deviation"},
     ],
     ids=str,
 )
 def test_a_constant_error_leaves_no_offset(settings):
     states, decisions = flown(controller(**settings))
-    # ``deviation`` is made at an input that is not the one held; ``full`` and ``diagonal`` weigh the spread as well.
-    exact = settings.get("form") != "deviation" and settings.get("covariance") not in ("full", "diagonal")
+    exact = settings.get("covariance") not in ("full", "diagonal")  # these weigh the covariance as well
     assert abs(states[-1, 0] - 0.4) < (1e-4 if exact else 2e-3)
     if "disturbance_gain" in settings:
         assert np.allclose(decisions[-1].disturbance, UNKNOWN, rtol=0, atol=1e-4)
@@ -104,13 +102,12 @@ def test_a_measurement_that_is_missing_leaves_the_estimate_as_it_is():
 
 
 @pytest.mark.parametrize("covariance", ["zero_order", "none"])
-@pytest.mark.parametrize("form", ["deviation", "trajectory"])
-def test_compiled_torch_batched_and_state_form_agree(form, covariance):
-    asked = controller(form=form, covariance=covariance, disturbance_gain=0.7)
+def test_compiled_torch_batched_and_state_form_agree(covariance):
+    asked = controller(covariance=covariance, disturbance_gain=0.7)
     states, decisions = flown(asked, steps=4)
     belief, before = Gaussian.certain(states[-1]), decisions[-1]
     answer = asked.control(belief, AT_REST, before)
-    in_cvxpy = controller(StateFormMPC, form=form, covariance=covariance, disturbance_gain=0.7)
+    in_cvxpy = controller(StateFormMPC, covariance=covariance, disturbance_gain=0.7)
     others = [in_cvxpy.control(belief, AT_REST, before)]
     with backend("torch"):
         others += [asked.control(belief, AT_REST, before), *asked.control_many([belief], [AT_REST], [before])]
@@ -132,10 +129,10 @@ def test_any_model_can_be_wrong():
     [
         ({"disturbance_gain": 1.2}, "lie between 0 and 1; got 1.2"),
         ({"disturbance_gain": -0.1}, "got -0.1"),
-        ({"disturbance_gain": 0.5, "form": "increment"}, "be 0 for form 'increment', which needs none; got 0.5"),
+        ({"disturbance_gain": 0.5, "form": "velocity"}, "be 0 for form 'velocity', which needs none; got 0.5"),
     ],
 )
-@pytest.mark.parametrize("kind", [ConvexMPC, StateFormMPC])
+@pytest.mark.parametrize("kind", [GPMPC, StateFormMPC])
 def test_a_gain_out_of_range_is_refused(kind, settings, rule):
     with pytest.raises(SettingError, match=rule):
         controller(kind, **settings)

@@ -8,9 +8,9 @@ from gpmpc.dynamics import linearize_by_autograd
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.mpc.linear_quadratic import dlqr, finite_horizon_lqr
 from gpmpc.mpc.lqr import LQR
-from gpmpc.mpc.nonlinear_mpc import NonlinearGPMPC
 from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import MeanEquivalence
 from gpmpc.status import Status

@@ -8,8 +8,9 @@ import pytest
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.convex_mpc import ConvexMPC
-from gpmpc.mpc.prediction import COVARIANCES, FORMS
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.prediction import FORMS
+from gpmpc.mpc.stages import COVARIANCES
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MeanEquivalence
@@ -19,7 +20,7 @@ from gpmpc.systems import step
 from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 
 H = 3
-PENALIZED = {"increment": "increments", "deviation": "deviations", "trajectory": "inputs"}
+PENALIZED = {"velocity": "increments", "trajectory": "deviations"}
 REFERENCE = Reference(np.zeros((H + 1, 6)), np.tile(HOVER, (H, 1)))
 
 
@@ -42,9 +43,9 @@ def problem(penalized="deviations", lower=-0.3, **prices):
 def test_it_gives_the_inputs_of_the_condensed_program(form, covariance, prices):
     moves = MeanEquivalence() if covariance == "none" else Linearization()
     arguments = (quadrotor_gp(), moves, problem(PENALIZED[form], **prices), H, HOVER, form, covariance)
-    controllers = [ConvexMPC(*arguments), StateFormMPC(*arguments)]
+    controllers = [GPMPC(*arguments), StateFormMPC(*arguments)]
     if not prices:
-        controllers.append(ConvexMPC(*arguments, CvxpySolver()))
+        controllers.append(GPMPC(*arguments, CvxpySolver()))
     state, last, worked = np.array([0.8, 0.2, -0.4, 0.1, 0.3, 0.0]), None, 0
     for _ in range(3):
         decisions = [c.control(Gaussian.certain(state), REFERENCE, last) for c in controllers]
@@ -82,7 +83,7 @@ def test_what_cannot_be_solved_is_reported():
 
 
 def test_importing_the_controllers_does_not_load_cvxpy():
-    modules = "gpmpc.mpc, gpmpc.mpc.convex_mpc, gpmpc.mpc.state_form"
+    modules = "gpmpc.mpc, gpmpc.mpc.gp_mpc, gpmpc.mpc.state_form"
     code = f"import sys, {modules}; print([m for m in ('cvxpy', 'hydra', 'matplotlib') if m in sys.modules])"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
     assert loaded == "[]"

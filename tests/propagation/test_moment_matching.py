@@ -8,7 +8,7 @@ from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.propagation import MomentMatching
-from gpmpc.propagation.moments import moments
+from gpmpc.propagation._moments import moments
 
 
 def model(size=20, n=2, m=1, noise=1e-3, lengthscale=1.0, predicts="next_state", seed=0):

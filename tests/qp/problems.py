@@ -66,3 +66,8 @@ def lazy(problem, warm_start=None):
 
 def primal(problem, warm_start=None):
     return PrimalActiveSet().solve(problem, warm_start)
+
+
+def solve_stacked(P, q, G, lower, upper, warm_start=None, soft=None):
+    """The solution of arrays that nobody has checked."""
+    return DualActiveSet().solve(QuadraticProgram.unchecked(P, q, G, lower, upper), warm_start, soft)

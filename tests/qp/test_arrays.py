@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gpmpc.qp import DualActiveSet, QuadraticProgram
-from tests.qp.problems import feasible_problem, worst_residual
+from tests.qp.problems import feasible_problem, solve_stacked, worst_residual
 
 ODD = {
     "every other entry": lambda a: np.repeat(a, 2, axis=-1)[..., ::2],
@@ -34,8 +34,8 @@ def test_an_odd_array_is_read_as_what_it_is(odd, position, rng):
             arrays[3], arrays[4] = np.full(15, -3.0), np.full(15, 4.0)
     given = list(arrays)
     given[position] = odd(arrays[position])
-    expected = DualActiveSet().solve_stacked(*arrays)
-    solutions = [DualActiveSet().solve_stacked(*given), DualActiveSet().solve_stacked(*given, expected)]
+    expected = solve_stacked(*arrays)
+    solutions = [solve_stacked(*given), solve_stacked(*given, expected)]
     prepared = DualActiveSet().prepare(given[0], given[2])
     solutions += [prepared.solve(given[1], *given[3:]), prepared.solve(given[1], *given[3:], expected)]
     for solution in solutions:
@@ -53,7 +53,7 @@ def test_an_axis_of_length_one_may_have_any_stride():
     for problem, x in ((one, [0.5]), (several, [2.0, -1.0])):
         for array in (problem.P, problem.G):
             assert array.strides == np.empty(array.shape).strides
-        solution = DualActiveSet().solve_stacked(problem.P, problem.q, problem.G, problem.lower, problem.upper)
+        solution = solve_stacked(problem.P, problem.q, problem.G, problem.lower, problem.upper)
         np.testing.assert_allclose(solution.x, x)
         assert solution.iterations <= 3
 
@@ -63,9 +63,9 @@ def test_eight_bytes_of_another_kind_are_not_taken_for_a_float(kind, rng):
     problem = feasible_problem(rng, 3, 4)
     rest = problem.lower, problem.upper
     q = np.arange(3).astype(kind)
-    expected = DualActiveSet().solve_stacked(problem.P, np.arange(3.0), problem.G, *rest)
+    expected = solve_stacked(problem.P, np.arange(3.0), problem.G, *rest)
     prepared = DualActiveSet().prepare(problem.P, problem.G)
-    for solution in (prepared.solve(q, *rest, expected), DualActiveSet().solve_stacked(problem.P, q, problem.G, *rest)):
+    for solution in (prepared.solve(q, *rest, expected), solve_stacked(problem.P, q, problem.G, *rest)):
         np.testing.assert_allclose(solution.x, expected.x, atol=1e-9)
 
 

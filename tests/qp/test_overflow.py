@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
-from gpmpc.qp.soft_rows import SoftRows
+from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram, SoftRows
 from gpmpc.status import Status
+from tests.qp.problems import solve_stacked
 
 FREE = np.full(3, np.inf)
 PROBLEMS = {  # the minimum is at -P^-1 q, which float64 cannot hold
@@ -19,7 +19,7 @@ def solve_in(mode, P, q, G, lower, upper):
     if mode == "gram":
         return DualActiveSet().prepare(P, G).solve(q, lower, upper)
     if mode == "lazy":
-        return DualActiveSet().solve_stacked(P, q, G, lower, upper)
+        return solve_stacked(P, q, G, lower, upper)
     return PrimalActiveSet().solve(QuadraticProgram.from_stacked(P, q, G, lower, upper))
 
 
@@ -75,12 +75,12 @@ def test_soft_rows_do_not_hide_it():
     P, q = PROBLEMS["in one variable"]
     free = np.append(FREE, 1.0)
     soft = SoftRows(quadratic=np.array([1.0]))
-    solution = DualActiveSet().solve_stacked(P, q, np.array([[0.0, 1.0, 0.0]]), -free, free, soft=soft)
+    solution = solve_stacked(P, q, np.array([[0.0, 1.0, 0.0]]), -free, free, soft=soft)
     assert solution.status is Status.NUMERICAL_TROUBLE
 
 
 def test_residuals_that_are_undefined_do_not_bear_a_solution_out():
-    solution = DualActiveSet().solve_stacked(np.eye(2), np.ones(2), np.zeros((0, 2)), -np.ones(2), np.ones(2))
+    solution = solve_stacked(np.eye(2), np.ones(2), np.zeros((0, 2)), -np.ones(2), np.ones(2))
     assert solution.is_optimal()
     for value in (np.nan, np.inf):
         x = np.array([value, -1.0])

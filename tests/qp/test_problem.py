@@ -3,6 +3,7 @@ import pytest
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram, SoftRows
+from tests.qp.problems import solve_stacked
 
 EYE = np.eye(2)
 INDEFINITE = np.array([[1.0, 2.0], [2.0, 1.0]])  # eigenvalues -1 and 3
@@ -68,13 +69,13 @@ GOOD = {"P": EYE, "q": np.zeros(2), "G": np.ones((1, 2)), "lower": -np.ones(3), 
 def test_the_fast_entries_refuse_the_same_misuse(name, value, message):
     arguments = GOOD | {name: value}
     with pytest.raises(ProblemError, match=message):
-        DualActiveSet().solve_stacked(**arguments)
+        solve_stacked(**arguments)
     with pytest.raises(ProblemError, match=message):
         DualActiveSet().prepare(arguments.pop("P"), arguments.pop("G")).solve(**arguments)
 
 
 def test_the_good_problem_of_these_tests_is_good():
-    assert DualActiveSet().solve_stacked(**GOOD).status.solved
+    assert solve_stacked(**GOOD).status.solved
 
 
 @pytest.mark.parametrize("bound", [np.inf, 1e20, 1e25, 1e300])

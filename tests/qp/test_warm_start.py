@@ -6,7 +6,7 @@ import pytest
 from gpmpc.qp import DualActiveSet, QPSolution
 from gpmpc.qp import record as layout
 from gpmpc.status import Status
-from tests.qp.problems import feasible_problem, gram, integer_problem, lazy, primal, worst_residual
+from tests.qp.problems import feasible_problem, gram, integer_problem, lazy, primal, solve_stacked, worst_residual
 
 ALL = pytest.mark.parametrize("solve", [gram, lazy, primal])
 DUAL = pytest.mark.parametrize("solve", [gram, lazy])
@@ -73,13 +73,13 @@ def test_strided_fortran_read_only_and_integer_inputs_give_the_same_bits(rng):
 
     prepared = DualActiveSet().prepare(P, G)
     expected = prepared.solve(q, lower, upper)
-    expected_lazy = DualActiveSet().solve_stacked(P, q, G, lower, upper)
+    expected_lazy = solve_stacked(P, q, G, lower, upper)
     for change in (strided, np.asfortranarray, frozen):
         arrays = [change(array) for array in (P, q, G, lower, upper)]
         kept = [array.copy() for array in arrays]
         again = DualActiveSet().prepare(arrays[0], arrays[2]).solve(arrays[1], arrays[3], arrays[4])
         np.testing.assert_array_equal(again.x, expected.x)
-        again = DualActiveSet().solve_stacked(*arrays)
+        again = solve_stacked(*arrays)
         np.testing.assert_array_equal(again.x, expected_lazy.x)
         for array, copy in zip(arrays, kept, strict=True):
             np.testing.assert_array_equal(array, copy)

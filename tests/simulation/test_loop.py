@@ -156,9 +156,10 @@ def test_every_failure_is_counted_with_step_and_status():
 def test_every_step_is_told_as_it_happens():
     told = []
     flight = fly(5, on_step=told.append, noise=Noise(**ALL_NOISE))
-    assert [s.index for s in told] == list(range(5))
+    assert [s.k for s in told] == list(range(5))
     assert [s.time for s in told] == [0, 0.1, 0.2, 0.3, 0.4]
-    assert np.array_equal([s.next_state for s in told], flight.states[1:])
+    assert np.array_equal([s.state for s in told], flight.states[:-1])
+    assert np.array_equal([s.measured for s in told], flight.measured)
     assert np.array_equal([s.input for s in told], flight.inputs)
 
 

@@ -1,11 +1,12 @@
 """The check itself: our own models pass, and each broken promise is found out and named."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import numpy as np
 import pytest
 import torch
 
-from gpmpc.dynamics import batched_jacobian
+from gpmpc.dynamics import linearize_by_autograd
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, ResidualModel
@@ -68,9 +69,8 @@ class Honest:
         root = torch.stack([torch.stack([0.1 + state[..., 0] ** 2, 0 * state[..., 0]], -1), state], -2)
         return Gaussian(pendulum(state, input), root @ root.mT)
 
-    def predict_with_jacobian(self, state, input=None):
-        (mean,), (A, B) = batched_jacobian(lambda x, u: (pendulum(x, u),), (state, input))
-        return replace(self.predict(state, input), mean=mean), A, B
+    def linearize(self, states, inputs, covariance=True):
+        return linearize_by_autograd(self, states, inputs, covariance)
 
 
 def test_an_outsiders_honest_model_passes():
@@ -120,21 +120,32 @@ class Dices(Honest):
 
 
 class WrongSlope(Honest):
-    def predict_with_jacobian(self, state, input=None):
-        at, A, B = super().predict_with_jacobian(state, input)
-        return at, A + 1e-3, B
+    def linearize(self, states, inputs, covariance=True):
+        found = super().linearize(states, inputs, covariance)
+        return found._replace(A=found.A + 1e-3)
 
 
 class TransposedSlope(Honest):
-    def predict_with_jacobian(self, state, input=None):
-        at, A, B = super().predict_with_jacobian(state, input)
-        return at, A, B.mT
+    def linearize(self, states, inputs, covariance=True):
+        found = super().linearize(states, inputs, covariance)
+        return found._replace(B=np.ascontiguousarray(found.B.mT))
+
+
+class FortranOrder(Honest):
+    def linearize(self, states, inputs, covariance=True):
+        found = super().linearize(states, inputs, covariance)
+        return found._replace(A=np.asfortranarray(found.A))
 
 
 class AnotherPrediction(Honest):
-    def predict_with_jacobian(self, state, input=None):
-        at, A, B = super().predict_with_jacobian(state, input)
-        return Gaussian(at.mean, at.covariance + self.noise_covariance), A, B
+    def linearize(self, states, inputs, covariance=True):
+        found = super().linearize(states, inputs)
+        return found._replace(covariance=found.covariance + self.noise_covariance.numpy() if covariance else None)
+
+
+class AlwaysCovariance(Honest):
+    def linearize(self, states, inputs, covariance=True):
+        return super().linearize(states, inputs)
 
 
 class FallsToSinglePrecision(Honest):
@@ -156,17 +167,16 @@ class NoDimension(Honest):
     [
         (ForgetsItsBatch, "a batch is the loop over its members; the covariance is off by"),
         (MovesTheMean, "a batch is the loop over its members; the mean is off by"),
-        (
-            WrongShape,
-            r"mean \(\*batch, k\) and covariance .*; got \(\(1,\), \(1, 1\)\), should be \(\(2,\), \(2, 2\)\)",
-        ),
+        (WrongShape, r"mean \(\*batch, k\) and covariance .*; got \(\(4, 1\), \(4, 1, 1\)\), should be \(\(4, 2\), "),
         (Lopsided, "the covariance is symmetric; an entry and its mirror image differ by 1.00e-06"),
         (Indefinite, "the covariance is positive semidefinite; its lowest eigenvalue is -"),
         (Scribbles, "the caller's state and input are left as they are"),
-        (Dices, "the same query has the same answer"),
-        (WrongSlope, "the derivative by the state agrees with finite differences of predict; it is off by 1.00e-03"),
-        (TransposedSlope, r"the derivative by the input is \(\*batch, k, m\); got torch.float64 \(4, 1, 2\)"),
-        (AnotherPrediction, "its prediction is predict's; the covariance is off by"),
+        (Dices, "the same arguments give the same result"),
+        (WrongSlope, "linearize: A agrees with finite differences of predict; it is off by 1.00e-03"),
+        (TransposedSlope, r"B is a C-contiguous float64 array of shape \(4, 2, 1\); got float64 \(4, 1, 2\)"),
+        (FortranOrder, "A is a C-contiguous float64 array"),
+        (AnotherPrediction, "its mean and covariance are predict's; the covariance is off by"),
+        (AlwaysCovariance, "no covariance where it is not wanted"),
         (FallsToSinglePrecision, "type and device are the model's, torch.float64 on cpu; got torch.float32"),
         (NoiseOfAnotherShape, r"noise_covariance is a torch.float64 tensor of shape \(2, 2\); got Tensor .* \(2,\)"),
         (NoDimension, "output_dim is a whole number, 1 or more; got None"),

@@ -146,7 +146,7 @@ def squeezed(model, belief, input):
         (a_triangle, {}, "the covariance is symmetric"),
         (indefinite, {}, "the covariance is positive semidefinite"),
         (scribbles, {}, "the caller's covariance is left as it is"),
-        (dices, {}, "the same belief gives the same answer"),
+        (dices, {}, "the same belief gives the same result"),
         (double_precision_only, {}, "a float32 model and belief give a float32 mean; got torch.float64"),
         (transposed_correlation, {}, "the cross covariance .* is S A' to first order"),
         (forgets_the_correlation, {"exact": True}, "cross covariance agrees with .* Monte Carlo"),
@@ -169,7 +169,7 @@ class WrongDerivative(MomentMatching):
 
 
 def test_a_wrong_closed_form_of_a_derivative_is_found():
-    with pytest.raises(AssertionError, match="covariance_by_covariance agrees with finite differences; that by entry"):
+    with pytest.raises(AssertionError, match="covariance_by_covariance agrees with finite differences; it is off by"):
         check_propagator(WrongDerivative())
 
 

@@ -1,0 +1,98 @@
+"""Standard streams that may be closed, full, or left by their reader; the console and progress bar of long commands."""
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any, TextIO
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+
+_SEARCH = "gpmpc.gp._search"  # logs single evaluations, where a bar says how far the work is
+
+
+class Output:
+    """A stream that ends the command where nothing can be written to it any more.
+
+    Args:
+        stream: What is written to.
+    """
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+        self.broken = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Writes as any stream does."""
+        return self._try(self._stream.write, text)
+
+    def flush(self) -> None:
+        """Flushes as any stream does."""
+        self._try(self._stream.flush)
+
+    def _try(self, act: Callable, *arguments: str) -> Any:
+        try:
+            return act(*arguments)
+        except OSError as error:
+            if not self.broken:
+                self.broken = True
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())  # for what is still in its buffer
+                if not isinstance(error, BrokenPipeError):  # the reader of a pipe, such as head, has seen enough
+                    print_error(f"cannot write to the standard output: {error.strerror}")
+            sys.exit(1)  # no error: nothing on the way may take it for one of a file
+
+
+@contextmanager
+def usable_streams() -> Iterator[None]:
+    """Makes both streams exist and take every letter; where the standard output takes nothing, the command ends."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed; else the next file that is opened would take its place
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+        with suppress(AttributeError):  # not of a file
+            getattr(sys, name).reconfigure(errors="backslashreplace")
+    usual, output = sys.stdout, Output(sys.stdout)
+    sys.stdout = output
+    try:
+        yield
+    finally:
+        with suppress(SystemExit):
+            output.flush()
+        sys.stdout = usual
+        if output.broken:
+            sys.exit(1)
+
+
+def print_error(line: str) -> None:
+    """Writes a line to the standard error, where that is possible."""
+    with suppress(OSError):
+        print(f"gpmpc: {line}", file=sys.stderr)
+
+
+def logging_console() -> "Console":
+    """Returns a console that the package's log lines go to as well, each text once, without a search's evaluations."""
+    from rich.console import Console
+    from rich.logging import RichHandler
+
+    console, shown = Console(), set()
+    handler = RichHandler(console=console, show_path=False, show_time=False, show_level=False)
+    handler.addFilter(lambda record: record.name != _SEARCH)
+    handler.addFilter(lambda record: not (record.getMessage() in shown or shown.add(record.getMessage())))
+    log = logging.getLogger("gpmpc")
+    log.setLevel(logging.INFO)
+    log.handlers, log.propagate = [handler], False
+    return console
+
+
+def progress_bar(console: "Console") -> "Progress":
+    """Returns a bar with how much is done, for how long, and how long it will still take."""
+    from rich import progress
+
+    columns = [progress.TextColumn("{task.description}"), progress.BarColumn(), progress.MofNCompleteColumn()]
+    times = [progress.TimeElapsedColumn(), progress.TextColumn("left"), progress.TimeRemainingColumn()]
+    return progress.Progress(*columns, *times, console=console)

@@ -1,0 +1,326 @@
+"""GP model predictive control: the control step, from a belief and a reference to the input.
+
+The dynamics of the belief are linearised along a plan (``gpmpc.mpc.prediction``), the states eliminated
+(``gpmpc.mpc.condense``), and what is left is a quadratic program in the inputs. One of them a step, of the form
+``trajectory``, is the real-time iteration (Diehl, Bock and Schloeder, 2005); of the form ``velocity`` with moments
+matched it is the convex GP-MPC of Cao, Lai and Alam (2017, section 4). Iterated (``gpmpc.mpc.sqp``), programs solve the
+nonlinear problem itself. Where the iteration ends, in the covariance modes of ``gpmpc.mpc.stages``:
+
+* ``full``, ``diagonal``: at a KKT point of the expected cost of the propagated belief, tr(Q Sigma) included, under
+  chance constraints: the nonlinear GP-MPC of Cao, Lai and Alam (2017, eq. (22)), where moments are matched.
+* ``zero_order``: the cost of the means under bounds tightened by the covariances that the solution itself leads to;
+  that these depend on the inputs is left out of the derivatives.
+* ``none``: the cost of the means.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+
+from gpmpc.dynamics import DynamicsModel
+from gpmpc.exceptions import SettingError, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.condense import CondensedProgram, Condenser
+from gpmpc.mpc.constraints import price_violations
+from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc.linear_quadratic import References, Stages, expand
+from gpmpc.mpc.prediction import Form, Prediction, PredictionModel
+from gpmpc.mpc.request import Request, check_method
+from gpmpc.mpc.sqp import FAILURES, FEASIBLE, FullStep, Globalization
+from gpmpc.mpc.stages import Covariance, Plan
+from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.propagation import Propagator
+from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
+from gpmpc.status import Status
+
+Array = np.ndarray
+
+
+class GPMPC:
+    """GP-MPC by quadratic programs.
+
+    Args:
+        model: What was learned.
+        propagator: How the belief moves; ``covariance="none"`` needs the model's mean only.
+        problem: Weights and bounds.
+        horizon: H, the number of predicted states.
+        initial_input: The input before the first step, and the first guess of every planned one (m,).
+        form: ``"trajectory"`` or ``"velocity"``; see ``gpmpc.mpc.prediction``.
+        covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see ``gpmpc.mpc.stages``.
+        solver: Of the quadratic program; ``DualActiveSet()`` by default, which state bounds with a price need.
+        iterations: Quadratic programs a step at most; more than one for ``"trajectory"`` only.
+        tolerance: Of more iterations: relative offset and defects of a plan that counts as solved (``gpmpc.mpc.sqp``),
+            estimated from the slower of the last two rates of convergence. 1e-8 may be out of reach.
+        feedback: Predicts the covariances of ``"zero_order"`` under a feedback, without which no long horizon with
+            state bounds is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"`` and
+            ``"diagonal"`` are those without feedback.
+        disturbance_gain: L in [0, 1], the observer gain of the constant-disturbance estimate; 0 disables it.
+
+    Attributes:
+        soft: Prices of the rows of the program's G, None where all are hard.
+
+    Raises:
+        SettingError: A setting is unknown or out of its range, or model and problem have other dimensions.
+    """
+
+    def __init__(
+        self,
+        model: DynamicsModel,
+        propagator: Propagator,
+        problem: TrackingProblem,
+        horizon: int,
+        initial_input: Sequence[float],
+        form: Form = "trajectory",
+        covariance: Covariance = "zero_order",
+        solver: QPSolver | None = None,
+        iterations: int = 1,
+        tolerance: float = 1e-6,
+        feedback: bool = True,
+        disturbance_gain: float = 0.0,
+    ):
+        settings = form, covariance, feedback, disturbance_gain
+        self.prediction = PredictionModel(model, propagator, problem, horizon, initial_input, *settings)
+        check_number("iterations", iterations, least=1, whole=True)
+        check_number("tolerance", tolerance, above=0)
+        if iterations > 1 and form != "trajectory":
+            raise SettingError("iterations", f"form {form!r} is one quadratic program, so 1; got {iterations}")
+        self.initial_input, self.problem, self.horizon = self.prediction.initial_input, problem, horizon
+        self.iterations, self.tolerance = iterations, tolerance
+        self.solver = DualActiveSet() if solver is None else solver
+        check_method("solver", self.solver, "solve", "DualActiveSet()")
+        weight = self.prediction.linearizer.weight
+        self._condenser = Condenser(problem, horizon, weight(problem.Q), weight(problem.terminal))
+        self._rates = self._condenser.bounds.rate_lower.size
+        self.soft = self.prediction.constraints.softness(self._rates)
+        if self.soft is not None and not isinstance(self.solver, DualActiveSet):
+            raise SettingError(
+                "solver", f"state bounds with a price (l1, l2) need DualActiveSet; got {type(self.solver).__name__}"
+            )
+
+    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+        """Decides the input for one step; see ``Controller.control``.
+
+        A belief that is not finite gives ``INVALID_MEASUREMENT``. ``iterations`` of the decision counts quadratic
+        programs; with more than one allowed, ``ITERATION_LIMIT`` says that the tolerance was not reached, and the plan
+        is the best that was: ``suboptimal``.
+
+        Args:
+            belief: What is known of the state.
+            reference: Over the horizon, with inputs where the weights ask for them.
+            previous: The last decision; one that is not applicable is ignored.
+
+        Raises:
+            ShapeError: Belief or reference have other dimensions, or reference inputs are missing.
+        """
+        request, clock = self.prediction.read(belief, reference, previous), _Stopwatch()
+        if not request.finite:
+            return request.unanswered(Status.INVALID_MEASUREMENT)
+        try:
+            plan = self.prediction.initial_guess(request, previous)
+            prediction = self.prediction.linearize(plan, request, previous)
+            return self._improve(prediction, request, previous, clock)
+        except FAILURES:
+            return request.unanswered(Status.NUMERICAL_TROUBLE, timing=clock.timing)
+
+    def _improve(
+        self, prediction: Prediction, request: Request, previous: Decision | None, clock: "_Stopwatch"
+    ) -> Decision:
+        """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
+        guess, solution = prediction.plan, previous.solution if previous is not None and previous.applicable else None
+        globalize = FullStep()
+        if self.iterations > 1:
+            globalize = Globalization(self.prediction, self._condenser.cost, request, self.tolerance)
+        status, count = None, 0
+        while status is None and count < self.iterations:
+            clock.model()
+            program = globalize.correct(self._condense(prediction, request), prediction.plan)
+            clock.build()
+            solution = self._solve(program, solution)
+            clock.solve()
+            count, status = count + 1, solution.status
+            if _is_usable(program, solution, prediction.plan):
+                proposed = self._proposed(prediction, program, solution, request.last)
+                prediction, status = globalize(prediction, program, solution, proposed)
+        clock.model()
+        status = Status.ITERATION_LIMIT if status is None else status
+        program = QuadraticProgram.unchecked(*program[:5])
+        suboptimal = not status.solved and prediction.plan is not guess and self._missed(prediction) <= FEASIBLE
+        if not (status.solved or suboptimal):
+            return replace(request.unanswered(status, count, clock.timing), problem=program, solution=solution)
+        plan, disturbance = prediction.plan, request.disturbance if self.prediction.disturbance_gain else None
+        inputs, beliefs = plan.inputs.copy(), self.prediction.linearizer.moments(plan.states, prediction.covariances)
+        found = program, solution, disturbance, suboptimal
+        return Decision(inputs[0], inputs, *beliefs, status, count, clock.timing, *found)
+
+    def control_many(
+        self, beliefs: Sequence[Gaussian], references: Sequence[Reference], previous: Sequence[Decision | None]
+    ) -> list[Decision]:
+        """``control`` for T questions, with the first stages of all of them linearised in one call.
+
+        The quadratic programs are solved one by one. The model's time is shared out equally.
+
+        Args:
+            beliefs: T, one a question.
+            references: T.
+            previous: T decisions, None where there is none.
+
+        Raises:
+            ShapeError: As for ``control``.
+        """
+        asked = list(zip(beliefs, references, previous, strict=True))
+        requests = [self.prediction.read(*question) for question in asked]
+        known, clock = [t for t, request in enumerate(requests) if request.finite], _Stopwatch()
+        decisions = [request.unanswered(Status.INVALID_MEASUREMENT) for request in requests]
+        try:
+            made = self.prediction.linearize_many([requests[t] for t in known], [previous[t] for t in known])
+        except FAILURES:  # one of them spoils the batch: which one, they say alone
+            return [self.control(*question) for question in asked]
+        clock.model(len(known))
+        for t, prediction in zip(known, made, strict=True):
+            try:
+                decisions[t] = self._improve(prediction, requests[t], previous[t], clock.copy())
+            except FAILURES:
+                decisions[t] = requests[t].unanswered(Status.NUMERICAL_TROUBLE, timing=clock.timing)
+        return decisions
+
+    @property
+    def bytes_per_question(self) -> int | None:
+        """Memory that ``control_many`` takes for each question at most [bytes]; None where it cannot be known.
+
+        It is known for GPs and derivatives in closed form: by torch a point takes some arrays (outputs, N, n + m + 1),
+        and a belief of which moments are matched some matrices (N, N) as well. The compiled kernels take far less.
+        """
+        model, linearizer = self.prediction.model, self.prediction.linearizer
+        if not hasattr(model, "features") or getattr(linearizer.propagator, "hessian", False):
+            return None
+        (N, d), n, size = model.features.shape, model.state_dim, self.horizon * self.problem.input_dim
+        p = len(linearizer.weight(self.problem.Q)) * n
+        each = 8 * n * N * (d + 1) + 4 * p * (p + d)
+        if not linearizer.at_points:
+            each += 8 * N * N + 4 * n * n * (N * (n + 1) + n * n + d)
+        return 8 * (self.prediction.points * each + 4 * size * (size + n * self.horizon))
+
+    def build(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> QuadraticProgram:
+        """The (first) quadratic program of a step, checked.
+
+        Its unknowns are the inputs u_0 .. u_{H-1}, one after the other. Rows of G: increments u_k - u_{k-1} where they
+        are bounded, then the bounded states of the stages 1 to H, upper bounds first; ``soft`` has their prices.
+
+        Args:
+            belief: As for ``control``.
+            reference: As for ``control``.
+            previous: As for ``control``.
+
+        Raises:
+            ShapeError: As for ``control``.
+            DataError: The belief is not finite, or it does not stay so.
+            ProblemError: The program is malformed, numerically.
+        """
+        request = self.prediction.read(belief, reference, previous)
+        plan = self.prediction.initial_guess(request, previous)
+        prediction = self.prediction.linearize(plan, request, previous)
+        return QuadraticProgram.from_stacked(*self._condense(prediction, request)[:5])
+
+    def _condense(self, prediction: Prediction, request: Request) -> CondensedProgram:
+        stages, references = Stages(*prediction.stages[:3]), References(request.targets, request.wanted, request.last)
+        return self._condenser.condense(stages, prediction.plan.states[0], references, prediction.rows)
+
+    def _solve(self, program: CondensedProgram, warm: QPSolution | None) -> QPSolution:
+        if isinstance(self.solver, DualActiveSet):
+            soft = self.soft
+            if soft is not None and len(program.feedback):  # there the bounds of inputs are rows, too
+                soft = self.prediction.constraints.softness(len(program.G) - len(soft.linear) + self._rates)
+            return self.solver.solve(QuadraticProgram.unchecked(*program[:5]), warm, soft)
+        fits = warm is not None and len(warm.q) == len(program.q) and len(warm.lower) == len(program.lower)
+        return self.solver.solve(QuadraticProgram.from_stacked(*program[:5]), warm if fits else None)
+
+    def _proposed(self, prediction: Prediction, program: CondensedProgram, solution: QPSolution, last: Array) -> Plan:
+        """The plan of a program's solution: its inputs, and the states that the stages lead to."""
+        stages, start = Stages(*prediction.stages[:3]), prediction.plan.states[0]
+        inputs, states = expand(stages, start, program.feedback, last, solution.x)
+        return Plan(states, inputs, prediction.covariances)
+
+    def _missed(self, prediction: Prediction) -> float:
+        """Violations of hard state bounds by a plan, summed."""
+        if self.soft is not None:
+            return 0.0
+        return price_violations(self.prediction.constraints.prices, prediction.rows, prediction.plan.states, 1.0)
+
+
+class NonlinearGPMPC(GPMPC):
+    """Nonlinear GP-MPC (Cao, Lai and Alam, 2017, eq. (22)): programs of the whole belief, iterated to convergence.
+
+    Args:
+        model: As for ``GPMPC``.
+        propagator: As for ``GPMPC``.
+        problem: As for ``GPMPC``.
+        horizon: As for ``GPMPC``.
+        initial_input: As for ``GPMPC``.
+        covariance: As for ``GPMPC``.
+        iterations: As for ``GPMPC``.
+        tolerance: As for ``GPMPC``.
+    """
+
+    def __init__(
+        self,
+        model: DynamicsModel,
+        propagator: Propagator,
+        problem: TrackingProblem,
+        horizon: int,
+        initial_input: Sequence[float],
+        covariance: Covariance = "full",
+        iterations: int = 100,
+        tolerance: float = 1e-5,
+    ):
+        settings = {"covariance": covariance, "iterations": iterations, "tolerance": tolerance}
+        super().__init__(model, propagator, problem, horizon, initial_input, **settings)
+
+
+def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> bool:
+    """Whether a program was solved, or its solver stopped at a limit at a feasible point no worse than the plan."""
+    if solution.status.solved:
+        return True
+    if solution.status not in (Status.ITERATION_LIMIT, Status.TIME_LIMIT) or not np.isfinite(solution.x).all():
+        return False
+    if not _violation(solution) <= FEASIBLE:
+        return False
+    other = solution._replace(x=0.0 * solution.x if len(program.feedback) else plan.inputs.ravel())
+    return solution.objective <= other.objective or _violation(other) > FEASIBLE
+
+
+def _violation(solution: QPSolution) -> float:
+    """The largest violation of a hard row."""
+    softness, caps = solution.terms.softness
+    return float(solution.violation()[(softness == 0.0) & np.isinf(caps)].max(initial=0.0))
+
+
+class _Stopwatch:
+    """Where the time goes, in laps: each call adds the time since the last one to its part."""
+
+    def __init__(self) -> None:
+        self._parts, self._last = [0.0, 0.0, 0.0], perf_counter()
+
+    def model(self, shares: int = 1) -> None:
+        self._lap(0, shares)
+
+    def build(self) -> None:
+        self._lap(1)
+
+    def solve(self) -> None:
+        self._lap(2)
+
+    def copy(self) -> "_Stopwatch":
+        other = _Stopwatch()
+        other._parts[:] = self._parts
+        return other
+
+    @property
+    def timing(self) -> Timing:
+        return Timing(*self._parts)
+
+    def _lap(self, part: int, shares: int = 1) -> None:
+        now = perf_counter()
+        self._parts[part] += (now - self._last) / max(1, shares)
+        self._last = now

@@ -1,0 +1,253 @@
+"""Dense algebra of the dual active-set kernels: products, and triangular factors L with reciprocals on the diagonal.
+
+A factor is lower triangular and stored by rows, so that one pair of solves serves both P = L'L and K_WW = L L'. Loops
+take four rows at a time: their sums hide each other's latency. Nothing is allocated and nothing is checked.
+"""
+
+import math
+
+from gpmpc.compiled import inline_njit
+from gpmpc.kernels.linalg import dot, four_dots
+from gpmpc.qp.lanes import lanes, less, put, scaled, some_lanes
+
+_LANES, _BLOCK = 8, 4
+_ROUNDING = 2.3e-16  # times n: share of P_ii below which a pivot is rounding
+_SKEW = 1e-10  # largest |P - P'| accepted, as a share of the largest diagonal entry
+
+
+@inline_njit
+def multiply_rows(A, places, count, vector, size, product):
+    """Writes ``product[i] = A[places[i]] . vector``."""
+    i = 0
+    while i + 4 <= count:
+        r0, r1, r2, r3 = A[places[i]], A[places[i + 1]], A[places[i + 2]], A[places[i + 3]]
+        four_dots((r0, r1, r2, r3), vector, size, product[i:])
+        i += 4
+    while i < count:
+        product[i] = dot(A[places[i]], vector, size)
+        i += 1
+
+
+@inline_njit
+def subtract_rows(target, rows, places, factors, count, size):
+    """Writes ``target -= sum_i factors[i] rows[places[i]]``."""
+    i = 0
+    while i + 4 <= count:
+        r0, r1, r2, r3 = rows[places[i]], rows[places[i + 1]], rows[places[i + 2]], rows[places[i + 3]]
+        f0, f1, f2, f3 = factors[i], factors[i + 1], factors[i + 2], factors[i + 3]
+        for j in range(size):
+            target[j] -= f0 * r0[j] + f1 * r1[j] + f2 * r2[j] + f3 * r3[j]
+        i += 4
+    while i < count:
+        row, f = rows[places[i]], factors[i]
+        for j in range(size):
+            target[j] -= f * row[j]
+        i += 1
+
+
+@inline_njit
+def solve_lower(L, k, a):
+    """Writes ``a <- L^-1 a``."""
+    i = 0
+    while i + 4 <= k:
+        r1, r2, r3 = L[i + 1], L[i + 2], L[i + 3]
+        a0, a1, a2, a3 = a[i], a[i + 1], a[i + 2], a[i + 3]
+        four_dots((L[i], r1, r2, r3), a, i, a[i:])
+        a0 = (a0 - a[i]) * L[i, i]
+        a1 = (a1 - a[i + 1] - r1[i] * a0) * r1[i + 1]
+        a2 = (a2 - a[i + 2] - r2[i] * a0 - r2[i + 1] * a1) * r2[i + 2]
+        a3 = (a3 - a[i + 3] - r3[i] * a0 - r3[i + 1] * a1 - r3[i + 2] * a2) * r3[i + 3]
+        a[i], a[i + 1], a[i + 2], a[i + 3] = a0, a1, a2, a3
+        i += 4
+    while i < k:
+        a[i] = (a[i] - dot(L[i], a, i)) * L[i, i]
+        i += 1
+
+
+@inline_njit
+def solve_transposed(L, end, a):
+    """Writes ``a <- L^-T a`` for a vector that is zero from ``end`` on."""
+    j = end
+    while j % 4:
+        j -= 1
+        row, f = L[j], a[j] * L[j, j]
+        a[j] = f
+        for i in range(j):
+            a[i] -= f * row[i]
+    while j > 0:
+        j -= 4
+        r0, r1, r2, r3 = L[j], L[j + 1], L[j + 2], L[j + 3]
+        a3 = a[j + 3] * r3[j + 3]
+        a2 = (a[j + 2] - a3 * r3[j + 2]) * r2[j + 2]
+        a1 = (a[j + 1] - a3 * r3[j + 1] - a2 * r2[j + 1]) * r1[j + 1]
+        a0 = (a[j] - a3 * r3[j] - a2 * r2[j] - a1 * r1[j]) * r0[j]
+        a[j], a[j + 1], a[j + 2], a[j + 3] = a0, a1, a2, a3
+        for i in range(j):
+            a[i] -= a0 * r0[i] + a1 * r1[i] + a2 * r2[i] + a3 * r3[i]
+
+
+@inline_njit
+def append_row(L, k, solved, pivot):
+    """Writes row k of ``L L' = K_WW``: ``solved = L^-1 K_Wp`` and ``pivot = K_pp - |solved|^2 > 0``."""
+    row = L[k]
+    for j in range(k):
+        row[j] = solved[j]
+    row[k] = 1.0 / math.sqrt(pivot)
+
+
+@inline_njit
+def delete_row(L, k, gone, solved, cosines, sines):
+    """Deletes row ``gone`` of L, which has k rows, and entry ``gone`` of a in ``solved = L^-1 a``.
+
+    Givens rotations restore the triangle (Golub and Van Loan, Matrix Computations, 4th ed., section 6.5.2); ``cosines``
+    and ``sines`` (k,) are scratch.
+    """
+    left = solved[gone]
+    for i in range(gone + 1, k):
+        row, above, rest = L[i], L[i - 1], L[i, gone]
+        for j in range(gone):
+            above[j] = row[j]
+        for j in range(gone + 1, i):
+            entry = row[j]
+            above[j - 1], rest = cosines[j] * rest + sines[j] * entry, cosines[j] * entry - sines[j] * rest
+        diagonal = 1.0 / row[i]
+        reciprocal = 1.0 / math.sqrt(rest * rest + diagonal * diagonal)
+        cosines[i], sines[i] = rest * reciprocal, diagonal * reciprocal
+        above[i - 1] = reciprocal
+        below = solved[i]
+        solved[i - 1], left = cosines[i] * left + sines[i] * below, cosines[i] * below - sines[i] * left
+
+
+@inline_njit
+def factorise(P, L):
+    """Writes L of ``P = L'L``; returns False unless P is symmetric, finite and positive definite.
+
+    Variables are eliminated from the last to the first: a constraint on the first few variables only, as all are in
+    predictive control where no state depends on later inputs, then has as short a row L^-T c. Rows of L are padded to a
+    multiple of eight; its upper triangle is undefined.
+    """
+    n = len(P)
+    if not is_symmetric(P):
+        return False
+    top = n // _BLOCK * _BLOCK
+    if top < n and not _finish_last_rows(P, L, top):
+        return False
+    good = True
+    while good and top > 0:
+        top -= _BLOCK
+        good = _finish_four_rows(P, L, top)
+    return good
+
+
+@inline_njit
+def is_symmetric(P):
+    """Returns whether P equals its transpose but for rounding; reads blocks that stay in the cache."""
+    n, largest, squares, skewed = len(P), 0.0, 0.0, 0
+    for i in range(n):
+        largest = max(largest, abs(P[i, i]))
+    allowed = _SKEW * largest
+    for left in range(0, n, 8):
+        for i in range(left, min(left + 8, n)):
+            for j in range(left, i):
+                squares += (P[i, j] - P[j, i]) * (P[i, j] - P[j, i])
+        for i in range(left + 8, n):
+            for j in range(left, left + 8):
+                squares += (P[i, j] - P[j, i]) * (P[i, j] - P[j, i])
+    if squares <= allowed * allowed:  # enough, and quickly summed
+        return True
+    for i in range(n):
+        for j in range(i):
+            skewed += not abs(P[i, j] - P[j, i]) <= allowed
+    return skewed == 0
+
+
+@inline_njit
+def _is_pivot(pivot, diagonal, n):
+    """Returns whether a pivot is positive, finite, and more than rounding."""
+    return (pivot > n * _ROUNDING * diagonal) & (pivot < math.inf)
+
+
+@inline_njit
+def _finish_last_rows(P, L, top):
+    """Writes the rows from ``top`` on, fewer than four."""
+    n = len(P)
+    for i in range(top, n):
+        for j in range(i + 1):
+            L[i, j] = P[i, j]
+    for i in range(n - 1, top - 1, -1):
+        row, pivot = L[i], L[i, i]
+        if not _is_pivot(pivot, P[i, i], n):
+            return False
+        reciprocal = 1.0 / math.sqrt(pivot)
+        for j in range(i):
+            row[j] *= reciprocal
+        row[i] = reciprocal
+        for k in range(top, i):
+            factor, target = row[k], L[k]
+            for j in range(k + 1):
+                target[j] -= factor * row[j]
+    return True
+
+
+@inline_njit
+def _subtract_below(P, L, top, j):
+    """Returns eight columns of four rows of P less what the rows of L below take off: registers hold all of it."""
+    a0, a1, a2, a3 = (
+        some_lanes(P[top], j),
+        some_lanes(P[top + 1], j),
+        some_lanes(P[top + 2], j),
+        some_lanes(P[top + 3], j),
+    )
+    for s in range(top + _BLOCK, len(P)):
+        row = L[s]
+        x = lanes(row, j)
+        a0, a1, a2, a3 = (
+            less(a0, row[top], x),
+            less(a1, row[top + 1], x),
+            less(a2, row[top + 2], x),
+            less(a3, row[top + 3], x),
+        )
+    return a0, a1, a2, a3
+
+
+@inline_njit
+def _finish_four_rows(P, L, top):
+    """Writes rows ``top`` to ``top + 3``, given those below; returns False where a pivot is none."""
+    n = len(P)
+    t0, t1, t2, t3 = L[top], L[top + 1], L[top + 2], L[top + 3]
+    j = top // _LANES * _LANES  # the piece with the diagonal comes first
+    a0, a1, a2, a3 = _subtract_below(P, L, top, j)
+    put(t0, j, a0)
+    put(t1, j, a1)
+    put(t2, j, a2)
+    put(t3, j, a3)
+    # the block of four by four: its pivots d, and what of which row to subtract from which
+    d3 = t3[top + 3]
+    r3 = 1.0 / d3
+    m23, m13, m03 = t3[top + 2] * r3, t3[top + 1] * r3, t3[top] * r3
+    d2 = t2[top + 2] - m23 * t3[top + 2]
+    r2 = 1.0 / d2
+    e21, e20 = t2[top + 1] - m23 * t3[top + 1], t2[top] - m23 * t3[top]
+    m12, m02 = e21 * r2, e20 * r2
+    d1 = t1[top + 1] - m13 * t3[top + 1] - m12 * e21
+    r1 = 1.0 / d1
+    e10 = t1[top] - m13 * t3[top] - m12 * e20
+    m01 = e10 * r1
+    d0 = t0[top] - m03 * t3[top] - m02 * e20 - m01 * e10
+    good = _is_pivot(d3, P[top + 3, top + 3], n) & _is_pivot(d2, P[top + 2, top + 2], n)
+    if not (good & _is_pivot(d1, P[top + 1, top + 1], n) & _is_pivot(d0, P[top, top], n)):
+        return False
+    g3, g2, g1, g0 = math.sqrt(r3), math.sqrt(r2), math.sqrt(r1), 1.0 / math.sqrt(d0)
+    while j >= 0:
+        a2 = less(a2, m23, a3)
+        a1 = less(less(a1, m13, a3), m12, a2)
+        a0 = less(less(less(a0, m03, a3), m02, a2), m01, a1)
+        put(t0, j, scaled(g0, a0))
+        put(t1, j, scaled(g1, a1))
+        put(t2, j, scaled(g2, a2))
+        put(t3, j, scaled(g3, a3))
+        j -= _LANES
+        if j >= 0:
+            a0, a1, a2, a3 = _subtract_below(P, L, top, j)
+    t0[top], t1[top + 1], t2[top + 2], t3[top + 3] = g0, g1, g2, g3
+    return True

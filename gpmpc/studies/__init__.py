@@ -1,0 +1,1 @@
+"""Studies: conditions and seeds, the trials that they make, the store of the records, and the tables of them."""

@@ -1,0 +1,295 @@
+"""Flies one trial of one subsystem with a learned model, and measures it.
+
+    data -> a random subset -> training -> controller -> closed loop -> metrics
+
+``Experiment`` holds everything that the numbers follow from, as objects; files and settings are not among them. It
+flies the translational subsystem along a trajectory, or the rotational one on its own, at its own rate, along the
+attitudes that the trajectory needs (``gpmpc.datasets.attitudes``). The seed is that of the subset, of the training's
+random starts and of the noise: one seed gives one result, and the subsets of one seed are nested, so that sizes can be
+compared in pairs.
+"""
+
+import inspect
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from gpmpc.datasets import DataSource, rotational_states_along
+from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
+from gpmpc.gp import Training, Transitions
+from gpmpc.metrics import NEAR, find_loss, time_quantiles, tracking_error, violation_rate
+from gpmpc.mpc.controller import Controller, Reference
+from gpmpc.mpc.supervision import OnFailure, check_policy
+from gpmpc.propagation import MomentMatching, Propagator
+from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
+from gpmpc.studies.document import Table
+from gpmpc.studies.study import random_rows
+from gpmpc.systems import Coupled, Map, Plant, Rotational, Translational
+from gpmpc.trajectories import Trajectory, states_along
+
+_NAMES = {"translational": Translational.state_names, "rotational": Rotational.state_names}
+_UNITS = {"translational": "m", "rotational": "rad"}  # of the positions and angles that errors are stated in
+_STAGES = ("model", "build", "solve", "total")  # of a decision's time
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One flight of one subsystem, with everything that it depends on.
+
+    Attributes:
+        data: Where transitions come from.
+        trajectory: What is followed, from its beginning.
+        plant: What flies, and the true model of a controller that takes one.
+        train: From transitions and a ``seed`` to a ``Training``.
+        controller: From a model, or from a ``plant`` where its first argument is called so, to a ``Controller``.
+        subsystem: Which of the two is learned and flown.
+        name: Of the trajectory, which data from files are filed under.
+        size: Rows drawn for the training; None takes all.
+        steps: Of the flight.
+        seed: Of all random numbers.
+        loop: What stands at the other end: the plant, or the learned model rolled on itself.
+        propagator: The controller's own, if it has one. A model loop carries its belief on with it, or by moment
+            matching.
+        noise: On the plant.
+        disturbances: Of the plant.
+        on_failure: What is applied where a solve fails.
+
+    Raises:
+        SettingError: A number out of range, an unknown policy or loop, a disturbance that does not fit the plant.
+        ShapeError: Noise that does not fit the plant.
+    """
+
+    data: DataSource
+    trajectory: Trajectory
+    plant: Plant
+    train: Callable[..., Training]
+    controller: Callable[..., Controller]
+    subsystem: Literal["translational", "rotational"] = "translational"
+    name: str = "elliptical"
+    size: int | None = None
+    steps: int = 100
+    seed: int = 0
+    loop: Literal["plant", "model"] = "plant"
+    propagator: Propagator | None = None
+    noise: Noise | None = None
+    disturbances: Sequence[Disturbance] = ()
+    on_failure: OnFailure = "previous_plan"
+
+    def __post_init__(self) -> None:
+        if self.size is not None:
+            check_number("data.size", self.size, least=1, whole=True)
+        check_number("steps", self.steps, least=1, whole=True)
+        check_number("seed", self.seed, least=0, whole=True)
+        check_policy(self.on_failure)
+        if self.loop not in ("plant", "model"):
+            raise SettingError("loop", f"must be 'plant' or 'model'; got {self.loop!r}")
+        if self.subsystem not in _NAMES:
+            raise SettingError("subsystem", f"must be one of {', '.join(_NAMES)}; got {self.subsystem!r}")
+        expected, names = _NAMES[self.subsystem], tuple(self.plant.dynamics.state_names)
+        if names != expected:
+            what = f"must have the states of the {self.subsystem} subsystem, {', '.join(expected)}"
+            whole = "; the whole quadrotor is flown by gpmpc.simulation.cascade_loop"
+            raise SettingError(
+                "plant", f"{what}; got {', '.join(names)}{whole if names == Coupled.state_names else ''}"
+            )
+        if self.subsystem == "rotational" and isinstance(self.plant, Map):
+            raise SettingError("plant", "the rotational subsystem is flown at its own rate; a Map has none")
+        if self.loop == "model" and not self.learns:
+            raise SettingError("loop", "a model loop needs a controller that learns a model; this one knows the plant")
+        for disturbance in self.disturbances:
+            if not hasattr(disturbance, "disturb_plant"):
+                what = "must each name what it is, such as {_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}}"
+                raise SettingError("disturbances", f"{what}; got {disturbance!r}")
+        if self.loop == "plant":  # noise and disturbances that do not fit it are found before the training
+            PlantSimulator(self.plant, np.zeros(len(names)), self.disturbances, self.noise, self.seed)
+
+    @property
+    def learns(self) -> bool:
+        """Whether the controller works on a learned model."""
+        return next(iter(inspect.signature(self.controller).parameters)) != "plant"
+
+    def training_rows(self) -> Transitions:
+        """Returns the rows drawn, in the order of the flight that they come from.
+
+        Raises:
+            SettingError: More rows are asked for than there are.
+            ShapeError: The data have other dimensions than the plant.
+        """
+        data = self.data.transitions(self.name, self.trajectory, self.subsystem)
+        expected = len(self.plant.dynamics.state_names), len(self.plant.dynamics.input_names)
+        if (data.state_dim, data.input_dim) != expected:
+            raise ShapeError(f"data and plant must have the same dimensions; got {data.state_dim, data.input_dim}")
+        size = len(data) if self.size is None else self.size
+        if size > len(data):
+            raise SettingError("data.size", f"must be at most {len(data)}, the rows of the data; got {size}")
+        return data[random_rows(len(data), size, self.seed)]
+
+    def references(self, count: int) -> np.ndarray:
+        """Returns the states to follow (count, n), one a step of the plant."""
+        time_step = self.plant.time_step
+        if self.subsystem == "rotational":
+            return rotational_states_along(self.trajectory, count, time_step)
+        return states_along(self.trajectory, time_step * np.arange(count))
+
+    def unplanned_noise(self, training: Training | None) -> np.ndarray:
+        """Returns standard deviations (n,) of the noise of a next state that the covariances of a plan leave out.
+
+        It is what the model has learned of it; a controller that knows the plant knows its noise as well.
+        """
+        n = len(self.plant.dynamics.state_names)
+        if getattr(self.propagator, "process_noise", False) or self.loop == "model":
+            return np.zeros(n)
+        if training is not None:
+            return training.posterior.noise_covariance.diagonal().sqrt().numpy()
+        noise = self.noise and self.noise.process
+        return np.zeros(n) if noise is None else np.array(noise, dtype=float)
+
+
+@dataclass(frozen=True)
+class Flown:
+    """An experiment that was flown.
+
+    Attributes:
+        rollout: Every step, as arrays.
+        controller: What steered.
+        training: What was learned; None where the controller knows the plant.
+        diverged: Where and why the system left the finite numbers, and the rollout ends; None where it did not.
+    """
+
+    rollout: Rollout
+    controller: Controller
+    training: Training | None
+    diverged: Diverged | None = None
+
+
+def run_trial(
+    experiment: Experiment, prepare: Callable[[Controller, Training | None], Callable[[Step], None]] | None = None
+) -> Flown:
+    """Trains and flies.
+
+    Args:
+        experiment: All of it.
+        prepare: Called before the first step with the controller and the training; what it returns is called with
+            every step.
+
+    Raises:
+        SettingError: More rows are asked for than there are, or settings that do not fit each other.
+        DataError: The data cannot be read.
+        TrainingError: An output could not be trained.
+        SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
+        Diverged: The system left the finite numbers in its first step.
+    """
+    plant, training = experiment.plant, None
+    if experiment.learns:
+        training = experiment.train(experiment.training_rows(), seed=experiment.seed)
+        controller = experiment.controller(training.posterior)
+    else:
+        controller = experiment.controller(plant)
+    system: Plant | ModelLoop = plant
+    if experiment.loop == "model":
+        system = ModelLoop(training.posterior, experiment.propagator or MomentMatching(), time_step=plant.time_step)
+    states = experiment.references(experiment.steps + controller.horizon + 1)
+    resting = np.asarray(controller.initial_input)  # falls back on it where the very first solve fails
+    reference = Reference(states, np.tile(resting, (len(states) - 1, 1)))
+    rehearse(system, controller, reference, states[0])
+    on_step = None if prepare is None else prepare(controller, training)
+    try:
+        rollout = closed_loop(
+            system,
+            controller,
+            reference,
+            states[0],
+            experiment.steps,
+            noise=experiment.noise,
+            disturbances=experiment.disturbances,
+            on_failure=experiment.on_failure,
+            seed=experiment.seed,
+            on_step=on_step,
+        )
+    except Diverged as error:
+        if error.flown is None:
+            raise
+        return Flown(error.flown, controller, training, error)
+    return Flown(rollout, controller, training)
+
+
+def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
+    """Returns the results of a flight as plain data; everything that differs between equal runs is under ``times``.
+
+    ``lost`` says since when and why a flight no longer follows its reference (``find_loss``, or it diverged). One that
+    diverged has no RMSE: None.
+    """
+    rollout, problem, training = flown.rollout, flown.controller.problem, flown.training
+    names = experiment.plant.dynamics.state_names[::2]
+    error = tracking_error(rollout.states, rollout.references)
+    rmse = {name: float(value) for name, value in zip(names, error.axes, strict=True)} | {"total": error.total}
+    if flown.diverged is not None or not np.isfinite(error.total):
+        rmse = dict.fromkeys(rmse)
+    violations = {"inputs": violation_rate(rollout.inputs, problem.input_lower, problem.input_upper)}
+    if problem.state_bounds is not None:
+        bounds = problem.state_bounds
+        violations["states"] = violation_rate(rollout.states[1:], bounds.lower, bounds.upper)
+    learned = None
+    if training is not None:
+        objective = [float(value) for value in training.objective]
+        learned = {"size": len(training.posterior), "evaluations": training.evaluations, "objective": objective}
+    return {
+        "steps": len(rollout.inputs),
+        "unit": _UNITS[experiment.subsystem],
+        "rmse": rmse,
+        "lost": _lost(experiment, flown),
+        "violations": {name: asdict(rate) | {"rate": rate.rate} for name, rate in violations.items()},
+        "failures": dict(Counter(status.name for _, status in rollout.failures)),
+        "suboptimal": dict(Counter(rollout.statuses[k].name for k in rollout.suboptimal)),
+        "iterations": {"mean": float(rollout.iterations.mean()), "largest": int(rollout.iterations.max())},
+        "training": learned,
+        "times": {"training": None if training is None else training.seconds}
+        | {stage: asdict(time_quantiles(np.array([getattr(t, stage) for t in rollout.timings]))) for stage in _STAGES},
+    }
+
+
+def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
+    """Returns step, time [s] and reason of a flight's loss; None where it was not lost."""
+    unit, found = _UNITS[experiment.subsystem], []
+    if loss := find_loss(flown.rollout.states, flown.rollout.references, NEAR[unit]):
+        far = f"{loss.distance:.3g} {unit} from its reference, more than {loss.limit:.3g} {unit}"
+        found.append((loss.step, far))
+    if flown.diverged is not None:
+        found.append((flown.diverged.step, " ".join(str(flown.diverged).split())))
+    if not found:
+        return None
+    step = found[0][0]
+    reasons = "; ".join(reason for _, reason in found)
+    return {"step": step, "time": round(step * flown.rollout.time_step, 9), "reason": reasons}
+
+
+def summary(result: Mapping[str, Any]) -> Table:
+    """Returns a run's metrics in words, a line each."""
+    options, training, times = result["settings"]["options"], result["training"], result["times"]
+    along = options["trajectory"] if options["subsystem"] == "translational" else f"{options['trajectory']} attitude"
+    lines = [("flight", f"{result['steps']} steps of {along} with {options['controller']}")]
+    if training:
+        lines.append(("training", f"{training['size']} rows, {times['training']:.2f} s"))
+    if lost := result.get("lost"):
+        lines.append(("lost", f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}"))
+    axes = ", ".join(f"{k} {v:.3g}" for k, v in result["rmse"].items() if v is not None and k != "total")
+    total = result["rmse"]["total"]
+    lines.append((f"RMSE [{result['unit']}]", "none: it diverged" if total is None else f"{total:.3g}  ({axes})"))
+    for name, rate in result["violations"].items():
+        outside = f"{rate['violations']} of {rate['steps']} steps outside"
+        lines.append((f"bounds of {name}", f"{outside} (95 %: {100 * rate['low']:.2g} to {100 * rate['high']:.2g} %)"))
+    lines.append(("failed solves", _counted(result["failures"]) or "none"))
+    if result.get("suboptimal"):
+        stopped = f"{_counted(result['suboptimal'])}: plans that were not optimal yet, applied"
+        lines.append(("stopped early", stopped))
+    stages = ", ".join(f"{stage} {1e3 * times[stage]['median']:.3g}" for stage in _STAGES[:3])
+    median, most = (f"{1e3 * times['total'][key]:.3g}" for key in ("median", "p99"))
+    lines.append(("decision [ms]", f"median {median}  ({stages}), 99 % below {most}"))
+    return Table(("", ""), lines)
+
+
+def _counted(statuses: Mapping[str, int]) -> str:
+    return ", ".join(f"{status} {count}" for status, count in statuses.items())

@@ -1,0 +1,156 @@
+"""Keeps a run in a folder that says whether the run is finished, what its results are and what made it.
+
+    config.yaml    the resolved settings
+    run.mcap       every step
+    metrics.json   the results; written last and in one piece: where it is, the run is finished
+    error.json     why it failed, where it did
+
+Runs of a sweep share nothing but the tree of such folders, so any number of processes can work on one tree: who works
+on a folder holds a lock on it, which the system takes back from a process that dies.
+"""
+
+import fcntl
+import hashlib
+import json
+import os
+import re
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gpmpc.exceptions import DataError, GpmpcError, SettingError
+from gpmpc.files import remove_partial, write_whole
+from gpmpc.provenance import provenance
+
+METRICS, ERROR, CONFIG, RECORDING = "metrics.json", "error.json", "config.yaml", "run.mcap"
+PLAN = "sweep-"  # begins the names of the files that say which runs a sweep asked for
+LONGEST_NAME = 150  # characters of a folder's name; file systems take 255 bytes
+
+
+class Busy(GpmpcError):
+    """Another process works on this run."""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """One run's folder.
+
+    Attributes:
+        path: Where it is.
+    """
+
+    path: Path
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is a result."""
+        return (self.path / METRICS).exists()
+
+    @property
+    def failed_at(self) -> int | None:
+        """When the run failed [ns]; None where it did not."""
+        try:
+            return (self.path / ERROR).stat().st_mtime_ns
+        except FileNotFoundError:
+            return None
+
+    @contextmanager
+    def locked(self, wait: bool = True) -> Iterator[None]:
+        """Makes the folder, clears it of half-written files and keeps other processes from working on it meanwhile.
+
+        Args:
+            wait: Until another process is done with it.
+
+        Raises:
+            Busy: Another process works on it, and ``wait`` is false.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        folder = os.open(self.path, os.O_RDONLY)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            remove_partial(self.path)
+            yield
+        except BlockingIOError as error:
+            raise Busy(f"{self.path}: another process works on this run") from error
+        finally:
+            os.close(folder)
+
+    def begin(self, config: str) -> None:
+        """Forgets an earlier failure and keeps the resolved settings."""
+        (self.path / ERROR).unlink(missing_ok=True)
+        write_whole(self.path / CONFIG, config)
+
+    def finish(self, result: Mapping[str, Any]) -> None:
+        """Makes the run a finished one."""
+        write_whole(self.path / METRICS, json.dumps(result, indent=1) + "\n")
+
+    def fail(self, error: BaseException, about: Mapping[str, Any]) -> None:
+        """Keeps why the run failed, with the traceback."""
+        content = {
+            **about,
+            "error": " ".join(str(error).split()) or type(error).__name__,
+            "kind": type(error).__name__,
+            "traceback": "".join(traceback.format_exception(error)),
+        }
+        write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")
+
+    def result(self, settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """Reads the result of the finished run.
+
+        Args:
+            settings: Those that are asked for now; None takes any.
+
+        Raises:
+            DataError: The file is not what a run writes.
+            SettingError: The run was flown with other settings: those of a file have changed meanwhile.
+        """
+        path = self.path / METRICS
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            before = content["settings"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{path}: is not what a run writes: {type(error).__name__}: {error}") from error
+        if settings is not None and (differs := difference(before, settings)):
+            reason = f"{self.path} holds a finished run of other settings ({differs})"
+            raise SettingError("folder", f"{reason}; choose another folder, or remove that one to fly it again")
+        return content
+
+
+def record(choices: Sequence[str], settings: Mapping[str, Any], command: str) -> dict[str, Any]:
+    """Returns the beginning of metrics.json and error.json: what was asked for and what made it.
+
+    Args:
+        choices: What the user chose, ``key=value`` each.
+        settings: The resolved configuration, with the chosen options by group under ``options``.
+        command: What makes this run again.
+    """
+    about = {"schema": 1, "choices": list(choices), "settings": dict(settings), "seed": settings.get("seed")}
+    return about | {"provenance": provenance() | {"command": command}}
+
+
+def folder_name(choices: Sequence[str]) -> str:
+    """Returns a name for a run of these choices, ``key=value`` each; runs of other choices have other names."""
+    text = ",".join(sorted(choices)) or "default"
+    name = re.sub(r"[^\w=.,+\-\[\]@]", "_", text, flags=re.ASCII)[:LONGEST_NAME]
+    # Equal up to upper and lower case is equal on some file systems; a comma in a choice could be one between two.
+    if name == text == text.lower() and not any("," in choice for choice in choices):
+        return name
+    text = json.dumps(sorted(choices))
+    return f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
+
+
+def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Returns in words where two settings differ, the first three of their leaves; empty where they are equal."""
+    differing = _differing(then, now)
+    first = ", ".join(f"{key}: {a!r} then, {b!r} now" for key, a, b in differing[:3])
+    return first + (f", and {len(differing) - 3} more" if len(differing) > 3 else "")
+
+
+def _differing(then: Any, now: Any, key: str = "") -> list[tuple[str, Any, Any]]:
+    if isinstance(then, Mapping) and isinstance(now, Mapping):
+        keys = dict.fromkeys([*then, *now])
+        return [d for k in keys for d in _differing(then.get(k), now.get(k), f"{key}.{k}" if key else k)]
+    return [] if then == now else [(key, then, now)]

@@ -1,0 +1,218 @@
+"""Runs every condition of a study with every seed, and keeps each record as soon as it is there.
+
+A *trial* is one condition with one seed. Trials are independent: they run in worker processes of one thread each, and
+the record of a finished one is appended to a file under the fingerprint of everything that it depends on. A study that
+was killed at any moment goes on where it stopped.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import cache, lru_cache, partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from threadpoolctl import threadpool_limits
+
+import gpmpc
+from gpmpc.compiling import tell_of_compiling
+from gpmpc.exceptions import DataError, GpmpcError, check_number
+from gpmpc.gp import GPPosterior, Training, Transitions, load_posterior, save_posterior
+from gpmpc.parallel import in_processes
+from gpmpc.studies.document import Document, Table
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One condition with one seed.
+
+    Attributes:
+        labels: First entries of its record, plain data: what the condition is called, which trial it is.
+        condition: What ``run_trial`` needs of it; it can be pickled.
+        seed: Of all random numbers.
+        fingerprint: Names everything that the numbers of the record depend on.
+        work: Trials of more work are started earlier, so that the last ones to run are short.
+    """
+
+    labels: Mapping[str, Any]
+    condition: Any
+    seed: int
+    fingerprint: str
+    work: float = 0.0
+
+
+class Study(Protocol):
+    """A published result: which trials it needs, and how its tables follow from their records."""
+
+    name: str  # of its documents
+    trial_name: str  # what its trials are called in JSON
+    run_trial: Callable[[Trial], dict[str, Any]]
+    workers: int | None
+
+    def trials(self, folder: Path) -> list[Trial]:
+        """Returns every trial in the order of the tables; trained models are kept in ``folder``."""
+
+    def summary(self, records: Sequence[dict]) -> tuple[list[Table], list[str]]:
+        """Returns the tables for a terminal and the paragraphs below them."""
+
+    def document(self, records: Sequence[dict]) -> Document:
+        """Returns everything that is written."""
+
+
+class TrialStore:
+    """Records of finished trials in a file of one JSON object a line; a line that a crash cut short is skipped.
+
+    Args:
+        path: The file; the first ``append`` makes it.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.records: dict[str, dict] = {}
+        if path.exists():
+            text = path.read_text(encoding="utf-8", errors="replace")
+            for line in text.splitlines():
+                try:
+                    entry = json.loads(line)
+                    self.records[entry["fingerprint"]] = entry["record"]
+                except (ValueError, KeyError, TypeError):
+                    continue
+            if text and not text.endswith("\n"):
+                with path.open("a", encoding="utf-8") as file:
+                    file.write("\n")
+
+    def append(self, fingerprint: str, record: dict) -> None:
+        """Keeps a record; it is on the disk when this returns."""
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"fingerprint": fingerprint, "record": record}) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        self.records[fingerprint] = record
+
+
+def run_study(
+    run_trial: Callable[[Trial], dict[str, Any]],
+    trials: Sequence[Trial],
+    store: TrialStore,
+    workers: int | None = None,
+    progress: Callable[[dict], None] = lambda record: None,
+) -> list[dict]:
+    """Runs the trials that the store does not hold yet.
+
+    Args:
+        run_trial: From a trial to plain data. What it raises as a ``GpmpcError``, or of linear algebra, is the trial's
+            ``error``; the others go on.
+        trials: All of the study.
+        store: Where records are kept.
+        workers: Processes; None takes one a core.
+        progress: Called with every record, found or new.
+
+    Returns:
+        One record a trial, in their order.
+
+    Raises:
+        GpmpcError: A worker process died.
+    """
+    missing = {trial.fingerprint: trial for trial in trials if trial.fingerprint not in store.records}
+    for trial in trials:
+        if trial.fingerprint not in missing:
+            progress(store.records[trial.fingerprint])
+    order = sorted(missing.values(), key=lambda trial: -trial.work)
+    try:
+        with closing(in_processes(partial(_record, run_trial), order, workers)) as finished:
+            for index, record in finished:
+                store.append(order[index].fingerprint, record)
+                progress(record)
+    except BrokenProcessPool as error:
+        raise GpmpcError("a worker process died (out of memory?); the same command goes on where it stopped") from error
+    return [store.records[trial.fingerprint] | dict(trial.labels) for trial in trials]
+
+
+@tell_of_compiling()
+def _record(run_trial: Callable[[Trial], dict[str, Any]], trial: Trial) -> dict[str, Any]:
+    """Runs one trial in a worker process."""
+    record = {**trial.labels, "seed": trial.seed}
+    try:
+        with one_thread():
+            return record | run_trial(trial)
+    except (GpmpcError, torch.linalg.LinAlgError) as error:
+        return record | {"error": str(error)}
+
+
+def check_workers(workers: Any) -> None:
+    """Raises a ``SettingError`` unless ``workers`` is None or a positive number of processes."""
+    if workers is not None:
+        check_number("workers", workers, least=1, whole=True)
+
+
+def derived_seed(*parts: int) -> int:
+    """Returns a seed of its own for every sequence of whole numbers."""
+    return int(np.random.SeedSequence(parts).generate_state(1)[0])
+
+
+def fingerprint(settings: Any, *arrays: Any, code: Sequence[str] = ()) -> str:
+    """Returns a text that differs where settings, arrays or code differ.
+
+    Args:
+        settings: Plain data.
+        arrays: NumPy arrays or CPU tensors; None counts as nothing.
+        code: Patterns of source files below the package, or whole paths.
+    """
+    digest = hashlib.sha256(b"".join(_source(pattern) for pattern in code))
+    digest.update(json.dumps(settings, sort_keys=True, default=str).encode())
+    for array in arrays:
+        digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:32]
+
+
+@cache
+def _source(pattern: str) -> bytes:
+    """Returns the source files of a pattern: a record of other code does not pass for finished."""
+    own = Path(pattern).is_absolute()
+    found = [Path(pattern)] if own else sorted(Path(gpmpc.__file__).parent.glob(pattern))
+    return b"".join(path.read_bytes() for path in found)
+
+
+def random_rows(count: int, size: int, seed: int) -> list[int]:
+    """Returns ``size`` of ``count`` rows, drawn at random and sorted; those of one seed are nested over sizes.
+
+    Raises:
+        DataError: There are fewer rows.
+    """
+    if size > count:
+        raise DataError(f"size: must be at most {count}, the transitions at hand; got {size}")
+    return np.sort(np.random.default_rng(seed).permutation(count)[:size]).tolist()
+
+
+def trained_model(train: Callable[..., Training], settings: Any, data: Transitions, seed: int, folder: Path) -> Path:
+    """Trains GPs unless a file in ``folder`` holds those of the same settings, data and seed; returns that file."""
+    path = folder / "models" / f"{fingerprint([settings, seed], data.features, data.next_states)}.safetensors"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with one_thread():
+            save_posterior(train(data, seed=seed).posterior, path)
+    return path
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keeps numerical libraries to one thread, so that sums have one order whatever the machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@lru_cache(maxsize=8)
+def load_model(path: Path) -> GPPosterior:
+    """Reads trained GPs, once a process."""
+    return load_posterior(path)

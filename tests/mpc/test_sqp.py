@@ -1,0 +1,197 @@
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.kkt import Instance, kkt_residual
+from benchmarks.pendulums import pendulum_gp
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import GPPosterior, backend
+from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.propagation import Linearization
+from gpmpc.qp import DualActiveSet
+from gpmpc.status import Status
+from tests.mpc.systems import HOVER, linear_gaussian, quadrotor_gp
+
+BOX = {"input_lower": [0.0, -0.7, -0.7], "input_upper": [20.0, 0.7, 0.7]}
+
+
+@pytest.fixture(scope="module")
+def quadrotor():
+    return quadrotor_gp(40)
+
+
+@pytest.fixture(scope="module")
+def reachable(quadrotor):
+    """A reference that the model follows exactly, at no cost: its own rollout."""
+    inputs = HOVER + 0.05 * np.random.default_rng(0).normal(size=(5, 3))
+    states = [np.zeros(6)]
+    for u in inputs:
+        states.append(quadrotor.predict(torch.tensor(states[-1]), torch.tensor(u)).mean.numpy())
+    return Reference(np.array(states), inputs)
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-9, 1e-300])
+def test_a_reference_that_can_be_reached_at_no_cost_is_reached(quadrotor, reachable, tolerance):
+    """1e-300 asks for more than there is: it ends where every step is lost in round-off."""
+    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
+    controller = GPMPC(
+        quadrotor, Linearization(), problem, 5, HOVER, covariance="none", iterations=40, tolerance=tolerance
+    )
+    decision = controller.control(Gaussian.certain(np.zeros(6)), reachable)
+    assert decision.status is Status.SOLVED
+    assert np.abs(decision.inputs - reachable.inputs).max() < max(1e-2 * tolerance, 1e-9)
+    assert decision.iterations < (12 if tolerance >= 1e-6 else 40)
+
+
+@pytest.mark.parametrize("penalized", ["inputs", "increments"])
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-7])
+def test_a_regulator_at_its_origin_has_no_trouble(penalized, tolerance):
+    """Data and their mirror image: the origin is an equilibrium of the mean, to which all cost vanishes."""
+    half = pendulum_gp(2, 40)
+    features, targets = (torch.cat([part, -part]) for part in (half.features, half.targets))
+    parts = half.lengthscales, half.signal_variance, half.noise_variance
+    model = GPPosterior.from_hyperparameters(features, targets, *parts, 1, predicts="difference")
+    problem = TrackingProblem([10.0, 1.0], [0.1], penalized=penalized, input_lower=[-6.0], input_upper=[6.0])
+    controller = GPMPC(model, Linearization(), problem, 8, [0.0], covariance="none", iterations=20, tolerance=tolerance)
+    state, last = np.array([0.8, 0.0]), None
+    for _ in range(120):
+        last = controller.control(Gaussian.certain(state), Reference(np.zeros((9, 2))), last)
+        assert last.status is Status.SOLVED
+        state = model.predict(torch.tensor(state), torch.tensor(last.input)).mean.numpy()
+    assert np.abs(state).max() < 1e-9
+
+
+def test_the_residual_vanishes_with_the_distance_where_the_cost_does(quadrotor):
+    """The cosine alone would not: the root of the cost is as small as the gradient."""
+    inputs = np.tile(HOVER, (3, 1))
+    states = [np.zeros(6)]
+    for u in inputs:
+        states.append(quadrotor.predict(torch.tensor(states[-1]), torch.tensor(u)).mean.numpy())
+    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="increments", **BOX)
+    question = Instance(Gaussian.certain(np.zeros(6)), Reference(np.array(states)), HOVER)
+    far, near, nearer = (kkt_residual(quadrotor, problem, question, inputs + d) for d in (1e-1, 1e-6, 1e-8))
+    assert far > 0.1
+    assert near < 1e-2
+    assert nearer == pytest.approx(1e-2 * near, rel=1e-3)
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
+def test_what_is_called_solved_is_within_ten_times_the_tolerance(quadrotor, tolerance):
+    """The stop estimates the residual of a plan that it has not rolled out; here another measures it."""
+    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="increments", **BOX)
+    controller = GPMPC(
+        quadrotor, Linearization(), problem, 5, HOVER, covariance="none", iterations=80, tolerance=tolerance
+    )
+    random, last, before = np.random.default_rng(1), None, HOVER
+    for _ in range(20):
+        belief = Gaussian.certain(0.5 * random.uniform(-1, 1, 6))
+        reference = Reference(np.tile(0.5 * random.uniform(-1, 1, 6), (6, 1)))
+        last = controller.control(belief, reference, last)
+        assert last.status is Status.SOLVED
+        residual = kkt_residual(quadrotor, problem, Instance(belief, reference, before), last.inputs)
+        assert residual < 10 * tolerance
+        before = last.input
+
+
+@pytest.mark.parametrize(("scale", "bound"), [(1.0, 0.01), (1e6, 1.0), (1e6, 1e4), (1e9, 1e7)])
+def test_plans_of_the_program_keep_their_rates_whatever_the_unit_of_the_inputs(scale, bound):
+    model = linear_gaussian(2, 1)
+    model = replace(model, B=model.B / scale)
+    problem = TrackingProblem(
+        [10.0, 1.0], [0.1 / scale**2], penalized="increments", rate_lower=[-bound], rate_upper=[bound]
+    )
+    controller = GPMPC(model, Linearization(), problem, 8, [1.234567 * scale], covariance="none", iterations=10)
+    state, last, before, bitten = np.array([0.8, 0.0]), None, np.array([1.234567 * scale]), 0
+    for _ in range(20):
+        last = controller.control(Gaussian.certain(state), Reference(np.zeros((9, 2))), last)
+        assert last.status is Status.SOLVED
+        rates = np.diff(last.inputs, axis=0, prepend=before[None])
+        assert np.abs(rates).max() <= bound + 1e-9 * max(1.0, np.abs(last.inputs).max())
+        bitten += int((np.abs(np.diff(last.inputs[:, 0])) > 0.999 * bound).sum())
+        state, before = model.predict(torch.tensor(state), torch.tensor(last.input)).mean.numpy(), last.input
+    assert bitten > 10
+
+
+class Other:
+    """A solver of somebody else's."""
+
+    def solve(self, problem, warm_start=None):
+        return DualActiveSet().solve(problem, warm_start)
+
+
+BOUNDS = StateBounds([-np.inf, -0.3] * 3, [np.inf, 0.3] * 3, l1=20.0, l2=5.0)
+
+
+@pytest.mark.parametrize("covariance", ["zero_order", "none"])
+@pytest.mark.parametrize(
+    "limits",
+    [{}, {"rate_lower": [-0.5, -0.05, -0.05], "rate_upper": [0.5, 0.05, 0.05]}, {"state_bounds": BOUNDS}],
+    ids=["box", "rates", "soft states"],
+)
+def test_compiled_and_torch_and_another_solver_iterate_alike(quadrotor, covariance, limits):
+    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="increments", **BOX, **limits)
+    arguments = quadrotor, Linearization(), problem, 5, HOVER, "trajectory", covariance
+    told = {} if "state_bounds" in limits else {"solver": Other()}  # prices need our own solver
+    ours, other = (GPMPC(*arguments, **solver, iterations=60, tolerance=1e-7) for solver in ({}, told))
+    random, last, before, programs = np.random.default_rng(2), None, None, 0
+    for _ in range(8):
+        belief = Gaussian(torch.tensor(0.4 * random.uniform(-1, 1, 6)), 1e-4 * torch.eye(6))
+        reference = Reference(np.tile(0.5 * random.uniform(-1, 1, 6), (6, 1)))
+        last = ours.control(belief, reference, last)
+        with backend("torch"):
+            before = other.control(belief, reference, before)
+        assert last.status is before.status
+        assert last.iterations == before.iterations
+        for name in ("inputs", "means", "covariances"):
+            assert np.allclose(getattr(last, name), getattr(before, name), rtol=0, atol=1e-9, equal_nan=True)
+        programs += last.iterations * last.status.solved
+    assert programs > 16
+
+
+def test_the_order_in_memory_of_what_is_asked_changes_nothing(quadrotor):
+    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
+    controller = GPMPC(quadrotor, Linearization(), problem, 5, HOVER, iterations=30)
+    random = np.random.default_rng(3)
+    states, inputs = 0.3 * random.uniform(-1, 1, (6, 6)), HOVER + 0.1 * random.uniform(-1, 1, (5, 3))
+    S = torch.tensor(np.cov(random.normal(size=(6, 40)))) * 1e-3
+    plain = controller.control(Gaussian(torch.tensor(states[0]), S), Reference(states, inputs))
+    mean = torch.tensor(np.repeat(states[0], 2))[::2]
+    strided = Reference(np.asfortranarray(states), np.repeat(inputs, 2, axis=0)[::2])
+    other = controller.control(Gaussian(mean, S.mT), strided)
+    assert plain.status is Status.SOLVED
+    assert np.array_equal(plain.inputs, other.inputs)
+    assert np.array_equal(plain.covariances, other.covariances)
+
+
+def test_the_parts_of_the_time_are_within_what_the_step_took(quadrotor, reachable):
+    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
+    controller = GPMPC(quadrotor, Linearization(), problem, 5, HOVER, covariance="none", iterations=30)
+    began = perf_counter()
+    timing = controller.control(Gaussian.certain(np.zeros(6)), reachable).timing
+    assert timing.total <= perf_counter() - began
+    assert min(timing.model, timing.build, timing.solve) > 0
+
+
+@pytest.mark.parametrize("start", ["reference", "hover"])
+@pytest.mark.parametrize("horizon", [10, 30, 60])
+def test_from_no_plan_at_all_few_programs_reach_a_kkt_point_at_any_horizon(quadrotor, horizon, start):
+    problem = TrackingProblem([1.0] * 6, [1.0] * 3, penalized="increments", **BOX)
+    controller = GPMPC(quadrotor, Linearization(), problem, horizon, HOVER, covariance="none", iterations=8)
+    time = 0.5 * np.arange(horizon + 1)[:, None]
+    references = np.hstack(
+        [part for axis in range(3) for part in (0.3 * np.sin(time + axis), 0.3 * np.cos(time + axis))]
+    )
+    belief, previous = Gaussian.certain(references[0]), None
+    if start == "hover":
+        zeros = np.zeros((horizon + 1, 6, 6))
+        plan = np.tile(HOVER, (horizon, 1)), np.tile(references[0], (horizon + 1, 1)), zeros
+        previous = Decision(HOVER, *plan, Status.SOLVED, 1, Timing(0.0, 0.0, 0.0))
+    decision = controller.control(belief, Reference(references), previous)
+    assert decision.status is Status.SOLVED
+    residual = kkt_residual(quadrotor, problem, Instance(belief, Reference(references), HOVER), decision.inputs)
+    assert residual < 1e-5

@@ -1,0 +1,69 @@
+"""Runs that were never flown, in the folders and with the content that real ones have."""
+
+import json
+
+import numpy as np
+
+from gpmpc.mpc.controller import Timing
+from gpmpc.simulation import Rollout
+from gpmpc.status import Status
+from gpmpc.studies.flight import Experiment, Flown, metrics
+from gpmpc.studies.report_document import report_document
+from gpmpc.studies.run_folder import PLAN, RunFolder, folder_name, record
+from gpmpc.systems import Integrated, Translational
+
+SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
+PLANT = Integrated(Translational(), time_step=1.0, substeps=1)
+
+
+class Bounds:
+    input_lower, input_upper, state_bounds = np.zeros(3), np.full(3, 10.0), None
+
+
+class Steering:
+    problem, horizon = Bounds, 1
+
+
+def metrics_of(error, steps=20, failing=0):
+    """The metrics of a flight that is everywhere ``error`` [m] from its reference in x."""
+    references = np.zeros((steps + 1, 6))
+    states = references.copy()
+    states[:, 0] = error
+    statuses = (Status.INFEASIBLE,) * failing + (Status.SOLVED,) * (steps - failing)
+    nothing, timing = np.full((steps, 6), np.nan), Timing(1e-3, 1e-4, 2e-3)
+    rollout = Rollout(
+        states, np.zeros((steps + 1, 6, 6)), states[:-1], np.ones((steps, 3)), references, nothing,
+        np.full((steps, 6, 6), np.nan), statuses, np.ones(steps, int), (timing,) * steps, 1.0,
+    )  # fmt: skip
+    experiment = Experiment(None, None, PLANT, None, lambda plant: None, steps=steps)
+    return metrics(experiment, Flown(rollout, Steering, None))
+
+
+def made_up_run(tree, choices, settings, result=None, error=None):
+    folder = RunFolder(tree / folder_name(choices))
+    folder.path.mkdir(parents=True)
+    about = record(choices, settings, "gpmpc run")
+    if error is None:
+        folder.finish(about | result)
+    else:
+        folder.fail(ValueError(error), about)
+
+
+def plan(tree, runs):
+    tree.mkdir(parents=True, exist_ok=True)
+    (tree / f"{PLAN}0.json").write_text(json.dumps({"runs": runs}))
+
+
+def chosen(controller, seed, **more):
+    settings = SETTINGS | {"seed": seed, "options": {"controller": controller}}
+    return sorted([f"controller={controller}", f"seed={seed}", *(f"{k}={v}" for k, v in more.items())]), settings
+
+
+def add(tree, controller, seed, error, **how):
+    made_up_run(tree, *chosen(controller, seed), result=metrics_of(error, **how))
+
+
+def documents(found, comparison=()):
+    """Every file of a report, by name."""
+    document = report_document(found, comparison)
+    return document.files("report") | {"report.html": document.html()}

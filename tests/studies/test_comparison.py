@@ -1,0 +1,97 @@
+"""Two groups of runs held against each other: the statistics are those of independent implementations."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from gpmpc.exceptions import DataError
+from gpmpc.studies.comparison import compare, sentences
+from gpmpc.studies.report import read_report as report
+from tests.studies.made_up import made_up_run, metrics_of
+
+SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
+GROUPS = "controller=lqr", "controller=convex"
+
+
+def fly(tree, controller, seed, error, **more):
+    choices = [f"controller={controller}", f"seed={seed}", *(f"{key}={value}" for key, value in more.items())]
+    settings = SETTINGS | {"seed": seed, "options": {"controller": controller}} | more
+    made_up_run(tree, choices, settings, result=metrics_of(error))
+
+
+def compared(tree, first, second):
+    """The comparison of the errors of LQR with those of the convex controller, a pair a seed."""
+    for seed, errors in enumerate(zip(first, second, strict=True)):
+        for controller, error in zip(("lqr", "convex"), errors, strict=True):
+            fly(tree, controller, seed, error)
+    return next(c for c in compare(report(tree), *GROUPS) if c.measure == "rmse")
+
+
+@pytest.mark.parametrize("pairs", [6, 9, 15])
+def test_the_statistics_of_pairs_are_those_of_scipy_and_of_their_definitions(pairs, tmp_path, rng):
+    a = rng.uniform(0.1, 0.2, pairs)
+    b = a + 0.01 * rng.normal(0.3, 1.0, pairs)
+    ours, theirs = compared(tmp_path, a, b), stats.ttest_rel(a, b)
+    assert ours.pairs == pairs
+    assert ours.means == pytest.approx((a.mean(), b.mean()))
+    assert ours.difference == pytest.approx((a - b).mean())
+    assert ours.interval == pytest.approx(tuple(theirs.confidence_interval(0.95)))
+    assert ours.t_test == pytest.approx(theirs.pvalue)
+    assert ours.standardised == pytest.approx(theirs.statistic / np.sqrt(pairs))
+    # The exact null distribution of the signed ranks: every sign of every rank is as likely as the other.
+    ranks = 1 + np.argsort(np.argsort(np.abs(a - b)))
+    signed = np.sign(a - b) @ ranks
+    assert ours.rank_biserial == pytest.approx(signed / ranks.sum())
+    signs = np.array(list(product([-1, 1], repeat=pairs)))
+    assert ours.wilcoxon == pytest.approx((np.abs(signs @ ranks) >= abs(signed)).mean())
+
+
+def test_swapped_groups_turn_the_signs_and_keep_the_tests(tmp_path, rng):
+    a, b = rng.uniform(0.1, 0.2, size=(2, 8))
+    ours, turned = compared(tmp_path / "ab", a, b), compared(tmp_path / "ba", b, a)
+    assert turned.means == ours.means[::-1]
+    assert (turned.wilcoxon, turned.t_test) == pytest.approx((ours.wilcoxon, ours.t_test))
+    assert turned.interval == pytest.approx((-ours.interval[1], -ours.interval[0]))
+    assert (turned.difference, turned.rank_biserial, turned.standardised) == pytest.approx(
+        (-ours.difference, -ours.rank_biserial, -ours.standardised)
+    )
+
+
+def test_a_verdict_is_given_below_five_percent_and_not_above(tmp_path):
+    """Of six pairs p is 2 / 64 where all agree, and 4 / 64 where the smallest difference contradicts the others."""
+    sizes = np.array([1, 2, 3, 4, 5, 6]) * 1e-3
+    found = compared(tmp_path / "agree", 0.2 + sizes, np.full(6, 0.2))
+    assert (found.wilcoxon, found.verdict) == (pytest.approx(2 / 64), "A is larger than B")
+    found = compared(tmp_path / "turned", 0.2 - sizes, np.full(6, 0.2))
+    assert (found.wilcoxon, found.verdict) == (pytest.approx(2 / 64), "A is smaller than B")
+    found = compared(tmp_path / "contradict", 0.2 + sizes * [-1, 1, 1, 1, 1, 1], np.full(6, 0.2))
+    assert (found.wilcoxon, found.verdict) == (pytest.approx(4 / 64), "no difference shown")
+
+
+def test_groups_without_two_seeds_in_common_are_refused(tmp_path):
+    for controller, seed in (("lqr", 0), ("lqr", 1), ("convex", 1), ("convex", 2)):
+        fly(tmp_path, controller, seed, 0.1)
+    with pytest.raises(DataError, match="fewer than two seeds in common"):
+        compare(report(tmp_path), *GROUPS)
+    fly(tmp_path, "convex", 0, 0.1)
+    assert compare(report(tmp_path), *GROUPS)[0].pairs == 2
+
+
+def test_the_words_name_what_only_one_measure_lacks_there_and_what_all_lack_at_the_top(tmp_path):
+    for seed in range(8):
+        fly(tmp_path, "lqr", seed, 0.1)
+        if seed != 7:
+            fly(tmp_path, "convex", seed, 0.2 + 1e-3 * seed)
+    found = compare(report(tmp_path), *GROUPS)
+    lines = sentences(report(tmp_path), found, *GROUPS)
+    assert len(lines) == 1 + len(found)
+    assert lines[0].endswith("Left out, since A or B lacks runs of it: seed=7.")
+    assert not any("seed=7" in line for line in lines[1:])
+    also = [replace(found[0], left_out=("seed=3", "seed=7")), *found[1:]]
+    lines = sentences(report(tmp_path), also, *GROUPS)
+    assert lines[0].endswith("lacks runs of it: seed=7.")
+    assert lines[1].endswith("left out as well: seed=3")
+    assert not any("left out" in line for line in lines[2:])

@@ -1,0 +1,285 @@
+"""A flight follows from its experiment alone."""
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+
+from gpmpc.cli.run import experiment_of
+from gpmpc.datasets import Excitation, ExcitedData
+from gpmpc.exceptions import Diverged, SettingError
+from gpmpc.gp import Trainer
+from gpmpc.mpc.controller import Decision, Timing
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.propagation import Linearization
+from gpmpc.simulation import Noise
+from gpmpc.status import Status
+from gpmpc.studies import flight as studied
+from gpmpc.studies.flight import Experiment, metrics, run_trial
+from gpmpc.studies.run_folder import Busy, RunFolder, folder_name
+from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational
+from gpmpc.trajectories import Elliptical, Hover, Lorenz, Step
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+PLANT = Integrated(Translational(), time_step=1.0, substeps=1)
+PROBLEM = TrackingProblem(
+    [10, 1] * 3, [0.1, 1, 1], penalized="increments", input_lower=[0, -0.7, -0.7], input_upper=[20, 0.7, 0.7]
+)
+HOVER = [7.26, 0, 0]
+EXCITED = Excitation(PLANT, [1] * 6, [1] * 3, HOVER, [0.3, 0.03, 0.03], [0.01] * 6)
+CONVEX = partial(GPMPC, propagator=Linearization(), problem=PROBLEM, horizon=2, initial_input=HOVER)
+ON_THE_PLANT = partial(NMPC, problem=PROBLEM, horizon=2, initial_input=HOVER)
+
+
+class Blind:
+    """Applies a law of the state, whatever it is asked for; a call takes the seconds that ``seconds`` gives."""
+
+    horizon, problem, initial_input = 1, replace(PROBLEM, input_lower=None, input_upper=None), HOVER
+
+    def __init__(self, plant, law, seconds=lambda: 0.0):
+        self.law, self.seconds = law, seconds
+
+    def control(self, belief, reference, previous=None):
+        inputs = np.array([self.law(belief.mean.numpy())], dtype=float)
+        timing = Timing(self.seconds(), 0.0, 0.0)
+        return Decision(inputs[0], inputs, np.zeros((2, 6)), np.zeros((2, 6, 6)), Status.SOLVED, 1, timing)
+
+
+def blind(law, **changes):
+    seconds = changes.pop("seconds", lambda: 0.0)
+    return experiment(data=None, controller=partial(Blind, law=law, seconds=seconds), **{"steps": 30} | changes)
+
+
+def experiment(**changes):
+    settings = {
+        "data": ExcitedData(EXCITED, EXCITED, samples=25), "trajectory": Elliptical(), "plant": PLANT,
+        "train": Trainer(restarts=0), "controller": CONVEX, "size": 20, "steps": 4,
+    }  # fmt: skip
+    return Experiment(**settings | changes)
+
+
+def numbers(experiment):
+    found = metrics(experiment, run_trial(experiment))
+    assert found.pop("times")["total"]["median"] >= 0
+    return found
+
+
+def test_the_same_seed_gives_the_same_numbers_and_another_one_others():
+    noise = Noise(measurement=[0.01] * 6)
+    first, again, other = (numbers(experiment(noise=noise, seed=seed)) for seed in (3, 3, 4))
+    assert first == again
+    assert first["rmse"]["total"] != other["rmse"]["total"]
+    assert first["training"]["size"] == 20
+
+
+def test_the_rows_of_a_seed_are_nested_and_in_the_order_of_the_flight():
+    everything = experiment(size=None).training_rows().features.numpy()
+    small, large = (experiment(size=size, seed=1).training_rows().features.numpy() for size in (5, 12))
+    assert len(everything) == 25
+    places = [[int(np.flatnonzero((everything == row).all(axis=1))[0]) for row in rows] for rows in (small, large)]
+    assert places[1] == sorted(places[1])
+    assert set(places[0]) < set(places[1])
+
+
+def test_a_model_loop_never_meets_the_plant_and_the_true_model_needs_no_data():
+    flown = run_trial(experiment(loop="model"))
+    assert np.trace(flown.rollout.covariances[-1]) > 0
+    known = run_trial(experiment(controller=ON_THE_PLANT, data=None))
+    assert known.training is None
+    assert metrics(experiment(controller=ON_THE_PLANT), known)["rmse"]["total"] < 0.01
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"size": 0}, "data.size: must be a whole number, 1 or more"),
+        ({"steps": 0}, "steps: must be a whole number, 1 or more"),
+        ({"loop": "plan"}, "loop: must be 'plant' or 'model'; got 'plan'"),
+        ({"on_failure": "cry"}, "on_failure: must be one of"),
+        ({"plant": Integrated(Coupled())}, "the translational subsystem, x, vx, y, vy, z, vz; got x, .*cascade_loop"),
+        ({"subsystem": "rotational"}, "must have the states of the rotational subsystem, phi, p"),
+        ({"subsystem": "rotational", "plant": Map(Rotational())}, "flown at its own rate; a Map has none"),
+        ({"subsystem": "whole"}, "subsystem: must be one of translational, rotational; got 'whole'"),
+        ({"controller": ON_THE_PLANT, "loop": "model"}, "loop: a model loop needs a controller that learns"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_flown_is_refused(changes, message):
+    with pytest.raises(SettingError, match=message):
+        experiment(**changes)
+
+
+def test_the_rotational_subsystem_follows_the_attitudes_of_the_trajectory_at_its_own_rate():
+    plant = Integrated(Rotational(), time_step=0.05, substeps=5)
+    excited = Excitation(plant, [1] * 6, [1] * 3, [0] * 3, [0.05] * 3, [1e-4, 1e-3] * 3)
+    problem = TrackingProblem([100, 1] * 3, [1] * 3, penalized="increments", input_lower=[-2] * 3, input_upper=[2] * 3)
+    settings = {"propagator": Linearization(), "problem": problem, "horizon": 5, "initial_input": [0] * 3}
+    turning = experiment(
+        subsystem="rotational", plant=plant, trajectory=Lorenz(), data=ExcitedData(EXCITED, excited, samples=60),
+        controller=partial(GPMPC, **settings), size=None, steps=100,
+    )  # fmt: skip
+    flight = run_trial(turning)
+    found = metrics(turning, flight)
+    assert flight.rollout.time_step == 0.05
+    assert np.ptp(flight.rollout.references[:, 0]) > 0.03  # [rad]: there was something to follow
+    assert set(found["rmse"]) == {"phi", "theta", "psi", "total"}
+    assert found["unit"] == "rad"
+    assert found["rmse"]["total"] < 0.005
+
+
+@pytest.mark.parametrize("trajectory", [Elliptical(), Lorenz(), Hover((0, 0, -5)), Step((0, 0, 0), (1, 1, -1), 3.0)])
+@pytest.mark.parametrize("law", [lambda x: [0, 0, 0], lambda x: [100, 0, 0], lambda x: [7.26, 0.6, 0]])
+def test_a_flight_that_no_longer_follows_is_lost_and_says_since_when(trajectory, law):
+    lost = blind(law, trajectory=trajectory)
+    flight = run_trial(lost)
+    found = metrics(lost, flight)["lost"]
+    away = np.linalg.norm((flight.rollout.states - flight.rollout.references)[:, ::2], axis=1)
+    assert found["time"] == found["step"]
+    assert 10 < away[found["step"]] <= away.max()
+    assert away[: found["step"]].max() < away[found["step"]]
+    assert f"{away[found['step']]:.3g} m from its reference" in found["reason"]
+
+
+@pytest.mark.parametrize("trajectory", [Elliptical(), Lorenz(), Hover((0, 0, -5))])
+def test_an_offset_and_a_short_flight_are_no_loss(trajectory):
+    heavy = Integrated(Translational(mass=0.888), time_step=1.0, substeps=1)
+    problem = replace(PROBLEM, Q=[1] * 6, R=[1] * 3)
+    sagging = experiment(
+        trajectory=trajectory, data=None, controller=lambda plant: ON_THE_PLANT(PLANT, problem=problem), plant=heavy,
+        steps=20,
+    )  # fmt: skip
+    found = metrics(sagging, run_trial(sagging))
+    assert found["rmse"]["z"] > 3
+    assert found["lost"] is None
+    for steps in (1, 2):
+        assert numbers(experiment(trajectory=trajectory, steps=steps))["lost"] is None
+
+
+def growing(rate):
+    """Thrust that is never quite infinite."""
+    return lambda x: [min(rate * float(abs(x[4])), 1.7e308), 0, 0]
+
+
+@pytest.mark.parametrize("growth", [1e60, 1e120])
+def test_a_flight_that_diverges_ends_in_metrics_that_can_be_written_and_say_so(growth):
+    told = []
+    diverging = blind(growing(growth), trajectory=Hover((0, 0, -5)))
+    flight = run_trial(diverging, lambda controller, training: told.append)
+    found = metrics(diverging, flight)
+    json.dumps(found, allow_nan=False)
+    assert found["lost"]["step"] == 1
+    assert "the plant's state is not finite any more" in found["lost"]["reason"]
+    assert set(found["rmse"].values()) == {None}
+    assert found["steps"] == flight.diverged.step == len(told) < 30
+    assert found["violations"]["inputs"]["steps"] == found["steps"]
+    with pytest.raises(Diverged):  # nothing was flown
+        run_trial(blind(growing(1e308), trajectory=Hover((0, 0, -5))))
+
+
+def test_what_the_first_calls_take_is_no_part_of_the_times():
+    slow = iter([40.0, 20.0])
+    measured = blind(lambda x: HOVER, steps=5, seconds=lambda: next(slow, 0.001))
+    assert metrics(measured, run_trial(measured))["times"]["total"]["largest"] == 0.001
+
+
+def composed():
+    """Settings of flights with every controller, propagation and solver there is."""
+    names = {group: sorted(path.stem for path in (CONF / group).glob("*.yaml")) for group in CHOSEN}
+    return [f"{group}={name}" for group, found in names.items() for name in found] + MORE
+
+
+CHOSEN = ("controller", "propagation", "solver")
+MORE = ["loop=model", "controller.iterations=5", "controller.disturbance_gain=0.3", "subsystem=rotational"]
+
+
+@pytest.fixture(scope="module")
+def learned():
+    """Rows and what was learned from them, by subsystem; trained once."""
+    kept = {}
+
+    def of(settings):
+        if settings.subsystem not in kept:
+            rows = settings.training_rows()
+            kept[settings.subsystem] = rows, settings.train(rows, seed=0)
+        rows, training = kept[settings.subsystem]
+
+        class Kept:
+            note = ""
+
+            def transitions(self, *_):
+                return rows
+
+        return replace(settings, data=Kept(), train=lambda *_, **__: training)
+
+    return of
+
+
+@pytest.mark.parametrize("choice", composed())
+def test_the_rehearsal_changes_no_bit(choice, learned, monkeypatch):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        tiny = ["data.samples=20", "model.restarts=0", "steps=4", "horizon=3"]
+        noise = [] if choice == "loop=model" else [f"noise.process={[1e-3] * 6}", f"noise.measurement={[1e-3] * 6}"]
+        settings = learned(experiment_of(compose("run", overrides=[choice, *tiny, *noise])))
+    rehearsed = run_trial(settings).rollout
+    monkeypatch.setattr(studied, "rehearse", lambda *_: None)
+    at_once = run_trial(settings).rollout
+    for name in (
+        "states",
+        "covariances",
+        "measured",
+        "inputs",
+        "predicted_means",
+        "predicted_covariances",
+        "iterations",
+    ):
+        assert np.array_equal(getattr(rehearsed, name), getattr(at_once, name), equal_nan=True), name
+    assert rehearsed.statuses == at_once.statuses
+
+
+def test_more_rows_than_there_are_are_refused():
+    with pytest.raises(SettingError, match="data.size: must be at most 25, the rows of the data; got 26"):
+        run_trial(experiment(size=26))
+
+
+def test_a_folder_is_finished_when_its_metrics_are_there_and_one_process_works_on_it(tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    with folder.locked():
+        with pytest.raises(Busy), RunFolder(tmp_path / "run").locked(wait=False):
+            pass
+        folder.fail(ValueError("no\nluck"), {})
+        assert not folder.finished
+        assert folder.failed_at
+        folder.begin("steps: 1")
+        assert folder.failed_at is None
+        folder.finish({"rmse": 1, "settings": {}})
+    assert folder.finished
+    assert folder.result() == {"rmse": 1, "settings": {}}
+    with folder.locked(wait=False):
+        pass
+    assert sorted(path.name for path in folder.path.iterdir()) == ["config.yaml", "metrics.json"]
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (["a=x/y"], ["a=x_y"]),
+        (["a=X"], ["a=x"]),
+        (["a=" + "1" * 300], ["a=" + "1" * 301]),
+        (["a=1", "b=2"], ["a=1,b=2"]),
+    ],
+    ids=["characters", "case", "length", "commas"],
+)
+def test_folders_of_different_choices_never_collide(one, other):
+    names = [folder_name(choices) for choices in (one, other)]
+    assert names[0].lower() != names[1].lower()
+    assert all(len(name) < 200 and "/" not in name for name in names)
+
+
+def test_the_order_of_choices_does_not_matter_for_the_name():
+    assert folder_name(["b=2", "a=1"]) == folder_name(["a=1", "b=2"]) == "a=1,b=2"

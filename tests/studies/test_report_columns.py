@@ -1,0 +1,36 @@
+"""A measure that is zero in every run takes no column where there is little room, and one where it is not."""
+
+import pytest
+
+from gpmpc.studies.report import read_report as report
+from gpmpc.studies.report_document import terminal_table
+from tests.studies.made_up import documents, made_up_run, metrics_of
+
+SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
+
+
+@pytest.mark.parametrize("failing", [0, 2])
+def test_failed_solves_have_a_column_if_any_run_has_some(failing, tmp_path):
+    for seed in range(4):
+        for controller in ("convex", "lqr"):
+            settings = SETTINGS | {"seed": seed, "options": {"controller": controller}}
+            some = failing if (controller, seed) == ("lqr", 3) else 0
+            choices = [f"controller={controller}", f"seed={seed}"]
+            made_up_run(tmp_path, choices, settings, result=metrics_of(0.1, failing=some))
+    found = report(tmp_path)
+    header = " ".join(terminal_table(found).header)
+    for words in (header, documents(found)["report.tex"]):
+        assert ("failed" in words) == bool(failing)
+        assert "RMSE" in words
+        assert "outside" not in words
+    assert "outside" in documents(found)["report.csv"]  # which has room for everything
+
+
+def test_a_comparison_stands_in_the_page_and_in_the_text_if_there_is_one(tmp_path):
+    for seed in range(2):
+        choices, settings = [f"seed={seed}"], SETTINGS | {"seed": seed}
+        made_up_run(tmp_path, choices, settings, result=metrics_of(0.1))
+    found, lines = report(tmp_path), ["first line of it", "second line of it"]
+    for name in ("report.md", "report.html"):
+        with_it, without = documents(found, lines)[name], documents(found)[name]
+        assert all(line in with_it and line not in without for line in [*lines, "Comparison"])

@@ -1,0 +1,195 @@
+"""A tree with damaged runs, lost flights and whatever a user wrote: every document is written, and none obeys."""
+
+import csv
+import io
+import json
+import re
+
+import pytest
+from rich.console import Console
+
+from gpmpc.studies.comparison import compare, sentences
+from gpmpc.studies.document import terminal
+from gpmpc.studies.report import read_report as report
+from gpmpc.studies.report_document import report_document, terminal_table
+from gpmpc.studies.run_folder import ERROR, METRICS, folder_name
+from tests.studies.made_up import SETTINGS, add, chosen, documents, made_up_run, metrics_of, plan
+
+RESULT = ("rmse", "steps", "failures", "violations", "times", "unit")  # what a failed run need not have
+
+
+def written_of(found):
+    """Markdown, HTML, CSV and LaTeX without the figures, which take their time."""
+    document = report_document(found, images={})
+    return {"md": document.markdown(), "html": document.html(), "csv": document.csv(), "tex": document.tex()}
+
+
+def shown(found):
+    """The table as a terminal shows it."""
+    console = Console(file=io.StringIO(), width=100)
+    console.print(terminal([terminal_table(found)]))
+    return console.file.getvalue()
+
+
+DAMAGE = {
+    "RMSE infinite": {"rmse": {"total": float("inf")}},
+    "RMSE NaN": {"rmse": {"total": float("nan")}},
+    "RMSE a text": {"rmse": {"total": "0.1"}},
+    "RMSE a truth": {"rmse": {"total": True}},
+    "RMSE too large for any number": {"rmse": {"total": 10**400}},
+    "RMSE a list": {"rmse": [0.1]},
+    "no RMSE": {"rmse": None},
+    "no step": {"steps": 0},
+    "steps a text": {"steps": "100"},
+    "steps NaN": {"steps": float("nan")},
+    "failures a list": {"failures": [1]},
+    "failures of texts": {"failures": {"INFEASIBLE": "3"}},
+    "violations of nothing": {"violations": {"inputs": {}}},
+    "violations a number": {"violations": 3},
+    "times missing": {"times": {}},
+    "times of texts": {"times": {"total": {"median": "fast"}, "training": 1}},
+    "training infinite": {"times": {"total": {"median": 1.0}, "training": float("inf")}},
+    "unit a number": {"unit": 1},
+    "choices a text": {"choices": "controller=nmpc"},
+    "choices of numbers": {"choices": [1, 2]},
+    "choices nothing": {"choices": None},
+    "settings a list": {"settings": []},
+    "options a list": {"settings": {"options": ["x"]}},
+}
+WHOLE = {
+    "empty": b"",
+    "cut": b'{"choices": ["controller=nmpc"], "sett',
+    "no object": b"[1, 2]",
+    "a number": b"1",
+    "no UTF-8": b'{"choices": ["\xff"]}',
+    "nested beyond all measure": b"[" * 100_000,
+    "other keys": b'{"a": 1}',
+}
+
+
+@pytest.mark.parametrize("name", [METRICS, ERROR])
+@pytest.mark.parametrize("damage", [*DAMAGE, *WHOLE])
+def test_one_damaged_run_is_skipped_with_its_reason_and_takes_no_other_with_it(damage, name, tmp_path):
+    for seed in range(2):
+        add(tmp_path, "lqr", seed, 0.1)
+    made_up_run(tmp_path, *chosen("nmpc", 0), result=metrics_of(0.1) | {"error": "none"})
+    folder = tmp_path / folder_name(chosen("nmpc", 0)[0])
+    content = json.loads((folder / METRICS).read_text()) | DAMAGE.get(damage, {})
+    (folder / METRICS).unlink()
+    (folder / name).write_bytes(WHOLE.get(damage) if damage in WHOLE else json.dumps(content).encode())
+    found = report(tmp_path)
+    reads_it = name == ERROR and set(DAMAGE.get(damage, ())) & {*RESULT}
+    assert len(found.skipped) == (0 if reads_it else 1)
+    assert all(line.startswith(f"{folder / name}: is not what a run writes: ") for line in found.skipped)
+    assert sum(len(cell.runs) for cell in found.cells) == 2
+    for text in (*written_of(found).values(), shown(found)):
+        assert "0.1" in text
+
+
+def test_a_plan_that_cannot_be_read_is_skipped(tmp_path):
+    tree = tmp_path
+    for seed in range(6):
+        add(tree, "lqr", seed, 0.1)
+    plan(tree, [chosen("lqr", seed)[0] for seed in range(8)])
+    for i, text in enumerate(("", "{}", '{"runs": 3}', '{"runs": [3]}', '{"runs": [[1]]}', '{"runs": ["ab"]}')):
+        (tree / f"sweep-damaged{i}.json").write_text(text)
+    found = report(tree)
+    assert len(found.skipped) == 6
+    assert all("is not what a sweep writes" in line for line in found.skipped)
+    assert found.commands() == [f"gpmpc run -m controller=lqr seed=6,7 folder={tree}"]
+
+
+NASTY = [
+    "[/nope]", "[red]x", r"\input{/etc/passwd}", "\\", "<script>alert(1)</script>", "<img src=x onerror=y>", "&amp;",
+    "a|b", "=1+1", "@SUM(A1)", "+cmd|'/C calc'!A0", "-2+3", "`rm`", "[x](javascript:y)", "$x$", r"$\frac", "%",
+    "a_b^c~d#{}", "*b*", "\x1b[31mred", "two\nlines", "tab\there", "\u202eleft", "\ud800", "nul\x00", "x" * 400,
+    "ünïcödé 漢字", "{unit}", "../../up",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("nasty", NASTY, ids=ascii)
+def test_what_a_user_chose_is_text_in_every_document(nasty, tmp_path):
+    for seed in range(2):
+        add(tmp_path, "lqr", seed, 0.1)
+    settings = SETTINGS | {"options": {"controller": nasty}}
+    lost = metrics_of(0.2) | {"lost": {"why": nasty}}
+    made_up_run(tmp_path, [f"controller={nasty}", "seed=0"], settings, result=lost)
+    made_up_run(tmp_path, [f"controller={nasty}", "seed=1"], settings, error=nasty)
+    found = report(tmp_path)
+    written = written_of(found)
+    for text in (*written.values(), shown(found)):
+        text.encode()
+        assert not set(text) & set("\x00\x1b\t\u202e")
+    text = re.sub(r"\n```\n.*?\n```\n", "", written["md"], flags=re.DOTALL)  # code is no markup
+    assert not re.search(r"<script|<img|\]\(java", text)
+    assert not re.search(r"<script|<img (?!alt)", written["html"])
+    commands = set(re.findall(r"\\[a-zA-Z]+", written["tex"]))
+    ours = "begin end toprule midrule bottomrule footnotesize usepackage textbackslash textasciitilde textasciicircum"
+    assert commands <= {f"\\{name}" for name in (*ours.split(), "textless", "textgreater", "textbar")}
+    rows = list(csv.reader(io.StringIO(written["csv"])))
+    assert {len(row) for row in rows} == {len(rows[0])}
+    for value in (value for row in rows for value in row if value.startswith(("=", "+", "-", "@"))):
+        float(value)
+    table = [line for line in written["md"].splitlines() if line.startswith("|")]
+    assert len(table) == 4
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in table} == {len(re.findall(r"\|", table[1]))}
+
+
+def test_figures_take_every_text(tmp_path):
+    for nasty in ("[/nope]", r"$\frac", "x" * 400, "a/b", "ünï", r"\input"):
+        choices = [f"controller={nasty}", f"+{nasty}=1", "seed=0"]
+        made_up_run(tmp_path, choices, SETTINGS | {"options": {"controller": nasty}}, result=metrics_of(0.2))
+    written = documents(report(tmp_path))
+    assert len({name.lower() for name in written}) == len(written) == 4 + 2 * 7
+    for name in written:
+        assert re.fullmatch(r"[\w.+-]{1,200}", name)
+
+
+def test_a_flight_that_was_lost_is_called_so(tmp_path):
+    for seed in range(6):
+        add(tmp_path, "convex", seed, 0.1)
+        lost = {"lost": {"step": 12 + seed, "reason": "14600 m away"}} if seed < 2 else {"lost": None}
+        result = metrics_of(0.2) | lost
+        if seed == 0:  # it diverged
+            result["rmse"] = dict.fromkeys(result["rmse"])
+        made_up_run(tmp_path, *chosen("lqr", seed), result=result)
+    found = report(tmp_path)
+    assert [len(cell.lost) for cell in found.cells] == [0, 2]
+    assert [len(cell.numbers("rmse")) for cell in found.cells] == [6, 5]
+    written = written_of(found)
+    for text in (written["md"], written["html"]):
+        for words in ("of those finished, 2 lost", "2 lost", "step 13, reason 14600 m away"):
+            assert words in text
+    assert "2 lost" in shown(found)
+    assert "2 lost" in written["tex"]
+    assert [row["lost"] for row in csv.DictReader(io.StringIO(written_of(found)["csv"]))] == ["0", "2"]
+
+
+@pytest.mark.parametrize("outlier", [1.0, 1e3, 1e150])
+def test_what_stands_before_quartiles_lies_between_them(outlier, tmp_path):
+    for seed, error in enumerate([0.1, 0.11, 0.12, 0.13, 0.14, outlier]):
+        add(tmp_path, "lqr", seed, error)
+    found = report(tmp_path)
+    (row,) = csv.DictReader(io.StringIO(written_of(found)["csv"]))
+    low, median, high = (float(row[f"rmse_{part} [m]"]) for part in ("q25", "median", "q75"))
+    assert low <= median <= high <= 0.14
+    assert not any("mean" in name for name in row)
+    for text in (*(written_of(found)[name] for name in ("md", "tex", "html")), shown(found)):
+        assert "0.125" in text
+        assert "Mean" not in text
+
+
+def test_wall_times_are_not_compared(tmp_path):
+    tree = tmp_path
+    for seed in range(6):
+        for controller in ("lqr", "convex"):
+            add(tree, controller, seed, 0.1 * (1 + seed) + 0.01 * len(controller))
+    for path in tree.glob(f"*/{METRICS}"):
+        content = json.loads(path.read_text())
+        content["times"]["training"] = content["times"]["total"]["median"] = 1.0 + ("lqr" in path.parent.name)
+        path.write_text(json.dumps(content))
+    found = report(tree)
+    assert {"decision", "training"} <= set(found.measures())
+    compared = compare(found, "controller=lqr", "controller=convex")
+    assert not {"decision", "training"} & {each.measure for each in compared}
+    assert "Times are not compared" in sentences(found, compared, "a", "b")[0]

@@ -1,0 +1,37 @@
+"""What a run says at its end are the numbers of its metrics."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from gpmpc.studies.document import terminal
+from gpmpc.studies.flight import summary
+from gpmpc.studies.run_folder import record
+from tests.studies.made_up import metrics_of
+
+OPTIONS = {"trajectory": "lorenz", "subsystem": "translational", "controller": "convex"}
+
+
+def said(result, **options):
+    stream = io.StringIO()
+    about = record([], {"seed": 0, "options": OPTIONS | options}, "gpmpc run")
+    Console(file=stream, width=200).print(terminal([summary(about | result)]))
+    lines = [line.strip() for line in stream.getvalue().splitlines()]
+    return {line.split("  ")[0]: line.partition("  ")[2].strip() for line in lines if "  " in line}
+
+
+@pytest.mark.parametrize("failing", [0, 3])
+def test_a_summary_has_a_line_for_each_thing_that_is_measured(failing):
+    result = metrics_of(0.125, steps=20, failing=failing)
+    lines = said(result)
+    assert lines["flight"] == "20 steps of lorenz with convex"
+    assert lines["RMSE [m]"].startswith("0.125  (x 0.125, y 0, z 0)")
+    assert lines["failed solves"] == (f"INFEASIBLE {failing}" if failing else "none")
+    assert result["violations"]
+    for name, rate in result["violations"].items():
+        assert lines[f"bounds of {name}"].startswith(
+            f"{rate['violations']} of {rate['steps']} steps outside (95 %: 0 to"
+        )
+    assert lines["decision [ms]"].startswith("median 3.1  (model 1, build 0.1, solve 2), 99 % below 3.1")
+    assert said(result, subsystem="rotational")["flight"] == "20 steps of lorenz attitude with convex"
