@@ -35,8 +35,8 @@ from gpmpc.mpc.controller import Controller, Decision, Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.lqr import LQR
 from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.mpc.state_form import StateFormMPC
-from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.plotting import png, quality
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from gpmpc.simulation import Rollout, closed_loop, rehearse

@@ -10,7 +10,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Dropout, Gust
 from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational

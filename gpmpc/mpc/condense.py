@@ -119,8 +119,9 @@ class Condenser:
             if not array.flags.c_contiguous:
                 raise ShapeError("stages, rows and references must be contiguous arrays")
         size, count = self._size, self._rates + rows.lower.size
-        matrices, ends = (np.empty((size, size)), np.empty(size), np.empty((count, size))), np.empty((2, size + count))
-        program = CondensedProgram(*matrices, *ends, self._plain)
+        lower, upper = np.empty((2, size + count))
+        P, q, G = np.empty((size, size)), np.empty(size), np.empty((count, size))
+        program = CondensedProgram(P, q, G, lower, upper, self._plain)
         if self._condense(self.cost, self.bounds, stages, start, references, rows, program) <= _LARGEST_GROWTH:
             return program
         return condense_with_feedback(self.cost, self.bounds, stages, start, references, rows)

@@ -5,7 +5,7 @@ and is handed to it again as ``previous``.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -114,6 +114,7 @@ class Controller(Protocol):
     @property
     def horizon(self) -> int:
         """H, how far it looks ahead."""
+        ...
 
     def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
         """Decides the input for one step.
@@ -123,6 +124,7 @@ class Controller(Protocol):
             reference: Over the controller's horizon.
             previous: The last decision, to warm-start from; None at the first step.
         """
+        ...
 
 
 class Request(NamedTuple):
@@ -239,7 +241,7 @@ def check_method(key: str, value: object, method: str, example: str) -> None:
         raise SettingError(key, f"must be an object with the method {method!r}, such as {example}; got {got}")
 
 
-def check_controller(problem: TrackingProblem, states: int, inputs: int, horizon: int, initial_input: Array) -> Array:
+def check_controller(problem: TrackingProblem, states: int, inputs: int, horizon: int, initial_input: Any) -> Array:
     """Checks the settings that every controller has against its model, and returns the initial input as an array (m,).
 
     Raises:
@@ -261,7 +263,7 @@ def check_controller(problem: TrackingProblem, states: int, inputs: int, horizon
     return np.array(initial_input, dtype=float)
 
 
-def _array(value: object) -> Array:
+def _array(value: Any) -> Array:
     """A tensor or array as contiguous float64 in host memory."""
     if hasattr(value, "detach"):
         try:

@@ -46,8 +46,8 @@ class TrackingCost(NamedTuple):
     @classmethod
     def of(cls, problem: TrackingProblem, weight: Array, terminal: Array) -> "TrackingCost":
         """The cost of a problem whose Q and terminal weight are W of s (p / n, n, n)."""
-        weights = (np.ascontiguousarray(part) for part in (weight, terminal, problem.R))
-        return cls(*weights, get_args(Penalized).index(problem.penalized))
+        W, T, R = (np.ascontiguousarray(part) for part in (weight, terminal, problem.R))
+        return cls(W, T, R, get_args(Penalized).index(problem.penalized))
 
 
 class References(NamedTuple):

@@ -101,7 +101,7 @@ class NMPC:
 
 def _build(
     plant: Plant, problem: TrackingProblem, horizon: int, tolerance: float
-) -> tuple[casadi.Function, tuple[dict, dict]]:
+) -> tuple[casadi.Function, list[dict[str, np.ndarray]]]:
     """IPOPT on the unknowns (x_1 .. x_H, u_0 .. u_{H-1}, slacks), and the bounds of unknowns and constraints."""
     n, m, H, limits = problem.state_dim, problem.input_dim, horizon, problem.state_bounds
     x0, last = casadi.SX.sym("x0", n), casadi.SX.sym("last", m)
@@ -117,8 +117,8 @@ def _build(
     if problem.rate_limited:
         constraints.append(casadi.vec(rates))
         g.append(np.tile([problem.rate_lower, problem.rate_upper], H))
-    hard = limits is not None and not limits.soft
-    box = [np.tile([limits.lower, limits.upper] if hard else [[-np.inf] * n, [np.inf] * n], H)]
+    free = [np.full(n, -np.inf), np.full(n, np.inf)]
+    box = [np.tile(free if limits is None or limits.soft else [limits.lower, limits.upper], H)]
     box.append(np.tile([problem.input_lower, problem.input_upper], H))
     unknowns = [casadi.vec(x), casadi.vec(u)]
     if limits is not None and limits.soft:
@@ -143,4 +143,4 @@ def _build(
         "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 500, "bound_relax_factor": 0.0},
     }
     bounds = [{"x": np.hstack(box)[side], "g": np.hstack(g)[side]} for side in (0, 1)]
-    return casadi.nlpsol("nmpc", "ipopt", nlp, options), tuple(bounds)
+    return casadi.nlpsol("nmpc", "ipopt", nlp, options), bounds

@@ -16,7 +16,7 @@ import torch
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Controller, Decision, Reference, Timing
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.status import Status
 
 OnFailure = Literal["previous_plan", "hold", "raise"]
@@ -130,7 +130,7 @@ def _conclude(
 ) -> Command:
     """The command of a decision; of none, where the controller was not called."""
     status = Status.INVALID_MEASUREMENT if decision is None else decision.status
-    reason, plan = status.advice, None if last is None else last.plan
+    reason = status.advice
     if decision is not None and decision.applicable:
         fits = _has_right_shape(controller, decision, last)
         checked = _admit(controller, decision, last) if fits else None
@@ -141,7 +141,8 @@ def _conclude(
         decision = replace(decision, status=status, suboptimal=False) if fits else None
     if on_failure == "raise":
         raise SolverFailure(step, reason)
-    if plan is not None and plan.applicable:
+    if last is not None and last.plan is not None and last.plan.applicable:
+        plan = last.plan
         rows = plan.inputs, plan.means, plan.covariances
         inputs, means, covariances = (np.concatenate([part[1:], part[-1:]]) for part in rows)
         first = last.input if on_failure == "hold" else inputs[0]

@@ -10,7 +10,6 @@ the bounds by kappa(eta) sqrt(Sigma_jj), kappa(eta) = Phi^-1(eta).
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any, Literal
@@ -28,7 +27,7 @@ class StateBounds:
     """Bounds on single states, each to hold with probability eta.
 
     Attributes:
-        lower: (n,); -inf where there is none.
+        lower: List or array (n,), kept as an array; -inf where there is none.
         upper: (n,); inf where there is none.
         confidence: eta.
         kappa: Standard deviations kept from a bound; Phi^-1(eta) unless given (the paper takes 2 for eta = 0.95).
@@ -39,10 +38,10 @@ class StateBounds:
         SettingError: Crossed bounds, eta outside (0.5, 1), or a weight that is not positive.
     """
 
-    lower: Sequence[float]
-    upper: Sequence[float]
+    lower: Any
+    upper: Any
     confidence: float = 0.95
-    kappa: float | None = None
+    kappa: Any = None
     l1: float | None = None
     l2: float | None = None
 
@@ -78,7 +77,7 @@ class TrackingProblem:
         R: Input weights, the diagonal (m,) or the matrix (m, m).
         penalized: What R weighs: ``"inputs"``, ``"deviations"`` from the reference inputs, or ``"increments"``.
         terminal: Weight of the last predicted state, like Q; Q itself by default.
-        input_lower: (m,); none by default.
+        input_lower: List or array (m,), kept as an array as the others; none by default.
         input_upper: (m,).
         rate_lower: Bound on u_i - u_{i-1} (m,) per step; none by default.
         rate_upper: (m,).
@@ -93,10 +92,10 @@ class TrackingProblem:
     R: Any
     penalized: Penalized = "inputs"
     terminal: Any = None
-    input_lower: Sequence[float] | None = None
-    input_upper: Sequence[float] | None = None
-    rate_lower: Sequence[float] | None = None
-    rate_upper: Sequence[float] | None = None
+    input_lower: Any = None
+    input_upper: Any = None
+    rate_lower: Any = None
+    rate_upper: Any = None
     state_bounds: StateBounds | None = None
 
     def __post_init__(self) -> None:
@@ -143,7 +142,7 @@ def _weight(key: str, value: Any) -> np.ndarray:
     except (TypeError, ValueError):
         weight = np.empty(0)
     weight = np.diag(weight) if weight.ndim == 1 else weight
-    if weight.ndim != 2 or weight.shape[0] != weight.shape[1] or not weight.size:
+    if weight.ndim != 2 or len(weight) != len(weight.T) or not weight.size:
         raise SettingError(key, f"must be the diagonal of a weight or a square matrix; got {value!r}")
     if not np.isfinite(weight).all():
         raise SettingError(key, f"must be finite; got {value!r}")

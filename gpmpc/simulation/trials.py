@@ -19,7 +19,7 @@ import torch
 from gpmpc.exceptions import GpmpcError, SettingError, SolverFailure, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Controller, Reference
-from gpmpc.mpc.supervision import Command, OnFailure, check_policy, commands
+from gpmpc.mpc.policy import Command, OnFailure, check_policy, commands
 from gpmpc.parallel import cores, in_processes
 from gpmpc.simulation.disturbances import Disturbance
 from gpmpc.simulation.loop import Flight, History, check_references, fly, window

@@ -16,7 +16,7 @@ from gpmpc.cli.run import experiment_of
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.plotting import png, quality
 from gpmpc.propagation import Linearization
 from gpmpc.systems import step

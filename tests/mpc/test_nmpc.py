@@ -5,7 +5,7 @@ from gpmpc.exceptions import SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.simulation import closed_loop
 from gpmpc.status import Status
 from gpmpc.systems import Integrated, Map, Rotational, Translational, step

@@ -12,8 +12,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.mpc.state_form import StateFormMPC
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.qp import DualActiveSet, PrimalActiveSet
 from gpmpc.simulation import closed_loop
