@@ -216,7 +216,7 @@ def copy_matrix(X, Y):
         copy(X[r], Y[r])
 
 
-def compile_for(kernel: Callable, signature: str | Signature) -> None:
+def compile_for(kernel: Callable, signature: str) -> None:
     """Compiles ``kernel`` for one signature and no other: it then refuses other types with ``TypeError``.
 
     Without this numba would quietly build a second kernel for Fortran-ordered or integer arrays.

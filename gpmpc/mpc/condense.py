@@ -101,7 +101,7 @@ class Condenser:
             np.tile(problem.rate_lower, (rated, 1)),
             np.tile(problem.rate_upper, (rated, 1)),
         )
-        compile_for(_condense, _SIGNATURE)
+        compile_for(_condense, _SIGNATURE)  # pyright: ignore[reportArgumentType]
         self._condense = unchecked_entry_point(_condense)
         n, m = problem.state_dim, problem.input_dim
         self._size, self._rates, self._plain = horizon * m, rated * m, np.empty((0, m, len(weight) * n + m + 1))
