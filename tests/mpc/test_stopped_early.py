@@ -34,7 +34,7 @@ def convex(problem=PROBLEM, **settings):
 def nmpc(monkeypatch):
     build = casadi.nlpsol
     with monkeypatch.context() as patch:
-        few = lambda *known: build(*known[:-1], known[-1] | {"ipopt": known[-1]["ipopt"] | {"max_iter": 8}})  # noqa: E731
+        few = lambda *known: build(*known[:-1], known[-1] | {"ipopt": known[-1]["ipopt"] | {"max_iter": 11}})  # noqa: E731
         patch.setattr(casadi, "nlpsol", few)
         return NMPC(QUADROTOR, PROBLEM, H, HOVER)
 
