@@ -47,7 +47,7 @@ class Penalty(Protocol):
 
 @dataclass(frozen=True)
 class SoftLimits:
-    """Soft walls around length-scales and signal-to-noise ratio, where the data say little about them.
+    """Soft walls around length-scales and signal-to-noise ratio, where the data leave them open.
 
     ((log l_d - log std(x~_d)) / log r)^p summed over d, and (log(sf / sn) / log s)^p; the penalties of PILCO
     (Deisenroth, 2010) and of the experiment of Cao, Lai and Alam (2017). Nearly flat inside, steep outside.

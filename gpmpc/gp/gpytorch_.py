@@ -146,7 +146,7 @@ def members(model: Any, likelihood: Any = None) -> list[tuple[Any, Any]]:
         for transform in ("input_transform", "outcome_transform"):
             if getattr(one, transform, None) is not None:
                 raise UnsupportedModel(
-                    f"the model carries an {transform}, which its hyperparameters know nothing of: "
+                    f"the model carries an {transform}, which its hyperparameters do not contain: "
                     "train without it, and give the units back by GPPosterior.unscaled"
                 )
         if one.train_targets.dtype != torch.float64 or one.train_inputs[0].dtype != torch.float64:

@@ -178,7 +178,7 @@ class KernelPosterior:
         return torch.diag(torch.cat([part.noise for part in self.parts]))
 
     def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "KernelPosterior":
-        """The same on another device, or in another type: float32 or float64."""
+        """Copies the model to another device, or to another type: float32 or float64."""
         check_destination(device, dtype)
         return replace(self, parts=tuple(part.to(device, dtype) for part in self.parts))
 
@@ -259,7 +259,7 @@ class _Part:
         size = self.features.shape[-2]
         joined = torch.cat([self.features, query.expand(*self.features.shape[:-2], -1, -1)], dim=-2)
         with exact_inference():
-            prior = self.model.forward(joined)  # lazy: only the two blocks asked for are evaluated
+            prior = self.model.forward(joined)  # lazy: only the two blocks below are evaluated
             covariance = prior.lazy_covariance_matrix
             k = covariance[..., :size, size:].to_dense()  # (*k, N, B)
             own = covariance[..., size:, size:].diagonal(dim1=-2, dim2=-1)

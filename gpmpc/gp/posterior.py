@@ -128,7 +128,7 @@ class GPPosterior:
         return cls(inputs, targets, *hyperparameters, cholesky, weights, input_dim, predicts)
 
     def unscaled(self, features: Scaling, targets: Scaling) -> "GPPosterior":
-        """The same GPs in physical units, where these were trained on scaled data.
+        """Converts GPs that were trained on scaled data to physical units.
 
         Args:
             features: The scaling of x~ = (x, u), (n + m,).
@@ -206,7 +206,7 @@ class GPPosterior:
         return bool((error <= torch.finfo(self.dtype).eps ** 0.75 * diagonal).all())
 
     def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "GPPosterior":
-        """The same on another device, or in another type: float32 or float64."""
+        """Copies the posterior to another device, or to another type: float32 or float64."""
         check_destination(device, dtype)
         tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
         return replace(self, **{name: value.to(device=device, dtype=dtype) for name, value in tensors.items()})
@@ -243,26 +243,16 @@ class GPPosterior:
 
     def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
         """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""
-        mean, A, B, V = self._expanded(state, input, covariance=True)
-        return Gaussian(mean, V), A, B
-
-    def mean_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """``predict_with_jacobian`` without the covariance, which costs most: mean (*batch, k), derivatives."""
-        mean, A, B, _ = self._expanded(state, input, covariance=False)
-        return mean, A, B
-
-    def _expanded(self, state: Tensor, input: Tensor | None, covariance: bool) -> tuple[Tensor, ...]:
         input = state[..., :0] if input is None else input
         check_query(self, state, input)
         if host_arrays(self.weights, state, input) is None:
             k, difference = self._correlations(state, input)
-            V = self._belief(k, state).covariance if covariance else k
-            return self._mean(k, state), *self._jacobian(k, difference), V
+            return self._belief(k, state), *self._jacobian(k, difference)
         batch, count = state.shape[:-1], state.shape[:-1].numel()
         x, u = state.numpy().reshape(count, self.state_dim), input.numpy().reshape(count, self.input_dim)
-        mean, A, B, V = self.linearize(x, u, covariance)
-        found = (mean, A, B, mean if V is None else V)
-        return tuple(torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found)
+        found = [part for part in self.linearize(x, u) if part is not None]
+        mean, A, B, V = (torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found)
+        return Gaussian(mean, V), A, B
 
     def mean_hessian(self, state: Tensor, input: Tensor | None = None) -> Tensor:
         """The mean's second derivatives by the state (*batch, k, n, n)."""

@@ -157,7 +157,7 @@ class Trainer:
             features: x~ = (x, u) (N, n + m).
             targets: (N, k).
             input_dim: m.
-            predicts: What the targets mean; by default what the trainer's setting says.
+            predicts: What the targets mean; the trainer's setting by default.
             seed: Of the random starts.
             start: Its hyperparameters are the first start instead; the random ones stay where they are.
 

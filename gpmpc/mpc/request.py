@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpmpc.compiled import compile_for, compiled, direct
+from gpmpc.compiled import compile_for, compiled, unchecked_entry_point
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
@@ -152,7 +152,7 @@ def check_controller(
     """
     global inspect
     compile_for(look_over, SIGNATURE)
-    inspect = direct(look_over)
+    inspect = unchecked_entry_point(look_over)
     if not isinstance(problem, TrackingProblem):
         raise SettingError("problem", f"must be TrackingProblem(...); got {type(problem).__name__}")
     check_number("horizon", horizon, least=1, whole=True)

@@ -245,7 +245,7 @@ def programs_of_the_double_pendulum(starts, seed):
                 c = at.mean - np.einsum("kij,kj->ki", at.A, states[:-1]) - np.einsum("kij,kj->ki", at.B, inputs)
                 stages = Stages(at.A, at.B, c)
                 program = condenser.condense(stages, start, references, no_rows(4, H))
-                solution = solver.solve_stacked(*program[:5])  # raises where P is not positive definite
+                solution = solver.solve(QuadraticProgram.unchecked(*program[:5]))  # raises where P is indefinite
                 found, moved = expand(stages, start, program.feedback, references.previous_input, solution.x)
                 assert solution.status is Status.SOLVED
                 assert np.isfinite(moved).all()
