@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from benchmarks.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
+from benchmarks.quadrotor_sequences import TIGHT
 from benchmarks.timing import write_results
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.problem import StateBounds
@@ -27,8 +28,6 @@ from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
 
-# Bounds that bite at about one step in ten: of ux and uy [-], and of the increments of U1 [N], ux, uy.
-TIGHT = {"elliptical": (0.015, [0.014, 0.004, 0.004]), "lorenz": (0.04, [0.2, 0.02, 0.03])}
 PROPAGATIONS = {"linearization": Linearization(), "moment_matching": MomentMatching()}
 
 

@@ -8,7 +8,6 @@ same process, issues independent multiply-adds from registers. Loads, stores, lo
 than N^2 are not in it: this is the arithmetic floor, to which ``ratio`` refers. ``streamed`` is what reading the two
 triangles once from memory takes, at the rate of a sum over an array of that size; at large N they no longer fit the
 caches.
-numbers cannot hide it; those of E can, so its reading is in no floor.
 
 Two beliefs are measured. Where all exponents are near zero, as they are for a belief that is narrow beside the
 length-scales, expm1 needs no reduction; ``ratio`` then refers to the floor without those instructions, and ``general``
@@ -27,7 +26,7 @@ from benchmarks.timing import write_results
 from gpmpc import kernels
 from gpmpc.compiled import compiled
 from gpmpc.gp import GPPosterior
-from gpmpc.qp.lanes import lanes, plus, put
+from gpmpc.kernels.simd import load, store
 
 STATES, INPUTS, LANES = 6, 3, 8
 # Vector instructions for eight pairs of points, R states:
@@ -79,7 +78,7 @@ def measured(packed: kernels.Packed, size: int, belief: str) -> dict:
         times.append(time.process_time() - start)
     middle, general = float(np.median(times)), instructions(packed, reduced=True) / max(rates)
     floor = general if belief == "wide" else instructions(packed, reduced=False) / max(rates)
-    factor, centred = summed(packed.inverse_cholesky), summed(packed.centred)
+    factor, centred = summed(packed.precision.inverse_cholesky), summed(packed.precision.centred)
     return {
         "N": size,
         "belief": belief,
@@ -98,7 +97,7 @@ def measured(packed: kernels.Packed, size: int, belief: str) -> dict:
 
 def instructions(packed: kernels.Packed, reduced: bool) -> float:
     """Vector instructions that a Jacobian must issue over all pairs, with or without the reduction of expm1."""
-    k, padded = packed.output_dim, packed.points.shape[1]
+    k, padded = packed.output_dim, packed.arrays.points.shape[1]
     square, triangle = padded**2 / LANES, padded * (padded + LANES) / 2 / LANES
     each = DELTA + EXPM1 + SUMS + (REDUCTION if reduced else 0)
     return k * (k - 1) / 2 * square * each + k * triangle * (each + WEIGHT + EXPLAINED)
@@ -115,17 +114,17 @@ def issue_rate(count: int = 200_000) -> float:
 @compiled
 def multiply_add(values, count):
     """Twelve chains of ``count`` multiply-adds in registers: two a cycle hide a latency of four."""
-    a, b, c, d = lanes(values, 0), lanes(values, 8), lanes(values, 16), lanes(values, 24)
-    e, f, g, h = lanes(values, 32), lanes(values, 40), lanes(values, 48), lanes(values, 56)
-    i, j, k, m = lanes(values, 64), lanes(values, 72), lanes(values, 80), lanes(values, 88)
-    added, factor = lanes(values, 96), values[104]
+    a, b, c, d = load(values, 0), load(values, 8), load(values, 16), load(values, 24)
+    e, f, g, h = load(values, 32), load(values, 40), load(values, 48), load(values, 56)
+    i, j, k, m = load(values, 64), load(values, 72), load(values, 80), load(values, 88)
+    added, factor = load(values, 96), values[104]
     for _ in range(count):
-        a, b, c, d = plus(added, factor, a), plus(added, factor, b), plus(added, factor, c), plus(added, factor, d)
-        e, f, g, h = plus(added, factor, e), plus(added, factor, f), plus(added, factor, g), plus(added, factor, h)
-        i, j, k, m = plus(added, factor, i), plus(added, factor, j), plus(added, factor, k), plus(added, factor, m)
-    put(values, 0, a), put(values, 8, b), put(values, 16, c), put(values, 24, d)
-    put(values, 32, e), put(values, 40, f), put(values, 48, g), put(values, 56, h)
-    put(values, 64, i), put(values, 72, j), put(values, 80, k), put(values, 88, m)
+        a, b, c, d = added + factor * a, added + factor * b, added + factor * c, added + factor * d
+        e, f, g, h = added + factor * e, added + factor * f, added + factor * g, added + factor * h
+        i, j, k, m = added + factor * i, added + factor * j, added + factor * k, added + factor * m
+    store(values, 0, a), store(values, 8, b), store(values, 16, c), store(values, 24, d)
+    store(values, 32, e), store(values, 40, f), store(values, 48, g), store(values, 56, h)
+    store(values, 64, i), store(values, 72, j), store(values, 80, k), store(values, 88, m)
 
 
 def summed(array: np.ndarray) -> float:

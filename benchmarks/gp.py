@@ -37,7 +37,7 @@ def main() -> None:
     torch.set_default_dtype(torch.float64)
     here, results, began = machine(), [], time.perf_counter()
     gps, at, u = posterior(8).packed, belief(), np.zeros(INPUTS)
-    kernels.mean_with_jacobian(gps, at.mean.numpy(), u)
+    kernels.linearize(gps, at.mean.numpy()[None], u[None], False, np.zeros(STATES), False)
     kernels.point_with_jacobian(gps, at.mean.numpy(), u)
     kernels.moments_with_jacobian(gps, at.mean.numpy(), at.covariance.numpy(), u)
     first = time.perf_counter() - began
@@ -114,6 +114,7 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
         whole = torch.func.jacrev(lambda x: gp.predict(x[:n], x[n:]).mean)(query)
         return (whole - adds).split(n, dim=1)
 
+    zeros = np.zeros(gp.output_dim)
     groups: list[Group] = [
         {
             "moments": lambda: kernels.moments(packed, mu, S, u)[:2],
@@ -124,7 +125,9 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
         {"diagonal with Jacobians": lambda: kernels.moments_with_jacobian(packed, mu, S, u, diagonal=True)[:8]},
         {"linearised": lambda: kernels.point_with_jacobian(packed, mu, u)[:8]},
         {
-            "mean with Jacobian": lambda: kernels.mean_with_jacobian(packed, mu, u)[1:],
+            "mean with Jacobian": lambda: [
+                part[0] for part in kernels.linearize(packed, mu[None], u[None], False, zeros, False)[1:3]
+            ],
             "mean with Jacobian, torch jacrev": by_jacrev,
             "mean with Jacobian, GPyTorch, frozen": by_gpytorch,
             "mean with Jacobian, GPyTorch": by_gpytorch_as_usual,

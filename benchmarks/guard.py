@@ -96,7 +96,9 @@ def groups() -> list[tuple]:
             small_calls(),
             stepping
             | {
-                "mean with Jacobian": lambda: gp.mean_with_jacobian(belief.mean, input),
+                "mean with Jacobian": lambda: gp.linearize(
+                    belief.mean[None].numpy(), input[None].numpy(), covariance=False
+                ),
                 "program": solving(programs),
             },
         ),

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gpmpc.dynamics import DynamicsModel
+from gpmpc.dynamics import DynamicsModel, predict_with_jacobian
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
@@ -102,7 +102,7 @@ def _rollout(model: DynamicsModel, state: Array, inputs: Array) -> tuple[Array, 
     """States (H + 1, n), and the Jacobians (H, n, n) and (H, n, m) of every step."""
     x, states, A, B = torch.tensor(state), [state], [], []
     for u in torch.from_numpy(np.array(inputs)):
-        moved, by_state, by_input = model.predict_with_jacobian(x, u)
+        moved, by_state, by_input = predict_with_jacobian(model, x, u)
         x = moved.mean
         states.append(x.numpy())
         A.append(by_state.numpy())

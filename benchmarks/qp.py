@@ -5,11 +5,12 @@
     .venv/bin/python -m benchmarks.qp --horizons 50 --modes changing --slow-solvers 0
     .venv/bin/python -m benchmarks.qp --rows 6,3           # also with bounds on the positions only
 
-Every solver meets the same sequence of QPs (``quadrotor_sequences``) in one process on one thread, warm-started from
-its own last solution. The solvers take turns, sequence by sequence, ``--passes`` times, and the fastest of a QP's
-passes counts: what another process on the machine does to one pass is not the solver's time. *Hot*: the problem has
-just been written to memory that stays the same, as a controller would. *Flushed*: all caches are overwritten before
-every call.
+All solvers solve one sequence of QPs in one process on one thread, each warm-started from its own last solution:
+``constant`` and ``changing`` are those of ``quadrotor_sequences``, ``elliptical`` and ``lorenz`` those of a learned
+controller on a flight, whose P and G change, with bounds of inputs and states. The solvers take turns, sequence by
+sequence, ``--passes`` times, and the fastest of a QP's passes counts: what another process on the machine does to one
+pass is not the solver's time. *Hot*: the problem has just been written to memory that stays the same, as a controller
+would. *Flushed*: all caches are overwritten before every call.
 
 Times include everything from contiguous arrays to x, so the Python layer of either side. DAQP has two paths, each with
 contiguous arrays: ``Model.update`` + ``Model.solve`` (warm), and ``daqp.solve`` from nothing; ratios are to the faster
@@ -30,7 +31,8 @@ from time import perf_counter
 import daqp
 import numpy as np
 
-from benchmarks.quadrotor_sequences import SequenceProblem, quadrotor_sequence
+from benchmarks.quadrotor import TRAJECTORIES
+from benchmarks.quadrotor_sequences import SequenceProblem, flight_sequence, quadrotor_sequence
 from gpmpc.qp import CvxpySolver, DualActiveSet, PrimalActiveSet, QuadraticProgram, make_solution
 from gpmpc.status import Status
 
@@ -39,6 +41,8 @@ PRIMAL, CVXPY = "PrimalActiveSet", "CVXPY + Clarabel"
 TARGETS = {
     "constant": {1: 0.60, 5: 0.50, 10: 0.45, 20: 0.42, 50: 0.34},
     "changing": {1: 0.85, 5: 0.57, 10: 0.30, 20: 0.20, 50: 0.09},
+    "elliptical": {1: 0.75, 5: 0.45, 10: 0.50, 20: 0.12},
+    "lorenz": {1: 0.75, 5: 0.45, 10: 0.25, 20: 0.12},
 }
 CACHES = np.zeros(12_000_000)  # 96 MB, more than any cache of the machine
 
@@ -145,24 +149,34 @@ def worst_residual(problem: SequenceProblem, answer) -> float:
     return max(solution.residuals())
 
 
+def active_rows(problem: SequenceProblem) -> int:
+    """Number of active constraints at the minimiser."""
+    solution = DualActiveSet().solve(QuadraticProgram.unchecked(*vars(problem).values()))
+    return int(np.count_nonzero(solution.active_set))
+
+
 def measure_cell(horizon: int, mode: str, rows: int, settings: argparse.Namespace) -> dict:
     """All solvers on one sequence."""
-    changing = mode == "changing"
+    changing = mode != "constant"
     closing = DualActiveSet()
 
     def close_loop(p: SequenceProblem) -> np.ndarray:
         return closing.solve(QuadraticProgram.unchecked(*vars(p).values())).x
 
-    problems = list(quadrotor_sequence(horizon, changing, settings.length, close_loop, positions_only=rows == 3))
+    if mode in TRAJECTORIES:
+        problems = flight_sequence(mode, horizon, settings.length)
+    else:
+        problems = list(quadrotor_sequence(horizon, changing, settings.length, close_loop, positions_only=rows == 3))
     fast = {OURS: ours(changing), DAQP_WARM: daqp_warm(changing), DAQP_COLD: daqp_cold}
     slow = {PRIMAL: by_protocol(PrimalActiveSet()), CVXPY: by_protocol(CvxpySolver("CLARABEL", {}))}
     cell = {
         "horizon": horizon,
         "mode": mode,
         "n": 3 * horizon,
-        "m": rows * horizon,
-        "rows a stage": rows,
+        "m": len(problems[0].G),
+        "rows a stage": len(problems[0].G) // horizon,
         "QPs": len(problems),
+        "active rows": float(np.mean([active_rows(p) for p in problems])),
         "solvers": {},
     }
     for condition, passes in (("hot", settings.passes), ("flushed", min(settings.passes, 2))):
@@ -201,7 +215,7 @@ def quantiles(seconds: np.ndarray) -> dict[str, float]:
 def describe(cell: dict) -> str:
     """One line per cell for the terminal."""
     solvers, ratio = cell["solvers"], cell["ratio hot"]
-    text = f"{cell['mode']:9s} H = {cell['horizon']:3d}, m = {cell['m']:3d}: "
+    text = f"{cell['mode']:10s} H = {cell['horizon']:3d}, m = {cell['m']:3d}, {cell['active rows']:4.1f} active: "
     text += f"{solvers[OURS]['hot']['median']:8.2f} us, {cell['best DAQP path']} "
     text += f"{solvers[cell['best DAQP path']]['hot']['median']:8.2f} us, ratio {ratio['median']:.3f}"
     if cell["horizon"] in TARGETS[cell["mode"]]:
@@ -257,7 +271,7 @@ def main() -> None:
     """Measures the cells asked for and writes what was found."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--horizons", default="1,5,10,20,50", help="comma-separated")
-    parser.add_argument("--modes", default="constant,changing", help="comma-separated")
+    parser.add_argument("--modes", default="constant,changing,elliptical,lorenz", help="comma-separated")
     parser.add_argument("--rows", default="6", help="bounded states a stage: 6 (positions, velocities), 3, or 6,3")
     parser.add_argument("--length", type=int, default=440, help="QPs per cell")
     parser.add_argument("--passes", type=int, default=3, help="turns of each solver")

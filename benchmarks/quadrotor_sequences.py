@@ -18,6 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.quadrotor import HOVER, TRAJECTORIES, problem, recorded, trained
+from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.problem import StateBounds
+from gpmpc.propagation import Linearization
+from gpmpc.trajectories import states_along
+
 Array = NDArray[np.float64]
 
 TIME_STEP = 0.1  # [s]
@@ -30,6 +36,10 @@ INPUT_LIMIT = np.array([4.0, 0.45, 0.45])  # deviation from hover: thrust [N], t
 WIDE = np.array([5.0, 6.0] * 3)  # bounds on positions [m] and velocities [m/s] outside the corridor
 NARROW = np.array([2.5, 2.5] * 3)  # and inside it
 POSITION_NOISE, VELOCITY_NOISE = 0.01, 0.05  # standard deviations per step [m], [m/s]
+
+
+# Bounds that are active at about one step in ten: of ux and uy [-], and of the increments of U1 [N], ux, uy.
+TIGHT = {"elliptical": (0.015, [0.014, 0.004, 0.004]), "lorenz": (0.04, [0.2, 0.02, 0.03])}
 
 
 @dataclass(frozen=True)
@@ -113,8 +123,32 @@ def quadrotor_sequence(
         feasible = G @ np.clip(np.concatenate([plan[3:], plan[-3:]]), -box, box)
         lower = np.concatenate([-box, np.minimum(-limits - offset, feasible - 0.01)])
         upper = np.concatenate([box, np.maximum(limits - offset, feasible + 0.01)])
-        problem = SequenceProblem(P, q, G, lower, upper)
-        yield problem
-        plan = solve(problem)
+        program = SequenceProblem(P, q, G, lower, upper)
+        yield program
+        plan = solve(program)
         noise = rng.standard_normal(6) * np.tile([POSITION_NOISE, VELOCITY_NOISE], 3)
         state = A @ state + B @ plan[:3] + noise
+
+
+def flight_sequence(trajectory: str, horizon: int, length: int) -> list[SequenceProblem]:
+    """The QPs of a flight of the learned quadrotor with the plant in the loop, those without a solution left out."""
+    states = states_along(TRAJECTORIES[trajectory], np.arange(length + horizon + 1.0))
+    margin = 0.05 + 0.02 * np.ptp(states, axis=0)  # [m, m/s] around all that the reference visits
+    bounds = StateBounds(states.min(axis=0) - margin, states.max(axis=0) + margin)
+    bounded = problem(bounds, tilt=TIGHT[trajectory][0])
+    controller = ConvexMPC(trained(trajectory), Linearization(), bounded, horizon, HOVER)
+    steps = recorded(controller, trajectory, length)
+    programs = [step.decision.problem for step in steps if step.decision.status.solved]
+    return [_two_sided(*(np.array(part) for part in program[:5])) for program in programs]
+
+
+def _two_sided(P: Array, q: Array, G: Array, lower: Array, upper: Array) -> SequenceProblem:
+    """Merges rows that are equal, such as an upper and a lower bound of one state: other solvers have fewer to scan."""
+    n = len(q)
+    rows, first, group = np.unique(G, axis=0, return_index=True, return_inverse=True)
+    low, high = np.full(len(rows), -np.inf), np.full(len(rows), np.inf)
+    np.maximum.at(low, group.ravel(), lower[n:])
+    np.minimum.at(high, group.ravel(), upper[n:])
+    order = np.argsort(first)
+    G, low, high = np.ascontiguousarray(rows[order]), low[order], high[order]
+    return SequenceProblem(P, q, G, np.concatenate([lower[:n], low]), np.concatenate([upper[:n], high]))

@@ -1,21 +1,18 @@
-"""Problem: can the uncertainty that a model and a propagator state be believed, one step ahead and many?
+"""Checks whether the uncertainty that a model and a propagator state can be believed, one step ahead and many.
 
-A controller with chance constraints trusts the predicted covariance over its whole horizon, where small faults of
-the model add up and a propagator's approximations with them. So held-out recordings are predicted from every one of
-their states k = 1 to H steps ahead, with the inputs that were applied, and what was predicted is compared with what
-was measured, per step and state: root mean squared error, negative log predictive density (Quinonero-Candela et al.,
-2006), and how often central intervals hold the measurement (Gneiting, Balabdaoui and Raftery, 2007). k = 1 from a
-certain state is the usual check of the model alone.
+Held-out recordings are predicted from every one of their states k = 1 to H steps ahead, with the inputs that were
+applied, and compared with what was measured, per step and state: root mean squared error, negative log predictive
+density (Quinonero-Candela et al., 2006), and how often central intervals hold the measurement (Gneiting, Balabdaoui and
+Raftery, 2007). k = 1 from a certain state is the usual check of the model alone.
 
 Predictions from neighbouring states overlap, so their errors are correlated: the effective number of samples is smaller
 than the count, the more so the larger k.
 """
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -26,6 +23,9 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp.transitions import Transitions
 from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
 from gpmpc.propagation import MomentMatching, Propagator
+
+if TYPE_CHECKING:
+    import pandas
 
 CHUNK = 64  # starts propagated at once: bounds the memory of moment matching at about CHUNK N^2 numbers
 
@@ -63,7 +63,7 @@ class Recording:
 
     @classmethod
     def chained(cls, transitions: Transitions) -> list["Recording"]:
-        """The runs in transitions: one goes on for as long as a row's next state is the following row's state."""
+        """Finds the runs in transitions: one goes on while a row's next state is the following row's state."""
         goes_on = (transitions.next_states[:-1] == transitions.states[1:]).all(dim=1).tolist()
         ends = [k + 1 for k, same in enumerate(goes_on) if not same] + [len(transitions)]
         runs = [slice(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True)]
@@ -75,63 +75,29 @@ class Recording:
 
 @dataclass(frozen=True)
 class Calibration:
-    """How predictions of k = 1 to H steps fared.
+    """How predictions of k = 1 to H steps fared, for n states and L levels."""
 
-    Attributes:
-        names: Of the n states.
-        levels: Of the intervals (L).
-        samples: Predictions compared at each step (H,).
-        rmse: Root mean squared error, in the units of each state (H, n).
-        nlpd: Negative log predictive density; lower is better (H, n).
-        coverage: Part of the measurements inside the central interval of each level (H, n, L).
-    """
-
-    names: tuple[str, ...]
-    levels: tuple[float, ...]
-    samples: Tensor
-    rmse: Tensor
-    nlpd: Tensor
-    coverage: Tensor
+    names: tuple[str, ...]  # of the n states
+    levels: tuple[float, ...]  # of the intervals
+    samples: Tensor  # (H,) predictions compared at each step
+    rmse: Tensor  # (H, n) root mean squared error, in the units of each state
+    nlpd: Tensor  # (H, n) negative log predictive density; lower is better
+    coverage: Tensor  # (H, n, L) part of the measurements inside the central interval of each level
 
     @property
     def horizon(self) -> int:
         """H, the longest prediction in steps."""
         return len(self.samples)
 
-    def rows(self) -> list[dict[str, Any]]:
-        """One row a step and state: step, state, samples, rmse, nlpd, and coverage_<level> for each level."""
-        return [
-            {
-                "step": k + 1,
-                "state": name,
-                "samples": int(self.samples[k]),
-                "rmse": float(self.rmse[k, i]),
-                "nlpd": float(self.nlpd[k, i]),
-                **{f"coverage_{level:g}": float(self.coverage[k, i, j]) for j, level in enumerate(self.levels)},
-            }
-            for k in range(self.horizon)
-            for i, name in enumerate(self.names)
-        ]
+    def to_pandas(self) -> "pandas.DataFrame":
+        """Returns a row a step and state: step, state, samples, rmse, nlpd, and coverage_<level> for each level."""
+        import pandas
 
-    def to_json(self) -> str:
-        """The rows as JSON; a figure that is not finite becomes null."""
-        rows = [
-            {key: None if isinstance(v, float) and not math.isfinite(v) else v for key, v in row.items()}
-            for row in self.rows()
-        ]
-        return json.dumps({"levels": list(self.levels), "states": list(self.names), "rows": rows}, indent=2)
-
-    def markdown(self, steps: Sequence[int] | None = None) -> str:
-        """A table of some steps (from 1), all by default."""
-        steps = range(1, self.horizon + 1) if steps is None else steps
-        titles = ["step", "state", "samples", "RMSE", "NLPD", *(f"{100 * level:g} % coverage" for level in self.levels)]
-        lines = [titles, ["---:", ":---", *["---:"] * (len(titles) - 2)]]
-        for row in self.rows():
-            if row["step"] in steps:
-                step, state, samples, rmse, nlpd, *coverage = row.values()
-                lines.append([str(step), state, str(samples), f"{rmse:.3g}", f"{nlpd:.2f}"])
-                lines[-1] += [f"{value:.3f}" for value in coverage]
-        return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        n = len(self.names)
+        table = {"step": [k + 1 for k in range(self.horizon) for _ in range(n)], "state": self.names * self.horizon}
+        table |= {"samples": self.samples.repeat_interleave(n), "rmse": self.rmse.ravel(), "nlpd": self.nlpd.ravel()}
+        table |= {f"coverage_{level:g}": self.coverage[..., j].ravel() for j, level in enumerate(self.levels)}
+        return pandas.DataFrame(table)
 
 
 def calibrate(

@@ -17,15 +17,13 @@ imports, directly or not.
 import hashlib
 import re
 import sys
-import time
 from collections.abc import Callable
 from functools import cache, partial
 from threading import Lock
+from typing import Any
 
 import numba
-from llvmlite import ir
-from numba.core import cgutils, types
-from numba.extending import intrinsic, register_jitable
+from numba.extending import register_jitable
 
 REORDERED = frozenset({"reassoc", "contract", "nsz"})
 
@@ -72,14 +70,6 @@ njit_noalloc = partial(njit_inner, allocates=False)
 
 inline_njit = partial(njit_noalloc, inline=True)
 """Compiles such a function into each of its callers."""
-
-woven = inline_njit  # former names
-
-
-def borrowing(function=None, *, locked=False, **options):
-    """Former name of ``njit_noalloc``, and of ``compiled(allocates=False)`` for kernels that keep the lock."""
-    return compiled(function, allocates=False, kernel=locked, locked=locked, **options)
-
 
 # numba optimises every function that a kernel calls, and makes machine code of it, before it does so for the kernel,
 # which contains it all. No public interface prevents that, nor does one prevent a kernel from running another kernel's
@@ -202,20 +192,6 @@ def _read_source(path: str | None) -> tuple[bytes, list[str]]:
     return hashlib.sha256(source).digest(), imported
 
 
-@njit_noalloc
-def copy(x, y):
-    """Writes a vector to one of its length. For ``y[:] = x`` numba compiles an error's words: a second a kernel."""
-    for i in range(len(y)):
-        y[i] = x[i]
-
-
-@njit_noalloc
-def copy_matrix(X, Y):
-    """Writes a matrix to one of its shape."""
-    for r in range(len(Y)):
-        copy(X[r], Y[r])
-
-
 def compile_for(kernel: Callable, signature: str) -> None:
     """Compiles ``kernel`` for one signature and no other: it then refuses other types with ``TypeError``.
 
@@ -239,23 +215,14 @@ def unchecked_entry_point(kernel: Callable) -> Callable:
         return kernel
 
 
-direct = unchecked_entry_point  # former name
+def call_unchecked(kernel: Callable, *arguments: Any) -> None:
+    """Calls a kernel whose callers always pass arguments of the same types, without looking at them from then on."""
+    entry = _entry_points.get(kernel)
+    if entry is not None:
+        entry(*arguments)
+    else:
+        kernel(*arguments)
+        _entry_points[kernel] = unchecked_entry_point(kernel)
 
 
-@intrinsic
-def clock(typing_context):
-    """Seconds since some moment, inside compiled code; zero where the system has no monotonic POSIX clock."""
-
-    def generate(context, builder, signature, arguments):
-        if not hasattr(time, "CLOCK_MONOTONIC"):
-            return context.get_constant(types.float64, 0.0)
-        whole, narrow = ir.IntType(64), ir.IntType(32)
-        moment = cgutils.alloca_once(builder, ir.ArrayType(whole, 2))  # struct timespec
-        kind = ir.FunctionType(narrow, [narrow, moment.type])
-        read = cgutils.get_or_insert_function(builder.module, kind, "clock_gettime")
-        builder.call(read, [narrow(time.CLOCK_MONOTONIC), moment])
-        parts = [builder.extract_value(builder.load(moment), i) for i in range(2)]
-        seconds, nanoseconds = (builder.sitofp(part, ir.DoubleType()) for part in parts)
-        return builder.fadd(seconds, builder.fmul(nanoseconds, ir.DoubleType()(1e-9)))
-
-    return types.float64(), generate
+_entry_points: dict[Callable, Callable] = {}

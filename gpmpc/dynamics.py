@@ -97,7 +97,7 @@ def linearize(model: DynamicsModel, states: Array, inputs: Array, covariance: bo
 def linearize_by_autograd(model: Any, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
     """Linearises any model that has ``predict``, by one evaluation of all K points and torch autograd.
 
-    It is slower than a closed form; the log says so once a class.
+    It is slower than a closed form, which is logged once a class.
 
     Args:
         model: With ``predict``, ``dtype`` and ``device``; arguments and results are converted.

@@ -1,4 +1,4 @@
-"""Problem: say in numbers how good predictions and flights are, and how far those numbers can be believed."""
+"""Computes how good predictions and flights are, and how far those numbers can be believed."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ NEAR = {"m": 10.0, "rad": math.pi / 2}
 
 
 def mean_squared_error(predicted: Tensor, observed: Tensor) -> float:
-    """Squared error summed over the outputs, averaged over the samples; both (N, n).
+    """Computes the squared error summed over the outputs, averaged over the samples; both (N, n).
 
     Raises:
         ShapeError: The shapes differ.
@@ -28,7 +28,7 @@ def mean_squared_error(predicted: Tensor, observed: Tensor) -> float:
 
 
 def negative_log_predictive_density(mean: Tensor, variance: Tensor, observed: Tensor) -> float:
-    """-log N(observed; mean, variance), averaged over samples and outputs; all (N, n). Lower is better.
+    """Computes -log N(observed; mean, variance), averaged over samples and outputs; all (N, n). Lower is better.
 
     Quinonero-Candela et al. (2006), "Evaluating predictive uncertainty challenge".
 
@@ -40,7 +40,7 @@ def negative_log_predictive_density(mean: Tensor, variance: Tensor, observed: Te
 
 
 def interval_coverage(mean: Tensor, variance: Tensor, observed: Tensor, level: float = 0.95) -> float:
-    """Part of the observations inside the central interval of the given level; all (N, n). Ideal is the level.
+    """Computes the part of observations inside the central interval of the given level; all (N, n). Ideal: the level.
 
     Raises:
         ShapeError: The shapes differ.
@@ -62,19 +62,14 @@ def _check_alike(**given: Tensor) -> None:
 
 @dataclass(frozen=True)
 class TrackingError:
-    """Root mean squared distance from the references.
+    """Root mean squared distance from the references."""
 
-    Attributes:
-        axes: Of every state looked at (j,), in its unit.
-        total: Root of the mean of their summed squares: over x, y, z the distance [m].
-    """
-
-    axes: np.ndarray
-    total: float
+    axes: np.ndarray  # (j,) of every state looked at, in its unit
+    total: float  # root of the mean of their summed squares: over x, y, z the distance [m]
 
 
 def tracking_error(states: np.ndarray, references: np.ndarray, axes: Sequence[int] = (0, 2, 4)) -> TrackingError:
-    """How far a flight was from its references, the initial state left out: nobody steered there.
+    """Computes how far a flight was from its references, the initial state left out: nobody steered there.
 
     Args:
         states: x[0] .. x[K] (K + 1, n), K of 1 or more.
@@ -84,14 +79,14 @@ def tracking_error(states: np.ndarray, references: np.ndarray, axes: Sequence[in
     Raises:
         ShapeError: The two do not belong together, or have no such axes.
     """
-    states, references = _looked_at(states, references, axes)
+    states, references = _select_axes(states, references, axes)
     with np.errstate(over="ignore"):
         squares = np.square(states - references)[1:].mean(axis=0)
         return TrackingError(np.sqrt(squares), float(np.sqrt(squares.sum())))
 
 
-def _looked_at(states: np.ndarray, references: np.ndarray, axes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Some axes of both (K + 1, j)."""
+def _select_axes(states: np.ndarray, references: np.ndarray, axes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Selects some axes of both (K + 1, j)."""
     if np.ndim(states) != 2 or np.shape(states) != np.shape(references) or len(states) < 2:
         raise ShapeError(
             f"states and references must both be (K + 1, n), K of 1 or more; got {np.shape(states)} and "
@@ -105,23 +100,17 @@ def _looked_at(states: np.ndarray, references: np.ndarray, axes: Sequence[int]) 
 
 @dataclass(frozen=True)
 class Loss:
-    """Where a flight was lost.
+    """Where a flight was lost."""
 
-    Attributes:
-        step: The first step k whose state is too far off.
-        distance: How far it is from its reference.
-        limit: How far it may be.
-    """
-
-    step: int
-    distance: float
-    limit: float
+    step: int  # the first step k whose state is too far off
+    distance: float  # from its reference
+    limit: float  # how far it may be
 
 
 def find_loss(
     states: np.ndarray, references: np.ndarray, least: float = 0.0, axes: Sequence[int] = (0, 2, 4)
 ) -> Loss | None:
-    """Where a flight is farther from its reference than the reference ever goes from where the flight began.
+    """Finds where a flight is farther from its reference than the reference ever goes from where the flight began.
 
     There the system would have been nearer had it never moved: it no longer follows. That holds for any system and any
     units; a reference that hardly moves needs a ``least``, such as ``NEAR``.
@@ -138,7 +127,7 @@ def find_loss(
     Raises:
         ShapeError: The two do not belong together, or have no such axes.
     """
-    states, references = _looked_at(states, references, axes)
+    states, references = _select_axes(states, references, axes)
     with np.errstate(over="ignore", invalid="ignore"):
         limit = max(least, float(np.linalg.norm(references - states[0], axis=1).max()))
         distances = np.linalg.norm(states - references, axis=1)
@@ -149,21 +138,13 @@ def find_loss(
 
 @dataclass(frozen=True)
 class ViolationRate:
-    """How often bounds were broken.
+    """How often bounds were broken."""
 
-    Attributes:
-        violations: Steps at which any entry was outside.
-        steps: All steps.
-        worst: Largest distance outside, in the entry's unit; 0 where there was none.
-        low: Lower end of the interval for the probability of a violation.
-        high: Its upper end.
-    """
-
-    violations: int
-    steps: int
-    worst: float
-    low: float
-    high: float
+    violations: int  # steps at which any entry was outside
+    steps: int  # all of them
+    worst: float  # largest distance outside, in the entry's unit; 0 where there was none
+    low: float  # lower end of the interval for the probability of a violation
+    high: float  # its upper end
 
     @property
     def rate(self) -> float:
@@ -174,7 +155,7 @@ class ViolationRate:
 def violation_rate(
     values: np.ndarray, lower: np.ndarray, upper: np.ndarray, level: float = 0.95, tolerance: float = 1e-9
 ) -> ViolationRate:
-    """How often states or inputs were outside their bounds, with the interval of Clopper and Pearson (1934).
+    """Counts how often states or inputs were outside their bounds, with the interval of Clopper and Pearson (1934).
 
     The interval takes steps for independent. Those of one flight are not: pool several seeds, and read it as a lower
     limit of the doubt.
@@ -206,7 +187,7 @@ def violation_rate(
 
 
 def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """The exact interval for a probability of which ``successes`` of ``trials`` are known (Clopper and Pearson, 1934).
+    """Computes the exact interval for a probability from ``successes`` of ``trials`` (Clopper and Pearson, 1934).
 
     Raises:
         SettingError: More successes than trials, no trials, or a level outside (0, 1).
@@ -232,7 +213,7 @@ class TimeQuantiles:
 
 
 def time_quantiles(seconds: np.ndarray) -> TimeQuantiles:
-    """Median, 95 % and 99 % quantile, and the largest of wall times (K,) [s].
+    """Computes median, 95 % and 99 % quantile, and the largest of wall times (K,) [s].
 
     Raises:
         ShapeError: There is none.

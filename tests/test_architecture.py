@@ -53,7 +53,7 @@ def test_recordings_are_written_and_read_without_torch_and_without_compilers():
         ("mcap", ["recording"]),
         ("google.protobuf", ["recording"]),
         ("foxglove", ["recording"]),
-        ("pandas", ["recording", "cli", "studies"]),
+        ("pandas", ["recording", "calibration.py", "cli", "studies"]),
     ],
 )
 def test_a_heavy_library_has_one_door(library, rooms):

@@ -1,7 +1,6 @@
 """Calibration of predictions many steps ahead: right on systems whose uncertainty is known, telling on wrong ones."""
 
 import io
-import json
 import math
 from dataclasses import dataclass, replace
 
@@ -142,22 +141,20 @@ def example():
     )
 
 
-def test_the_report_is_rows_json_and_markdown():
-    rows = example().rows()
-    assert len(rows) == 4
-    assert rows[1] == pytest.approx(
-        {"step": 1, "state": "rate", "samples": 20, "rmse": 0.2, "nlpd": 2.0, "coverage_0.5": 0.6, "coverage_0.95": 1.0}
-    )
-    data = json.loads(example().to_json())
-    assert data["levels"] == [0.5, 0.95]
-    assert data["rows"][0] == rows[0]
-    assert data["rows"][3]["nlpd"] is None
-    lines = example().markdown(steps=[2]).splitlines()
-    assert lines[0] == "| step | state | samples | RMSE | NLPD | 50 % coverage | 95 % coverage |"
-    assert lines[2:] == [
-        "| 2 | angle | 10 | 0.3 | 3.00 | 0.400 | 0.800 |",
-        "| 2 | rate | 10 | 0.4 | inf | 0.300 | 0.700 |",
+def test_the_report_is_a_data_frame():
+    frame = example().to_pandas()
+    assert list(frame.columns) == ["step", "state", "samples", "rmse", "nlpd", "coverage_0.5", "coverage_0.95"]
+    assert frame.iloc[1].tolist() == [1, "rate", 20, pytest.approx(0.2), 2.0, pytest.approx(0.6), 1.0]
+    assert frame.iloc[3].tolist() == [
+        2,
+        "rate",
+        10,
+        pytest.approx(0.4),
+        math.inf,
+        pytest.approx(0.3),
+        pytest.approx(0.7),
     ]
+    assert frame["state"].tolist() == ["angle", "rate"] * 2
 
 
 def test_the_figure_has_a_column_for_each_state_and_a_row_for_each_measure():
@@ -200,11 +197,3 @@ def test_misuse_is_refused_with_the_rule():
         Recording(torch.zeros(3, 2), torch.zeros(3, 1))
     with pytest.raises(DataError, match="inputs of a recording must be finite"):
         Recording(torch.zeros(3, 2), torch.full((2, 1), torch.nan))
-
-
-def test_a_table_without_a_choice_has_every_step_and_with_one_that_alone():
-    everything, table = example().markdown(), example().rows()
-    assert everything.count("\n") == 1 + len(table)
-    for choice, steps in ((None, [1, 2]), ([1], [1]), ([2], [2]), ([1, 2], [1, 2]), ([3], [])):
-        lines = example().markdown(choice).splitlines()[2:]
-        assert [int(line.split("|")[1]) for line in lines] == [step for step in steps for _ in example().names]

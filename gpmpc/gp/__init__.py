@@ -3,7 +3,7 @@
 from gpmpc.gp._kernel import Hyperparameters
 from gpmpc.gp._search import SoftLimits
 from gpmpc.gp.backend import backend
-from gpmpc.gp.gpytorch_ import fit, to_gpytorch
+from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
 from gpmpc.gp.gpytorch_posteriors import KernelPosterior, from_gpytorch
 from gpmpc.gp.online import SlidingWindow, append_points, append_transitions, remove_points
 from gpmpc.gp.posterior import GPPosterior
@@ -11,7 +11,7 @@ from gpmpc.gp.scaling import Scaling, centre, identity, min_max, standardize
 from gpmpc.gp.sparse import sparse_posterior
 from gpmpc.gp.sparse_training import SparseTrainer, SparseTraining
 from gpmpc.gp.storage import load_metadata, load_posterior, save_posterior
-from gpmpc.gp.training import Trainer, Training, train, train_many
+from gpmpc.gp.training import Trainer, Training, train
 from gpmpc.gp.transitions import Transitions
 
 __all__ = [
@@ -30,7 +30,7 @@ __all__ = [
     "append_transitions",
     "backend",
     "centre",
-    "fit",
+    "exact_inference",
     "from_gpytorch",
     "identity",
     "load_metadata",
@@ -42,5 +42,4 @@ __all__ = [
     "standardize",
     "to_gpytorch",
     "train",
-    "train_many",
 ]

@@ -73,7 +73,7 @@ def pack(header: dict[str, Any], arrays: Iterable[tuple[str, np.ndarray]]) -> by
 
 
 def read_header(path: Path) -> Any:
-    """What ``header.json`` says; None where there is none."""
+    """Reads ``header.json``; None where there is none."""
     with _opened(path) as (archive, _):
         if HEADER not in archive.namelist():
             return None
@@ -114,7 +114,7 @@ def _checksum(header: dict[str, Any], archive: zipfile.ZipFile) -> str:
 
 
 class _File(io.FileIO):
-    """Sets aside no more memory for a read than the file has left, whatever a damaged number asks for."""
+    """Sets aside no more memory for a read than the file has left, whatever a damaged number demands."""
 
     def read(self, count: int | None = -1) -> bytes:
         left = max(os.fstat(self.fileno()).st_size - self.tell(), 0)

@@ -68,7 +68,7 @@ def factorize(inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noi
 def _factorize_in_place(
     inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The same numbers in the memory of the result (k, N, N) and little more; with LAPACK's info (k,)."""
+    """Factorises in the memory of the result (k, N, N) and little more; returns LAPACK's info (k,) too."""
     (size, _), outputs = inputs.shape, len(lengthscales)
     info = zeros(outputs, dtype=int32, device=inputs.device)
     cholesky = inputs.new_empty(outputs, size, size).mT  # columns contiguous, as LAPACK wants them

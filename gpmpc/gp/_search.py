@@ -13,7 +13,7 @@ theta = (log length-scales, log sf, log(sf / sn)), in a wide box around the data
 import logging
 import time
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -47,7 +47,7 @@ class Penalty(Protocol):
 
 @dataclass(frozen=True)
 class SoftLimits:
-    """Soft walls around length-scales and signal-to-noise ratio, where the data say little about them.
+    """Soft walls around length-scales and signal-to-noise ratio, where the data leave them open.
 
     ((log l_d - log std(x~_d)) / log r)^p summed over d, and (log(sf / sn) / log s)^p; the penalties of PILCO
     (Deisenroth, 2010) and of the experiment of Cao, Lai and Alam (2017). Nearly flat inside, steep outside.
@@ -78,17 +78,6 @@ class SoftLimits:
 
 
 @dataclass(frozen=True)
-class SearchSettings:
-    """The settings of a ``Trainer`` that concern the search; their meaning stands there."""
-
-    penalty: Penalty | None
-    likelihood: str
-    tolerance: float
-    lengthscale_limit: float
-    signal_to_noise_limit: float
-
-
-@dataclass(frozen=True)
 class SearchProblem:
     """One output to be fitted; everything in scaled units.
 
@@ -101,7 +90,6 @@ class SearchProblem:
         rows: The subset that the search begins with; None for all points from the start.
         std: Of the inputs (d,), see ``column_std``.
         constant: Which inputs are (d,).
-        settings: Of the search.
     """
 
     name: str
@@ -112,7 +100,6 @@ class SearchProblem:
     rows: np.ndarray | None
     std: np.ndarray
     constant: np.ndarray
-    settings: SearchSettings
 
 
 @dataclass(frozen=True)
@@ -126,9 +113,12 @@ class SearchResult:
     seconds: float  # [s]
 
 
-def find_hyperparameters(problem: SearchProblem) -> SearchResult:
-    """Searches for one output's hyperparameters; ``objective`` is ``FAILED`` or more where every start failed."""
-    begin, settings = time.perf_counter(), problem.settings
+def find_hyperparameters(problem: SearchProblem, settings: Any) -> SearchResult:
+    """Searches for one output's hyperparameters with a ``Trainer``'s settings.
+
+    ``objective`` of the result is ``FAILED`` or more where every start failed.
+    """
+    begin = time.perf_counter()
     inputs, targets = problem.inputs, problem.targets
     log_inputs, log_output = np.log(problem.std), np.log(column_std(targets[:, None])[0])
     centre = np.append(log_inputs, [log_output, 0.0])
@@ -244,7 +234,7 @@ def log_hyperparameters(posterior: GPPosterior, features: Scaling, targets: Scal
     return torch.cat(columns, dim=1).numpy()
 
 
-def _penalized(settings: SearchSettings, inputs: np.ndarray, targets: np.ndarray, log_std: np.ndarray) -> Objective:
+def _penalized(settings: Any, inputs: np.ndarray, targets: np.ndarray, log_std: np.ndarray) -> Objective:
     """Negative log marginal likelihood plus penalty of one output over theta."""
     backends = {"closed_form": NegativeLogMarginalLikelihood, "gpytorch": GPyTorchLikelihood}
     likelihood, penalty = backends[settings.likelihood](inputs, targets), settings.penalty

@@ -37,11 +37,6 @@ def backend(choice: _Backend) -> Iterator[None]:
         _chosen.reset(token)
 
 
-def chosen_backend() -> _Backend:
-    """The choice of ``backend`` that is in force."""
-    return _chosen.get()
-
-
 def host_arrays(*tensors: Tensor) -> list[np.ndarray] | None:
     """Returns the tensors as arrays for the compiled loops; None where torch has to evaluate."""
     choice = _chosen.get()

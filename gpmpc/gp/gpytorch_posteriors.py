@@ -20,7 +20,6 @@ from torch import Tensor
 from gpmpc.dynamics import (
     Array,
     Linearized,
-    batched_jacobian,
     check_destination,
     check_query,
     linearize_by_autograd,
@@ -179,7 +178,7 @@ class KernelPosterior:
         return torch.diag(torch.cat([part.noise for part in self.parts]))
 
     def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "KernelPosterior":
-        """The same on another device, or in another type: float32 or float64."""
+        """Copies the model to another device, or to another type: float32 or float64."""
         check_destination(device, dtype)
         return replace(self, parts=tuple(part.to(device, dtype) for part in self.parts))
 
@@ -203,15 +202,6 @@ class KernelPosterior:
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
         """Linearises the mean at K points (K, n), (K, m) by torch autograd."""
         return linearize_by_autograd(self, states, inputs, covariance)
-
-    def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
-        """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""
-        input = state[..., :0] if input is None else input
-        check_query(self, state, input)
-        batch = torch.broadcast_shapes(state.shape[:-1], input.shape[:-1])
-        arguments = (state.expand(*batch, -1), input.expand(*batch, -1))
-        (mean, covariance), (by_state, by_input) = batched_jacobian(self._moments, arguments)
-        return Gaussian(mean, covariance), by_state, by_input
 
     def _moments(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
         batch = torch.broadcast_shapes(state.shape[:-1], input.shape[:-1])
@@ -269,7 +259,7 @@ class _Part:
         size = self.features.shape[-2]
         joined = torch.cat([self.features, query.expand(*self.features.shape[:-2], -1, -1)], dim=-2)
         with exact_inference():
-            prior = self.model.forward(joined)  # lazy: only the two blocks asked for are evaluated
+            prior = self.model.forward(joined)  # lazy: only the two blocks below are evaluated
             covariance = prior.lazy_covariance_matrix
             k = covariance[..., :size, size:].to_dense()  # (*k, N, B)
             own = covariance[..., size:, size:].diagonal(dim1=-2, dim2=-1)

@@ -146,7 +146,7 @@ def targets_of(posterior: GPPosterior, transitions: Transitions) -> Tensor:
 class SlidingWindow:
     """Appends new points to a posterior and removes others until it holds no more than a given number.
 
-    New points stay under either rule, unless they alone are more than that; the log then says so.
+    New points stay under either rule, unless they alone are more than that (which is logged).
 
     Attributes:
         points: How many points the posterior may hold.

@@ -128,7 +128,7 @@ class GPPosterior:
         return cls(inputs, targets, *hyperparameters, cholesky, weights, input_dim, predicts)
 
     def unscaled(self, features: Scaling, targets: Scaling) -> "GPPosterior":
-        """The same GPs in physical units, where these were trained on scaled data.
+        """Converts GPs that were trained on scaled data to physical units.
 
         Args:
             features: The scaling of x~ = (x, u), (n + m,).
@@ -206,7 +206,7 @@ class GPPosterior:
         return bool((error <= torch.finfo(self.dtype).eps ** 0.75 * diagonal).all())
 
     def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "GPPosterior":
-        """The same on another device, or in another type: float32 or float64."""
+        """Copies the posterior to another device, or to another type: float32 or float64."""
         check_destination(device, dtype)
         tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
         return replace(self, **{name: value.to(device=device, dtype=dtype) for name, value in tensors.items()})
@@ -243,26 +243,16 @@ class GPPosterior:
 
     def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
         """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""
-        mean, A, B, V = self._expanded(state, input, covariance=True)
-        return Gaussian(mean, V), A, B
-
-    def mean_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """``predict_with_jacobian`` without the covariance, which costs most: mean (*batch, k), derivatives."""
-        mean, A, B, _ = self._expanded(state, input, covariance=False)
-        return mean, A, B
-
-    def _expanded(self, state: Tensor, input: Tensor | None, covariance: bool) -> tuple[Tensor, ...]:
         input = state[..., :0] if input is None else input
         check_query(self, state, input)
         if host_arrays(self.weights, state, input) is None:
             k, difference = self._correlations(state, input)
-            V = self._belief(k, state).covariance if covariance else k
-            return self._mean(k, state), *self._jacobian(k, difference), V
+            return self._belief(k, state), *self._jacobian(k, difference)
         batch, count = state.shape[:-1], state.shape[:-1].numel()
         x, u = state.numpy().reshape(count, self.state_dim), input.numpy().reshape(count, self.input_dim)
-        mean, A, B, V = self.linearize(x, u, covariance)
-        found = (mean, A, B, mean if V is None else V)
-        return tuple(torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found)
+        found = [part for part in self.linearize(x, u) if part is not None]
+        mean, A, B, V = (torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found)
+        return Gaussian(mean, V), A, B
 
     def mean_hessian(self, state: Tensor, input: Tensor | None = None) -> Tensor:
         """The mean's second derivatives by the state (*batch, k, n, n)."""
@@ -271,29 +261,6 @@ class GPPosterior:
         weighted = k * self.weights
         total = weighted.sum(-1)[..., None, None] * torch.diag_embed(self.lengthscales[:, : self.state_dim] ** -2)
         return (weighted[..., None] * z).mT @ z - total
-
-    def sample(
-        self,
-        state: Tensor,
-        input: Tensor | None = None,
-        samples: int = 1,
-        generator: torch.Generator | None = None,
-        observation_noise: bool = False,
-    ) -> Tensor:
-        """Independent draws of the next state (samples, *batch, k).
-
-        Args:
-            state: x (*batch, n).
-            input: u (*batch, m).
-            samples: How many.
-            generator: Of the random numbers; torch's global one by default.
-            observation_noise: Adds the noise variance.
-        """
-        belief = self.predict(state, input)
-        variance = belief.variance + self.noise_variance if observation_noise else belief.variance
-        shape = (samples, *belief.mean.shape)
-        normal = torch.randn(shape, generator=generator, dtype=self.dtype, device=self.device)
-        return belief.mean + variance.sqrt() * normal
 
     def variance_reduction(self, k: Tensor) -> Tensor:
         """|L_a^-1 k_a|^2 (*batch, k) of correlations k (*batch, k, N): by how much the data reduce the variance.

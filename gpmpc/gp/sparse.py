@@ -13,7 +13,7 @@ A = Lz^-1 Kzx Lam^-1/2 and A A' = U diag(b) U',
     C = Lz^-T U diag(b / (1 + b)) U' Lz^-1,   beta = Lz^-T U diag(1 / (1 + b)) U' A Lam^-1/2 (y - offset)
     cholesky of C^-1:  R', where Q R = diag(sqrt((1 + b) / b)) U' Lz'    (never squared: C^-1 is huge where b is small)
 
-The collapsed bound of Titsias (2009, eq. (9)), for FITC without its last term, says how good Z and hyperparameters are:
+The collapsed bound of Titsias (2009, eq. (9)), for FITC without its last term, measures Z and hyperparameters:
 
     log N(y | 0, Q + Lam) - tr(Kxx - Qxx) / (2 sn2),     Q = A~' A~,  A~ = Lz^-1 Kzx
 
@@ -39,7 +39,7 @@ from gpmpc.gp.posterior import GPPosterior
 Method = Literal["sgpr", "fitc"]
 JITTER = 1e-8  # of Kzz, in units of sf2
 _ENTRIES = 200_000  # of a block of A
-_UNINFORMED = 1e-10  # directions of which the data tell less than this (b) get a pseudo-noise of 1 / this
+_UNINFORMED = 1e-10  # directions in which the data inform less than this (b) get a pseudo-noise of 1 / this
 
 
 class _Sums(NamedTuple):

@@ -76,7 +76,7 @@ class SparseTrainer:
         scaling: How features and targets are scaled for training, as in ``Trainer``.
         iterations: Of L-BFGS, at most.
         learn_locations: Whether the inducing points move; else only the hyperparameters are fitted.
-        subset: How many random transitions the first, exact, training sees.
+        subset: Number of random transitions in the first, exact, training.
         restarts: Random starts of that one.
         tolerance: Relative decrease of the objective at which L-BFGS stops.
         signal_to_noise_limit: The box holds sf / sn within this factor of one.
@@ -127,7 +127,7 @@ class SparseTrainer:
         features, targets = training_data(features, targets, input_dim, predicts)
         n = features.shape[1] - input_dim
         names = [f"x{i + 1}" for i in range(n)] + [f"u{i + 1}" for i in range(input_dim)]
-        # A stationary kernel sees differences only; those from one of the points are exact, wherever the data lie.
+        # A stationary kernel depends on differences; those from one of the points are exact, wherever the data lie.
         feature_scaling = Scaling(features[0], self.scaling(features, names).factor)
         target_scaling = self.scaling(targets, [f"y{a + 1}" for a in range(targets.shape[1])])
         x, y = feature_scaling.scale(features), target_scaling.scale(targets)

@@ -3,15 +3,11 @@
 Each output is fitted on its own, over theta = (log length-scales, log sf, log(sf / sn)) inside a wide box; see
 ``gpmpc.gp._search``. Exact GPs are cubic in time and square in memory over the points: one factor of 200 MB an output
 at N = 5000. What cannot fit is refused before the work.
-
-Many sets are trained side by side on every core (``train_many``), one output of one set a job, with bitwise the numbers
-of each training alone on one thread.
 """
 
 import logging
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,14 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError, UnsupportedModel, check_number
-from gpmpc.gp._kernel import PREDICTS, Predicts
+from gpmpc.exceptions import DataError, SettingError, TrainingError, UnsupportedModel, check_number
+from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
 from gpmpc.gp._likelihood import FAILED
 from gpmpc.gp._search import (
     Penalty,
     SearchProblem,
-    SearchResult,
-    SearchSettings,
     column_std,
     constant_columns,
     find_hyperparameters,
@@ -38,13 +32,11 @@ from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.scaling import Scaling, centre
 from gpmpc.gp.transitions import Transitions, check_transitions
 from gpmpc.memory import GIB, available_memory
-from gpmpc.parallel import cores, in_processes
 
 _log = logging.getLogger(__name__)
 # N x N matrices that one evaluation of the likelihood holds, measured; the posterior holds one an output.
 _MATRICES = {"closed_form": 1, "gpytorch": 13}
 _MANY = 1000  # points: from here on the log has a line an output
-_PROCESS = 0.4 * GIB  # bytes that a worker takes before it has data: torch and its kin
 
 
 @dataclass(frozen=True)
@@ -58,7 +50,7 @@ class Training:
         explored: The same where the exploration from every start ended (n, restarts + 1), over the subset if there is
             one; ``FAILED`` where none could.
         evaluations: Likelihood evaluations, all starts and outputs together.
-        seconds: Wall time [s]; of ``train_many`` the sum over the outputs.
+        seconds: Wall time [s].
     """
 
     posterior: GPPosterior
@@ -165,7 +157,7 @@ class Trainer:
             features: x~ = (x, u) (N, n + m).
             targets: (N, k).
             input_dim: m.
-            predicts: What the targets mean; by default what the trainer's setting says.
+            predicts: What the targets mean; the trainer's setting by default.
             seed: Of the random starts.
             start: Its hyperparameters are the first start instead; the random ones stay where they are.
 
@@ -177,30 +169,34 @@ class Trainer:
             TrainingError: Every start failed for an output, which is named.
         """
         begin = time.perf_counter()
-        problem = _prepared(self, features, targets, input_dim, predicts, seed, start)
+        check_number("seed", seed, least=0, whole=True)
+        predicts = self.predicts if predicts is None else predicts
+        features, targets = training_data(features, targets, input_dim, predicts)
+        (size, d), outputs = features.shape, targets.shape[1]
+        _check_memory(size, outputs, self.likelihood)
+        names = [f"x{i + 1}" for i in range(d - input_dim)] + [f"u{i + 1}" for i in range(input_dim)]
+        feature_scaling = self.scaling(features, names)
+        target_scaling = self.scaling(targets, [f"y{a + 1}" for a in range(outputs)])
+        x, y = feature_scaling.scale(features).numpy(), target_scaling.scale(targets).numpy()
+        first: list[np.ndarray | None] = [None] * outputs
+        if start is not None:
+            _check_start("start", start)
+            first = list(log_hyperparameters(start, feature_scaling, target_scaling))
+        rng = np.random.default_rng(seed)
+        perturbations = rng.normal(size=(outputs, self.restarts + 1, d + 2))
+        rows = None
+        converged = start is not None and not self.restarts  # a subset could not improve on where the search begins
+        if self.subset is not None and size > self.subset and not converged:
+            rows = np.sort(rng.permutation(size)[: self.subset])
+        columns = features.numpy()
+        std, constant = column_std(columns) / feature_scaling.factor.numpy(), constant_columns(columns)
         found = []
-        for task in problem.tasks:
-            found.append(find_hyperparameters(task))
-            if len(features) > _MANY:
-                _log.info("training: %s: %d evaluations, %.1f s", task.name, found[-1].evaluations, found[-1].seconds)
-        return problem.training(found, begin)
-
-
-@dataclass(frozen=True)
-class _Prepared:
-    """A data set's training, taken apart by outputs."""
-
-    features: Tensor
-    targets: Tensor
-    feature_scaling: Scaling
-    target_scaling: Scaling
-    input_dim: int
-    predicts: Predicts
-    tasks: Sequence[SearchProblem]
-
-    def training(self, found: Sequence[SearchResult], begin: float | None = None) -> Training:
-        """Joins the outputs' results; without ``begin`` (``time.perf_counter``) their seconds add up."""
-        assembling = time.perf_counter()
+        for a in range(outputs):
+            name = f"output {a + 1} of {outputs}"
+            problem = SearchProblem(name, x, y[:, a], first[a], perturbations[a], rows, std, constant)
+            found.append(find_hyperparameters(problem, self))
+            if size > _MANY:
+                _log.info("training: %s: %d evaluations, %.1f s", name, found[-1].evaluations, found[-1].seconds)
         failed = [a for a, one in enumerate(found) if one.objective >= FAILED]
         if failed:
             raise TrainingError(
@@ -209,69 +205,20 @@ class _Prepared:
                 f"{', '.join(str(a) for a in failed)}: lower signal_to_noise_limit, or remove duplicate rows",
             )
         theta = np.array([one.theta for one in found])
-        theta[:, :-2] += self.feature_scaling.factor.log().numpy()
-        theta[:, -2] += self.target_scaling.factor.log().numpy()
-        physical = torch.from_numpy(theta)
+        theta[:, :-2] += feature_scaling.factor.log().numpy()
+        theta[:, -2] += target_scaling.factor.log().numpy()
+        kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
         posterior = GPPosterior.from_hyperparameters(
-            self.features,
-            self.targets,
-            lengthscales=physical[:, :-2].exp(),
-            signal_variance=(2 * physical[:, -2]).exp(),
-            noise_variance=(2 * (physical[:, -2] - physical[:, -1])).exp(),
-            input_dim=self.input_dim,
-            predicts=self.predicts,
-            offset=self.target_scaling.offset,
+            features, targets, *kernel, input_dim, predicts, offset=target_scaling.offset
         )
-        spent = sum(one.seconds for one in found) + time.perf_counter() - assembling
         return Training(
             posterior,
             theta,
             objective=np.array([one.objective for one in found]),
             explored=np.array([one.explored for one in found]),
             evaluations=sum(one.evaluations for one in found),
-            seconds=spent if begin is None else time.perf_counter() - begin,
+            seconds=time.perf_counter() - begin,
         )
-
-
-def _prepared(
-    trainer: Trainer,
-    features: Tensor,
-    targets: Tensor,
-    input_dim: int,
-    predicts: Predicts | None,
-    seed: int,
-    start: GPPosterior | None = None,
-) -> _Prepared:
-    check_number("seed", seed, least=0, whole=True)
-    predicts = trainer.predicts if predicts is None else predicts
-    features, targets = training_data(features, targets, input_dim, predicts)
-    (size, d), outputs = features.shape, targets.shape[1]
-    _check_memory([(size, outputs)], trainer.likelihood)
-    names = [f"x{i + 1}" for i in range(d - input_dim)] + [f"u{i + 1}" for i in range(input_dim)]
-    feature_scaling = trainer.scaling(features, names)
-    target_scaling = trainer.scaling(targets, [f"y{a + 1}" for a in range(outputs)])
-    x, y = feature_scaling.scale(features).numpy(), target_scaling.scale(targets).numpy()
-    first: list[np.ndarray | None] = [None] * outputs
-    if start is not None:
-        _check_start("start", start)
-        first = list(log_hyperparameters(start, feature_scaling, target_scaling))
-    rng = np.random.default_rng(seed)
-    perturbations = rng.normal(size=(outputs, trainer.restarts + 1, d + 2))
-    rows = None
-    converged = start is not None and not trainer.restarts  # a subset could not improve on where the search begins
-    if trainer.subset is not None and size > trainer.subset and not converged:
-        rows = np.sort(rng.permutation(size)[: trainer.subset])
-    columns = features.numpy()
-    std, constant = column_std(columns) / feature_scaling.factor.numpy(), constant_columns(columns)
-    limits = trainer.tolerance, trainer.lengthscale_limit, trainer.signal_to_noise_limit
-    settings = SearchSettings(trainer.penalty, trainer.likelihood, *limits)
-    tasks = [
-        SearchProblem(
-            f"output {a + 1} of {outputs}", x, y[:, a], first[a], perturbations[a], rows, std, constant, settings
-        )
-        for a in range(outputs)
-    ]
-    return _Prepared(features, targets, feature_scaling, target_scaling, input_dim, predicts, tasks)
 
 
 def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
@@ -279,100 +226,19 @@ def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
     return Trainer(**settings)(transitions, seed)
 
 
-def train_many(
-    trainer: Trainer,
-    sets: Sequence[Transitions],
-    seeds: int | Sequence[int] = 0,
-    workers: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[Training | TrainingError]:
-    """Trains on many sets of transitions at once, on every core; as ``trainer(set, seed)`` one after another.
-
-    A script calls it below ``if __name__ == "__main__":``, since every worker process imports the script.
-
-    Args:
-        trainer: Its settings; picklable.
-        sets: Of any sizes and dimensions.
-        seeds: One a set, or one for all.
-        workers: Processes; None takes one a core, or fewer where memory asks for it. Starting them takes seconds: a few
-            small trainings are faster alone.
-        progress: Called with the number of outputs fitted so far, and of all.
-
-    Returns:
-        One training a set, in their order; the error instead where every start failed for one of its outputs.
-
-    Raises:
-        SettingError: A seed or the number of workers is out of range.
-        ShapeError: There are not as many seeds as sets.
-        DataError: The kernel matrices would not fit the memory that is available, those of all workers or all results.
-    """
-    if workers is not None:
-        check_number("workers", workers, least=1, whole=True)
-    seeds = [int(seeds)] * len(sets) if isinstance(seeds, int | np.integer) else list(seeds)
-    for seed in seeds:
-        check_number("seeds", seed, least=0, whole=True)
-    if len(seeds) != len(sets):
-        raise ShapeError(f"one seed a set is needed, or one for all; got {len(seeds)} for {len(sets)} sets")
-    for one in sets:
-        check_transitions(one)
-    problems = [
-        _prepared(trainer, one.features, one.targets(trainer.predicts), one.input_dim, trainer.predicts, seed)
-        for one, seed in zip(sets, seeds, strict=True)
-    ]
-    places = [(s, a) for s, problem in enumerate(problems) for a in range(len(problem.tasks))]
-    places.sort(key=lambda place: -len(sets[place[0]]))  # the last jobs to run are then short ones
-    tasks = [problems[s].tasks[a] for s, a in places]
-    if not tasks:
-        return []
-    shapes = [(len(one), one.state_dim) for one in sets]
-    workers = min(workers, len(tasks)) if workers else _workers_that_fit(shapes, trainer.likelihood, len(tasks))
-    _check_memory(shapes, trainer.likelihood, workers)
-    found: dict[tuple[int, int], SearchResult] = {}
-    with closing(in_processes(find_hyperparameters, tasks, workers)) as finished:
-        for index, result in finished:
-            found[places[index]] = result
-            if progress is not None:
-                progress(len(found), len(tasks))
-    trainings: list[Training | TrainingError] = []
-    for s, problem in enumerate(problems):
-        try:
-            trainings.append(problem.training([found[s, a] for a in range(len(problem.tasks))]))
-        except TrainingError as error:  # of this set; the others stand
-            trainings.append(error)
-    return trainings
-
-
-def _workers_that_fit(shapes: Sequence[tuple[int, int]], likelihood: str, tasks: int) -> int:
-    free, workers = available_memory(), min(cores(), tasks)
-    while free is not None and workers > 1:
-        if _needed_memory(shapes, likelihood, workers) + workers * _PROCESS <= free:
-            break
-        workers -= 1
-    return workers
-
-
 def _check_start(key: str, posterior: Any) -> None:
     if not isinstance(posterior, GPPosterior):
         raise UnsupportedModel(f"{key} must be a GPPosterior; got {type(posterior).__name__}")
 
 
-def _check_memory(shapes: Sequence[tuple[int, int]], likelihood: str, workers: int = 1) -> None:
-    """Raises ``DataError`` where trainings of N points and k outputs each would not fit the available memory."""
-    free, needed = available_memory(), _needed_memory(shapes, likelihood, workers)
+def _check_memory(size: int, outputs: int, likelihood: str) -> None:
+    """Raises ``DataError`` where a training of N points and k outputs would not fit the available memory."""
+    free = available_memory()
+    needed = 8 * size**2 * max(_MATRICES[likelihood], outputs + 2)  # two more while a factor is made
     if free is None or needed <= free:
         return
-    size, outputs = max(shapes)
-    fitting = int((free / needed) ** 0.5 * size)
-    many = f"{len(shapes)} trainings of exact GPs of up to" if len(shapes) > 1 else "exact GPs of"
     raise DataError(
-        f"{many} {size} points and {outputs} outputs need {needed / GIB:.3g} GiB, {8 * size**2 / GIB:.3g} GiB a kernel "
-        f"matrix; {free / GIB:.3g} GiB are available: train on {fitting} points or fewer, or sparse GPs (SparseTrainer)"
+        f"exact GPs of {size} points and {outputs} outputs need {needed / GIB:.3g} GiB, {8 * size**2 / GIB:.3g} GiB a "
+        f"kernel matrix; {free / GIB:.3g} GiB are available: train on {int((free / needed) ** 0.5 * size)} points or "
+        "fewer, or sparse GPs (SparseTrainer)"
     )
-
-
-def _needed_memory(shapes: Sequence[tuple[int, int]], likelihood: str, workers: int = 1) -> int:
-    """The bytes of the searches, or of the posteriors, whichever take more."""
-    tasks = sorted((size for size, outputs in shapes for _ in range(outputs)), reverse=True)
-    searches = sum(8 * _MATRICES[likelihood] * size**2 for size in tasks[:workers])
-    kept = sum(8 * outputs * size**2 for size, outputs in shapes)
-    return max(searches, kept + 2 * 8 * max(tasks) ** 2)  # two more while a factor is made

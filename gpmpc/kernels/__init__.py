@@ -1,28 +1,29 @@
-"""Problem: GP predictions at certain and uncertain points, with derivatives, inside a controller's millisecond.
+"""Predictions of Gaussian processes at certain and uncertain points with their derivatives, by compiled loops.
 
-``gpmpc.propagation.moment_matching`` states the mathematics and serves torch; here the same closed forms and all their
-first derivatives are evaluated by compiled loops over ``Packed`` arrays, on one thread. Only the k latent functions f
-of x~ = (x, u), x ~ N(mu, S) and u certain: what is made of them (next states, differences, observation noise, a nearest
-semidefinite covariance) is the caller's. Every function takes one point, or H of them along a first dimension, which
-all results then have in front. Nothing is kept between calls: any number of threads may call at once.
+``gpmpc.propagation.moment_matching`` states the mathematics and serves torch; here the closed forms and their first
+derivatives are evaluated for ``Packed`` arrays, on one thread. They belong to the k latent functions f of x~ = (x, u),
+with x ~ N(mu, S) and u certain; callers add the previous state, observation noise or a nearest semidefinite covariance.
+Every function but ``linearize`` takes one point, or H of them along a first dimension, which all results then have in
+front. Nothing is kept between calls: any number of threads may call at once.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gpmpc.compiled import call_unchecked
 from gpmpc.exceptions import ShapeError
-from gpmpc.kernels.moments import CROSS, JACOBIAN, VALUE, moments_along
+from gpmpc.kernels import gp_moments, gp_moments_simd
+from gpmpc.kernels.gp_moments import CROSS, JACOBIAN, VALUE
+from gpmpc.kernels.gp_point import expand_points, linearize_points
 from gpmpc.kernels.packed import Array, Packed, pack
-from gpmpc.kernels.point import HESSIAN, linearize_along, means_along, means_memory, points_along
 
 __all__ = [
     "Expansion",
     "Moments",
     "Packed",
     "linearize",
-    "mean_with_jacobian",
     "moments",
     "moments_with_jacobian",
     "pack",
@@ -116,40 +117,14 @@ def linearize(
     if x.shape != (K, n) or u.shape != (K, m):
         raise ShapeError(f"the model takes states (K, {n}) and inputs (K, {m}); got {x.shape} and {u.shape}")
     x, u = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(u, dtype=np.float64)
-    M, J, J_u = np.empty((K, k)), np.empty((K, k, n)), np.empty((K, k, m))
+    M, A, B = np.empty((K, k)), np.empty((K, k, n)), np.empty((K, k, m))
     V = np.zeros((K if covariance else 0, k, k))
-    gp = packed.points, packed.inverse_squares, packed.log_signal, packed.weights
+    kept = k * (-(-K // 4) * 4) if covariance else 0
+    memory = np.empty((2 * (n + m) + 1 + kept) * packed.arrays.points.shape[1] + 8)
     columns = packed.columns if covariance else V
-    linearize_along(gp, columns, offset, adds_state, x, u, M, J, J_u, V)
-    return M, J, J_u, V if covariance else None
-
-
-def mean_with_jacobian(packed: Packed, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array, Array]:
-    """The posterior mean at a certain point.
-
-    Args:
-        packed: The GPs.
-        x: State (n,) or (H, n).
-        u: Control (m,) or (H, m).
-
-    Returns:
-        M (k,), dM/dx (k, n) and dM/du (k, m).
-
-    Raises:
-        ShapeError: x or u do not fit the model.
-    """
-    n, m = packed.state_dim, packed.input_dim
-    if type(x) is np.ndarray and type(u) is np.ndarray and x.shape == (n,) and u.shape == (m,):
-        queries, single = np.concatenate((x, u), dtype=np.float64)[None], True  # the usual case, quickly
-    else:
-        x, u, single = _points(packed, x, u)
-        queries = np.concatenate((x, u), axis=1)
-    points, out = packed.points, np.empty((len(queries), packed.output_dim, 1 + n + m))
-    memory = np.empty(means_memory(*points.shape))
-    means_along(points, packed.inverse_squares, packed.log_signal, packed.weights, queries, n, memory, out)
-    if single:
-        return out[0, :, 0], out[0, :, 1 : 1 + n], out[0, :, 1 + n :]
-    return out[..., 0], out[..., 1 : 1 + n], out[..., 1 + n :]
+    offset = np.ascontiguousarray(offset, dtype=np.float64)
+    call_unchecked(linearize_points, packed.arrays, columns, (offset, adds_state), x, u, memory, (M, A, B, V))
+    return M, A, B, V if covariance else None
 
 
 def point_with_jacobian(packed: Packed, x: ArrayLike, u: ArrayLike, hessian: bool = False) -> Expansion:
@@ -168,19 +143,9 @@ def point_with_jacobian(packed: Packed, x: ArrayLike, u: ArrayLike, hessian: boo
     H, k, n, m = len(x), packed.output_dim, packed.state_dim, packed.input_dim
     third = k if hessian else 0
     shapes = [(k,), (k,), (k, n), (k, m), (k, n), (k, m), (k, n, n), (k, n, m), (third, n, n, n), (third, n, n, m)]
-    out = tuple([np.empty((H, *shape)) for shape in shapes])
-    points_along(
-        HESSIAN if hessian else JACOBIAN,
-        packed.points,
-        packed.inverse_squares,
-        packed.log_signal,
-        packed.weights,
-        packed.inverse_cholesky,
-        x,
-        u,
-        out,
-    )
-    return Expansion(*_given(out, single, 10 if hessian else 8))
+    out = Expansion(*[np.empty((H, *shape)) for shape in shapes])
+    call_unchecked(expand_points, packed.arrays, packed.precision.inverse_cholesky, x, u, hessian, out)
+    return Expansion(*_computed(out, single, 10 if hessian else 8))
 
 
 def moments(
@@ -202,7 +167,7 @@ def moments(
         ShapeError: mu, S or u do not fit the model.
     """
     out, single = _moments(packed, mu, S, u, diagonal, VALUE)
-    return tuple(_given(out, single, 3)[:3])
+    return tuple(_computed(out, single, 3)[:3])
 
 
 def moments_with_jacobian(
@@ -210,11 +175,13 @@ def moments_with_jacobian(
 ) -> Moments:
     """``moments`` and their derivatives; ``cross`` adds those of J."""
     out, single = _moments(packed, mu, S, u, diagonal, CROSS if cross else JACOBIAN)
-    return Moments(*_given(out, single, 10 if cross else 8))
+    return Moments(*_computed(out, single, 10 if cross else 8))
 
 
-def _moments(packed: Packed, mu, S, u, diagonal: bool, order: int) -> tuple[tuple[Array, ...], bool]:
-    """The ten arrays of ``Moments``, H in front; whether one belief was asked for."""
+def _moments(
+    packed: Packed, mu: ArrayLike, S: ArrayLike, u: ArrayLike, diagonal: bool, order: int, plain: bool = False
+) -> tuple[Moments, bool]:
+    """Moments with H in front, by the plain kernel or the fast one, and whether one belief was given."""
     mu, u, single = _points(packed, mu, u)
     S = np.array(S, dtype=np.float64, order="C", ndmin=3)
     H, k, n, m = len(mu), packed.output_dim, packed.state_dim, packed.input_dim
@@ -224,21 +191,12 @@ def _moments(packed: Packed, mu, S, u, diagonal: bool, order: int) -> tuple[tupl
         )
     first, second = (k if order >= JACOBIAN else 0), (k if order == CROSS else 0)
     shapes = [(k,), (k, k), (k, n), (first, n, n), (first, m), (first, k, n), (first, k, n, n), (first, k, m)]
-    out = tuple([np.empty((H, *shape)) for shape in [*shapes, (second, n, n, n), (second, n, m)]])
-    moments_along(
-        order,
-        bool(diagonal),
-        packed.points,
-        packed.inverse_squares,
-        packed.signal_variance,
-        packed.weights,
-        packed.inverse_cholesky,
-        packed.centred,
-        mu,
-        S,
-        u,
-        out,
-    )
+    out = Moments(*[np.zeros((H, *shape)) for shape in [*shapes, (second, n, n, n), (second, n, m)]])
+    arguments = order, bool(diagonal), packed.arrays
+    if plain:
+        gp_moments.evaluate_moments(*arguments, packed.dense_precision, mu, S, u, out)
+    else:
+        call_unchecked(gp_moments_simd.evaluate_moments, *arguments, packed.precision, mu, S, u, out)
     return out, single
 
 
@@ -252,6 +210,6 @@ def _points(packed: Packed, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array, b
     return x, u, single
 
 
-def _given(out: tuple[Array, ...], single: bool, count: int) -> list[Array | None]:
-    """Those that were computed, without H for one point; None for the others."""
+def _computed(out: tuple[Any, ...], single: bool, count: int) -> list[Any]:
+    """The first ``count`` arrays, without H for one point; None for the others."""
     return [(array[0] if single else array) if i < count else None for i, array in enumerate(out)]

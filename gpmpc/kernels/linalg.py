@@ -1,6 +1,6 @@
-"""Dense linear algebra for compiled loops: small vectors and matrices, where a library call costs more than its work.
+"""Dense linear algebra for compiled loops: small vectors and matrices, for which a library call costs too much.
 
-The functions write into arrays of their caller and allocate nothing, but for ``square_root``. Sizes come from the
+All but ``aligned`` and ``square_root`` write into arrays of their caller and allocate nothing. Sizes come from the
 arrays; where rows are padded, a caller passes the number of entries that count.
 """
 
@@ -9,6 +9,21 @@ import math
 import numpy as np
 
 from gpmpc.compiled import inline_njit, njit_inner, njit_noalloc
+from gpmpc.kernels.simd import load, store, zeros
+
+
+@njit_inner
+def aligned(size):
+    """Uninitialised float64 numbers that start on a cache line."""
+    memory = np.empty(size + 8)
+    skip = (-(memory.ctypes.data >> 3)) % 8
+    return memory[skip : skip + size]
+
+
+@njit_inner
+def aligned_rows(rows, length):
+    """An uninitialised matrix whose rows start on cache lines where ``length`` is a multiple of 8."""
+    return aligned(rows * length).reshape(rows, length)
 
 
 @njit_noalloc
@@ -58,6 +73,44 @@ def multiply(A, count, x, size, out):
     while i < count:
         out[i] = dot(A[i], x, size)
         i += 1
+
+
+@inline_njit
+def combine_rows(rows, count, factors, start, width, out):
+    """Writes sum_j factors[j] rows[j] over ``count`` rows, columns from ``start`` on, ``width`` of them.
+
+    Rows and ``out`` are padded: what lies between the last and the next whole register is written too. Several sums
+    at a time hide the latency of one.
+    """
+    at, end = start, start + width
+    while at + 8 < end:
+        a = b = c = d = e = f = g = h = zeros()
+        j = 0
+        while j + 4 <= count:
+            r0, r1, r2, r3 = rows[j], rows[j + 1], rows[j + 2], rows[j + 3]
+            f0, f1, f2, f3 = factors[j], factors[j + 1], factors[j + 2], factors[j + 3]
+            a, b = a + f0 * load(r0, at), b + f0 * load(r0, at + 8)
+            c, d = c + f1 * load(r1, at), d + f1 * load(r1, at + 8)
+            e, f = e + f2 * load(r2, at), f + f2 * load(r2, at + 8)
+            g, h = g + f3 * load(r3, at), h + f3 * load(r3, at + 8)
+            j += 4
+        while j < count:
+            a, b = a + factors[j] * load(rows[j], at), b + factors[j] * load(rows[j], at + 8)
+            j += 1
+        store(out, at, (a + c) + (e + g))
+        store(out, at + 8, (b + d) + (f + h))
+        at += 16
+    if at < end:
+        a = b = c = d = zeros()
+        j = 0
+        while j + 4 <= count:
+            a, b = a + factors[j] * load(rows[j], at), b + factors[j + 1] * load(rows[j + 1], at)
+            c, d = c + factors[j + 2] * load(rows[j + 2], at), d + factors[j + 3] * load(rows[j + 3], at)
+            j += 4
+        while j < count:
+            a = a + factors[j] * load(rows[j], at)
+            j += 1
+        store(out, at, (a + b) + (c + d))
 
 
 @njit_noalloc
@@ -178,3 +231,39 @@ def square_root(S, out):
                 total += U[i, k] * r[k] * U[j, k]
             out[i, j] = out[j, i] = total
     return r, U.copy()
+
+
+@njit_noalloc
+def condition(S, D, whiten, G):
+    """Writes G = (I + S D)^-1 and W = C^-1 D^1/2 for S >= 0, diagonal D > 0; returns 1/2 log|I + S D|.
+
+    With B = D^1/2 S D^1/2 and I + B = C C', well conditioned also where S is singular, G = D^-1/2 (I + B)^-1 D^1/2 and
+    |W x|^2 = x' (S + D^-1)^-1 x. The pivots less one come without a one to cancel: a small S keeps its digits.
+    """
+    n, half_logdet = len(S), 0.0
+    for i in range(n):  # C, in place of G
+        for j in range(i + 1):
+            total = math.sqrt(D[i]) * S[i, j] * math.sqrt(D[j]) - dot(G[i], G[j], j)
+            if i == j:
+                half_logdet += math.log1p(total) / 2
+                G[i, i] = math.sqrt(1.0 + total)
+            else:
+                G[i, j] = total / G[j, j]
+    for j in range(n):  # C^-1 by columns
+        for i in range(n):
+            whiten[i, j] = 1.0 if i == j else 0.0
+        for i in range(j, n):
+            for k in range(j, i):
+                whiten[i, j] -= G[i, k] * whiten[k, j]
+            whiten[i, j] /= G[i, i]
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, n):
+                total += whiten[k, i] * whiten[k, j]
+            G[i, j] = total * math.sqrt(D[j] / D[i])
+            G[j, i] = total * math.sqrt(D[i] / D[j])
+    for i in range(n):
+        for j in range(i + 1):
+            whiten[i, j] *= math.sqrt(D[j])
+    return half_logdet

@@ -1,20 +1,13 @@
-"""Problem: the posterior's arrays in the order in which compiled loops read them.
+"""The posterior's arrays in the order in which compiled loops read them.
 
-A vector over the training points is a row: contiguous, N padded to a multiple of 8 (one full vector register) by copies
-of the last point with weight zero, which change no sum. The inputs x~ = (x, u) are such rows too: n states, then m
-controls, each block padded to a multiple of 3 rows, because the loops take three rows at a time.
-
-Symmetric and triangular N x N matrices are kept as lower block triangles: of rows 8I .. 8I + 7 the first 8 (I + 1)
-columns, zeros above the diagonal. The two that exist then fit the memory of one square:
-
-    inverse_cholesky  L_a^-1, for |L_a^-1 q|^2 and (K_a + sn2_a I)^-1 q; row after row, rows 8I .. start at 32 I (I + 1)
-    centred           E_a = beta_a beta_a' - (K_a + sn2_a I)^-1, doubled below the diagonal: sums over i >= j suffice;
-                      block of 4 x 16 after block, in the order in which ``gpmpc.kernels.pair_sums`` meets them: tile
-                      after tile, in a tile row after row of blocks. Memory is read in one stream
+A vector over the training points is a row: contiguous, N padded to P, a multiple of 16 (two vector registers), by
+copies of the last point with weight zero, which change no sum. The inputs x~ = (x, u) are such rows: n states, then m
+controls.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -22,32 +15,55 @@ from numpy.typing import NDArray
 
 from gpmpc.exceptions import SettingError, ShapeError
 
-LANES = 8  # doubles in a vector register
-GROUP = 3  # rows that one loop takes together
-ROWS, COLUMNS = 4, 16  # of a block of pairs
-TILE = 16  # times 16 columns: a tile, which all rows meet before the next one
-
 Array = NDArray[np.float64]
 
+ROWS, COLUMNS = 4, 16  # of a block of pairs of points
 
-@dataclass(frozen=True)
-class Packed:
-    """k GPs over the same N points; build it with ``pack``. P is N padded, R the number of padded rows of x~.
+
+class GPArrays(NamedTuple):
+    """k GPs over the same points, for compiled code.
 
     Attributes:
-        points: x~ of the training points (R, P).
-        inverse_squares: 1 / l_a^2, zero at padded rows (k, R).
-        signal_variance: sf2 (k,).
+        points: x~ of the training points (n + m, P).
+        inverse_squares: D = 1 / l^2 (k, n + m).
+        log_signal: log sf2 (k,).
         weights: beta (k, P).
-        cholesky: Lower factor of K + sn2 I (k, N, N).
-        state_dim: n.
-        input_dim: m.
+        size: N.
     """
 
     points: Array
     inverse_squares: Array
-    signal_variance: Array
+    log_signal: Array
     weights: Array
+    size: int
+
+
+class Precision(NamedTuple):
+    """(K + sn2 I)^-1 of k GPs in two forms, as lower triangles.
+
+    Attributes:
+        inverse_cholesky: L_a^-1, four rows after four rows: of rows i to i + 3 the columns before i + 4, rounded up to
+            a multiple of 8, with zeros above the diagonal (k, size).
+        centred: E_a = beta_a beta_a' - (K_a + sn2_a I)^-1, doubled below the diagonal, so that sums over i >= j
+            suffice; block of 4 x 16 after block, rows of blocks one after the other (k, size).
+    """
+
+    inverse_cholesky: Array
+    centred: Array
+
+
+@dataclass(frozen=True)
+class Packed:
+    """k GPs over the same N points; build it with ``pack``.
+
+    Attributes:
+        arrays: What predictions of the mean read.
+        cholesky: Lower factor L of K + sn2 I (k, N, N).
+        state_dim: n.
+        input_dim: m.
+    """
+
+    arrays: GPArrays
     cholesky: Array
     state_dim: int
     input_dim: int
@@ -55,59 +71,44 @@ class Packed:
     @property
     def output_dim(self) -> int:
         """Number of outputs, k."""
-        return len(self.weights)
-
-    @cached_property
-    def log_signal(self) -> Array:
-        """The logarithms of sf2 (k,)."""
-        return np.log(self.signal_variance)
+        return len(self.cholesky)
 
     @cached_property
     def columns(self) -> Array:
-        """L_a by columns (k, N, N); a view where the factor lies in memory so, as LAPACK makes it."""
+        """L by columns (k, N, N); a view where the factor lies in memory so, as LAPACK makes it."""
         return np.ascontiguousarray(self.cholesky.transpose(0, 2, 1))
 
     @cached_property
-    def inverse_cholesky(self) -> Array:
-        """L_a^-1 as block triangles (k, triangle_size(P))."""
-        return self._triangles(lambda a: scipy.linalg.lapack.dtrtri(self.cholesky[a], lower=1)[0])
+    def precision(self) -> Precision:
+        """What exact moments and derivatives of the variance read."""
+        padded, size = self.arrays.points.shape[1], self.arrays.size
+        inverse, centred = [], []
+        for a in range(self.output_dim):
+            triangle = np.zeros((padded, padded))
+            triangle[:size, :size], _ = scipy.linalg.lapack.dtrtri(self.cholesky[a], lower=1)
+            lengths = [i // 8 * 8 + 8 for i in range(0, padded, ROWS)]
+            rows = zip(range(0, padded, ROWS), lengths, strict=True)
+            inverse.append(np.concatenate([triangle[i : i + ROWS, :length].ravel() for i, length in rows]))
+            square, blocks = self._centred_square(a), []
+            for i in range(0, padded, ROWS):
+                row = square[i : i + ROWS, : i // COLUMNS * COLUMNS + COLUMNS]
+                blocks.append(row.reshape(ROWS, -1, COLUMNS).swapaxes(0, 1).ravel())
+            centred.append(np.concatenate(blocks))
+        return Precision(_aligned(np.stack(inverse)), _aligned(np.stack(centred)))
 
-    @cached_property
-    def centred(self) -> Array:
-        """E_a by blocks, doubled below the diagonal (k, a little more than triangle_size(P))."""
-        padded, width = self.points.shape[1], TILE * COLUMNS
-        size = sum(-(-(i + ROWS) // COLUMNS) for i in range(0, padded, ROWS)) * ROWS * COLUMNS
-        triangles = aligned_zeros(len(self.weights), size)
-        for a, triangle in enumerate(triangles):
-            square, place = self._centred_square(a), 0
-            for start in range(0, padded, width):
-                for i in range(start, padded, ROWS):
-                    count = min(-(-(i + ROWS - start) // COLUMNS), TILE)
-                    met, row = np.zeros((ROWS, count * COLUMNS)), square[i : i + ROWS, start : start + count * COLUMNS]
-                    met[: row.shape[0], : row.shape[1]] = row
-                    triangle[place : place + met.size] = met.reshape(ROWS, count, COLUMNS).swapaxes(0, 1).ravel()
-                    place += met.size
-        return triangles
+    @property
+    def dense_precision(self) -> Array:
+        """(K + sn2 I)^-1 (k, N, N), for the plain moments."""
+        lower = [np.tril(scipy.linalg.lapack.dpotri(factor, lower=1)[0]) for factor in self.cholesky]
+        return np.stack([triangle + np.tril(triangle, -1).T for triangle in lower])
 
     def _centred_square(self, a: int) -> Array:
-        size = len(self.cholesky[a])
+        padded, size = self.arrays.points.shape[1], self.arrays.size
         precision, _ = scipy.linalg.lapack.dpotri(self.cholesky[a], lower=1)  # the lower triangle
-        beta = self.weights[a, :size]
-        square = np.tril(np.multiply.outer(2 * beta, beta) - 2 * precision)
+        beta, square = self.arrays.weights[a, :size], np.zeros((padded, padded))
+        square[:size, :size] = np.tril(np.multiply.outer(2 * beta, beta) - 2 * precision)
         np.fill_diagonal(square, square.diagonal() / 2)
         return square
-
-    def _triangles(self, square) -> Array:
-        padded = self.points.shape[1]
-        triangles = aligned_zeros(len(self.weights), triangle_size(padded))
-        for a, triangle in enumerate(triangles):
-            lower = square(a)
-            for start in range(0, len(lower), LANES):
-                rows = lower[start : start + LANES, : start + LANES]
-                length = start + LANES
-                at = start * length // 2
-                triangle[at : at + LANES * length].reshape(LANES, length)[: rows.shape[0], : rows.shape[1]] = rows
-        return triangles
 
 
 def pack(
@@ -118,7 +119,7 @@ def pack(
     weights: Array,
     state_dim: int,
 ) -> Packed:
-    """Lays out exact SE-ARD GPs for the compiled moments.
+    """Lays out exact SE-ARD GPs for the compiled kernels.
 
     Args:
         features: x~ = (x, u) of the training points (N, n + m).
@@ -152,30 +153,17 @@ def pack(
         if not (value > 0).all():
             raise SettingError(name, f"must be positive; got {value.tolist()}")
 
-    padded, rows = padded_to(LANES, size), padded_to(GROUP, state_dim)
-    places = np.r_[:state_dim, rows : rows + d - state_dim]  # where the columns of x~ go
-    points = aligned_zeros(rows + padded_to(GROUP, d - state_dim), padded)
-    points[places, :size] = features.T
-    points[:, size:] = points[:, size - 1 : size]
-    inverse_squares = np.zeros((outputs, len(points)))
-    inverse_squares[:, places] = lengthscales**-2.0
-    padded_weights = aligned_zeros(outputs, padded)
-    padded_weights[:, :size] = weights
-    return Packed(points, inverse_squares, signal_variance, padded_weights, cholesky, state_dim, d - state_dim)
+    padding = (0, -size % COLUMNS)
+    points = _aligned(np.pad(features.T, ((0, 0), padding), mode="edge"))
+    padded_weights = _aligned(np.pad(weights, ((0, 0), padding)))
+    arrays = GPArrays(points, lengthscales**-2.0, np.log(signal_variance), padded_weights, size)
+    return Packed(arrays, cholesky, state_dim, d - state_dim)
 
 
-def padded_to(multiple: int, size: int) -> int:
-    """The least multiple that is not below ``size``."""
-    return -(-size // multiple) * multiple
-
-
-def aligned_zeros(rows: int, columns: int) -> Array:
-    """Zeros whose rows start on cache lines when ``columns`` is a multiple of 8."""
-    memory = np.zeros(rows * columns + LANES)
-    skip = -(memory.ctypes.data // memory.itemsize) % LANES
-    return memory[skip : skip + rows * columns].reshape(rows, columns)
-
-
-def triangle_size(padded: int) -> int:
-    """Numbers in the block triangle of a square of ``padded`` rows."""
-    return padded * (padded + LANES) // 2
+def _aligned(rows: Array) -> Array:
+    """A copy whose rows start on cache lines where they are multiples of 8."""
+    memory = np.empty(rows.size + 8)
+    skip = -(memory.ctypes.data // memory.itemsize) % 8
+    aligned = memory[skip : skip + rows.size].reshape(rows.shape)
+    aligned[:] = rows
+    return aligned

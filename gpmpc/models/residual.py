@@ -2,7 +2,7 @@
 
     x[k+1] = f0(x[k], u[k]) + B d(x_s[k], u_s[k])
 
-f0 is the nominal model, d a GP over a selection of the states and inputs, and B says which states it acts on (Hewing,
+f0 is the nominal model, d a GP over a selection of the states and inputs, and B its effect on the states (Hewing,
 Kabzan and Zeilinger, 2020, eq. (3)).
 """
 
@@ -46,8 +46,8 @@ class ResidualModel:
             moment matching.
         residual: d, with ``predicts="value"``.
         B: Where it acts (n, k).
-        states: Which states d sees, in its order.
-        inputs: Which inputs d sees, in its order.
+        states: The states that d depends on, in its order.
+        inputs: The inputs that d depends on, in its order.
         input_dim: m, all of them.
 
     Raises:
@@ -69,7 +69,7 @@ class ResidualModel:
             raise SettingError("residual", f"must be a GP with predicts='value'; got {getattr(gp, 'predicts', gp)!r}")
         if (len(self.states), len(self.inputs)) != (gp.state_dim, gp.input_dim):
             raise ShapeError(
-                f"the residual sees {gp.state_dim} states and {gp.input_dim} inputs; "
+                f"the residual has {gp.state_dim} states and {gp.input_dim} inputs; "
                 f"got {len(self.states)} and {len(self.inputs)} selected"
             )
         if self.B.dim() != 2 or self.B.shape[1] != gp.output_dim:
@@ -107,8 +107,8 @@ class ResidualModel:
             nominal: f0.
             transitions: What was observed.
             B: Where d acts (n, k); on every state by default.
-            states: Which states d sees; all by default.
-            inputs: Which inputs d sees; all by default.
+            states: The states that d depends on; all by default.
+            inputs: The inputs that d depends on; all by default.
             trainer: A ``Trainer`` or ``SparseTrainer`` that does not learn differences.
             seed: Of the random starts.
 
@@ -131,7 +131,7 @@ class ResidualModel:
         if B.dim() != 2 or len(B) != n:
             raise ShapeError(f"B must be ({n}, k), a row a state; got {tuple(B.shape)}")
         if int(torch.linalg.matrix_rank(B)) < B.shape[1]:
-            raise SettingError("B", "must have linearly independent columns: what acts alike cannot be told apart")
+            raise SettingError("B", "must have linearly independent columns: equal effects cannot be distinguished")
         _check_chosen(states, n, inputs, m)
         features, targets = _residuals(nominal, B, states, inputs, transitions)
         training = trainer.fit(features, targets, len(inputs), "value", seed)
@@ -159,7 +159,7 @@ class ResidualModel:
 
     @property
     def output_dim(self) -> int:
-        """The same: it predicts the next state."""
+        """Number of outputs, n: the next state."""
         return len(self.B)
 
     @property
@@ -241,7 +241,7 @@ class ResidualModel:
         return AffineForm(self.residual, nominal.A, nominal.B, nominal.c, self.B, list(self.states), list(self.inputs))
 
     def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "ResidualModel":
-        """The same on another device or in another type; a nominal that is no ``Affine`` is taken as it is."""
+        """Copies the model to another device or type; a nominal model that is not ``Affine`` is taken as it is."""
         check_destination(device, dtype)
         nominal = self.nominal
         if isinstance(nominal, Affine):

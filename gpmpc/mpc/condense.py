@@ -30,8 +30,7 @@ from numba import types
 
 from gpmpc.compiled import compile_for, compiled, njit_inner, njit_noalloc, unchecked_entry_point
 from gpmpc.exceptions import ShapeError
-from gpmpc.kernels.linalg import copy, copy_matrix, dot
-from gpmpc.kernels.point_rows import aligned_rows
+from gpmpc.kernels.linalg import aligned_rows, combine_rows, copy, copy_matrix, dot
 from gpmpc.mpc.linear_quadratic import (
     DEVIATIONS,
     INCREMENTS,
@@ -43,7 +42,6 @@ from gpmpc.mpc.linear_quadratic import (
     optimal_feedback,
 )
 from gpmpc.mpc.problem import TrackingProblem
-from gpmpc.qp.lanes import combine
 
 Array = np.ndarray
 
@@ -176,27 +174,27 @@ def _add_varying_stages(cost, stages, E, H, P, G):
             for j in range(m):
                 B[i, j] = stages.B[at, i, j]
         for i in range(p):
-            combine(B, p, M[i], 0, m, MB[i])
-            combine(A, p, M[i], 0, p, MA[i])
+            combine_rows(B, p, M[i], 0, m, MB[i])
+            combine_rows(A, p, M[i], 0, p, MA[i])
             for j in range(m):
                 BM[k, j, i] = 2.0 * MB[i, j]
         for i in range(p):
-            combine(MA, p, transposed[i], 0, p, M[i])
+            combine_rows(MA, p, transposed[i], 0, p, M[i])
     gamma, following, row = _zeros(p, H * m), _zeros(p, H * m), _zeros(1, H * m)[0]
     for k in range(H):  # forward: Gamma_{k+1}
         at, width = min(k, last), (k + 1) * m
         for i in range(p):
-            combine(gamma, p, stages.A[at, i], 0, k * m, following[i])
+            combine_rows(gamma, p, stages.A[at, i], 0, k * m, following[i])
             for j in range(m):
                 following[i, k * m + j] = stages.B[at, i, j]
         gamma, following = following, gamma
         for a in range(m):
-            combine(gamma, p, BM[k, a], 0, width, row)
+            combine_rows(gamma, p, BM[k, a], 0, width, row)
             out = P[k * m + a]
             for j in range(width):
                 out[j] += row[j]
         for e in range(r):
-            combine(gamma, p, E[min(k, len(E) - 1), e], 0, width, row)
+            combine_rows(gamma, p, E[min(k, len(E) - 1), e], 0, width, row)
             copy(row, G[k * r + e, :width])
     _mirror(P)
 
@@ -213,7 +211,7 @@ def _add_constant_stages(cost, stages, E, H, P, G):
         for a in range(m):
             X[a, i] = stages.B[0, i, a]
     for row in range(m, size):
-        combine(transposed, p, X[row - m], 0, p, X[row])
+        combine_rows(transposed, p, X[row - m], 0, p, X[row])
     strip, stage, end = _zeros(p, size + 8), _zeros(1, size + 8)[0], _zeros(1, size + 8)[0]
     for row in range(size):
         for i in range(p):
@@ -224,10 +222,10 @@ def _add_constant_stages(cost, stages, E, H, P, G):
         j, start = H - 1 - k, k * m
         for a in range(m):
             _weigh(W, X[start + a], weighed)
-            combine(strip, p, weighed, start, size - start, stage)
+            combine_rows(strip, p, weighed, start, size - start, stage)
             if not same:
                 _weigh(T, X[start + a], weighed)
-                combine(strip, p, weighed, start, size - start, end)
+                combine_rows(strip, p, weighed, start, size - start, end)
             ends, total, out = stage if same else end, sums[a], P[j * m + a]
             for d in range(j + 1):
                 for b in range(m):
@@ -235,7 +233,7 @@ def _add_constant_stages(cost, stages, E, H, P, G):
             for i in range(size - start):
                 total[i] += stage[start + i]
     for e in range(r):
-        combine(strip, p, E[e], 0, size, stage)
+        combine_rows(strip, p, E[e], 0, size, stage)
         for k in range(H):
             for d in range(k + 1):
                 for b in range(m):
@@ -295,7 +293,7 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
         for i in range(m):
             for j in range(m):
                 P[here + i, here + j] = 2.0 * hessians[k, i, j]
-            combine(reach, p + m, feedback[k, i], 0, here, inputs[i])
+            combine_rows(reach, p + m, feedback[k, i], 0, here, inputs[i])
             inputs[i, here + i] = 1.0
             copy(inputs[i], G[here + i, :width])
             if limited > 0:
@@ -307,10 +305,10 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
         for i in range(p):
             for j in range(p + m):
                 factors[j] = stages.A[at, i, j] if j < p else stages.B[at, i, j - p]
-            combine(reach, p + m, factors, 0, width, following[i])
+            combine_rows(reach, p + m, factors, 0, width, following[i])
         copy_matrix(following, reach[:p])
         for e in range(r):
-            combine(reach, p, E[min(k, len(E) - 1), e], 0, width, inputs[0])
+            combine_rows(reach, p, E[min(k, len(E) - 1), e], 0, width, inputs[0])
             copy(inputs[0], G[size + limited + k * r + e, :width])
             inputs[0, here:width] = 0.0
     previous, lower, upper = references.previous_input, np.full(size + count, -np.inf), np.full(size + count, np.inf)
@@ -361,7 +359,7 @@ def _weigh(W, x, y):
     """Writes W x for the symmetric blocks of ``_padded`` to ``y``, and up to seven numbers after it."""
     n = W.shape[1]
     for b in range(len(W)):
-        combine(W[b], n, x[b * n :], 0, n, y[b * n :])
+        combine_rows(W[b], n, x[b * n :], 0, n, y[b * n :])
 
 
 @njit_noalloc

@@ -19,7 +19,7 @@ import torch
 from gpmpc.dynamics import DynamicsModel, linearize, tensors_for, to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
-from gpmpc.kernels.extended import roots
+from gpmpc.kernels.extended_state import square_roots
 from gpmpc.propagation import Propagator, differentiate
 from gpmpc.propagation import linearize as linearize_belief
 
@@ -95,7 +95,7 @@ class StageLinearizer:
         """The vectors s (K, p) of beliefs (K, n), (K, n, n)."""
         if self.covariance == "full":
             S = np.empty(covariances.shape)
-            roots(np.ascontiguousarray(covariances), S)
+            square_roots(np.ascontiguousarray(covariances), S)
             return np.concatenate((means, S.reshape(len(S), -1)), axis=1)
         if self.covariance == "diagonal":
             variances = np.diagonal(covariances, axis1=1, axis2=2)

@@ -3,7 +3,7 @@
     x+ = A x + G u + c + B f(x_s, u_s)
 
 covers what a model with exact moments can be: next states (A = 0, B = I), differences (A = B = I), and the residual of
-an affine nominal model, whose f sees only some states and inputs. With C = Cov[x, B f] = S J' B' (Stein, 1981),
+an affine nominal model, whose f depends on some states and inputs only. With C = Cov[x, B f] = S J' B' (Stein, 1981),
 
     mu+ = A mu + G u + c + B M,   Sigma+ = A S A' + A C + C' A' + B V B',   Cov[x, x+] = S A' + C
 
@@ -66,7 +66,7 @@ class Composition:
         return None if form is None else cls(form)
 
     def seen(self, belief: Gaussian, input: Tensor) -> tuple[Gaussian, Tensor]:
-        """What f sees of a belief and an input."""
+        """Selects from a belief and an input what f depends on."""
         if self.states is None:
             return belief, input
         S = belief.covariance[..., self.states, :][..., self.states]
@@ -126,7 +126,7 @@ class Composition:
         return hessian if self.B is None else torch.einsum("ia,...acd->...icd", self.B, hessian)
 
     def _by_state(self, derivative: Tensor, axes: int = 1) -> Tensor:
-        """A derivative by what f sees of the state (its last axes) as one by the whole state."""
+        """Extends a derivative by the states of f (its last axes) to one by the whole state."""
         if self.states is None:
             return derivative
         full = derivative.new_zeros(*derivative.shape[:-axes], *[len(self.B)] * axes)

@@ -77,7 +77,7 @@ def linearize(propagator: Propagator, model: Any, belief: Gaussian, input: Tenso
     arrays = host_arrays(*parts, *derivatives)
     if arrays is None:
         return LocalModel(*_extended(belief, input, moved.belief, d), moved.belief)
-    from gpmpc.kernels.extended import extended_models  # loads numba
+    from gpmpc.kernels.extended_state import extended_models  # loads numba
 
     H, p = batch.numel(), n + n * n
     arrays = [np.ascontiguousarray(array.reshape(H, *array.shape[len(batch) :])) for array in arrays]

@@ -74,7 +74,7 @@ class MomentMatching(Propagator):
         return self._compiled(f, belief.mean.shape[:-1], arrays[1:])
 
     def _compiled(self, f: GPPosterior, batch: torch.Size, arrays: Sequence[Any], cross: bool | None = None) -> Latent:
-        """The moments of f by ``gpmpc.kernels``; ``cross`` asks for derivatives, with those of J or without."""
+        """The moments of f by ``gpmpc.kernels``; ``cross`` adds derivatives, with those of J or without."""
         from gpmpc import kernels  # loads numba
 
         mean, S, u = arrays

@@ -20,7 +20,7 @@ class Propagation:
         belief: N(mean, covariance) of the next state; the covariance is symmetric positive semidefinite.
         cross_covariance: Cov[x, x+] (*batch, n, k).
         deficit: How far below zero the covariance's smallest eigenvalue was before the projection (*batch,). More
-            than round-off of the largest entry says that the model is too nearly noise-free for double precision.
+            than round-off of the largest entry: the model is too nearly noise-free for double precision.
     """
 
     belief: Gaussian

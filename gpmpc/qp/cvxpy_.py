@@ -36,7 +36,7 @@ from gpmpc.status import Status
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-KEPT = 16  # compiled problems per thread
+_KEPT = 16  # compiled problems per thread
 STATUSES = {
     "optimal": Status.SOLVED,
     "optimal_inaccurate": Status.SOLVED,
@@ -135,7 +135,7 @@ class CvxpySolver:
         below, above = (lower > -ABSENT) & ~equal, (upper < ABSENT) & ~equal
         key = (n, equal.tobytes(), below.tobytes(), above.tobytes())
         if key not in forms:
-            if len(forms) == KEPT:
+            if len(forms) == _KEPT:
                 del forms[next(iter(forms))]
             forms[key] = _formulate(n, equal, below, above)
         return forms[key]

@@ -66,12 +66,12 @@ def iterate(work, active, k, count, margin, iterations, batches):
             k = drop_wrong_multipliers(work, active, k)
         else:
             mu_p, scale = work.mu[p], work.scale[p]
-            satisfied, k, changes = satisfy_constraint(work, active, k, p)
+            satisfied, k, changes = _satisfy_constraint(work, active, k, p)
             iterations += changes
             if not satisfied:
                 size = max(abs(work.y[p]), work.negligible[p] / NEGLIGIBLE)
                 if work.excess[p] * scale > _HOPELESS * size:
-                    write_ray(work, active, k, p)
+                    _write_ray(work, active, k, p)
                     return INFEASIBLE, k, iterations, batches, passed
                 work.mu[p], passed = mu_p, True  # what it gained on the way belongs to no working set
                 ignore_violations(work, p)
@@ -94,7 +94,7 @@ def iterate(work, active, k, count, margin, iterations, batches):
 
 
 @inline_njit
-def satisfy_constraint(work, active, k, p):
+def _satisfy_constraint(work, active, k, p):
     """Moves multipliers until constraint p is satisfied: steps 1 and 2 of Goldfarb and Idnani's algorithm.
 
     Returns:
@@ -104,14 +104,14 @@ def satisfy_constraint(work, active, k, p):
     above = mu[p] > 0.0 or (mu[p] == 0.0 and work.y[p] > work.upper[p])
     sense = 1.0 if above == (mu[p] == 0.0) else -1.0  # the direction of mu_p, which comes back from a cap
     violation = (work.y[p] - (work.upper[p] if above else work.lower[p])) * sense
-    place = make_row(work, active, k, p)
+    place = _make_row(work, active, k, p)
     row, size = work.rows[place], int(work.end[p])
     free_value = dot(row, work.v, len(work.x))
     K_pp = dot(row, row, size) + work.softness[p]
     multiply_rows(work.rows, active.place, k, row, size, solved)  # K_Wp
     solve_lower(active.factor, k, solved)
     while True:
-        write_slot(work, active, k, p, above)
+        _write_slot(work, active, k, p, above)
         active.place[k], active.free_value[k], active.diagonal[k] = place, free_value, K_pp
         # step direction:  r = K_WW^-1 K_Wp,  d = K_pp - K_pW r;  mu_p moves by t, mu_W by -t r and y_p by -t d
         for i in range(k):
@@ -119,12 +119,12 @@ def satisfy_constraint(work, active, k, p):
         solve_transposed(active.factor, k, r)
         d = K_pp - dot(solved, solved, k)
         if d < _DOUBTFUL * K_pp:
-            d = distance_to_span(work, active, k, p, row)
+            d = _distance_to_span(work, active, k, p, row)
         # ratio test:  t = min(t1, t2);  t2 = violation / d makes p hold,  t1 takes a multiplier to the end of its range
         step = max(0.0, violation) / d if d > _DEPENDENT * K_pp and k < work.capacity else np.inf
         room = active.most[k] - mu[p] if sense > 0.0 else mu[p] - active.least[k]
         capped = room < step
-        step, blocking = first_blocking(work, active, k, sense, room if capped else step)
+        step, blocking = _first_blocking(work, active, k, sense, room if capped else step)
         if step == np.inf:  # no step ends: (r, -1) is Farkas' proof, unless rounding made the violation
             for i in range(k):
                 work.negligible[p] += _ROUNDING * abs(r[i] * active.bound[i])
@@ -137,7 +137,7 @@ def satisfy_constraint(work, active, k, p):
         if blocking < k:  # partial step: the blocking constraint leaves, and p is tried again
             leaving = abs(active.name[blocking]) - 1
             mu[leaving] = active.least[blocking] if sense * r[blocking] > 0.0 else active.most[blocking]
-            drop_constraint(work, active, k, blocking)
+            _drop_constraint(work, active, k, blocking)
             k -= 1
             active.place[k + 1] = active.place[k]  # the entering row keeps its place in slot k
             restore_limits(work, leaving)
@@ -153,7 +153,7 @@ def satisfy_constraint(work, active, k, p):
 
 
 @inline_njit
-def first_blocking(work, active, k, sense, step):
+def _first_blocking(work, active, k, sense, step):
     """Returns the longest step up to ``step`` that keeps the multipliers in range, and the slot that ends it (or k)."""
     r, size = work.r, 0.0
     for i in range(k):
@@ -169,7 +169,7 @@ def first_blocking(work, active, k, sense, step):
 
 
 @inline_njit
-def distance_to_span(work, active, k, p, row):
+def _distance_to_span(work, active, k, p, row):
     """Returns ``d = |w_p - sum r_i w_i|^2``, softness included, as a sum of squares, which cannot cancel."""
     rest, n = work.scratch, len(work.x)
     for j in range(n):
@@ -182,7 +182,7 @@ def distance_to_span(work, active, k, p, row):
 
 
 @inline_njit
-def write_ray(work, active, k, p):
+def _write_ray(work, active, k, p):
     """Writes Farkas' proof that p contradicts the working constraints to mu: ``C' ray = 0``, ``ray' bounds < 0``."""
     sense = 1.0 if work.y[p] > work.upper[p] else -1.0
     for i in range(len(work.mu)):
@@ -201,7 +201,7 @@ def add_constraints(work, active, k, count):
     first, solved = k, work.solved
     for i in range(count):
         p = abs(work.candidates[i]) - 1
-        place = make_row(work, active, first + i, p)
+        place = _make_row(work, active, first + i, p)
         row, size = work.rows[place], int(work.end[p])
         multiply_rows(work.rows, active.place, k, row, size, solved)
         solve_lower(active.factor, k, solved)
@@ -209,7 +209,7 @@ def add_constraints(work, active, k, count):
         pivot = K_pp - dot(solved, solved, k)
         if pivot > _GUESSED_PIVOT * K_pp:
             active.place[first + i] = active.place[k]
-            write_slot(work, active, k, p, work.candidates[i] > 0)
+            _write_slot(work, active, k, p, work.candidates[i] > 0)
             active.place[k], active.free_value[k], active.diagonal[k] = place, dot(row, work.v, len(work.x)), K_pp
             append_row(active.factor, k, solved, pivot)
             k += 1
@@ -219,7 +219,7 @@ def add_constraints(work, active, k, count):
 
 
 @inline_njit
-def make_row(work, active, slot, p):
+def _make_row(work, active, slot, p):
     """Returns the place of ``w_p = L^-T c_p``, computed in the place that the slot has free if it is not known."""
     if work.prepared:
         return p
@@ -238,7 +238,7 @@ def make_row(work, active, slot, p):
 
 
 @inline_njit
-def write_slot(work, active, k, p, above):
+def _write_slot(work, active, k, p, above):
     """Writes constraint p, at its upper bound (``above``) or its lower one, and its multiplier's range to slot k."""
     cap, equality = work.cap[p], work.lower[p] == work.upper[p]
     active.name[k] = p + 1 if above else -(p + 1)
@@ -248,7 +248,7 @@ def write_slot(work, active, k, p, above):
 
 
 @inline_njit
-def drop_constraint(work, active, k, slot):
+def _drop_constraint(work, active, k, slot):
     """Drops the constraint in a slot from the working set of k, and from ``work.solved``; its place becomes free."""
     delete_row(active.factor, k, slot, work.solved, work.cosines, work.sines)
     place = active.place[slot]
@@ -281,7 +281,7 @@ def drop_wrong_multipliers(work, active, k):
         if slot == k:
             break
         p = abs(active.name[slot]) - 1
-        drop_constraint(work, active, k, slot)
+        _drop_constraint(work, active, k, slot)
         k -= 1
         work.mu[p] = 0.0
         restore_limits(work, p)

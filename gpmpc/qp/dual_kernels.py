@@ -13,6 +13,7 @@ import numpy as np
 
 from gpmpc.compiled import compiled, inline_njit
 from gpmpc.kernels.linalg import dot, multiply
+from gpmpc.kernels.simd import any_nonzero, load, load_some, total, zeros
 from gpmpc.qp.dual_iteration import (
     NEGLIGIBLE,
     add_constraints,
@@ -22,7 +23,6 @@ from gpmpc.qp.dual_iteration import (
     iterate,
     multiply_constraints,
 )
-from gpmpc.qp.lanes import any_nonzero, lanes, no_lanes, plus, plus_product, product, some_lanes, total
 from gpmpc.qp.record import (
     CONSTRAINTS,
     HEADER,
@@ -42,7 +42,7 @@ from gpmpc.qp.workspace import all_finite, is_dense, is_dense_matrix, open_works
 SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 
 _ABSENT = 1e20  # a bound of this size or more is none
-_NOISE = 2e-14  # violation that a constraint which depends on others may be left with: see ``worst_violation``
+_NOISE = 2e-14  # violation that a constraint which depends on others may be left with: see ``_worst_violation``
 _LATER = 1e-11  # violation, as a share of the length of q, that waits for the refined x
 _ROUNDS = 10  # returns from the residuals to the iteration
 _REFINEMENTS = 3
@@ -63,19 +63,19 @@ def solve(P, q, G, lower, upper, guess, memory, out):
     if not (shaped and dense and is_dense_matrix(P) and is_dense_matrix(G) and all_finite(q)):
         return MISUSE
     work, active = open_workspace(P, q, G, memory, out)
-    if not work.prepared and not (factorise(P, work.L) and measure_rows(work)):
+    if not work.prepared and not (factorise(P, work.L) and _measure_rows(work)):
         return MISUSE
     least = 0.0  # length of x that is none
     for i in range(n):
         least = max(least, abs(q[i]) * work.scale[i])
     least *= NEGLIGIBLE
-    if not read_bounds(work, lower, upper, least):
+    if not _read_bounds(work, lower, upper, least):
         return MISUSE
-    return solve_opened(work, active, guess, least)
+    return _solve_opened(work, active, guess, least)
 
 
 @inline_njit
-def solve_opened(work, active, guess, least):
+def _solve_opened(work, active, guess, least):
     """Solves the program in the workspace."""
     n, M = len(work.x), len(work.mu)
     known = len(guess) > HEADER and guess[VARIABLES] == n and guess[CONSTRAINTS] == M and 0 <= guess[WORKING] <= M
@@ -107,20 +107,21 @@ def solve_opened(work, active, guess, least):
         share = min(pivots, math.sqrt(share))
         if passed or share < _ILL:
             fine = _FINEST
-        worst, refined = refine(work, active, k, least, min(fine, _DOUBT * share))
+        worst, size, refined = _refine(work, active, k, least, min(fine, _DOUBT * share))
         moved = moved or refined
         status = SOLVED if worst <= min(work.tolerance, _DOUBT * share) else NUMERICAL_TROUBLE
         rounds += 1
         if (not moved and margin == 0.0) or rounds == _ROUNDS or worst >= _UNDEFINED:
             break
         margin, moved = 0.0, False
-        count = list_violated(work, margin)
+        near = worst * size / share if fine > _FINEST else 0.0  # what the error of x may hide
+        count = list_violated(work, -near)
         if count == 0:
             break
         if fine > _FINEST:  # a small violation is believed of the best x only
             fine, count, moved = _FINEST, 0, True
     unsure = passed or rounds == _ROUNDS  # of the violations that are left
-    if unsure and status == SOLVED and worst_violation(work, least) > _NOISE:
+    if unsure and status == SOLVED and _worst_violation(work, least) > _NOISE:
         status = NUMERICAL_TROUBLE
     out = work.record
     out[STATUS], out[ITERATIONS], out[WORKING], out[VARIABLES], out[CONSTRAINTS] = status, iterations, k, n, M
@@ -155,7 +156,7 @@ def start(work, active, guess):
 
 
 @inline_njit
-def read_bounds(work, lower, upper, least):
+def _read_bounds(work, lower, upper, least):
     """Copies the bounds, with absent ones infinite, and clears mu; returns False if any are crossed or undefined."""
     wrong = 0
     for p in range(len(lower)):
@@ -168,7 +169,7 @@ def read_bounds(work, lower, upper, least):
 
 
 @inline_njit
-def measure_rows(work):
+def _measure_rows(work):
     """Writes lengths in the metric of P's diagonal, and the ends of the rows of G; returns False if not finite."""
     n, G, units, scale = len(work.x), work.G, work.scratch, work.scale
     for i in range(n):
@@ -177,49 +178,49 @@ def measure_rows(work):
         units[i] = 0.0
     undefined, end = 0.0, 0
     for p in range(len(G)):
-        row, near, far = G[p], no_lanes(), no_lanes()
+        row, near, far = G[p], zeros(), zeros()
         head, tail, rest = row[:end], row[end:], units[end:]
         for j in range(0, end, 8):
-            values = product(some_lanes(head, j), lanes(units, j))
-            near = plus_product(near, values, values)
+            values = load_some(head, j) * load(units, j)
+            near = near + values * values
         for j in range(0, n - end, 8):
-            values = product(some_lanes(tail, j), lanes(rest, j))
-            far = plus_product(far, values, values)
+            values = load_some(tail, j) * load(rest, j)
+            far = far + values * values
         if any_nonzero(far):  # longer than the row before
             end = n
             while end > 0 and row[end - 1] == 0.0:
                 end -= 1
             end = round_end(end, n)
-        length = math.sqrt(total(plus(near, 1.0, far)))
+        length = math.sqrt(total(near + far))
         undefined += length * 0.0
         scale[n + p], work.end[n + p] = (length if length > 0.0 else 1.0), end
     return undefined == 0.0
 
 
 @inline_njit
-def refine(work, active, k, least, fine):
+def _refine(work, active, k, least, fine):
     """Corrects x and mu on the working set until their residual is ``fine``, or no longer halves.
 
     Returns:
-        The residual, and whether x moved.
+        The residual, the length of x that it is a share of, and whether x moved.
     """
     best, moved = np.inf, False
     add_multipliers(work, active, k)
     for attempt in range(_REFINEMENTS + 1):
-        worst = measure_residuals(work, active, k, least)
+        worst, size = _measure_residuals(work, active, k, least)
         if worst <= fine or attempt == _REFINEMENTS or not worst < 0.5 * best:
             break
         best, moved = worst, True
-        take_newton_step(work, active, k)
+        _take_newton_step(work, active, k)
         add_multipliers(work, active, k)
-    return worst, moved
+    return worst, size, moved
 
 
 @inline_njit
-def measure_residuals(work, active, k, least):
-    """Returns the largest residual of stationarity and of the working constraints, as a share of x = y[:n], y = C x.
+def _measure_residuals(work, active, k, least):
+    """Returns the residual of stationarity and of the working constraints, as a share of x, and the length of x.
 
-    The length of x is that in the metric of P, at least ``least``, so that neither the units of the data nor a cost of
+    This length is that in the metric of P, at least ``least``, so that neither the units of the data nor a cost of
     another size hide an error of x. A hundredth of the error is also measured by the largest entry of x, and that of a
     row by its bound or its own terms. ``_UNDEFINED`` where a number that it is made of is not finite: comparisons alone
     would pass over NaN.
@@ -248,11 +249,11 @@ def measure_residuals(work, active, k, least):
                 for j in range(int(work.end[p])):
                     own = max(own, abs(row[j] * y[j]))
             worst = max(worst, max(rest / length, 1e-2 * rest / own))
-    return worst if worst + undefined + size < np.inf else _UNDEFINED
+    return (worst if worst + undefined + size < np.inf else _UNDEFINED), size
 
 
 @inline_njit
-def take_newton_step(work, active, k):
+def _take_newton_step(work, active, k):
     """Takes one Newton step on the working set for the residuals; multipliers stay in range."""
     n, y, change, trial = len(work.x), work.y, work.scratch, work.r
     for i in range(n):
@@ -277,7 +278,7 @@ def take_newton_step(work, active, k):
 
 
 @inline_njit
-def worst_violation(work, least):
+def _worst_violation(work, least):
     """Returns the largest violation beyond what multipliers pay for, as a share of its bound or, a thousandth, of x."""
     y, mu, worst = work.y, work.mu, 0.0
     size = math.sqrt(max(abs(dot(work.slope, y, len(work.x))), least * least))

@@ -24,12 +24,12 @@ from gpmpc.qp.solution import Terms, proves_infeasibility, zero_row_size
 Array = NDArray[np.float64]
 
 NEGLIGIBLE = 1e-26  # violation, as a share of the terms that it is a sum of, that doubled digits cannot tell from none
-ROUNDING = 1e-14  # share of these terms by which a row may contradict others that it depends on: the data's rounding
+_ROUNDING = 1e-14  # share of these terms by which a row may contradict others that it depends on: the data's rounding
 # Distances from the span of the others, as a share of the row, within which a row depends on them. Where rows that
 # differ by rounding only are taken for independent ones, x does not converge: then the next one is tried.
-DEPENDENT = (1e-14, 1e-13, 1e-12, 1e-10)
-CONVERGED = 1e-12  # last correction of x, as a share of its size
-CORRECTIONS = 12
+_DEPENDENT = (1e-14, 1e-13, 1e-12, 1e-10)
+_CONVERGED = 1e-12  # last correction of x, as a share of its size
+_CORRECTIONS = 12
 
 
 @np.errstate(all="ignore")  # what is not finite does not convince
@@ -48,7 +48,7 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, li
     result = record.copy()
     try:
         lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
-        for dependent in DEPENDENT:
+        for dependent in _DEPENDENT:
             solve = _Solve(terms, q, lower, upper, dependent, late)
             result[layout.STATUS] = solve.run(_names(record, len(q), len(lower)), limit)
             if result[layout.STATUS] != layout.NUMERICAL_TROUBLE:
@@ -94,12 +94,12 @@ class _Solve:
                 return layout.SOLVED
             if self.iterations >= limit:
                 return layout.ITERATION_LIMIT
-            rounding = ROUNDING * self._terms_of(p, side)
+            rounding = _ROUNDING * self._terms_of(p, side)
             if not self._step_to(p, side, sense, violation, rounding):
                 if self._prove(p, sense):
                     return layout.INFEASIBLE
                 terms = [self._terms_of(w, s) for w, s in zip(self.members, self.sides, strict=True)]
-                if violation > rounding + ROUNDING * np.abs(self.r) @ np.array(terms):
+                if violation > rounding + _ROUNDING * np.abs(self.r) @ np.array(terms):
                     return layout.NUMERICAL_TROUBLE
                 passed.add(p)
 
@@ -179,7 +179,7 @@ class _Solve:
         S = np.diag(self.softness[W])
         pulling = np.flatnonzero(self.mu[0])
         others = np.setdiff1d(pulling, W)  # soft rows at their caps
-        for _ in range(CORRECTIONS):
+        for _ in range(_CORRECTIONS):
             x, mu = self.x, self.mu
             r1 = _sum_products(
                 [(self.P, x[0]), (self.P, x[1]), (C.T, mu[0, W]), (C.T, mu[1, W]), (self.C[others].T, mu[0, others])],
@@ -197,7 +197,7 @@ class _Solve:
             size = max(np.abs(x[0]).max(), NEGLIGIBLE * np.abs(self.q).max())
             if not np.isfinite(size):
                 return False
-            if np.abs(dx).max() <= CONVERGED * size:
+            if np.abs(dx).max() <= _CONVERGED * size:
                 box = [i for i, p in enumerate(W) if p < n]  # bounds of variables hold exactly
                 x[0, np.array(W, dtype=int)[box]], x[1, np.array(W, dtype=int)[box]] = b[box], 0.0
                 return True

@@ -36,12 +36,12 @@ from gpmpc.status import Status
 
 Array = NDArray[np.float64]
 
-RANK = 1e-11  # share of the largest pivot of the QR below which a working row depends on the others
-STILL = 1e-13  # share of the size of x below which a direction is zero
-FULL_STEPS = 2  # unhindered steps on one working set after which what is left of d is rounding
-INSIDE = 1e-9  # share of the size of a row by which phase 1 may miss it
+_RANK = 1e-11  # share of the largest pivot of the QR below which a working row depends on the others
+_STILL = 1e-13  # share of the size of x below which a direction is zero
+_FULL_STEPS = 2  # unhindered steps on one working set after which what is left of d is rounding
+_INSIDE = 1e-9  # share of the size of a row by which phase 1 may miss it
 LAST_CHANGES = 20  # of the working set, when its last digits are found
-ZERO_STEPS = 20  # steps of length zero in a row after which Bland's rule breaks a possible cycle
+_ZERO_STEPS = 20  # steps of length zero in a row after which Bland's rule breaks a possible cycle
 
 
 class _Rows(NamedTuple):
@@ -112,14 +112,14 @@ class PrimalActiveSet:
                 return finish(Status.NUMERICAL_TROUBLE, x, nothing, nothing, iteration)
             if not np.isfinite(d).all():
                 return finish(Status.NUMERICAL_TROUBLE, x, nothing, nothing, iteration)
-            if full_steps == FULL_STEPS or np.abs(d).max() <= STILL * max(1.0, np.abs(x).max()):
+            if full_steps == _FULL_STEPS or np.abs(d).max() <= _STILL * max(1.0, np.abs(x).max()):
                 droppable = np.where(rows.equality[working], np.inf, multipliers)
                 if not working or droppable.min() >= 0.0:
                     stacked = _stack(rows, working, multipliers, M)
                     active = np.zeros(M)
                     active[rows.stacked[working]] = np.sign(rows.factor[working])
                     return finish(Status.SOLVED, x, stacked, active, iteration)
-                drop = np.argmax(droppable < 0.0) if still > ZERO_STEPS else np.argmin(droppable)
+                drop = np.argmax(droppable < 0.0) if still > _ZERO_STEPS else np.argmin(droppable)
                 working.pop(int(drop))
                 full_steps = 0
                 continue
@@ -175,7 +175,7 @@ def _phase_1(rows: _Rows, start: Array) -> tuple[Array, Array | None]:
     if least.x is None:
         return start, np.zeros(len(rows.h))
     x = start + least.x[:n]
-    if (A @ x - h <= INSIDE * np.maximum(1.0, np.abs(h))).all():
+    if (A @ x - h <= _INSIDE * np.maximum(1.0, np.abs(h))).all():
         return x, None
     weights = -least.ineqlin.marginals
     ray = weights[: len(rows.h)].copy()
@@ -197,7 +197,7 @@ def farkas_ray(problem: QuadraticProgram) -> Array | None:
 def _close_to_guess(rows: _Rows, x: Array, guess: Array) -> NDArray[np.bool_]:
     """Which guessed rows hold with equality at x."""
     guessed = np.sign(guess[rows.stacked]) == np.sign(rows.factor)
-    return guessed & (np.abs(rows.A @ x - rows.h) <= INSIDE * np.maximum(1.0, np.abs(rows.h)))
+    return guessed & (np.abs(rows.A @ x - rows.h) <= _INSIDE * np.maximum(1.0, np.abs(rows.h)))
 
 
 def _minimise_on_rows(P: Array, gradient: Array, A: Array, gap: Array) -> tuple[Array, Array]:
@@ -207,7 +207,7 @@ def _minimise_on_rows(P: Array, gradient: Array, A: Array, gap: Array) -> tuple[
     """
     Q, R, order = qr(A.T, pivoting=True)
     pivots = np.abs(np.diagonal(R))
-    rank = int(np.sum(pivots > RANK * pivots[0])) if len(pivots) else 0
+    rank = int(np.sum(pivots > _RANK * pivots[0])) if len(pivots) else 0
     Q1, Q2, R = Q[:, :rank], Q[:, rank:], R[:rank, :rank]
     d = Q1 @ solve_triangular(R, gap[order[:rank]], trans="T")
     if Q2.shape[1]:
@@ -223,7 +223,7 @@ def _step_length(rows: _Rows, x: Array, d: Array, working: list[int]) -> tuple[f
     speed = rows.A @ d
     speed[working] = 0.0
     room = np.maximum(rows.h - rows.A @ x, 0.0)
-    towards = speed > STILL * np.linalg.norm(d)
+    towards = speed > _STILL * np.linalg.norm(d)
     if not towards.any():
         return 1.0, None
     kappas = np.where(towards, room / np.where(towards, speed, 1.0), np.inf)

@@ -188,7 +188,7 @@ def _largest_ratio(rest: ArrayLike, own: ArrayLike) -> float:
     return float(np.max(np.divide(rest, own, out=np.zeros(np.shape(rest)), where=np.not_equal(rest, 0.0))))
 
 
-def hard_terms(problem: QuadraticProgram) -> Terms:
+def _hard_terms(problem: QuadraticProgram) -> Terms:
     """The terms of a problem without soft rows."""
     M = sum(problem.G.shape)
     return Terms(problem.P, problem.G, np.vstack([np.zeros(M), np.full(M, np.inf)]))
@@ -230,7 +230,7 @@ def make_solution(
     record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
     return QPSolution(
         record[layout.HEADER : layout.HEADER + n],
-        hard_terms(problem),
+        _hard_terms(problem),
         problem.q,
         problem.lower,
         problem.upper,

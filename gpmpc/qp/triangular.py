@@ -8,7 +8,7 @@ import math
 
 from gpmpc.compiled import inline_njit
 from gpmpc.kernels.linalg import dot, four_dots
-from gpmpc.qp.lanes import lanes, less, put, scaled, some_lanes
+from gpmpc.kernels.simd import load, load_some, store
 
 _LANES, _BLOCK = 8, 4
 _ROUNDING = 2.3e-16  # times n: share of P_ii below which a pivot is rounding
@@ -127,7 +127,7 @@ def factorise(P, L):
     multiple of eight; its upper triangle is undefined.
     """
     n = len(P)
-    if not is_symmetric(P):
+    if not _is_symmetric(P):
         return False
     top = n // _BLOCK * _BLOCK
     if top < n and not _finish_last_rows(P, L, top):
@@ -140,7 +140,7 @@ def factorise(P, L):
 
 
 @inline_njit
-def is_symmetric(P):
+def _is_symmetric(P):
     """Returns whether P equals its transpose but for rounding; reads blocks that stay in the cache."""
     n, largest, squares, skewed = len(P), 0.0, 0.0, 0
     for i in range(n):
@@ -192,21 +192,13 @@ def _finish_last_rows(P, L, top):
 @inline_njit
 def _subtract_below(P, L, top, j):
     """Returns eight columns of four rows of P less what the rows of L below take off: registers hold all of it."""
-    a0, a1, a2, a3 = (
-        some_lanes(P[top], j),
-        some_lanes(P[top + 1], j),
-        some_lanes(P[top + 2], j),
-        some_lanes(P[top + 3], j),
-    )
+    a0, a1 = load_some(P[top], j), load_some(P[top + 1], j)
+    a2, a3 = load_some(P[top + 2], j), load_some(P[top + 3], j)
     for s in range(top + _BLOCK, len(P)):
         row = L[s]
-        x = lanes(row, j)
-        a0, a1, a2, a3 = (
-            less(a0, row[top], x),
-            less(a1, row[top + 1], x),
-            less(a2, row[top + 2], x),
-            less(a3, row[top + 3], x),
-        )
+        x = load(row, j)
+        a0, a1 = a0 - row[top] * x, a1 - row[top + 1] * x
+        a2, a3 = a2 - row[top + 2] * x, a3 - row[top + 3] * x
     return a0, a1, a2, a3
 
 
@@ -217,10 +209,10 @@ def _finish_four_rows(P, L, top):
     t0, t1, t2, t3 = L[top], L[top + 1], L[top + 2], L[top + 3]
     j = top // _LANES * _LANES  # the piece with the diagonal comes first
     a0, a1, a2, a3 = _subtract_below(P, L, top, j)
-    put(t0, j, a0)
-    put(t1, j, a1)
-    put(t2, j, a2)
-    put(t3, j, a3)
+    store(t0, j, a0)
+    store(t1, j, a1)
+    store(t2, j, a2)
+    store(t3, j, a3)
     # the block of four by four: its pivots d, and what of which row to subtract from which
     d3 = t3[top + 3]
     r3 = 1.0 / d3
@@ -239,13 +231,13 @@ def _finish_four_rows(P, L, top):
         return False
     g3, g2, g1, g0 = math.sqrt(r3), math.sqrt(r2), math.sqrt(r1), 1.0 / math.sqrt(d0)
     while j >= 0:
-        a2 = less(a2, m23, a3)
-        a1 = less(less(a1, m13, a3), m12, a2)
-        a0 = less(less(less(a0, m03, a3), m02, a2), m01, a1)
-        put(t0, j, scaled(g0, a0))
-        put(t1, j, scaled(g1, a1))
-        put(t2, j, scaled(g2, a2))
-        put(t3, j, scaled(g3, a3))
+        a2 = a2 - m23 * a3
+        a1 = a1 - m13 * a3 - m12 * a2
+        a0 = a0 - m03 * a3 - m02 * a2 - m01 * a1
+        store(t0, j, g0 * a0)
+        store(t1, j, g1 * a1)
+        store(t2, j, g2 * a2)
+        store(t3, j, g3 * a3)
         j -= _LANES
         if j >= 0:
             a0, a1, a2, a3 = _subtract_below(P, L, top, j)

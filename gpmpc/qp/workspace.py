@@ -17,7 +17,7 @@ from gpmpc.qp.record import HEADER
 
 Array = NDArray[np.float64]
 
-LIMIT, TOLERANCE, SOFT, PREPARED, SETTINGS = 0, 1, 2, 3, 4
+_LIMIT, TOLERANCE, SOFT, PREPARED, SETTINGS = 0, 1, 2, 3, 4
 _REALS, _INTEGERS = 5, 26  # rows of ``memory`` at which vectors begin, after settings and traits,
 _REST = 30  # then integers, the factor of the working set, L and rows
 _END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
@@ -85,7 +85,7 @@ def new_memory(softness: Array, n: int, limit: int, tolerance: float, soft: bool
     ``prepared`` makes room for the rows of all constraints.
     """
     M = softness.shape[1]
-    capacity = most_working(n, M, soft)
+    capacity = _most_working(n, M, soft)
     wide = padded(max(M, capacity + 2, SETTINGS)) + 8  # kernels write whole lanes
     own = n * padded(n) + n * (M if prepared else capacity + 1)
     memory = aligned(_REST + capacity + 1 - (-own // wide), wide)
@@ -104,7 +104,7 @@ def softness_in(memory: Array, M: int) -> Array:
 def factor_and_rows(memory: Array, n: int, m: int) -> tuple[Array, Array]:
     """Returns L of P = L'L, a copy, and the rows w_p (M, n) of prepared memory, a view."""
     settings, rest = memory[0], memory[_REST:]
-    start = rest[most_working(n, n + m, settings[SOFT] != 0.0) + 1 :].reshape(-1)
+    start = rest[_most_working(n, n + m, settings[SOFT] != 0.0) + 1 :].reshape(-1)
     L = np.tril(start[: n * padded(n)].reshape(n, padded(n))[:, :n])
     np.fill_diagonal(L, 1.0 / np.diagonal(L))
     return L, start[n * padded(n) :][: (n + m) * n].reshape(n + m, n)
@@ -118,7 +118,7 @@ def aligned(rows: int, columns: int) -> Array:
 
 
 @inline_njit
-def most_working(n, M, soft):
+def _most_working(n, M, soft):
     """Returns how many constraints can work at once."""
     return M if soft else min(n, M)
 
@@ -158,14 +158,14 @@ def open_workspace(P, q, G, memory, out):
     n, M = len(q), len(q) + len(G)
     settings, real, whole = memory[0], memory[_REALS:_INTEGERS], memory[_INTEGERS:_REST].view(np.int64)
     soft = settings[SOFT] != 0.0
-    capacity = most_working(n, M, soft)
+    capacity = _most_working(n, M, soft)
     factor, rest = memory[_REST : _REST + capacity + 1], memory[_REST + capacity + 1 :]
     L, rows = matrix(rest, 0, n, padded(n)), matrix(rest, n * padded(n), M, n)
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     work = Workspace(
         P, q, G, L, rows, real[0], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2], memory[3],
         memory[4], out, x, mu, real[6][:M], real[7], whole[0], whole[1], real[8], real[9], real[10], real[11], real[12],
-        real[13], real[14], real[15], capacity, int(settings[LIMIT]), settings[TOLERANCE], soft,
+        real[13], real[14], real[15], capacity, int(settings[_LIMIT]), settings[TOLERANCE], soft,
         settings[PREPARED] != 0.0,
     )  # fmt: skip
     active = WorkingSet(whole[2], whole[3], real[16], real[17], real[18], real[19], real[20], factor)

@@ -1,5 +1,6 @@
 """Copies steps as they are recorded, and serialises the copies later."""
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from gpmpc.qp import QPSolution
 
 Array = np.ndarray
+_ndarray, _float64 = np.ndarray, np.dtype(np.float64)
 _NUMBERS = {status: number for number, status in enumerate(Status)}
 _ARRAYS = (
     "reference",
@@ -33,10 +35,51 @@ _ARRAYS = (
 _MARK = np.array([-1.2345678901234567e300]).tobytes()  # no tag or length looks like it
 
 
-class Kept(NamedTuple):
-    """A step with copies of its arrays."""
+class Packed(NamedTuple):
+    """A step with its arrays copied into one piece of memory."""
 
     step: Step  # its numbers hold; its arrays may have changed since
+    gp_size: int
+    shapes: list[tuple[int, ...]]
+    data: bytes
+
+
+def pack(step: Step, gp_size: int | None, n: int, m: int, record_problems: bool) -> Packed:
+    """Copies a step.
+
+    Raises:
+        ShapeError: An array of the step does not fit n states and m inputs.
+    """
+    decision, given = step.decision, ()
+    arrays = [step.reference, step.state, step.measured, step.innovation, step.input, step.belief_covariance]
+    expected = [(n,), (n,), (n,), (n,), (m,), (n, n)]
+    if decision is not None:
+        H, solution, problem = len(decision.inputs), decision.solution, decision.problem
+        arrays += [decision.inputs, decision.means, decision.covariances]
+        expected += [(H, m), (H + 1, n), (H + 1, n, n)]
+        if solution is not None:
+            P, G, softness = solution.terms
+            arrays += [solution.x, solution.record]
+            given = (P, solution.q, G, solution.lower, solution.upper, softness)
+        elif problem is not None:
+            hard = np.vstack([np.zeros(len(problem.lower)), np.full(len(problem.lower), np.inf)])
+            given = (problem.P, problem.q, problem.G, problem.lower, problem.upper, hard)
+        if record_problems:
+            arrays += given
+    for i, array in enumerate(arrays):
+        if array.__class__ is not _ndarray or array.dtype is not _float64 or not array.flags.c_contiguous:
+            arrays[i] = np.ascontiguousarray(array, dtype=float)
+    shapes = [array.shape for array in arrays]
+    if shapes[: len(expected)] != expected:
+        wrong = next(i for i, shape in enumerate(expected) if shapes[i] != shape)
+        raise ShapeError(f"step {step.k}: {_ARRAYS[wrong]} must be {expected[wrong]}; got {shapes[wrong]}")
+    return Packed(step, step.gp_size if gp_size is None else gp_size, shapes, b"".join(arrays))
+
+
+class Kept(NamedTuple):
+    """A step whose arrays are its own."""
+
+    step: Step  # for its numbers
     gp_size: int
     reference: Array
     state: Array
@@ -44,10 +87,9 @@ class Kept(NamedTuple):
     innovation: Array
     input: Array
     belief_covariance: Array
-    plan: tuple[Array, Array, Array] | None  # inputs, means, covariances
-    qp: list[Array] | None  # P, q, G, lower, upper, softness
-    solution: "QPSolution | None"  # with a record of its own
-    size: int  # [bytes]
+    plan: Sequence[Array] | None  # inputs, means, covariances
+    solution: "QPSolution | None"
+    qp: Sequence[Array] | None  # P, q, G, lower, upper, softness
 
     @property
     def status(self) -> Status:
@@ -55,38 +97,18 @@ class Kept(NamedTuple):
         return self.step.decision.status if self.step.status is None else self.step.status
 
 
-def keep(step: Step, gp_size: int | None, n: int, m: int, record_problems: bool) -> Kept:
-    """Copies a step.
-
-    Raises:
-        ShapeError: An array of the step does not fit n states and m inputs.
-    """
-    decision, solution, problem, given = step.decision, None, None, None
-    arrays = [step.reference, step.state, step.measured, step.innovation, step.input, step.belief_covariance]
-    shapes = [(n,), (n,), (n,), (n,), (m,), (n, n)]
-    if decision is not None:
-        H, solution, problem = len(decision.inputs), decision.solution, decision.problem
-        arrays += [decision.inputs, decision.means, decision.covariances]
-        shapes += [(H, m), (H + 1, n), (H + 1, n, n)]
-    copies = [np.array(array, dtype=float) for array in arrays]
-    if [copy.shape for copy in copies] != shapes:
-        wrong = next(i for i, copy in enumerate(copies) if copy.shape != shapes[i])
-        raise ShapeError(f"step {step.k}: {_ARRAYS[wrong]} must be {shapes[wrong]}; got {copies[wrong].shape}")
-    size = sum([copy.nbytes for copy in copies])
-    if solution is not None:
-        P, G, softness = solution.terms
-        given = (P, solution.q, G, solution.lower, solution.upper, softness)
-        solution = solution._replace(x=np.array(solution.x), record=np.array(solution.record))
-    elif problem is not None:
-        hard = np.vstack([np.zeros(len(problem.lower)), np.full(len(problem.lower), np.inf)])
-        given = (problem.P, problem.q, problem.G, problem.lower, problem.upper, hard)
-    if given is not None and record_problems:
-        size += given[0].nbytes + given[2].nbytes
-        given = [np.array(array, dtype=float) for array in given]
-    else:
-        given = None
-    gp_size = step.gp_size if gp_size is None else gp_size
-    return Kept(step, gp_size, *copies[:6], tuple(copies[6:]) or None, given, solution, size)
+def unpack(packed: Packed) -> Kept:
+    """Finds the arrays of a step again; they are views of the copy."""
+    numbers, arrays, start = np.frombuffer(packed.data), [], 0
+    for shape in packed.shapes:
+        end = start + math.prod(shape)
+        arrays.append(numbers[start:end].reshape(shape))
+        start = end
+    decision, solution, rest = packed.step.decision, None, arrays[9:]
+    if decision is not None and decision.solution is not None:
+        solution = decision.solution._replace(x=rest[0], record=rest[1])
+        rest = rest[2:]
+    return Kept(packed.step, packed.gp_size, *arrays[:6], arrays[6:9] or None, solution, rest or None)
 
 
 class Encoder:

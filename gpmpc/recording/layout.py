@@ -1,4 +1,4 @@
-"""Problem: a recording of any plant should be seen in Foxglove without arranging a dozen panels by hand.
+"""Makes a layout for Foxglove that fits a recording.
 
 A layout names message paths, so it is made from the names of the states and inputs that a recording holds. Its format
 is the one that Foxglove and its open fork Lichtblick (github.com/lichtblick-suite/lichtblick) export and import: a

@@ -26,7 +26,7 @@ from gpmpc.provenance import provenance
 from gpmpc.recording._messages import RecordedSystem, units_by_field
 from gpmpc.recording._records import CONFIG, LARGEST
 from gpmpc.recording._scene import Scene
-from gpmpc.recording._steps import Encoder, Kept, failure_log, keep
+from gpmpc.recording._steps import Encoder, Packed, failure_log, pack, unpack
 from gpmpc.step import Step
 
 _INTERVAL = 1.0  # [s] after which the next step ends a chunk
@@ -78,7 +78,7 @@ class McapRecorder:
         self._n, self._m = len(states), len(inputs)
         self._start, self._record_problems, self._chunk_size = start_time_ns, record_problems, chunk_size
         self._encoder = Encoder(system)
-        self._waiting: list[Kept] = []
+        self._waiting: list[Packed] = []
         self._bytes, self._steps, self._last = 0, 0, time.perf_counter()
         self._error: str | None = None
         self._server: Any = None
@@ -115,11 +115,12 @@ class McapRecorder:
         """
         if self._error is not None:
             raise RecordingError(self._error)
-        kept = keep(step, gp_size, self._n, self._m, self._record_problems)
-        if 4 * kept.size > LARGEST:
-            raise RecordingError(f"{self.path}: a step of {kept.size} bytes is too large; at most {LARGEST // 4}")
-        self._waiting.append(kept)
-        self._bytes += kept.size
+        packed = pack(step, gp_size, self._n, self._m, self._record_problems)
+        size = len(packed.data)
+        if 4 * size > LARGEST:
+            raise RecordingError(f"{self.path}: a step of {size} bytes is too large; at most {LARGEST // 4}")
+        self._waiting.append(packed)
+        self._bytes += size
         if self._server is not None:
             self._serialise()
         if self._bytes > self._chunk_size or time.perf_counter() - self._last > _INTERVAL:
@@ -161,11 +162,12 @@ class McapRecorder:
         """Logs the steps that wait: into the open chunk, and to viewers."""
         if not self._waiting:
             return
-        stamps = [self._start + round(kept.step.time * 1e9) for kept in self._waiting]
-        for topic, row, message in self._encoder.encode(self._waiting):
+        steps = [unpack(packed) for packed in self._waiting]
+        stamps = [self._start + round(kept.step.time * 1e9) for kept in steps]
+        for topic, row, message in self._encoder.encode(steps):
             self._channels[topic].log(message, log_time=stamps[row])
-        self._scene.log(self._waiting, stamps)
-        for kept, nanoseconds in zip(self._waiting, stamps, strict=True):
+        self._scene.log(steps, stamps)
+        for kept, nanoseconds in zip(steps, stamps, strict=True):
             if kept.step.failed or not kept.status.solved:
                 self._log.log(failure_log(kept, nanoseconds), log_time=nanoseconds)
         self._steps += len(self._waiting)

@@ -4,7 +4,7 @@ from gpmpc.simulation.cascade_loop import CascadeRollout, cascade_loop
 from gpmpc.simulation.disturbances import Disturbance, Dropout, Gust, Replaced
 from gpmpc.simulation.loop import Rollout, closed_loop, rehearse
 from gpmpc.simulation.simulator import ModelLoop, Noise, PlantSimulator
-from gpmpc.simulation.trials import Trial, closed_loops, trials
+from gpmpc.simulation.trials import Trial, closed_loops
 from gpmpc.step import Step
 
 __all__ = [
@@ -23,5 +23,4 @@ __all__ = [
     "closed_loop",
     "closed_loops",
     "rehearse",
-    "trials",
 ]

@@ -1,7 +1,5 @@
 """Freezing trained GPyTorch models: SE-ARD ones, sparse ones, and those of any kernel."""
 
-import math
-
 import gpytorch
 import pytest
 import torch
@@ -17,9 +15,10 @@ from gpytorch.kernels import (
 from gpytorch.likelihoods import FixedNoiseGaussianLikelihood, GaussianLikelihood
 from gpytorch.means import ConstantMean, LinearMean, ZeroMean
 
-from gpmpc.exceptions import SettingError, ShapeError, TrainingError, UnsupportedModel
+from gpmpc.dynamics import predict_with_jacobian
+from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import Hyperparameters, KernelPosterior, fit, from_gpytorch
+from gpmpc.gp import Hyperparameters, KernelPosterior, from_gpytorch
 from gpmpc.gp.gpytorch_ import exact_inference
 from gpmpc.gp.sparse import collapsed_bound
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, differentiate
@@ -114,7 +113,7 @@ def test_a_frozen_model_is_exact_where_gpytorch_by_itself_is_not(size, freeze):
 def assert_equal(model, freeze):
     gp = freeze(model, input_dim=1, predicts="value")
     query = data(7, seed=5)[0]
-    belief, by_state, by_input = gp.predict_with_jacobian(query[:, :2], query[:, 2:])
+    belief, by_state, by_input = predict_with_jacobian(gp, query[:, :2], query[:, 2:])
     mean, variance = theirs(model, query)
     assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-10)
     assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-10)
@@ -137,7 +136,7 @@ def test_any_kernel_predicts_what_gpytorch_does(kind, size):
     model = one_output(size, ANY_KERNEL[kind](), mean=LinearMean(3))
     gp = KernelPosterior.from_gpytorch(model, input_dim=1, predicts="value")
     query = data(6, seed=5)[0]
-    belief, by_state, by_input = gp.predict_with_jacobian(query[:, :2], query[:, 2:])
+    belief, by_state, by_input = predict_with_jacobian(gp, query[:, :2], query[:, 2:])
     mean, variance = theirs(model, query)
     assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-10)
     assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-10)
@@ -162,7 +161,7 @@ def test_leading_batch_dimensions_are_those_of_the_query():
     single = gp.predict(x[1, 2], u[1, 2])
     assert torch.allclose(whole.mean[1, 2], single.mean, atol=1e-13)
     assert torch.allclose(whole.covariance[1, 2], single.covariance, atol=1e-13)
-    _, by_state, by_input = gp.predict_with_jacobian(x, u)
+    _, by_state, by_input = predict_with_jacobian(gp, x, u)
     assert (by_state.shape, by_input.shape) == ((2, 3, 2, 2), (2, 3, 2, 1))
 
 
@@ -170,7 +169,7 @@ def test_a_difference_model_adds_the_state():
     x, u = torch.rand(4, 2), torch.rand(4, 1)
     plain, difference = matern_dynamics(), matern_dynamics("difference")
     assert torch.allclose(difference.predict(x, u).mean, plain.predict(x, u).mean + x)
-    jacobians = [gp.predict_with_jacobian(x, u)[1] for gp in (plain, difference)]
+    jacobians = [predict_with_jacobian(gp, x, u)[1] for gp in (plain, difference)]
     assert torch.allclose(jacobians[1] - jacobians[0], torch.eye(2).expand(4, 2, 2))
 
 
@@ -324,52 +323,3 @@ def test_sparse_models_over_other_points_are_refused():
         from_gpytorch(models, input_dim=1)
     with pytest.raises(UnsupportedModel, match="freeze it by from_gpytorch"):
         KernelPosterior.from_gpytorch(models[0], input_dim=1, predicts="value")
-
-
-# --- training -------------------------------------------------------------------------------------------------------
-
-
-def log_density(model):
-    with exact_inference(), torch.no_grad():
-        prior = model.likelihood(model.forward(*model.train_inputs))
-        return float(
-            torch.distributions.MultivariateNormal(prior.mean, prior.covariance_matrix)
-            .log_prob(model.train_targets)
-            .sum()
-        )
-
-
-def test_training_climbs_to_where_the_gradient_vanishes_and_more_starts_never_end_lower():
-    x, y = data(50, 1)
-    single = Model(x, y[0], ScaleKernel(MaternKernel(nu=2.5, ard_num_dims=3)), ConstantMean()).double()
-    before = log_density(single)
-    found = fit(single)
-    assert not single.training
-    assert -found.objective[0] > before + 10
-    assert -found.objective[0] == pytest.approx(log_density(single))
-    again = Model(x, y[0], ScaleKernel(MaternKernel(nu=2.5, ard_num_dims=3)), ConstantMean()).double()
-    several = fit(again, restarts=2)
-    assert several.explored.shape == (1, 3)
-    assert several.objective[0] <= found.objective[0] + 1e-6
-
-
-def test_a_list_is_trained_member_by_member_and_predicts():
-    x, y = data(60)
-    models = [Model(x, each, ScaleKernel(MaternKernel(nu=1.5))).double() for each in y]
-    assert fit(models).objective.shape == (2,)
-    gp, query = KernelPosterior.from_gpytorch(models, input_dim=1), data(50, seed=3)
-    error = gp.predict(query[0][:, :2], query[0][:, 2:]).mean.mT - query[1]
-    assert float(error.square().mean().sqrt()) < 0.3
-
-
-def test_training_that_fails_from_every_start_names_the_outputs_and_restores_the_parameters():
-    x, y = data(10, 2)
-    models = [Model(x, each, ScaleKernel(RBFKernel())).double() for each in y]
-    models[1].set_train_data(targets=torch.full((10,), math.inf), strict=False)
-    before = [p.clone() for p in models[1].parameters()]
-    with pytest.raises(TrainingError, match="no start of 2 .* for output 1:") as caught:
-        fit(models, restarts=1)
-    assert caught.value.outputs == [1]
-    assert all(torch.equal(p, q) for p, q in zip(models[1].parameters(), before, strict=True))
-    with pytest.raises(SettingError, match="restarts: must be a whole number, 0 or more; got -1"):
-        fit(models[0], restarts=-1)

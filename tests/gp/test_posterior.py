@@ -156,18 +156,6 @@ def test_a_value_model_may_have_any_number_of_outputs():
     assert torch.allclose(belief.mean, targets, atol=0.05)
 
 
-def test_samples_have_the_predicted_moments_and_follow_their_generator():
-    gp, state, control = posterior(size=5), torch.rand(3, 2), torch.rand(3, 1)
-    draw = gp.sample(state, control, 40_000, torch.Generator().manual_seed(1))
-    noisy = gp.sample(state, control, 40_000, torch.Generator().manual_seed(1), observation_noise=True)
-    belief = gp.predict(state, control)
-    assert draw.shape == (40_000, 3, 2)
-    assert torch.equal(draw, gp.sample(state, control, 40_000, torch.Generator().manual_seed(1)))
-    assert torch.allclose(draw.mean(0), belief.mean, atol=5 * float(belief.variance.max() / 40_000) ** 0.5)
-    assert torch.allclose(draw.var(0), belief.variance, rtol=0.05)
-    assert torch.allclose(noisy.var(0), belief.variance + gp.noise_variance, rtol=0.05)
-
-
 def test_a_posterior_in_single_precision_predicts_nearly_the_same():
     gp, state, control = posterior(), torch.rand(4, 2), torch.rand(4, 1)
     single = gp.to(dtype=torch.float32)

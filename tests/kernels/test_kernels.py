@@ -13,27 +13,13 @@ import torch
 from gpmpc import kernels
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.kernels import exponential, pair_sums, point_rows
-from gpmpc.kernels.block import add_to_columns, expm1, expm1_near_zero, outer_sum
-from gpmpc.kernels.exponential import NEAR_ZERO
-from gpmpc.kernels.packed import aligned_zeros, pack
-from gpmpc.kernels.pair_sums import Side
+from gpmpc.kernels import gp_point, simd
+from gpmpc.kernels.gp_moments import CROSS
+from gpmpc.kernels.packed import pack
+from gpmpc.kernels.rows import largest_size, largest_square, reduce_variance, reduce_variances
+from gpmpc.kernels.simd import NEAR_ZERO, load, store
 from gpmpc.propagation._moments import moments
 from tests.propagation.test_moment_matching import belief, by_mpmath, model
-
-
-def from_python(inner):
-    """A function that Python can call."""
-
-    @numba.njit
-    def call(*arguments):
-        return inner(*arguments)
-
-    return call
-
-
-exp_all, largest_exponent = from_python(exponential.exp_all), from_python(pair_sums.largest_exponent)
-explain, explain_several = from_python(point_rows.explain), from_python(point_rows.explain_several)
 
 
 def packed(gp):
@@ -53,6 +39,12 @@ def close(mine, other, tolerance):
     other = np.asarray(other)
     assert mine.shape == other.shape
     assert np.abs(mine - other).max(initial=0) <= tolerance * max(np.abs(other).max(initial=0), 1e-300)
+
+
+def plain_moments(*arguments):
+    """What the specification says."""
+    out, _ = kernels._moments(*arguments, diagonal=False, order=CROSS, plain=True)
+    return [array[0] for array in out]
 
 
 def symmetric(derivative):
@@ -112,6 +104,8 @@ def test_values_and_derivatives_agree_with_torch(name, arguments, at, shift):
     close(mine.dJ_du, dJ[2], 1e-9)
     for value, with_jacobian in zip(kernels.moments(packed(gp), *numbers(mu, S, u)), mine[:3], strict=True):
         close(value, with_jacobian, 1e-12)
+    for fast, plain in zip(mine, plain_moments(packed(gp), *numbers(mu, S, u)), strict=True):
+        close(fast, plain, 1e-9)
 
 
 @pytest.mark.parametrize(
@@ -130,11 +124,12 @@ def test_values_and_derivatives_agree_with_torch(name, arguments, at, shift):
 def test_the_moments_agree_with_a_fifty_digit_evaluation(arguments, at, shift, tolerance):
     gp, at, u = case({"size": 7} | arguments, at, shift)
     exact_M, exact_V, exact_cross = (exact.numpy() for exact in by_mpmath(gp, at, u))
-    M, V, J = kernels.moments(packed(gp), *numbers(at.mean, at.covariance, u))
-    assert np.abs(V - exact_V).max() < tolerance * np.abs(exact_V).max()
-    assert np.abs(M - exact_M).max() < tolerance * max(1e-3, np.abs(exact_M).max())
-    cross = at.covariance.numpy() @ J.T
-    assert np.abs(cross - exact_cross).max() < tolerance * max(1e-3, np.abs(exact_cross).max())
+    arguments = packed(gp), *numbers(at.mean, at.covariance, u)
+    for M, V, J in (kernels.moments(*arguments), plain_moments(*arguments)[:3]):
+        assert np.abs(V - exact_V).max() < tolerance * np.abs(exact_V).max()
+        assert np.abs(M - exact_M).max() < tolerance * max(1e-3, np.abs(exact_M).max())
+        cross = at.covariance.numpy() @ J.T
+        assert np.abs(cross - exact_cross).max() < tolerance * max(1e-3, np.abs(exact_cross).max())
 
 
 @pytest.mark.parametrize("size", [1, 7, 8, 9, 189, 500])
@@ -246,10 +241,13 @@ def test_the_expansion_at_a_point_agrees_with_torch(n, m, size):
     without = kernels.point_with_jacobian(packed(gp), *numbers(x, u))
     assert without.d3M_dx3 is None
     assert all((mine == other).all() for mine, other in zip(without[:8], point[:8], strict=True))
-    for mine, other in zip(
-        kernels.mean_with_jacobian(packed(gp), *numbers(x, u)), (point.M, point.J, point.dM_du), strict=True
-    ):
-        close(mine, other, 1e-12)
+    offset = np.arange(float(n))
+    for adds_state in (False, True):
+        M, A, B, V = kernels.linearize(packed(gp), *numbers(x[None], u[None]), True, offset, adds_state)
+        close(M[0], point.M + offset + adds_state * x.numpy(), 1e-12)
+        close(A[0], point.J + adds_state * np.eye(n), 1e-12)
+        close(B[0], point.dM_du, 1e-12)
+        close(V[0], np.diag(point.variance), 1e-11)
 
 
 @pytest.mark.parametrize("covariance", [0.0, 1e-14])
@@ -267,13 +265,22 @@ def test_without_covariance_the_moments_are_the_expansion_at_the_mean(covariance
 
 
 @pytest.mark.parametrize("size", [3, 21])
-def test_several_vectors_are_explained_as_each_alone(size):
+def test_variances_at_several_points_are_reduced_as_each_alone(size):
     mine = packed(model(size=size))
-    q = aligned_zeros(8, mine.points.shape[1])
+    q = np.zeros((8, mine.arrays.points.shape[1]))
     q[:5, :size] = np.random.default_rng(0).normal(size=(5, size))
-    alone, totals = [explain(mine.inverse_cholesky[1], row, np.empty_like(row)) for row in q], np.zeros(8)
-    explain_several(mine.columns[1], q, totals)
-    assert np.allclose(totals, alone, rtol=1e-12, atol=0)
+
+    @numba.njit
+    def alone(triangle, row):
+        return reduce_variance(triangle, row, np.empty_like(row))
+
+    @numba.njit
+    def together(columns, rows, totals):
+        reduce_variances(columns, rows, totals)
+
+    expected, totals = [alone(mine.precision.inverse_cholesky[1], row) for row in q], np.zeros(8)
+    together(mine.columns[1], q, totals)
+    assert np.allclose(totals, expected, rtol=1e-12, atol=0)
 
 
 def test_many_points_are_the_loop_over_them():
@@ -282,14 +289,14 @@ def test_many_points_are_the_loop_over_them():
     mu, S = np.stack([b.mean for b in beliefs]), np.stack([b.covariance for b in beliefs])
     u = np.linspace(-1, 1, 8).reshape(4, 2)
     together = [
-        kernels.mean_with_jacobian(gps, mu, u),
+        kernels.linearize(gps, mu, u, True, np.zeros(3), False),
         kernels.point_with_jacobian(gps, mu, u, hessian=True),
         kernels.moments(gps, mu, S, u, diagonal=True),
         kernels.moments_with_jacobian(gps, mu, S, u, cross=True),
     ]
     for h in range(4):
         alone = [
-            kernels.mean_with_jacobian(gps, mu[h], u[h]),
+            [part[0] for part in kernels.linearize(gps, mu[h : h + 1], u[h : h + 1], True, np.zeros(3), False)],
             kernels.point_with_jacobian(gps, mu[h], u[h], hessian=True),
             kernels.moments(gps, mu[h], S[h], u[h], diagonal=True),
             kernels.moments_with_jacobian(gps, mu[h], S[h], u[h], cross=True),
@@ -322,32 +329,31 @@ def test_not_a_number_is_passed_on():
     assert np.isnan(d.V).all()
 
 
-@numba.njit
-def add_expm1(x, row, one, sums, near):
-    for at in range(0, len(x), 16):
-        x_ij = outer_sum(row, 0, x, at)
-        add_to_columns(sums, at, expm1_near_zero(x_ij) if near else expm1(x_ij), one, 0)
+def by_lanes(function):
+    """A function of Lanes, for arrays of any length."""
 
+    @numba.njit
+    def write(x):
+        for j in range(0, len(x), 8):
+            store(x, j, function(load(x, j)))
 
-def block_expm1(values, near=False):
-    """expm1 of a block, read off its rows in turn."""
-    x, sums = np.zeros((2, -(-len(values) // 16) * 16))
-    x[: len(values)] = values
-    answers = []
-    for one in np.eye(4):
-        sums[:] = 0.0
+    def evaluate(values):
+        x = np.zeros(-(-len(values) // 8) * 8)
+        x[: len(values)] = values
         with np.errstate(invalid="ignore"):
-            add_expm1(x, np.zeros(4), one, sums, near)
-        answers.append(sums[: len(values)].copy())
-    assert all(np.array_equal(answer, answers[0], equal_nan=True) for answer in answers)
-    return answers[0]
+            write(x)
+        return x[: len(values)]
+
+    return evaluate
+
+
+exp, expm1, expm1_near_zero = (by_lanes(f) for f in (simd.exp, simd.expm1, simd.expm1_near_zero))
 
 
 @pytest.mark.parametrize(("low", "high"), [(-0.35, 0.35), (-1.1, 1.1), (-40, 30), (-1e-9, 1e-9), (-745, 709)])
 def test_the_exponentials_are_those_of_fifty_digits(low, high):
     x = np.random.default_rng(0).uniform(low, high, 2000)
-    y = x.copy()
-    exp_all(y)
+    y = exp(x)
     with mpmath.workdps(50):
         exact = np.array([float(mpmath.exp(v)) for v in x])
         assert np.abs(y - exact).max(where=exact < 3e-308, initial=0) <= 5e-324
@@ -355,48 +361,54 @@ def test_the_exponentials_are_those_of_fifty_digits(low, high):
         assert (np.abs(y - exact)[normal] <= 3e-16 * exact[normal]).all()
         x = x[x <= 300]
         exact = np.array([float(mpmath.expm1(v)) for v in x])
-        y = block_expm1(x)
+        y = expm1(x)
         assert (np.abs(y - exact) <= (4e-16 + 3.4e-17 * np.maximum(x, 0)) * np.abs(exact)).all()
 
 
 def test_near_zero_the_exponentials_without_reduction_are_the_same_to_the_last_bit():
     x = np.random.default_rng(1).uniform(-NEAR_ZERO, NEAR_ZERO, 2000) * np.geomspace(1e-12, 1, 2000)
     x[:2] = -NEAR_ZERO, NEAR_ZERO
-    assert np.array_equal(block_expm1(x), block_expm1(x, near=True))
+    assert np.array_equal(expm1(x), expm1_near_zero(x))
 
 
-@pytest.mark.parametrize("dims", [3, 6])
-def test_no_exponent_of_a_pair_is_beyond_its_bound(dims):
-    generator = np.random.default_rng(dims)
-    left, z, shifts = (generator.standard_normal(shape) for shape in ((dims, 16), (dims, 16), (2, 16)))
-    z[:, 3], left[:, 5] = 8.0, 2.0  # parallel: the bound is met
-    delta = np.add.outer(*shifts) + left.T @ z
-    rows, columns = Side(left, shifts[0], shifts[0]), Side(z, shifts[1], shifts[1])
-    bound = largest_exponent(left, rows, columns, np.empty(16))
-    assert np.abs(delta).max() <= bound <= np.abs(delta).max() + 2 * np.abs(shifts).max(axis=1).sum()
-    for array in (left, z, shifts[0], shifts[1]):
-        last, array[..., -1] = array[..., -1].copy(), np.nan
-        assert np.isnan(largest_exponent(left, rows, columns, np.empty(16)))
-        array[..., -1] = last
+@pytest.mark.parametrize("dims", [1, 3, 6])
+def test_sizes_over_points_are_the_largest_ones(dims):
+    rows = np.random.default_rng(dims).standard_normal((dims, 48))
+    rows[0, 29], rows[-1, 7] = -8.0, np.nan  # NaN is passed over: such a pair stays NaN in either way
+
+    @numba.njit
+    def sizes(rows):
+        return largest_square(rows), largest_size(rows[0])
+
+    assert sizes(rows) == pytest.approx((np.nanmax((rows**2).sum(axis=0)), 8.0), rel=1e-15)
+
+
+def test_loops_over_points_may_use_the_widest_registers():
+    gps = packed(model())
+    kernels.linearize(gps, np.zeros((1, 2)), np.zeros((1, 1)), False, np.zeros(2), False)
+    anew = numba.njit(gp_point.linearize_points.py_func)  # the kernel itself may have been loaded
+    x, u, out = np.zeros((1, 2)), np.zeros((1, 1)), (np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2, 1)))
+    memory, none = np.empty(7 * gps.arrays.points.shape[1] + 8), np.zeros((0, 2, 2))
+    anew(gps.arrays, none, (np.zeros(2), False), x, u, memory, (*out, none))
+    assert '"prefer-vector-width"="512"' in anew.inspect_llvm(anew.signatures[0])
 
 
 def test_the_exponentials_keep_the_limits():
     x = np.array([0.0, -0.0, -1e9, -np.inf, 709.78, 710.0, 1e9, np.inf, np.nan, -745.2, -744.5])
-    y = x.copy()
-    exp_all(y)
+    y = exp(x)
     with np.errstate(over="ignore"):
         assert np.array_equal(y, np.exp(x), equal_nan=True) or np.allclose(y, np.exp(x), rtol=2e-16, equal_nan=True)
-    assert block_expm1([0.0, -1e9, -np.inf, 1e-320]).tolist() == [0.0, -1.0, -1.0, 1e-320]
-    large = block_expm1([1e9, np.inf, 300.0])
+    assert expm1([0.0, -1e9, -np.inf, 1e-320]).tolist() == [0.0, -1.0, -1.0, 1e-320]
+    large = expm1([1e9, np.inf, 300.0])
     assert large[0] == large[1] == large[2] == pytest.approx(np.exp(300.0), rel=2e-14)
-    assert np.isnan(block_expm1([np.nan, 1.0])).tolist() == [True, False]
+    assert np.isnan(expm1([np.nan, 1.0])).tolist() == [True, False]
 
 
 def test_what_does_not_fit_is_refused():
     gp = model()
     gps = packed(gp)
     with pytest.raises(ShapeError, match="the model has 2 states and 1 inputs; got 3 and 1"):
-        kernels.mean_with_jacobian(gps, np.zeros(3), np.zeros(1))
+        kernels.point_with_jacobian(gps, np.zeros(3), np.zeros(1))
     with pytest.raises(ShapeError, match="got 2 and 2"):
         kernels.moments(gps, np.zeros(2), np.eye(2), np.zeros(2))
     with pytest.raises(ShapeError, match=r"S must have shape \(2, 2\); got \(3, 3\)"):
@@ -407,17 +419,5 @@ def test_what_does_not_fit_is_refused():
         packed(replace(gp, lengthscales=-gp.lengthscales))
 
 
-def test_the_compiled_moments_load_no_torch_of_their_own():
-    names = [
-        "belief_algebra",
-        "block",
-        "explained",
-        "exponential",
-        "moments",
-        "point",
-        "packed",
-        "pair_sums",
-        "point_rows",
-    ]
-    folder = Path(kernels.__file__).parent
-    assert not [name for name in names if "torch" in (folder / f"{name}.py").read_text()]
+def test_the_kernels_load_no_torch_of_their_own():
+    assert not [path for path in Path(kernels.__file__).parent.glob("*.py") if "import torch" in path.read_text()]

@@ -2,15 +2,16 @@
 
 import logging
 
+import casadi
 import numpy as np
 import pytest
 import torch
 
 from gpmpc.dynamics import Linearized, linearize, linearize_by_autograd
-from gpmpc.exceptions import ShapeError
+from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.models import Affine, ResidualModel
+from gpmpc.models import Affine, CasadiNominal, ResidualModel
 
 N, M = 3, 2
 
@@ -108,3 +109,19 @@ def test_the_models_own_method_is_used():
 def test_points_that_do_not_fit_are_an_error():
     with pytest.raises(ShapeError, match=r"states \(K, 3\) and inputs \(K, 2\); got \(2, 3\) and \(1, 2\)"):
         posterior().linearize(np.zeros((2, N)), np.zeros((1, M)))
+
+
+def test_a_nominal_model_in_casadi_is_the_one_in_torch():
+    x, u = casadi.SX.sym("x", N), casadi.SX.sym("u", M)
+    after = x + 0.1 * casadi.vertcat(casadi.sin(x[1]), x[2] * u[0], u[1] - x[0])
+    theirs, ours = residual(CasadiNominal(casadi.Function("f", [x, u], [after]))), residual(pendulum)
+    points, inputs = draw(8, 5, N), draw(9, 5, M)
+    for _ in range(2):
+        for got, expected in zip(theirs.linearize(points.numpy(), inputs.numpy()), ours.linearize(
+            points.numpy(), inputs.numpy()), strict=True):  # fmt: skip
+            assert got.flags.c_contiguous
+            np.testing.assert_allclose(got, expected, atol=1e-12)
+    predicted = theirs.predict(points.reshape(5, 1, N), inputs.reshape(5, 1, M))
+    assert torch.allclose(predicted.mean, ours.predict(points, inputs).mean[:, None], atol=1e-13)
+    with pytest.raises(UnsupportedModel, match=r"a nominal CasADi function maps \(state, input\) to the next state"):
+        CasadiNominal(casadi.Function("f", [x], [x]))

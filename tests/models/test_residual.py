@@ -152,7 +152,7 @@ def test_a_trainer_of_differences_is_no_trainer_of_residuals():
     [
         ({"states": [2.0, 0]}, SettingError, r"states: must be different indices from 0 to 2; got \[2.0, 0\]"),
         ({"inputs": [True]}, SettingError, r"inputs: must be different indices from 0 to 1; got \[True\]"),
-        ({"states": [2]}, ShapeError, "sees 2 states and 1 inputs; got 1 and 1 selected"),
+        ({"states": [2]}, ShapeError, "has 2 states and 1 inputs; got 1 and 1 selected"),
         ({"states": [2, 3]}, SettingError, r"states: must be different indices from 0 to 2; got \[2, 3\]"),
         ({"inputs": [2]}, SettingError, r"inputs: must be different indices from 0 to 1; got \[2\]"),
         ({"states": [1, 1]}, SettingError, r"different indices from 0 to 2; got \[1, 1\]"),

@@ -123,15 +123,15 @@ def test_transforms_and_forward_mode_fall_back_to_torch_unasked():
     assert torch.allclose(mapped, gp.predict_with_jacobian(states, control.expand(3, 2))[1], atol=1e-12)
     with torch.autograd.forward_ad.dual_level():
         dual = torch.autograd.forward_ad.make_dual(states[0], torch.ones(3))
-        mean, _, _ = gp.mean_with_jacobian(dual, control)
+        mean = gp.predict_with_jacobian(dual, control)[0].mean
         tangent = torch.autograd.forward_ad.unpack_dual(mean).tangent
     assert torch.allclose(tangent, mapped[0].sum(-1), atol=1e-12)
 
 
 def test_a_float32_model_is_answered_by_torch_in_float32():
     gp = MODELS["next state"].to(dtype=torch.float32)
-    mean, A, _ = gp.mean_with_jacobian(torch.zeros(3, dtype=torch.float32), torch.zeros(2, dtype=torch.float32))
-    assert mean.dtype == A.dtype == torch.float32
+    belief, A, _ = gp.predict_with_jacobian(torch.zeros(3, dtype=torch.float32), torch.zeros(2, dtype=torch.float32))
+    assert belief.mean.dtype == A.dtype == torch.float32
 
 
 def value_model(n, m, k):

@@ -1,15 +1,13 @@
-"""Problem: from the derivatives of the next belief to those of its extended state s = [mu; vec S], S = Sigma^(1/2).
+"""The local model s+ = A s + B u + c of the extended state s = [mu; vec S], S = Sigma^(1/2), for H beliefs.
 
-``gpmpc.propagation.local_model`` states the mathematics and serves torch; here are the same loops compiled, for H
-beliefs. dSigma = E S + S E for a change E of the root turns derivatives D by Sigma into 2 D S; the next root's
-derivative X solves X S+ + S+ X = dSigma+, entry by entry in the eigenbasis of S+.
+Mathematics: ``gpmpc.propagation.local_model``. With dSigma = E S + S E for a change E of the root, derivatives
+D by Sigma become 2 D S; the next root's derivative X solves X S+ + S+ X = dSigma+, entry by entry in the basis of S+.
 """
-
-import math
 
 import numpy as np
 
-from gpmpc.compiled import compiled, copy, njit_inner, njit_noalloc
+from gpmpc.compiled import compiled, njit_noalloc
+from gpmpc.kernels.linalg import copy, square_root
 
 
 @compiled
@@ -31,10 +29,10 @@ def extended_models(means, covariances, inputs, next_means, next_covariances, de
     H, n = means.shape
     m, p = inputs.shape[1], n + n * n
     now, after, S, S_next = np.empty(p), np.empty(p), np.empty((n, n)), np.empty((n, n))
-    change, turned = np.empty((n * n, p + m)), np.empty((n * n, p + m))
+    change, rotated = np.empty((n * n, p + m)), np.empty((n * n, p + m))
     for h in range(H):
-        root(covariances[h], S)
-        r, U = root(next_covariances[h], S_next)
+        square_root(covariances[h], S)
+        r, U = square_root(next_covariances[h], S_next)
         copy(means[h], now[:n])
         copy(next_means[h], after[:n])
         copy(S.reshape(n * n), now[n:])
@@ -42,21 +40,21 @@ def extended_models(means, covariances, inputs, next_means, next_covariances, de
         for i in range(n):
             copy(mean_by_mean[h, i], A[h, i, :n])
             copy(mean_by_input[h, i], B[h, i])
-            by_root(mean_by_covariance[h, i], S, A[h, i, n:])
+            _write_derivative_by_root(mean_by_covariance[h, i], S, A[h, i, n:])
             for j in range(n):
                 row = change[i * n + j]
                 copy(by_mean[h, i, j], row[:n])
                 copy(by_input[h, i, j], row[p:])
-                by_root(by_covariance[h, i, j], S, row[n:p])
-        turn(U.T.copy(), change, turned)
-        turn(U.T.copy(), turned, change)
+                _write_derivative_by_root(by_covariance[h, i, j], S, row[n:p])
+        _rotate(U.T.copy(), change, rotated)
+        _rotate(U.T.copy(), rotated, change)
         for i in range(n):
             for j in range(n):
                 total = r[i] + r[j]
                 for column in range(p + m):
                     change[i * n + j, column] *= 1.0 / total if total > 0.0 else 0.0
-        turn(U, change, turned)
-        turn(U, turned, change)
+        _rotate(U, change, rotated)
+        _rotate(U, rotated, change)
         for i in range(n * n):
             copy(change[i, :p], A[h, n + i])
             copy(change[i, p:], B[h, n + i])
@@ -69,30 +67,14 @@ def extended_models(means, covariances, inputs, next_means, next_covariances, de
 
 
 @compiled
-def roots(covariances, out):
+def square_roots(covariances, out):
     """Writes the symmetric roots of covariances (H, n, n)."""
     for h in range(len(covariances)):
-        root(covariances[h], out[h])
-
-
-@njit_inner
-def root(covariance, out):
-    """Writes the symmetric root; returns its eigenvalues and eigenvectors."""
-    r, U = np.linalg.eigh(covariance)
-    n = len(r)
-    for i in range(n):
-        r[i] = math.sqrt(max(r[i], 0.0))
-    for i in range(n):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(n):
-                total += U[i, k] * r[k] * U[j, k]
-            out[i, j] = out[j, i] = total
-    return r, U.copy()
+        square_root(covariances[h], out[h])
 
 
 @njit_noalloc
-def by_root(D, S, row):
+def _write_derivative_by_root(D, S, row):
     """Writes 2 D S, row by row."""
     n = len(S)
     for i in range(n):
@@ -104,8 +86,8 @@ def by_root(D, S, row):
 
 
 @njit_noalloc
-def turn(U, matrices, out):
-    """Writes (U X)' of each column's matrix X; twice in a row U X U'."""
+def _rotate(U, matrices, out):
+    """Writes (U X)' for each column's matrix X; applied twice this gives U X U'."""
     n = len(U)
     for i in range(n):
         for j in range(n):

@@ -1,0 +1,105 @@
+"""A viewer that connects to the live view receives the steps as they are recorded."""
+
+import base64
+import json
+import os
+import select
+import socket
+import struct
+
+import numpy as np
+import pytest
+
+from gpmpc.recording import _messages, read_run
+from tests.recording import runs
+
+
+class Viewer:
+    """A WebSocket client that knows as much of the protocols (RFC 6455, foxglove.sdk.v1) as these tests need."""
+
+    def __init__(self, address):
+        host, port = address.removeprefix("ws://").split(":")
+        self.stream = socket.create_connection((host, int(port)), timeout=20)
+        key = base64.b64encode(os.urandom(16)).decode()
+        lines = [f"GET / HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade"]
+        lines += [f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: foxglove.sdk.v1"]
+        self.stream.sendall("\r\n".join([*lines, "\r\n"]).encode())
+        answer = b""
+        while not answer.endswith(b"\r\n\r\n"):
+            answer += self.stream.recv(1)
+        assert answer.startswith(b"HTTP/1.1 101")
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.stream.close()
+
+    def _read(self, count):
+        data = b""
+        while len(data) < count:
+            data += self.stream.recv(count - len(data))
+        return data
+
+    def receive(self):
+        """The next message: data from JSON, or bytes."""
+        kind, length = self._read(2)
+        if length > 125:
+            length = struct.unpack(*((">H", self._read(2)) if length == 126 else (">Q", self._read(8))))[0]
+        content = self._read(length)
+        return json.loads(content) if kind & 15 == 1 else content
+
+    def send(self, data):
+        content = json.dumps(data).encode()
+        head = struct.pack(">BBH", 0x81, 0x80 | 126, len(content)) + bytes(4)  # a mask of zeros
+        self.stream.sendall(head + content)
+
+    def subscribe(self, *topics):
+        """Numbers of the subscriptions' topics."""
+        channels = {}
+        while not set(topics) <= set(channels):
+            if isinstance(message := self.receive(), dict) and message["op"] == "advertise":
+                channels |= {channel["topic"]: channel for channel in message["channels"]}
+        wanted = [{"id": channels[topic]["id"], "channelId": channels[topic]["id"]} for topic in topics]
+        self.send({"op": "subscribe", "subscriptions": wanted})
+        return {channels[topic]["id"]: topic for topic in topics}
+
+
+@pytest.fixture
+def recorder(tmp_path):
+    recorder = runs.recorder(tmp_path / "run.mcap", live=True)
+    yield recorder
+    recorder.close()
+
+
+def test_a_viewer_receives_every_step_at_once_and_the_file_holds_it_as_well(recorder):
+    classes = _messages.message_classes(_messages.descriptor(runs.STATES, runs.INPUTS))
+    steps, seen, rng = [], {"/step": [], "/plan/tube": []}, np.random.default_rng(0)
+    with Viewer(recorder.address) as viewer:
+        topics = viewer.subscribe(*seen)
+        while len(seen["/step"]) < 10 and len(steps) < 200:
+            steps.append(runs.make_step(len(steps), rng))
+            recorder.record(steps[-1])
+            while select.select([viewer.stream], [], [], 0.1)[0]:  # at first the subscription is on its way
+                message = viewer.receive()
+                if isinstance(message, bytes) and message[0] == 1:
+                    seen[topics[struct.unpack_from("<I", message, 1)[0]]].append(message[13:])
+    received = [classes["Step"].FromString(message) for message in seen["/step"]]
+    assert [step.k for step in received] == list(range(len(steps) - 10, len(steps)))
+    assert [step.state.vx for step in received] == [step.state[1] for step in steps[-10:]]
+    assert len(seen["/plan/tube"]) == 10
+    recorder.close()
+    assert read_run(recorder.path).steps.tolist() == list(range(len(steps)))
+
+
+def test_a_second_live_view_takes_another_port(recorder, tmp_path):
+    with runs.recorder(tmp_path / "other.mcap", live=True) as other:
+        assert other.address.startswith("ws://127.0.0.1:")
+        assert other.address != recorder.address
+        with Viewer(other.address) as viewer:
+            viewer.subscribe("/step")
+
+
+def test_a_recorder_without_live_view_has_no_address(tmp_path):
+    with runs.recorder(tmp_path / "run.mcap") as recorder:
+        assert recorder.address is None
