@@ -17,12 +17,13 @@ the covariances of ``full``, damped BFGS updates put it into the program (Noceda
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import torch
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import compiled, unchecked_entry_point
 from gpmpc.exceptions import DataError, ProblemError
 from gpmpc.kernels.linalg import dot
 from gpmpc.mpc.condense import CondensedProgram
@@ -74,11 +75,11 @@ class Globalization:
     def __init__(self, model: PredictionModel, cost: TrackingCost, request: Request, tolerance: float):
         self._model, self._cost_terms, self._request, self._tolerance = model, cost, request, tolerance
         self._references = request.references
-        self._zero = References(*map(np.zeros_like, self._references))
+        self._zero = References(*(np.zeros(part.shape) for part in self._references))
         problem = model.problem
         sizes = np.maximum(1.0, np.abs(self._references.previous_input))
         sizes = np.minimum(sizes, problem.input_upper - problem.input_lower)
-        self._smallest = float((np.diag(problem.R) * (_SMALL * sizes) ** 2).min()) + np.finfo(float).tiny
+        self._smallest = float((problem.R.diagonal() * sizes * sizes).min()) * _SMALL**2 + 1e-300
         self._defect_prices, self._row_price = np.zeros(len(cost.state) * problem.state_dim), 0.0
         self._size, self._rate, self._creeps = math.inf, 1.0, False
         self._updates: deque[tuple[Array, Array]] = deque(maxlen=_MEMORY)  # steps and changes of the gradient
@@ -121,8 +122,8 @@ class Globalization:
         z = z[len(z) - at.rows.lower.size :].reshape(at.rows.lower.shape)
         self._row_price = max(self._row_price, 2.0 * float(np.abs(z).max())) if z.size else self._row_price
         terms, followed = self._cost_terms, (self._references, self._zero)
-        found = _assess(
-            terms, followed, prices, self._row_price, at.stages.A, at.stages.next, at.rows, plan, proposed, z
+        found = _call(
+            _assess, terms, followed, prices, self._row_price, at.stages.A, at.stages.next, at.rows, plan, proposed, z
         )
         cost, curvature, promised, largest, defects, costates = found
         size = max(math.sqrt(curvature / (cost + self._smallest)), largest)
@@ -140,7 +141,7 @@ class Globalization:
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
             for trial in self._candidates(at, _between(plan, proposed, length), program.feedback):
                 rows, weights = at.rows._replace(E=trial.rows.E), (prices, self._row_price, self._defect_prices)
-                if _merit(terms, self._references, weights, trial.stages.next, rows, trial.plan) <= bound:
+                if _call(_merit, terms, self._references, weights, trial.stages.next, rows, trial.plan) <= bound:
                     return trial, None
             length /= 2.0
         if size**2 <= _ROUND_OFF:  # size^2 of the cost is what could still be gained
@@ -203,6 +204,21 @@ def _merit(cost, references, weights, after, rows, plan):
         for i in range(after.shape[1]):
             merit += defect_prices[i] * abs(after[k, i] - plan.states[k + 1, i])
     return merit
+
+
+def _call(kernel: Callable, *arguments: Any) -> Any:
+    """Calls a kernel without numba's look at the types, which takes longer than the kernel where they are named tuples.
+
+    They are always those of the first call: tuples of contiguous float64 arrays.
+    """
+    entry = _entry_points.get(kernel)
+    if entry is None:
+        kernel(*arguments)
+        entry = _entry_points[kernel] = unchecked_entry_point(kernel)
+    return entry(*arguments)
+
+
+_entry_points: dict[Callable, Callable] = {}
 
 
 @compiled
