@@ -28,9 +28,9 @@ from gpmpc.exceptions import DataError, ProblemError
 from gpmpc.kernels.linalg import dot
 from gpmpc.mpc.condense import CondensedProgram
 from gpmpc.mpc.constraints import price_violations
+from gpmpc.mpc.controller import Request
 from gpmpc.mpc.linear_quadratic import References, TrackingCost, tracking_cost
 from gpmpc.mpc.prediction import Prediction, PredictionModel
-from gpmpc.mpc.request import Request
 from gpmpc.mpc.stages import Plan
 from gpmpc.qp import QPSolution
 from gpmpc.status import Status
@@ -38,7 +38,6 @@ from gpmpc.status import Status
 Array = np.ndarray
 
 FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, torch.linalg.LinAlgError)  # no finite numbers
-FEASIBLE = 1e-3  # hard bounds may be missed by so much, in their units, by a plan that a next step would mend
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 _SHORTEST_STEP = 2.0**-10
 _ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
@@ -75,10 +74,11 @@ class Globalization:
 
     def __init__(self, model: PredictionModel, cost: TrackingCost, request: Request, tolerance: float):
         self._model, self._cost_terms, self._request, self._tolerance = model, cost, request, tolerance
-        self._references = References(request.targets, request.wanted, request.last)
+        self._references = request.references
         self._zero = References(*(np.zeros(part.shape) for part in self._references))
         problem = model.problem
-        sizes = np.minimum(np.maximum(1.0, np.abs(request.last)), problem.input_upper - problem.input_lower)
+        sizes = np.maximum(1.0, np.abs(self._references.previous_input))
+        sizes = np.minimum(sizes, problem.input_upper - problem.input_lower)
         self._smallest = float((problem.R.diagonal() * sizes * sizes).min()) * _SMALL**2 + 1e-300
         self._defect_prices, self._row_price = np.zeros(len(cost.state) * problem.state_dim), 0.0
         self._size, self._rate, self._creeps = math.inf, 1.0, False

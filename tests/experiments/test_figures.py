@@ -211,7 +211,7 @@ def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
     """From the last input held, a nearly flat direction of this GP takes it hundreds of iterations."""
     from gpmpc.gaussian import Gaussian
     from gpmpc.gp import Transitions
-    from gpmpc.mpc.tracking import TrackingProblem
+    from gpmpc.mpc.problem import TrackingProblem
 
     rng = np.random.default_rng(0)
     states, inputs = rng.normal(size=(40, 2)), rng.normal(size=(40, 1))
