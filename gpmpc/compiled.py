@@ -106,7 +106,7 @@ else:
             def set_env(self, name, environment):
                 """Does nothing: there is no machine code."""
 
-        codegen = _NoEngine()
+        codegen = _NoEngine()  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
 
         def _optimize_final_module(self):
             pass
@@ -143,7 +143,7 @@ else:
 
 def _jit_cached(function: Callable, options: dict) -> Callable:
     try:
-        kernel = numba.njit(cache=True, **options)(function)
+        kernel: Any = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # "cannot cache function ...: no locator available"
         return numba.njit(**options)(function)
     try:
@@ -192,7 +192,7 @@ def _read_source(path: str | None) -> tuple[bytes, list[str]]:
     return hashlib.sha256(source).digest(), imported
 
 
-def compile_for(kernel: Callable, signature: str) -> None:
+def compile_for(kernel: Any, signature: str) -> None:
     """Compiles ``kernel`` for one signature and no other: it then refuses other types with ``TypeError``.
 
     Without this numba would quietly build a second kernel for Fortran-ordered or integer arrays.
@@ -203,7 +203,7 @@ def compile_for(kernel: Callable, signature: str) -> None:
             kernel.disable_compile()
 
 
-def unchecked_entry_point(kernel: Callable) -> Callable:
+def unchecked_entry_point(kernel: Any) -> Callable:
     """The machine code of a kernel that ``compile_for`` has compiled, called without numba's look at the arguments.
 
     That look takes a quarter of a microsecond. The caller has to see to it that each argument is a NumPy array of the
