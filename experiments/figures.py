@@ -219,7 +219,7 @@ class Figures:
     seed: int = 0
     workers: int | None = None
 
-    name, trial_name = "figures", "flights"
+    name, trial_name, lost_is_result = "figures", "flights", True
 
     def __post_init__(self) -> None:
         for key, least in (("steps", 1), ("samples", 2), ("seed", 0)):

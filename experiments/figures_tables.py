@@ -34,6 +34,7 @@ KEYS = ["name", "loop", "controller", "trajectory", "subsystem", "horizon", "siz
 HEADER = ["", "trajectory", "H", "RMSE x, y, z", "total", "trials", "outside", "failed"]
 HEADER += ["ms: median", "95 %", "largest"]
 BOUNDS_HEADER = ["", "trajectory", "H", "allowed %", "broken %", "of steps", "at a bound %", "of steps", "paid"]
+KINDS = {"slsqp": "nonlinear"}  # of the paper's two controllers
 TIMES_HEADER = ["", "trajectory", "our s", "paper's s", "paper's / ours"]
 
 
@@ -137,13 +138,17 @@ def timing(rows: pd.DataFrame) -> list[list[str]]:
     timed = rows[(rows.loop == "model") & (rows.horizon == 1) & (rows.subsystem == "translational") & (rows.trials > 0)]
     timed, lines = list(timed.itertuples()), []
     for row in timed:
-        if paper := paper_seconds().get((row.controller, row.trajectory)):
+        if paper := paper_seconds().get((KINDS.get(row.controller, row.controller), row.trajectory)):
             lines.append([row.name, row.trajectory, f"{row.seconds:.3f}", f"{paper:g}", f"{paper / row.seconds:.0f}"])
     for trajectory in dict.fromkeys(row.trajectory for row in timed):
         here = [row for row in timed if row.trajectory == trajectory]
         convex = next((row for row in here if row.controller == "convex"), None)
         for row in here:
-            if row.controller == "nonlinear" and convex and ("nonlinear", trajectory) in paper_seconds():
+            if (
+                KINDS.get(row.controller, row.controller) == "nonlinear"
+                and convex
+                and ("nonlinear", trajectory) in paper_seconds()
+            ):
                 paper = paper_seconds()["nonlinear", trajectory] / paper_seconds()["convex", trajectory]
                 ratio = f"{row.seconds / convex.seconds:.2f}"
                 lines.append([f"ratio: {row.name} / {convex.name}", trajectory, ratio, f"{paper:.2f}", ""])

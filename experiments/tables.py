@@ -84,7 +84,7 @@ class Tables:
     state_std: float = 0.1
     workers: int | None = None
 
-    name, trial_name = "tables", "draws"
+    name, trial_name, lost_is_result = "tables", "draws", False
 
     def __post_init__(self) -> None:
         sizes = (self.sizes,) if isinstance(self.sizes, int) else self.sizes

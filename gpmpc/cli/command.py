@@ -25,7 +25,7 @@ from gpmpc.cli.configuration import complete, config_folder, find_modules_here, 
 from gpmpc.cli.log import log
 from gpmpc.cli.reports import plot, report
 from gpmpc.cli.run import one_line, own_error, run
-from gpmpc.cli.study import figures, tables
+from gpmpc.cli.study import figures, quality, tables
 from gpmpc.cli.terminal import print_error
 from gpmpc.exceptions import GpmpcError
 
@@ -58,6 +58,7 @@ commands:
   report    A tree of runs as one table, with figures; whether two groups of runs differ
   plot      A recorded flight as figures and an animation
   figures   Figures 2 to 4 and section 5.2: the flights, in the paper's reading and with the plant in the loop
+  quality   Closed-loop cost over the time of a decision, for every controller and propagation
   log       What is in a recording (info), rescue an unfinished one (recover), a table of its steps (export),
             a layout to look at it in Foxglove (layout)
 
@@ -191,5 +192,6 @@ COMMANDS: dict[str, tuple[Callable[[DictConfig], None], str]] = {
     "run": (run, "run"),
     "tables": (tables, "tables"),
     "figures": (figures, "figures"),
+    "quality": (quality, "quality"),
 }
 PLAIN: dict[str, Callable[[list[str]], None]] = {"log": log, "plot": plot, "report": report}

@@ -151,7 +151,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
     from gpmpc.simulation import Noise
     from gpmpc.studies.flight import Experiment
 
-    config = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    config = DictConfig(plain_data(config))
     folder_of(config.folder)
     check_number("horizon", config.horizon, least=1, whole=True)
     if not OmegaConf.is_list(config.disturbances):
@@ -192,9 +192,19 @@ def experiment_of(config: DictConfig) -> "Experiment":
 
 def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, Any]:
     """Returns all that a result depends on, as plain data: the settings, and the chosen option by group."""
-    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    settings = plain_data(config)
     options = {group: chosen.get(group) for group in GROUPS}
     return {key: value for key, value in settings.items() if key not in ASIDE} | {"options": options}
+
+
+def plain_data(config: DictConfig) -> dict[str, Any]:
+    """Returns settings with everything resolved.
+
+    Raises:
+        OmegaConfBaseException: A setting without a default is missing.
+    """
+    found: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    return found
 
 
 def choices(overrides: Sequence[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""``gpmpc tables`` and ``gpmpc figures``: run a published result's trials and write its documents."""
+"""``gpmpc tables``, ``gpmpc figures`` and ``gpmpc quality``: run a result's trials and write its documents."""
 
 import sys
 from dataclasses import replace
@@ -7,6 +7,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from gpmpc.cli.arguments import folder_of, writing
+from gpmpc.cli.run import experiment_of, plain_data, plain_settings
 from gpmpc.cli.terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
 
@@ -15,11 +16,11 @@ SHOWN_ERRORS = 10
 
 def tables(config: DictConfig) -> None:
     """Computes Tables 1 and 2; the task behind ``conf/tables.yaml``."""
-    from gpmpc.experiments.tables import Tables
+    from gpmpc.experiments.tables import Tables  # pyright: ignore[reportMissingImports] stands in experiments/
 
     parts = _parts(config, "data", "trajectory", "subsystem", "model")
     numbers = {key: config[key] for key in ("draws", "seed", "state_std", "workers")}
-    settings = _plain(config)
+    settings = plain_data(config)
     _run(
         Tables(
             data=parts["data"],
@@ -36,11 +37,11 @@ def tables(config: DictConfig) -> None:
 
 def figures(config: DictConfig) -> None:
     """Flies the paper's figures; the task behind ``conf/figures.yaml``."""
-    from gpmpc.experiments.figures import LOOPS, Figures, Row
+    from gpmpc.experiments.figures import LOOPS, Figures, Row  # pyright: ignore[reportMissingImports]
 
     sources = ("data", "excited", "undithered")
     parts = _parts(config, *sources, "trajectory", "subsystem", "model", "flying", "plant")
-    settings, rows = _plain(config), {}
+    settings, rows = plain_data(config), {}
     loops = settings["loop"] if isinstance(settings["loop"], list) else [settings["loop"]]
     for loop in loops:
         if loop not in LOOPS:
@@ -69,6 +70,22 @@ def figures(config: DictConfig) -> None:
     )
 
 
+def quality(config: DictConfig) -> None:
+    """Measures cost over time; the task behind ``conf/quality.yaml``."""
+    from hydra import compose
+
+    from gpmpc.experiments.quality import FAMILIES, TRUTH, Quality  # pyright: ignore[reportMissingImports]
+
+    parts, settings, experiments, flown = _parts(config, "trajectory"), plain_data(config), {}, {}
+    for family in FAMILIES:
+        if family is TRUTH or settings["only"] is None or str(settings["only"]) in family.words:
+            composed = compose("run", [*family.words.split(), f"noise.process={[settings['noise']] * 6}"])
+            experiments[family] = experiment_of(composed)
+            flown[family.words] = plain_settings(composed, {})
+    numbers = {key: settings[key] for key in ("horizons", "steps", "seeds", "workers")}
+    _run(Quality(experiments, parts["trajectory"], flown, **numbers), config)
+
+
 def _run(study: Any, config: DictConfig) -> None:
     """Runs what is missing of a study, writes its documents, prints its tables; exits with 1 where a trial failed."""
     from gpmpc.files import write_whole
@@ -76,7 +93,7 @@ def _run(study: Any, config: DictConfig) -> None:
     from gpmpc.studies.document import json_text, terminal
     from gpmpc.studies.study import TrialStore, run_study
 
-    settings, console = _plain(config), logging_console()
+    settings, console = plain_data(config), logging_console()
     folder = folder_of(settings["folder"])
     with progress_bar(console) as progress:
         task = progress.add_task("preparing data and models", total=None)
@@ -99,15 +116,17 @@ def _run(study: Any, config: DictConfig) -> None:
     console.print(terminal(shown, *notes))
     console.print(f"\nwritten to {folder}: {', '.join(sorted(written))}", soft_wrap=True)
     failed = [record for record in records if "error" in record]
+    kind = "lost" if study.lost_is_result else "failed"
     for record in failed[:SHOWN_ERRORS]:
         which = ", ".join(f"{key} {value}" for key, value in trials[records.index(record)].labels.items())
-        console.print(f"failed: {which}: {record['error']}", soft_wrap=True, highlight=False, markup=False)
-    if failed:
+        console.print(
+            f"{kind}: {which}: {record['error']}",
+            soft_wrap=True,
+            highlight=False,
+            markup=False,
+        )
+    if failed and (len(failed) == len(records) or not study.lost_is_result):
         sys.exit(1)
-
-
-def _plain(config: DictConfig) -> dict[str, Any]:
-    return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
 
 
 def _parts(config: DictConfig, *groups: str) -> dict[str, Any]:

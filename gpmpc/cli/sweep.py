@@ -163,7 +163,8 @@ def _composer(given: Namespace, overrides: Sequence[str]) -> Composer:
         searched = [f"hydra.searchpath=['file://{Path(given.config_dir).absolute()}']"]
     config = hydra.compose(given.config_name or "run", [*overrides, *searched], return_hydra_config=True)
     config.hydra.mode = RunMode.MULTIRUN
-    return Composer(HydraContext(GlobalHydra.instance().config_loader(), NoCallbacks()), config)
+    nothing: Any = NoCallbacks()
+    return Composer(HydraContext(GlobalHydra.instance().config_loader(), nothing), config)
 
 
 def _jobs(combinations: Sequence[list[str]], tree: Path) -> list[Job]:

@@ -24,7 +24,7 @@ def quality(rows: Sequence[Mapping]) -> Figure:
     named by what is typed after ``gpmpc run``.
 
     Args:
-        rows: Of ``benchmarks.quality``; lost ones are counted in the corner.
+        rows: Of the quality study; lost ones are counted in the corner.
     """
     flown = [row for row in rows if row["lost"] is None]
     families, horizons = list(dict.fromkeys(row["family"] for row in rows)), sorted({row["H"] for row in rows})

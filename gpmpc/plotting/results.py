@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -24,8 +24,8 @@ class Panel:
     """
 
     title: str
-    draws: Mapping[int, Sequence[float]]
-    paper: Mapping[int, float]
+    draws: dict[int, list[float]]
+    paper: dict[int, float]
 
 
 def error_over_size(panels: Sequence[Panel], label: str) -> Figure:
@@ -149,7 +149,7 @@ def tracking(groups: Sequence[tuple[Sequence[str], Sequence[Curve]]]) -> Figure:
     columns = max(len(labels) for labels, _ in groups)
     figure = Figure(figsize=(4.0 * columns, 2.7 * len(groups) + 0.7), layout="constrained")
     axes = figure.subplots(len(groups), columns, squeeze=False, sharex=True)
-    handles: dict[str, object] = {}
+    handles: dict[str, Any] = {}
     for row, (labels, curves) in zip(axes, groups, strict=True):
         for j, (axis, label) in enumerate(zip(row, labels, strict=False)):
             wanted = next((c.wanted for c in curves if c.wanted is not None), None)
@@ -191,7 +191,7 @@ def over_settings(
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(4.8 * columns, 3.3 * rows + 0.8), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    handles: dict[str, object] = {}
+    handles: dict[str, Any] = {}
     for axis, (title, curves) in zip(axes, panels.items(), strict=False):
         axis.set_title(title, fontsize="medium")
         for i, curve in enumerate(curves):

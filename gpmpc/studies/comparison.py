@@ -99,7 +99,8 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         pairs = [side.loc[both.index, both.columns].mean(axis=0).to_numpy() for side in (first, second)]
         if len(pairs[0]) >= 2:
             seeds = sorted((n for n in left_out if n.startswith(f"{SEED}=")), key=lambda name: in_order(name[5:]))
-            comparisons.append(_test(measure, *pairs, (*(n for n in left_out if n not in seeds), *seeds)))
+            names = (*(n for n in left_out if n not in seeds), *seeds)
+            comparisons.append(_test(measure, pairs[0], pairs[1], names))
     if not comparisons:
         raise DataError(f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common")
     return comparisons

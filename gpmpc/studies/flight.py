@@ -19,9 +19,9 @@ import numpy as np
 
 from gpmpc.datasets import DataSource, rotational_states_along
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
-from gpmpc.gp import Training, Transitions
+from gpmpc.gp import GPPosterior, Training, Transitions
 from gpmpc.metrics import NEAR, find_loss, time_quantiles, tracking_error, violation_rate
-from gpmpc.mpc.controller import Controller, Reference
+from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.supervision import OnFailure, check_policy
 from gpmpc.propagation import MomentMatching, Propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
@@ -66,7 +66,7 @@ class Experiment:
     trajectory: Trajectory
     plant: Plant
     train: Callable[..., Training]
-    controller: Callable[..., Controller]
+    controller: Callable[..., Any]
     subsystem: Literal["translational", "rotational"] = "translational"
     name: str = "elliptical"
     size: int | None = None
@@ -154,19 +154,21 @@ class Flown:
 
     Attributes:
         rollout: Every step, as arrays.
-        controller: What steered.
+        controller: The ``Controller`` that steered, with its ``problem``.
         training: What was learned; None where the controller knows the plant.
         diverged: Where and why the system left the finite numbers, and the rollout ends; None where it did not.
     """
 
     rollout: Rollout
-    controller: Controller
+    controller: Any
     training: Training | None
     diverged: Diverged | None = None
 
 
 def run_trial(
-    experiment: Experiment, prepare: Callable[[Controller, Training | None], Callable[[Step], None]] | None = None
+    experiment: Experiment,
+    prepare: Callable[[Any, Training | None], Callable[[Step], None]] | None = None,
+    model: GPPosterior | None = None,
 ) -> Flown:
     """Trains and flies.
 
@@ -174,6 +176,7 @@ def run_trial(
         experiment: All of it.
         prepare: Called before the first step with the controller and the training; what it returns is called with
             every step.
+        model: Trained before; None trains one where the controller needs it.
 
     Raises:
         SettingError: More rows are asked for than there are, or settings that do not fit each other.
@@ -183,14 +186,13 @@ def run_trial(
         Diverged: The system left the finite numbers in its first step.
     """
     plant, training = experiment.plant, None
-    if experiment.learns:
+    if experiment.learns and model is None:
         training = experiment.train(experiment.training_rows(), seed=experiment.seed)
-        controller = experiment.controller(training.posterior)
-    else:
-        controller = experiment.controller(plant)
+        model = training.posterior
+    controller = experiment.controller(model if experiment.learns else plant)
     system: Plant | ModelLoop = plant
-    if experiment.loop == "model":
-        system = ModelLoop(training.posterior, experiment.propagator or MomentMatching(), time_step=plant.time_step)
+    if experiment.loop == "model" and model is not None:
+        system = ModelLoop(model, experiment.propagator or MomentMatching(), time_step=plant.time_step)
     states = experiment.references(experiment.steps + controller.horizon + 1)
     resting = np.asarray(controller.initial_input)  # falls back on it where the very first solve fails
     reference = Reference(states, np.tile(resting, (len(states) - 1, 1)))

@@ -52,17 +52,21 @@ class Study(Protocol):
 
     name: str  # of its documents
     trial_name: str  # what its trials are called in JSON
+    lost_is_result: bool  # whether a trial that raises, such as a lost flight, is a result like any other
     run_trial: Callable[[Trial], dict[str, Any]]
     workers: int | None
 
     def trials(self, folder: Path) -> list[Trial]:
         """Returns every trial in the order of the tables; trained models are kept in ``folder``."""
+        ...
 
     def summary(self, records: Sequence[dict]) -> tuple[list[Table], list[str]]:
         """Returns the tables for a terminal and the paragraphs below them."""
+        ...
 
     def document(self, records: Sequence[dict]) -> Document:
         """Returns everything that is written."""
+        ...
 
 
 class TrialStore:
@@ -141,7 +145,7 @@ def _record(run_trial: Callable[[Trial], dict[str, Any]], trial: Trial) -> dict[
     try:
         with one_thread():
             return record | run_trial(trial)
-    except (GpmpcError, torch.linalg.LinAlgError) as error:
+    except (GpmpcError, torch.linalg.LinAlgError) as error:  # pyright: ignore[reportPrivateImportUsage]
         return record | {"error": str(error)}
 
 

@@ -1,0 +1,334 @@
+"""Closed-loop cost over the time of a decision, for every controller and propagation of the package: ``gpmpc quality``.
+
+Every case flies the same flights: the quadrotor's translational subsystem, the plant in the loop, the same seeds of its
+noise. Its name is what is typed after ``gpmpc run``. The cost is the stage cost that all of them minimise, summed along
+the true flight,
+
+    1/K  sum_{k=1..K} |x_k - r_k|^2_Q + sum_{k=0..K-1} |u_k - u_{k-1}|^2_R
+
+divided by that of NMPC on the true model with the longest horizon. Nothing bounds a state here, so what covariances buy
+does not show; what they take does. Cases take turns, flight by flight. A decision's time is the processor time of its
+thread; compiling and loading come before.
+"""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from gpmpc.exceptions import GpmpcError, SettingError, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.metrics import tracking_error
+from gpmpc.mpc.controller import Controller, Decision, Reference
+from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.plotting import png, quality
+from gpmpc.studies.document import MISSING, Document, Table, number
+from gpmpc.studies.flight import Experiment, run_trial
+from gpmpc.studies.study import Trial, check_workers, fingerprint, load_model, trained_model
+from gpmpc.trajectories import Trajectory
+
+ROOMS = ("gp", "models", "propagation", "kernels", "qp", "mpc", "simulation", "datasets", "systems")
+CODE = ("gaussian.py", *(f"{room}/*.py" for room in ROOMS), __file__)
+LOST = 5.0  # [m] from the reference, some hundred times what is usual: nothing to compare costs with
+SAME = 1e-3  # difference of two costs below which the seeds' noise hides it: it buys no time
+LEGEND = (
+    "cost: of the states and of the inputs' increments, over that of NMPC on the true model at the longest horizon, "
+    "geometric mean over the trajectories. ms: processor time of a decision. front: no other controller on a learned "
+    "model is as good, to 0.1 %, in less time, or better in the same."
+)
+
+
+class Family(NamedTuple):
+    """One choice of settings, at many horizons.
+
+    Attributes:
+        name: Kind of controller, for the reader.
+        words: What chooses it.
+        longest: The longest horizon that is worth the time.
+    """
+
+    name: str
+    words: str
+    longest: float = math.inf
+
+
+TRUTH = Family("NMPC, true model", "controller=nmpc")
+INCREMENTS, STATES = "increments (paper)", "state form, Clarabel"
+MEAN, ZERO_ORDER = "trajectory, mean only", "trajectory, zero order"
+SPREAD, CONVERGED = "trajectory, diagonal or full", "trajectory, converged"
+NONLINEAR = "nonlinear GP-MPC"
+CONVEX, FULL, DIAGONAL = "controller=convex", "controller.covariance=full", "controller.covariance=diagonal"
+NONE, EXACT, POINTS = "controller.covariance=none", "propagation=moment_matching", "propagation=unscented"
+MORE = "controller.iterations=100 controller.tolerance=1e-6"
+FIRST_ORDER = "propagation=linearization"
+FAMILIES = (
+    TRUTH,
+    Family("LQR", "controller=lqr"),
+    Family(INCREMENTS, "controller=paper"),
+    Family(INCREMENTS, f"controller=paper {DIAGONAL}"),
+    Family(INCREMENTS, f"controller=paper {NONE}"),
+    Family(MEAN, f"{CONVEX} {NONE}"),
+    Family(ZERO_ORDER, CONVEX),
+    Family(ZERO_ORDER, f"{CONVEX} propagation=mean_equivalence"),
+    Family(ZERO_ORDER, f"{CONVEX} {EXACT}"),
+    Family(ZERO_ORDER, f"{CONVEX} {POINTS}"),
+    Family(SPREAD, f"{CONVEX} {DIAGONAL}"),
+    Family(SPREAD, f"{CONVEX} {DIAGONAL} {EXACT}"),
+    Family(SPREAD, f"{CONVEX} {FULL}"),
+    Family(SPREAD, f"{CONVEX} {FULL} {EXACT}"),
+    Family(SPREAD, f"{CONVEX} {FULL} {POINTS}"),
+    Family(CONVERGED, f"{CONVEX} {NONE} {MORE}"),
+    Family(CONVERGED, f"{CONVEX} {MORE}"),
+    Family(STATES, "controller=state_form"),
+    Family(NONLINEAR, f"controller=nonlinear {FIRST_ORDER}"),
+    Family(NONLINEAR, "controller=nonlinear"),
+)
+
+
+class Condition(NamedTuple):
+    """What a trial needs: its flight, and the file of the trained GPs; None where none are needed."""
+
+    experiment: Experiment
+    model: Path | None
+
+
+@dataclass(frozen=True)
+class Quality:
+    """The flights of all cases.
+
+    Attributes:
+        experiments: By family: the flight that its words mean after ``gpmpc run``.
+        trajectories: By name.
+        settings: Of the flights and of the training, as plain data for the fingerprint.
+        horizons: H of every family, up to its longest.
+        steps: Of a flight.
+        seeds: Of the noise: flights on each trajectory.
+        workers: Processes; more than one disturb each other's times.
+
+    Raises:
+        SettingError: A number out of range, no trajectory, or no case.
+    """
+
+    experiments: Mapping[Family, Experiment]
+    trajectories: Mapping[str, Trajectory]
+    settings: Any
+    horizons: Sequence[int] = (1, 5, 10, 20)
+    steps: int = 50
+    seeds: int = 3
+    workers: int | None = 1
+
+    name, trial_name, lost_is_result = "quality", "flights", True
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.horizons, list | tuple) or not self.horizons:
+            raise SettingError("horizons", f"must be a list with something in it; got {self.horizons!r}")
+        for horizon in self.horizons:
+            check_number("horizons", horizon, least=1, whole=True)
+        check_number("steps", self.steps, least=1, whole=True)
+        check_number("seeds", self.seeds, least=1, whole=True)
+        check_workers(self.workers)
+        for key, chosen in (("trajectory", self.trajectories), ("families", self.experiments)):
+            if not chosen:
+                raise SettingError(key, "choose at least one")
+
+    @property
+    def cases(self) -> list[tuple[Family, int]]:
+        """Families and horizons, the reference of all costs first."""
+        horizons = sorted(set(self.horizons))
+        found = [(f, H) for f in self.experiments for H in horizons if f.longest >= H]
+        return list(dict.fromkeys([(TRUTH, horizons[-1]), *found]))
+
+    def trials(self, folder: Path) -> list[Trial]:
+        """Returns every flight; cases take turns. GPs are trained once a trajectory and kept in ``folder``."""
+        models = {}
+        for name, trajectory in self.trajectories.items():
+            learning = next((e for e in self.experiments.values() if e.learns), None)
+            if learning is not None:
+                learning = replace(learning, trajectory=trajectory, name=name, seed=0)
+                models[name] = trained_model(learning.train, self.settings, learning.training_rows(), 0, folder)
+        trials = []
+        for seed, (name, trajectory), (family, horizon) in product(
+            range(self.seeds), self.trajectories.items(), self.cases
+        ):
+            experiment = self.experiments[family]
+            make = experiment.controller
+            flown = replace(experiment, trajectory=trajectory, name=name, seed=seed, steps=self.steps)
+            flown = replace(flown, controller=At(make, horizon) if experiment.learns else AtPlant(make, horizon))
+            labels = {"family": family.name, "what": family.words, "H": horizon, "trajectory": name}
+            named = fingerprint([labels, self.settings, repr(trajectory), seed, self.steps], code=CODE)
+            condition = Condition(flown, models[name] if experiment.learns else None)
+            trials.append(Trial(labels, condition, seed, named))
+        return trials
+
+    @staticmethod
+    def run_trial(trial: Trial) -> dict:
+        """Flies one trial.
+
+        Raises:
+            GpmpcError: The vehicle has left its path.
+        """
+        experiment, model = trial.condition
+        flown = run_trial(experiment, model=None if model is None else load_model(model))
+        rollout, controller = flown.rollout, flown.controller
+        distance = np.linalg.norm((rollout.states - rollout.references)[:, ::2], axis=1)
+        if not distance.max() <= LOST:
+            raise GpmpcError(f"{LOST:g} m off its path after {int(np.argmax(~(distance <= LOST)))} steps")
+        before = controller.initial_input
+        return {
+            "cost": stage_cost(controller.problem, rollout.states, rollout.references, rollout.inputs, before),
+            "rmse": float(tracking_error(rollout.states, rollout.references).total),
+            "seconds": controller.seconds[-len(rollout.inputs) :],
+            "failed": len(rollout.failures),
+        }
+
+    def rows(self, records: Sequence[dict]) -> list[dict]:
+        """Returns the cost and the times of every case.
+
+        A row holds ``median`` and ``p99`` of a decision [ms]; ``cost``, the geometric mean over the trajectories of its
+        ratio to NMPC's on the same flights, and ``cost ...`` by trajectory; ``rmse ...`` [m]; how many solves
+        ``failed``; ``front``. A case that lost a flight has none of these numbers, and ``lost`` says how.
+        """
+        flown: dict[tuple, dict[str, list[dict]]] = {}
+        for record in records:
+            case = flown.setdefault((record["what"], record["H"]), {})
+            case.setdefault(record["trajectory"], []).append(record)
+        truth = flown[TRUTH.words, max(self.horizons)]
+        cases = [case for case in self.cases if case[0] in self.experiments and case[1] in self.horizons]
+        rows = [_row(family, H, flown[family.words, H], truth) for family, H in cases]
+        candidates = [row for row in rows if row["lost"] is None and row["family"] != TRUTH.name]
+        members = pareto_front([row["median"] for row in candidates], [row["cost"] for row in candidates], SAME)
+        for row, member in zip(candidates, members, strict=True):
+            row["front"] = member
+        return rows
+
+    def summary(self, records: Sequence[dict]) -> tuple[list[Table], list[str]]:
+        """Returns the table for a terminal."""
+        return [_table(self.rows(records))], [LEGEND]
+
+    def document(self, records: Sequence[dict]) -> Document:
+        """Returns the table and the figure."""
+        rows = self.rows(records)
+        lost = [f"{row['what']} horizon={row['H']}: {row['lost']}" for row in rows if row["lost"]]
+        return Document(
+            "Quality over time",
+            [_table(rows)],
+            pd.DataFrame(rows, dtype=object),
+            notes=[LEGEND],
+            lists={"Lost": lost} if lost else {},
+            images={"quality.png": png(quality(rows), dpi=130)},
+        )
+
+
+class Clocked:
+    """A controller whose decisions are timed, in seconds of its thread's processor time."""
+
+    def __init__(self, controller: Controller):
+        self._controller, self.seconds = controller, []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._controller, name)
+
+    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+        """Decides as the controller does."""
+        began = time.thread_time_ns()
+        decision = self._controller.control(belief, reference, previous)
+        self.seconds.append(1e-9 * (time.thread_time_ns() - began))
+        return decision
+
+
+class At(NamedTuple):
+    """A controller on a learned model at another horizon, timed."""
+
+    make: Any
+    horizon: int
+
+    def __call__(self, model: Any) -> Clocked:
+        """Makes the controller."""
+        return Clocked(self.make(model, horizon=self.horizon))
+
+
+class AtPlant(NamedTuple):
+    """A controller on the true model at another horizon, timed."""
+
+    make: Any
+    horizon: int
+
+    def __call__(self, plant: Any) -> Clocked:
+        """Makes the controller."""
+        return Clocked(self.make(plant, horizon=self.horizon))
+
+
+def stage_cost(
+    weights: TrackingProblem, states: np.ndarray, references: np.ndarray, inputs: np.ndarray, before: Sequence[float]
+) -> float:
+    """Returns the tracking cost on states and increments of a flight per step; see the module's text.
+
+    Args:
+        weights: Q and R.
+        states: x_0 .. x_K (K + 1, n); the initial one costs nothing.
+        references: r_0 .. r_K (K + 1, n).
+        inputs: u_0 .. u_{K-1} (K, m).
+        before: u_{-1} (m,).
+    """
+    errors, increments = states[1:] - references[1:], np.diff(inputs, axis=0, prepend=[before])
+    cost = np.einsum("ki,ij,kj", errors, weights.Q, errors) + np.einsum("ki,ij,kj", increments, weights.R, increments)
+    return float(cost / len(inputs))
+
+
+def pareto_front(times: Sequence[float], costs: Sequence[float], least: float = 0.0) -> list[bool]:
+    """Returns which cases are not dominated: none is at least as good in both and better in one.
+
+    Args:
+        times: Less is better.
+        costs: Less is better.
+        least: What takes more time has to cost less by more than this.
+    """
+    order = sorted(range(len(times)), key=lambda i: (times[i], costs[i]))
+    members, best, at = [False] * len(order), np.inf, np.nan
+    for i in order:
+        if costs[i] < best - least:
+            members[i], best, at = True, costs[i], times[i]
+        elif (times[i], costs[i]) == (at, best):  # not told apart
+            members[i] = True
+    return members
+
+
+def _row(family: Family, horizon: int, flown: Mapping[str, list[dict]], truth: Mapping[str, list[dict]]) -> dict:
+    """Returns the row of a case, from records by trajectory."""
+    records = [record for of in flown.values() for record in of]
+    lost = next((_why(record) for record in records if "error" in record), None)
+    if lost is None and (astray := next((r for of in truth.values() for r in of if "error" in r), None)):
+        lost = f"nothing to compare with: NMPC on the true model, {_why(astray)}"
+    row = {"family": family.name, "what": family.words, "H": horizon, "lost": lost, "front": False}
+    row["flights"] = sum("error" not in record for record in records)
+    if lost is not None:
+        return row
+    sums = [{name: sum(r["cost"] for r in group) for name, group in of.items()} for of in (flown, truth)]
+    costs = {name: cost / sums[1][name] for name, cost in sums[0].items()}
+    seconds = [second for record in records for second in record["seconds"]]
+    row |= {"median": 1e3 * float(np.median(seconds)), "p99": 1e3 * float(np.quantile(seconds, 0.99))}
+    row |= {"cost": float(np.exp(np.mean(np.log(list(costs.values())))))}
+    row |= {f"cost {name}": float(ratio) for name, ratio in costs.items()}
+    row |= {f"rmse {name}": float(np.sqrt(np.mean([r["rmse"] ** 2 for r in of]))) for name, of in flown.items()}
+    return row | {"failed": sum(record["failed"] for record in records), "samples": len(seconds)}
+
+
+def _why(record: Mapping[str, Any]) -> str:
+    return f"{record['trajectory']}, seed {record['seed']}: {record['error']}"
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    lines = []
+    for row in rows:
+        if row["lost"] is None:
+            figures = [f"{row['cost']:.4f}", number(row["median"]), number(row["p99"]), str(row["failed"])]
+        else:
+            figures = ["lost", *[MISSING] * 3]
+        lines.append([row["what"], str(row["H"]), *figures, "●" if row["front"] else ""])
+    return Table(["gpmpc run", "H", "cost", "ms: median", "99 %", "failed", "front"], lines, "Quality over time")

@@ -1,0 +1,151 @@
+"""Quality over time: its cost, its front, and that what flies is what its words choose."""
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gpmpc.cli.run import experiment_of
+from gpmpc.exceptions import SettingError
+from gpmpc.experiments.quality import FAMILIES, TRUTH, Family, Quality, pareto_front, stage_cost
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.plotting import quality
+from gpmpc.propagation import Linearization
+from gpmpc.studies.study import TrialStore, run_study
+from gpmpc.trajectories import Elliptical
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+CHEAP = Family("trajectory", "controller=convex controller.covariance=none")
+
+few = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12)
+
+
+@given(few)
+def test_nobody_on_the_front_is_dominated_and_everybody_else_is(points):
+    def dominated(i):
+        at_least = [(t, c) for t, c in points if t <= points[i][0] and c <= points[i][1]]
+        return any(other != points[i] for other in at_least)
+
+    found = pareto_front([t for t, _ in points], [c for _, c in points])
+    assert found == [not dominated(i) for i in range(len(points))]
+
+
+@given(few, st.integers(1, 3))
+def test_where_more_time_has_to_buy_something_every_member_does_and_nobody_else(points, least):
+    times, costs = [t for t, _ in points], [c for _, c in points]
+    found = pareto_front(times, costs, least)
+    front = sorted({point for point, member in zip(points, found, strict=True) if member})
+    assert all(after[1] < before[1] - least for before, after in pairwise(front))
+    for (time, cost), member in zip(points, found, strict=True):
+        assert member or any(t <= time and c <= cost + least for t, c in front)
+
+
+def test_the_cost_is_the_sum_of_what_every_step_pays(rng):
+    roots = rng.normal(size=(6, 6)), rng.normal(size=(3, 3))
+    weights = TrackingProblem(*(root @ root.T + np.eye(len(root)) for root in roots), penalized="increments")
+    x, r, u, before = rng.normal(size=(8, 6)), rng.normal(size=(8, 6)), rng.normal(size=(7, 3)), [1.0, -2.0, 0.5]
+    paid = 0.0
+    for k in range(7):
+        e, v = x[k + 1] - r[k + 1], u[k] - (u[k - 1] if k else before)
+        paid += e @ weights.Q @ e + v @ weights.R @ v
+    assert stage_cost(weights, x, r, u, before) == pytest.approx(paid / 7, rel=1e-12)
+
+
+def flight(family, **changes):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        words = [*family.words.split(), "model.restarts=0", "data.samples=60", f"noise.process={[0.01] * 6}"]
+        return replace(experiment_of(compose("run", words)), **changes)
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.words)
+def test_the_words_of_a_family_are_settings_of_a_run(family):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        assert experiment_of(compose("run", [*family.words.split(), "horizon=2"])).loop == "plant"
+
+
+def test_every_controller_and_propagation_of_the_settings_is_among_the_contenders():
+    words = " ".join(family.words for family in FAMILIES)
+    for controller in (CONF / "controller").glob("*.yaml"):
+        assert f"controller={controller.stem}" in words
+    for propagation in (CONF / "propagation").glob("*.yaml"):
+        assert f"propagation={propagation.stem}" in words
+
+
+def astray(model, horizon):
+    """Hardly ever moves an input."""
+    problem = TrackingProblem(
+        [1] * 6, [1e12] * 3, "increments", input_lower=[0, -0.7, -0.7], input_upper=[20, 0.7, 0.7]
+    )
+    return GPMPC(model, Linearization(), problem, horizon, [7.26, 0, 0])
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory):
+    torch.set_default_dtype(torch.float64)
+    lost = Family("astray", "controller=convex")
+    experiments = {TRUTH: flight(TRUTH), CHEAP: flight(CHEAP), lost: flight(lost, controller=astray)}
+    study = Quality(experiments, {"elliptical": Elliptical()}, None, horizons=[1, 2], steps=12, seeds=2)
+    folder = tmp_path_factory.mktemp("quality")
+    trials = study.trials(folder)
+    assert len({trial.fingerprint for trial in trials}) == len(trials) == 12
+    records = run_study(study.run_trial, trials, TrialStore(folder / "trials.jsonl"), workers=1)
+    document = study.document(records)
+    assert document.images["quality.png"].startswith(b"\x89PNG")
+    assert "controller=convex horizon=2: elliptical, seed 0: " in document.markdown()
+    return {(row["what"], row["H"]): row for row in study.rows(records)}
+
+
+def test_a_flight_gives_rows_of_finite_numbers_in_the_order_of_the_cases(rows):
+    words = (TRUTH.words, CHEAP.words, "controller=convex")
+    assert sorted(rows) == sorted((what, H) for what in words for H in (1, 2))
+    for key, row in rows.items():
+        if key[0] != words[2]:
+            assert row["lost"] is None
+            assert all(np.isfinite(row[key]) and row[key] > 0 for key in ("cost", "median", "p99", "rmse elliptical"))
+            assert row["median"] <= row["p99"]
+            assert (row["failed"], row["flights"], row["samples"]) == (0, 2, 24)
+
+
+def test_nmpc_on_the_true_model_costs_one_and_is_no_member_of_the_front(rows):
+    assert rows[TRUTH.words, 2]["cost"] == pytest.approx(1, abs=1e-12)
+    assert not rows[TRUTH.words, 2]["front"]
+    assert any(row["front"] for row in rows.values())
+
+
+def test_a_case_that_cannot_fly_is_reported_as_lost(rows):
+    row = rows["controller=convex", 2]
+    assert row["lost"].startswith("elliptical, seed 0: ")
+    assert "cost" not in row
+    assert not row["front"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"horizons": []}, "horizons: must be a list"),
+        ({"horizons": [0]}, "horizons: must be a whole number"),
+        ({"steps": 0}, "steps: must be a whole number"),
+        ({"seeds": 0}, "seeds: must be a whole number"),
+        ({"trajectories": {}}, "trajectory: choose at least one"),
+        ({"experiments": {}}, "families: choose at least one"),
+    ],
+)
+def test_a_setting_out_of_its_range_is_refused(settings, message):
+    given = {"experiments": {TRUTH: None}, "trajectories": {"elliptical": Elliptical()}, "settings": None}
+    with pytest.raises(SettingError, match=message):
+        Quality(**(given | settings))
+
+
+def test_the_figure_names_the_members_of_the_front_and_counts_the_lost(rows):
+    figure = quality(list(rows.values()))
+    named = {text.get_text()[3:] for legend in figure.legends for text in legend.get_texts()}
+    for row in rows.values():
+        assert (f"{row['what']} horizon={row['H']}" in named) == row["front"]
+    assert "lost: 2" in [text.get_text() for text in figure.axes[0].texts]
