@@ -148,7 +148,8 @@ def _jit_cached(function: Callable, options: dict) -> Callable:
         return numba.njit(**options)(function)
     try:
         index = kernel._cache._cache_file
-        index._source_stamp = index._source_stamp, sources_stamp(function.__module__)
+        # compared before anything else in the index is read, which may name modules that are gone
+        index._version = f"{index._version} {sources_stamp(function.__module__).hex()}"
     except AttributeError:  # another numba: edits of other files go unseen
         pass
     return kernel
