@@ -35,10 +35,11 @@ def main() -> None:
         return
     results = []
     with tempfile.TemporaryDirectory() as folder:
-        model = Path(folder) / "model.npz"
+        model = Path(folder) / "model.safetensors"
         from benchmarks.floor import posterior  # loads torch
+        from gpmpc.gp import save_posterior
 
-        posterior(arguments.size).save(model)
+        save_posterior(posterior(arguments.size), model)
         for covariance in ("none", "zero_order"):
             command = [
                 sys.executable,

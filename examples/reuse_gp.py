@@ -37,7 +37,8 @@ np.savetxt(folder / "pendulum.csv", log, delimiter=",", header="angle,rate,torqu
 
 # A project with a recording starts here: read it, train, save ...
 data = Transitions.from_csv(folder / "pendulum.csv", states=["angle", "rate"], inputs=["torque"])
-save_posterior(train(data).posterior, folder / "pendulum.safetensors")
+units = {"states": {"angle": "rad", "rate": "rad/s"}, "inputs": {"torque": "N m"}}
+save_posterior(train(data).posterior, folder / "pendulum.safetensors", metadata=units)
 
 # ... and later, or elsewhere: load, and forecast 20 steps from an uncertain start.
 gp = load_posterior(folder / "pendulum.safetensors")

@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import lz4.frame
 import zstandard
@@ -35,7 +35,12 @@ _ROOM, _RATIO = 64 * 2**20, 300  # [bytes], and bytes a byte of the file; runs a
 _OBJECT = 2000  # [bytes] that a message takes besides its content
 _HEAD = struct.Struct("<BQ")  # kind and length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_CLASSES = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.ATTACHMENT: Attachment, Opcode.METADATA: Metadata}
+_CLASSES: dict[int, Any] = {
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.METADATA: Metadata,
+}
 _BROKEN = (McapError, struct.error, UnicodeDecodeError, OverflowError, zstandard.ZstdError)
 
 
@@ -129,9 +134,9 @@ def _agree(stored: int, computed: int) -> bool:
 class _Whole(BytesIO):
     """A stream whose ``read`` gives all of the length, or raises."""
 
-    def read(self, length: int) -> bytes:
-        data = super().read(length)
-        if len(data) < length:
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        if len(data) < (size or 0):
             raise EndOfFile
         return data
 

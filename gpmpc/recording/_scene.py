@@ -17,14 +17,14 @@ from foxglove.messages import Pose, Quaternion, Timestamp, Vector3
 from gpmpc.recording._steps import Kept
 
 Array = np.ndarray
-Numbers = Sequence[float]
+Numbers = list[float]
 
 DISPLAY, VEHICLE = "display", "vehicle"
 POSITION, ATTITUDE = ("x", "y", "z"), ("phi", "theta", "psi")
 _INTERVAL = 1 / 30  # [s]
 _SIGMAS = 2.0  # radius of the tube in standard deviations
 _TUBE, _LINE = messages.Color(r=0.12, g=0.45, b=0.85, a=0.18), messages.Color(r=0.12, g=0.45, b=0.85, a=0.9)
-_LEVEL = (1.0, 0.0, 0.0, 0.0)  # the quaternion w, x, y, z of no rotation
+_LEVEL = [1.0, 0.0, 0.0, 0.0]  # the quaternion w, x, y, z of no rotation
 
 
 class Scene:
@@ -38,7 +38,7 @@ class Scene:
     """
 
     def __init__(self, context: Context, states: Sequence[str], frame: str, z_down: bool):
-        self._frame, self._display_turn = frame, (0.0, 1.0, 0.0, 0.0) if z_down else _LEVEL
+        self._frame, self._display_turn = frame, [0.0, 1.0, 0.0, 0.0] if z_down else _LEVEL
         self._axes = [axis for axis, name in enumerate(POSITION) if name in states]
         self._position = [states.index(POSITION[axis]) for axis in self._axes]
         self._attitude = [states.index(name) for name in ATTITUDE] if set(ATTITUDE) <= set(states) else []
@@ -81,15 +81,15 @@ class Scene:
     def _ellipsoids(self, covariances: Array) -> list[tuple[Numbers, Numbers]]:
         """Computes the quaternions and the diameters of the 2-sigma ellipsoids of covariances (K, n, n)."""
         spatial = np.zeros((len(covariances), 3, 3))
-        every = np.arange(len(covariances))
-        spatial[np.ix_(every, self._axes, self._axes)] = covariances[np.ix_(every, self._position, self._position)]
+        rows, columns = np.array(self._axes, int)[:, None], self._axes
+        spatial[:, rows, columns] = covariances[:, np.array(self._position, int)[:, None], self._position]
         variances, directions = np.linalg.eigh(np.nan_to_num(spatial, posinf=0.0, neginf=0.0))
         directions[np.linalg.det(directions) < 0, :, 0] *= -1  # reflections are no rotations
         diameters = 2 * _SIGMAS * np.sqrt(np.maximum(variances, 0))
         return list(zip(_from_matrices(directions).tolist(), diameters.tolist(), strict=True))
 
     def _log_vehicle(self, points: Sequence[Numbers], turns: Sequence[Numbers], nanoseconds: int) -> None:
-        frames = ((DISPLAY, self._frame, (0.0, 0.0, 0.0), self._display_turn),)
+        frames = ((DISPLAY, self._frame, [0.0, 0.0, 0.0], self._display_turn),)
         frames += ((self._frame, VEHICLE, points[0], turns[0]),)
         for channel, (parent, child, point, turn) in zip(self._frames, frames, strict=True):
             transform = messages.FrameTransform(
@@ -121,7 +121,7 @@ class Scene:
         ]
         line = messages.LinePrimitive(
             type=messages.LinePrimitiveLineType.LineStrip,
-            pose=_pose((0.0, 0.0, 0.0), _LEVEL),
+            pose=_pose([0.0, 0.0, 0.0], _LEVEL),
             thickness=2.0,
             scale_invariant=True,
             points=[messages.Point3(x=x, y=y, z=z) for x, y, z in points],

@@ -51,7 +51,7 @@ def pack(step: Step, gp_size: int | None, n: int, m: int, record_problems: bool)
         ShapeError: An array of the step does not fit n states and m inputs.
     """
     decision, given = step.decision, ()
-    arrays = [step.reference, step.state, step.measured, step.innovation, step.input, step.belief_covariance]
+    arrays: list[Any] = [step.reference, step.state, step.measured, step.innovation, step.input, step.belief_covariance]
     expected = [(n,), (n,), (n,), (n,), (m,), (n, n)]
     if decision is not None:
         H, solution, problem = len(decision.inputs), decision.solution, decision.problem
@@ -94,7 +94,8 @@ class Kept(NamedTuple):
     @property
     def status(self) -> Status:
         """How the solve ended."""
-        return self.step.decision.status if self.step.status is None else self.step.status
+        status = self.step.status or (self.step.decision and self.step.decision.status)
+        return status or Status.INVALID_MEASUREMENT
 
 
 def unpack(packed: Packed) -> Kept:
@@ -108,7 +109,7 @@ def unpack(packed: Packed) -> Kept:
     if decision is not None and decision.solution is not None:
         solution = decision.solution._replace(x=rest[0], record=rest[1])
         rest = rest[2:]
-    return Kept(packed.step, packed.gp_size, *arrays[:6], arrays[6:9] or None, solution, rest or None)
+    return Kept._make((packed.step, packed.gp_size, *arrays[:6], arrays[6:9] or None, solution, rest or None))
 
 
 class Encoder:
@@ -147,7 +148,8 @@ class Encoder:
         states = iter(self._encode["State"](np.concatenate(groups, axis=1).reshape(-1, covariances.shape[-1])))
         inputs = self._encode["Input"](np.array([step.input for step in kept]))
         timings = self._encode["Timing"](np.array([_times(step.step.decision) for step in kept]))
-        stages = self._encode_stages([step for step in kept if step.plan is not None])
+        plans = [(step.step.time, step.plan) for step in kept if step.plan is not None]
+        stages = self._encode_stages(plans)
         for row, step in enumerate(kept):
             about, decision, solution = step.step, step.step.decision, step.solution
             head = {"time": about.time, "k": about.k}
@@ -182,16 +184,15 @@ class Encoder:
                 arrays = {name: np.array(a).tobytes() for name, a in zip(QP_ARRAYS, (*step.qp, *solved), strict=True)}
                 yield QP, row, self._qp(variables=variables, rows=rows, **arrays, **head).SerializeToString()
 
-    def _encode_stages(self, kept: Sequence[Kept]) -> Iterator[list[bytes]]:
-        """Yields the serialised stages of every plan."""
-        if not kept:
+    def _encode_stages(self, plans: Sequence[tuple[float, Sequence[Array]]]) -> Iterator[list[bytes]]:
+        """Yields the serialised stages of every plan, given when it begins [s], its inputs, means, covariances."""
+        if not plans:
             return
-        lengths = [len(step.plan[1]) for step in kept]
-        times = [step.step.time + self._time_step * np.arange(count) for step, count in zip(kept, lengths, strict=True)]
-        deviations = _deviation(np.concatenate([step.plan[2] for step in kept]))
-        means = np.concatenate([step.plan[1] for step in kept])
-        inputs = np.concatenate([part for step in kept for part in (step.plan[0], step.plan[0][-1:])])
-        table = np.column_stack([np.concatenate(times), means, deviations, inputs])
+        lengths = [len(means) for _, (_, means, _) in plans]
+        times = [time + self._time_step * np.arange(len(means)) for time, (_, means, _) in plans]
+        inputs = np.concatenate([part for _, (inputs, *_) in plans for part in (inputs, inputs[-1:])])
+        means, covariances = (np.concatenate([plan[i] for _, plan in plans]) for i in (1, 2))
+        table = np.column_stack([np.concatenate(times), means, _deviation(covariances), inputs])
         ends = np.cumsum(lengths)
         stages = self._encode["Stage"](table)
         last = self._encode_last(table[ends - 1, : -inputs.shape[1]])

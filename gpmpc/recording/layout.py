@@ -64,8 +64,8 @@ def _tabs(run: Run) -> dict[str, Panels]:
     """The panels with plots, from top to bottom, by the title of their tab."""
     units, groups = run.metadata.get("units", {}), _groups(run.state_names)
     tabs = {title: {f"Plot!state-{n}": _tracking(n, units) for n in names} for title, names in groups.items()}
-    bounded = zip(run.input_names, np.isfinite(run.input_bounds).any(axis=0), strict=True)
-    tabs["Inputs"] = {f"Plot!input-{name}": _input(name, units, has_bounds) for name, has_bounds in bounded}
+    bounded = zip(run.input_names, np.isfinite(run.input_bounds).T, strict=True)
+    tabs["Inputs"] = {f"Plot!input-{name}": _input(name, units, bool(finite.any())) for name, finite in bounded}
     tabs["Uncertainty"] = {}
     for title, names in list(groups.items())[:2]:
         unit = _unit(units, *(f"state.{name}" for name in names))

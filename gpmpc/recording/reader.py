@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from gpmpc.qp import QPSolution, QPSolver
 
 Array = np.ndarray
+_STATUSES = tuple(Status)
 
 
 class RecordedProblem(NamedTuple):
@@ -128,14 +129,14 @@ def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
     recorded = run.problems.get(k)
     if recorded is None:
         raise RecordingError(f"{run.path}: holds no quadratic program of step {k}; it holds {len(run.problems)} others")
-    solver = solver if solver is not None else DualActiveSet()
+    solve = DualActiveSet().solve if solver is None else solver.solve
     inverse, caps = recorded.softness[:, len(recorded.q) :]
     try:
         problem = QuadraticProgram.from_stacked(*recorded[:5])
         if not inverse.any() and np.isinf(caps).all():
-            return solver.solve(problem)
+            return solve(problem)
         with np.errstate(divide="ignore"):
-            return solver.solve(problem, soft=SoftRows(quadratic=1 / inverse, linear=caps))
+            return solve(problem, soft=SoftRows(quadratic=1 / inverse, linear=caps))
     except GpmpcError as error:
         raise RecordingError(f"{run.path}: step {k}: {error}") from error
 
@@ -178,6 +179,7 @@ def read_run(path: str | Path) -> Run:
         finished=finished and RECOVERED not in metadata,
         state_names=decoder.states,
         input_names=decoder.inputs,
+        statuses=tuple(_STATUSES[step.status] for step in messages[STEP]),
         **_steps(messages[STEP], decoder.states, decoder.inputs),
         **_plans(path, messages[PLAN], messages[STEP], decoder.states, decoder.inputs),
         channels={channel.topic: (counts[i], names.get(channel.schema_id, "")) for i, channel in channels.items()},
@@ -249,7 +251,7 @@ def _table(messages: Sequence[Any], fields: tuple[str, ...]) -> Array:
 
 
 def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Any]:
-    n, statuses = len(states), tuple(Status)
+    n = len(states)
     groups = {"references": "reference", "states": "state", "measured": "measured", "innovations": "innovation"}
     arrays = {name: _table([getattr(step, group) for step in steps], states) for name, group in groups.items()}
     integers = {"steps": "k", "iterations": "iterations", "active_set_sizes": "active_set_size"}
@@ -264,7 +266,6 @@ def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dic
         "inputs": _table([step.input for step in steps], inputs),
         "input_bounds": bounds,
         "belief_covariances": np.frombuffer(b"".join(s.belief_covariance for s in steps)).reshape(len(steps), n, n),
-        "statuses": tuple(statuses[step.status] for step in steps),
         "timings": _table([step.timing for step in steps], _messages.TIMING),
         "failed": np.array([step.failed for step in steps], dtype=bool),
     }

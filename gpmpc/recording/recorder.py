@@ -152,7 +152,7 @@ class McapRecorder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: Any) -> None:
-        if error is None:
+        if error is None or kind is None:
             self.close()
             return
         with contextlib.suppress(RecordingError):  # most likely the same error
@@ -248,7 +248,7 @@ class _File:
             else:
                 os.ftruncate(self._descriptor, self._whole)
 
-    def write(self, data: bytes) -> int:
+    def write(self, data: bytes | bytearray) -> int:
         """Writes all of the data."""
         left = memoryview(data)
         try:

@@ -119,16 +119,18 @@ def _decide(
     cascade: Cascade, references: Reference, on_failure: OnFailure, j: int, belief: Gaussian, last: _Decided | None
 ) -> _Decided:
     k, phase = divmod(j, cascade.ratio)
-    outer, inner, angles = (None, None, np.zeros(3)) if last is None else (last.outer, last.inner, last.angles)
-    if phase == 0:
-        ahead = window(references, k, cascade.outer.horizon)
-        outer = command(cascade.outer, _part(belief, _OUTER), ahead, outer, on_failure, k)
+    if last is None or phase == 0:
+        ahead, before = window(references, k, cascade.outer.horizon), last and last.outer
+        outer = command(cascade.outer, _part(belief, _OUTER), ahead, before, on_failure, k)
+    else:
+        outer = last.outer
     measured = belief.mean.cpu().numpy().astype(float)[6::2]
     # Attitudes start from where the vehicle is, or was when that was last known.
+    angles = np.zeros(3) if last is None else last.angles
     angles = measured if np.isfinite(measured).all() else angles
     planned = outer.input[None] if outer.plan is None else outer.plan.inputs
     attitude = cascade.attitude_reference(planned, angles, phase)
-    inner = command(cascade.inner, _part(belief, _INNER), attitude, inner, on_failure, j)
+    inner = command(cascade.inner, _part(belief, _INNER), attitude, last and last.inner, on_failure, j)
     return _Decided(np.append(outer.input[:1], inner.input), outer, inner, attitude, angles)
 
 

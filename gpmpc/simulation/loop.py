@@ -111,11 +111,11 @@ def closed_loop(
 
     flight = Flight(simulator, history.recording(references))
     fly([flight], decide, steps, system.time_step)
-    rollout = history.rollout(simulator, references, system.time_step) if history.steps else None
-    if isinstance(flight.error, Diverged):
-        flight.error.flown = rollout
+    if isinstance(flight.error, Diverged) and history.steps:
+        flight.error.flown = history.rollout(simulator, references, system.time_step)
+    if flight.error is not None:
         raise flight.error
-    return rollout
+    return history.rollout(simulator, references, system.time_step)
 
 
 def rehearse(system: Plant | ModelLoop, controller: Controller, references: Reference, initial: Any) -> None:
@@ -133,6 +133,7 @@ class Decided(Protocol):
     @property
     def input(self) -> Array:
         """(m,)."""
+        ...
 
 
 class Moment(NamedTuple):

@@ -82,13 +82,16 @@ class Simulator(Protocol):
     @property
     def mean(self) -> Array:
         """The state, or the mean of its belief (n,)."""
+        ...
 
     @property
     def covariance(self) -> Array:
         """Of the belief (n, n); zero for a plant's state."""
+        ...
 
     def measure(self, time: float) -> Gaussian:
         """Measures the state at a time [s]."""
+        ...
 
     def step(self, time: float, input: Array) -> Array:
         """Takes one step from a time [s] on; returns the input that was applied (m,).
@@ -96,6 +99,7 @@ class Simulator(Protocol):
         Raises:
             Diverged: The next state is not finite.
         """
+        ...
 
 
 class PlantSimulator:
@@ -138,7 +142,8 @@ class PlantSimulator:
                 raise ShapeError(f"noise.{key} must have {length} standard deviations; got {len(values)}")
         # One stream a source: whether states are measured with noise changes nothing about the wind.
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
-        self._streams = dict(zip(("initial", "process", "measurement", "input"), streams, strict=True))
+        sources: list[str] = ["initial", "process", "measurement", "input"]
+        self._streams = dict(zip(sources, streams, strict=True))
         self.plant, self.disturbances, self.noise = plant, tuple(disturbances), noise
         mean, covariance = (initial.mean, initial.covariance) if isinstance(initial, Gaussian) else (initial, None)
         self.mean = _check_state(mean, n)
@@ -246,19 +251,22 @@ def step_together(simulators: Sequence[Any], time: float, inputs: Sequence[Array
 
     Several plants are stepped in one evaluation.
     """
-    outcomes: list[Array | Diverged] = []
-    if len(simulators) > 1:
-        applied = [simulator._applied_input(input) for simulator, input in zip(simulators, inputs, strict=True)]
-        plant = simulators[0]._disturbed_plant(time)  # disturbances look at the time, not at a trial
-        with np.errstate(over="ignore", invalid="ignore"):
-            states = step_many(plant, np.array([s.mean for s in simulators]), np.array(applied))
-    for i, simulator in enumerate(simulators):
+    if len(simulators) == 1:
         try:
-            if len(simulators) == 1:
-                outcomes.append(simulator.step(time, inputs[0]))
-            else:
-                simulator._arrive(states[i], applied[i])
-                outcomes.append(applied[i])
+            return [simulators[0].step(time, inputs[0])]
+        except Diverged as error:
+            return [error]
+    if not simulators:
+        return []
+    outcomes: list[Array | Diverged] = []
+    applied = [simulator._applied_input(input) for simulator, input in zip(simulators, inputs, strict=True)]
+    plant = simulators[0]._disturbed_plant(time)  # disturbances look at the time, not at a trial
+    with np.errstate(over="ignore", invalid="ignore"):
+        states = step_many(plant, np.array([s.mean for s in simulators]), np.array(applied))
+    for simulator, state, input in zip(simulators, states, applied, strict=True):
+        try:
+            simulator._arrive(state, input)
+            outcomes.append(input)
         except Diverged as error:
             outcomes.append(error)
     return outcomes

@@ -114,7 +114,7 @@ def chunk_size(controller: Controller, trials: int, memory: int = _MEMORY, chunk
         return min(chunk, trials)
     if not hasattr(controller, "control_many"):
         return trials
-    each = controller.bytes_per_question
+    each = getattr(controller, "bytes_per_question", None)
     if each is None:
         raise SettingError("chunk", "the memory that this model takes is not known: say how many trials fly at a time")
     return min(trials, max(1, int(memory // each)))

@@ -20,7 +20,7 @@ import torch
 from gpmpc.exceptions import GpmpcError
 from gpmpc.gp import Transitions, load_posterior
 from gpmpc.models import load_residual_model
-from tests.gp.small_models import SAVE, posterior, residual_model
+from tests.gp.small_models import SAVE, as_before, posterior, residual_model
 
 MEMORY, SECONDS = 300 * 2**20, 5.0
 
@@ -254,10 +254,17 @@ def from_csv(path):
 
 
 def main(kind, count, seed):
-    makers = {"model": posterior, "residual": residual_model, "transitions": transitions, "csv": transitions}
+    makers = {
+        "model": posterior,
+        "old": posterior,
+        "residual": residual_model,
+        "transitions": transitions,
+        "csv": transitions,
+    }
     made = makers[kind]()
     load = {
         "model": load_posterior,
+        "old": load_posterior,
         "residual": load_residual_model,
         "transitions": Transitions.load,
         "csv": from_csv,
@@ -270,9 +277,11 @@ def main(kind, count, seed):
             path.write_text("\n".join(["a,b,c", *rows]))
         elif kind == "transitions":
             made.save(path)
+        elif kind == "old":
+            as_before(made, path)
         else:
             SAVE[type(made)](made, path)
-        parts = ZIP if kind == "transitions" else SAFETENSORS
+        parts = ZIP if kind in ("transitions", "old") else SAFETENSORS
         whole, same = path.read_bytes(), content(load(path))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

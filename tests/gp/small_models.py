@@ -2,7 +2,7 @@
 
 import torch
 
-from gpmpc.gp import GPPosterior, load_posterior, save_posterior
+from gpmpc.gp import GPPosterior, _archive, load_posterior, save_posterior, storage
 from gpmpc.models import Affine, ResidualModel, load_residual_model, save_residual_model
 
 SAVE = {GPPosterior: save_posterior, ResidualModel: save_residual_model}
@@ -31,3 +31,12 @@ def residual_model():
     gp = posterior(n=1, m=1, predicts="value")
     nominal = Affine(torch.tensor([[1.0, 0.1], [-0.2, 0.9]]), torch.tensor([[0.0, 0.1], [0.1, 0.0]]), torch.ones(2))
     return ResidualModel(nominal, gp, torch.tensor([[0.0], [1.0]]), [1], [0], 2)
+
+
+def as_before(model, path):
+    """Writes a model as gpmpc 1 did: arrays in an .npz archive."""
+    new = path.with_suffix(".new")
+    SAVE[type(model)](model, new)
+    header, arrays = storage._content(new, "model")
+    header = {key: value for key, value in header.items() if key not in ("checksum", "metadata")}
+    path.write_bytes(_archive.pack(header | {"format_version": 1}, arrays.items()))

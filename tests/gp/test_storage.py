@@ -13,9 +13,8 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
 from gpmpc.gp import GPPosterior, Trainer, Transitions, load_metadata, load_posterior, save_posterior, storage
-from gpmpc.gp import _archive as archive
 from gpmpc.models import ResidualModel, save_residual_model
-from tests.gp.small_models import LOAD, SAVE, posterior, residual_model
+from tests.gp.small_models import LOAD, SAVE, as_before, posterior, residual_model
 
 
 def trained():
@@ -87,15 +86,6 @@ def test_the_file_is_plain_arrays_and_a_readable_header(tmp_path):
     assert header["created"].endswith("+00:00")
     with pytest.raises(SettingError, match="metadata: must be what JSON can hold"):
         save_posterior(gp, path, {"states": gp})
-
-
-def as_before(model, path):
-    """Writes a model as gpmpc 1 did: arrays in an .npz archive."""
-    new = path.with_suffix(".new")
-    SAVE[type(model)](model, new)
-    header, arrays = storage._content(new, "model")
-    header = {key: value for key, value in header.items() if key not in ("checksum", "metadata")}
-    path.write_bytes(archive.pack(header | {"format_version": 1}, arrays.items()))
 
 
 @pytest.mark.parametrize("make", [posterior, residual_model], ids=["posterior", "residual"])
