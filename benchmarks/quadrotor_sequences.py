@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.quadrotor import HOVER, TRAJECTORIES, problem, recorded, trained
-from gpmpc.mpc.convex_mpc import ConvexMPC
+from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.tracking import StateBounds
 from gpmpc.propagation import Linearization
 from gpmpc.trajectories import states_along
@@ -136,7 +136,7 @@ def flight_sequence(trajectory: str, horizon: int, length: int) -> list[Sequence
     margin = 0.05 + 0.02 * np.ptp(states, axis=0)  # [m, m/s] around all that the reference visits
     bounds = StateBounds(states.min(axis=0) - margin, states.max(axis=0) + margin)
     bounded = problem(bounds, tilt=TIGHT[trajectory][0])
-    controller = ConvexMPC(trained(trajectory), Linearization(), bounded, horizon, HOVER)
+    controller = GPMPC(trained(trajectory), Linearization(), bounded, horizon, HOVER)
     steps = recorded(controller, trajectory, length)
     programs = [step.decision.problem for step in steps if step.decision.status.solved]
     return [_two_sided(*(np.array(part) for part in program[:5])) for program in programs]

@@ -86,8 +86,9 @@ class CvxpySolver:
         for side in form.sides:
             side.rows.value = columns[side.members]
             side.bound.value = ((lower if side.sign < 0 else upper) - offset)[side.members]
-        warm = isinstance(warm_start, QPSolution) and len(warm_start.q) == n
-        if warm:
+        warm = False
+        if isinstance(warm_start, QPSolution) and len(warm_start.q) == n:
+            warm = True
             form.y.value = factor @ (warm_start.x - free)
         built = perf_counter()
         solutions = []
@@ -149,7 +150,7 @@ def _solve_form(form: "_Form", name: str, warm: bool, options: dict) -> str:
         with warnings.catch_warnings():  # an inaccurate solution is judged by its residuals
             warnings.simplefilter("ignore")
             form.problem.solve(solver=name, warm_start=warm, **options)
-    except cvxpy.error.SolverError:
+    except cvxpy.SolverError:
         return "solver_error"
     return form.problem.status
 

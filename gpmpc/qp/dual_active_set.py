@@ -27,6 +27,7 @@ from gpmpc.qp.solution import QPSolution, Terms, WarmStart, proves_infeasibility
 from gpmpc.qp.workspace import PREPARED, factor_and_rows, new_memory, softness_in
 
 Array = NDArray[np.float64]
+_Arrays = tuple[Array, Array, Array, Array, Array]  # P, q, G, lower, upper
 
 _NO_RECORD = layout.NO_RECORD
 _FLOAT = np.dtype(np.float64)
@@ -84,10 +85,10 @@ class DualActiveSet:
             ProblemError: The problem was not checked and breaks a rule of ``QuadraticProgram``.
         """
         try:
-            plan = self._plans[problem.G.shape] if soft is None else self._plan(*problem.G.shape, soft)
+            plan = self._plans[problem.G.shape] if soft is None else self._plan(problem.G.shape, soft)
         except (AttributeError, KeyError, TypeError):  # the first of its shape, or an unchecked one without a shape
             problem = QuadraticProgram.from_stacked(*problem)
-            plan = self._plan(*problem.G.shape, soft)
+            plan = self._plan(problem.G.shape, soft)
         return _solve(problem, warm_start, plan, self)
 
     def prepare(self, P: ArrayLike, G: ArrayLike | None = None, soft: SoftRows | None = None) -> "Prepared":
@@ -103,12 +104,9 @@ class DualActiveSet:
         """
         return Prepared(self, QuadraticProgram(P, np.zeros(len(np.atleast_1d(P))), G), soft)
 
-    def workspace(self, rows: int, variables: int, soft: SoftRows | None = None) -> tuple[Array, Array]:
-        """Returns softness and memory for kernels that call ``dual_kernels.solve`` themselves, holding the lock."""
-        return self._plan(rows, variables, soft)[:2]
-
-    def _plan(self, m: int, n: int, soft: SoftRows | None, prepared: bool = False) -> tuple[Array, Array, int, slice]:
+    def _plan(self, shape: tuple, soft: SoftRows | None, prepared: bool = False) -> tuple[Array, Array, int, slice]:
         """Returns softness, memory, the record's length, and where x is in it, for a shape of G."""
+        m, n = shape
         softness, M, limit = stack_softness(soft, n, m), n + m, self._limit(n + m)
         if self.time_limit is not None:
             limit = min(limit, _ITERATIONS_PER_LOOK)
@@ -133,9 +131,12 @@ class Prepared:
         began = perf_counter()
         self._P, self._G, self._solver = problem.P, problem.G, solver
         m, n = problem.G.shape
-        self._plan = solver._plan(m, n, soft, prepared=True)
+        self._plan = solver._plan((m, n), soft, prepared=True)
         _, memory, size, _ = self._plan
-        status = solve(*problem, layout.NO_RECORD, memory, np.empty(size))  # factorises P, measures the rows of G
+        P, q, G, lower, upper = problem
+        status = solve(
+            P, q, G, lower, upper, layout.NO_RECORD, memory, np.empty(size)
+        )  # factorises P, measures the rows of G
         if status == layout.SOLVED:  # else numbers overflow, and every solve is to find that out by itself
             L, rows = factor_and_rows(memory, n, m)
             C = np.vstack([np.eye(n), problem.G])
@@ -158,14 +159,14 @@ class Prepared:
         return _solve((self._P, q, self._G, lower, upper), warm_start, self._plan, self._solver)
 
 
-def _solve(problem: tuple[Array, ...], warm_start: WarmStart, plan: tuple, solver: DualActiveSet) -> QPSolution:
+def _solve(problem: _Arrays, warm_start: WarmStart, plan: tuple, solver: DualActiveSet) -> QPSolution:
     """Solves (P, q, G, lower, upper) in the memory of ``plan``."""
     began = perf_counter()
     P, q, G, lower, upper = problem
     softness, memory, size, where = plan
     record = _empty(size)
     try:
-        guess = _NO_RECORD if warm_start is None else warm_start.record
+        guess = _NO_RECORD if warm_start is None else warm_start.record  # pyright: ignore[reportAttributeAccessIssue]
         if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
             status = _run(P, q, G, lower, upper, guess, memory, record)
         else:  # may still be float64: a dtype that was pickled is another object
@@ -180,7 +181,7 @@ def _solve(problem: tuple[Array, ...], warm_start: WarmStart, plan: tuple, solve
     )
 
 
-def _solve_again(problem, warm_start, memory, solver, status, record, began) -> tuple[tuple[Array, ...], Array]:
+def _solve_again(problem, warm_start, memory, solver, status, record, began) -> tuple[_Arrays, Array]:
     """Continues a solve that did not end as ``SOLVED``: checks the problem, goes on, accepts the status or tries again.
 
     Returns:
@@ -191,14 +192,15 @@ def _solve_again(problem, warm_start, memory, solver, status, record, began) -> 
     """
     if status == layout.MISUSE:
         problem = QuadraticProgram.from_stacked(*problem)  # raises if it is misuse indeed
-        n, M = len(problem.q), len(problem.lower)
-        status = solve(*problem, _as_record(warm_start, n, M), memory, record)
+    P, q, G, lower, upper = problem
+    if status == layout.MISUSE:
+        n, M = len(q), len(lower)
+        status = solve(P, q, G, lower, upper, _as_record(warm_start, n, M), memory, record)
         if status == layout.MISUSE:  # a proper problem: rows that overflow, P at the edge of definiteness
             record[:] = 0.0
             record[[layout.STATUS, layout.VARIABLES, layout.CONSTRAINTS]] = layout.NUMERICAL_TROUBLE, n, M
         elif status == layout.SOLVED:
             return problem, record
-    P, q, G, lower, upper = problem
     done, limit = record[layout.ITERATIONS], solver._limit(len(lower))
 
     def late() -> bool:
@@ -209,14 +211,14 @@ def _solve_again(problem, warm_start, memory, solver, status, record, began) -> 
             record[layout.STATUS] = layout.TIME_LIMIT if late() else layout.ITERATION_LIMIT
             break
         guess, record = record, np.empty_like(record)
-        solve(*problem, guess, memory, record)
+        solve(P, q, G, lower, upper, guess, memory, record)
         done += record[layout.ITERATIONS]
     record[layout.ITERATIONS] = done
     stopped = record[layout.STATUS] == layout.ITERATION_LIMIT and solver.iteration_limit is not None
     if stopped or _is_certain(record, G, lower, upper):
         return problem, record
     guess, record = record, np.empty_like(record)
-    if solve(*problem, guess, memory, record) == layout.MISUSE:
+    if solve(P, q, G, lower, upper, guess, memory, record) == layout.MISUSE:
         record = guess
     record[layout.ITERATIONS] += done
     if not _is_certain(record, G, lower, upper):

@@ -204,7 +204,7 @@ def _refine(work, active, k, least, fine):
     Returns:
         The residual, the length of x that it is a share of, and whether x moved.
     """
-    best, moved = np.inf, False
+    worst, size, best, moved = np.inf, 0.0, np.inf, False
     add_multipliers(work, active, k)
     for attempt in range(_REFINEMENTS + 1):
         worst, size = _measure_residuals(work, active, k, least)

@@ -53,7 +53,7 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, li
             result[layout.STATUS] = solve.run(_names(record, len(q), len(lower)), limit)
             if result[layout.STATUS] != layout.NUMERICAL_TROUBLE:
                 break
-        solve.write(result)
+        solve.write(result)  # pyright: ignore[reportPossiblyUnboundVariable]
     except TimeoutError:
         result[layout.STATUS] = layout.TIME_LIMIT
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):  # not finite, or not positive definite once scaled

@@ -150,10 +150,10 @@ def _read_warm_start(warm_start: WarmStart, n: int, M: int) -> tuple[Array, Arra
     x, active = np.zeros(n), np.zeros(M)
     if isinstance(warm_start, QPSolution):
         if len(warm_start.q) == n and len(warm_start.lower) == M:
-            active = warm_start.active_set
+            active = warm_start.active_set.astype(np.float64)
             x = np.where(np.isfinite(warm_start.x), warm_start.x, 0.0)
     elif warm_start is not None:
-        active = np.nan_to_num(np.asarray(warm_start, dtype=float))
+        active = np.nan_to_num(np.asarray(warm_start, dtype=np.float64))
         if active.shape != (M,):
             raise ProblemError(f"a warm start must be a solution or an active set of shape {(M,)}; got {active.shape}")
     return x, active

@@ -202,7 +202,7 @@ def _check_matrices(P: ArrayLike, q: ArrayLike, G: ArrayLike | None) -> tuple[tu
     return (n, rows[0]), P, q, G
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class SoftRows:
     """Prices of violated rows of G; infinity keeps a row hard.
 
@@ -211,23 +211,24 @@ class SoftRows:
     14.3): it is met exactly as long as its multiplier stays below w. In the dual both are simple: a quadratic weight
     adds 1/rho to the diagonal of K, a linear one caps the multiplier. A row that is to pay both is written twice.
 
-    Args:
-        quadratic: (m,) rho > 0; infinite where omitted.
-        linear: (m,) w > 0; infinite where omitted.
-
-    Raises:
-        ProblemError: A weight that is not positive, or two finite weights on one row.
+    Attributes:
+        quadratic: (m,) rho > 0.
+        linear: (m,) w > 0.
     """
 
-    quadratic: NDArray[np.float64] | ArrayLike | None = None
-    linear: NDArray[np.float64] | ArrayLike | None = None
+    quadratic: Array
+    linear: Array
 
-    def __post_init__(self):
-        given = self.quadratic if self.quadratic is not None else self.linear
+    def __init__(self, quadratic: ArrayLike | None = None, linear: ArrayLike | None = None):
+        """Checks the weights; those of a kind that is omitted are infinite.
+
+        Raises:
+            ProblemError: A weight that is not positive, or two finite weights on one row.
+        """
+        given = quadratic if quadratic is not None else linear
         if given is None:
             raise ProblemError("soft rows need quadratic weights, linear weights, or both; got neither")
-        for name in ("quadratic", "linear"):
-            value = getattr(self, name)
+        for name, value in (("quadratic", quadratic), ("linear", linear)):
             array = np.full(np.shape(given), np.inf) if value is None else value
             array = _as_float_array(f"{name} weights", array, (np.size(given),))
             if not (array > 0.0).all():

@@ -7,12 +7,10 @@ Threads may share it, since a solve keeps the interpreter's lock. It is one matr
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba.core import types
-from numba.extending import intrinsic
-from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
 
 from gpmpc.compiled import inline_njit
+from gpmpc.kernels.linalg import aligned_rows
 from gpmpc.qp.record import HEADER
 
 Array = NDArray[np.float64]
@@ -87,8 +85,9 @@ def new_memory(softness: Array, n: int, limit: int, tolerance: float, soft: bool
     M = softness.shape[1]
     capacity = _most_working(n, M, soft)
     wide = padded(max(M, capacity + 2, SETTINGS)) + 8  # kernels write whole lanes
-    own = n * padded(n) + n * (M if prepared else capacity + 1)
-    memory = aligned(_REST + capacity + 1 - (-own // wide), wide)
+    own = n * padded(n) + n * max(M if prepared else 0, capacity + 1)
+    memory = aligned_rows(_REST + capacity + 1 - (-own // wide), wide)  # loads across cache lines take twice the time
+    memory[:] = 0.0
     box = np.arange(M) < n
     memory[0, :SETTINGS] = limit, tolerance, soft, False
     memory[1, :M], memory[2:4, :M] = box, softness
@@ -110,13 +109,6 @@ def factor_and_rows(memory: Array, n: int, m: int) -> tuple[Array, Array]:
     return L, start[n * padded(n) :][: (n + m) * n].reshape(n + m, n)
 
 
-def aligned(rows: int, columns: int) -> Array:
-    """Returns zeros that begin where a cache line does: loads of eight numbers across two lines take twice the time."""
-    memory = np.zeros(rows * columns + 8)
-    start = -memory.ctypes.data // 8 % 8
-    return memory[start : start + rows * columns].reshape(rows, columns)
-
-
 @inline_njit
 def _most_working(n, M, soft):
     """Returns how many constraints can work at once."""
@@ -135,23 +127,6 @@ def round_end(end, n):
     return min(n, (end + _END_STEP - 1) // _END_STEP * _END_STEP)
 
 
-@intrinsic
-def matrix(typing_context, memory, start, rows, columns):
-    """The entries of a contiguous array from ``start`` on as (rows, columns); numba's reshape takes 20 ns more."""
-    kind = types.Array(types.float64, 2, "C")
-
-    def generate(context, builder, signature, arguments):
-        source, start, rows, columns = arguments
-        data = builder.gep(context.make_array(memory)(context, builder, source).data, [start])
-        step = context.get_constant(types.intp, 8)
-        view = context.make_array(kind)(context, builder)
-        strides = builder.mul(columns, step), step
-        populate_array(view, data=data, shape=(rows, columns), strides=strides, itemsize=step, meminfo=None)
-        return view._getvalue()
-
-    return kind(memory, types.intp, types.intp, types.intp), generate
-
-
 @inline_njit
 def open_workspace(P, q, G, memory, out):
     """Returns the workspace and the working set in ``memory`` and the record ``out``."""
@@ -159,8 +134,10 @@ def open_workspace(P, q, G, memory, out):
     settings, real, whole = memory[0], memory[_REALS:_INTEGERS], memory[_INTEGERS:_REST].view(np.int64)
     soft = settings[SOFT] != 0.0
     capacity = _most_working(n, M, soft)
-    factor, rest = memory[_REST : _REST + capacity + 1], memory[_REST + capacity + 1 :]
-    L, rows = matrix(rest, 0, n, padded(n)), matrix(rest, n * padded(n), M, n)
+    factor, rest = memory[_REST : _REST + capacity + 1], memory[_REST + capacity + 1 :].reshape(-1)
+    count = M if settings[PREPARED] != 0.0 else capacity + 1
+    size = n * padded(n)
+    L, rows = rest[:size].reshape(n, padded(n)), rest[size : size + count * n].reshape(count, n)
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     work = Workspace(
         P, q, G, L, rows, real[0], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2], memory[3],
