@@ -71,6 +71,19 @@ def test_no_file_grows_past_400_lines():
     assert not long
 
 
+def test_no_private_interface_of_hydra_omegaconf_or_argparse_is_used():
+    private = re.compile(r"hydra\._internal|omegaconf\._|\._get_node\(|\._actions\b")
+    sources = [*ROOT.glob("gpmpc/**/*.py"), *ROOT.glob("experiments/*.py")]
+    assert not [str(path.relative_to(ROOT)) for path in sources if private.search(path.read_text())]
+
+
+def test_published_results_stand_below_the_command_line_and_above_everything_else():
+    above = re.compile(r"^\s*(?:from|import) gpmpc\.(?:cli|experiments)\b", re.MULTILINE)
+    lower = [path for path in ROOT.glob("gpmpc/**/*.py") if path.parts[-2] not in ("cli", "experiments")]
+    assert not [str(path.relative_to(ROOT)) for path in lower if above.search(path.read_text())]
+    assert not [path.name for path in ROOT.glob("experiments/*.py") if "gpmpc.cli" in path.read_text()]
+
+
 HOUSE = House(ROOT)
 
 

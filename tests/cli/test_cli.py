@@ -109,7 +109,7 @@ def small_run(tmp_path_factory):
     """A small run on our own data."""
     cwd = tmp_path_factory.mktemp("run")
     arguments = ["tables", "draws=1", "sizes=[5]", "data.samples=12", "trajectory=elliptical", "model.restarts=0"]
-    return cwd, arguments, gpmpc(*arguments, cwd=cwd)
+    return cwd, arguments, forked(*arguments, cwd=cwd)
 
 
 def test_a_run_writes_every_document_and_prints_the_tables(small_run):
