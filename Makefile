@@ -20,6 +20,9 @@ lint: $(ENV)  ## Format check, linter and import contracts
 	.venv/bin/ruff check .
 	.venv/bin/lint-imports
 
+types: $(ENV)  ## Type check of the package and the examples
+	.venv/bin/pyright
+
 bench: $(ENV)  ## What everything costs on this machine, beside others; some of it: make bench ONLY="peers qp"
 	for name in $(ONLY); do .venv/bin/python -m benchmarks.$$name || exit 1; done
 

@@ -1,6 +1,6 @@
-"""Problem: solvers stop by measures of their own; who took longer may just have gone further.
+"""Relative KKT residual of a plan: one measure for solvers that stop by tests of their own.
 
-All plans are judged by one function, which no contender uses: the gradient of the reduced problem, the inputs alone its
+No solver uses it. It is the gradient of the reduced problem, the inputs alone its
 unknowns, the states those of the GPs' mean rolled out by torch,
 
     f(U) = sum_i |x_i - r_i|^2_Q + sum_i |v_i|^2_R,   x_{i+1} = m(x_i, u_i),   lower <= U <= upper
@@ -33,7 +33,7 @@ SMALL = 1e-3  # share of an input's size
 
 @dataclass(frozen=True)
 class Instance:
-    """What every contender is asked at one step.
+    """The optimal control problem of one step.
 
     Attributes:
         belief: Of the current state; its mean counts.
@@ -57,7 +57,7 @@ class Instance:
 
 
 def kkt_residual(model: DynamicsModel, problem: TrackingProblem, instance: Instance, inputs: Array) -> float:
-    """How far a plan is from a KKT point; see the module's text.
+    """Computes how far a plan is from a KKT point; see the module's text.
 
     Args:
         model: Its mean is the dynamics; float64 in host memory.

@@ -1,4 +1,4 @@
-"""Problem: the same controller with the fastest free solver of small dense programs in place of our own.
+"""DAQP as a QP solver of the controllers.
 
 DAQP (Arnstroem, Bemporad and Axehill, 2022), a dual active-set method in C, through the interface of its Python package
 that keeps the working set from one solve to the next.

@@ -1,4 +1,4 @@
-"""Problem: what a user of the do-mpc toolbox (Fiedler et al., 2023) would write for the same GPs and the same cost.
+"""The problem in the do-mpc toolbox (Fiedler et al., 2023), as its manual would have it.
 
 A discrete model with the GPs' mean as its right-hand side, do-mpc's own ``MPC`` with a penalty of the increments, and
 IPOPT with MUMPS behind it. do-mpc starts from its last solution, as it stands; its internals are left alone.

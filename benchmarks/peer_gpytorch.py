@@ -1,4 +1,4 @@
-"""Problem: what a GPyTorch user has at hand for control: the trained model, autograd through its rollout, and SciPy.
+"""A GPyTorch model, autograd through its rollout, and SciPy's SLSQP.
 
 The cost of a plan is rolled out through the model's own predictions, its gradient comes from ``backward``, and SLSQP
 (Kraft, 1988) keeps the inputs in their box. Predictions of the mean alone, from GPyTorch's cache, no parameter with a

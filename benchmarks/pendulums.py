@@ -1,4 +1,4 @@
-"""Problem: speed over the size of the GPs, the horizon and the state's dimension needs one system of every size.
+"""Coupled pendulums of any number, and GPs of them: one system of every size.
 
 A row of c pendulums, each with a torque of its own and a spring to its neighbours: 2 c states, c inputs; smooth,
 nonlinear, coupled and stable to fly with any model of it. Its GPs are not trained, since hyperparameters do not change
