@@ -23,8 +23,8 @@ from benchmarks.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, rec
 from benchmarks.quadrotor_sequences import TIGHT
 from benchmarks.timing import write_results
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
+from gpmpc.mpc.problem import StateBounds
 from gpmpc.mpc.state_form import StateFormMPC
-from gpmpc.mpc.tracking import StateBounds
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
 

@@ -21,7 +21,7 @@ from gpmpc.metrics import tracking_error
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Gust, Noise, Replaced, cascade_loop
 from gpmpc.systems import Coupled, Integrated

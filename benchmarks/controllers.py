@@ -23,9 +23,8 @@ from benchmarks.quadrotor import HOVER, TRAJECTORIES, Asked, problem, recorded, 
 from benchmarks.timing import write_results
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc.controller import Decision, Timing
+from gpmpc.mpc.controller import Decision, Request, Timing
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.request import Request
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.status import Status
 

@@ -24,7 +24,7 @@ from gpmpc.dynamics import DynamicsModel, predict_with_jacobian
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 
 Array = np.ndarray
 

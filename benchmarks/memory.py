@@ -73,7 +73,7 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
     from gpmpc.gp import load_posterior
     from gpmpc.mpc.controller import Reference
     from gpmpc.mpc.gp_mpc import GPMPC
-    from gpmpc.mpc.tracking import TrackingProblem
+    from gpmpc.mpc.problem import TrackingProblem
     from gpmpc.propagation import Linearization
 
     torch.set_num_threads(1)

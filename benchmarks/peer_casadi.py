@@ -19,7 +19,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.casadi_ import casadi_function
 from gpmpc.interrupts import interrupts_after
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 
 Array = np.ndarray
 

@@ -17,7 +17,7 @@ from benchmarks.peer_casadi import IPOPT_WARM, MAX_ITERATIONS, check_problem, me
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.interrupts import interrupts_after
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 
 MISSING = "not installed: pip install 'gpmpc[bench]'"
 

@@ -16,7 +16,7 @@ from benchmarks.kkt import Instance
 from benchmarks.peer_casadi import check_problem
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 
 
 class Plan(NamedTuple):

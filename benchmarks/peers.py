@@ -42,7 +42,7 @@ from benchmarks.timing import (
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc.controller import Controller, Decision, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 

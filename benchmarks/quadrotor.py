@@ -10,7 +10,7 @@ from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, standardize
 from gpmpc.mpc.controller import Controller, Decision, Reference
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.simulation import Noise, closed_loop
 from gpmpc.systems import Integrated, Rotational, Translational
 from gpmpc.trajectories import Elliptical, Lorenz, states_along

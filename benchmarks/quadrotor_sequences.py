@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks.quadrotor import HOVER, TRAJECTORIES, problem, recorded, trained
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.tracking import StateBounds
+from gpmpc.mpc.problem import StateBounds
 from gpmpc.propagation import Linearization
 from gpmpc.trajectories import states_along
 

@@ -25,8 +25,8 @@ from gpmpc.mpc.controller import Controller
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.lqr import LQR
 from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.mpc.state_form import StateFormMPC
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import cascade_loop, closed_loop
 from gpmpc.systems import Coupled, Integrated

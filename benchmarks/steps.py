@@ -23,7 +23,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc.controller import Controller, Decision, Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.simulation import closed_loop

@@ -26,7 +26,7 @@ from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.metrics import tracking_error
 from gpmpc.mpc.controller import Controller, Decision, Reference
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.plotting import png, quality
 from gpmpc.studies.document import MISSING, Document, Table, number
 from gpmpc.studies.flight import Experiment, run_trial

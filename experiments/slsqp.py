@@ -21,9 +21,8 @@ from scipy.optimize import minimize
 from gpmpc.dynamics import DynamicsModel, tensors_for, to_array
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Decision, Reference, Timing
-from gpmpc.mpc.request import Request, check_controller, check_dynamics
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.controller import Decision, Reference, Request, Timing, check_controller, check_dynamics
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.propagation import Propagator, differentiate
 from gpmpc.status import Status
 
@@ -103,11 +102,11 @@ class SLSQP:
         began = time.perf_counter()
         request = Request.read(self.problem, self.horizon, self.initial_input, belief, reference, previous)
         if not request.finite:
-            return request.unanswered(Status.INVALID_MEASUREMENT)
+            return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
             found, status, count = self._minimize(request)
         except (DataError, np.linalg.LinAlgError, RuntimeError):  # a trial plan led the model out of its numbers
-            return request.unanswered(Status.NUMERICAL_TROUBLE)
+            return request.failed_decision(Status.NUMERICAL_TROUBLE)
         inputs, timing = found.plan.reshape(self.horizon, -1), Timing(0.0, 0.0, time.perf_counter() - began)
         kept = bool((found.margins <= 1e3 * FEASIBLE).all())
         predicted = found.means, found.covariances, status, count, timing
@@ -120,9 +119,13 @@ class SLSQP:
             (self.horizon, self.problem.state_dim, len(self._state)),
         )
         means, covariances, by_state, by_input = self._roll_out(plan, request)
-        errors = means[1:] - request.targets
+        errors = means[1:] - request.references.states
         weighted = np.einsum("iab,ib->ia", self._weights, errors)
-        offset = {"inputs": 0.0, "deviations": request.wanted.ravel(), "increments": self._first(request.last)}
+        offset = {
+            "inputs": 0.0,
+            "deviations": request.references.inputs.ravel(),
+            "increments": self._first(request.references.previous_input),
+        }
         v = self._penalized @ plan - offset[self.problem.penalized]
         cost = (errors * weighted).sum() + (self._weights * covariances[1:]).sum() + v @ self._R @ v
         sd = np.sqrt(covariances[1:].diagonal(axis1=-2, axis2=-1)[:, self._state].clip(0))  # (H, r)
@@ -146,7 +149,7 @@ class SLSQP:
     def _minimize(self, request: Request) -> tuple[Evaluation, Status, int]:
         """Rounds of SLSQP, each in inputs scaled by the Gauss-Newton Hessian, from the better of two plans."""
         lower, upper = (np.tile(side, self.horizon) for side in (self.problem.input_lower, self.problem.input_upper))
-        starts = [plan.ravel().clip(lower, upper) for plan in (request.held, request.shifted)]
+        starts = [plan.ravel().clip(lower, upper) for plan in (request.constant_guess, request.initial_guess)]
         found, used = min((self.evaluate(plan, request) for plan in starts), key=_rank), 0
         for _ in range(ROUNDS):
             scale = abs(found.cost) + found.plan @ found.hessian @ found.plan + np.finfo(float).tiny
@@ -163,7 +166,7 @@ class SLSQP:
         return found, Status.NUMERICAL_TROUBLE if kept else Status.INFEASIBLE, used
 
     def _keeps_rates(self, plan: Array, request: Request) -> bool:
-        rates = (self._differences @ plan - self._first(request.last)).reshape(self.horizon, -1)
+        rates = (self._differences @ plan - self._first(request.references.previous_input)).reshape(self.horizon, -1)
         return bool((np.maximum(rates - self.problem.rate_upper, self.problem.rate_lower - rates) <= FEASIBLE).all())
 
     def _round(
@@ -180,7 +183,7 @@ class SLSQP:
 
         rows, low, high = [np.eye(len(T))], [lower], [upper]
         if self.problem.rate_limited:
-            first, H = self._first(request.last), self.horizon
+            first, H = self._first(request.references.previous_input), self.horizon
             rows.append(self._differences)
             low.append(np.tile(self.problem.rate_lower, H) + first)
             high.append(np.tile(self.problem.rate_upper, H) + first)

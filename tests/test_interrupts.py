@@ -12,7 +12,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.interrupts import interrupts_after
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.systems import Integrated, Translational
 
 

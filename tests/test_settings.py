@@ -10,7 +10,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Dropout, Gust
 from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational
@@ -42,7 +42,6 @@ def excited(**settings):
 
 CASES = [
     (nmpc, "tolerance", (0.0, -1e-6, math.nan)),
-    (nmpc, "first_guess", ("warm", None)),
     (convex, "iterations", (0, 1.5, -1)),
     (convex, "tolerance", (0.0, math.inf, "small")),
     (convex, "disturbance_gain", (-0.1, math.nan)),

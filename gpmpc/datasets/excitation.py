@@ -24,7 +24,7 @@ from gpmpc.datasets.flights import SUBSYSTEMS, check_weights, transitions_of
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gp.transitions import Transitions
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.simulation import Noise, Rollout, closed_loop
 from gpmpc.systems import ATTITUDES, Plant, attitude_for_thrust_direction
 from gpmpc.trajectories import Trajectory, states_along

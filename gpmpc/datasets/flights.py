@@ -18,7 +18,7 @@ from torch import Tensor
 from gpmpc.exceptions import DataError, SettingError, check_number, check_numbers
 from gpmpc.gp import Scaling, Transitions
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.simulation import Rollout, closed_loop
 from gpmpc.systems import ATTITUDES, Plant, attitude_for_thrust_direction
 from gpmpc.trajectories import Trajectory

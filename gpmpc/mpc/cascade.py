@@ -1,12 +1,10 @@
-"""Problem: a quadrotor's position is steered through its attitude, which is a hundred times faster.
+"""A cascade of two controllers: a quadrotor's position is steered through its attitude, which is much faster.
 
-Two controllers share the work (Cao, Lai and Alam, 2017). The outer one, on the translational subsystem,
-decides the thrust U1 and its direction (ux, uy), once a second say; the direction, by eq. (2) inverted, is the attitude
-that the inner one, on the rotational subsystem, takes the vehicle to at a rate of its own. (With the plant in the loop
-an inner loop at 1 Hz is unworkable; 20 Hz flies well.)
-
-An angle that is to be reached soon has to be approached with a rate that fits: the references of the rates are those of
-a first-order approach, (angle_d - angle) / response time.
+The outer controller, on the translational subsystem, decides the thrust U1 and its direction (ux, uy), once a second
+say; the direction, by eq. (2) of Cao, Lai and Alam (2017) inverted, is the attitude that the inner one, on the
+rotational subsystem, takes the vehicle to at a rate of its own. (With the plant in the loop an inner loop at 1 Hz is
+unworkable; 20 Hz flies well.) The references of the angular rates are those of a first-order approach to the attitude,
+(angle_d - angle) / response time.
 """
 
 from dataclasses import dataclass

@@ -13,8 +13,8 @@ import numpy as np
 
 from gpmpc.compiled import compiled
 from gpmpc.mpc.condense import StateRows
+from gpmpc.mpc.problem import StateBounds
 from gpmpc.mpc.stages import Covariance
-from gpmpc.mpc.tracking import StateBounds
 from gpmpc.qp import SoftRows
 
 Array = np.ndarray

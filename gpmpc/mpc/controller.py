@@ -1,18 +1,29 @@
-"""Problem: everything that turns what is known of the state, and a reference, into an input, behind one call.
+"""The protocol of controllers: from a belief and a reference to a decision.
 
-A controller keeps nothing between calls: what it wants to remember (its last plan) is part of the ``Decision`` that it
-returns, and comes back to it as ``previous``.
+A controller keeps nothing between calls: what it needs of its last plan is part of the ``Decision`` that it returns,
+and is handed to it again as ``previous``.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from gpmpc.exceptions import ShapeError
+from gpmpc.compiled import compile_for, compiled, njit_inner, unchecked_entry_point
+from gpmpc.dynamics import DynamicsModel
+from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.linear_quadratic import References
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.qp import QPSolution, QuadraticProgram
 from gpmpc.status import Status
+
+Array = np.ndarray
+
+FEASIBLE = 1e-3  # by how much a suboptimal plan may miss hard bounds, in their units: a next step mends it
+_NO_PLAN, _NO_DISTURBANCE = np.empty((0, 0)), np.empty(0)
+_SIGNATURE = "i8(f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])"
+_BELIEF, _STATES, _INPUTS, _PREVIOUS = 1, 2, 4, 8  # what may not be finite
 
 
 @dataclass(frozen=True)
@@ -27,8 +38,8 @@ class Reference:
         ShapeError: The two do not belong together.
     """
 
-    states: np.ndarray
-    inputs: np.ndarray | None = None
+    states: Array
+    inputs: Array | None = None
 
     def __post_init__(self) -> None:
         if np.ndim(self.states) != 2 or len(self.states) < 2:
@@ -44,17 +55,11 @@ class Reference:
 
 @dataclass(frozen=True)
 class Timing:
-    """Where the wall time of a decision went [s].
+    """Wall time of the parts of a decision [s]."""
 
-    Attributes:
-        model: Propagation and linearisation.
-        build: From the local model to the optimisation problem.
-        solve: The optimisation problem itself.
-    """
-
-    model: float  # [s]
-    build: float  # [s]
-    solve: float  # [s]
+    model: float  # propagation and linearisation
+    build: float  # from the local model to the optimisation problem
+    solve: float  # of the optimisation problem
 
     @property
     def total(self) -> float:
@@ -73,25 +78,25 @@ class Decision:
         covariances: Their covariances (H + 1, n, n); zero where the controller does not predict them.
         status: How the solve ended.
         iterations: Iterations of the solver.
-        timing: Where the time went.
+        timing: Wall time of the parts.
         problem: The quadratic program that was solved last, where there is one.
         solution: Its solution: active set, multipliers, residuals; a warm start for the next.
-        disturbance: What was added to the model's mean at every stage (n,), an estimate of its constant error; None
-            where nothing is estimated.
+        disturbance: Estimate of the model's constant error (n,), added to its mean at every stage; None where nothing
+            is estimated.
         suboptimal: The solve stopped short of its tolerance, at a limit say, with a plan that keeps its bounds and that
             steps towards the optimum led to (Scokaert, Mayne and Rawlings, 1999).
     """
 
-    input: np.ndarray
-    inputs: np.ndarray
-    means: np.ndarray
-    covariances: np.ndarray
+    input: Array
+    inputs: Array
+    means: Array
+    covariances: Array
     status: Status
     iterations: int
     timing: Timing
     problem: QuadraticProgram | None = None
     solution: QPSolution | None = None
-    disturbance: np.ndarray | None = None
+    disturbance: Array | None = None
     suboptimal: bool = False
 
     def __post_init__(self) -> None:
@@ -109,6 +114,7 @@ class Controller(Protocol):
     @property
     def horizon(self) -> int:
         """H, how far it looks ahead."""
+        ...
 
     def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
         """Decides the input for one step.
@@ -118,3 +124,175 @@ class Controller(Protocol):
             reference: Over the controller's horizon.
             previous: The last decision, to warm-start from; None at the first step.
         """
+        ...
+
+
+class Request(NamedTuple):
+    """The arguments of ``control``, validated and converted to contiguous float64 arrays.
+
+    Attributes:
+        state: Mean of the belief (n,).
+        covariance: Of the belief (n, n).
+        references: r_1 .. r_H, reference inputs (zero where there are none), and the input before this step.
+        initial_guess: The last plan, one step on, its last input repeated (H, m); the previous input repeated where no
+            plan may be applied. Within the input bounds.
+        finite: Whether the belief is. A belief that is not is a bad measurement, not misuse.
+        disturbance: Added to the model's mean at every stage (n,), or nothing (0,).
+    """
+
+    state: Array
+    covariance: Array
+    references: References
+    initial_guess: Array
+    finite: bool
+    disturbance: Array = _NO_DISTURBANCE
+
+    @classmethod
+    def read(
+        cls,
+        problem: TrackingProblem,
+        horizon: int,
+        initial_input: Array,
+        belief: Gaussian,
+        reference: Reference,
+        previous: Decision | None,
+    ) -> "Request":
+        """Validates the arguments of ``Controller.control``.
+
+        Args:
+            problem: Of n states and m inputs.
+            horizon: H.
+            initial_input: Taken for the previous input where there is no decision before (m,).
+            belief: Of the state.
+            reference: Over the horizon.
+            previous: The last decision. Of one that is not applicable only ``input`` counts: what was applied.
+
+        Raises:
+            ShapeError: Belief or reference have other dimensions than the problem and the horizon.
+            DataError: The reference is not finite.
+        """
+        if not (isinstance(belief, Gaussian) and isinstance(reference, Reference)):
+            raise ShapeError(
+                "control takes a Gaussian (Gaussian.certain(x) for a measured state) and a Reference(states); "
+                f"got {type(belief).__name__} and {type(reference).__name__}"
+            )
+        n, m = problem.state_dim, problem.input_dim
+        state, covariance, states = _array(belief.mean), _array(belief.covariance), _array(reference.states)
+        if state.shape != (n,) or states.shape != (horizon + 1, n):
+            raise ShapeError(
+                f"state and reference must have shapes ({n},) and ({horizon + 1}, {n}); "
+                f"got {state.shape} and {states.shape}"
+            )
+        inputs = np.zeros((horizon, m)) if reference.inputs is None else _array(reference.inputs)
+        if inputs.shape != (horizon, m):
+            raise ShapeError(f"reference inputs must have shape ({horizon}, {m}); got {inputs.shape}")
+        last, plan = initial_input if previous is None else _array(previous.input), _NO_PLAN
+        if previous is not None and previous.applicable and np.shape(previous.inputs) == (horizon, m):
+            plan = _array(previous.inputs)
+        last, guess = _array(last), np.empty((horizon, m))
+        bounds = problem.input_lower, problem.input_upper
+        found = _run(state, covariance, states, inputs, last, plan, *bounds, guess)
+        if found & _PREVIOUS:
+            last = _array(initial_input)
+            found = _run(state, covariance, states, inputs, last, plan, *bounds, guess)
+        for part, name, values in ((_STATES, "states", states), (_INPUTS, "inputs", inputs)):
+            if found & part:
+                raise DataError(f"reference {name} must be finite; got {values[~np.isfinite(values)][0]}")
+        return cls(state, covariance, References(states[1:], inputs, last), guess, not found & _BELIEF)
+
+    @property
+    def constant_guess(self) -> Array:
+        """The previous input over the whole horizon (H, m)."""
+        return np.tile(self.references.previous_input, (len(self.initial_guess), 1))
+
+    def failed_decision(self, status: Status, iterations: int = 0, timing: Timing | None = None) -> Decision:
+        """The decision of a step without a usable solve: the initial guess, and no prediction."""
+        H, n = self.references.states.shape
+        return Decision(
+            input=self.initial_guess[0],
+            inputs=self.initial_guess,
+            means=np.full((H + 1, n), np.nan),
+            covariances=np.full((H + 1, n, n), np.nan),
+            status=status,
+            iterations=iterations,
+            timing=timing or Timing(0.0, 0.0, 0.0),
+        )
+
+
+def check_dynamics(model: DynamicsModel) -> tuple[int, int]:
+    """Returns the numbers of states and inputs of a model that predicts the next state.
+
+    Raises:
+        SettingError: It is no model, or predicts something else.
+    """
+    if not hasattr(model, "predict"):
+        raise SettingError("model", f"must be a DynamicsModel, such as GPPosterior; got {type(model).__name__}")
+    if model.output_dim != model.state_dim:
+        raise SettingError(
+            "model", f"must predict the next state; got {model.state_dim} states and {model.output_dim} outputs"
+        )
+    return model.state_dim, model.input_dim
+
+
+def check_method(key: str, value: object, method: str, example: str) -> None:
+    """Raises ``SettingError`` unless a setting is an object (no class of them) with a method."""
+    if isinstance(value, type) or not hasattr(value, method):
+        got = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
+        raise SettingError(key, f"must be an object with the method {method!r}, such as {example}; got {got}")
+
+
+def check_controller(problem: TrackingProblem, states: int, inputs: int, horizon: int, initial_input: Any) -> Array:
+    """Checks the settings that every controller has against its model, and returns the initial input as an array (m,).
+
+    Raises:
+        SettingError: A horizon below 1, weights of another dimension than the model's, or an initial input of the
+            wrong length.
+    """
+    global _run
+    compile_for(_check, _SIGNATURE)
+    _run = unchecked_entry_point(_check)
+    if not isinstance(problem, TrackingProblem):
+        raise SettingError("problem", f"must be TrackingProblem(...); got {type(problem).__name__}")
+    check_number("horizon", horizon, least=1, whole=True)
+    check_numbers("initial_input", initial_input, inputs)
+    if (problem.state_dim, problem.input_dim) != (states, inputs):
+        raise SettingError(
+            "problem",
+            f"must weigh {states} states and {inputs} inputs; got {problem.state_dim} and {problem.input_dim}",
+        )
+    return np.array(initial_input, dtype=float)
+
+
+def _array(value: Any) -> Array:
+    """A tensor or array as contiguous float64 in host memory."""
+    if hasattr(value, "detach"):
+        try:
+            value = value.numpy()
+        except (RuntimeError, TypeError):  # on another device, or part of a graph
+            value = value.numpy(force=True)
+    return np.ascontiguousarray(value, dtype=np.float64)
+
+
+@compiled(locked=True)
+def _check(state, covariance, states, inputs, last, plan, lower, upper, guess):
+    """Returns which parts are not finite, a sum of ``_BELIEF`` .. ``_PREVIOUS``, and writes the initial guess."""
+    H, m = guess.shape
+    for k in range(H):
+        for j in range(m):
+            u = plan[min(k + 1, H - 1), j] if len(plan) > 0 else last[j]
+            guess[k, j] = min(max(u, lower[j]), upper[j])
+    found = 0 if _is_finite(state) and _is_finite(covariance.ravel()) else _BELIEF
+    found += 0 if _is_finite(states.ravel()) else _STATES
+    found += 0 if _is_finite(inputs.ravel()) else _INPUTS
+    return found + (0 if _is_finite(last) else _PREVIOUS)
+
+
+@njit_inner
+def _is_finite(values):
+    total = 0.0
+    for value in values:
+        total += value * 0.0
+    return total == 0.0
+
+
+_run = _check  # until it is compiled

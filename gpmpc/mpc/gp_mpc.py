@@ -24,13 +24,12 @@ from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.condense import CondensedProgram, Condenser
 from gpmpc.mpc.constraints import price_violations
-from gpmpc.mpc.controller import Decision, Reference, Timing
-from gpmpc.mpc.linear_quadratic import References, Stages, expand
+from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_method
+from gpmpc.mpc.linear_quadratic import Stages, expand
 from gpmpc.mpc.prediction import Form, Prediction, PredictionModel
-from gpmpc.mpc.request import Request, check_method
-from gpmpc.mpc.sqp import FAILURES, FEASIBLE, FullStep, Globalization
+from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.sqp import FAILURES, FullStep, Globalization
 from gpmpc.mpc.stages import Covariance, Plan
-from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Propagator
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
 from gpmpc.status import Status
@@ -116,13 +115,13 @@ class GPMPC:
         """
         request, clock = self.prediction.read(belief, reference, previous), _Stopwatch()
         if not request.finite:
-            return request.unanswered(Status.INVALID_MEASUREMENT)
+            return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
             plan = self.prediction.initial_guess(request, previous)
             prediction = self.prediction.linearize(plan, request, previous)
             return self._improve(prediction, request, previous, clock)
         except FAILURES:
-            return request.unanswered(Status.NUMERICAL_TROUBLE, timing=clock.timing)
+            return request.failed_decision(Status.NUMERICAL_TROUBLE, timing=clock.timing)
 
     def _improve(
         self, prediction: Prediction, request: Request, previous: Decision | None, clock: "_Stopwatch"
@@ -141,14 +140,14 @@ class GPMPC:
             clock.solve()
             count, status = count + 1, solution.status
             if _is_usable(program, solution, prediction.plan):
-                proposed = self._proposed(prediction, program, solution, request.last)
+                proposed = self._proposed(prediction, program, solution, request.references.previous_input)
                 prediction, status = globalize(prediction, program, solution, proposed)
         clock.model()
         status = Status.ITERATION_LIMIT if status is None else status
         program = QuadraticProgram.unchecked(*program[:5])
         suboptimal = not status.solved and prediction.plan is not guess and self._missed(prediction) <= FEASIBLE
         if not (status.solved or suboptimal):
-            return replace(request.unanswered(status, count, clock.timing), problem=program, solution=solution)
+            return replace(request.failed_decision(status, count, clock.timing), problem=program, solution=solution)
         plan, disturbance = prediction.plan, request.disturbance if self.prediction.disturbance_gain else None
         inputs, beliefs = plan.inputs.copy(), self.prediction.linearizer.moments(plan.states, prediction.covariances)
         found = program, solution, disturbance, suboptimal
@@ -172,7 +171,7 @@ class GPMPC:
         asked = list(zip(beliefs, references, previous, strict=True))
         requests = [self.prediction.read(*question) for question in asked]
         known, clock = [t for t, request in enumerate(requests) if request.finite], _Stopwatch()
-        decisions = [request.unanswered(Status.INVALID_MEASUREMENT) for request in requests]
+        decisions = [request.failed_decision(Status.INVALID_MEASUREMENT) for request in requests]
         try:
             made = self.prediction.linearize_many([requests[t] for t in known], [previous[t] for t in known])
         except FAILURES:  # one of them spoils the batch: which one, they say alone
@@ -182,7 +181,7 @@ class GPMPC:
             try:
                 decisions[t] = self._improve(prediction, requests[t], previous[t], clock.copy())
             except FAILURES:
-                decisions[t] = requests[t].unanswered(Status.NUMERICAL_TROUBLE, timing=clock.timing)
+                decisions[t] = requests[t].failed_decision(Status.NUMERICAL_TROUBLE, timing=clock.timing)
         return decisions
 
     @property
@@ -224,7 +223,7 @@ class GPMPC:
         return QuadraticProgram.from_stacked(*self._condense(prediction, request)[:5])
 
     def _condense(self, prediction: Prediction, request: Request) -> CondensedProgram:
-        stages, references = Stages(*prediction.stages[:3]), References(request.targets, request.wanted, request.last)
+        stages, references = Stages(*prediction.stages[:3]), request.references
         return self._condenser.condense(stages, prediction.plan.states[0], references, prediction.rows)
 
     def _solve(self, program: CondensedProgram, warm: QPSolution | None) -> QPSolution:

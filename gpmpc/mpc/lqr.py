@@ -11,10 +11,9 @@ import numpy as np
 
 from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Decision, Reference, Timing
-from gpmpc.mpc.linear_quadratic import PENALIZED, References, Stages, TrackingCost, optimal_feedback
-from gpmpc.mpc.request import Request, check_controller, check_dynamics
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.controller import Decision, Reference, Request, Timing, check_controller, check_dynamics
+from gpmpc.mpc.linear_quadratic import Stages, TrackingCost, optimal_feedback
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.status import Status
 
 
@@ -39,8 +38,7 @@ class LQR:
     def __init__(self, model: DynamicsModel, problem: TrackingProblem, horizon: int, initial_input: Sequence[float]):
         self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
         self.model, self.problem, self.horizon = model, problem, horizon
-        weights = (np.ascontiguousarray(weight)[None] for weight in (problem.Q, problem.terminal))
-        self._cost = TrackingCost(*weights, np.ascontiguousarray(problem.R), PENALIZED.index(problem.penalized))
+        self._cost = TrackingCost.of(problem, problem.Q[None], problem.terminal[None])
 
     def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
         """The clipped linear-quadratic plan; see ``Controller.control``. Covariances are not predicted.
@@ -51,19 +49,19 @@ class LQR:
         began = time.perf_counter()
         request = Request.read(self.problem, self.horizon, self.initial_input, belief, reference, previous)
         if not request.finite:
-            return request.unanswered(Status.INVALID_MEASUREMENT)
-        states = np.vstack([request.state, request.targets[:-1]])
-        inputs = request.held if reference.inputs is None else request.wanted
+            return request.failed_decision(Status.INVALID_MEASUREMENT)
+        (targets, inputs, last), x, p = request.references, request.state, self.problem
+        states = np.vstack([x, targets[:-1]])
+        inputs = request.constant_guess if reference.inputs is None else inputs
         at = linearize(self.model, states, inputs, covariance=False)
         modelled = time.perf_counter()
         c = at.mean - np.einsum("iab,ib->ia", at.A, states) - np.einsum("iab,ib->ia", at.B, inputs)
         stages = Stages(at.A, at.B, c)
         if not all(np.isfinite(part).all() for part in stages):
-            return request.unanswered(Status.NUMERICAL_TROUBLE)
-        feedback, _ = optimal_feedback(self._cost, stages, References(request.targets, request.wanted, request.last))
+            return request.failed_decision(Status.NUMERICAL_TROUBLE)
+        feedback, _ = optimal_feedback(self._cost, stages, request.references)
         if not np.isfinite(feedback).all():
-            return request.unanswered(Status.NUMERICAL_TROUBLE)
-        n, p, x, last = self.problem.state_dim, self.problem, request.state, request.last
+            return request.failed_decision(Status.NUMERICAL_TROUBLE)
         states, inputs = [x], []
         for A, B, offset, F in zip(*stages, feedback, strict=True):
             u = F @ np.concatenate([x, last, [1.0]])
@@ -77,7 +75,7 @@ class LQR:
             input=inputs[0],
             inputs=np.array(inputs),
             means=np.array(states),
-            covariances=np.zeros((self.horizon + 1, n, n)),
+            covariances=np.zeros((self.horizon + 1, len(x), len(x))),
             status=Status.SOLVED if finite else Status.NUMERICAL_TROUBLE,
             iterations=self.horizon,
             timing=Timing(modelled - began, 0.0, time.perf_counter() - modelled),

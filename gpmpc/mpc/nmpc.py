@@ -1,30 +1,28 @@
-"""Problem: the best that a controller can do which knows the true model (nonlinear MPC, the paper's benchmark).
+"""Nonlinear MPC on the true model: the best that a controller can do which knows it, and the paper's benchmark.
 
 A ``TrackingProblem`` under x_{i+1} = plant(x_i, u_i), from the belief's mean; state bounds hold for the states
 themselves, since the model is taken to be true. It generated the data of Cao, Lai and Alam (2017), whose sum over
 N = H + 1 states starts at the measured one (its cost is constant) and has one input more, which only pays for itself.
 Multiple shooting in CasADi (Andersson et al., 2019), solved by IPOPT (Waechter and Biegler, 2006) with exact
-derivatives.
+derivatives. It starts from the previous input repeated: the last plan shifted saves an interior-point method nothing,
+and led IPOPT to a worse local minimum on the paper's elliptical flight, where the end of a plan costs little.
 """
 
 import time
 from collections.abc import Sequence
-from typing import Literal
 
 import casadi
 import numpy as np
 
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc.exceptions import check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.interrupts import interrupts_after
-from gpmpc.mpc.controller import Decision, Reference, Timing
-from gpmpc.mpc.request import Request, check_controller
-from gpmpc.mpc.sqp import FEASIBLE
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_controller
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.status import Status
 from gpmpc.systems import Plant
 
-IPOPT_STATUS = {
+_STATUSES = {
     "Solve_Succeeded": Status.SOLVED,
     "Infeasible_Problem_Detected": Status.INFEASIBLE,
     "Maximum_Iterations_Exceeded": Status.ITERATION_LIMIT,
@@ -40,17 +38,13 @@ class NMPC:
         plant: The model, and what ``x_{i+1} = plant(x_i, u_i)`` means.
         problem: Weights and bounds. Soft state bounds get one slack variable each, with their weights.
         horizon: H, the number of predicted states.
-        initial_input: Taken for the last input where there is no previous decision (m,): the first guess, and where
+        initial_input: Taken for the previous input where there is no decision before (m,): the first guess, and where
             rates and increments start.
         tolerance: IPOPT's, on the scaled optimality conditions.
-        first_guess: ``"hold"`` starts from the last input held; ``"shift"`` from the last plan shifted, which keeps to
-            its local minimum but saves an interior-point method nothing (6 iterations either way on smooth flights).
-            The paper's data need ``"hold"``: the end of a plan steers little of their cost, so its inputs lie far from
-            the next solution, and from there IPOPT found a worse local minimum on the elliptical flight.
 
     Raises:
-        SettingError: A horizon below 1, weights of another dimension than the plant's, a guess of the wrong length, or
-            an unknown first guess.
+        SettingError: A horizon below 1, weights of another dimension than the plant's, or an initial input of the wrong
+            length.
     """
 
     def __init__(
@@ -60,14 +54,11 @@ class NMPC:
         horizon: int,
         initial_input: Sequence[float],
         tolerance: float = 1e-10,
-        first_guess: Literal["hold", "shift"] = "hold",
     ):
         n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
         self.initial_input = check_controller(problem, n, m, horizon, initial_input)
         check_number("tolerance", tolerance, above=0)
-        if first_guess not in ("hold", "shift"):
-            raise SettingError("first_guess", f"must be 'hold' or 'shift'; got {first_guess!r}")
-        self.plant, self.problem, self.horizon, self.first_guess = plant, problem, horizon, first_guess
+        self.plant, self.problem, self.horizon = plant, problem, horizon
         self._solver, self._bounds = _build(plant, problem, horizon, tolerance)
 
     def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
@@ -80,28 +71,21 @@ class NMPC:
         start = time.perf_counter()
         request = Request.read(self.problem, H, self.initial_input, belief, reference, previous)
         if not request.finite:
-            return request.unanswered(Status.INVALID_MEASUREMENT)
-        guess = request.held if self.first_guess == "hold" else request.shifted
-        guess = guess.clip(self.problem.input_lower, self.problem.input_upper)
-        lower, upper = self._bounds
-        states = [request.state]
+            return request.failed_decision(Status.INVALID_MEASUREMENT)
+        (targets, inputs, last), (lower, upper) = request.references, self._bounds
+        guess, states = request.constant_guess.clip(self.problem.input_lower, self.problem.input_upper), [request.state]
         for u in guess:
             states.append(np.array(self.plant.successor(states[-1], u), dtype=float))
         unknowns = np.zeros(len(lower["x"]))
         unknowns[: H * (n + m)] = np.concatenate([*states[1:], guess.ravel()])
+        parameters = np.concatenate([request.state, last, targets.ravel(), inputs.ravel()])
+        bounds = {"lbx": lower["x"], "ubx": upper["x"], "lbg": lower["g"], "ubg": upper["g"]}
         with interrupts_after():
-            solution = self._solver(
-                x0=unknowns,
-                p=np.concatenate([request.state, request.last, request.targets.ravel(), request.wanted.ravel()]),
-                lbx=lower["x"],
-                ubx=upper["x"],
-                lbg=lower["g"],
-                ubg=upper["g"],
-            )
+            solution = self._solver(x0=unknowns, p=parameters, **bounds)
         stats, found = self._solver.stats(), {key: np.array(solution[key]).ravel() for key in ("x", "g")}
         means = np.vstack([request.state, found["x"][: H * n].reshape(H, n)])
         inputs = found["x"][H * n : H * (n + m)].reshape(H, m)
-        status = IPOPT_STATUS.get(stats["return_status"], Status.NUMERICAL_TROUBLE)
+        status = _STATUSES.get(stats["return_status"], Status.NUMERICAL_TROUBLE)
         violation = np.max([np.maximum(lower[key] - at, at - upper[key]).max() for key, at in found.items()])
         return Decision(
             input=inputs[0],
@@ -117,7 +101,7 @@ class NMPC:
 
 def _build(
     plant: Plant, problem: TrackingProblem, horizon: int, tolerance: float
-) -> tuple[casadi.Function, tuple[dict, dict]]:
+) -> tuple[casadi.Function, list[dict[str, np.ndarray]]]:
     """IPOPT on the unknowns (x_1 .. x_H, u_0 .. u_{H-1}, slacks), and the bounds of unknowns and constraints."""
     n, m, H, limits = problem.state_dim, problem.input_dim, horizon, problem.state_bounds
     x0, last = casadi.SX.sym("x0", n), casadi.SX.sym("last", m)
@@ -133,8 +117,8 @@ def _build(
     if problem.rate_limited:
         constraints.append(casadi.vec(rates))
         g.append(np.tile([problem.rate_lower, problem.rate_upper], H))
-    hard = limits is not None and not limits.soft
-    box = [np.tile([limits.lower, limits.upper] if hard else [[-np.inf] * n, [np.inf] * n], H)]
+    free = [np.full(n, -np.inf), np.full(n, np.inf)]
+    box = [np.tile(free if limits is None or limits.soft else [limits.lower, limits.upper], H)]
     box.append(np.tile([problem.input_lower, problem.input_upper], H))
     unknowns = [casadi.vec(x), casadi.vec(u)]
     if limits is not None and limits.soft:
@@ -159,4 +143,4 @@ def _build(
         "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 500, "bound_relax_factor": 0.0},
     }
     bounds = [{"x": np.hstack(box)[side], "g": np.hstack(g)[side]} for side in (0, 1)]
-    return casadi.nlpsol("nmpc", "ipopt", nlp, options), tuple(bounds)
+    return casadi.nlpsol("nmpc", "ipopt", nlp, options), bounds

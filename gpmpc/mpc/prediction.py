@@ -36,11 +36,10 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.linalg import copy_matrix, product
 from gpmpc.mpc.condense import StateRows
 from gpmpc.mpc.constraints import ChanceConstraints
-from gpmpc.mpc.controller import Decision, Reference
+from gpmpc.mpc.controller import Decision, Reference, Request, check_controller, check_dynamics, check_method
 from gpmpc.mpc.linear_quadratic import finite_horizon_lqr
-from gpmpc.mpc.request import Request, check_controller, check_dynamics, check_method
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.mpc.stages import Covariance, LinearizedStages, Plan, StageLinearizer
-from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization, Propagator
 
 Array = np.ndarray
@@ -138,18 +137,22 @@ class PredictionModel:
             covariances[0] = request.covariance
         if self.form == "velocity":
             means[1:], covariances[1:] = request.state, covariances[0]
-            return Plan(self.linearizer.state(means, covariances), np.tile(request.last, (H, 1)), covariances)
-        inputs, known = request.shifted, previous is not None and previous.applicable
+            return Plan(
+                self.linearizer.state(means, covariances),
+                request.constant_guess,
+                covariances,
+            )
+        inputs, known = request.initial_guess, previous is not None and previous.applicable
         known = known and len(previous.means) == H + 1
         if known:
             means[1:H], means[H] = previous.means[2:], previous.means[H]
         else:
-            means[1:] = request.targets
+            means[1:] = request.references.states
             if problem.penalized == "deviations":
-                inputs = request.wanted.clip(problem.input_lower, problem.input_upper)
+                inputs = request.references.inputs.clip(problem.input_lower, problem.input_upper)
         if problem.rate_limited:
             inputs = inputs.copy()
-            _keep_rates(inputs, request.last, problem.rate_lower, problem.rate_upper)
+            _keep_rates(inputs, request.references.previous_input, problem.rate_lower, problem.rate_upper)
         if not self.linearizer.at_points:
             covariances[1:] = previous.covariances[1:] if known else self._first_covariances(means, inputs, request)
         return Plan(self.linearizer.state(means, covariances), inputs, covariances)
@@ -206,7 +209,7 @@ class PredictionModel:
     ) -> LinearizedStages:
         """A held linearisation as that of the increments since s_{-1}, the state that the last decision began at."""
         before = self.linearizer.state(previous.means[:1], previous.covariances[:1])[0]
-        c = plan.states[0] - stages.A[0] @ before - stages.B[0] @ request.last
+        c = plan.states[0] - stages.A[0] @ before - stages.B[0] @ request.references.previous_input
         if not request.covariance.any():
             n = self.problem.state_dim
             c[n:] = stages.c[0, n:]
@@ -225,7 +228,7 @@ class PredictionModel:
         gains = np.broadcast_to(-self.gain(prediction.stages), (self.horizon, problem.input_dim, n))
         gains = feedback[:, :, :n] if len(feedback) else gains
         states, inputs, covariances = (part.copy() for part in towards)
-        last, disturbance = request.last, request.disturbance if len(request.disturbance) else None
+        last, disturbance = request.references.previous_input, request.disturbance if len(request.disturbance) else None
         for k in range(self.horizon):
             input = towards.inputs[k] + gains[k] @ (states[k, :n] - towards.states[k, :n])
             input = np.clip(input, last + problem.rate_lower, last + problem.rate_upper)
@@ -258,7 +261,8 @@ class PredictionModel:
         if previous is None or not previous.applicable:
             return np.zeros(self.problem.state_dim)
         before = np.zeros_like(request.state) if previous.disturbance is None else previous.disturbance
-        predicted = linearize(self.model, previous.means[:1], request.last[None], covariance=False).mean[0]
+        applied = request.references.previous_input[None]
+        predicted = linearize(self.model, previous.means[:1], applied, covariance=False).mean[0]
         return before + self.disturbance_gain * (request.state - predicted - before)
 
 

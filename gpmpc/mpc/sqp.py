@@ -17,19 +17,20 @@ the covariances of ``full``, damped BFGS updates put it into the program (Noceda
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import torch
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import compiled, unchecked_entry_point
 from gpmpc.exceptions import DataError, ProblemError
 from gpmpc.kernels.linalg import dot
-from gpmpc.mpc.condense import CondensedProgram, StateRows
+from gpmpc.mpc.condense import CondensedProgram
 from gpmpc.mpc.constraints import price_violations
+from gpmpc.mpc.controller import Request
 from gpmpc.mpc.linear_quadratic import References, TrackingCost, tracking_cost
 from gpmpc.mpc.prediction import Prediction, PredictionModel
-from gpmpc.mpc.request import Request
 from gpmpc.mpc.stages import Plan
 from gpmpc.qp import QPSolution
 from gpmpc.status import Status
@@ -37,7 +38,6 @@ from gpmpc.status import Status
 Array = np.ndarray
 
 FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, torch.linalg.LinAlgError)  # no finite numbers
-FEASIBLE = 1e-3  # hard bounds may be missed by so much, in their units, by a plan that a next step would mend
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 _SHORTEST_STEP = 2.0**-10
 _ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
@@ -74,14 +74,16 @@ class Globalization:
 
     def __init__(self, model: PredictionModel, cost: TrackingCost, request: Request, tolerance: float):
         self._model, self._cost_terms, self._request, self._tolerance = model, cost, request, tolerance
-        self._references = References(request.targets, request.wanted, request.last)
-        self._zero = References(*map(np.zeros_like, self._references))
+        self._references = request.references
+        self._zero = References(*(np.zeros(part.shape) for part in self._references))
         problem = model.problem
-        sizes = np.minimum(np.maximum(1.0, np.abs(request.last)), problem.input_upper - problem.input_lower)
-        self._smallest = float((np.diag(problem.R) * (_SMALL * sizes) ** 2).min()) + np.finfo(float).tiny
-        self._defect_prices, self._row_price = np.zeros(1), 0.0
+        sizes = np.maximum(1.0, np.abs(self._references.previous_input))
+        sizes = np.minimum(sizes, problem.input_upper - problem.input_lower)
+        self._smallest = float((problem.R.diagonal() * sizes * sizes).min()) * _SMALL**2 + 1e-300
+        self._defect_prices, self._row_price = np.zeros(len(cost.state) * problem.state_dim), 0.0
         self._size, self._rate, self._creeps = math.inf, 1.0, False
         self._updates: deque[tuple[Array, Array]] = deque(maxlen=_MEMORY)  # steps and changes of the gradient
+        self._gradient = np.empty(0)  # of the cost at the plan of the last program
         self._last: tuple[Array, Array, Array] | None = None  # inputs, gradient of the Lagrangian, multipliers
 
     def correct(self, program: CondensedProgram, plan: Plan) -> CondensedProgram:
@@ -89,7 +91,7 @@ class Globalization:
         if len(program.feedback):  # its unknowns are not the inputs
             return program
         inputs = plan.inputs.ravel()
-        gradient = program.P @ inputs + program.q
+        self._gradient = gradient = program.P @ inputs + program.q
         if self._last is not None:
             before, last_gradient, z = self._last
             if self._size < _NEAR and np.any(inputs != before):
@@ -112,31 +114,34 @@ class Globalization:
             solution: Its solution.
             proposed: The plan that this means.
         """
-        plan, last_rate = at.plan, self._rate
+        plan, last_rate, prices = at.plan, self._rate, self._model.constraints.prices
+        z = solution.z
         if not len(program.feedback):
-            inputs = plan.inputs.ravel()
-            self._last = inputs, program.P @ inputs + program.q + program.G.T @ solution.z, solution.z
-        z = solution.z[len(solution.z) - at.rows.lower.size :].reshape(at.rows.lower.shape)
-        self._row_price = max(self._row_price, 2.0 * float(np.abs(z).max(initial=0.0)))
-        change = Plan(proposed.states - plan.states, proposed.inputs - plan.inputs, plan.covariances)
-        cost, curvature, defects = self._cost(at, at.rows), self._track(change, self._zero), _defects(at)
-        reach = max(1.0, float(np.abs(plan.states).max()))
-        size = max(math.sqrt(curvature / (cost + self._smallest)), float(defects.max()) / reach)
+            gradient = self._gradient + program.G.T @ z if len(z) else self._gradient
+            self._last = plan.inputs.ravel(), gradient, z
+        z = z[len(z) - at.rows.lower.size :].reshape(at.rows.lower.shape)
+        self._row_price = max(self._row_price, 2.0 * float(np.abs(z).max())) if z.size else self._row_price
+        terms, followed = self._cost_terms, (self._references, self._zero)
+        found = _call(
+            _assess, terms, followed, prices, self._row_price, at.stages.A, at.stages.next, at.rows, plan, proposed, z
+        )
+        cost, curvature, promised, largest, defects, costates = found
+        size = max(math.sqrt(curvature / (cost + self._smallest)), largest)
         self._size, self._rate = size, size / self._size if math.isfinite(self._size) else 1.0
         self._creeps = self._creeps or (self._rate > _CREEP and size < _NEAR)
         slower = max(self._rate, last_rate)  # the solution is better than the plan by about the slower of two rates
         settled = self._rate >= 1.0 and size**2 <= _NOISE
         if settled or size <= self._tolerance or size * slower <= self._tolerance * (1.0 - slower):
             return at._replace(plan=proposed), Status.SOLVED
-        costates = _costates(self._cost_terms, at.stages.A, proposed.states, self._references.states, at.rows.E, z)
-        self._defect_prices = np.maximum(self._defect_prices, 1.5 * np.abs(costates).max(axis=0))
-        merit = cost + float(defects.sum(axis=0) @ self._defect_prices)
-        slope = self._track(proposed, self._references) + self._price(at.rows, proposed) - curvature - merit
+        self._defect_prices = np.maximum(self._defect_prices, 1.5 * costates)
+        merit = cost + float(defects @ self._defect_prices)
+        slope = promised - curvature - merit
         length = 1.0
         while length >= _SHORTEST_STEP:
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
             for trial in self._candidates(at, _between(plan, proposed, length), program.feedback):
-                if self._cost(trial, at.rows) + float(_defects(trial).sum(axis=0) @ self._defect_prices) <= bound:
+                rows, weights = at.rows._replace(E=trial.rows.E), (prices, self._row_price, self._defect_prices)
+                if _call(_merit, terms, self._references, weights, trial.stages.next, rows, trial.plan) <= bound:
                     return trial, None
             length /= 2.0
         if size**2 <= _ROUND_OFF:  # size^2 of the cost is what could still be gained
@@ -157,24 +162,63 @@ class Globalization:
             except FAILURES:  # a trial plan may lead the model out of its numbers
                 continue
 
-    def _cost(self, at: Prediction, rows: StateRows) -> float:
-        """Cost and price of violated rows of a plan, within the bounds of ``rows``."""
-        return self._track(at.plan, self._references) + self._price(rows._replace(E=at.rows.E), at.plan)
-
-    def _track(self, plan: Plan, references: References) -> float:
-        return tracking_cost(self._cost_terms, plan.states, plan.inputs, references)
-
-    def _price(self, rows: StateRows, plan: Plan) -> float:
-        return price_violations(self._model.constraints.prices, rows, plan.states, self._row_price)
-
-
-def _defects(at: Prediction) -> Array:
-    """|F(s_k, u_k) - s_{k+1}| (H, p)."""
-    return np.abs(at.stages.next - at.plan.states[1:])
-
 
 def _between(plan: Plan, other: Plan, share: float) -> Plan:
     return other if share == 1.0 else Plan(*(a + share * (b - a) for a, b in zip(plan, other, strict=True)))
+
+
+@compiled
+def _assess(cost, followed, prices, row_price, A, after, rows, plan, proposed, z):
+    """What a step from a plan to a proposed one promises.
+
+    Returns:
+        Cost with price of violated rows at the plan, curvature of the step in the cost, cost with price promised, the
+        largest defect relative to the states, defects summed over the stages (p,), largest costates (p,).
+    """
+    references, zero = followed
+    (H, p), reach, largest, defects, most = after.shape, 1.0, 0.0, np.zeros(after.shape[1]), np.zeros(after.shape[1])
+    for k in range(H):
+        for i in range(p):
+            reach = max(reach, abs(plan.states[k + 1, i]))
+            defects[i] += abs(after[k, i] - plan.states[k + 1, i])
+            largest = max(largest, abs(after[k, i] - plan.states[k + 1, i]))
+    here = tracking_cost(cost, plan.states, plan.inputs, references)
+    here += price_violations(prices, rows, plan.states, row_price)
+    curvature = tracking_cost(cost, proposed.states - plan.states, proposed.inputs - plan.inputs, zero)
+    promised = tracking_cost(cost, proposed.states, proposed.inputs, references)
+    promised += price_violations(prices, rows, proposed.states, row_price)
+    costates = _costates(cost, A, proposed.states, references.states, rows.E, z)
+    for k in range(H):
+        for i in range(p):
+            most[i] = max(most[i], abs(costates[k, i]))
+    return here, curvature, promised, largest / reach, defects, most
+
+
+@compiled
+def _merit(cost, references, weights, after, rows, plan):
+    """The exact penalty function at a plan, within the bounds of ``rows``."""
+    prices, row_price, defect_prices = weights
+    merit = tracking_cost(cost, plan.states, plan.inputs, references)
+    merit += price_violations(prices, rows, plan.states, row_price)
+    for k in range(len(after)):
+        for i in range(after.shape[1]):
+            merit += defect_prices[i] * abs(after[k, i] - plan.states[k + 1, i])
+    return merit
+
+
+def _call(kernel: Callable, *arguments: Any) -> Any:
+    """Calls a kernel without numba's look at the types, which takes longer than the kernel where they are named tuples.
+
+    They are always those of the first call: tuples of contiguous float64 arrays.
+    """
+    entry = _entry_points.get(kernel)
+    if entry is None:
+        kernel(*arguments)
+        entry = _entry_points[kernel] = unchecked_entry_point(kernel)
+    return entry(*arguments)
+
+
+_entry_points: dict[Callable, Callable] = {}
 
 
 @compiled

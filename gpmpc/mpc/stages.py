@@ -16,10 +16,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
+from gpmpc.compiled import compiled
 from gpmpc.dynamics import DynamicsModel, linearize, tensors_for, to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.extended_state import square_roots
+from gpmpc.kernels.linalg import dot
 from gpmpc.propagation import Propagator, differentiate
 from gpmpc.propagation import linearize as linearize_belief
 
@@ -127,8 +129,7 @@ class StageLinearizer:
         if disturbance is not None:
             after = after.copy()
             after[:, : self._n] += disturbance
-        c = after - (A @ states[..., None] + B @ inputs[..., None])[..., 0]
-        return LinearizedStages(A, B, c, after, V)
+        return LinearizedStages(A, B, _constants(A, B, after, states, inputs), after, V)
 
     def _points(self, states: Array, inputs: Array, _: Array) -> tuple[Array, ...]:
         found = linearize(self.model, states, inputs, self.covariance == "zero_order")
@@ -171,3 +172,13 @@ class StageLinearizer:
     def _tensors(self, means: Array, covariances: Array, inputs: Array) -> tuple[Gaussian, torch.Tensor]:
         mean, covariance, input = tensors_for(self.model, means, covariances, inputs)
         return Gaussian(mean, covariance), input
+
+
+@compiled
+def _constants(A, B, after, states, inputs):
+    """C (K, p) of s+ = A s + B u + c through the points."""
+    c = after.copy()
+    for k in range(len(c)):
+        for i in range(c.shape[1]):
+            c[k, i] -= dot(A[k, i], states[k], A.shape[2]) + dot(B[k, i], inputs[k], B.shape[2])
+    return c

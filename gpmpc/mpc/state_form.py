@@ -20,12 +20,11 @@ import numpy as np
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing
 from gpmpc.mpc.prediction import Form, Prediction, PredictionModel
-from gpmpc.mpc.request import Request
-from gpmpc.mpc.sqp import FAILURES, FEASIBLE
+from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.sqp import FAILURES
 from gpmpc.mpc.stages import Covariance
-from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Propagator
 from gpmpc.qp.cvxpy_ import STATUSES, TIGHT
 from gpmpc.status import Status
@@ -82,14 +81,14 @@ class StateFormMPC:
 
         request, began = self.prediction.read(belief, reference, previous), perf_counter()
         if not request.finite:
-            return request.unanswered(Status.INVALID_MEASUREMENT)
+            return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
             plan = self.prediction.initial_guess(request, previous)
             prediction = self.prediction.linearize(plan, request, previous)
             if not all(np.isfinite(part).all() for part in prediction.stages):
                 raise DataError("the stages are not finite")
         except FAILURES:
-            return request.unanswered(Status.NUMERICAL_TROUBLE, timing=Timing(perf_counter() - began, 0.0, 0.0))
+            return request.failed_decision(Status.NUMERICAL_TROUBLE, timing=Timing(perf_counter() - began, 0.0, 0.0))
         modelled = perf_counter()
         self._program.set(prediction, request)
         built, program = perf_counter(), self._program.problem
@@ -104,7 +103,7 @@ class StateFormMPC:
         iterations = (program.solver_stats.num_iters or 0) if program.solver_stats else 0
         suboptimal = status is Status.ITERATION_LIMIT and self._program.feasible
         if not (status.solved or suboptimal):
-            return request.unanswered(status, iterations, timing)
+            return request.failed_decision(status, iterations, timing)
         inputs, states = np.array(self._program.inputs.value), np.array(self._program.states.value)
         beliefs = self.prediction.linearizer.moments(states, prediction.covariances)
         disturbance = request.disturbance if self.prediction.disturbance_gain else None
@@ -164,9 +163,9 @@ class _Program:
         for parameters, values in zip(self._stages, zip(*prediction.stages[:3], strict=True), strict=True):
             for parameter, value in zip(parameters, values, strict=True):
                 parameter.value = value
-        self._start.value, self._last.value = prediction.plan.states[0], request.last
-        self._wanted.value, targets = request.wanted, np.zeros(self._targets.shape)
-        targets[:, : request.targets.shape[1]] = request.targets
+        self._start.value, self._last.value = prediction.plan.states[0], request.references.previous_input
+        self._wanted.value, targets = request.references.inputs, np.zeros(self._targets.shape)
+        targets[:, : request.references.states.shape[1]] = request.references.states
         self._targets.value = targets
         if self._rows:
             r = self._rows[0].shape[0]

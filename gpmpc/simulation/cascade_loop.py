@@ -16,7 +16,7 @@ from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.supervision import Command, OnFailure, check_policy, command
+from gpmpc.mpc.policy import Command, OnFailure, check_policy, command
 from gpmpc.simulation.disturbances import Disturbance
 from gpmpc.simulation.loop import Flight, History, Moment, Rollout, check_references, fly, window
 from gpmpc.simulation.simulator import Noise, PlantSimulator

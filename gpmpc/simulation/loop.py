@@ -15,7 +15,7 @@ import numpy as np
 from gpmpc.exceptions import Diverged, GpmpcError, SettingError, ShapeError, SolverFailure, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Controller, Reference, Timing
-from gpmpc.mpc.supervision import Command, OnFailure, check_policy, command
+from gpmpc.mpc.policy import Command, OnFailure, check_policy, command
 from gpmpc.simulation.disturbances import Disturbance
 from gpmpc.simulation.simulator import ModelLoop, ModelSimulator, Noise, PlantSimulator, Simulator, step_together
 from gpmpc.status import Status
@@ -85,7 +85,7 @@ def closed_loop(
         noise: On a plant's states, measurements and inputs.
         disturbances: Gusts, other plants, dropouts: what the controller does not know of.
         on_failure: What is applied where a solve fails: ``"previous_plan"``, ``"hold"`` or ``"raise"``; see
-            ``gpmpc.mpc.supervision``.
+            ``gpmpc.mpc.policy``.
         seed: Of all random numbers; equal seeds give equal numbers.
         on_step: Called after every step and outside of everything that is timed, such as a recorder's ``record``.
 

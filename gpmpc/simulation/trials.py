@@ -14,7 +14,7 @@ import numpy as np
 from gpmpc.exceptions import SettingError, SolverFailure, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Controller, Reference
-from gpmpc.mpc.supervision import Command, OnFailure, check_policy, commands
+from gpmpc.mpc.policy import Command, OnFailure, check_policy, commands
 from gpmpc.simulation.disturbances import Disturbance
 from gpmpc.simulation.loop import Flight, History, Rollout, check_references, fly, window
 from gpmpc.simulation.simulator import ModelLoop, Noise, PlantSimulator

@@ -22,7 +22,7 @@ from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
 from gpmpc.gp import GPPosterior, Training, Transitions
 from gpmpc.metrics import NEAR, find_loss, time_quantiles, tracking_error, violation_rate
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.supervision import OnFailure, check_policy
+from gpmpc.mpc.policy import OnFailure, check_policy
 from gpmpc.propagation import MomentMatching, Propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
 from gpmpc.studies.document import Table

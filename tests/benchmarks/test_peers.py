@@ -16,7 +16,7 @@ from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
 from gpmpc.systems import Integrated, Translational

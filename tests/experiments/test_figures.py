@@ -211,7 +211,7 @@ def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
     """From the last input held, a nearly flat direction of this GP takes it hundreds of iterations."""
     from gpmpc.gaussian import Gaussian
     from gpmpc.gp import Transitions
-    from gpmpc.mpc.tracking import TrackingProblem
+    from gpmpc.mpc.problem import TrackingProblem
 
     rng = np.random.default_rng(0)
     states, inputs = rng.normal(size=(40, 2)), rng.normal(size=(40, 1))
@@ -224,7 +224,7 @@ def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
     wanted = gp.predict(torch.tensor(states[0]), torch.tensor(inputs[0])).mean.numpy()
     decision = controller.control(Gaussian.certain(states[0]), Reference(np.stack([states[0], wanted]), inputs[:1]))
     assert decision.status.solved
-    assert decision.iterations <= 1
+    assert decision.iterations <= 2
     assert np.allclose(decision.inputs, inputs[:1], atol=1e-3)
 
 

@@ -15,7 +15,7 @@ from gpmpc.cli.run import experiment_of
 from gpmpc.exceptions import SettingError
 from gpmpc.experiments.quality import FAMILIES, TRUTH, Family, Quality, pareto_front, stage_cost
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.plotting import quality
 from gpmpc.propagation import Linearization
 from gpmpc.studies.study import TrialStore, run_study

@@ -8,11 +8,10 @@ import torch
 
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.controller import Reference, Request
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.request import Request
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.mpc.state_form import StateFormMPC
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import PrimalActiveSet
 from tests.mpc.systems import HOVER, quadrotor_gp

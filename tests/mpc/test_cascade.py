@@ -7,7 +7,7 @@ from gpmpc.exceptions import SettingError, ShapeError, SolverFailure
 from gpmpc.metrics import tracking_error
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.simulation import Dropout, Gust, Noise, Replaced, cascade_loop
 from gpmpc.status import Status
 from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational, step, thrust_direction

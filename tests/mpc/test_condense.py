@@ -8,10 +8,10 @@ import pytest
 from gpmpc.exceptions import ShapeError
 from gpmpc.mpc.condense import Condenser, StateRows, condense_with_feedback
 from gpmpc.mpc.linear_quadratic import References, Stages, expand, tracking_cost
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
 from gpmpc.status import Status
-from tests.mpc.double_pendulum import ACROBOT, PENDUBOT, UPRIGHT, DoublePendulum, successor
+from tests.mpc.double_pendulum import ACROBOT, PENDUBOT, UPRIGHT, DoublePendulum
 
 PENALIZED = ("inputs", "deviations", "increments")
 
@@ -211,7 +211,7 @@ def test_arrays_that_are_not_contiguous_are_refused(rng):
         )
 
 
-def wild_plans(rng, joint, start, goal, H):
+def wild_plans(rng, model, start, goal, H):
     """Plans to linearise along: the straight line, a rollout without torque, one with two kicks, and sheer noise."""
     line = np.linspace(0.0, 1.0, H + 1)[:, None]
     torques = np.zeros((H, 1))
@@ -220,7 +220,7 @@ def wild_plans(rng, joint, start, goal, H):
     for inputs in (torques, kicks):
         states = [start]
         for u in inputs:
-            states.append(successor(states[-1], u, joint))
+            states.append(model.successor(states[-1], u))
         yield np.array(states), inputs
     noise = rng.normal(size=(H, 4)) * [2.0, 2.0, 30.0, 30.0]
     yield np.vstack([start, noise]), rng.uniform(-6, 6, (H, 1))
@@ -240,7 +240,7 @@ def programs_of_the_double_pendulum(starts, seed):
         for turns in product((0, 1), (-1, 0, 1)):
             goal = UPRIGHT + 2 * np.pi * np.array([*turns, 0, 0])
             references = References(np.tile(goal, (H, 1)), np.zeros((H, 1)), np.zeros(1))
-            for states, inputs in wild_plans(rng, joint, start, goal, H):
+            for states, inputs in wild_plans(rng, model, start, goal, H):
                 at = model.linearize(states[:-1], inputs)
                 c = at.mean - np.einsum("kij,kj->ki", at.A, states[:-1]) - np.einsum("kij,kj->ki", at.B, inputs)
                 stages = Stages(at.A, at.B, c)

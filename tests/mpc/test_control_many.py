@@ -12,8 +12,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.mpc.stages import StageLinearizer
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from gpmpc.status import Status
 from tests.mpc.systems import HOVER, linear_gaussian, quadrotor_gp

@@ -11,9 +11,9 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.policy import command
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.mpc.state_form import StateFormMPC
-from gpmpc.mpc.supervision import command
-from gpmpc.mpc.tracking import TrackingProblem
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.status import Status
 from tests.mpc.small_models import double_integrator, pendulum_posterior

@@ -13,8 +13,8 @@ from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.prediction import FORMS
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.mpc.stages import COVARIANCES
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, rollout
 from gpmpc.qp import CvxpySolver, DualActiveSet
 from gpmpc.status import Status

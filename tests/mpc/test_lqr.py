@@ -11,7 +11,7 @@ from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.mpc.linear_quadratic import dlqr, finite_horizon_lqr
 from gpmpc.mpc.lqr import LQR
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.propagation import MeanEquivalence
 from gpmpc.status import Status
 from tests.mpc.small_models import LinearGaussian, double_integrator, pendulum_posterior

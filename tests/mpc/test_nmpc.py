@@ -5,7 +5,7 @@ from gpmpc.exceptions import SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.simulation import closed_loop
 from gpmpc.status import Status
 from gpmpc.systems import Integrated, Map, Rotational, Translational, step
@@ -159,18 +159,6 @@ def test_soft_bounds_of_one_state_leave_the_others_free():
     assert np.allclose(free.inputs, bounded.inputs, atol=1e-6)
 
 
-@pytest.mark.parametrize("first_guess", ["hold", "shift"])
-def test_both_first_guesses_fly_the_same_path(first_guess):
-    plant = Integrated(Translational(), time_step=0.5)
-    problem = TrackingProblem([10.0, 1, 10, 1, 10, 1], [0.1, 1, 1], "increments")
-    controller = NMPC(plant, problem, 6, [7.26, 0, 0], first_guess=first_guess)
-    t = 0.5 * np.arange(20)
-    references = np.stack([np.sin(t), np.cos(t), np.cos(t), -np.sin(t), -0.1 * t, 0 * t - 0.1], axis=1)
-    rollout = closed_loop(plant, controller, references, references[0], 12)
-    again = closed_loop(plant, NMPC(plant, problem, 6, [7.26, 0, 0]), references, references[0], 12)
-    assert np.allclose(rollout.inputs, again.inputs, atol=1e-5)
-
-
 def test_a_bad_measurement_is_said_so_and_the_last_plan_is_handed_on():
     plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
     controller = NMPC(plant, TrackingProblem([1.0, 0.1], [0.1]), 3, [0.0])
@@ -184,8 +172,6 @@ def test_reference_inputs_of_another_number_are_refused():
     controller = NMPC(Map(Rotational()), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3)
     with pytest.raises(ShapeError, match=r"reference inputs must have shape \(3, 3\); got \(3, 2\)"):
         controller.control(Gaussian.certain(np.zeros(6)), Reference(np.zeros((4, 6)), np.zeros((3, 2))))
-    with pytest.raises(SettingError, match="first_guess: must be 'hold' or 'shift'; got 'warm'"):
-        NMPC(Map(Rotational()), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3, first_guess="warm")
 
 
 @pytest.mark.parametrize("prices", [{"l1": 0.3}, {"l2": 2.0}, {"l1": 0.3, "l2": 2.0}], ids=str)

@@ -9,11 +9,10 @@ import torch
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.controller import Reference, Request
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.request import Request
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, rollout
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
@@ -310,10 +309,10 @@ def test_a_failed_plan_is_no_warm_start_and_one_that_stopped_at_a_limit_is():
     impatient = NonlinearGPMPC(pendulum_posterior(), Linearization(), problem, 4, [0.0], iterations=2, tolerance=1e-9)
     stopped = impatient.control(belief((2.0, -2.0)), swing(4))
     request = Request.read(problem, 4, np.zeros(1), belief(), swing(4), stopped)
-    assert np.array_equal(request.shifted, stopped.inputs[[1, 2, 3, 3]])
+    assert np.array_equal(request.initial_guess, stopped.inputs[[1, 2, 3, 3]])
     failed = replace(stopped, suboptimal=False)
     request = Request.read(problem, 4, np.zeros(1), belief(), swing(4), failed)
-    assert np.array_equal(request.shifted, request.held)
+    assert np.array_equal(request.initial_guess, request.constant_guess)
 
 
 @pytest.mark.parametrize("kind", KINDS)

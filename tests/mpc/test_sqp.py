@@ -11,7 +11,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.qp import DualActiveSet
 from gpmpc.status import Status

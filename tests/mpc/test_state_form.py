@@ -10,9 +10,9 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.prediction import FORMS
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.mpc.stages import COVARIANCES
 from gpmpc.mpc.state_form import StateFormMPC
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MeanEquivalence
 from gpmpc.qp import CvxpySolver
 from gpmpc.status import Status

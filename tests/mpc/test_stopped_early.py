@@ -12,8 +12,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.nmpc import NMPC
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.mpc.state_form import StateFormMPC
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.qp import DualActiveSet, PrimalActiveSet
 from gpmpc.simulation import closed_loop
@@ -34,9 +34,9 @@ def convex(problem=PROBLEM, **settings):
 def nmpc(monkeypatch):
     build = casadi.nlpsol
     with monkeypatch.context() as patch:
-        few = lambda *known: build(*known[:-1], known[-1] | {"ipopt": known[-1]["ipopt"] | {"max_iter": 8}})  # noqa: E731
+        few = lambda *known: build(*known[:-1], known[-1] | {"ipopt": known[-1]["ipopt"] | {"max_iter": 11}})  # noqa: E731
         patch.setattr(casadi, "nlpsol", few)
-        return NMPC(QUADROTOR, PROBLEM, H, HOVER, first_guess="shift")
+        return NMPC(QUADROTOR, PROBLEM, H, HOVER)
 
 
 STOPPED = {

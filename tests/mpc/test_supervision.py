@@ -4,8 +4,8 @@ import pytest
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Decision, Reference, Timing
-from gpmpc.mpc.supervision import command
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.policy import command
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.status import Status
 
 STATE, FAR = Gaussian.certain(np.zeros(1)), Reference(np.zeros((5, 1)))

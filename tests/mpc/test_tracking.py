@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import SettingError
-from gpmpc.mpc.tracking import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import StateBounds, TrackingProblem
 
 
 def test_diagonals_and_matrices_mean_the_same():

@@ -7,8 +7,8 @@ from gpmpc.exceptions import ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.controller import Decision, Reference, Timing
-from gpmpc.mpc.supervision import command, commands
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.policy import command, commands
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import ModelLoop, cascade_loop, closed_loop, closed_loops
 from gpmpc.status import Status

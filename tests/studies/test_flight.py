@@ -16,7 +16,7 @@ from gpmpc.gp import Trainer
 from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.tracking import TrackingProblem
+from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise
 from gpmpc.status import Status

@@ -1,4 +1,4 @@
-"""Problem: what a tracking controller is to make small, and what it has to keep.
+"""The tracking problem of all controllers: weights and bounds.
 
     minimise    sum_{i=1..H} E|x_i - r_i|^2_Q + sum_{i=0..H-1} |v_i|^2_R       (the last state's weight may be another)
     subject to  input_lower <= u_i <= input_upper,   rate_lower <= u_i - u_{i-1} <= rate_upper,
@@ -6,12 +6,10 @@
 
 where v is the input itself, its deviation from the reference input, or its increment (Cao, Lai and Alam, 2017,
 sections 3.2-3.3). For a Gaussian x_i, E|x - r|^2_Q = |mu - r|^2_Q + tr(Q Sigma), and a chance constraint is mu_j within
-the bounds by kappa(eta) sqrt(Sigma_jj), kappa(eta) = Phi^-1(eta). All controllers of this package take this one
-description.
+the bounds by kappa(eta) sqrt(Sigma_jj), kappa(eta) = Phi^-1(eta).
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any, Literal
@@ -29,7 +27,7 @@ class StateBounds:
     """Bounds on single states, each to hold with probability eta.
 
     Attributes:
-        lower: (n,); -inf where there is none.
+        lower: List or array (n,), kept as an array; -inf where there is none.
         upper: (n,); inf where there is none.
         confidence: eta.
         kappa: Standard deviations kept from a bound; Phi^-1(eta) unless given (the paper takes 2 for eta = 0.95).
@@ -40,10 +38,10 @@ class StateBounds:
         SettingError: Crossed bounds, eta outside (0.5, 1), or a weight that is not positive.
     """
 
-    lower: Sequence[float]
-    upper: Sequence[float]
+    lower: Any
+    upper: Any
     confidence: float = 0.95
-    kappa: float | None = None
+    kappa: Any = None
     l1: float | None = None
     l2: float | None = None
 
@@ -79,7 +77,7 @@ class TrackingProblem:
         R: Input weights, the diagonal (m,) or the matrix (m, m).
         penalized: What R weighs: ``"inputs"``, ``"deviations"`` from the reference inputs, or ``"increments"``.
         terminal: Weight of the last predicted state, like Q; Q itself by default.
-        input_lower: (m,); none by default.
+        input_lower: List or array (m,), kept as an array as the others; none by default.
         input_upper: (m,).
         rate_lower: Bound on u_i - u_{i-1} (m,) per step; none by default.
         rate_upper: (m,).
@@ -94,10 +92,10 @@ class TrackingProblem:
     R: Any
     penalized: Penalized = "inputs"
     terminal: Any = None
-    input_lower: Sequence[float] | None = None
-    input_upper: Sequence[float] | None = None
-    rate_lower: Sequence[float] | None = None
-    rate_upper: Sequence[float] | None = None
+    input_lower: Any = None
+    input_upper: Any = None
+    rate_lower: Any = None
+    rate_upper: Any = None
     state_bounds: StateBounds | None = None
 
     def __post_init__(self) -> None:
@@ -138,14 +136,14 @@ class TrackingProblem:
 
 
 def _weight(key: str, value: Any) -> np.ndarray:
-    """A weight as its matrix, from the matrix or its diagonal."""
+    """A weight from its diagonal or its matrix."""
     try:
         weight = np.array(value, dtype=float)
     except (TypeError, ValueError):
-        raise SettingError(key, f"must be the diagonal of a weight or a square matrix; got {value!r}") from None
+        weight = np.empty(0)
     weight = np.diag(weight) if weight.ndim == 1 else weight
-    if weight.ndim != 2 or weight.shape[0] != weight.shape[1] or not weight.size:
-        raise SettingError(key, f"must be the diagonal of a weight or a square matrix; got shape {weight.shape}")
+    if weight.ndim != 2 or len(weight) != len(weight.T) or not weight.size:
+        raise SettingError(key, f"must be the diagonal of a weight or a square matrix; got {value!r}")
     if not np.isfinite(weight).all():
         raise SettingError(key, f"must be finite; got {value!r}")
     if not np.allclose(weight, weight.T, rtol=1e-12, atol=0):
@@ -157,23 +155,20 @@ def _weight(key: str, value: Any) -> np.ndarray:
 
 
 def _set_bounds(owner: Any, lower_key: str, upper_key: str, length: int) -> None:
-    """Puts a pair of bounds onto a frozen dataclass as arrays; None becomes infinite."""
-    arrays = []
+    """Replaces a pair of bounds of a frozen dataclass by arrays; None becomes infinite."""
     for key, absent in ((lower_key, -math.inf), (upper_key, math.inf)):
         value = getattr(owner, key)
         try:
             array = np.full(length, absent) if value is None else np.array(value, dtype=float)
         except (TypeError, ValueError):
-            raise SettingError(key, f"must be a list of {length} numbers; got {value!r}") from None
+            array = np.empty(0)
         if array.shape != (length,) or np.isnan(array).any():
             raise SettingError(key, f"must be a list of {length} numbers; got {value!r}")
         if (-np.sign(absent) * array >= ABSENT).any():
             raise SettingError(key, f"no number keeps it: a bound of size {ABSENT:g} or more is none; got {value!r}")
         object.__setattr__(owner, key, array)
-        arrays.append(array)
-    crossed = np.flatnonzero(arrays[0] > arrays[1])
-    if len(crossed):
-        j = crossed[0]
+    lower, upper = getattr(owner, lower_key), getattr(owner, upper_key)
+    for j in np.flatnonzero(lower > upper)[:1]:
         raise SettingError(
-            f"{lower_key}, {upper_key}", f"must not cross; entry {j} has {arrays[0][j]:g} above {arrays[1][j]:g}"
+            f"{lower_key}, {upper_key}", f"must not cross; entry {j} has {lower[j]:g} above {upper[j]:g}"
         )

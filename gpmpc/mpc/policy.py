@@ -1,0 +1,191 @@
+"""Applies the declared policy where a controller fails, and checks every input before it reaches a plant.
+
+A failed iterate is never applied and never handed on: the next call gets the last plan that was applicable, shifted as
+if it had been made one step ago, with what was really applied as its first input. A plan that is used up holds its last
+input. Whatever is applied is finite and within the box and the rates of the controller's problem, even where the status
+of a decision says otherwise: inputs beyond a bound by rounding are put onto it, others count as failed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+
+from gpmpc.exceptions import SettingError, SolverFailure
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.controller import Controller, Decision, Reference, Timing
+from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.status import Status
+
+OnFailure = Literal["previous_plan", "hold", "raise"]
+
+_ROUNDING = 1e-4  # share of an input or of 1, whichever is more, by which a loose solver may miss a bound
+
+
+@dataclass(frozen=True)
+class Command:
+    """What one step applies, and what the next one needs.
+
+    Attributes:
+        input: Applied (m,).
+        status: How the step's own solve ended; ``INVALID_MEASUREMENT`` where the controller was not called,
+            ``NUMERICAL_TROUBLE`` where it called a plan solved that must not reach a plant.
+        decision: Of the controller, with this status, a failed iterate perhaps; None where it was not called or
+            returned inputs of another shape.
+        plan: The last applicable decision, shifted to this step. Before the first one that is not, with what was
+            applied as its ``input``; None where nothing was.
+    """
+
+    input: np.ndarray
+    status: Status
+    decision: Decision | None
+    plan: Decision | None
+
+    @property
+    def failed(self) -> bool:
+        """Whether the policy chose the input, not the decision."""
+        return self.decision is None or not self.decision.applicable
+
+
+def command(
+    controller: Controller,
+    belief: Gaussian,
+    reference: Reference,
+    last: Command | None = None,
+    on_failure: OnFailure = "raise",
+    step: int = 0,
+) -> Command:
+    """Decides one step's input by a controller, or by the policy where it has none.
+
+    Args:
+        controller: Called where the belief is finite.
+        belief: Of the state (n,).
+        reference: Over the controller's horizon.
+        last: The command of the step before; None at the first.
+        on_failure: ``"previous_plan"`` goes on along the last applicable plan, ``"hold"`` keeps the last input applied,
+            ``"raise"`` stops. Before the first such plan, the first two take the reference's own input if there is
+            one, within the controller's input and rate bounds, and stop otherwise.
+        step: Number of the step, for the message.
+
+    Raises:
+        SettingError: No such policy.
+        SolverFailure: The policy is ``"raise"``, or there is nothing to fall back on.
+    """
+    check_policy(on_failure)
+    plan = None if last is None else last.plan
+    decision = controller.control(belief, reference, plan) if _is_finite(belief) else None
+    return _conclude(controller, decision, reference, last, on_failure, step)
+
+
+def commands(
+    controller: Controller,
+    beliefs: Sequence[Gaussian],
+    reference: Reference,
+    last: Sequence[Command | None],
+    on_failure: OnFailure = "raise",
+    step: int = 0,
+) -> list[Command | SolverFailure]:
+    """``command`` for many systems that follow one reference; where it would raise ``SolverFailure``, that instead.
+
+    A controller with ``control_many`` is called once for all of them.
+    """
+    check_policy(on_failure)
+    finite = [t for t, belief in enumerate(beliefs) if _is_finite(belief)]
+    plans = [None if command is None else command.plan for command in last]
+    many = getattr(controller, "control_many", None)
+    if many is None:
+        found = [controller.control(beliefs[t], reference, plans[t]) for t in finite]
+    else:
+        found = many([beliefs[t] for t in finite], [reference] * len(finite), [plans[t] for t in finite])
+    decisions = dict(zip(finite, found, strict=True))
+    outcomes: list[Command | SolverFailure] = []
+    for t, before in enumerate(last):
+        try:
+            outcomes.append(_conclude(controller, decisions.get(t), reference, before, on_failure, step))
+        except SolverFailure as failure:
+            outcomes.append(failure)
+    return outcomes
+
+
+def check_policy(on_failure: str) -> None:
+    """Raises ``SettingError`` unless there is such a policy."""
+    if on_failure not in get_args(OnFailure):
+        policies = ", ".join(map(repr, get_args(OnFailure)))
+        raise SettingError("on_failure", f"must be one of {policies}; got {on_failure!r}")
+
+
+def _is_finite(belief: Gaussian) -> bool:
+    return bool(torch.isfinite(belief.mean).all() and torch.isfinite(belief.covariance).all())
+
+
+def _conclude(
+    controller: Controller,
+    decision: Decision | None,
+    reference: Reference,
+    last: Command | None,
+    on_failure: OnFailure,
+    step: int,
+) -> Command:
+    """The command of a decision; of none, where the controller was not called."""
+    status = Status.INVALID_MEASUREMENT if decision is None else decision.status
+    reason = status.advice
+    if decision is not None and decision.applicable:
+        fits = _has_right_shape(controller, decision, last)
+        checked = _admit(controller, decision, last) if fits else None
+        if checked is not None:
+            return Command(checked.input, status, checked, checked)
+        reason = f"its plan, {status.name}, is not finite or out of its bounds or shape; its input: {decision.input}"
+        status = Status.NUMERICAL_TROUBLE
+        decision = replace(decision, status=status, suboptimal=False) if fits else None
+    if on_failure == "raise":
+        raise SolverFailure(step, reason)
+    if last is not None and last.plan is not None and last.plan.applicable:
+        plan = last.plan
+        rows = plan.inputs, plan.means, plan.covariances
+        inputs, means, covariances = (np.concatenate([part[1:], part[-1:]]) for part in rows)
+        first = last.input if on_failure == "hold" else inputs[0]
+        shifted = replace(_with_first_input(plan, inputs, first), means=means, covariances=covariances)
+        shifted = _admit(controller, shifted, last)
+        if shifted is not None:
+            return Command(shifted.input, status, decision, shifted)
+    if reference.inputs is None or not np.isfinite(reference.inputs[0]).all():
+        raise SolverFailure(step, f"{reason} (no earlier plan and no reference input to fall back on)")
+    input = _within_bounds(controller, np.array(reference.inputs[0], dtype=float), last)
+    H, n = reference.horizon, reference.states.shape[1]
+    unknown = np.full((H + 1, n), np.nan), np.full((H + 1, n, n), np.nan)
+    applied = Decision(input, np.tile(input, (H, 1)), *unknown, status, 0, Timing(0.0, 0.0, 0.0))
+    return Command(input, status, decision, applied)
+
+
+def _has_right_shape(controller: Controller, decision: Decision, last: Command | None) -> bool:
+    """Whether the inputs of a decision have the shapes (m,) and (H, m)."""
+    problem = getattr(controller, "problem", None)
+    known = isinstance(problem, TrackingProblem)
+    m = problem.input_dim if known else (decision if last is None else last).input.size
+    return decision.input.shape == (m,) == np.shape(decision.inputs)[1:] and len(decision.inputs) > 0
+
+
+def _admit(controller: Controller, plan: Decision, last: Command | None) -> Decision | None:
+    """A plan, its first input put onto the bounds that it misses by rounding; None where it must not be applied."""
+    input = _within_bounds(controller, plan.input, last)
+    off = np.abs(input - plan.input)
+    if not (off <= _ROUNDING * np.maximum(1.0, np.abs(input))).all() or not np.isfinite(plan.inputs).all():
+        return None  # off is NaN where an input is not finite
+    return _with_first_input(plan, plan.inputs, input) if off.any() else plan
+
+
+def _within_bounds(controller: Controller, input: np.ndarray, last: Command | None) -> np.ndarray:
+    """The nearest input in the box of the controller's problem, where it has one, and among these within its rates."""
+    problem = getattr(controller, "problem", None)
+    if not isinstance(problem, TrackingProblem):
+        return input
+    before = getattr(controller, "initial_input", None) if last is None else last.input
+    if before is not None:
+        input = np.minimum(np.maximum(input, before + problem.rate_lower), before + problem.rate_upper)
+    return np.minimum(np.maximum(input, problem.input_lower), problem.input_upper)
+
+
+def _with_first_input(plan: Decision, inputs: np.ndarray, first: np.ndarray) -> Decision:
+    return replace(plan, input=first, inputs=np.concatenate([first[None], inputs[1:]]))
