@@ -26,7 +26,7 @@ from benchmarks.timing import write_results
 from gpmpc import kernels
 from gpmpc.compiled import compiled
 from gpmpc.gp import GPPosterior
-from gpmpc.kernels.simd import load, store
+from gpmpc.kernels._simd import load, store
 
 STATES, INPUTS, LANES = 6, 3, 8
 # Vector instructions for eight pairs of points, R states:

@@ -106,7 +106,7 @@ else:
             def set_env(self, name, environment):
                 """Does nothing: there is no machine code."""
 
-        codegen = _NoEngine()
+        codegen = _NoEngine()  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
 
         def _optimize_final_module(self):
             pass
@@ -143,12 +143,13 @@ else:
 
 def _jit_cached(function: Callable, options: dict) -> Callable:
     try:
-        kernel = numba.njit(cache=True, **options)(function)
+        kernel: Any = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # "cannot cache function ...: no locator available"
         return numba.njit(**options)(function)
     try:
         index = kernel._cache._cache_file
-        index._source_stamp = index._source_stamp, sources_stamp(function.__module__)
+        # compared before anything else in the index is read, which may name modules that are gone
+        index._version = f"{index._version} {sources_stamp(function.__module__).hex()}"
     except AttributeError:  # another numba: edits of other files go unseen
         pass
     return kernel
@@ -192,7 +193,7 @@ def _read_source(path: str | None) -> tuple[bytes, list[str]]:
     return hashlib.sha256(source).digest(), imported
 
 
-def compile_for(kernel: Callable, signature: str) -> None:
+def compile_for(kernel: Any, signature: str) -> None:
     """Compiles ``kernel`` for one signature and no other: it then refuses other types with ``TypeError``.
 
     Without this numba would quietly build a second kernel for Fortran-ordered or integer arrays.
@@ -203,7 +204,7 @@ def compile_for(kernel: Callable, signature: str) -> None:
             kernel.disable_compile()
 
 
-def unchecked_entry_point(kernel: Callable) -> Callable:
+def unchecked_entry_point(kernel: Any) -> Callable:
     """The machine code of a kernel that ``compile_for`` has compiled, called without numba's look at the arguments.
 
     That look takes a quarter of a microsecond. The caller has to see to it that each argument is a NumPy array of the

@@ -1,4 +1,4 @@
-"""Problem: kernels are compiled at their first use on a machine: up to a minute in which nothing is seen."""
+"""Reports on the terminal that kernels are being compiled, as they are at their first use on a machine."""
 
 import time
 from collections.abc import Iterator
@@ -7,28 +7,28 @@ from typing import Any
 
 
 @contextmanager
-def tell_of_compiling() -> Iterator[None]:
+def report_compilation() -> Iterator[None]:
     """Prints that kernels are being compiled, and in the end how long it took; nothing where all are loaded."""
-    from numba.core import event
+    from numba.core import event as events
 
-    class Clock(event.Listener):
+    class Clock(events.Listener):
         """Adds up the time of compilations; one inside another counts once."""
 
         seconds, began, depth = 0.0, 0.0, 0
 
-        def on_start(self, _: Any) -> None:
+        def on_start(self, event: Any) -> None:
             if self.depth == 0:
                 self.began = time.perf_counter()
                 if not self.seconds:
-                    print("compiling numerical kernels: once on this machine, up to a minute", flush=True)
+                    print("compiling numerical kernels: once on this machine, about half a minute", flush=True)
             self.depth += 1
 
-        def on_end(self, _: Any) -> None:
+        def on_end(self, event: Any) -> None:
             self.depth -= 1
             if self.depth == 0:
                 self.seconds += time.perf_counter() - self.began
 
-    with event.install_listener("numba:compile", Clock()) as clock:
+    with events.install_listener("numba:compile", Clock()) as clock:
         try:
             yield
         finally:

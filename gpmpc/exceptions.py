@@ -1,4 +1,4 @@
-"""The two roads of failure, first half: misuse raises, with the rule that was broken and what was got instead.
+"""Errors of misuse, which name the rule that was broken and what was given instead.
 
 A numerical outcome (a solver that stops early, an infeasible problem) is no exception but a ``gpmpc.status.Status``.
 Every error of this package derives from ``GpmpcError``; its text is one line that a user can act on, and it survives

@@ -1,4 +1,4 @@
-"""Problem: a file that looks finished has to be finished, whenever the process or the machine dies."""
+"""Writes files in one piece or not at all, whenever the process or the machine dies."""
 
 import os
 from collections.abc import Iterator

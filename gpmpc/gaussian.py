@@ -1,4 +1,4 @@
-"""Problem: what is known about a state is a Gaussian belief N(mean, covariance), alone or in a batch."""
+"""Gaussian beliefs N(mean, covariance), alone or in a batch, and symmetric square roots of covariances."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,7 @@
-"""Problem: CasADi keeps a Ctrl-C during a solve to itself: IPOPT stops, and whoever asked goes on with its iterate.
+"""Delays Ctrl-C until a solve of CasADi has ended.
 
-A flight would be flown on with a failed solve, a measurement with a time that was cut short. So a solve is not
-interrupted: it ends, and then the interrupt is raised.
+CasADi does not pass a Ctrl-C during a solve on: IPOPT stops, and its caller goes on with the last iterate, so that a
+flight would continue with a failed solve and a measurement with a time that was cut short.
 """
 
 import signal

@@ -1,4 +1,4 @@
-"""Problem: work that needs more memory than there is should say so at its start, not be killed an hour later."""
+"""The memory that is left for this process, so that work which needs more says so at its start."""
 
 import os
 from pathlib import Path

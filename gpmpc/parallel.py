@@ -1,4 +1,4 @@
-"""Problem: independent jobs should use every core, without one thread pool inside another and without orphans.
+"""Independent jobs in processes of their own, one thread each.
 
 Jobs run in freshly started processes (spawn: it is safe with threads and the same on every system), one thread each. On
 Ctrl-C, which reaches the whole process group, the parent alone answers: what is running is ended, nothing hangs. Where

@@ -1,4 +1,4 @@
-"""Problem: a result has to say what made it: versions, source commit, machine, command."""
+"""Collects what made a result: versions, source commit, machine, command."""
 
 import os
 import platform

@@ -1,7 +1,7 @@
-"""The two roads of failure, second half: how a numerical method ended, with advice on what to try.
+"""How a numerical method ended, with advice on what to try.
 
-A solver that stops without a solution has not been misused; it reports a ``Status``, and the caller's declared policy
-acts on it. (Misuse raises: see ``gpmpc.exceptions``.)
+A solver that stops without a solution has not been misused: it reports a ``Status``, and its caller's declared policy
+acts on it. Misuse raises an error of ``gpmpc.exceptions``.
 """
 
 from enum import Enum

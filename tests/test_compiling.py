@@ -6,7 +6,7 @@ import time
 import numba
 import pytest
 
-from gpmpc.compiling import tell_of_compiling
+from gpmpc.compiling import report_compilation
 
 
 def test_compiling_is_told_once_with_its_time_and_a_call_of_what_is_compiled_is_not(capsys):
@@ -19,7 +19,7 @@ def test_compiling_is_told_once_with_its_time_and_a_call_of_what_is_compiled_is_
         return 2 * inner(x)
 
     began = time.perf_counter()
-    with tell_of_compiling():
+    with report_compilation():
         assert outer(1.0) == 4
         assert outer(1) == 4
     taken = time.perf_counter() - began
@@ -27,7 +27,7 @@ def test_compiling_is_told_once_with_its_time_and_a_call_of_what_is_compiled_is_
     assert "compiling" in first
     told = float(re.fullmatch(r"compiled in ([\d.]+) s", last)[1])
     assert 0 <= told <= taken + 0.05
-    with tell_of_compiling():
+    with report_compilation():
         outer(2.0)
     assert capsys.readouterr().out == ""
 
@@ -37,7 +37,7 @@ def test_an_error_meanwhile_is_passed_on(capsys):
     def kernel(x):
         return x
 
-    with pytest.raises(KeyError), tell_of_compiling():
+    with pytest.raises(KeyError), report_compilation():
         raise KeyError
     kernel(1.0)
     assert capsys.readouterr().out == ""  # nobody listens any more

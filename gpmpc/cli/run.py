@@ -34,12 +34,12 @@ def run(config: DictConfig) -> None:
     """Flies, prints the results and where they are kept; the task behind ``conf/run.yaml``."""
     from rich.console import Console
 
-    from gpmpc.compiling import tell_of_compiling
+    from gpmpc.compiling import report_compilation
     from gpmpc.studies.document import terminal
     from gpmpc.studies.flight import summary
 
     console = Console()
-    with console.status("flying"), tell_of_compiling():
+    with console.status("flying"), report_compilation():
         experiment_of(config)  # what a user can get wrong is found before anything is written
         outcome = run_one(config)
     if "error" in outcome:

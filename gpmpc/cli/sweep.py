@@ -30,7 +30,7 @@ from omegaconf import DictConfig, open_dict
 from gpmpc.cli.arguments import folder_of, writing
 from gpmpc.cli.run import choices, experiment_of, plain_settings, run_one
 from gpmpc.cli.terminal import print_error, progress_bar
-from gpmpc.compiling import tell_of_compiling
+from gpmpc.compiling import report_compilation
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.files import write_whole
 from gpmpc.parallel import THREADS, children_ignore_interrupts, end_with
@@ -101,7 +101,7 @@ def sweep(given: Namespace, conf: Path) -> None:
         composer = _composer(given, combinations[0])
         jobs = _jobs(combinations, folder_of(composer.config.folder))
         finished, waiting = ([job for job in jobs if job.folder.finished is state] for state in (True, False))
-        with tell_of_compiling():
+        with report_compilation():
             _check(waiting, composer)
         with console.status(f"comparing the settings of {len(finished)} finished runs"):
             for job in finished:
@@ -131,7 +131,7 @@ def run_job_after_others(config: DictConfig) -> dict[str, Any]:
     return _outcome(config, wait=True)
 
 
-@tell_of_compiling()
+@report_compilation()
 def _outcome(config: DictConfig, wait: bool) -> dict[str, Any]:
     try:
         outcome = run_one(config, wait)

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 from gpmpc.compiled import call_unchecked
 from gpmpc.exceptions import ShapeError
 from gpmpc.kernels import gp_moments, gp_moments_simd
+from gpmpc.kernels._packed import Array, Packed, pack
 from gpmpc.kernels.gp_moments import CROSS, JACOBIAN, VALUE
 from gpmpc.kernels.gp_point import expand_points, linearize_points
-from gpmpc.kernels.packed import Array, Packed, pack
 
 __all__ = [
     "Expansion",

@@ -22,17 +22,7 @@ import numpy as np
 from numpy import ndarray
 
 from gpmpc.compiled import compiled, inline_njit, njit_inner, njit_noalloc
-from gpmpc.kernels.gp_moments import CROSS, JACOBIAN
-from gpmpc.kernels.linalg import (
-    add_product,
-    aligned_rows,
-    condition,
-    congruence,
-    multiply_transposed,
-    product,
-    symmetrize,
-)
-from gpmpc.kernels.rows import (
+from gpmpc.kernels._rows import (
     add_products,
     largest_size,
     largest_square,
@@ -43,7 +33,17 @@ from gpmpc.kernels.rows import (
     second_moments,
     transform,
 )
-from gpmpc.kernels.simd import NEAR_ZERO, exp, expm1, expm1_near_zero, load, store, total, use_widest_registers, zeros
+from gpmpc.kernels._simd import NEAR_ZERO, exp, expm1, expm1_near_zero, load, store, total, use_widest_registers, zeros
+from gpmpc.kernels.gp_moments import CROSS, JACOBIAN
+from gpmpc.kernels.linalg import (
+    add_product,
+    aligned_rows,
+    condition,
+    congruence,
+    multiply_transposed,
+    product,
+    symmetrize,
+)
 
 
 class _Belief(NamedTuple):

@@ -14,9 +14,9 @@ The moments are summed over x~_i - x~, which all outputs share, and scaled by D_
 import numpy as np
 
 from gpmpc.compiled import compiled, njit_noalloc
+from gpmpc.kernels._rows import multiply, project, reduce_variance, reduce_variances
+from gpmpc.kernels._simd import exp, load, store, total, use_widest_registers, zeros
 from gpmpc.kernels.linalg import aligned_rows
-from gpmpc.kernels.rows import multiply, project, reduce_variance, reduce_variances
-from gpmpc.kernels.simd import exp, load, store, total, use_widest_registers, zeros
 
 
 @njit_noalloc

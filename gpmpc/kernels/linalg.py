@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from gpmpc.compiled import inline_njit, njit_inner, njit_noalloc
-from gpmpc.kernels.simd import load, store, zeros
+from gpmpc.kernels._simd import load, store, zeros
 
 
 @njit_inner

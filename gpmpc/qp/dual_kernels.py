@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from gpmpc.compiled import compiled, inline_njit
+from gpmpc.kernels._simd import any_nonzero, load, load_some, total, zeros
 from gpmpc.kernels.linalg import dot, multiply
-from gpmpc.kernels.simd import any_nonzero, load, load_some, total, zeros
 from gpmpc.qp.dual_iteration import (
     NEGLIGIBLE,
     add_constraints,

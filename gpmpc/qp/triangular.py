@@ -7,8 +7,8 @@ take four rows at a time: their sums hide each other's latency. Nothing is alloc
 import math
 
 from gpmpc.compiled import inline_njit
+from gpmpc.kernels._simd import load, load_some, store
 from gpmpc.kernels.linalg import dot, four_dots
-from gpmpc.kernels.simd import load, load_some, store
 
 _LANES, _BLOCK = 8, 4
 _ROUNDING = 2.3e-16  # times n: share of P_ii below which a pivot is rounding

@@ -21,7 +21,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 import gpmpc
-from gpmpc.compiling import tell_of_compiling
+from gpmpc.compiling import report_compilation
 from gpmpc.exceptions import DataError, GpmpcError, check_number
 from gpmpc.gp import GPPosterior, Training, Transitions, load_posterior, save_posterior
 from gpmpc.parallel import in_processes
@@ -138,7 +138,7 @@ def run_study(
     return [store.records[trial.fingerprint] | dict(trial.labels) for trial in trials]
 
 
-@tell_of_compiling()
+@report_compilation()
 def _record(run_trial: Callable[[Trial], dict[str, Any]], trial: Trial) -> dict[str, Any]:
     """Runs one trial in a worker process."""
     record = {**trial.labels, "seed": trial.seed}

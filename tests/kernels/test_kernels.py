@@ -13,11 +13,11 @@ import torch
 from gpmpc import kernels
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.kernels import gp_point, simd
+from gpmpc.kernels import _simd, gp_point
+from gpmpc.kernels._packed import pack
+from gpmpc.kernels._rows import largest_size, largest_square, reduce_variance, reduce_variances
+from gpmpc.kernels._simd import NEAR_ZERO, load, store
 from gpmpc.kernels.gp_moments import CROSS
-from gpmpc.kernels.packed import pack
-from gpmpc.kernels.rows import largest_size, largest_square, reduce_variance, reduce_variances
-from gpmpc.kernels.simd import NEAR_ZERO, load, store
 from gpmpc.propagation._moments import moments
 from tests.propagation.test_moment_matching import belief, by_mpmath, model
 
@@ -347,7 +347,7 @@ def by_lanes(function):
     return evaluate
 
 
-exp, expm1, expm1_near_zero = (by_lanes(f) for f in (simd.exp, simd.expm1, simd.expm1_near_zero))
+exp, expm1, expm1_near_zero = (by_lanes(f) for f in (_simd.exp, _simd.expm1, _simd.expm1_near_zero))
 
 
 @pytest.mark.parametrize(("low", "high"), [(-0.35, 0.35), (-1.1, 1.1), (-40, 30), (-1e-9, 1e-9), (-745, 709)])

@@ -7,6 +7,8 @@ where the processor can. Everything here is for compiled code only; arrays are c
 """
 
 import operator
+from collections.abc import Callable
+from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -15,10 +17,10 @@ from numba.extending import intrinsic, lower_builtin, models, register_model, ty
 
 from gpmpc.compiled import inline_njit
 
-WIDTH = 8
+_WIDTH = 8
 
-_VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
-_INTEGERS = ir.VectorType(ir.IntType(64), WIDTH)
+_VECTOR = ir.VectorType(ir.DoubleType(), _WIDTH)
+_INTEGERS = ir.VectorType(ir.IntType(64), _WIDTH)
 _FLAGS = ("contract", "nsz")  # not "reassoc": it would cancel the constant that rounds in ``exp``
 
 
@@ -38,13 +40,18 @@ class _LanesModel(models.PrimitiveModel):
 LANES = Lanes()
 
 
+def _define(function: Callable[..., Any]) -> Any:
+    """Makes an intrinsic, which compiled code calls without the first argument."""
+    return intrinsic(function)
+
+
 def _constant(value, kind=_VECTOR):
-    return ir.Constant(kind, [value] * WIDTH)
+    return ir.Constant(kind, [value] * _WIDTH)
 
 
 def _spread(builder, value, kind=_VECTOR):
     first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
-    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH))
+    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), [0] * _WIDTH))
 
 
 def _pointer(context, builder, array_type, array, index):
@@ -82,7 +89,7 @@ _define_operator(operator.sub, "fsub")
 _define_operator(operator.mul, "fmul")
 
 
-@intrinsic
+@_define
 def zeros(typing_context):
     """Eight zeros."""
 
@@ -92,7 +99,7 @@ def zeros(typing_context):
     return LANES(), generate
 
 
-@intrinsic
+@_define
 def load(typing_context, array, index):
     """The entries ``array[index : index + 8]``."""
 
@@ -102,7 +109,7 @@ def load(typing_context, array, index):
     return LANES(array, types.intp), generate
 
 
-@intrinsic
+@_define
 def load_some(typing_context, array, index):
     """The entries ``array[index : index + 8]``; zeros where the array has ended."""
 
@@ -110,7 +117,7 @@ def load_some(typing_context, array, index):
         place = _pointer(context, builder, signature.args[0], *arguments)
         size = context.make_array(signature.args[0])(context, builder, arguments[0]).nitems
         left = _spread(builder, builder.sub(size, arguments[1]), _INTEGERS)
-        present = builder.icmp_signed("<", ir.Constant(_INTEGERS, list(range(WIDTH))), left)
+        present = builder.icmp_signed("<", ir.Constant(_INTEGERS, list(range(_WIDTH))), left)
         kind = ir.FunctionType(_VECTOR, [place.type, ir.IntType(32), present.type, _VECTOR])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.masked.load.v8f64.p0v8f64")
         return builder.call(function, [place, ir.IntType(32)(8), present, _constant(0.0)])
@@ -118,7 +125,7 @@ def load_some(typing_context, array, index):
     return LANES(array, types.intp), generate
 
 
-@intrinsic
+@_define
 def store(typing_context, array, index, values):
     """``array[index : index + 8] = values``."""
 
@@ -129,7 +136,7 @@ def store(typing_context, array, index, values):
     return types.none(array, types.intp, LANES), generate
 
 
-@intrinsic
+@_define
 def lane(typing_context, values, index):
     """One of the eight numbers."""
 
@@ -139,21 +146,21 @@ def lane(typing_context, values, index):
     return types.float64(LANES, types.intp), generate
 
 
-@intrinsic
+@_define
 def rotate(typing_context, values, distance):
     """The entries rotated by a distance that is known when compiling."""
     if not isinstance(distance, types.IntegerLiteral):
         raise TypingError("the distance must be a literal")
-    order = [(i + distance.literal_value) % WIDTH for i in range(WIDTH)]
+    order = [(i + distance.literal_value) % _WIDTH for i in range(_WIDTH)]
 
     def generate(context, builder, signature, arguments):
-        mask = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), order)
+        mask = ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), order)
         return builder.shuffle_vector(arguments[0], arguments[0], mask)
 
     return LANES(LANES, distance), generate
 
 
-@intrinsic
+@_define
 def larger(typing_context, values, others):
     """Entry by entry the larger one of ``values`` and ``|others|``; NaN in ``others`` is passed over."""
 
@@ -164,7 +171,7 @@ def larger(typing_context, values, others):
     return LANES(LANES, LANES), generate
 
 
-@intrinsic
+@_define
 def clip(typing_context, values, low, high):
     """The entries, not below ``low`` and not above ``high``; NaN stays."""
 
@@ -176,20 +183,20 @@ def clip(typing_context, values, low, high):
     return LANES(LANES, types.float64, types.float64), generate
 
 
-@intrinsic
+@_define
 def any_nonzero(typing_context, values):
     """Whether an entry is not zero, as NaN is not."""
 
     def generate(context, builder, signature, arguments):
         nonzero = builder.fcmp_unordered("!=", arguments[0], _constant(0.0))
-        return builder.icmp_unsigned("!=", builder.bitcast(nonzero, ir.IntType(WIDTH)), ir.IntType(WIDTH)(0))
+        return builder.icmp_unsigned("!=", builder.bitcast(nonzero, ir.IntType(_WIDTH)), ir.IntType(_WIDTH)(0))
 
     return types.boolean(LANES), generate
 
 
-@intrinsic
+@_define
 def power_of_two(typing_context, shifted):
-    """2^k for whole numbers k from -1022 to 1023, given as k + ``SHIFT``."""
+    """2^k for whole numbers k from -1022 to 1023, given as k + ``_SHIFT``."""
 
     def generate(context, builder, signature, arguments):
         bits = builder.shl(builder.bitcast(arguments[0], _INTEGERS), _constant(52, _INTEGERS))
@@ -198,7 +205,7 @@ def power_of_two(typing_context, shifted):
     return LANES(LANES), generate
 
 
-@intrinsic
+@_define
 def use_widest_registers(typing_context):
     """Lets LLVM use registers of 512 bits in the calling function; left alone it stops at 256 (1.6 times slower here).
 
@@ -230,13 +237,13 @@ def largest(values):
     return max(lane(values, 0), lane(values, 1))
 
 
-# The exponential (Cody and Waite, 1980): x = k ln 2 + r with |r| <= ln(2)/2, exp(x) = 2^k exp(r). Adding SHIFT leaves k
-# in the lowest bits, biased as an exponent is. expm1(r) = r + r^2 g(r) with a polynomial g of degree 9, interpolated at
-# Chebyshev's points: 4e-17 relative to expm1. No branch and no table.
+# exp (Cody and Waite, 1980): x = k ln 2 + r with |r| <= ln(2)/2, exp(x) = 2^k exp(r). Adding _SHIFT leaves k in the
+# lowest bits, biased as an exponent is. expm1(r) = r + r^2 g(r) with a polynomial g of degree 9, interpolated at the
+# points of Chebyshev: 4e-17 relative to expm1. No branch and no table.
 
-SHIFT = 6755399441055744.0 + 1023.0  # 1.5 * 2^52, and the bias of the exponent
-PER_LN2 = 1.4426950408889634
-LN2_HIGH, LN2_LOW = 0.6931471805599453, 2.3190468138462996e-17
+_SHIFT = 6755399441055744.0 + 1023.0  # 1.5 * 2^52, and the bias of the exponent
+_PER_LN2 = 1.4426950408889634
+_LN2_HIGH, _LN2_LOW = 0.6931471805599453, 2.3190468138462996e-17
 NEAR_ZERO = 0.34  # below ln(2)/2: k = 0
 
 
@@ -259,8 +266,8 @@ def expm1_near_zero(x):
 def expm1(x):
     """The exponential less one to 3e-16 + 3.4e-17 |x|, without the low part of ln 2; constant from x = 300 on."""
     x = clip(x, -60.0, 300.0)
-    shifted = x * PER_LN2 + SHIFT
-    r = x - (shifted - SHIFT) * LN2_HIGH
+    shifted = x * _PER_LN2 + _SHIFT
+    r = x - (shifted - _SHIFT) * _LN2_HIGH
     scale = power_of_two(shifted)
     return expm1_near_zero(r) * scale + (scale - 1.0)
 
@@ -269,8 +276,8 @@ def expm1(x):
 def exp(x):
     """The exponential to 3e-16; 2^k is applied in two halves, so that results reach down to the subnormal numbers."""
     x = clip(x, -750.0, 720.0)
-    k = (x * PER_LN2 + SHIFT) - SHIFT
-    r = (x - k * LN2_HIGH) - k * LN2_LOW
-    shifted = k * 0.5 + SHIFT
-    rest = (k - (shifted - SHIFT)) + SHIFT
+    k = (x * _PER_LN2 + _SHIFT) - _SHIFT
+    r = (x - k * _LN2_HIGH) - k * _LN2_LOW
+    shifted = k * 0.5 + _SHIFT
+    rest = (k - (shifted - _SHIFT)) + _SHIFT
     return (expm1_near_zero(r) + 1.0) * power_of_two(shifted) * power_of_two(rest)
