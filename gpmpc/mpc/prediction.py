@@ -126,7 +126,9 @@ class PredictionModel:
         return request
 
     def initial_guess(self, request: Request, previous: Decision | None) -> Plan:
-        """The last plan, shifted by a stage; without one the reference, under its inputs where R weighs deviations.
+        """The last plan, shifted by a stage; without one a line from the state to the last reference along the others.
+
+        Its inputs are the previous one, or the reference's where R weighs deviations.
 
         Covariances are those of the last plan, unshifted: they depend on the time since the last measurement.
         """
@@ -147,7 +149,8 @@ class PredictionModel:
         if known:
             means[1:H], means[H] = previous.means[2:], previous.means[H]
         else:
-            means[1:] = request.references.states
+            states, shares = request.references.states, np.linspace(1.0, 0.0, H + 1)[1:, None]
+            means[1:] = states + shares * (request.state - states[0])
             if problem.penalized == "deviations":
                 inputs = request.references.inputs.clip(problem.input_lower, problem.input_upper)
         if problem.rate_limited:
