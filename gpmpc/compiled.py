@@ -216,14 +216,17 @@ def unchecked_entry_point(kernel: Any) -> Callable:
         return kernel
 
 
-def call_unchecked(kernel: Callable, *arguments: Any) -> None:
-    """Calls a kernel whose callers always pass arguments of the same types, without looking at them from then on."""
+def call_unchecked(kernel: Callable, *arguments: Any) -> Any:
+    """Calls a kernel whose callers always pass arguments of the same types, without looking at them from then on.
+
+    Where arguments are named tuples, that look takes longer than many a kernel. All arrays have to be contiguous.
+    """
     entry = _entry_points.get(kernel)
     if entry is not None:
-        entry(*arguments)
-    else:
-        kernel(*arguments)
-        _entry_points[kernel] = unchecked_entry_point(kernel)
+        return entry(*arguments)
+    found = kernel(*arguments)
+    _entry_points[kernel] = unchecked_entry_point(kernel)
+    return found
 
 
 _entry_points: dict[Callable, Callable] = {}

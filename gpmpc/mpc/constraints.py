@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.mpc.condense import StateRows
 from gpmpc.mpc.problem import StateBounds
 from gpmpc.mpc.stages import Covariance
@@ -58,7 +58,8 @@ class ChanceConstraints:
         """The rows, tightened, at covariances of the states Sigma_0 .. Sigma_H (H + 1, n, n), of H stages or one."""
         lower, upper = np.empty((2, self._horizon, len(self._bound)))
         if len(self._bound):
-            _tighten(self._state, self._sign, self._bound, self._margin, covariances, lower, upper)
+            sides = self._state, self._sign, self._bound, self._margin
+            call_unchecked(_tighten, *sides, covariances, lower, upper)
         return StateRows(
             self._rows(covariances[1 : stages + 1]) if self._constant is None else self._constant, lower, upper
         )

@@ -19,6 +19,7 @@ from time import perf_counter
 
 import numpy as np
 
+from gpmpc.compiled import call_unchecked
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
@@ -238,7 +239,8 @@ class GPMPC:
     def _proposed(self, prediction: Prediction, program: CondensedProgram, solution: QPSolution, last: Array) -> Plan:
         """The plan of a program's solution: its inputs, and the states that the stages lead to."""
         stages, start = Stages(*prediction.stages[:3]), prediction.plan.states[0]
-        inputs, states = expand(stages, start, program.feedback, last, solution.x)
+        unknowns = np.ascontiguousarray(solution.x, dtype=np.float64)
+        inputs, states = call_unchecked(expand, stages, start, program.feedback, last, unknowns)
         return Plan(states, inputs, prediction.covariances)
 
     def _missed(self, prediction: Prediction) -> float:

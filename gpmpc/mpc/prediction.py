@@ -29,7 +29,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
@@ -199,7 +199,7 @@ class PredictionModel:
         covariances, mode = plan.covariances, self.linearizer.covariance
         if mode == "zero_order":
             covariances, K = np.empty_like(covariances), self.gain(stages)
-            _predict_covariances(stages.A, stages.B, stages.V, request.covariance, K, covariances)
+            call_unchecked(_predict_covariances, *stages[:2], stages.V, request.covariance, K, covariances)
         elif self.form == "velocity" and mode != "none":
             covariances = np.repeat(self.linearizer.moments(stages.next, covariances)[1], self.horizon + 1, axis=0)
             covariances[0] = request.covariance
@@ -249,7 +249,8 @@ class PredictionModel:
         if not self.feedback:
             return np.zeros((problem.input_dim, n))
         A, B = np.ascontiguousarray(stages.A[:1, :n, :n]), np.ascontiguousarray(stages.B[:1, :n])
-        return finite_horizon_lqr(A, B, problem.Q, problem.R, problem.terminal, self.horizon)[0][0]
+        weights = problem.Q, problem.R, problem.terminal
+        return call_unchecked(finite_horizon_lqr, A, B, *weights, self.horizon)[0][0]
 
     def _first_covariances(self, means: Array, inputs: Array, request: Request) -> Array:
         """Sigma_1 .. Sigma_H (H, n, n) along a first guess, linearised at its points."""

@@ -11,6 +11,7 @@ the bounds by kappa(eta) sqrt(Sigma_jj), kappa(eta) = Phi^-1(eta).
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from statistics import NormalDist
 from typing import Any, Literal
 
@@ -129,7 +130,7 @@ class TrackingProblem:
         """Number of inputs, m."""
         return len(self.R)
 
-    @property
+    @cached_property
     def rate_limited(self) -> bool:
         """Whether there is any bound on the increments."""
         return bool(np.isfinite(self.rate_lower).any() or np.isfinite(self.rate_upper).any())

@@ -17,13 +17,12 @@ the covariances of ``full``, damped BFGS updates put it into the program (Noceda
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 import torch
 
-from gpmpc.compiled import compiled, unchecked_entry_point
+from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.exceptions import DataError, ProblemError
 from gpmpc.kernels.linalg import dot
 from gpmpc.mpc.condense import CondensedProgram
@@ -122,7 +121,7 @@ class Globalization:
         z = z[len(z) - at.rows.lower.size :].reshape(at.rows.lower.shape)
         self._row_price = max(self._row_price, 2.0 * float(np.abs(z).max())) if z.size else self._row_price
         terms, followed = self._cost_terms, (self._references, self._zero)
-        found = _call(
+        found = call_unchecked(
             _assess, terms, followed, prices, self._row_price, at.stages.A, at.stages.next, at.rows, plan, proposed, z
         )
         cost, curvature, promised, largest, defects, costates = found
@@ -141,7 +140,8 @@ class Globalization:
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
             for trial in self._candidates(at, _between(plan, proposed, length), program.feedback):
                 rows, weights = at.rows._replace(E=trial.rows.E), (prices, self._row_price, self._defect_prices)
-                if _call(_merit, terms, self._references, weights, trial.stages.next, rows, trial.plan) <= bound:
+                arguments = terms, self._references, weights, trial.stages.next, rows, trial.plan
+                if call_unchecked(_merit, *arguments) <= bound:
                     return trial, None
             length /= 2.0
         if size**2 <= _ROUND_OFF:  # size^2 of the cost is what could still be gained
@@ -204,21 +204,6 @@ def _merit(cost, references, weights, after, rows, plan):
         for i in range(after.shape[1]):
             merit += defect_prices[i] * abs(after[k, i] - plan.states[k + 1, i])
     return merit
-
-
-def _call(kernel: Callable, *arguments: Any) -> Any:
-    """Calls a kernel without numba's look at the types, which takes longer than the kernel where they are named tuples.
-
-    They are always those of the first call: tuples of contiguous float64 arrays.
-    """
-    entry = _entry_points.get(kernel)
-    if entry is None:
-        kernel(*arguments)
-        entry = _entry_points[kernel] = unchecked_entry_point(kernel)
-    return entry(*arguments)
-
-
-_entry_points: dict[Callable, Callable] = {}
 
 
 @compiled

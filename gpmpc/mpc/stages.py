@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
-from gpmpc.compiled import compiled
+from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.dynamics import DynamicsModel, linearize, tensors_for, to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
@@ -129,12 +129,14 @@ class StageLinearizer:
         if disturbance is not None:
             after = after.copy()
             after[:, : self._n] += disturbance
-        return LinearizedStages(A, B, _constants(A, B, after, states, inputs), after, V)
+        return LinearizedStages(A, B, call_unchecked(_constants, A, B, after, states, inputs), after, V)
 
     def _points(self, states: Array, inputs: Array, _: Array) -> tuple[Array, ...]:
         found = linearize(self.model, states, inputs, self.covariance == "zero_order")
         V = np.zeros((len(states), self._n, self._n)) if found.covariance is None else found.covariance
-        return found.mean, found.A, found.B, V if self._noise is None else V + self._noise
+        V = V if self._noise is None else V + self._noise
+        after, A, B, V = map(np.ascontiguousarray, (found.mean, found.A, found.B, V))  # a model may give views
+        return after, A, B, V
 
     def _zero_order(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
         moved, d = differentiate(self.propagator, self.model, *self._tensors(states, covariances, inputs))
