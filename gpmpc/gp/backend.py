@@ -11,6 +11,7 @@ from contextvars import ContextVar
 from typing import Literal
 
 import numpy as np
+import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -44,14 +45,14 @@ def host_arrays(*tensors: Tensor) -> list[np.ndarray] | None:
         return None
     reason, arrays = "", []
     try:
-        arrays = [tensor.numpy() for tensor in tensors]
+        for tensor in tensors:  # in microseconds: a step of control asks several times
+            arrays.append(tensor.numpy())
+            if forward_ad.unpack_dual(tensor).tangent is not None:
+                reason = "forward-mode differentiation is under way"
+            elif tensor.dtype is not torch.float64:
+                reason = "a tensor is not float64"
     except (RuntimeError, TypeError):
         reason = "a tensor is on another device, part of a graph, or inside a function transform"
-    else:
-        if any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors):
-            reason = "forward-mode differentiation is under way"
-        elif any(array.dtype != np.float64 for array in arrays):
-            reason = "a tensor is not float64"
     if not reason:
         return arrays
     if choice == "compiled":

@@ -192,6 +192,11 @@ class GPPosterior:
         features, lengthscales, signal_variance, cholesky, weights = (part.numpy() for part in parts)
         return pack(features, lengthscales, signal_variance, cholesky, weights, self.state_dim)
 
+    @cached_property
+    def _prior(self) -> tuple[Array, bool]:
+        """The prior means (k,) in host memory, and whether the state is added to a prediction."""
+        return self.offset.numpy(), self.predicts == "difference"
+
     @property
     def affine_form(self) -> AffineForm:
         """Next states (A = 0) or differences (A = I) as moments are composed of them."""
@@ -233,8 +238,7 @@ class GPPosterior:
         if host_arrays(self.weights) is not None:
             from gpmpc import kernels  # loads numba
 
-            offset, adds_state = self.offset.numpy(), self.predicts == "difference"
-            return Linearized(*kernels.linearize(self.packed, states, inputs, covariance, offset, adds_state))
+            return Linearized(*kernels.linearize(self.packed, states, inputs, covariance, *self._prior))
         x, u = tensors_for(self, states, inputs)
         k, difference = self._correlations(x, u)
         A, B = self._jacobian(k, difference)

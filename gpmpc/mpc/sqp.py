@@ -74,7 +74,6 @@ class Globalization:
     def __init__(self, model: PredictionModel, cost: TrackingCost, request: Request, tolerance: float):
         self._model, self._cost_terms, self._request, self._tolerance = model, cost, request, tolerance
         self._references = request.references
-        self._zero = References(*(np.zeros(part.shape) for part in self._references))
         problem = model.problem
         sizes = np.maximum(1.0, np.abs(self._references.previous_input))
         sizes = np.minimum(sizes, problem.input_upper - problem.input_lower)
@@ -120,10 +119,8 @@ class Globalization:
             self._last = plan.inputs.ravel(), gradient, z
         z = z[len(z) - at.rows.lower.size :].reshape(at.rows.lower.shape)
         self._row_price = max(self._row_price, 2.0 * float(np.abs(z).max())) if z.size else self._row_price
-        terms, followed = self._cost_terms, (self._references, self._zero)
-        found = call_unchecked(
-            _assess, terms, followed, prices, self._row_price, at.stages.A, at.stages.next, at.rows, plan, proposed, z
-        )
+        terms, stages = (self._cost_terms, self._references, prices, self._row_price), (at.stages.A, at.stages.next)
+        found = call_unchecked(_assess, terms, stages, at.rows, plan, proposed, z)
         cost, curvature, promised, largest, defects, costates = found
         size = max(math.sqrt(curvature / (cost + self._smallest)), largest)
         self._size, self._rate = size, size / self._size if math.isfinite(self._size) else 1.0
@@ -139,9 +136,8 @@ class Globalization:
         while length >= _SHORTEST_STEP:
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
             for trial in self._candidates(at, _between(plan, proposed, length), program.feedback):
-                rows, weights = at.rows._replace(E=trial.rows.E), (prices, self._row_price, self._defect_prices)
-                arguments = terms, self._references, weights, trial.stages.next, rows, trial.plan
-                if call_unchecked(_merit, *arguments) <= bound:
+                rows = at.rows._replace(E=trial.rows.E)
+                if call_unchecked(_merit, terms, self._defect_prices, trial.stages.next, rows, trial.plan) <= bound:
                     return trial, None
             length /= 2.0
         if size**2 <= _ROUND_OFF:  # size^2 of the cost is what could still be gained
@@ -168,14 +164,15 @@ def _between(plan: Plan, other: Plan, share: float) -> Plan:
 
 
 @compiled
-def _assess(cost, followed, prices, row_price, A, after, rows, plan, proposed, z):
+def _assess(terms, stages, rows, plan, proposed, z):
     """What a step from a plan to a proposed one promises.
 
     Returns:
         Cost with price of violated rows at the plan, curvature of the step in the cost, cost with price promised, the
         largest defect relative to the states, defects summed over the stages (p,), largest costates (p,).
     """
-    references, zero = followed
+    (cost, references, prices, row_price), (A, after) = terms, stages
+    zero = References(0.0 * references.states, 0.0 * references.inputs, 0.0 * references.previous_input)
     (H, p), reach, largest, defects, most = after.shape, 1.0, 0.0, np.zeros(after.shape[1]), np.zeros(after.shape[1])
     for k in range(H):
         for i in range(p):
@@ -195,9 +192,9 @@ def _assess(cost, followed, prices, row_price, A, after, rows, plan, proposed, z
 
 
 @compiled
-def _merit(cost, references, weights, after, rows, plan):
+def _merit(terms, defect_prices, after, rows, plan):
     """The exact penalty function at a plan, within the bounds of ``rows``."""
-    prices, row_price, defect_prices = weights
+    cost, references, prices, row_price = terms
     merit = tracking_cost(cost, plan.states, plan.inputs, references)
     merit += price_violations(prices, rows, plan.states, row_price)
     for k in range(len(after)):
