@@ -53,13 +53,15 @@ class ChanceConstraints:
         self._margin = self._kappa if covariance == "zero_order" else 0.0
         moves = covariance == "full" and self.per_stage > 0
         self._constant = None if moves else self._rows(np.zeros((1, state_dim, state_dim)))
+        nothing = np.empty((horizon, 0))
+        self._unbounded = None if self._constant is None or entries else StateRows(self._constant, nothing, nothing)
 
     def at(self, covariances: Array, stages: int) -> StateRows:
         """The rows, tightened, at covariances of the states Sigma_0 .. Sigma_H (H + 1, n, n), of H stages or one."""
+        if self._unbounded is not None:
+            return self._unbounded
         lower, upper = np.empty((2, self._horizon, len(self._bound)))
-        if len(self._bound):
-            sides = self._state, self._sign, self._bound, self._margin
-            call_unchecked(_tighten, *sides, covariances, lower, upper)
+        call_unchecked(_tighten, self._state, self._sign, self._bound, self._margin, covariances, lower, upper)
         return StateRows(
             self._rows(covariances[1 : stages + 1]) if self._constant is None else self._constant, lower, upper
         )

@@ -75,9 +75,8 @@ class Globalization:
         self._model, self._cost_terms, self._request, self._tolerance = model, cost, request, tolerance
         self._references = request.references
         problem = model.problem
-        sizes = np.maximum(1.0, np.abs(self._references.previous_input))
-        sizes = np.minimum(sizes, problem.input_upper - problem.input_lower)
-        self._smallest = float((problem.R.diagonal() * sizes * sizes).min()) * _SMALL**2 + 1e-300
+        weights = problem.R, problem.input_lower, problem.input_upper
+        self._smallest = call_unchecked(_smallest_cost, *weights, self._references.previous_input)
         self._defect_prices, self._row_price = np.zeros(len(cost.state) * problem.state_dim), 0.0
         self._size, self._rate, self._creeps = math.inf, 1.0, False
         self._updates: deque[tuple[Array, Array]] = deque(maxlen=_MEMORY)  # steps and changes of the gradient
@@ -120,8 +119,8 @@ class Globalization:
         z = z[len(z) - at.rows.lower.size :].reshape(at.rows.lower.shape)
         self._row_price = max(self._row_price, 2.0 * float(np.abs(z).max())) if z.size else self._row_price
         terms, stages = (self._cost_terms, self._references, prices, self._row_price), (at.stages.A, at.stages.next)
-        found = call_unchecked(_assess, terms, stages, at.rows, plan, proposed, z)
-        cost, curvature, promised, largest, defects, costates = found
+        found = call_unchecked(_assess, terms, self._defect_prices, stages, at.rows, plan, proposed, z)
+        cost, curvature, promised, largest, merit, self._defect_prices = found
         size = max(math.sqrt(curvature / (cost + self._smallest)), largest)
         self._size, self._rate = size, size / self._size if math.isfinite(self._size) else 1.0
         self._creeps = self._creeps or (self._rate > _CREEP and size < _NEAR)
@@ -129,8 +128,6 @@ class Globalization:
         settled = self._rate >= 1.0 and size**2 <= _NOISE
         if settled or size <= self._tolerance or size * slower <= self._tolerance * (1.0 - slower):
             return at._replace(plan=proposed), Status.SOLVED
-        self._defect_prices = np.maximum(self._defect_prices, 1.5 * costates)
-        merit = cost + float(defects @ self._defect_prices)
         slope = promised - curvature - merit
         length = 1.0
         while length >= _SHORTEST_STEP:
@@ -164,16 +161,26 @@ def _between(plan: Plan, other: Plan, share: float) -> Plan:
 
 
 @compiled
-def _assess(terms, stages, rows, plan, proposed, z):
+def _smallest_cost(R, lower, upper, last):
+    """The cost of an input that is small beside the last one: of the cheapest."""
+    least = np.inf
+    for j in range(len(R)):
+        size = min(max(1.0, abs(last[j])), upper[j] - lower[j]) * _SMALL
+        least = min(least, R[j, j] * size * size)
+    return least + 1e-300
+
+
+@compiled
+def _assess(terms, defect_prices, stages, rows, plan, proposed, z):
     """What a step from a plan to a proposed one promises.
 
     Returns:
         Cost with price of violated rows at the plan, curvature of the step in the cost, cost with price promised, the
-        largest defect relative to the states, defects summed over the stages (p,), largest costates (p,).
+        largest defect relative to the states, merit of the plan under new prices of defects, and these prices (p,).
     """
     (cost, references, prices, row_price), (A, after) = terms, stages
     zero = References(0.0 * references.states, 0.0 * references.inputs, 0.0 * references.previous_input)
-    (H, p), reach, largest, defects, most = after.shape, 1.0, 0.0, np.zeros(after.shape[1]), np.zeros(after.shape[1])
+    (H, p), reach, largest, defects, new = after.shape, 1.0, 0.0, np.zeros(after.shape[1]), defect_prices.copy()
     for k in range(H):
         for i in range(p):
             reach = max(reach, abs(plan.states[k + 1, i]))
@@ -187,8 +194,8 @@ def _assess(terms, stages, rows, plan, proposed, z):
     costates = _costates(cost, A, proposed.states, references.states, rows.E, z)
     for k in range(H):
         for i in range(p):
-            most[i] = max(most[i], abs(costates[k, i]))
-    return here, curvature, promised, largest / reach, defects, most
+            new[i] = max(new[i], 1.5 * abs(costates[k, i]))
+    return here, curvature, promised, largest / reach, here + dot(defects, new, p), new
 
 
 @compiled
