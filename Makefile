@@ -15,12 +15,10 @@ figures: $(ENV)  ## Figures 2 to 4 and section 5.2; settings: make figures SET="
 test: $(ENV)  ## The whole test suite; options: make test ARGS="-k gaussian"
 	.venv/bin/python -m pytest $(ARGS)
 
-lint: $(ENV)  ## Format check, linter and import contracts
+lint: $(ENV)  ## Format check, linter, import contracts and types
 	.venv/bin/ruff format --check .
 	.venv/bin/ruff check .
 	.venv/bin/lint-imports
-
-types: $(ENV)  ## Type check of the package and the examples
 	.venv/bin/pyright
 
 bench: $(ENV)  ## What everything costs on this machine, beside others; some of it: make bench ONLY="peers qp"

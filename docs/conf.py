@@ -24,14 +24,23 @@ html_theme = "furo"
 html_title = "gpmpc"
 
 
-def escape_stars(app, what, name, obj, options, lines):
-    """Lets docstrings write shapes as (*batch, n) and norms as |x|, outside of code."""
-    for i, line in enumerate(lines):
-        parts = line.split("``")
-        parts[::2] = [part.replace("*", r"\*").replace("|", r"\|") for part in parts[::2]]
-        lines[i] = "``".join(parts)
+def mark_formulas(app, what, name, obj, options, lines):
+    """Sets indented formulas of a module's text as they stand, and lets others write (*batch, n) and |x|."""
+    marked = []
+    for line in lines:
+        formula = what == "module" and line.startswith("    ")
+        if formula and marked and not marked[-1]:
+            marked += ["::", ""]
+        if not formula:
+            parts = line.split("``")
+            parts[::2] = [part.replace("*", r"\*").replace("|", r"\|") for part in parts[::2]]
+            line = "``".join(parts)
+            if line.startswith(r"\* "):  # a list
+                line = line[1:]
+        marked.append(line)
+    lines[:] = marked
 
 
 def setup(app):
     """Registers what this site adds to Sphinx."""
-    app.connect("autodoc-process-docstring", escape_stars, priority=100)
+    app.connect("autodoc-process-docstring", mark_formulas, priority=100)

@@ -19,7 +19,7 @@ class Step:
         k: Number of the step, from 0.
         reference: What the state was to be (n,).
         state: The plant's true state, or the mean of a model's belief (n,).
-        measured: What the controller was told of it (n,).
+        measured: Its measurement, as the controller got it (n,).
         input: The input that was applied (m,); after a failure not the decision's.
         decision: What the controller decided, with its plan, status, timing and quadratic program; None where it was
             not called, or returned inputs of another shape.

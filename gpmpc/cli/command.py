@@ -1,4 +1,4 @@
-"""Problem: one command with a handful of subcommands, settings composed by Hydra, and mistakes answered in one line.
+"""Parses the command line, composes the settings with Hydra, and turns a user's mistake into one line.
 
 A user's mistake (an unknown setting, a missing file, a value out of range) ends with exit code 2 and one line on the
 standard error; ``HYDRA_FULL_ERROR=1`` shows where it came from. Heavy libraries are imported inside the task, so help

@@ -1,7 +1,7 @@
-"""Problem: the rotational subsystem is to follow the attitudes that a flight along a trajectory asks for.
+"""Computes the attitudes that a flight along a trajectory needs, the references of the rotational subsystem.
 
-The trajectory alone says which: between two outer steps the velocity has to change by v[k+1] - v[k], so the thrust has
-to give the mean acceleration a = (v[k+1] - v[k]) / T beside the weight. With z downwards
+Between two outer steps the velocity has to change by v[k+1] - v[k], so the thrust has to give the mean acceleration
+a = (v[k+1] - v[k]) / T beside the weight. With z downwards
 
     U1 / m = |a - g e_z|,   ux = a_x / (U1 / m),   uy = a_y / (U1 / m),
 

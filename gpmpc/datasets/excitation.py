@@ -1,10 +1,11 @@
-"""Problem: a flight that tracks well teaches little, and a model learned from it fails with the plant in the loop.
+"""Records flights with dither on the inputs, from which a model for control can be learned.
 
-Where the controller does its work, inputs are a function of states and references, and what each of them does on its
-own cannot be told apart (Ljung, 1999, section 13.4: a closed loop has to be excited). A GP trained on such data
-predicts the very same flight closely and has useless derivatives by the inputs, which are what a controller steers by.
-The remedy is dither: seeded white noise on the inputs, in their own units, well above the process noise. Measured, 189
-samples, error of the derivatives by the inputs relative to the plant's, median along the elliptical flight:
+A flight that tracks well teaches little: where the controller does its work, inputs are a function of states and
+references, and the effects of the two cannot be separated (Ljung, 1999, section 13.4: a closed loop has to be
+excited). A GP trained on such data predicts the very same flight closely and has useless derivatives by the inputs,
+which are what a controller steers by. The remedy is dither: seeded white noise on the inputs, in their own units, well
+above the process noise. Measured, 189 samples, error of the derivatives by the inputs relative to the plant's, median
+along the elliptical flight:
 
                      dither and noise   noise alone   neither
     translational               0.012          0.19       4.1

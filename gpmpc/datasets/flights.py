@@ -1,9 +1,9 @@
-"""Problem: where the transitions of an experiment come from.
+"""Records or reads the transitions of an experiment.
 
 ``NMPCData`` flies the experiment of Cao, Lai and Alam (2017), section 5, itself: unconstrained NMPC on the true plant,
 first along the trajectory with the translational subsystem, then along the attitude that those controls ask for with
-the rotational one. ``PaperData`` reads the four files that the authors published. Either is asked for one trajectory
-and one subsystem at a time.
+the rotational one. ``PaperData`` reads the four files that the authors published. Both give the data of one
+trajectory and one subsystem at a time.
 """
 
 from collections.abc import Callable, Sequence

@@ -9,7 +9,7 @@ import io
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -41,6 +41,10 @@ class Transitions:
     states: Tensor
     inputs: Tensor
     next_states: Tensor
+
+    if TYPE_CHECKING:  # anything that is an array of numbers
+
+        def __init__(self, states: Any, inputs: Any, next_states: Any) -> None: ...
 
     def __post_init__(self) -> None:
         for name in NAMES:

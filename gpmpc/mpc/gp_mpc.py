@@ -133,7 +133,7 @@ class GPMPC:
         if self.iterations > 1:
             globalize = Globalization(self.prediction, self._condenser.cost, request, self.tolerance)
         status, count = None, 0
-        while status is None and count < self.iterations:
+        while True:
             clock.model()
             program = globalize.correct(self._condense(prediction, request), prediction.plan)
             clock.build()
@@ -143,6 +143,8 @@ class GPMPC:
             if _is_usable(program, solution, prediction.plan):
                 proposed = self._proposed(prediction, program, solution, request.references.previous_input)
                 prediction, status = globalize(prediction, program, solution, proposed)
+            if status is not None or count == self.iterations:
+                break
         clock.model()
         status = Status.ITERATION_LIMIT if status is None else status
         program = QuadraticProgram.unchecked(*program[:5])
@@ -193,9 +195,10 @@ class GPMPC:
         and a belief of which moments are matched some matrices (N, N) as well. The compiled kernels take far less.
         """
         model, linearizer = self.prediction.model, self.prediction.linearizer
-        if not hasattr(model, "features") or getattr(linearizer.propagator, "hessian", False):
+        features = getattr(model, "features", None)
+        if features is None or getattr(linearizer.propagator, "hessian", False):
             return None
-        (N, d), n, size = model.features.shape, model.state_dim, self.horizon * self.problem.input_dim
+        (N, d), n, size = features.shape, model.state_dim, self.horizon * self.problem.input_dim
         p = len(linearizer.weight(self.problem.Q)) * n
         each = 8 * n * N * (d + 1) + 4 * p * (p + d)
         if not linearizer.at_points:

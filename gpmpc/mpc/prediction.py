@@ -88,7 +88,7 @@ class PredictionModel:
         propagator: Propagator,
         problem: TrackingProblem,
         horizon: int,
-        initial_input: Array,
+        initial_input: Sequence[float] | Array,
         form: Form,
         covariance: Covariance,
         feedback: bool,
@@ -139,15 +139,12 @@ class PredictionModel:
             covariances[0] = request.covariance
         if self.form == "velocity":
             means[1:], covariances[1:] = request.state, covariances[0]
-            return Plan(
-                self.linearizer.state(means, covariances),
-                request.constant_guess,
-                covariances,
-            )
-        inputs, known = request.initial_guess, previous is not None and previous.applicable
-        known = known and len(previous.means) == H + 1
-        if known:
-            means[1:H], means[H] = previous.means[2:], previous.means[H]
+            return Plan(self.linearizer.state(means, covariances), request.constant_guess, covariances)
+        inputs, last = request.initial_guess, None
+        if previous is not None and previous.applicable and len(previous.means) == H + 1:
+            last = previous
+        if last is not None:
+            means[1:H], means[H] = last.means[2:], last.means[H]
         else:
             states, shares = request.references.states, np.linspace(1.0, 0.0, H + 1)[1:, None]
             means[1:] = states + shares * (request.state - states[0])
@@ -157,7 +154,7 @@ class PredictionModel:
             inputs = inputs.copy()
             _keep_rates(inputs, request.references.previous_input, problem.rate_lower, problem.rate_upper)
         if not self.linearizer.at_points:
-            covariances[1:] = previous.covariances[1:] if known else self._first_covariances(means, inputs, request)
+            covariances[1:] = self._first_covariances(means, inputs, request) if last is None else last.covariances[1:]
         return Plan(self.linearizer.state(means, covariances), inputs, covariances)
 
     def linearize(self, plan: Plan, request: Request, previous: Decision | None = None) -> Prediction:
@@ -179,10 +176,10 @@ class PredictionModel:
             return []
         K, T = self.points, len(requests)
         plans = [self.initial_guess(*question) for question in zip(requests, previous, strict=True)]
-        points = [np.concatenate([part[:K] for part in parts]) for parts in zip(*plans, strict=True)]
+        states, inputs, covariances = (np.concatenate([s[:K] for s in parts]) for parts in zip(*plans, strict=True))
         disturbances = [np.broadcast_to(r.disturbance, (K, len(r.state))) for r in requests if len(r.disturbance)]
         disturbance = np.concatenate(disturbances) if disturbances else None
-        stages = self.linearizer(*points, disturbance)
+        stages = self.linearizer(states, inputs, covariances, disturbance)
         parts = zip(*(part.reshape(T, K, *part.shape[1:]) for part in stages), strict=True)
         asked = zip(plans, map(LinearizedStages._make, parts), requests, previous, strict=True)
         return [self.predict(*question) for question in asked]

@@ -36,7 +36,8 @@ from gpmpc.status import Status
 
 Array = np.ndarray
 
-FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, torch.linalg.LinAlgError)  # no finite numbers
+_TORCH_FAILURE = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
+FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, _TORCH_FAILURE)  # no finite numbers
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 _SHORTEST_STEP = 2.0**-10
 _ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much

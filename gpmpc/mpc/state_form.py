@@ -77,7 +77,7 @@ class StateFormMPC:
 
     def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
         """Decides the input for one step; see ``GPMPC.control``."""
-        import cvxpy
+        from cvxpy.error import SolverError
 
         request, began = self.prediction.read(belief, reference, previous), perf_counter()
         if not request.finite:
@@ -97,7 +97,7 @@ class StateFormMPC:
                 warnings.simplefilter("ignore")
                 program.solve(solver=self.solver, **{"warm_start": False} | self.options)
             status = STATUSES.get(program.status, Status.NUMERICAL_TROUBLE)
-        except cvxpy.error.SolverError:
+        except SolverError:
             status = Status.NUMERICAL_TROUBLE
         timing = Timing(modelled - began, built - modelled, perf_counter() - built)
         iterations = (program.solver_stats.num_iters or 0) if program.solver_stats else 0
@@ -136,18 +136,18 @@ class _Program:
             A, B, c = self._stages[min(k, K - 1)]
             rules.append(s[k + 1] == A @ s[k] + B @ u[k] + c)
         self._rows = [cvxpy.Parameter((r, p)) for _ in range(K if r else 0)]
-        self._bounds = cvxpy.Parameter((H, r)) if r else None
-        if r:
+        limits = problem.state_bounds
+        if r and limits is not None:
+            self._bounds = cvxpy.Parameter((H, r))
             slack = cvxpy.Variable((H, r), nonneg=True) if rows.soft else np.zeros((H, r))
             # Every bound as an upper one: the rows of lower bounds are handed over with their sign turned.
             at = [self._rows[min(k, K - 1)] @ s[k + 1] for k in range(H)]
             rules += [at[k] <= self._bounds[k] + slack[k] for k in range(H)]
             if rows.soft:
-                limits = problem.state_bounds
                 cost += (limits.l1 or 0.0) * cvxpy.sum(slack) + (limits.l2 or 0.0) * cvxpy.sum_squares(slack)
         rules += [] if constraints is None else list(constraints(s, u))
         self.problem = cvxpy.Problem(cvxpy.Minimize(cost), rules)
-        if not self.problem.is_dcp(dpp=True):
+        if not self.problem.is_dpp():
             raise SettingError("constraints", "must be convex, and parametrised as CVXPY's rules (DPP) ask")
 
     @property

@@ -1,4 +1,4 @@
-"""Problem: figures of the results; the only importer of matplotlib.
+"""Draws the results; the only package that imports matplotlib.
 
 Every function returns a ``Figure`` made without pyplot, so nothing global is touched and no window opens.
 """

@@ -1,4 +1,4 @@
-"""Problem: see a flight as it went: where the vehicle was, what it planned, and how sure it was of that.
+"""Animates a flight: where the vehicle was, what it planned, and how certain the plan was.
 
 Left the whole flight from above (x, y) and its height, right what the controller saw: its plan with 2-sigma ellipses of
 the predicted positions. These are often far smaller than the plan is long; they are then drawn enlarged, and the factor

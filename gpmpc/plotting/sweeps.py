@@ -1,4 +1,4 @@
-"""Figures of a sweep: what came of its runs over a variable that was varied."""
+"""Draws the results of a sweep's runs over a variable."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

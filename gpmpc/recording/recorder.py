@@ -260,7 +260,7 @@ class _File:
         return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """Tells the position; the library is told not to seek, but asks for it."""
+        """Returns the position, which the library reads although it does not seek."""
         return self._position
 
     def flush(self) -> None:

@@ -31,7 +31,7 @@ class Rollout:
 
     states: Array  # (K + 1, n) x[0] .. x[K], or the means of the beliefs
     covariances: Array  # (K + 1, n, n) of the beliefs; zero with a plant in the loop
-    measured: Array  # (K, n) what the controller was told of x[0] .. x[K-1]
+    measured: Array  # (K, n) measurements of x[0] .. x[K-1]
     inputs: Array  # (K, m) that were applied, u[0] .. u[K-1]
     references: Array  # (K + 1, n) r[0] .. r[K]; the last one is r[K-1] again where no r[K] was given
     predicted_means: Array  # (K, n) that the controller expected of x[1] .. x[K]; NaN where its plan was not applied
