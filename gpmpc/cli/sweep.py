@@ -24,6 +24,7 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, open_dict
 
@@ -97,6 +98,8 @@ def sweep(given: Namespace, conf: Path) -> None:
         os.environ[name] = "1"
     console, combinations = Console(), _combinations(given.overrides)
     conf = Path(given.config_path or conf).absolute()
+    if given.config_dir is not None:
+        _search_also(Path(given.config_dir))
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf)):
         composer = _composer(given, combinations[0])
         jobs = _jobs(combinations, folder_of(composer.config.folder))
@@ -154,14 +157,21 @@ def _combinations(overrides: Sequence[str]) -> list[list[str]]:
     return [list(combination) for combination in itertools.product(*values.values())]
 
 
+def _search_also(folder: Path) -> None:
+    """Lets Hydra look for settings in a folder of the user's, behind the package's own."""
+    if not folder.is_dir():
+        raise SettingError("--config-dir", f"{folder}: no such folder")
+
+    class OwnFolder(SearchPathPlugin):
+        def manipulate_search_path(self, search_path: Any) -> None:
+            search_path.append("command-line", f"file://{folder.absolute()}")
+
+    Plugins.instance().register(OwnFolder)
+
+
 def _composer(given: Namespace, overrides: Sequence[str]) -> Composer:
     """Composes the first run with Hydra's own settings, which say what the launcher is."""
-    searched = []
-    if given.config_dir is not None:
-        if not Path(given.config_dir).is_dir():
-            raise SettingError("--config-dir", f"{given.config_dir}: no such folder")
-        searched = [f"hydra.searchpath=['file://{Path(given.config_dir).absolute()}']"]
-    config = hydra.compose(given.config_name or "run", [*overrides, *searched], return_hydra_config=True)
+    config = hydra.compose(given.config_name or "run", [*overrides], return_hydra_config=True)
     config.hydra.mode = RunMode.MULTIRUN
     nothing: Any = NoCallbacks()
     return Composer(HydraContext(GlobalHydra.instance().config_loader(), nothing), config)
