@@ -1,6 +1,7 @@
 """What ``pip install`` gives works outside the checkout, settings included."""
 
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -48,3 +49,20 @@ def test_an_installed_package_finds_its_settings_from_an_empty_directory(wheel, 
     assert result.returncode == 0, result.stderr
     assert "draws: 3" in result.stdout
     assert not list(empty.iterdir())
+
+
+def test_every_file_that_the_documentation_names_is_there():
+    named = re.compile(
+        r"\b(?:gpmpc|benchmarks|experiments|examples|conf|docs|tests)/[\w/.-]+\.(?:py|yaml|json|md|png|gif)\b"
+    )
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md")]
+    missing = {f"{page.name}: {name}" for page in pages for name in named.findall(page.read_text())}
+    missing = {entry for entry in missing if not (ROOT / entry.partition(": ")[2]).exists()}
+    assert not missing
+    links = {
+        f"{page.name}: {link}"
+        for page in pages
+        for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text())
+        if not (page.parent / link).exists()
+    }
+    assert not links
