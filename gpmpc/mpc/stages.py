@@ -135,8 +135,8 @@ class StageLinearizer:
         found = linearize(self.model, states, inputs, self.covariance == "zero_order")
         V = np.zeros((len(states), self._n, self._n)) if found.covariance is None else found.covariance
         V = V if self._noise is None else V + self._noise
-        after, A, B, V = map(np.ascontiguousarray, (found.mean, found.A, found.B, V))  # a model may give views
-        return after, A, B, V
+        parts = found.mean, found.A, found.B, V  # a model may give views, which the kernels do not notice
+        return tuple([np.ascontiguousarray(part, dtype=np.float64) for part in parts])
 
     def _zero_order(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
         moved, d = differentiate(self.propagator, self.model, *self._tensors(states, covariances, inputs))

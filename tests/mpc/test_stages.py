@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc.dynamics import Linearized
 from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, ResidualModel
@@ -51,6 +52,28 @@ def test_the_shortcut_gives_the_same_stage(model, noise):
     _, long = stage_at("zero_order", ByDifferentiation(process_noise=noise), model, belief, input)
     for mine, theirs in zip(short, long, strict=True):
         assert np.allclose(mine, theirs, rtol=0, atol=1e-12)
+
+
+def test_a_model_may_give_views_and_other_types():
+    model, rng = pendulum_posterior(), np.random.default_rng(0)
+    states, inputs, covariances = rng.normal(size=(5, 2)), rng.normal(size=(5, 1)), np.zeros((5, 2, 2))
+
+    class Views:
+        state_dim = model.state_dim
+
+        def linearize(self, states, inputs, covariance):
+            mean, A, B, V = model.linearize(states, inputs, covariance)
+            one = np.eye(2, dtype=int)
+            return Linearized(
+                np.asfortranarray(mean), A.mT.copy().mT, np.asfortranarray(B), np.broadcast_to(one, V.shape)
+            )
+
+    expected = StageLinearizer(model, Linearization(), "zero_order")(states, inputs, covariances)
+    found = StageLinearizer(Views(), Linearization(), "zero_order")(states, inputs, covariances)
+    for mine, theirs in zip(found, expected._replace(V=np.tile(np.eye(2), (5, 1, 1))), strict=True):
+        assert mine.flags.c_contiguous
+        assert mine.dtype == float
+        np.testing.assert_array_equal(mine, theirs)
 
 
 @pytest.mark.parametrize("mode", ["full", "diagonal", "zero_order", "none"])
