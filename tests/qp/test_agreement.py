@@ -24,11 +24,11 @@ def daqp_solution(problem: QuadraticProgram):
     return x, flag in DAQP_SOLVED
 
 
-def gram(problem, warm_start=None):
+def prepared(problem, warm_start=None):
     return DualActiveSet().prepare(problem.P, problem.G).solve(problem.q, problem.lower, problem.upper, warm_start)
 
 
-def lazy(problem, warm_start=None):
+def changing(problem, warm_start=None):
     return DualActiveSet().solve(problem, warm_start)
 
 
@@ -42,7 +42,7 @@ def test_no_disagreement_with_daqp_on_integer_problems_feasible_and_infeasible(b
         guess = rng.integers(-1, 2, len(problem.lower)) if rng.random() < 0.5 else None
         x, solved = daqp_solution(problem)
         outcomes.add(solved)
-        for solve in (gram, lazy):
+        for solve in (prepared, changing):
             solution = solve(problem, guess)
             assert solution.status is (Status.SOLVED if solved else Status.INFEASIBLE)
             if solved:
@@ -56,7 +56,7 @@ def test_no_disagreement_with_clarabel_on_integer_problems(feasible):
     rng, clarabel = np.random.default_rng([7, bool(feasible)]), CvxpySolver()
     for _ in range(60):
         problem = integer_problem(rng, feasible)
-        theirs, ours = clarabel.solve(problem), lazy(problem)
+        theirs, ours = clarabel.solve(problem), changing(problem)
         assert ours.status is theirs.status
         if ours.status.solved:
             assert distance(problem, ours.x, theirs.x) < 1e-6
@@ -68,7 +68,7 @@ def test_the_papers_algorithm_finds_what_the_dual_method_finds(feasible):
     for _ in range(600):
         problem = integer_problem(rng, feasible)
         guess = rng.integers(-1, 2, len(problem.lower)) if rng.random() < 0.5 else None
-        dual, solution = lazy(problem), primal.solve(problem, guess)
+        dual, solution = changing(problem), primal.solve(problem, guess)
         assert solution.status is dual.status
         if dual.status.solved:
             assert worst_residual(solution) < 1e-9
@@ -99,7 +99,7 @@ def small_problems(draw):
 @settings(max_examples=400, deadline=None, derandomize=True)
 def test_three_methods_agree_on_whatever_hypothesis_invents(case):
     problem, guess = case
-    solutions = [gram(problem, guess), lazy(problem, guess), PrimalActiveSet().solve(problem, guess)]
+    solutions = [prepared(problem, guess), changing(problem, guess), PrimalActiveSet().solve(problem, guess)]
     assert len({solution.status for solution in solutions}) == 1
     assert solutions[0].status in (Status.SOLVED, Status.INFEASIBLE)
     if solutions[0].status.solved:
@@ -108,7 +108,7 @@ def test_three_methods_agree_on_whatever_hypothesis_invents(case):
             assert distance(problem, solutions[0].x, solution.x) < 1e-8
 
 
-@pytest.mark.parametrize("solve", [gram, lazy])
+@pytest.mark.parametrize("solve", [prepared, changing])
 @pytest.mark.parametrize("condition", [1.0, 1e4, 1e8])
 @pytest.mark.parametrize("n", [1, 2, 3, 7, 20, 50, 150])
 def test_every_size_and_conditioning_is_solved_to_1e_9(solve, n, condition, rng):
@@ -124,5 +124,5 @@ def test_every_size_and_conditioning_is_solved_to_1e_9(solve, n, condition, rng)
 @pytest.mark.parametrize("n", range(1, 151, 7))
 def test_every_number_of_variables_from_1_to_150_without_rows(n, rng):
     problem = feasible_problem(rng, n, 0)
-    for solution in (gram(problem), lazy(problem)):
+    for solution in (prepared(problem), changing(problem)):
         assert solution.is_optimal(1e-9)

@@ -6,10 +6,10 @@ from scipy.linalg import hilbert
 
 from gpmpc.qp import QuadraticProgram
 from gpmpc.status import Status
-from tests.qp.problems import feasible_problem, gram, lazy, primal, stacked_rows, worst_residual
+from tests.qp.problems import changing, feasible_problem, prepared, primal, stacked_rows, worst_residual
 
-ALL = pytest.mark.parametrize("solve", [gram, lazy, primal])
-DUAL = pytest.mark.parametrize("solve", [gram, lazy])
+ALL = pytest.mark.parametrize("solve", [prepared, changing, primal])
+DUAL = pytest.mark.parametrize("solve", [prepared, changing])
 
 
 @ALL

@@ -18,7 +18,7 @@ from tests.qp.problems import feasible_problem, integer_problem
 PACKAGE = Path(__file__).resolve().parents[2] / "gpmpc"
 
 
-@pytest.mark.parametrize("mode", ["gram", "lazy"])
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
 def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_goes_on(mode, rng):
     problem = feasible_problem(rng, 20, 30)
     full = DualActiveSet().solve(problem)
@@ -27,7 +27,7 @@ def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_go
     prepared = limited.prepare(problem.P, problem.G)
     solution, objectives = None, []
     for _ in range(full.iterations):
-        if mode == "gram":
+        if mode == "prepared":
             solution = prepared.solve(problem.q, problem.lower, problem.upper, solution)
         else:
             solution = limited.solve(problem, solution)
@@ -44,14 +44,14 @@ def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_go
     assert len(objectives) > 2
 
 
-@pytest.mark.parametrize("mode", ["gram", "lazy"])
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
 def test_the_time_limit_stops_a_long_solve_and_does_not_touch_a_short_one(mode, rng):
     problem = feasible_problem(rng, 120, 300)
     full = DualActiveSet().solve(problem)
     assert full.iterations > 50
 
     def solve(solver):
-        if mode == "gram":
+        if mode == "prepared":
             return solver.prepare(problem.P, problem.G).solve(problem.q, problem.lower, problem.upper)
         return solver.solve(problem)
 
@@ -160,13 +160,15 @@ def crowded_vertex(rng):
     return QuadraticProgram((P + P.T) / 2, q, G, h_upper=G @ vertex), vertex
 
 
-@pytest.mark.parametrize("mode", ["gram", "lazy"])
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
 def test_vertices_where_many_rows_meet_are_found_without_cycling(mode, rng):
     solver = DualActiveSet()
     for _ in range(30):
         problem, vertex = crowded_vertex(rng)
         prepared = solver.prepare(problem.P, problem.G)
-        solution = prepared.solve(problem.q, problem.lower, problem.upper) if mode == "gram" else solver.solve(problem)
+        solution = (
+            prepared.solve(problem.q, problem.lower, problem.upper) if mode == "prepared" else solver.solve(problem)
+        )
         assert solution.status is Status.SOLVED
         x, _, flag, _ = daqp.solve(
             problem.P.copy(), problem.q.copy(), problem.G.copy(), np.minimum(problem.upper, 1e30),
@@ -176,7 +178,7 @@ def test_vertices_where_many_rows_meet_are_found_without_cycling(mode, rng):
         np.testing.assert_allclose(solution.x, x, atol=1e-7 * np.abs(vertex).max())
 
 
-@pytest.mark.parametrize("mode", ["gram", "lazy"])
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
 def test_rows_that_depend_on_each_other_but_for_rounding_are_no_obstacle(mode, rng):
     """Two to six times as many rows as variables meet in a vertex, and span half of the space."""
     solver = DualActiveSet()
@@ -189,7 +191,9 @@ def test_rows_that_depend_on_each_other_but_for_rounding_are_no_obstacle(mode, r
         multipliers = rng.uniform(0, 1, m) * (rng.random(m) < 0.5)
         problem = QuadraticProgram((P + P.T) / 2, -P @ vertex - G.T @ multipliers, G, h_upper=G @ vertex)
         prepared = solver.prepare(problem.P, problem.G)
-        solution = prepared.solve(problem.q, problem.lower, problem.upper) if mode == "gram" else solver.solve(problem)
+        solution = (
+            prepared.solve(problem.q, problem.lower, problem.upper) if mode == "prepared" else solver.solve(problem)
+        )
         assert solution.status is Status.SOLVED
         np.testing.assert_allclose(solution.x, vertex, atol=1e-6 * np.abs(vertex).max())
 

@@ -8,16 +8,16 @@ from gpmpc.status import Status
 from tests.qp.problems import feasible_problem, worst_residual
 
 
-def gram(problem, soft, warm_start=None):
+def prepared(problem, soft, warm_start=None):
     prepared = DualActiveSet().prepare(problem.P, problem.G, soft)
     return prepared.solve(problem.q, problem.lower, problem.upper, warm_start)
 
 
-def lazy(problem, soft, warm_start=None):
+def changing(problem, soft, warm_start=None):
     return DualActiveSet().solve(problem, warm_start, soft)
 
 
-DUAL = pytest.mark.parametrize("solve", [gram, lazy])
+DUAL = pytest.mark.parametrize("solve", [prepared, changing])
 
 
 def with_slacks(problem, soft, curvature=1e-6):
@@ -76,7 +76,7 @@ def test_soft_rows_solve_the_problem_written_out_with_slacks(solve, kind, n, m, 
 @DUAL
 def test_an_exact_penalty_above_the_multipliers_leaves_a_feasible_problem_as_it_is(solve, rng):
     problem = feasible_problem(rng, 6, 9)
-    hard = lazy(problem, None)
+    hard = changing(problem, None)
     assert np.abs(hard.z).max() > 0.1
     exact = solve(problem, SoftRows(linear=np.full(9, 1.01 * np.abs(hard.z).max())))
     np.testing.assert_allclose(exact.x, hard.x, atol=1e-10)
@@ -88,7 +88,7 @@ def test_an_exact_penalty_above_the_multipliers_leaves_a_feasible_problem_as_it_
 def test_infinite_weights_are_hard_rows(solve, rng):
     problem = feasible_problem(rng, 6, 9)
     np.testing.assert_allclose(
-        solve(problem, SoftRows(quadratic=np.full(9, np.inf))).x, lazy(problem, None).x, atol=1e-10
+        solve(problem, SoftRows(quadratic=np.full(9, np.inf))).x, changing(problem, None).x, atol=1e-10
     )
 
 

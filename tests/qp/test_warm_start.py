@@ -6,10 +6,18 @@ import pytest
 from gpmpc.qp import DualActiveSet, QPSolution
 from gpmpc.qp import record as layout
 from gpmpc.status import Status
-from tests.qp.problems import feasible_problem, gram, integer_problem, lazy, primal, solve_stacked, worst_residual
+from tests.qp.problems import (
+    changing,
+    feasible_problem,
+    integer_problem,
+    prepared,
+    primal,
+    solve_stacked,
+    worst_residual,
+)
 
-ALL = pytest.mark.parametrize("solve", [gram, lazy, primal])
-DUAL = pytest.mark.parametrize("solve", [gram, lazy])
+ALL = pytest.mark.parametrize("solve", [prepared, changing, primal])
+DUAL = pytest.mark.parametrize("solve", [prepared, changing])
 
 
 @ALL
