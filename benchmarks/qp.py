@@ -50,7 +50,7 @@ Solve = Callable[[SequenceProblem], tuple[np.ndarray, np.ndarray]]
 
 
 def ours(changing: bool) -> Callable[[SequenceProblem], Solve]:
-    """A warm-started ``DualActiveSet``: lazy mode if P and G change, Gram mode if not."""
+    """A warm-started ``DualActiveSet``, with a prepared program where P and G stay."""
 
     def begin(first: SequenceProblem) -> Solve:
         solver, last = DualActiveSet(), None
