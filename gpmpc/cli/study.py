@@ -18,14 +18,14 @@ def tables(config: DictConfig) -> None:
     """Computes Tables 1 and 2; the task behind ``conf/tables.yaml``."""
     from gpmpc.experiments.tables import Tables  # pyright: ignore[reportMissingImports] stands in experiments/
 
-    parts = _parts(config, "data", "trajectory", "subsystem", "model")
+    parts = _parts(config, "data", "trajectory", "model")
     numbers = {key: config[key] for key in ("draws", "seed", "state_std", "workers")}
     settings = plain_data(config)
     _run(
         Tables(
             data=parts["data"],
             trajectories=parts["trajectory"],
-            subsystems=parts["subsystem"],
+            subsystems=settings["subsystem"],
             model=parts["model"],
             model_settings=settings["model"],
             sizes=settings["sizes"],
@@ -40,7 +40,7 @@ def figures(config: DictConfig) -> None:
     from gpmpc.experiments.figures import LOOPS, Figures, Row  # pyright: ignore[reportMissingImports]
 
     sources = ("data", "excited", "undithered")
-    parts = _parts(config, *sources, "trajectory", "subsystem", "model", "flying", "plant")
+    parts = _parts(config, *sources, "trajectory", "model", "flying")
     settings, rows = plain_data(config), {}
     loops = settings["loop"] if isinstance(settings["loop"], list) else [settings["loop"]]
     for loop in loops:
@@ -59,10 +59,9 @@ def figures(config: DictConfig) -> None:
             rows={name: row for name, row in rows.items() if row.loop in loops},
             data={key: parts[key] for key in sources},
             trajectories=parts["trajectory"],
-            subsystems=parts["subsystem"],
+            subsystems=settings["subsystem"],
             models={"model": parts["model"], "plant": parts["flying"]},
             model_settings={"model": settings["model"], "plant": settings["flying"]},
-            plant=parts["plant"],
             number=settings["trials"],
             **{key: settings[key] for key in numbers},
         ),
@@ -135,5 +134,5 @@ def _parts(config: DictConfig, *groups: str) -> dict[str, Any]:
 
     for key in groups:
         if not config.get(key):
-            raise SettingError(key, "choose at least one" if key in ("trajectory", "subsystem") else "choose one")
+            raise SettingError(key, "choose at least one" if key == "trajectory" else "choose one")
     return {key: instantiate(config[key], _convert_="all") for key in groups}
