@@ -38,7 +38,7 @@ def log(given: argparse.Namespace) -> Result:
     endings = ENDINGS[given.action]
     ending = {"recover": ".recovered.mcap", "export": ".csv", "layout": ".layout.json"}[given.action]
     output = given.output or given.file.parent / f"{given.file.stem}{ending}"
-    if given.action != "recover" and output.suffix not in endings:
+    if given.output and given.action != "recover" and output.suffix not in endings:
         raise SettingError("output", f"must end in {' or '.join(endings)}; got {output.name!r}")
     note = {"recover": _recover, "export": _export, "layout": _layout}[given.action](given.file, output)
     print(f"written to {output}: {note}")

@@ -21,10 +21,10 @@ def explain(error: Exception, name: str) -> str | None:
         error: Any.
         name: Of the command's file of settings; empty where it has none.
     """
-    if isinstance(error, OSError) and own_error(error) is None:
-        return f"{error.filename}: {error.strerror}" if error.filename else str(error)
     if isinstance(error, GpmpcError | HydraException | OmegaConfBaseException):
         return _of_settings(error, name)
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}" if error.filename else str(error)
     if name and isinstance(error, TypeError | ValueError | ArithmeticError):  # a value that no check foresaw
         reason = " ".join(str(error).split()) or type(error).__name__
         return f"{reason}; is a setting of the wrong kind? --debug shows where"
