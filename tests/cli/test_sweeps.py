@@ -128,7 +128,7 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
         (["system=pendulum", "trajectory=lorenz"], "trajectory: must prescribe angle of pendulum; got positions of 3"),
         (["system=pendulum", "controller.problem.Q=[1,1,1]"], "controller.problem: weighs 3 states and 1 inputs"),
         (["system=pendulm"], "system: no such option 'pendulm'"),
-        (["system._target_=gpmpc.systems.Rotational"], "system: _target_ must name a function that returns"),
+        (["system._target_=builtins.dict"], "system: _target_ must name a function that returns"),
         (["folder=null"], "folder: must be the path of a folder; got None"),
         (["folder="], "folder: must be the path of a folder; got ''"),
         (["horizon=0"], "horizon: must be a whole number, 1 or more; got 0"),
