@@ -108,7 +108,7 @@ def _satisfy_constraint(work, active, k, p):
     row, size = work.rows[place], int(work.end[p])
     free_value = dot(row, work.v, len(work.x))
     K_pp = dot(row, row, size) + work.softness[p]
-    multiply_rows(work.rows, active.place, k, row, size, solved)  # K_Wp
+    _multiply_working_rows(work, active, k, p, row)
     solve_lower(active.factor, k, solved)
     while True:
         _write_slot(work, active, k, p, above)
@@ -203,7 +203,7 @@ def add_constraints(work, active, k, count):
         p = abs(work.candidates[i]) - 1
         place = _make_row(work, active, first + i, p)
         row, size = work.rows[place], int(work.end[p])
-        multiply_rows(work.rows, active.place, k, row, size, solved)
+        _multiply_working_rows(work, active, k, p, row)
         solve_lower(active.factor, k, solved)
         K_pp = dot(row, row, size) + work.softness[p]
         pivot = K_pp - dot(solved, solved, k)
@@ -235,6 +235,16 @@ def _make_row(work, active, slot, p):
         row[p] = 1.0
     solve_transposed(work.L, int(work.end[p]), row)
     return place
+
+
+@inline_njit
+def _multiply_working_rows(work, active, k, p, row):
+    """Writes K_Wp to ``solved``, where ``row`` is w_p."""
+    if work.prepared:
+        for i in range(k):
+            work.solved[i] = work.gram[p, active.place[i]]
+    else:
+        multiply_rows(work.rows, active.place, k, row, int(work.end[p]), work.solved)
 
 
 @inline_njit
