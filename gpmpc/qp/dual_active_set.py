@@ -137,15 +137,16 @@ class Prepared:
         build_seconds: Time that the preparation took [s].
     """
 
+    __slots__ = ("_G", "_P", "_memory", "_size", "_softness", "_solver", "_x", "build_seconds")
+
     def __init__(self, solver: DualActiveSet, problem: QuadraticProgram, soft: SoftRows | None):
         began = perf_counter()
         self._P, self._G, self._solver = problem.P, problem.G, solver
         m, n = problem.G.shape
-        self._plan = solver._plan((m, n), soft, prepared=True)
-        _, memory, size, _ = self._plan
+        self._softness, self._memory, self._size, self._x = solver._plan((m, n), soft, prepared=True)
         # factorises P and measures the rows of G; where numbers overflow, every solve is to find that out by itself
-        if solve(*problem, layout.NO_RECORD, memory, np.empty(size)) == layout.SOLVED:
-            prepare_memory(memory, problem.G)
+        if solve(*problem, layout.NO_RECORD, self._memory, np.empty(self._size)) == layout.SOLVED:
+            prepare_memory(self._memory, problem.G)
         self.build_seconds = perf_counter() - began
 
     def solve(self, q: Array, lower: Array, upper: Array, warm_start: WarmStart = None) -> QPSolution:
@@ -161,17 +162,21 @@ class Prepared:
             ProblemError: Shapes that do not match, NaN, crossed bounds.
         """
         began = perf_counter()  # line by line as in ``DualActiveSet.solve``: a call costs a tenth of a small solve
-        problem, softness, memory, size, where = (self._P, q, self._G, lower, upper), *self._plan
-        record, status = _empty(size), layout.MISUSE
+        P, G = self._P, self._G
+        record, status = _empty(self._size), layout.MISUSE
         try:
             guess = _NO_RECORD if warm_start is None else warm_start.record  # pyright: ignore[reportAttributeAccessIssue]
             if q.dtype is lower.dtype is upper.dtype is _FLOAT:
-                status = _run(self._P, q, self._G, lower, upper, guess, memory, record)
+                status = _run(P, q, G, lower, upper, guess, self._memory, record)
                 if not status:
-                    return _new(QPSolution, (record[where], problem, softness, record, 0.0, perf_counter() - began))
+                    problem = P, q, G, lower, upper
+                    return _new(
+                        QPSolution, (record[self._x], problem, self._softness, record, 0.0, perf_counter() - began)
+                    )
         except (AttributeError, TypeError):
             pass
-        return _solve_again(problem, warm_start, self._plan, self._solver, status, record, began)
+        plan = self._softness, self._memory, self._size, self._x
+        return _solve_again((P, q, G, lower, upper), warm_start, plan, self._solver, status, record, began)
 
 
 def _solve_again(problem: _Arrays, warm_start, plan, solver, status, record, began) -> QPSolution:

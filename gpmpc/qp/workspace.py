@@ -16,7 +16,7 @@ from gpmpc.qp.record import HEADER
 
 Array = NDArray[np.float64]
 
-_LIMIT, TOLERANCE, SOFT, PREPARED, SETTINGS = 0, 1, 2, 3, 4
+_LIMIT, TOLERANCE, SOFT, PREPARED, UNCHANGED, SETTINGS = 0, 1, 2, 3, 4, 5
 _REALS, _INTEGERS = 5, 26  # rows of ``memory`` at which vectors begin, after settings and traits,
 _REST = 30  # then integers, the factor of the working set, L and rows
 _END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
@@ -63,6 +63,7 @@ class Workspace(NamedTuple):
     limit: int  # changes of the working set
     tolerance: float
     soft: bool  # whether rows are soft
+    settings: Any  # of the memory; one is how many rows of the factor are as ``start`` made them from the last guess
     prepared: bool  # whether L, scale, end, rows and gram are there
 
 
@@ -91,7 +92,7 @@ def new_memory(softness: Array, n: int, limit: int, tolerance: float, soft: bool
     memory = aligned_rows(_REST + capacity + 1 - (-own // wide), wide)  # loads across cache lines take twice the time
     memory[:] = 0.0
     box = np.arange(M) < n
-    memory[0, :SETTINGS] = limit, tolerance, soft, False
+    memory[0, :SETTINGS] = limit, tolerance, soft, False, 0
     memory[1, :M], memory[2:4, :M] = box, softness
     memory[4, :M] = box * np.minimum(n, (np.arange(M) // _END_STEP + 1) * _END_STEP)
     return memory
@@ -144,7 +145,7 @@ def open_workspace(P, q, G, memory, out):
     work = Workspace(
         P, q, G, L, rows, gram, real[0], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2], memory[3],
         memory[4], out, x, mu, real[6][:M], real[7], whole[0], whole[1], real[8], real[9], real[10], real[11], real[12],
-        real[13], real[14], real[15], capacity, int(settings[_LIMIT]), settings[TOLERANCE], soft, prepared,
+        real[13], real[14], real[15], capacity, int(settings[_LIMIT]), settings[TOLERANCE], soft, settings, prepared,
     )  # fmt: skip
     active = WorkingSet(whole[2], whole[3], real[16], real[17], real[18], real[19], real[20], factor)
     return work, active
