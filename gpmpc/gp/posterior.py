@@ -266,7 +266,7 @@ class GPPosterior:
         total = weighted.sum(-1)[..., None, None] * torch.diag_embed(self.lengthscales[:, : self.state_dim] ** -2)
         return (weighted[..., None] * z).mT @ z - total
 
-    def variance_reduction(self, k: Tensor, outputs: Tensor | slice = slice(None)) -> Tensor:
+    def variance_reduction(self, k: Tensor, outputs: list[int] | slice = slice(None)) -> Tensor:
         """|L_a^-1 k_a|^2 (*batch, k) of correlations k (*batch, k, N): by how much the data reduce the variance.
 
         The batch goes to the right-hand side's columns: broadcast against it, L would be copied for every member.

@@ -37,6 +37,7 @@ from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation._composition import Latent
 
 _ENTRIES = 2**18  # of the matrices (N, N) that are made at once, of one pair of outputs at least
+_Pairs = tuple[list[int], list[int]]
 _LARGEST = {torch.float64: 300.0, torch.float32: 80.0}  # delta
 
 
@@ -120,9 +121,9 @@ def _output_terms(model: GPPosterior, a: Any, mu: Tensor, S: Tensor, u: Tensor) 
     return _OutputTerms(nu * D[:, None, :], model.signal_variance[a, None] * (-exponent).exp(), half_logdet, G, T)
 
 
-def _pair_entries(model: GPPosterior, a: Tensor, b: Tensor, mu: Tensor, S: Tensor, u: Tensor) -> Tensor:
+def _pair_entries(model: GPPosterior, a: list[int], b: list[int], mu: Tensor, S: Tensor, u: Tensor) -> Tensor:
     """V_ab (*batch, P) of P pairs, all with a = b or none, at one belief for all or one for each (as above)."""
-    same = bool(a[0] == b[0])
+    same = a[0] == b[0]
     D_a, D_b = (model.lengthscales[one, : model.state_dim] ** -2 for one in (a, b))
     of_a = _output_terms(model, a, mu, S, u)
     of_b = of_a if same else _output_terms(model, b, mu, S, u)
@@ -139,33 +140,34 @@ def _pair_entries(model: GPPosterior, a: Tensor, b: Tensor, mu: Tensor, S: Tenso
     return entries + model.signal_variance[a] - model.variance_reduction(of_a.q, a)
 
 
-def _pair_entries_with_gradient(model: GPPosterior, ab: Tensor, at: Sequence[Tensor], axis: int) -> tuple[Tensor, ...]:
+def _pair_entries_with_gradient(model: GPPosterior, ab: _Pairs, at: Sequence[Tensor], axis: int) -> tuple[Tensor, ...]:
     """V_ab (*batch, P), and its derivatives by mu (*batch, P, n), S (*batch, P, n, n) and u (*batch, P, m)."""
 
     def total(*copies: Tensor) -> tuple[Tensor, Tensor]:
         entries = _pair_entries(model, *ab, *copies)
         return entries.sum(), entries
 
-    copies = [part.repeat_interleave(ab.shape[1], dim=axis) for part in at]
+    copies = [part.repeat_interleave(len(ab[0]), dim=axis) for part in at]
     gradients, entries = torch.func.grad(total, argnums=(0, 1, 2), has_aux=True)(*copies)
     return entries, *gradients
 
 
-def _chunks(model: GPPosterior, belief: Gaussian, diagonal: bool) -> list[Tensor]:
-    """The pairs a <= b of outputs (2, P), as many in one tensor as are evaluated at once; first those with a = b."""
-    k = model.output_dim
-    pairs = [torch.arange(k).repeat(2, 1)] + ([] if diagonal or k == 1 else [torch.triu_indices(k, k, 1)])
+def _chunks(model: GPPosterior, belief: Gaussian, diagonal: bool) -> list[_Pairs]:
+    """The pairs a <= b of outputs, as many in one list as are evaluated at once; first those with a = b."""
+    outputs = range(model.output_dim)
     count = max(1, _ENTRIES // max(1, belief.mean.shape[:-1].numel() * len(model) ** 2))
-    return [chunk for kind in pairs for chunk in kind.split(count, dim=1)]
+    kinds = [(a, a) for a in outputs], [(a, b) for b in outputs for a in range(b) if not diagonal]
+    chunks = [pairs[i : i + count] for pairs in kinds for i in range(0, len(pairs), count)]
+    return [([a for a, _ in chunk], [b for _, b in chunk]) for chunk in chunks]
 
 
-def _symmetric_from_pairs(parts: Sequence[Tensor], pairs: Sequence[Tensor], axis: int) -> Tensor:
+def _symmetric_from_pairs(parts: Sequence[Tensor], pairs: Sequence[_Pairs], axis: int) -> Tensor:
     """A symmetric matrix (*batch, k, k, ...) from its entries (*batch, P, ...); zero where there is none."""
-    a, b = torch.cat(list(pairs), dim=1)
-    place = torch.full((int(b.max()) + 1, int(b.max()) + 1), len(a))
-    place[a, b] = place[b, a] = torch.arange(len(a))
+    places = {pair: p for p, pair in enumerate((a, b) for chunk in pairs for a, b in zip(*chunk, strict=True))}
+    k = max(places)[0] + 1
+    order = [places.get((min(a, b), max(a, b)), len(places)) for a in range(k) for b in range(k)]
     entries = torch.cat([*parts, torch.zeros_like(parts[0].narrow(axis, 0, 1))], dim=axis)
-    return entries.index_select(axis, place.flatten().to(entries.device)).unflatten(axis, place.shape)
+    return entries.index_select(axis, torch.tensor(order, device=entries.device)).unflatten(axis, (k, k))
 
 
 def _conditioned(S: Tensor, D: Tensor) -> tuple[Tensor, Tensor, Tensor]:
