@@ -12,7 +12,7 @@ file from someone else is read where their module is installed on purpose.
 """
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -24,66 +24,114 @@ from torch import Tensor
 
 from gpmpc.exceptions import DataError, GpmpcError, UnsupportedModel
 from gpmpc.gp._archive import existing_file, new_file
-from gpmpc.gp.storage import posterior_of_parts, posterior_parts, read_model, write_model
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp.storage import load_metadata, posterior_of_parts, posterior_parts, read_model, write_model
+from gpmpc.models.delay import DelayedModel
+from gpmpc.models.disturbance import DisturbedModel
 from gpmpc.models.nominal import Affine, CasadiFunction
 from gpmpc.models.residual import ResidualModel
 
 
-def save_residual_model(model: ResidualModel, path: str | Path, metadata: Mapping[str, Any] | None = None) -> None:
-    """Writes a residual model to one file, in one piece or not at all.
+def save_model(model: Any, path: str | Path, metadata: Mapping[str, Any] | None = None) -> None:
+    """Writes a model of this package to one file, in one piece or not at all.
 
     Args:
-        model: On any device; float64 or float32.
+        model: A ``GPPosterior``, ``ResidualModel``, ``DelayedModel`` or ``DisturbedModel``, on any device.
         path: The file; ``.safetensors`` by convention.
         metadata: Stored in the header, such as names and units; what JSON can hold.
 
     Raises:
-        UnsupportedModel: The nominal model or the effect is code that cannot be imported by a path.
+        UnsupportedModel: It is another model, or its nominal model or effect is code that cannot be imported by a path.
         SettingError: A tensor is neither float64 nor float32, or the metadata are no JSON.
         DataError: The folder does not exist.
     """
     path = new_file(path)
-    header: dict[str, Any] = {
-        "input_dim": model.input_dim,
-        "states": [int(i) for i in model.states],
-        "inputs": [int(i) for i in model.inputs],
-        "angles": [int(i) for i in model.angles],
-    }
-    header["residual"], residual = posterior_parts(path, model.residual)
-    tensors = {f"residual/{name}": value for name, value in residual.items()}
+    header, tensors = _parts(path, model)
+    write_model(path, header.pop("kind"), header, tensors, metadata)
+
+
+def load_model(path: str | Path) -> Any:
+    """Reads a file of ``save_model`` or ``save_posterior``, into host memory.
+
+    Raises:
+        DataError: The file is missing, damaged, of another kind or of a newer format, or names code that is not there.
+    """
+    path = existing_file(path, "a saved model")
+    kind = load_metadata(path).get("kind")
+    if kind not in _BUILD:
+        raise DataError(f"{path}: holds a {kind}; expected one of {', '.join(_BUILD)}")
+    return _built(path, *read_model(path, kind))
+
+
+def _parts(path: Path, model: Any) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The header, with its kind, and the tensors of a model."""
+    kind = type(model).__name__
+    if type(model) not in (GPPosterior, ResidualModel, DelayedModel, DisturbedModel):
+        raise UnsupportedModel(f"only {', '.join(_BUILD)} can be saved; got {kind}")
+    if isinstance(model, GPPosterior):
+        header, tensors = posterior_parts(path, model)
+        return {"kind": kind, **header}, tensors
+    inner, name = (model.residual, "residual") if isinstance(model, ResidualModel) else (model.model, "model")
+    nested, inner_tensors = _parts(path, inner)
+    header = {"kind": kind, name: nested}
+    tensors = {f"{name}/{key}": value for key, value in inner_tensors.items()}
+    if isinstance(model, DelayedModel):
+        return header | {"delay": model.delay}, tensors
+    if isinstance(model, DisturbedModel):
+        numbers = {"std": list(map(float, model.std)), "decay": list(map(float, model.decay or ()))}
+        return header | numbers, tensors | {"effect": model.effect}
+    header["input_dim"] = model.input_dim
+    header |= {key: [int(i) for i in getattr(model, key)] for key in ("states", "inputs", "angles")}
     if isinstance(model.nominal, Affine):
-        tensors |= {f"nominal/{name}": getattr(model.nominal, name) for name in ("A", "B", "c")}
+        tensors |= {f"nominal/{part}": getattr(model.nominal, part) for part in "ABc"}
     else:
         header["nominal"] = _import_path("nominal", model.nominal)
     if callable(model.B):
         header["B"] = _import_path("B", model.B)
     else:
         tensors["B"] = model.B
-    if model.noise is not None:
-        tensors["noise"] = model.noise
-    write_model(path, "ResidualModel", header, tensors, metadata)
+    return header, tensors if model.noise is None else tensors | {"noise": model.noise}
 
 
-def load_residual_model(path: str | Path) -> ResidualModel:
-    """Reads a file of ``save_residual_model``, into host memory.
-
-    Raises:
-        DataError: The file is missing, damaged, of another kind or of a newer format, or names code that is not there.
-    """
-    path = existing_file(path, "a saved ResidualModel")
-    header, tensors = read_model(path, "ResidualModel")
-    residual = {name.partition("/")[2]: value for name, value in tensors.items() if name.startswith("residual/")}
-    gp = posterior_of_parts(path, header.get("residual"), residual)
-    numbers = {name: value for name, value in tensors.items() if not name.startswith("residual/")}
+def _built(path: Path, header: Any, tensors: Mapping[str, Tensor]) -> Any:
+    """Builds a model of a file's header and tensors, after a check of everything."""
     try:
-        if not all(bool(torch.isfinite(part).all()) for part in numbers.values()):
-            raise DataError("B, the noise and the nominal model must be finite")
-        B, nominal = _function(header, "B"), _function(header, "nominal")
-        nominal = Affine(*(numbers[f"nominal/{part}"] for part in "ABc")) if nominal is None else nominal
-        selected = header["states"], header["inputs"], header["input_dim"], header.get("angles", [])
-        return ResidualModel(nominal, gp, numbers["B"] if B is None else B, *selected, numbers.get("noise"))
-    except (GpmpcError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: not a consistent residual model ({error})") from error
+        return _BUILD[header.get("kind", "GPPosterior")](path, header, tensors)
+    except (GpmpcError, AttributeError, KeyError, TypeError) as error:
+        text = f"not a consistent model ({error})"
+        raise (error if str(error).startswith(str(path)) else DataError(f"{path}: {text}")) from error
+
+
+def _inner(path: Path, name: str, header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> tuple[Any, dict]:
+    """The model inside a model, and the other tensors, all of them finite."""
+    own = {key: value for key, value in tensors.items() if not key.startswith(f"{name}/")}
+    inner = {key.partition("/")[2]: value for key, value in tensors.items() if key.startswith(f"{name}/")}
+    if not all(bool(torch.isfinite(part).all()) for part in own.values()):
+        raise DataError("the numbers beside the inner model must be finite")
+    return _built(path, header[name], inner), own
+
+
+def _build_residual(path: Path, header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> ResidualModel:
+    gp, own = _inner(path, "residual", header, tensors)
+    B, nominal = _function(header, "B"), _function(header, "nominal")
+    nominal = Affine(*(own[f"nominal/{part}"] for part in "ABc")) if nominal is None else nominal
+    selected = header["states"], header["inputs"], header["input_dim"], header.get("angles", [])
+    return ResidualModel(nominal, gp, own["B"] if B is None else B, *selected, own.get("noise"))
+
+
+def _build_disturbed(path: Path, header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> DisturbedModel:
+    model, own = _inner(path, "model", header, tensors)
+    return DisturbedModel(model, own["effect"], header["std"], header["decay"])
+
+
+_BUILD: dict[str, Callable[[Path, Any, Mapping[str, Tensor]], Any]] = {
+    "GPPosterior": posterior_of_parts,
+    "ResidualModel": _build_residual,
+    "DelayedModel": lambda path, header, tensors: DelayedModel(
+        _inner(path, "model", header, tensors)[0], header["delay"]
+    ),
+    "DisturbedModel": _build_disturbed,
+}
 
 
 def _import_path(key: str, function: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from gpmpc.dynamics import predict_with_jacobian
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, Transitions
-from gpmpc.models import Affine, CasadiFunction, Lags, ResidualModel, load_residual_model, save_residual_model
+from gpmpc.models import Affine, CasadiFunction, Lags, ResidualModel, load_model, save_model
 from gpmpc.propagation import Linearization, MomentMatching, MonteCarlo, Unscented
 from gpmpc.testing import check_model
 
@@ -168,8 +168,8 @@ def test_lags_are_shifted_and_a_velocity_that_is_not_measured_is_found_in_them()
 )
 def test_a_nominal_model_and_an_effect_are_saved_by_the_path_they_are_imported_from(nominal, effect, tmp_path):
     model = with_effect(nominal, effect)
-    save_residual_model(model, tmp_path / "m.safetensors")
-    loaded = load_residual_model(tmp_path / "m.safetensors")
+    save_model(model, tmp_path / "m.safetensors")
+    loaded = load_model(tmp_path / "m.safetensors")
     x, u = draw(8, 6, 2), draw(9, 6, 1)
     for ours, theirs in zip(model.linearize(x.numpy(), u.numpy()), loaded.linearize(x.numpy(), u.numpy()), strict=True):
         assert np.array_equal(ours, theirs)
@@ -177,11 +177,11 @@ def test_a_nominal_model_and_an_effect_are_saved_by_the_path_they_are_imported_f
 
 def test_code_without_a_path_is_refused_and_so_is_a_path_that_leads_nowhere(tmp_path, monkeypatch):
     with pytest.raises(UnsupportedModel, match="nominal is code that a file cannot name"):
-        save_residual_model(with_effect(lambda x, u: x), tmp_path / "m")
-    save_residual_model(with_effect(), tmp_path / "m")
+        save_model(with_effect(lambda x, u: x), tmp_path / "m")
+    save_model(with_effect(), tmp_path / "m")
     monkeypatch.delitem(globals(), "rotation")
     with pytest.raises(DataError, match="no function that can be imported here"):
-        load_residual_model(tmp_path / "m")
+        load_model(tmp_path / "m")
 
 
 @pytest.mark.parametrize(
