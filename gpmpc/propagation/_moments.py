@@ -36,7 +36,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation._composition import Latent
 
-_ENTRIES = 2**18  # of the matrices (N, N) that are made at once, of one pair of outputs at least
+_ENTRIES = 2**18  # of what is made at once of each kind, for one pair of outputs at least
 _Pairs = tuple[list[int], list[int]]
 _LARGEST = {torch.float64: 300.0, torch.float32: 80.0}  # delta
 
@@ -155,7 +155,8 @@ def _pair_entries_with_gradient(model: GPPosterior, ab: _Pairs, at: Sequence[Ten
 def _chunks(model: GPPosterior, belief: Gaussian, diagonal: bool) -> list[_Pairs]:
     """The pairs a <= b of outputs, as many in one list as are evaluated at once; first those with a = b."""
     outputs = range(model.output_dim)
-    count = max(1, _ENTRIES // max(1, belief.mean.shape[:-1].numel() * len(model) ** 2))
+    size = len(model) * (len(model) + 8 * model.state_dim)  # of the matrices (N, N), and of the points' terms
+    count = max(1, _ENTRIES // max(1, belief.mean.shape[:-1].numel() * size))
     kinds = [(a, a) for a in outputs], [(a, b) for b in outputs for a in range(b) if not diagonal]
     chunks = [pairs[i : i + count] for pairs in kinds for i in range(0, len(pairs), count)]
     return [([a for a, _ in chunk], [b for _, b in chunk]) for chunk in chunks]

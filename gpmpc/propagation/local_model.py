@@ -87,7 +87,8 @@ def linearize(propagator: Propagator, model: Any, belief: Gaussian, input: Tenso
     A = np.concatenate([np.concatenate([of_mean, mean_by_root], axis=-1), lower[..., :p]], axis=-2)
     B = np.concatenate([mean_by_input, lower[..., p:]], axis=-2)
     c = s_next - (A @ s[..., None] + B @ u[..., None])[..., 0]
-    return LocalModel(*tensors_for(model, A, B, c), moved.belief)
+    A, B, c = tensors_for(model, A, B, c)
+    return LocalModel(A, B, c, moved.belief)
 
 
 def _congruence(U: Array, X: Array) -> Array:
