@@ -66,6 +66,21 @@ class QPSolution(NamedTuple):
         return QuadraticProgram.unchecked(*self.arrays)
 
     @property
+    def q(self) -> Array:
+        """(n,)."""
+        return self.arrays[1]
+
+    @property
+    def lower(self) -> Array:
+        """(M,) lower bounds of the stacked constraints."""
+        return self.arrays[3]
+
+    @property
+    def upper(self) -> Array:
+        """(M,) upper bounds likewise."""
+        return self.arrays[4]
+
+    @property
     def multipliers(self) -> Array:
         """(M,) multipliers of the stacked constraints; Farkas' proof if the status is ``INFEASIBLE``."""
         start = layout.HEADER + len(self.x)
