@@ -150,7 +150,7 @@ class Encoder:
                 plan.stages.add(time=time, mean=self._state(mean.tolist()), std=self._state(std.tolist()), **last)
             yield PLAN, plan.SerializeToString()
         if copy.problem:
-            rows, variables = copy.problem[2].shape
+            variables, rows = len(copy.problem[1]), len(copy.problem[2])
             solved: Any = ((), ()) if solution is None else (solution.x, solution.multipliers)
             arrays = {k: np.array(a).tobytes() for k, a in zip(QP_ARRAYS, (*copy.problem, *solved), strict=True)}
             yield QP, self._qp(variables=variables, rows=rows, **arrays, **head).SerializeToString()

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from foxglove import Context, channels
 from foxglove import messages as fg
-from scipy.spatial.transform import Rotation
 
 from gpmpc.recording._encoding import StepCopy
 from gpmpc.recording._messages import RecordedSystem
@@ -42,7 +41,7 @@ class Scene:
         self._display_turn = fg.Quaternion(x=1.0) if system.z_down else fg.Quaternion(w=1.0)
         self._axes = [axis for axis, name in enumerate(POSITION) if name in states]
         self._position = [states.index(POSITION[axis]) for axis in self._axes]
-        self._attitude = [states.index(name) for name in ATTITUDE[::-1]] if set(ATTITUDE) <= set(states) else []
+        self._attitude = [states.index(name) for name in ATTITUDE] if set(ATTITUDE) <= set(states) else []
         self._next = -np.inf if self._axes or self._attitude else np.inf  # time of the next picture [s]
         self._frames = [channels.FrameTransformChannel(topic, context=context) for topic in ("/tf/display", "/tf")]
         self._poses = [channels.PoseInFrameChannel(topic, context=context) for topic in ("/pose", "/reference")]
@@ -90,7 +89,7 @@ class Scene:
         """Where states (K, n) are and how they are turned."""
         turns = [fg.Quaternion(w=1.0)] * len(states)
         if self._attitude:
-            turns = _quaternions(Rotation.from_euler("ZYX", states[:, self._attitude]).as_quat())
+            turns = _quaternions(_from_angles(states[:, self._attitude]))
         return [fg.Vector3(x=x, y=y, z=z) for x, y, z in self._positions(states).tolist()], turns
 
     def _ellipsoids(self, places: list[fg.Vector3], covariances: Array) -> list[fg.SpherePrimitive]:
@@ -116,11 +115,18 @@ def _quaternions(numbers: Array) -> list[fg.Quaternion]:
     return [fg.Quaternion(x=x, y=y, z=z, w=w) for x, y, z, w in numbers.tolist()]
 
 
+def _from_angles(angles: Array) -> Array:
+    """Computes the quaternions x, y, z, w (K, 4) of Rz(yaw) Ry(pitch) Rx(roll) from roll, pitch, yaw (K, 3)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles.T / 2), np.sin(angles.T / 2)
+    x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
+    return np.stack([x, y, cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy], axis=1)
+
+
 def _from_matrices(R: Array) -> Array:
     """Computes the quaternions x, y, z, w (K, 4) of rotation matrices (K, 3, 3).
 
     They are the eigenvectors of the largest eigenvalue of a symmetric matrix (Bar-Itzhack, J. Guidance and Control 23,
-    2000). SciPy orthogonalises its matrices first, which takes as long as all else of a picture.
+    2000).
     """
     K = np.zeros((len(R), 4, 4))
     trace = R.trace(axis1=1, axis2=2)
