@@ -152,12 +152,19 @@ def read_run(path: str | Path) -> Run:
     schemas: dict[int, str] = {}
     channels: dict[int, Channel] = {}
     counts: Counter[int] = Counter()
-    messages: dict[str, list[Message]] = {STEP: [], PLAN: [], QP: []}
+    messages: dict[str, list[Any]] = {STEP: [], PLAN: [], QP: []}
+    described: _Described | None = None
     config, finished = "", False
     for record in whole_records(path):
         if isinstance(record, Message):
             counts[record.channel_id] += 1
-            messages.get(channels[record.channel_id].topic, []).append(record)
+            topic = channels[record.channel_id].topic
+            if topic in messages:  # parsed at once, so that one that is damaged ends it before more are in memory
+                if described is None:  # another tool may have moved the metadata behind the messages
+                    everything = whole_records(path) if "run" not in metadata else ()
+                    behind = {more.name: more.metadata for more in everything if isinstance(more, Metadata)}
+                    described = _describe(path, metadata | behind)
+                messages[topic].append(_decode(path, topic, described, record))
         elif isinstance(record, Schema):
             schemas[record.id] = record.name
         elif isinstance(record, Channel):
@@ -167,8 +174,8 @@ def read_run(path: str | Path) -> Run:
         elif isinstance(record, Attachment) and record.name == CONFIG:
             config = record.data.decode(errors="replace")
         finished = isinstance(record, Footer)
-    states, inputs, classes = _described(path, metadata.get("run", {}))
-    steps, plans, programs = (list(_decoded(path, topic, classes, messages.pop(topic))) for topic in (STEP, PLAN, QP))
+    states, inputs, _ = described or _describe(path, metadata)
+    steps, plans = messages[STEP], messages[PLAN]
     return Run(
         path=path,
         finished=finished and RECOVERED not in metadata,
@@ -180,46 +187,55 @@ def read_run(path: str | Path) -> Run:
         channels={channel.topic: (counts[i], schemas.get(channel.schema_id, "")) for i, channel in channels.items()},
         metadata=metadata,
         config=config,
-        problems=dict(programs),
+        problems=dict(messages[QP]),
     )
 
 
-def _described(path: Path, about: dict[str, str]) -> tuple[tuple[str, ...], tuple[str, ...], dict[str, Any]]:
-    """Returns the names of states and inputs and the classes of the messages.
+class _Described(NamedTuple):
+    """What the metadata say of the messages."""
+
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    classes: dict[str, Any]
+
+
+def _describe(path: Path, metadata: dict[str, dict[str, str]]) -> _Described:
+    """Finds the names of states and inputs, and builds the classes of the messages.
 
     Raises:
         RecordingError: The metadata do not tell of a run.
     """
+    about = metadata.get("run", {})
     if not {"state_names", "input_names"} <= about.keys():
         raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
     try:
         states, inputs = (_messages.check_names(key, about[key].split()) for key in ("state_names", "input_names"))
-        return states, inputs, _messages.message_classes(_messages.descriptor(states, inputs, "bytes"))
+        classes = _messages.message_classes(_messages.descriptor(states, inputs, "bytes"))
     except SettingError as error:
         raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
+    return _Described(states, inputs, classes)
 
 
-def _decoded(path: Path, topic: str, classes: dict[str, Any], records: list[Message]) -> Iterator[Any]:
-    """Yields parsed messages; of a quadratic program its step's number k and itself.
+def _decode(path: Path, topic: str, described: _Described, record: Message) -> Any:
+    """Parses a message; of a quadratic program it returns its step's number k and itself.
 
     Raises:
-        RecordingError: One does not parse, or its arrays do not belong together.
+        RecordingError: It does not parse, or its arrays do not belong together.
     """
-    kind, n = classes[TOPICS[topic]], len(classes["State"].DESCRIPTOR.fields)
-    for record in records:
-        try:
-            message = kind.FromString(record.data)
-            if topic == STEP:
-                _numbers(message, "belief_covariance", n, n)
-                if not 0 <= message.status < len(_STATUSES):
-                    raise ValueError(f"status {message.status} is unknown")
-            elif topic == PLAN:
-                _numbers(message, "covariances", len(message.stages), n, n)
-                if not message.stages:
-                    raise ValueError("it has no stage")
-            yield (message.k, _problem(message)) if topic == QP else message
-        except (DecodeError, ValueError) as error:
-            raise RecordingError(f"{path}: message {record.sequence} of {topic} is damaged: {error}") from error
+    n = len(described.states)
+    try:
+        message = described.classes[TOPICS[topic]].FromString(record.data)
+        if topic == STEP:
+            _numbers(message, "belief_covariance", n, n)
+            if not 0 <= message.status < len(_STATUSES):
+                raise ValueError(f"status {message.status} is unknown")
+        elif topic == PLAN:
+            _numbers(message, "covariances", len(message.stages), n, n)
+            if not message.stages:
+                raise ValueError("it has no stage")
+        return (message.k, _problem(message)) if topic == QP else message
+    except (DecodeError, ValueError) as error:
+        raise RecordingError(f"{path}: message {record.sequence} of {topic} is damaged: {error}") from error
 
 
 def _numbers(message: Any, field: str, *shape: int) -> Array:

@@ -5,6 +5,7 @@ operation, the processor time of the slowest [s], and the largest memory of the 
 process, whose peak the kernel resets before each: memory that one file leaves behind counts for the next.
 """
 
+import argparse
 import contextlib
 import io
 import json
@@ -68,6 +69,9 @@ def given(*arguments):
 def operations(path):
     """Everything that is done with a recording."""
     recovered = path.with_suffix(".recovered.mcap")
+
+    def given(action):
+        return argparse.Namespace(action=action, file=path, output=None)
 
     def replays():
         run = read_run(path)
