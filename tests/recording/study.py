@@ -5,7 +5,6 @@ operation, the processor time of the slowest [s], and the largest memory of the 
 process, whose peak the kernel resets before each: memory that one file leaves behind counts for the next.
 """
 
-import argparse
 import contextlib
 import io
 import json
@@ -70,9 +69,6 @@ def operations(path):
     """Everything that is done with a recording."""
     recovered = path.with_suffix(".recovered.mcap")
 
-    def given(action):
-        return argparse.Namespace(action=action, file=path, output=None)
-
     def replays():
         run = read_run(path)
         for k in (*list(run.problems)[:2], 10**9):
@@ -107,11 +103,12 @@ def examine(path, original):
 
 def study(recording, seed, first, end):
     original, data = read_run(recording), recording.read_bytes()
+    replay(original, int(original.steps[0]))  # compiles
     kinds = (*damage.DAMAGES, *damage.DAMAGES, *damage.EDITS)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "damaged.mcap"
         path.write_bytes(data)
-        bare = examine(path, original)["megabytes"]  # imports and compiles
+        bare = examine(path, original)["megabytes"]  # imports
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         for i in range(first, end):
             rng = np.random.default_rng([seed, i])
