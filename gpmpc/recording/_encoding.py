@@ -45,9 +45,8 @@ def pack(step: Step, gp_size: int | None, n: int, m: int, record_problems: bool)
         arrays += [decision.inputs, decision.means, decision.covariances]
         expected += [(H, m), (H + 1, n), (H + 1, n, n)]
         if solution is not None:
-            P, G, softness = solution.terms
             arrays += [solution.x, solution.record]
-            problem = (P, solution.q, G, solution.lower, solution.upper, softness)
+            problem = (*solution.arrays, solution.softness)
         elif program is not None:
             hard = np.vstack([np.zeros(len(program.lower)), np.full(len(program.lower), np.inf)])
             problem = (program.P, program.q, program.G, program.lower, program.upper, hard)
