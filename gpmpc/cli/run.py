@@ -126,7 +126,7 @@ def _recorder(
         dynamics.input_names,
         time_step=experiment.plant.time_step,
         units={name: unit for name, unit in UNITS.items() if name in names},
-        input_bounds=[problem.input_lower, problem.input_upper],
+        input_bounds=[problem.inputs.lower, problem.inputs.upper],
     )
     metadata = {
         "seed": experiment.seed,

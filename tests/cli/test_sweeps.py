@@ -231,7 +231,7 @@ def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(swee
     assert refused.returncode == 2
     assert refused.stderr.count("\n") == 1
     assert f"folder: tree/{path.parent.name} holds a finished run of other settings" in refused.stderr
-    assert "controller.problem.Q: [7.0, 1.0, 1.0, 1.0, 1.0, 1.0] then, [1.0, 1.0" in refused.stderr
+    assert "controller.problem.cost.Q: [7.0, 1.0, 1.0, 1.0, 1.0, 1.0] then, [1.0, 1.0" in refused.stderr
     assert "gone: 1 then, None now" in refused.stderr
     assert "choose another folder, or remove that one to fly it again" in refused.stderr
     assert json.loads(path.read_text()) == found  # nothing was overwritten, nothing else flown
