@@ -108,12 +108,14 @@ class Box(Constraint):
         super().__post_init__()
         sides = [None if side is None else _numbers(key, side) for key, side in self._sides]
         shape = next((side.shape for side in sides if side is not None), (0,))
-        for (key, _), side, absent in zip(self._sides, sides, (-math.inf, math.inf), strict=True):
+        for (key, value), side, absent in zip(self._sides, sides, (-math.inf, math.inf), strict=True):
             array = np.full(shape, absent) if side is None else side
             if array.ndim not in (1, 2) or array.shape != shape:
-                raise SettingError(key, f"must be a list of {shape[-1]} numbers, or one by stage; got {side!r}")
+                raise SettingError(key, f"must be a list of {shape[-1]} numbers, or one by stage; got {value!r}")
             if (-np.sign(absent) * array >= ABSENT).any():
-                raise SettingError(key, f"no number keeps it: a bound of size {ABSENT:g} or more is none; got {side!r}")
+                raise SettingError(
+                    key, f"no number keeps it: a bound of size {ABSENT:g} or more is none; got {value!r}"
+                )
             object.__setattr__(self, key, array)
         for at in np.argwhere(self.lower > self.upper)[:1]:
             entry, at = at[-1], tuple(at)

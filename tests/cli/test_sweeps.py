@@ -223,7 +223,7 @@ def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(swee
     assert "4 runs: 0 flown, 4 finished before, 0 failed" in again.stdout
     path = sorted(tree.glob("*/metrics.json"))[2]
     found = json.loads(path.read_text())
-    found["settings"]["controller"]["problem"]["Q"][0] = 7.0
+    found["settings"]["controller"]["problem"]["cost"]["Q"][0] = 7.0
     found["settings"]["gone"] = 1
     path.write_text(json.dumps(found))
     (tree / path.parent.name.replace("seed=0", "seed=1") / "metrics.json").unlink()

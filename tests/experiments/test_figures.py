@@ -96,7 +96,7 @@ def test_a_run_goes_on_where_it_stopped(finished):
             ["bounds.plant=null"],
             "bounds: must hold lower and upper of the plant on elliptical, translational; got none",
         ),
-        (["bounds.plant.lower=[5,5]"], "input_lower: must be a list of 3 numbers; got [5, 5]"),
+        (["bounds.plant.lower=[5,5]"], "upper: must be a list of 2 numbers, or one by stage; got [100"),
         (
             ["rows.ours_convex.subsystems=[rolling]"],
             "subsystems: must be among translational, rotational; got 'rolling'",

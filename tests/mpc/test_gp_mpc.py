@@ -468,11 +468,8 @@ def test_a_reference_that_does_not_belong_is_refused():
 @pytest.mark.parametrize("covariance", ["zero_order", "none"])
 def test_the_compiled_rollout_is_the_one_stage_by_stage(covariance, feedback, process_noise):
     H, propagator = 6, Linearization(process_noise=process_noise)
-    arguments = (gp(), propagator, quadrotor_problem(), H, HOVER, "trajectory", covariance)
-    compiled, by_torch = (
-        GPMPC(*arguments, prediction=PredictionSettings(feedback=feedback)),
-        GPMPC(*arguments, prediction=PredictionSettings(feedback=feedback)),
-    )
+    settings = PredictionSettings(covariance=covariance, feedback=feedback)
+    compiled, by_torch = (GPMPC(gp(), propagator, quadrotor_problem(), H, HOVER, settings) for _ in range(2))
     belief = Gaussian(torch.full((6,), 0.2), 1e-3 * torch.eye(6))
     first = compiled.control(belief, at_origin(H))
     with backend("torch"):

@@ -165,7 +165,7 @@ BOUNDS = Box([-np.inf, -0.3] * 3, [np.inf, 0.3] * 3, probability=0.95, penalty=2
 )
 def test_compiled_and_torch_and_another_solver_iterate_alike(quadrotor, covariance, limits):
     problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3), **BOX, **limits)
-    arguments = quadrotor, Linearization(), problem, 5, HOVER, "trajectory", covariance
+    arguments = quadrotor, Linearization(), problem, 5, HOVER, PredictionSettings(covariance=covariance)
     told = {} if "constraints" in limits else {"solver": Other()}  # prices need our own solver
     ours, other = (GPMPC(*arguments, **solver, iterations=60, tolerance=1e-7) for solver in ({}, told))
     random, last, before, programs = np.random.default_rng(2), None, None, 0

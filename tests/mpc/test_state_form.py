@@ -9,8 +9,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import FORMS
-from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.prediction import FORMS, PredictionSettings
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.mpc.stages import COVARIANCES
 from gpmpc.mpc.state_form import StateFormMPC
@@ -38,7 +37,14 @@ def problem(penalized="deviations", lower=-0.3, penalty=None):
 @pytest.mark.parametrize("prices", [{}, {"lower": -0.05, "penalty": 3.0}], ids=["hard", "soft"])
 def test_it_gives_the_inputs_of_the_condensed_program(form, covariance, prices):
     moves = MeanEquivalence() if covariance == "none" else Linearization()
-    arguments = (quadrotor_gp(), moves, problem(PENALIZED[form], **prices), H, HOVER, PredictionSettings(form, covariance))
+    arguments = (
+        quadrotor_gp(),
+        moves,
+        problem(PENALIZED[form], **prices),
+        H,
+        HOVER,
+        PredictionSettings(form, covariance),
+    )
     controllers = [GPMPC(*arguments), StateFormMPC(*arguments)]
     if not prices:
         controllers.append(GPMPC(*arguments, CvxpySolver()))
