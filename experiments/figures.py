@@ -359,6 +359,36 @@ class Figures:
         return tables.document(tables.summarise(records), records, self.data["data"].note)
 
 
+def from_settings(made: Mapping[str, Any], settings: Mapping[str, Any], flight: Any) -> Figures:
+    """Makes the flights that ``conf/figures.yaml`` describes; arguments as in ``gpmpc.experiments.tables``.
+
+    Raises:
+        SettingError: An unknown loop, or a row with an unknown setting.
+    """
+    loops, rows = _several(settings["loop"]), {}
+    for loop in loops:
+        if loop not in LOOPS:
+            raise SettingError("loop", f"must be among {', '.join(LOOPS)}; got {loop!r}")
+    for name, row in settings["rows"].items():
+        if row is not None:  # left out on the command line
+            try:
+                rows[name] = Row(**row)
+            except TypeError as error:
+                raise SettingError(f"rows.{name}", str(error).removeprefix("Row.__init__() ")) from error
+    numbers = ("bounds", "state_bounds", "steps", "samples", "noise", "seed", "workers")
+    return Figures(
+        rows={name: row for name, row in rows.items() if row.loop in loops},
+        data={key: made[key] for key in ("data", "excited", "undithered")},
+        trajectories=made["trajectory"],
+        subsystems=made["subsystem"],
+        models={"model": made["model"], "plant": made["flying"]},
+        model_settings={"model": settings["model"], "plant": settings["flying"]},
+        plant=made["plant"],
+        number=settings["trials"],
+        **{key: settings[key] for key in numbers},
+    )
+
+
 def tracking_problem(row: Row, inputs: Bounds, states: Bounds | None) -> Problem:
     """Returns the tracking problem of a row."""
     box = Box(inputs.lower, inputs.upper) if row.bounded else Box()

@@ -202,6 +202,19 @@ class Tables:
         )
 
 
+def from_settings(made: Mapping[str, Any], settings: Mapping[str, Any], flight: Any) -> Tables:
+    """Makes the tables that ``conf/tables.yaml`` describes.
+
+    Args:
+        made: The settings, with objects in the place of what names a class.
+        settings: The same as plain data.
+        flight: Not needed.
+    """
+    numbers = {key: settings[key] for key in ("sizes", "draws", "seed", "state_std", "workers")}
+    objects = made["data"], made["trajectory"], made["subsystem"], made["model"]
+    return Tables(*objects, model_settings=settings["model"], **numbers)
+
+
 @dataclass(frozen=True)
 class Fit:
     """What one draw needs: data in the units of the model, how they are scored, how the model is trained."""

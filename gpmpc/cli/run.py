@@ -14,7 +14,8 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc.cli.arguments import folder_of, writing
+from gpmpc.cli.arguments import Result, folder_of, writing
+from gpmpc.cli.terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, check_number
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaCo
 LOST = 3  # exit code of a run that is finished, and whose flight was lost
 
 
-def run(config: DictConfig) -> None:
+def run(config: DictConfig) -> Result:
     """Flies, prints the results and where they are kept; the task behind ``conf/run.yaml``."""
     from rich.console import Console
 
@@ -43,13 +44,12 @@ def run(config: DictConfig) -> None:
         experiment_of(config)  # what a user can get wrong is found before anything is written
         outcome = run_one(config)
     if "error" in outcome:
-        print(f"gpmpc: {outcome['error']} (traceback: {outcome['folder']}/error.json)", file=sys.stderr)
-        sys.exit(2 if outcome["mistake"] else 1)
+        print_error(f"{outcome['error']} (traceback: {outcome['folder']}/error.json)")
+        return Result(outcome, 2 if outcome["mistake"] else 1)
     console.print(terminal([summary(outcome["result"])]))
     state = "finished before" if outcome["skipped"] else "written to"
     console.print(f"{state}: {outcome['folder']}", soft_wrap=True, highlight=False, markup=False)
-    if outcome["result"].get("lost"):
-        sys.exit(LOST)
+    return Result(outcome["result"] | {"folder": outcome["folder"]}, LOST if outcome["result"].get("lost") else 0)
 
 
 def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:

@@ -156,6 +156,6 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
 
 
 def test_the_traceback_is_there_for_who_asks(tmp_path):
-    result = gpmpc("tables", "draws=0", cwd=tmp_path, HYDRA_FULL_ERROR="1")
+    result = gpmpc("tables", "draws=0", "--debug", cwd=tmp_path)
     assert result.returncode != 0
     assert "Traceback" in result.stderr

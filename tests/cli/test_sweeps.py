@@ -134,7 +134,7 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
         (["-m", "seed=range(0)"], "seed: holds no value to sweep over"),
         (["seed=range(3"], "'seed=range(3': cannot be read; a setting is written SETTING=VALUE"),
         (["controller=papre"], "state_form (did you mean 'paper'?)"),
-        (["--hlep"], "unknown option '--hlep' (did you mean '--help'?); gpmpc run --help lists the settings"),
+        (["--hlep"], "unknown option '--hlep' (did you mean '--help'?); gpmpc run --help lists what there is"),
         (["noise.process=0.1"], "noise.process: must be a list of standard deviations, one for every state; got 0.1"),
         (["noise.process=[0.1]"], "noise.process must have 6 standard deviations; got 1"),
         (["disturbances=gust"], "disturbances: must be a list; got 'gust'"),

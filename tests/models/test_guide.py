@@ -9,7 +9,7 @@ import pytest
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
-@pytest.mark.parametrize("page", ["guide_models.md"])
+@pytest.mark.parametrize("page", ["guide_models.md", "guide_estimation.md"])
 def test_the_blocks_of_a_guide_run(page, tmp_path, monkeypatch):
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)  # what a block writes stays out of the repository

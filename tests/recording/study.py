@@ -19,6 +19,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 
+from gpmpc.cli.command import COMMANDS
 from gpmpc.cli.log import log
 from gpmpc.exceptions import GpmpcError
 from gpmpc.recording import layout, read_run, recover, replay
@@ -60,6 +61,10 @@ def outcome(operation, path, original):
     return "unfinished" if not run.finished else "same" if same(run, original) else "other"
 
 
+def given(*arguments):
+    return COMMANDS["log"].parser("log").parse_args(arguments)
+
+
 def operations(path):
     """Everything that is done with a recording."""
     recovered = path.with_suffix(".recovered.mcap")
@@ -73,8 +78,8 @@ def operations(path):
     yield "read", lambda: read_run(path)
     yield "layout", lambda: layout(read_run(path)) and None
     yield "replay", replays
-    yield "info", lambda: log(["info", str(path)])
-    yield "export", lambda: log(["export", str(path), str(path.with_suffix(".csv"))])
+    yield "info", lambda: log(given("info", str(path))) and None
+    yield "export", lambda: log(given("export", str(path), str(path.with_suffix(".csv")))) and None
     yield "recover", lambda: recover(path, recovered) and None
     if recovered.exists():
         yield "recovered", lambda: read_run(recovered)
