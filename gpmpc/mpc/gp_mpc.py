@@ -291,7 +291,7 @@ def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> b
 
 def _violation(solution: QPSolution) -> float:
     """The largest violation of a hard row."""
-    softness, caps = solution.terms.softness
+    softness, caps = solution.softness
     return float(solution.violation()[(softness == 0.0) & np.isinf(caps)].max(initial=0.0))
 
 
