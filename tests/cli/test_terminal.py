@@ -157,7 +157,7 @@ def test_help_and_tab_list_only_choices_that_the_command_has(tmp_path):
         ("gpmpc run controller=nonlin", ["controller=nonlinear"]),
         ("gpmpc run noise.p", ["noise.process="]),
         ("gpmpc run controller=lqr controller.d", []),
-        ("gpmpc run controller.d", ["controller.disturbance_gain="]),
+        ("gpmpc run controller.prediction.d", ["controller.prediction.disturbance_gain="]),
         ("gpmpc run folder=tr", ["folder=tree/"]),
         ("gpmpc run --conf", ["--config-name", "--config-dir"]),
         ("gpmpc figures study=h", ["study=horizon"]),
