@@ -180,13 +180,13 @@ class Quality:
         experiment, model = trial.condition
         flown = run_trial(experiment, model=None if model is None else load_model(model))
         rollout, controller = flown.rollout, flown.controller
-        distance = np.linalg.norm((rollout.states - rollout.references)[:, ::2], axis=1)
+        distance = np.linalg.norm((rollout.states - rollout.references)[:, experiment.system.tracked_indices], axis=1)
         if not distance.max() <= LOST:
             raise GpmpcError(f"{LOST:g} m off its path after {int(np.argmax(~(distance <= LOST)))} steps")
         before = controller.initial_input
         return {
             "cost": stage_cost(controller.problem, rollout.states, rollout.references, rollout.inputs, before),
-            "rmse": float(tracking_error(rollout.states, rollout.references).total),
+            "rmse": float(tracking_error(rollout.states, rollout.references, experiment.system.tracked_indices).total),
             "seconds": controller.seconds[-len(rollout.inputs) :],
             "failed": len(rollout.failures),
         }
