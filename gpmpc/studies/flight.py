@@ -234,10 +234,11 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     rmse["total"] = error.total
     if flown.diverged is not None or not np.isfinite(error.total):
         rmse = dict.fromkeys(rmse)
-    violations = {"inputs": violation_rate(rollout.inputs, problem.inputs.lower, problem.inputs.upper)}
-    boxes = [bounds for bounds in problem.constraints if isinstance(bounds, Box)]
+    first = [side[0] for side in problem.inputs.by_stage(flown.controller.horizon)]
+    violations = {"inputs": violation_rate(rollout.inputs, *first)}
+    boxes = [bounds.by_stage(flown.controller.horizon) for bounds in problem.constraints if isinstance(bounds, Box)]
     if boxes:
-        lower, upper = np.max([box.lower for box in boxes], axis=0), np.min([box.upper for box in boxes], axis=0)
+        lower, upper = np.max([box[0][0] for box in boxes], axis=0), np.min([box[1][0] for box in boxes], axis=0)
         violations["states"] = violation_rate(rollout.states[1:], lower, upper)
     learned = None
     if training is not None:
