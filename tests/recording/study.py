@@ -103,11 +103,12 @@ def examine(path, original):
 
 def study(recording, seed, first, end):
     original, data = read_run(recording), recording.read_bytes()
+    replay(original, int(original.steps[0]))  # compiles
     kinds = (*damage.DAMAGES, *damage.DAMAGES, *damage.EDITS)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "damaged.mcap"
         path.write_bytes(data)
-        bare = examine(path, original)["megabytes"]  # imports and compiles
+        bare = examine(path, original)["megabytes"]  # imports
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         for i in range(first, end):
             rng = np.random.default_rng([seed, i])
