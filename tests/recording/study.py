@@ -109,7 +109,8 @@ def study(recording, seed, first, end):
         path = Path(folder) / "damaged.mcap"
         path.write_bytes(data)
         bare = examine(path, original)["megabytes"]  # imports
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()  # libraries take much
+        resource.setrlimit(resource.RLIMIT_AS, (mapped + MEMORY, resource.RLIM_INFINITY))
         for i in range(first, end):
             rng = np.random.default_rng([seed, i])
             kind = kinds[i % len(kinds)]
