@@ -22,16 +22,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from gpmpc.datasets import DataSource, Subsystem
+from gpmpc.datasets import DataSource
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.experiments import figures_tables as tables
 from gpmpc.experiments.slsqp import SLSQP
+from gpmpc.experiments.subsystems import SCALINGS, SYSTEMS, check_subsystems
 from gpmpc.gp import Scaling, Transitions
 from gpmpc.metrics import tracking_error, violation_rate
+from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.controller import Controller, Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Constraint, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import ModelLoop, Noise, Rollout, closed_loop, rehearse
 from gpmpc.studies.document import Document, Table
@@ -44,17 +46,15 @@ from gpmpc.studies.study import (
     random_rows,
     trained_model,
 )
-from gpmpc.systems import Plant, Translational
-from gpmpc.systems.quadrotor import GRAVITY
-from gpmpc.trajectories import Trajectory, states_along
+from gpmpc.systems.attitudes import GRAVITY
+from gpmpc.trajectories import Trajectory
 
 ROOMS = ("gp", "models", "propagation", "kernels", "qp", "mpc", "simulation", "datasets", "systems")
 CODE = ("gaussian.py", "metrics.py", *(f"{room}/*.py" for room in ROOMS), __file__)
 PROPAGATIONS = {"moment_matching": MomentMatching, "linearization": Linearization}
 CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "slsqp": SLSQP, "convex": GPMPC}
 LOOPS = ("model", "plant")
-SUBSYSTEMS = ("translational", "rotational")
-PENALTIES = ("l1", "l2")  # of state bounds that cannot be kept, among a row's settings
+PLANT = SYSTEMS["translational"]  # the plant in the loop
 AT_BOUND = 1e-6  # [m, m/s] distance of a plan to a bound that counts as none
 
 
@@ -67,7 +67,7 @@ class Row:
         controller: ``"nmpc"`` (on the true plant), ``"nonlinear"`` or ``"convex"``.
         R: Input weights, the diagonal (m,).
         Q: State weights, the diagonal (n,).
-        penalized: What R weighs; see ``TrackingProblem``.
+        penalized: What R weighs; see ``Tracking``.
         bounded: Whether the inputs are bounded.
         horizon: H, or several.
         propagation: ``"moment_matching"`` or ``"linearization"``: how the controller's belief moves.
@@ -78,7 +78,7 @@ class Row:
         confidence: eta of the state bounds of the trajectory, or several; None without state bounds.
         subsystems: Which are flown; the plant in the loop is translational.
         trials: Seeds, for plants; None takes the study's.
-        settings: Further arguments of the controller.
+        settings: Further arguments of the controller, and the ``penalty`` of state bounds that cannot be kept.
         title: What it is called in tables and figures; its name by default.
 
     Raises:
@@ -109,13 +109,11 @@ class Row:
                 raise SettingError(key, f"must be one of {', '.join(possible)}; got {getattr(self, key)!r}")
         if self.loop == "model" and self.controller == "nmpc":
             raise SettingError("controller", "nmpc knows the true plant and needs it in the loop; got loop model")
-        parameters = {*inspect.signature(CONTROLLERS[self.controller]).parameters, *PENALTIES}
+        parameters = {*inspect.signature(CONTROLLERS[self.controller]).parameters, "penalty"}
         for key in self.settings:
             if key not in parameters:
                 raise SettingError(f"settings.{key}", f"controller {self.controller} takes no such setting")
-        for subsystem in self.subsystems:
-            if subsystem not in SUBSYSTEMS:
-                raise SettingError("subsystems", f"must be among {', '.join(SUBSYSTEMS)}; got {subsystem!r}")
+        check_subsystems("subsystems", self.subsystems)
         for key, least in (("horizon", 1), ("size", 0)):
             for value in _several(getattr(self, key)):
                 check_number(key, value, least=least, whole=True)
@@ -128,7 +126,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Box:
+class Bounds:
     """Lower and upper bounds; None leaves an entry free."""
 
     lower: Sequence[float]
@@ -146,7 +144,6 @@ class Condition:
         scaling: Of the states, to the units of the data.
         inputs: Bounds of the inputs, in the units of the model.
         states: Bounds of the states; None where there are none.
-        plant: The true plant.
         noise: Standard deviation of the process noise, every state.
         steps: Of the flight.
         drawn: Whether the record holds the curves that are drawn.
@@ -156,9 +153,8 @@ class Condition:
     model: Path | None
     reference: Reference
     scaling: Scaling
-    inputs: Box
-    states: Box | None
-    plant: Plant
+    inputs: Bounds
+    states: Bounds | None
     noise: float
     steps: int
     drawn: bool = False
@@ -166,12 +162,14 @@ class Condition:
     def controller(self) -> Controller:
         """Makes the controller."""
         row, problem = self.row, tracking_problem(self.row, self.inputs, self.states)
-        settings = {key: value for key, value in row.settings.items() if key not in PENALTIES}
+        settings = {key: value for key, value in row.settings.items() if key != "penalty"}
+        if "prediction" in settings:
+            settings["prediction"] = PredictionSettings(**settings["prediction"])
         known = self.reference.inputs
-        at_first = np.array([self.plant.dynamics.mass * GRAVITY, 0.0, 0.0]) if known is None else known[0]
-        at_first = np.clip(at_first, problem.input_lower, problem.input_upper)
+        at_first = np.array([PLANT.dynamics.mass * GRAVITY, 0.0, 0.0]) if known is None else known[0]
+        at_first = np.clip(at_first, problem.inputs.lower, problem.inputs.upper)
         if self.model is None:
-            return NMPC(self.plant, problem, row.horizon, at_first, **settings)
+            return NMPC(PLANT, problem, row.horizon, at_first, **settings)
         propagator = PROPAGATIONS[row.propagation](process_noise=row.process_noise)
         make = CONTROLLERS[row.controller]
         return make(load_model(self.model), propagator, problem, row.horizon, at_first, **settings)
@@ -185,10 +183,9 @@ class Figures:
         rows: By name.
         data: Where transitions come from, by name; ``data`` is that of the paper's reading.
         trajectories: By name.
-        subsystems: By name.
+        subsystems: Names, or one.
         models: By loop: from transitions and a ``seed`` to a ``Training``.
         model_settings: The same as plain data, for the fingerprint.
-        plant: The translational plant in the loop.
         bounds: Input bounds ``{lower, upper}`` by loop, then (``model``) by subsystem or trajectory.
         state_bounds: State bounds ``{lower, upper}`` by trajectory, for rows with a confidence; null is no bound.
         steps: Of a flight.
@@ -206,10 +203,9 @@ class Figures:
     rows: Mapping[str, Row]
     data: Mapping[str, DataSource]
     trajectories: Mapping[str, Trajectory]
-    subsystems: Mapping[str, Subsystem]
+    subsystems: Sequence[str]
     models: Mapping[str, Callable[..., Any]]
     model_settings: Mapping[str, Any]
-    plant: Plant
     bounds: Mapping[str, Any]
     state_bounds: Mapping[str, Any]
     steps: int = 189
@@ -233,14 +229,11 @@ class Figures:
         for name, row in self.rows.items():
             if row.data not in self.data:
                 raise SettingError(f"rows.{name}.data", f"must be one of {', '.join(self.data)}; got {row.data!r}")
-        if tuple(self.plant.dynamics.state_names) != Translational.state_names:
-            names = ", ".join(self.plant.dynamics.state_names)
-            raise SettingError("plant", f"must have the states of the translational subsystem; got {names}")
+        object.__setattr__(self, "subsystems", check_subsystems("subsystem", self.subsystems))
         for _, row, trajectory, subsystem in self._flown:
             tracking_problem(row, *self._bounds(row, trajectory, subsystem))
         if not self._flown:
-            chosen = ", ".join(self.subsystems) or "none"
-            raise SettingError("subsystem", f"no row flies it in the chosen loops; got {chosen}")
+            raise SettingError("subsystem", f"no row flies it in the chosen loops; got {', '.join(self.subsystems)}")
 
     @cached_property
     def _flown(self) -> list[tuple[str, Row, str, str]]:
@@ -271,7 +264,7 @@ class Figures:
         for name, row, trajectory, subsystem in self._flown:
             condition = self._condition(row, trajectory, subsystem, folder)
             reference, bounds = condition.reference, [condition.inputs, condition.states]
-            settings = [name, asdict(row), trajectory, subsystem, repr(self.plant), self.noise, self.steps]
+            settings = [name, asdict(row), trajectory, subsystem, repr(PLANT), self.noise, self.steps]
             settings += [condition.model and condition.model.name, *(box and asdict(box) for box in bounds)]
             arrays = reference.states, reference.inputs, condition.scaling.factor
             named = fingerprint(settings, *arrays, code=CODE)
@@ -283,7 +276,7 @@ class Figures:
                 trials.append(Trial(labels | {"trial": trial}, flown, seed, fingerprint([named, trial, seed])))
         return trials
 
-    def _bounds(self, row: Row, trajectory: str, subsystem: str) -> tuple[Box, Box | None]:
+    def _bounds(self, row: Row, trajectory: str, subsystem: str) -> tuple[Bounds, Bounds | None]:
         """Returns the bounds of the inputs and of the states."""
         of_inputs = self.bounds.get(row.loop) or {}
         if row.loop == "model":
@@ -295,8 +288,8 @@ class Figures:
                 raise SettingError(key, what)
         if of_states is not None:
             absent = {"lower": -np.inf, "upper": np.inf}
-            of_states = Box(**{k: [absent[k] if v is None else float(v) for v in of_states[k]] for k in absent})
-        return Box(of_inputs["lower"], of_inputs["upper"]), of_states
+            of_states = Bounds(**{k: [absent[k] if v is None else float(v) for v in of_states[k]] for k in absent})
+        return Bounds(of_inputs["lower"], of_inputs["upper"]), of_states
 
     def _data(self, row: Row, trajectory: str, subsystem: str) -> tuple[Transitions | None, list[int]]:
         """Returns the transitions of a row, and those that its GP learns from; None for the true model's controller."""
@@ -307,7 +300,7 @@ class Figures:
         source = replace(self.data[row.data], samples=count)
         key = f"{source!r} {trajectory} {self.trajectories[trajectory]!r} {subsystem}"
         if key not in self._flights:
-            self._flights[key] = source.transitions(trajectory, self.trajectories[trajectory], subsystem)
+            self._flights[key] = source.transitions(SYSTEMS[subsystem], self.trajectories[trajectory], trajectory)
         data = self._flights[key]
         return data, random_rows(len(data) if row.loop == "plant" else needed, size, self.seed)
 
@@ -317,17 +310,16 @@ class Figures:
             return trained_model(self.models[row.loop], settings, learned[chosen], self.seed, folder)
 
         n_ahead, (data, chosen) = self.steps + row.horizon, self._data(row, trajectory, subsystem)
-        rest = {"plant": self.plant, "noise": self.noise, "steps": self.steps}
+        rest = {"noise": self.noise, "steps": self.steps}
         bounds = self._bounds(row, trajectory, subsystem)
         if row.loop == "plant":
-            times = self.plant.time_step * np.arange(n_ahead + 1)
-            reference = Reference(states_along(self.trajectories[trajectory], times))
+            reference = Reference(PLANT.reference_states(self.trajectories[trajectory], n_ahead + 1))
             unscaled, model = Scaling(torch.zeros(6), torch.ones(6)), None if data is None else trained(data)
             return Condition(row, model, reference, unscaled, *bounds, **rest)
-        part, n, m = self.subsystems[subsystem], data.state_dim, data.input_dim
+        system, scaling = SYSTEMS[subsystem], SCALINGS[subsystem]
         # States and next states share one scaling, so that a prediction can be fed back in.
         visited = torch.cat([data.states, data.next_states[-1:]])
-        states, inputs = part.scaling(visited, part.columns[:n]), part.scaling(data.inputs, part.columns[n : n + m])
+        states, inputs = scaling(visited, system.state_names), scaling(data.inputs, system.input_names)
         learned = Transitions(states.scale(data.states), inputs.scale(data.inputs), states.scale(data.next_states))
         reference = Reference(states.scale(visited)[: n_ahead + 1].numpy(), learned.inputs[:n_ahead].numpy())
         return Condition(row, trained(learned), reference, states, *bounds, **rest)
@@ -340,13 +332,13 @@ class Figures:
         if condition.row.loop == "model":
             system, noise = ModelLoop(load_model(condition.model), MomentMatching()), None
         else:
-            system, noise = condition.plant, Noise(process=[condition.noise] * 6)
+            system, noise = PLANT, Noise(process=[condition.noise] * 6)
         rehearse(system, controller, reference, reference.states[0])
         rollout = closed_loop(
             system, controller, reference, reference.states[0], condition.steps,
             noise=noise, on_failure="previous_plan", seed=trial.seed,
         )  # fmt: skip
-        return measure(rollout, condition, controller.problem.state_bounds)
+        return measure(rollout, condition, controller.problem.constraints)
 
     def summary(self, records: Sequence[dict]) -> tuple[list[Table], list[str]]:
         """Returns the tables for a terminal."""
@@ -381,27 +373,26 @@ def from_settings(made: Mapping[str, Any], settings: Mapping[str, Any], flight: 
         subsystems=made["subsystem"],
         models={"model": made["model"], "plant": made["flying"]},
         model_settings={"model": settings["model"], "plant": settings["flying"]},
-        plant=made["plant"],
         number=settings["trials"],
         **{key: settings[key] for key in numbers},
     )
 
 
-def tracking_problem(row: Row, inputs: Box, states: Box | None) -> TrackingProblem:
+def tracking_problem(row: Row, inputs: Bounds, states: Bounds | None) -> Problem:
     """Returns the tracking problem of a row."""
-    bounds = {"input_lower": inputs.lower, "input_upper": inputs.upper} if row.bounded else {}
-    limits = None
+    box = Box(inputs.lower, inputs.upper) if row.bounded else Box()
+    limits = []
     if states is not None:
-        penalties = {key: row.settings[key] for key in PENALTIES if key in row.settings}
-        limits = StateBounds(states.lower, states.upper, confidence=row.confidence, **penalties)
-    return TrackingProblem(row.Q, row.R, row.penalized, state_bounds=limits, **bounds)
+        price = row.settings.get("penalty")
+        limits = [Box(states.lower, states.upper, probability=row.confidence, penalty=price)]
+    return Problem(Tracking(row.Q, row.R, penalized=row.penalized), box, constraints=limits)
 
 
-def measure(rollout: Rollout, condition: Condition, limits: StateBounds | None) -> dict:
+def measure(rollout: Rollout, condition: Condition, constraints: Sequence[Constraint]) -> dict:
     """Returns the record of a flight."""
     scale, inputs = condition.scaling, condition.inputs
     states, references = (scale.restore(torch.from_numpy(x)).numpy() for x in (rollout.states, rollout.references))
-    error = tracking_error(states, references)
+    error = tracking_error(states, references, PLANT.tracked_indices)
     inside = violation_rate(rollout.inputs, inputs.lower, inputs.upper, tolerance=1e-8)
     measured = {
         "rmse": error.axes.tolist(),
@@ -411,11 +402,11 @@ def measure(rollout: Rollout, condition: Condition, limits: StateBounds | None) 
         "iterations": float(rollout.iterations.mean()),
         "seconds": np.round(rollout.seconds, 7).tolist(),
     }
-    if limits is not None:
+    for limits in constraints:
         after, expected = rollout.states[1:], rollout.predicted_means
         std = np.sqrt(rollout.predicted_covariances.diagonal(axis1=1, axis2=2))
         beyond = np.maximum(limits.lower - after, after - limits.upper).max(axis=1)
-        planned = limits.kappa * std + np.maximum(limits.lower - expected, expected - limits.upper)
+        planned = limits.standard_deviations() * std + np.maximum(limits.lower - expected, expected - limits.upper)
         margin = planned.max(axis=1)  # of the program's own promise; NaN where nothing was solved
         at_bound = np.abs(margin) <= AT_BOUND
         measured["violations"] = [int((beyond > 0).sum()), len(after)]

@@ -14,12 +14,12 @@ from gpmpc.gp import GPPosterior, Trainer, Transitions, append_points, train
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching, rollout
 from gpmpc.qp import DualActiveSet
 from gpmpc.simulation import Gust, closed_loop
-from gpmpc.systems import Integrated, step
+from gpmpc.systems import System, step
 
 F = torch.float64
 
@@ -63,7 +63,7 @@ def controller(kind=GPMPC, **changed):
     given = {
         "model": posterior(),
         "propagator": Linearization(),
-        "problem": TrackingProblem(Q=[1.0, 1.0], R=[1.0]),
+        "problem": Problem(Tracking([1.0, 1.0], [1.0], penalized="inputs")),
         "horizon": 3,
         "initial_input": [0.0],
     }
@@ -145,12 +145,18 @@ def test_models_and_data_say_what_they_are_in_one_line():
         (lambda: train(data(), seed=1.5), "seed: must be a whole number, 0 or more; got 1.5"),
         (lambda: train((1, 2)), r"transitions: must be Transitions\(...\); got tuple"),
         (lambda: Transitions.from_csv("any.csv", "angle", []), "states: must be a list of column names; got .*'angle'"),
-        (lambda: TrackingProblem([1.0], [1.0], input_lower=[np.inf]), "input_lower: no number keeps it"),
-        (lambda: TrackingProblem([1.0], [1.0], state_bounds=(-1, 1)), r"must be StateBounds\(...\); got tuple"),
-        (lambda: StateBounds(None, [1.0]), "lower: must be a list of n numbers, infinite where unbounded; got None"),
-        (lambda: StateBounds([0.0], 1), "upper: must be a list of n numbers, infinite where unbounded; got 1"),
+        (
+            lambda: Problem(Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([np.inf])),
+            "lower: no number keeps it",
+        ),
+        (
+            lambda: Problem(Tracking([1.0], [1.0], penalized="inputs"), constraints=[(-1, 1)]),
+            r"must be Box\(...\) or Halfspaces\(...\); got tuple",
+        ),
+        (lambda: Box([0.0], 1), "upper: must be a list of numbers, infinite where unbounded; got 1"),
+        (lambda: Box([0.0, 0.0], [1.0]), "upper: must be a list of 2 numbers"),
         (lambda: controller(model="gp.npz"), "model: must be a DynamicsModel, such as GPPosterior; got str"),
-        (lambda: controller(problem={"Q": [1]}), r"problem: must be TrackingProblem\(...\); got dict"),
+        (lambda: controller(problem={"Q": [1]}), r"problem: must be Problem\(...\); got dict"),
         (
             lambda: controller(propagator=Linearization),
             "propagator: .*such as Linearization.*got the class Linearization",
@@ -215,14 +221,14 @@ def test_a_controller_says_what_it_takes(kind):
 @pytest.mark.parametrize(
     ("settings", "rule"),
     [
-        ({"system": Oscillator()}, "system: must be a plant, such as Integrated.*; got Oscillator"),
+        ({"system": Oscillator()}, "system: must be a plant, such as System.*; got Oscillator"),
         ({"noise": 0.1}, r"noise: must be Noise\(...\); got 0.1"),
         ({"disturbances": Gust({"velocity": 1.0})}, "disturbances: must be a list of them; got Gust"),
     ],
 )
 def test_a_closed_loop_says_what_it_takes(settings, rule):
     given = {
-        "system": Integrated(Oscillator(), 0.1),
+        "system": System(Oscillator(), 0.1),
         "controller": controller(),
         "references": np.zeros((9, 2)),
         "initial": [0.0, 0.0],
@@ -233,12 +239,12 @@ def test_a_closed_loop_says_what_it_takes(settings, rule):
 
 
 def test_a_step_of_other_lengths_is_refused():
-    plant = Integrated(Oscillator(), 0.1)
+    plant = System(Oscillator(), 0.1)
     for state, input in ((np.zeros(3), np.zeros(1)), (np.zeros(2), 0.0)):
         with pytest.raises(ShapeError, match=r"state and input must have shapes \(2,\) and \(1,\); got"):
             step(plant, state, input)
     with pytest.raises(ShapeError, match="derivative must give 2 entries, one for each of state_names; got 1"):
-        step(Integrated(Short(), 0.1), np.zeros(2), np.zeros(1))
+        step(System(Short(), 0.1), np.zeros(2), np.zeros(1))
 
 
 @pytest.mark.parametrize(
@@ -253,4 +259,4 @@ def test_predictions_of_another_shape_are_not_broadcast(measure):
 
 def test_tracking_errors_of_axes_that_are_not_there_are_refused():
     with pytest.raises(ShapeError, match=r"axes must be states from 0 to 1; got \(0, 2, 4\)"):
-        metrics.tracking_error(np.zeros((3, 2)), np.zeros((3, 2)))
+        metrics.tracking_error(np.zeros((3, 2)), np.zeros((3, 2)), (0, 2, 4))

@@ -14,7 +14,7 @@ from gpmpc.cli.run import experiment_of, plain_data, plain_settings
 from gpmpc.cli.terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
 
-ONE, SEVERAL = ("data", "excited", "undithered", "model", "flying", "plant"), ("trajectory", "subsystem")
+ONE, SEVERAL = ("data", "excited", "undithered", "model", "flying"), ("trajectory", "subsystem")
 SHOWN_ERRORS = 10
 
 
@@ -74,4 +74,4 @@ def _study(config: DictConfig, settings: dict[str, Any]) -> Any:
 
     made = hydra.utils.instantiate(config, _convert_="all")
     module = import_module(f"gpmpc.experiments.{HydraConfig.get().job.name}")
-    return module.from_settings({"trajectory": {}, "subsystem": {}} | made, settings, flight)
+    return module.from_settings({"trajectory": {}} | made, settings, flight)

@@ -58,7 +58,7 @@ def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
         (["tables", "data.horizon=1.5"], "data.horizon: must be a whole number, 1 or more; got 1.5"),
         (["tables", "data.translational.Q=[1,2]"], "Q: must be a list of 6 numbers; got [1, 2]"),
         (
-            ["tables", "data.translational.plant.dynamics.mass=heavy"],
+            ["tables", "data.translational.plant.dynamics.dynamics.mass=heavy"],
             "mass: must be a number above 0 [kg]; got 'heavy'",
         ),
         (["tables", "folder=null"], "folder: must be the path of a folder; got None"),

@@ -37,7 +37,7 @@ def single(tmp_path_factory):
 def test_a_run_leaves_a_folder_that_says_everything(single):
     cwd, done = single
     assert done.returncode == 0, done.stderr
-    for text in ("4 steps of elliptical with convex", "RMSE [m]", "INVALID_MEASUREMENT 1", "25 rows"):
+    for text in ("4 steps of translational along elliptical", "RMSE [m]", "INVALID_MEASUREMENT 1", "25 rows"):
         assert text in done.stdout
     (folder,) = (cwd / "tree").iterdir()
     assert sorted(path.name for path in folder.iterdir()) == ["config.yaml", "metrics.json", "run.mcap"]
@@ -80,10 +80,10 @@ def test_a_recorded_flight_is_drawn(single):
 
 
 def test_the_attitude_alone_is_flown_recorded_drawn_and_reported_in_radians(tmp_path):
-    settings = ["subsystem=rotational", "trajectory=lorenz", *TINY, "steps=70", "horizon=3", "folder=tree"]
+    settings = ["system=rotational", "trajectory=lorenz", *TINY, "steps=70", "horizon=3", "folder=tree"]
     done = forked("run", *settings, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "70 steps of lorenz attitude with convex" in done.stdout
+    assert "70 steps of rotational along lorenz with convex" in done.stdout
     assert "RMSE [rad]" in done.stdout
     (folder,) = (tmp_path / "tree").iterdir()
     run = read_run(folder / "run.mcap")
@@ -124,8 +124,11 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
         (["controller=lqr", "propagation=unscented"], "propagation: this controller has none to choose"),
         (["recorder=mpac"], "recorder: must be 'mcap' or 'none'; got 'mpac'"),
         (["horizon=1,2"], "horizon: a list is written in brackets, horizon=[1,2]; a sweep takes -m"),
-        (["plant=coupled"], "the whole quadrotor is flown by gpmpc.simulation.cascade_loop"),
-        (["subsystem=rotational", "plant=rotational_map"], "plant: the rotational subsystem is flown at its own rate"),
+        (["system=pendulum", "data=excited"], "data: these data are of translational and rotational alone"),
+        (["system=pendulum", "trajectory=lorenz"], "trajectory: must prescribe angle of pendulum; got positions of 3"),
+        (["system=pendulum", "controller.problem.cost.Q=[1,1,1]"], "controller.problem: weighs 3 states and 1 inputs"),
+        (["system=pendulm"], "system: no such option 'pendulm'"),
+        (["system._target_=builtins.dict"], "system: _target_ must name a function that returns"),
         (["folder=null"], "folder: must be the path of a folder; got None"),
         (["folder="], "folder: must be the path of a folder; got ''"),
         (["horizon=0"], "horizon: must be a whole number, 1 or more; got 0"),
@@ -223,7 +226,7 @@ def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(swee
     assert "4 runs: 0 flown, 4 finished before, 0 failed" in again.stdout
     path = sorted(tree.glob("*/metrics.json"))[2]
     found = json.loads(path.read_text())
-    found["settings"]["controller"]["problem"]["Q"][0] = 7.0
+    found["settings"]["controller"]["problem"]["cost"]["Q"][0] = 7.0
     found["settings"]["gone"] = 1
     path.write_text(json.dumps(found))
     (tree / path.parent.name.replace("seed=0", "seed=1") / "metrics.json").unlink()
@@ -231,7 +234,7 @@ def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(swee
     assert refused.returncode == 2
     assert refused.stderr.count("\n") == 1
     assert f"folder: tree/{path.parent.name} holds a finished run of other settings" in refused.stderr
-    assert "controller.problem.Q: [7.0, 1.0, 1.0, 1.0, 1.0, 1.0] then, [1.0, 1.0" in refused.stderr
+    assert "controller.problem.cost.Q: [7.0, 1.0, 1.0, 1.0, 1.0, 1.0] then, [1.0, 1.0" in refused.stderr
     assert "gone: 1 then, None now" in refused.stderr
     assert "choose another folder, or remove that one to fly it again" in refused.stderr
     assert json.loads(path.read_text()) == found  # nothing was overwritten, nothing else flown

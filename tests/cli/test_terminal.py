@@ -157,7 +157,7 @@ def test_help_and_tab_list_only_choices_that_the_command_has(tmp_path):
         ("gpmpc run controller=nonlin", ["controller=nonlinear"]),
         ("gpmpc run noise.p", ["noise.process="]),
         ("gpmpc run controller=lqr controller.d", []),
-        ("gpmpc run controller.d", ["controller.disturbance_gain="]),
+        ("gpmpc run controller.prediction.d", ["controller.prediction.disturbance_gain="]),
         ("gpmpc run folder=tr", ["folder=tree/"]),
         ("gpmpc run --conf", ["--config-name", "--config-dir"]),
         ("gpmpc figures study=h", ["study=horizon"]),
@@ -240,7 +240,7 @@ class Terminal:
         (["tables", "-m", "draws=1,2"], "unknown option '-m'"),
         (["run", "-m", "--cfg", "job", "seed=1,2"], "--cfg: shows the settings of one run; leave out -m"),
         (["run", "tolerence=1"], "(did you mean 'model.tolerance' or 'controller.tolerance'"),
-        (["run", "controller.problem.q=1"], "(did you mean 'controller.problem.Q'?)"),
+        (["run", "controller.problem.cost.q=1"], "(did you mean 'controller.problem.cost.Q'?)"),
         (["run", "--experimental-rerun", "x"], "unknown option '--experimental-rerun'"),
         (["run", "-m", "--config-dir", "nowhere"], "--config-dir: nowhere: no such folder"),
         (["run", "-m", "--config-name", "nothing"], "Cannot find primary config 'nothing'"),
@@ -260,12 +260,12 @@ def test_settings_and_classes_of_the_users_own_folder_are_found(sweep, tmp_path)
     (tmp_path / "own" / "controller").mkdir(parents=True)
     (tmp_path / "own" / "controller" / "mine.yaml").write_text("defaults: [convex]\ntolerance: 0.5\n")
     (tmp_path / "own" / "ours.yaml").write_text("defaults: [run, _self_]\nseed: 5\n")
-    (tmp_path / "vehicle.py").write_text("from gpmpc.systems import Translational\nclass Mine(Translational): pass\n")
-    found = ["--config-dir", "own", "--config-name", "ours", "controller=mine", "plant.dynamics._target_=vehicle.Mine"]
+    (tmp_path / "vehicle.py").write_text("from gpmpc.systems import translational as mine\n")
+    found = ["--config-dir", "own", "--config-name", "ours", "controller=mine", "system._target_=vehicle.mine"]
     done = forked("run", *sweep, *found, *TINY, "folder=tree", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (path,) = (tmp_path / "tree").glob("*/config.yaml")
-    for text in ("tolerance: 0.5", "seed: 5", "vehicle.Mine"):
+    for text in ("tolerance: 0.5", "seed: 5", "vehicle.mine"):
         assert text in path.read_text()
 
 

@@ -12,20 +12,18 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 
-from gpmpc.datasets import PaperData, Subsystem
+from gpmpc.datasets import PaperData
 from gpmpc.exceptions import SettingError
 from gpmpc.experiments.figures import Figures, Row
 from gpmpc.experiments.figures_tables import LOOPS, paper_seconds, summarise
-from gpmpc.gp import SoftLimits, identity, train
+from gpmpc.gp import SoftLimits, train
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.propagation import MomentMatching
-from gpmpc.systems import Integrated, Translational
 from gpmpc.trajectories import Elliptical, Lorenz
 from tests.cli.command import forked
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
-COLUMNS = ["x", "vx", "y", "vy", "z", "vz", "U1", "ux", "uy", "x+", "vx+", "y+", "vy+", "z+", "vz+"]
 BOUNDS = {
     "model": {
         "elliptical": {"lower": [0, -0.2, -0.2], "upper": [100, 0.2, 0.2]},
@@ -34,7 +32,7 @@ BOUNDS = {
     "plant": {"lower": [0, -0.7, -0.7], "upper": [100, 0.7, 0.7]},
 }
 OURS = {"loop": "model", "controller": "convex", "horizon": 10, "R": [0.1, 1000, 1000]}
-OURS["settings"] = {"form": "trajectory", "covariance": "none"}
+OURS["settings"] = {"prediction": {"form": "trajectory", "covariance": "none"}}
 FREE = {"loop": "model", "controller": "nonlinear", "R": [1e-10] * 3, "bounded": False}
 TINY = ["steps=3", "samples=15", "trials=1", "model.restarts=0", "flying.restarts=0", "workers=1", "trajectory=lorenz"]
 TINY += ["subsystem=[translational,rotational]", "folder=out"]
@@ -96,14 +94,13 @@ def test_a_run_goes_on_where_it_stopped(finished):
             ["bounds.plant=null"],
             "bounds: must hold lower and upper of the plant on elliptical, translational; got none",
         ),
-        (["bounds.plant.lower=[5,5]"], "input_lower: must be a list of 3 numbers; got [5, 5]"),
+        (["bounds.plant.lower=[5,5]"], "upper: must be a list of 2 numbers, or one by stage; got [100"),
         (
             ["rows.ours_convex.subsystems=[rolling]"],
             "subsystems: must be among translational, rotational; got 'rolling'",
         ),
         (["+rows.convex.settings.foo=1"], "settings.foo: controller convex takes no such setting"),
         (["samples=15", "steps=3", "+rows.ours_convex.size=16"], "size: must be at most 15, the transitions at hand"),
-        (["plant=coupled"], "plant: must have the states of the translational subsystem"),
     ],
 )
 def test_a_mistake_is_answered_in_one_line_before_anything_is_trained(tmp_path, arguments, message):
@@ -185,10 +182,9 @@ def on_the_authors_data(folder, rows):
         rows={name: Row(**row) for name, row in rows.items()},
         data={"data": PaperData(folder)},
         trajectories={"elliptical": Elliptical(), "lorenz": Lorenz()},
-        subsystems={"translational": Subsystem(COLUMNS, ["x", "y", "z"], identity)},
+        subsystems="translational",
         models={"model": model, "plant": model},
         model_settings={"model": "paper", "plant": "paper"},
-        plant=Integrated(Translational(), 1.0, 1),
         bounds=BOUNDS,
         state_bounds={},
         workers=1,
@@ -211,7 +207,7 @@ def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
     """From the last input held, a nearly flat direction of this GP takes it hundreds of iterations."""
     from gpmpc.gaussian import Gaussian
     from gpmpc.gp import Transitions
-    from gpmpc.mpc.problem import TrackingProblem
+    from gpmpc.mpc.problem import Problem, Tracking
 
     rng = np.random.default_rng(0)
     states, inputs = rng.normal(size=(40, 2)), rng.normal(size=(40, 1))
@@ -219,7 +215,7 @@ def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
     import torch
 
     gp = train(Transitions(*map(torch.tensor, (states, inputs, after)))).posterior
-    problem = TrackingProblem([1, 1], [1e-8], penalized="deviations")
+    problem = Problem(Tracking([1, 1], [1e-8], penalized="deviations"))
     controller = NonlinearGPMPC(gp, MomentMatching(), problem, 1, [5.0])
     wanted = gp.predict(torch.tensor(states[0]), torch.tensor(inputs[0])).mean.numpy()
     decision = controller.control(Gaussian.certain(states[0]), Reference(np.stack([states[0], wanted]), inputs[:1]))

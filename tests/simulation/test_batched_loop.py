@@ -9,12 +9,13 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
 from gpmpc.simulation.trials import chunk_size
 from gpmpc.status import Status
-from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational, step, step_many
+from gpmpc.systems import Coupled, Map, Rotational, System, Translational, step, step_many
 from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 
 H, STEPS = 3, 8
@@ -26,11 +27,21 @@ ARRAYS = ("states", "covariances", "measured", "inputs", "references", "predicte
 
 
 def controller(covariance="zero_order", propagator=None, model=GP, bound=2.0, **settings):
-    box = {"input_lower": [0, -0.4, -0.4], "input_upper": [15, 0.4, 0.4]}
-    problem = TrackingProblem(
-        [1] * 6, [0.1] * 3, penalized="increments", state_bounds=StateBounds([-bound] * 6, [bound] * 6), **box
+    box = {"inputs": Box([0, -0.4, -0.4], [15, 0.4, 0.4])}
+    problem = Problem(
+        Tracking([1] * 6, [0.1] * 3),
+        constraints=[Box([-bound] * 6, [bound] * 6, probability=0.95, penalty=None)],
+        **box,
     )
-    return GPMPC(model, propagator or Linearization(), problem, H, HOVER, covariance=covariance, **settings)
+    return GPMPC(
+        model,
+        propagator or Linearization(),
+        problem,
+        H,
+        HOVER,
+        prediction=PredictionSettings(covariance=covariance),
+        **settings,
+    )
 
 
 def fly(asked, seeds=4, plant=QUADROTOR, initial=START, **settings):
@@ -150,7 +161,7 @@ class Proportional:
 
 
 def test_a_controller_that_answers_one_by_one_flies_many_too_and_divergence_is_one_trials_own():
-    plant, initial = Integrated(Explosive(), time_step=0.5), Gaussian(torch.zeros(1), 4 * torch.eye(1))
+    plant, initial = System(Explosive(), time_step=0.5), Gaussian(torch.zeros(1), 4 * torch.eye(1))
     asked = (plant, Proportional(), np.zeros((20, 1)), initial, 15)
     flown = closed_loops(*asked, 12)
     assert any("Diverged: step" in trial.error for trial in flown if trial.error)
@@ -160,11 +171,11 @@ def test_a_controller_that_answers_one_by_one_flies_many_too_and_divergence_is_o
 @pytest.mark.parametrize(
     "plant",
     [
-        Map(Translational(frozen_attitude=(0.7, 0.7))),
-        Integrated(Translational(), 0.3),
-        Integrated(Rotational(), 0.1, substeps=2),
-        Integrated(Coupled(), 0.05),
-        Map(Explosive()),
+        System(Map(Translational(frozen_attitude=(0.7, 0.7)))),
+        System(Translational(), 0.3),
+        System(Rotational(), 0.1, substeps=2),
+        System(Coupled(), 0.05),
+        System(Map(Explosive())),
     ],
     ids=lambda plant: f"{type(plant).__name__} {type(plant.dynamics).__name__}",
 )

@@ -5,19 +5,20 @@ import json
 import numpy as np
 
 from gpmpc.mpc.controller import Timing
+from gpmpc.mpc.problem import Box
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
 from gpmpc.studies.flight import Experiment, Flown, metrics
 from gpmpc.studies.report_document import report_document
 from gpmpc.studies.run_folder import PLAN, RunFolder, folder_name, record
-from gpmpc.systems import Integrated, Translational
+from gpmpc.systems import translational
 
 SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
-PLANT = Integrated(Translational(), time_step=1.0, substeps=1)
+PLANT = translational()
 
 
 class Bounds:
-    input_lower, input_upper, state_bounds = np.zeros(3), np.full(3, 10.0), None
+    inputs, constraints = Box(np.zeros(3), np.full(3, 10.0)), ()
 
 
 class Steering:

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from gpmpc.datasets import rotational_states_along
-from gpmpc.datasets.attitudes import approached, attitudes_along
-from gpmpc.systems import Integrated, Translational, step, thrust_direction
+from gpmpc.systems import System, Translational, step, thrust_direction
+from gpmpc.systems.attitudes import approached, attitudes_along, rotational_states_along
 from gpmpc.systems.quadrotor import GRAVITY
 from gpmpc.trajectories import Elliptical, Hover, Lorenz, states_along
 
@@ -14,7 +13,7 @@ from gpmpc.trajectories import Elliptical, Hover, Lorenz, states_along
 @pytest.mark.parametrize("outer_step", [0.5, 1.0])
 def test_a_thrust_along_them_takes_the_velocity_from_one_reference_to_the_next(trajectory, outer_step):
     vehicle = Translational()
-    plant = Integrated(vehicle, outer_step, 1)
+    plant = System(vehicle, outer_step, 1)
     states = states_along(trajectory, outer_step * np.arange(31))
     for k, (roll, pitch) in enumerate(attitudes_along(trajectory, 30, outer_step)):
         ux, uy, vertical = thrust_direction(roll, pitch, 0.0)

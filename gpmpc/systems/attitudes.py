@@ -11,10 +11,11 @@ loop approaches each at first order, (angle_d - angle) / response time, as ``gpm
 
 import numpy as np
 
-from gpmpc.systems import attitude_for_thrust_direction
-from gpmpc.systems.quadrotor import GRAVITY
+from gpmpc.exceptions import SettingError
 from gpmpc.trajectories import Trajectory
 
+GRAVITY = 9.81  # [m/s^2]
+ATTITUDES = ("paper", "exact")  # how thrust direction becomes attitude
 OUTER_STEP = 1.0  # [s] for which an attitude is asked for
 RESPONSE_TIME = 0.1  # [s]
 
@@ -51,3 +52,32 @@ def rotational_states_along(trajectory: Trajectory, count: int, time_step: float
     hold = max(1, round(OUTER_STEP / time_step))
     angles = attitudes_along(trajectory, -(-count // hold))
     return approached(angles, count, hold, time_step, RESPONSE_TIME)
+
+
+def attitude_for_thrust_direction(ux: np.ndarray, uy: np.ndarray, convention: str = "exact") -> np.ndarray:
+    """Roll and pitch that point the thrust along (ux, uy) at psi = 0; Cao, Lai and Alam (2017), eq. (2) inverted.
+
+    ux = cos(phi) sin(theta) and uy = -sin(phi) give phi = -asin(uy) and theta = asin(ux / cos(phi)). The authors' data
+    hold theta = sign(phi) asin(ux) instead. Arguments outside [-1, 1] saturate.
+
+    Args:
+        ux: Thrust direction along x, any shape [-].
+        uy: Thrust direction along y, same shape [-].
+        convention: ``"exact"``, or ``"paper"`` for the authors' formula.
+
+    Returns:
+        Roll and pitch [rad], stacked along a new last axis of length 2.
+
+    Raises:
+        SettingError: The convention is neither of the two.
+    """
+    phi = -np.arcsin(np.clip(uy, -1, 1))
+    if convention == "paper":
+        theta = np.sign(phi) * np.arcsin(np.clip(ux, -1, 1))
+    elif convention == "exact":
+        horizontal = np.cos(phi)
+        ratio = np.divide(ux, horizontal, out=np.zeros_like(horizontal), where=horizontal > 1e-12)
+        theta = np.arcsin(np.clip(ratio, -1, 1))
+    else:
+        raise SettingError("attitude", f"must be 'paper' or 'exact'; got {convention!r}")
+    return np.stack([phi, theta], axis=-1)
