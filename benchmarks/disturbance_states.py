@@ -26,6 +26,8 @@ from gpmpc.gp import GPPosterior
 from gpmpc.models import DisturbedModel
 from gpmpc.mpc.controller import Decision, Reference
 from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Tracking
 from gpmpc.propagation import Linearization
 
 GAINS, CHANGES, STATES = (0.0, 0.3, 1.0), (0.01, 0.1), 6
@@ -46,8 +48,8 @@ class FilteredControl:
         eye, n = torch.eye(STATES, dtype=torch.float64), STATES
         self.model, self.sensor = DisturbedModel(model, eye, [change] * n), sensor
         self.problem, self.horizon = problem(), HORIZON
-        weights = {name: np.diag([1.0] * n + [0.0] * n) for name in ("Q", "terminal")}
-        self.inner = GPMPC(self.model, Linearization(), replace(self.problem, **weights), HORIZON, HOVER)
+        cost = Tracking([1] * n + [0] * n, [1] * 3)
+        self.inner = GPMPC(self.model, Linearization(), replace(self.problem, cost=cost), HORIZON, HOVER)
         self.initial_input = self.inner.initial_input
         self.filter = KalmanFilter.extended(self.model, Measurement.of_states(2 * n, range(n), [sensor] * n))
         self.seconds: list[tuple[float, float]] = []
@@ -89,7 +91,8 @@ def main() -> None:
             for mass in MASSES:
                 for noise in NOISES:
                     if isinstance(way, float):
-                        controller = GPMPC(model, Linearization(), problem(), HORIZON, HOVER, disturbance_gain=way)
+                        prediction = PredictionSettings(disturbance_gain=way)
+                        controller = GPMPC(model, Linearization(), problem(), HORIZON, HOVER, prediction)
                     else:
                         controller = FilteredControl(model, float(way.partition(", ")[2]), SENSORS[noise])
                     row.append(pooled(flights(controller, trajectory, mass, noise, arguments)))

@@ -36,7 +36,7 @@ from gpmpc.gp import Trainer, Transitions
 from gpmpc.models import Affine, DelayedModel, ResidualModel
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 
 STEP, LIMIT, HORIZON, DELAY = 0.05, 15.0, 20, 3
@@ -168,9 +168,8 @@ def fly(model: ResidualModel, loop: Loop, steps: int, seed: int) -> Flown:
     delayed = DelayedModel(model, loop.assumed) if loop.assumed else None
     planned: Any = delayed if delayed is not None and loop.augmented else model
     extra = planned.state_dim - 2
-    problem = TrackingProblem(
-        [10.0, 0.1] + [0.0] * extra, [1e-2], penalized="increments", input_lower=[-LIMIT], input_upper=[LIMIT]
-    )
+    cost = Tracking([10.0, 0.1] + [0.0] * extra, [1e-2])
+    problem = Problem(cost, Box([-LIMIT], [LIMIT]))
     propagator = Linearization(process_noise=True)
     controller = GPMPC(planned, propagator, problem, HORIZON, [0.0])
     sensor = Measurement.of_states(2, [0, 1], SENSOR.tolist())
