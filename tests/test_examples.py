@@ -44,7 +44,7 @@ def test_the_example_of_a_log_learns_from_its_own_files_and_leaves_a_figure(tmp_
     names["main"](tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {*(f"flight_{i}.csv" for i in (1, 2, 3)), "own_log.png"}
     printed = capsys.readouterr().out
-    assert "gap: , up to 0.31" in printed
+    assert "gaps, up to 0.3" in printed
     assert "held value" in printed
     assert "motor torque" in printed
     assert (tmp_path / "own_log.png").stat().st_size > 10_000
