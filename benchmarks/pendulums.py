@@ -14,8 +14,7 @@ import torch
 
 from gpmpc.exceptions import check_number
 from gpmpc.gp import GPPosterior
-from gpmpc.systems import Integrated
-from gpmpc.systems.plant import step
+from gpmpc.systems import System, step
 
 DAMPING = 0.3  # [1/s]
 SPRING = 1.0  # [1/s^2]
@@ -60,9 +59,9 @@ class Pendulums:
         return rates
 
 
-def pendulum_plant(state_dim: int) -> Integrated:
+def pendulum_plant(state_dim: int) -> System:
     """The plant with n = ``state_dim`` states."""
-    return Integrated(Pendulums(state_dim // 2), TIME_STEP, 4)
+    return System(Pendulums(state_dim // 2), TIME_STEP, 4)
 
 
 def pendulum_gp(state_dim: int, size: int, seed: int = 0) -> GPPosterior:

@@ -12,7 +12,7 @@ from gpmpc.gp import GPPosterior, Trainer, standardize
 from gpmpc.mpc.controller import Controller, Decision, Reference
 from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.simulation import Noise, closed_loop
-from gpmpc.systems import Integrated, Rotational, Translational
+from gpmpc.systems import rotational, translational
 from gpmpc.trajectories import Elliptical, Lorenz, states_along
 
 TRAJECTORIES = {"elliptical": Elliptical(), "lorenz": Lorenz()}
@@ -21,11 +21,11 @@ STATE_BOUNDS = {  # x [m], vx [m/s], y, vy, z, vz: a little inside the trajector
     "lorenz": ([-10, -np.inf, -13, -np.inf, -np.inf, -np.inf], [10, np.inf, 13, np.inf, np.inf, np.inf]),
 }
 HOVER = [7.26, 0.0, 0.0]  # U1 [N], ux, uy [-]
-OUTER, INNER = Integrated(Translational(), 1.0, 1), Integrated(Rotational(), 0.05, 10)
+OUTER, INNER = translational(), rotational()
 NOISE = Noise(process=[0.01] * 6)
 DATA = ExcitedData(
-    Excitation(OUTER, [1] * 6, [1] * 3, HOVER, [0.3, 0.03, 0.03], [0.01] * 6),
-    Excitation(INNER, [1] * 6, [1] * 3, [0.0] * 3, [0.05] * 3, [1e-4, 1e-3] * 3),
+    Excitation([1] * 6, [1] * 3, HOVER, [0.3, 0.03, 0.03], [0.01] * 6),
+    Excitation([1] * 6, [1] * 3, [0.0] * 3, [0.05] * 3, [1e-4, 1e-3] * 3),
 )
 TRAINER = Trainer(predicts="difference", scaling=standardize)
 
@@ -42,7 +42,7 @@ class Asked:
 
 def trained(trajectory: str, subsystem: str = "translational", size: int = 189) -> GPPosterior:
     """GPs on 189 transitions of a dithered flight, or on some of them."""
-    data = DATA.transitions(trajectory, TRAJECTORIES[trajectory], subsystem)
+    data = DATA.transitions({"translational": OUTER, "rotational": INNER}[subsystem], TRAJECTORIES[trajectory])
     data = data[sorted(np.random.default_rng(0).permutation(len(data))[:size].tolist())]
     return TRAINER(data, seed=0).posterior
 

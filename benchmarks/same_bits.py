@@ -29,7 +29,7 @@ from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import cascade_loop, closed_loop
-from gpmpc.systems import Coupled, Integrated
+from gpmpc.systems import Coupled, System
 from gpmpc.trajectories import states_along
 
 STEPS, H, PATH = 8, 6, TRAJECTORIES["lorenz"]
@@ -97,7 +97,7 @@ def fly(names: list[str]) -> dict[str, np.ndarray]:
     for name in names:
         controller = CONTROLLERS[name]()
         if isinstance(controller, Cascade):
-            plant, start = Integrated(Coupled(), INNER.time_step, 1), np.concatenate([references[0], np.zeros(6)])
+            plant, start = System(Coupled(), INNER.time_step, 1), np.concatenate([references[0], np.zeros(6)])
             flight = cascade_loop(plant, controller, references, start, 2, on_failure="previous_plan")
             arrays = {"states": flight.states, "inputs": flight.inputs}
         else:

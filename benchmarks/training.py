@@ -34,10 +34,16 @@ def main() -> None:
     torch.set_num_threads(1)
     with initialize_config_dir(version_base="1.3", config_dir=str(config_folder())):
         config = compose("tables")
-    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "trajectory", "subsystem", "model")}
+    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "trajectory", "model")}
     trainer = parts["model"]
     experiment = Tables(
-        parts["data"], parts["trajectory"], parts["subsystem"], trainer, None, sizes=arguments.sizes, draws=1
+        parts["data"],
+        parts["trajectory"],
+        ("translational", "rotational"),
+        trainer,
+        None,
+        sizes=arguments.sizes,
+        draws=1,
     )
     reference = replace(trainer, likelihood="gpytorch")
     results = []

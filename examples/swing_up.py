@@ -8,8 +8,7 @@ from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import closed_loop
-from gpmpc.systems import Integrated
-from gpmpc.systems.plant import step
+from gpmpc.systems import System, step
 
 
 class Pendulum:
@@ -22,7 +21,7 @@ class Pendulum:
         return [-x[1] * x[2], x[0] * x[2], 15.0 * x[1] + 3.0 * u[0]]
 
 
-plant, rng = Integrated(Pendulum(), time_step=0.05), np.random.default_rng(0)
+plant, rng = System(Pendulum(), time_step=0.05), np.random.default_rng(0)
 angles, torques = rng.uniform(-np.pi, np.pi, 400), rng.uniform(-2, 2, (400, 1))
 states = np.column_stack([np.cos(angles), np.sin(angles), rng.uniform(-8, 8, 400)])
 measured = [step(plant, x, u) for x, u in zip(states, torques, strict=True)] + rng.normal(0, 0.001, (400, 3))

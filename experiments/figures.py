@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from gpmpc.datasets import DataSource, Subsystem
+from gpmpc.datasets import DataSource
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.experiments import figures_tables as tables
 from gpmpc.experiments.slsqp import SLSQP
+from gpmpc.experiments.subsystems import SCALINGS, SYSTEMS, check_subsystems
 from gpmpc.gp import Scaling, Transitions
 from gpmpc.metrics import tracking_error, violation_rate
 from gpmpc.mpc.controller import Controller, Reference
@@ -44,16 +45,15 @@ from gpmpc.studies.study import (
     random_rows,
     trained_model,
 )
-from gpmpc.systems import Plant, Translational
-from gpmpc.systems.quadrotor import GRAVITY
-from gpmpc.trajectories import Trajectory, states_along
+from gpmpc.systems.attitudes import GRAVITY
+from gpmpc.trajectories import Trajectory
 
 ROOMS = ("gp", "models", "propagation", "kernels", "qp", "mpc", "simulation", "datasets", "systems")
 CODE = ("gaussian.py", "metrics.py", *(f"{room}/*.py" for room in ROOMS), __file__)
 PROPAGATIONS = {"moment_matching": MomentMatching, "linearization": Linearization}
 CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "slsqp": SLSQP, "convex": GPMPC}
 LOOPS = ("model", "plant")
-SUBSYSTEMS = ("translational", "rotational")
+PLANT = SYSTEMS["translational"]  # the plant in the loop
 PENALTIES = ("l1", "l2")  # of state bounds that cannot be kept, among a row's settings
 AT_BOUND = 1e-6  # [m, m/s] distance of a plan to a bound that counts as none
 
@@ -113,9 +113,7 @@ class Row:
         for key in self.settings:
             if key not in parameters:
                 raise SettingError(f"settings.{key}", f"controller {self.controller} takes no such setting")
-        for subsystem in self.subsystems:
-            if subsystem not in SUBSYSTEMS:
-                raise SettingError("subsystems", f"must be among {', '.join(SUBSYSTEMS)}; got {subsystem!r}")
+        check_subsystems("subsystems", self.subsystems)
         for key, least in (("horizon", 1), ("size", 0)):
             for value in _several(getattr(self, key)):
                 check_number(key, value, least=least, whole=True)
@@ -146,7 +144,6 @@ class Condition:
         scaling: Of the states, to the units of the data.
         inputs: Bounds of the inputs, in the units of the model.
         states: Bounds of the states; None where there are none.
-        plant: The true plant.
         noise: Standard deviation of the process noise, every state.
         steps: Of the flight.
         drawn: Whether the record holds the curves that are drawn.
@@ -158,7 +155,6 @@ class Condition:
     scaling: Scaling
     inputs: Box
     states: Box | None
-    plant: Plant
     noise: float
     steps: int
     drawn: bool = False
@@ -168,10 +164,10 @@ class Condition:
         row, problem = self.row, tracking_problem(self.row, self.inputs, self.states)
         settings = {key: value for key, value in row.settings.items() if key not in PENALTIES}
         known = self.reference.inputs
-        at_first = np.array([self.plant.dynamics.mass * GRAVITY, 0.0, 0.0]) if known is None else known[0]
+        at_first = np.array([PLANT.dynamics.mass * GRAVITY, 0.0, 0.0]) if known is None else known[0]
         at_first = np.clip(at_first, problem.input_lower, problem.input_upper)
         if self.model is None:
-            return NMPC(self.plant, problem, row.horizon, at_first, **settings)
+            return NMPC(PLANT, problem, row.horizon, at_first, **settings)
         propagator = PROPAGATIONS[row.propagation](process_noise=row.process_noise)
         make = CONTROLLERS[row.controller]
         return make(load_model(self.model), propagator, problem, row.horizon, at_first, **settings)
@@ -185,10 +181,9 @@ class Figures:
         rows: By name.
         data: Where transitions come from, by name; ``data`` is that of the paper's reading.
         trajectories: By name.
-        subsystems: By name.
+        subsystems: Names, or one.
         models: By loop: from transitions and a ``seed`` to a ``Training``.
         model_settings: The same as plain data, for the fingerprint.
-        plant: The translational plant in the loop.
         bounds: Input bounds ``{lower, upper}`` by loop, then (``model``) by subsystem or trajectory.
         state_bounds: State bounds ``{lower, upper}`` by trajectory, for rows with a confidence; null is no bound.
         steps: Of a flight.
@@ -206,10 +201,9 @@ class Figures:
     rows: Mapping[str, Row]
     data: Mapping[str, DataSource]
     trajectories: Mapping[str, Trajectory]
-    subsystems: Mapping[str, Subsystem]
+    subsystems: Sequence[str]
     models: Mapping[str, Callable[..., Any]]
     model_settings: Mapping[str, Any]
-    plant: Plant
     bounds: Mapping[str, Any]
     state_bounds: Mapping[str, Any]
     steps: int = 189
@@ -233,14 +227,11 @@ class Figures:
         for name, row in self.rows.items():
             if row.data not in self.data:
                 raise SettingError(f"rows.{name}.data", f"must be one of {', '.join(self.data)}; got {row.data!r}")
-        if tuple(self.plant.dynamics.state_names) != Translational.state_names:
-            names = ", ".join(self.plant.dynamics.state_names)
-            raise SettingError("plant", f"must have the states of the translational subsystem; got {names}")
+        object.__setattr__(self, "subsystems", check_subsystems("subsystem", self.subsystems))
         for _, row, trajectory, subsystem in self._flown:
             tracking_problem(row, *self._bounds(row, trajectory, subsystem))
         if not self._flown:
-            chosen = ", ".join(self.subsystems) or "none"
-            raise SettingError("subsystem", f"no row flies it in the chosen loops; got {chosen}")
+            raise SettingError("subsystem", f"no row flies it in the chosen loops; got {', '.join(self.subsystems)}")
 
     @cached_property
     def _flown(self) -> list[tuple[str, Row, str, str]]:
@@ -271,7 +262,7 @@ class Figures:
         for name, row, trajectory, subsystem in self._flown:
             condition = self._condition(row, trajectory, subsystem, folder)
             reference, bounds = condition.reference, [condition.inputs, condition.states]
-            settings = [name, asdict(row), trajectory, subsystem, repr(self.plant), self.noise, self.steps]
+            settings = [name, asdict(row), trajectory, subsystem, repr(PLANT), self.noise, self.steps]
             settings += [condition.model and condition.model.name, *(box and asdict(box) for box in bounds)]
             arrays = reference.states, reference.inputs, condition.scaling.factor
             named = fingerprint(settings, *arrays, code=CODE)
@@ -307,7 +298,7 @@ class Figures:
         source = replace(self.data[row.data], samples=count)
         key = f"{source!r} {trajectory} {self.trajectories[trajectory]!r} {subsystem}"
         if key not in self._flights:
-            self._flights[key] = source.transitions(trajectory, self.trajectories[trajectory], subsystem)
+            self._flights[key] = source.transitions(SYSTEMS[subsystem], self.trajectories[trajectory], trajectory)
         data = self._flights[key]
         return data, random_rows(len(data) if row.loop == "plant" else needed, size, self.seed)
 
@@ -317,17 +308,16 @@ class Figures:
             return trained_model(self.models[row.loop], settings, learned[chosen], self.seed, folder)
 
         n_ahead, (data, chosen) = self.steps + row.horizon, self._data(row, trajectory, subsystem)
-        rest = {"plant": self.plant, "noise": self.noise, "steps": self.steps}
+        rest = {"noise": self.noise, "steps": self.steps}
         bounds = self._bounds(row, trajectory, subsystem)
         if row.loop == "plant":
-            times = self.plant.time_step * np.arange(n_ahead + 1)
-            reference = Reference(states_along(self.trajectories[trajectory], times))
+            reference = Reference(PLANT.reference_states(self.trajectories[trajectory], n_ahead + 1))
             unscaled, model = Scaling(torch.zeros(6), torch.ones(6)), None if data is None else trained(data)
             return Condition(row, model, reference, unscaled, *bounds, **rest)
-        part, n, m = self.subsystems[subsystem], data.state_dim, data.input_dim
+        system, scaling = SYSTEMS[subsystem], SCALINGS[subsystem]
         # States and next states share one scaling, so that a prediction can be fed back in.
         visited = torch.cat([data.states, data.next_states[-1:]])
-        states, inputs = part.scaling(visited, part.columns[:n]), part.scaling(data.inputs, part.columns[n : n + m])
+        states, inputs = scaling(visited, system.state_names), scaling(data.inputs, system.input_names)
         learned = Transitions(states.scale(data.states), inputs.scale(data.inputs), states.scale(data.next_states))
         reference = Reference(states.scale(visited)[: n_ahead + 1].numpy(), learned.inputs[:n_ahead].numpy())
         return Condition(row, trained(learned), reference, states, *bounds, **rest)
@@ -340,7 +330,7 @@ class Figures:
         if condition.row.loop == "model":
             system, noise = ModelLoop(load_model(condition.model), MomentMatching()), None
         else:
-            system, noise = condition.plant, Noise(process=[condition.noise] * 6)
+            system, noise = PLANT, Noise(process=[condition.noise] * 6)
         rehearse(system, controller, reference, reference.states[0])
         rollout = closed_loop(
             system, controller, reference, reference.states[0], condition.steps,
@@ -357,6 +347,35 @@ class Figures:
         return tables.document(tables.summarise(records), records, self.data["data"].note)
 
 
+def from_settings(made: Mapping[str, Any], settings: Mapping[str, Any], flight: Any) -> Figures:
+    """Makes the flights that ``conf/figures.yaml`` describes; arguments as in ``gpmpc.experiments.tables``.
+
+    Raises:
+        SettingError: An unknown loop, or a row with an unknown setting.
+    """
+    loops, rows = _several(settings["loop"]), {}
+    for loop in loops:
+        if loop not in LOOPS:
+            raise SettingError("loop", f"must be among {', '.join(LOOPS)}; got {loop!r}")
+    for name, row in settings["rows"].items():
+        if row is not None:  # left out on the command line
+            try:
+                rows[name] = Row(**row)
+            except TypeError as error:
+                raise SettingError(f"rows.{name}", str(error).removeprefix("Row.__init__() ")) from error
+    numbers = ("bounds", "state_bounds", "steps", "samples", "noise", "seed", "workers")
+    return Figures(
+        rows={name: row for name, row in rows.items() if row.loop in loops},
+        data={key: made[key] for key in ("data", "excited", "undithered")},
+        trajectories=made["trajectory"],
+        subsystems=made["subsystem"],
+        models={"model": made["model"], "plant": made["flying"]},
+        model_settings={"model": settings["model"], "plant": settings["flying"]},
+        number=settings["trials"],
+        **{key: settings[key] for key in numbers},
+    )
+
+
 def tracking_problem(row: Row, inputs: Box, states: Box | None) -> TrackingProblem:
     """Returns the tracking problem of a row."""
     bounds = {"input_lower": inputs.lower, "input_upper": inputs.upper} if row.bounded else {}
@@ -371,7 +390,7 @@ def measure(rollout: Rollout, condition: Condition, limits: StateBounds | None) 
     """Returns the record of a flight."""
     scale, inputs = condition.scaling, condition.inputs
     states, references = (scale.restore(torch.from_numpy(x)).numpy() for x in (rollout.states, rollout.references))
-    error = tracking_error(states, references)
+    error = tracking_error(states, references, PLANT.tracked_indices)
     inside = violation_rate(rollout.inputs, inputs.lower, inputs.upper, tolerance=1e-8)
     measured = {
         "rmse": error.axes.tolist(),

@@ -13,7 +13,7 @@ thread; compiling and loading come before.
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -176,13 +176,13 @@ class Quality:
         experiment, model = trial.condition
         flown = run_trial(experiment, model=None if model is None else load_model(model))
         rollout, controller = flown.rollout, flown.controller
-        distance = np.linalg.norm((rollout.states - rollout.references)[:, ::2], axis=1)
+        distance = np.linalg.norm((rollout.states - rollout.references)[:, experiment.system.tracked_indices], axis=1)
         if not distance.max() <= LOST:
             raise GpmpcError(f"{LOST:g} m off its path after {int(np.argmax(~(distance <= LOST)))} steps")
         before = controller.initial_input
         return {
             "cost": stage_cost(controller.problem, rollout.states, rollout.references, rollout.inputs, before),
-            "rmse": float(tracking_error(rollout.states, rollout.references).total),
+            "rmse": float(tracking_error(rollout.states, rollout.references, experiment.system.tracked_indices).total),
             "seconds": controller.seconds[-len(rollout.inputs) :],
             "failed": len(rollout.failures),
         }
@@ -223,6 +223,24 @@ class Quality:
             lists={"Lost": lost} if lost else {},
             images={"quality.png": png(quality(rows), dpi=130)},
         )
+
+
+def from_settings(
+    made: Mapping[str, Any], settings: Mapping[str, Any], flight: Callable[[str], tuple[Experiment, Any]]
+) -> Quality:
+    """Makes the flights that ``conf/quality.yaml`` describes; arguments as in ``gpmpc.experiments.tables``.
+
+    Args:
+        made: See there.
+        settings: See there.
+        flight: From what is typed after ``gpmpc run`` to the flight and its settings.
+    """
+    noise, only = f"noise.process=[{','.join([str(settings['noise'])] * 6)}]", settings["only"]
+    chosen = [family for family in FAMILIES if family is TRUTH or only is None or str(only) in family.words]
+    flown = {family: flight(f"{family.words} {noise}") for family in chosen}
+    experiments = {family: experiment for family, (experiment, _) in flown.items()}
+    numbers = {key: settings[key] for key in ("horizons", "steps", "seeds", "workers")}
+    return Quality(experiments, made["trajectory"], {f.words: plain for f, (_, plain) in flown.items()}, **numbers)
 
 
 class Clocked:

@@ -26,8 +26,9 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from gpmpc.datasets import DataSource, Subsystem
+from gpmpc.datasets import DataSource
 from gpmpc.exceptions import DataError, SettingError, check_number
+from gpmpc.experiments.subsystems import SCALINGS, SYSTEMS, check_subsystems
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Scaling, Training, Transitions
 from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
@@ -60,7 +61,7 @@ class Tables:
     Attributes:
         data: Where transitions come from.
         trajectories: By name.
-        subsystems: By name.
+        subsystems: Names, or one.
         model: From transitions and a ``seed`` to a ``Training``.
         model_settings: The same as plain data, for the fingerprint.
         sizes: Training set sizes.
@@ -75,7 +76,7 @@ class Tables:
 
     data: DataSource
     trajectories: Mapping[str, Trajectory]
-    subsystems: Mapping[str, Subsystem]
+    subsystems: Sequence[str]
     model: Callable[..., Training]
     model_settings: Any
     sizes: Sequence[int] = (10, 50, 100, 189)
@@ -97,9 +98,9 @@ class Tables:
         check_number("seed", self.seed, least=0, whole=True)
         check_workers(self.workers)
         check_number("state_std", self.state_std, least=0)
-        for key, chosen in (("trajectory", self.trajectories), ("subsystem", self.subsystems)):
-            if not chosen:
-                raise SettingError(key, "choose at least one")
+        object.__setattr__(self, "subsystems", check_subsystems("subsystem", self.subsystems))
+        if not self.trajectories:
+            raise SettingError("trajectory", "choose at least one")
 
     def trials(self, folder: Path | None = None) -> list[Trial]:
         """Returns every draw, in the order of the tables.
@@ -131,16 +132,17 @@ class Tables:
 
     def _scaled(self, trajectory: str, name: str) -> tuple[Transitions, Scaling, tuple[int, ...]]:
         """Returns the data in the units of the model, the scaling of the next states, the indices that are reported."""
-        raw, subsystem = self.data.transitions(trajectory, self.trajectories[trajectory], name), self.subsystems[name]
-        n, m, columns = raw.state_dim, raw.input_dim, list(subsystem.columns)
+        system, raw = SYSTEMS[name], self.data.transitions(SYSTEMS[name], self.trajectories[trajectory], trajectory)
+        n, m, states = raw.state_dim, raw.input_dim, system.state_names
+        columns = [*states, *system.input_names, *(f"{state}+" for state in states)]
         if len(columns) != 2 * n + m:
             named = f"the data have {2 * n + m} columns; the subsystem names {len(columns)}"
             raise DataError(f"{trajectory} {name}: {named}")
-        scaling = subsystem.scaling(torch.cat([raw.features, raw.next_states], dim=1), columns)
+        scaling = SCALINGS[name](torch.cat([raw.features, raw.next_states], dim=1), columns)
         pieces = [slice(0, n), slice(n, n + m), slice(n + m, None)]
         states, inputs, next_states = (Scaling(scaling.offset[piece], scaling.factor[piece]) for piece in pieces)
         data = Transitions(states.scale(raw.states), inputs.scale(raw.inputs), next_states.scale(raw.next_states))
-        return data, next_states, tuple(columns.index(state) for state in subsystem.reported)
+        return data, next_states, tuple(system.tracked_indices)
 
     @staticmethod
     def run_trial(trial: Trial) -> dict:
@@ -200,6 +202,19 @@ class Tables:
             images={"tables.png": _figure(records)},
             latex=tables,
         )
+
+
+def from_settings(made: Mapping[str, Any], settings: Mapping[str, Any], flight: Any) -> Tables:
+    """Makes the tables that ``conf/tables.yaml`` describes.
+
+    Args:
+        made: The settings, with objects in the place of what names a class.
+        settings: The same as plain data.
+        flight: Not needed.
+    """
+    numbers = {key: settings[key] for key in ("sizes", "draws", "seed", "state_std", "workers")}
+    objects = made["data"], made["trajectory"], made["subsystem"], made["model"]
+    return Tables(*objects, model_settings=settings["model"], **numbers)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
@@ -172,11 +173,22 @@ def batched_jacobian(
 def predict_with_jacobian(model: Any, state: Tensor, input: Tensor) -> tuple[Gaussian, Tensor, Tensor]:
     """Predicts, with the mean's derivatives by state (*batch, k, n) and input (*batch, k, m).
 
-    By the model's own method of this name, which torch can differentiate further, or by autograd where it has none.
+    By the model's ``linearize`` where torch follows nothing; else by its own method of this name, which torch can
+    differentiate and transform further, or by autograd.
     """
+    if hasattr(model, "linearize") and (arrays := _constant_arrays(state, input)) is not None:
+        check_query(model, state, input)
+        batch, count = state.shape[:-1], state.shape[:-1].numel()
+        flat = (np.ascontiguousarray(a, dtype=np.float64).reshape(count, a.shape[-1]) for a in arrays)
+        found = tensors_for(model, *model.linearize(*flat))
+        mean, A, B, covariance = (part.reshape(*batch, *part.shape[1:]) for part in found)
+        return Gaussian(mean, covariance), A, B
     method = getattr(model, "predict_with_jacobian", None)
-    if method is not None:
-        return method(state, input)
+    return predict_by_autograd(model, state, input) if method is None else method(state, input)
+
+
+def predict_by_autograd(model: Any, state: Tensor, input: Tensor) -> tuple[Gaussian, Tensor, Tensor]:
+    """``predict_with_jacobian`` by torch autograd, for any model that has ``predict``."""
 
     def prediction(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         belief = model.predict(x, u)
@@ -184,6 +196,16 @@ def predict_with_jacobian(model: Any, state: Tensor, input: Tensor) -> tuple[Gau
 
     (mean, covariance), (A, B) = batched_jacobian(prediction, (state, input))
     return Gaussian(mean, covariance), A, B
+
+
+def _constant_arrays(*tensors: Tensor) -> list[Array] | None:
+    """Tensors in host memory as arrays; None where autograd or a function transform follows one of them."""
+    try:
+        arrays = [tensor.numpy() for tensor in tensors]
+    except (RuntimeError, TypeError):
+        return None
+    followed = any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
+    return None if followed else arrays
 
 
 def check_query(model: Any, state: Tensor, input: Tensor) -> None:

@@ -12,10 +12,6 @@ from torch import Tensor
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import check_tensors
 
-# Nothing is lost that is nearer than this to what it is to follow. A vehicle on its side carries itself no more; ten
-# metres are a hundred times what a controlled one is off, and twice where a fifth more mass than was learned holds it.
-NEAR = {"m": 10.0, "rad": math.pi / 2}
-
 
 def mean_squared_error(predicted: Tensor, observed: Tensor) -> float:
     """Computes the squared error summed over the outputs, averaged over the samples; both (N, n).
@@ -68,25 +64,27 @@ class TrackingError:
     total: float  # root of the mean of their summed squares: over x, y, z the distance [m]
 
 
-def tracking_error(states: np.ndarray, references: np.ndarray, axes: Sequence[int] = (0, 2, 4)) -> TrackingError:
+def tracking_error(
+    states: np.ndarray, references: np.ndarray, axes: Sequence[int], angles: Sequence[int] = ()
+) -> TrackingError:
     """Computes how far a flight was from its references, the initial state left out: nobody steered there.
 
     Args:
         states: x[0] .. x[K] (K + 1, n), K of 1 or more.
         references: r[0] .. r[K] (K + 1, n).
-        axes: Which states to look at; x, y, z of the translational ones by default.
+        axes: Which states to look at, all in one unit.
+        angles: Those of them whose errors are taken within half a turn [rad].
 
     Raises:
         ShapeError: The two do not belong together, or have no such axes.
     """
-    states, references = _select_axes(states, references, axes)
-    with np.errstate(over="ignore"):
-        squares = np.square(states - references)[1:].mean(axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        squares = np.square(_errors(states, references, axes, angles))[1:].mean(axis=0)
         return TrackingError(np.sqrt(squares), float(np.sqrt(squares.sum())))
 
 
-def _select_axes(states: np.ndarray, references: np.ndarray, axes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Selects some axes of both (K + 1, j)."""
+def _errors(states: np.ndarray, references: np.ndarray, axes: Sequence[int], angles: Sequence[int]) -> np.ndarray:
+    """Differences on some axes (K + 1, j), those of angles in [-pi, pi)."""
     if np.ndim(states) != 2 or np.shape(states) != np.shape(references) or len(states) < 2:
         raise ShapeError(
             f"states and references must both be (K + 1, n), K of 1 or more; got {np.shape(states)} and "
@@ -95,7 +93,11 @@ def _select_axes(states: np.ndarray, references: np.ndarray, axes: Sequence[int]
     n = np.shape(states)[1]
     if not all(-n <= axis < n for axis in axes):
         raise ShapeError(f"axes must be states from 0 to {n - 1}; got {tuple(axes)}")
-    return np.asarray(states)[:, list(axes)], np.asarray(references)[:, list(axes)]
+    errors = (np.asarray(states) - np.asarray(references))[:, list(axes)]
+    for j, axis in enumerate(axes):
+        if axis in angles:
+            errors[:, j] = (errors[:, j] + math.pi) % (2 * math.pi) - math.pi
+    return errors
 
 
 @dataclass(frozen=True)
@@ -108,18 +110,23 @@ class Loss:
 
 
 def find_loss(
-    states: np.ndarray, references: np.ndarray, least: float = 0.0, axes: Sequence[int] = (0, 2, 4)
+    states: np.ndarray,
+    references: np.ndarray,
+    axes: Sequence[int],
+    least: float = 0.0,
+    angles: Sequence[int] = (),
 ) -> Loss | None:
     """Finds where a flight is farther from its reference than the reference ever goes from where the flight began.
 
     There the system would have been nearer had it never moved: it no longer follows. That holds for any system and any
-    units; a reference that hardly moves needs a ``least``, such as ``NEAR``.
+    units; a reference that hardly moves needs a ``least``, such as ``System.lost``.
 
     Args:
         states: x[0] .. x[K] (K + 1, n).
         references: r[0] .. r[K] (K + 1, n).
+        axes: Which states to look at, all in one unit.
         least: No flight is lost that is nearer than this.
-        axes: Which states to look at, all in one unit; x, y, z of the translational ones by default.
+        angles: Those of them whose errors are taken within half a turn [rad].
 
     Returns:
         The first such step; None where there is none.
@@ -127,10 +134,10 @@ def find_loss(
     Raises:
         ShapeError: The two do not belong together, or have no such axes.
     """
-    states, references = _select_axes(states, references, axes)
     with np.errstate(over="ignore", invalid="ignore"):
-        limit = max(least, float(np.linalg.norm(references - states[0], axis=1).max()))
-        distances = np.linalg.norm(states - references, axis=1)
+        distances = np.linalg.norm(_errors(states, references, axes, angles), axis=1)
+        still = np.broadcast_to(np.asarray(states)[0], np.shape(references))  # had it never moved
+        limit = max(least, float(np.linalg.norm(_errors(still, references, axes, angles), axis=1).max()))
     beyond = ~(distances <= limit)  # what is no number is nowhere near
     k = int(np.argmax(beyond))
     return Loss(k, float(distances[k]), limit) if beyond[k] else None

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 PACKAGES = ("gpmpc", "torch", "gpytorch", "numpy", "scipy", "casadi", "hydra-core")
 
@@ -20,8 +21,34 @@ def provenance() -> dict:
         "git": git_commit(),
         "python": platform.python_version(),
         "versions": versions(),
-        "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},
+        "machine": {"system": platform.system(), "processor": processor(), "cores": os.cpu_count()},
     }
+
+
+def environment() -> dict[str, str | None]:
+    """What computes: the versions that matter, the BLAS library, the processor; a line each of a report of a bug."""
+    import numpy as np
+
+    configuration: Any = np.show_config(mode="dicts")
+    blas = configuration["Build Dependencies"]["blas"]
+    own = {"gpmpc": version("gpmpc"), "python": platform.python_version()}
+    return {
+        **own,
+        **versions(("torch", "gpytorch", "numba", "numpy", "scipy", "casadi")),
+        "BLAS": f"{blas['name']} {blas['version']}",
+        "CPU": f"{processor()}, {os.cpu_count()} cores",
+        "system": f"{platform.system()} {platform.release()}",
+    }
+
+
+def processor() -> str:
+    """The processor's name, where the system tells it; else its architecture."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(named, "") or platform.processor() or platform.machine()
 
 
 def now() -> str:

@@ -1,8 +1,9 @@
-"""Positions that a vehicle is to follow, as functions of time.
+"""Positions that a system is to follow, as functions of time.
 
-Every trajectory is called with times t [s] of any shape and returns positions (..., 3) [m]; ``velocity`` returns their
-time derivative (..., 3) [m/s]. ``Elliptical`` and ``Lorenz`` are those of Cao, Lai and Alam (2017), section 5, decoded
-from the authors' data (the paper's z axis points downwards); the others are for everyday use.
+Every trajectory is called with times t [s] of any shape and returns positions (..., d), one for each tracked state of
+the system, in its unit; ``velocity`` returns their time derivative (..., d). ``Elliptical`` and ``Lorenz``, with d = 3,
+are those of Cao, Lai and Alam (2017), section 5, decoded from the authors' data (the paper's z axis points downwards);
+the others are for everyday use and have any d.
 """
 
 from collections.abc import Sequence
@@ -21,11 +22,11 @@ class Trajectory(Protocol):
     """A position over time."""
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
-        """Positions (..., 3) [m] at times (...) [s]."""
+        """Positions (..., d) at times (...) [s]."""
         ...
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
-        """Velocities (..., 3) [m/s] at times (...) [s]."""
+        """Velocities (..., d) at times (...) [s]."""
         ...
 
 
@@ -161,28 +162,27 @@ class Step:
     """A jump from one position to another.
 
     Attributes:
-        before: Position until the jump [m].
-        after: Position from the jump on [m].
+        before: Position until the jump (d,).
+        after: Position from the jump on (d,).
         at: Time of the jump [s].
     """
 
-    before: Sequence[float] = (0.0, 0.0, 0.0)  # [m]
-    after: Sequence[float] = (1.0, 1.0, -1.0)  # [m]
+    before: Sequence[float] = (0.0, 0.0, 0.0)
+    after: Sequence[float] = (1.0, 1.0, -1.0)
     at: float = 0.0  # [s]
 
     def __post_init__(self) -> None:
         check_number("at", self.at)
-        _check_positions("before", [self.before])
-        _check_positions("after", [self.after])
+        _check_positions("before, after", [self.before, self.after])
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
-        """Positions (..., 3) [m] at times (...) [s]."""
+        """Positions (..., d) at times (...) [s]."""
         reached = np.asarray(time, dtype=float)[..., None] >= self.at
         return np.where(reached, np.asarray(self.after, dtype=float), np.asarray(self.before, dtype=float))
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
-        """Zero (..., 3) [m/s]: the jump has no velocity."""
-        return np.zeros((*np.shape(time), 3))
+        """Zero (..., d): the jump has no velocity."""
+        return np.zeros((*np.shape(time), len(self.after)))
 
 
 @dataclass(frozen=True)
@@ -190,36 +190,36 @@ class Hover:
     """One position, held.
 
     Attributes:
-        position: Where to hover [m].
+        position: Where (d,).
     """
 
-    position: Sequence[float] = (0.0, 0.0, 0.0)  # [m]
+    position: Sequence[float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         _check_positions("position", [self.position])
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
-        """Positions (..., 3) [m] at times (...) [s]."""
-        return np.broadcast_to(np.asarray(self.position, dtype=float), (*np.shape(time), 3)).copy()
+        """Positions (..., d) at times (...) [s]."""
+        return np.broadcast_to(np.asarray(self.position, dtype=float), (*np.shape(time), len(self.position))).copy()
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
-        """Zero (..., 3) [m/s]."""
-        return np.zeros((*np.shape(time), 3))
+        """Zero (..., d)."""
+        return np.zeros((*np.shape(time), len(self.position)))
 
 
 @dataclass(frozen=True)
 class Waypoints:
     """A smooth path through given positions at given times; the first and the last one are held outside.
 
-    A monotone cubic (Fritsch and Carlson, 1980) a coordinate: it passes every waypoint and overshoots none.
+    A monotone cubic (Fritsch and Carlson, 1980) per coordinate: it passes every waypoint and overshoots none.
 
     Attributes:
         times: Strictly increasing times of the waypoints [s].
-        positions: One position (3) a time [m].
+        positions: One position (d,) per time.
     """
 
     times: Sequence[float]  # [s]
-    positions: Sequence[Sequence[float]]  # [m]
+    positions: Sequence[Sequence[float]]
 
     def __post_init__(self) -> None:
         _check_positions("positions", self.positions)
@@ -236,11 +236,11 @@ class Waypoints:
         return PchipInterpolator(np.asarray(self.times, dtype=float), np.asarray(self.positions, dtype=float))
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
-        """Positions (..., 3) [m] at times (...) [s]."""
+        """Positions (..., d) at times (...) [s]."""
         return self._path(np.clip(time, self.times[0], self.times[-1]))
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
-        """Velocities (..., 3) [m/s] at times (...) [s]; zero before the first and after the last waypoint."""
+        """Velocities (..., d) at times (...) [s]; zero before the first and after the last waypoint."""
         t = np.asarray(time, dtype=float)
         inside = (t >= self.times[0]) & (t <= self.times[-1])
         return self._path.derivative()(np.clip(t, self.times[0], self.times[-1])) * inside[..., None]
@@ -253,8 +253,11 @@ def states_along(trajectory: Trajectory, time: np.ndarray) -> np.ndarray:
 
 
 def _check_positions(key: str, positions: Sequence[Sequence[float]]) -> None:
+    """Raises unless all are lists of one length of finite numbers."""
     for position in positions:
+        length = len(positions[0]) if hasattr(positions[0], "__len__") and len(positions[0]) else -1
         try:
-            check_numbers(key, position, 3)
+            check_numbers(key, position, length)
         except SettingError:
-            raise SettingError(key, f"a position is three finite numbers x, y, z [m]; got {position}") from None
+            what = "a position is a list of finite numbers, one per tracked state, and all have one length"
+            raise SettingError(key, f"{what}; got {position}") from None

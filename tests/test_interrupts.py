@@ -13,7 +13,7 @@ from gpmpc.interrupts import interrupts_after
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.problem import TrackingProblem
-from gpmpc.systems import Integrated, Translational
+from gpmpc.systems import System, Translational
 
 
 def swallow():
@@ -60,7 +60,7 @@ def test_an_error_inside_is_that_error():
 
 
 def test_ipopt_ends_a_solve_that_an_interrupt_meets_and_nmpc_passes_it_on():
-    plant = Integrated(Translational(), time_step=1.0, substeps=1)
+    plant = System(Translational(), time_step=1.0, substeps=1)
     controller = NMPC(plant, TrackingProblem([1.0] * 6, [1.0] * 3), 5, [7.26, 0.0, 0.0])
     solver, statuses = controller._solver, []
 

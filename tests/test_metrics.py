@@ -17,6 +17,8 @@ from gpmpc.metrics import (
     violation_rate,
 )
 
+AXES = (0, 2, 4)  # x, y, z of the translational states
+
 
 def test_the_mean_squared_error_sums_over_outputs_and_averages_over_samples():
     assert mean_squared_error(torch.tensor([[1.0, 2.0], [0.0, 0.0]]), torch.zeros(2, 2)) == 2.5
@@ -46,7 +48,7 @@ def test_the_tracking_error_is_that_of_the_axes_and_of_the_distance_without_the_
     states[0] = 100.0  # where nobody steered
     states[1, ::2], states[2, ::2] = [3, 0, 0], [0, 4, 0]
     states[:, 1::2] = 7.0  # velocities are not looked at
-    error = tracking_error(states, references)
+    error = tracking_error(states, references, AXES)
     assert np.allclose(error.axes, [np.sqrt(9 / 2), np.sqrt(16 / 2), 0])
     assert error.total == pytest.approx(np.sqrt(25 / 2))
     assert tracking_error(states, references, axes=[1]).total == pytest.approx(7.0)
@@ -67,17 +69,24 @@ def test_a_flight_is_lost_where_it_would_have_been_nearer_had_it_never_moved(sca
 def test_what_hovers_is_lost_beyond_the_least_distance_and_what_is_no_number_is_lost_anyway():
     references = np.zeros((4, 6))
     drifting = np.outer(np.arange(4.0), [1, 50, 0, 50, 0, 50])  # velocities are not looked at
-    assert find_loss(drifting, references, least=3.0) is None
-    assert find_loss(drifting, references, least=1.5).step == 2
+    assert find_loss(drifting, references, AXES, least=3.0) is None
+    assert find_loss(drifting, references, AXES, least=1.5).step == 2
     drifting[1, 0] = np.nan
-    assert find_loss(drifting, references, least=1.5).step == 1
-    assert find_loss(np.outer([0, 1, 1e300, 1e308], np.ones(6)), references, least=2.0).step == 2
+    assert find_loss(drifting, references, AXES, least=1.5).step == 1
+    assert find_loss(np.outer([0, 1, 1e300, 1e308], np.ones(6)), references, AXES, least=2.0).step == 2
+
+
+def test_errors_of_angles_are_taken_within_half_a_turn():
+    turned, upright = np.array([[3.0, 0.0], [2 * np.pi + 0.1, 0.0], [-2 * np.pi - 0.1, 0.0]]), np.zeros((3, 2))
+    assert tracking_error(turned, upright, [0], angles=[0]).total == pytest.approx(0.1)
+    assert find_loss(turned, upright, [0], angles=[0]) is None
+    assert find_loss(turned, upright, [0]).step == 1
 
 
 def test_coming_back_from_a_distant_start_is_no_loss():
     approaching = np.outer([9.0, 5.0, -2.0, 0.5], np.ones(6))
-    assert find_loss(approaching, np.zeros((4, 6))) is None
-    assert find_loss(-approaching * [[1], [1], [5], [1]], np.zeros((4, 6))).step == 2
+    assert find_loss(approaching, np.zeros((4, 6)), AXES) is None
+    assert find_loss(-approaching * [[1], [1], [5], [1]], np.zeros((4, 6)), AXES).step == 2
 
 
 def test_a_violation_is_a_step_with_any_entry_outside():
@@ -109,8 +118,8 @@ def test_the_quantiles_of_times_are_in_order():
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda: find_loss(np.zeros((3, 6)), np.zeros((2, 6))), ShapeError, "states and references must both be"),
-        (lambda: tracking_error(np.zeros((3, 6)), np.zeros((2, 6))), ShapeError, r"got \(3, 6\) and \(2, 6\)"),
+        (lambda: find_loss(np.zeros((3, 6)), np.zeros((2, 6)), AXES), ShapeError, "states and references must both be"),
+        (lambda: tracking_error(np.zeros((3, 6)), np.zeros((2, 6)), AXES), ShapeError, r"got \(3, 6\) and \(2, 6\)"),
         (lambda: violation_rate(np.zeros((3, 2)), [0], [1]), ShapeError, r"bounds \(d,\).*got \(3, 2\), \(1,\)"),
         (lambda: binomial_interval(3, 2), SettingError, "successes: must lie between 0 and trials"),
         (lambda: binomial_interval(1, 2, 95), SettingError, "level: must lie between 0 and 1; got 95"),
@@ -149,7 +158,7 @@ def test_the_interval_of_a_violation_rate_is_the_binomial_one_at_the_level():
         (lambda: violation_rate(np.zeros((3, 2)), [0, 0], [1]), ShapeError, r"got \(3, 2\), \(2,\), \(1,\)"),
         (lambda: tracking_error(np.zeros((3, 6)), np.zeros((3, 6)), [6]), ShapeError, r"from 0 to 5; got \(6,\)"),
         (lambda: tracking_error(np.zeros((3, 6)), np.zeros((3, 6)), [-7]), ShapeError, r"from 0 to 5; got \(-7,\)"),
-        (lambda: tracking_error(np.zeros((1, 6)), np.zeros((1, 6))), ShapeError, "K of 1 or more"),
+        (lambda: tracking_error(np.zeros((1, 6)), np.zeros((1, 6)), AXES), ShapeError, "K of 1 or more"),
         (lambda: binomial_interval(0, 0), SettingError, "got 0 of 0"),
         (lambda: binomial_interval(-1, 3), SettingError, "got -1 of 3"),
         (lambda: binomial_interval(1, 3, 0.0), SettingError, "level: must lie between 0 and 1; got 0"),

@@ -13,11 +13,11 @@ from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Dropout, Gust
-from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational
+from gpmpc.systems import Coupled, Map, Rotational, System, Translational
 from gpmpc.trajectories import Elliptical, Step, Waypoints
 from tests.mpc.small_models import double_integrator
 
-PLANT = Integrated(Rotational(), 0.05, 1)
+PLANT = System(Rotational(), 0.05, 1)
 PROBLEM = TrackingProblem([1.0] * 6, [1.0] * 3)
 
 
@@ -37,7 +37,7 @@ def flown(**settings):
 
 def excited(**settings):
     given = {"Q": [1] * 6, "R": [1] * 3, "initial_input": [0] * 3, "dither": [0] * 3, "noise": [0] * 6}
-    return Excitation(PLANT, **(given | settings))
+    return Excitation(**(given | settings))
 
 
 CASES = [
@@ -56,9 +56,9 @@ CASES = [
     (flown, "R", ([1] * 2, [1, 1, -1])),
     (excited, "Q", ([1] * 7, [-1] * 6)),
     (excited, "R", ([1] * 4, [-1] * 3)),
-    (lambda **settings: Map(Rotational(), **settings), "time_step", (0.0, -1.0, math.inf)),
-    (lambda **settings: Integrated(Rotational(), **settings), "time_step", (0.0, -1.0, math.nan)),
-    (lambda **settings: Integrated(Rotational(), **settings), "substeps", (0, 1.5, -2)),
+    (lambda **settings: System(Map(Rotational()), **settings), "time_step", (0.0, -1.0, math.inf)),
+    (lambda **settings: System(Rotational(), **settings), "time_step", (0.0, -1.0, math.nan)),
+    (lambda **settings: System(Rotational(), **settings), "substeps", (0, 1.5, -2)),
     (Translational, "mass", (0.0, -0.74, math.nan)),
     (Translational, "frozen_attitude", ((1.0, math.nan), (1.0, 2.0, 3.0))),
     (Coupled, "mass", (0.0, math.inf)),

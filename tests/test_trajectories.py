@@ -73,9 +73,9 @@ def test_a_step_jumps_at_its_time():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: Hover([1, 2]), r"position: a position is three finite numbers x, y, z \[m\]; got \[1, 2\]"),
-        (lambda: Hover([1, 2, np.nan]), "three finite numbers"),
-        (lambda: Step(after=[1]), "after: a position"),
+        (lambda: Hover([]), "position: a position is a list of finite numbers, one per tracked state"),
+        (lambda: Hover([1, 2, np.nan]), "list of finite numbers"),
+        (lambda: Step(after=[1]), "before, after: a position"),
         (lambda: Waypoints([0, 1], [[0, 0, 0]]), "got 2 times, 1 positions"),
         (lambda: Waypoints([0, 0], [[0, 0, 0], [1, 1, 1]]), r"strictly increasing \[s\]; got \[0, 0\]"),
     ],

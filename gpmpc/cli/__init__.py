@@ -3,10 +3,8 @@
 What stands here is there before any library: Ctrl-C ends the command with one line from its first moment on.
 """
 
-import os
 import signal
 import sys
-import threading
 from contextlib import suppress
 from types import FrameType
 
@@ -22,13 +20,14 @@ def main() -> None:
     def interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
         """Interrupts once more what was interrupted inside a finaliser: Python would print a traceback and go on."""
         if issubclass(lost.exc_type, KeyboardInterrupt):
-            threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+            signal.setitimer(signal.ITIMER_REAL, 0.05)  # once this call is over
         else:
             sys.__unraisablehook__(lost)
 
     ignored = signal.getsignal(signal.SIGINT) is not signal.default_int_handler  # as under nohup
     if not ignored:
         signal.signal(signal.SIGINT, interrupt)
+        signal.signal(signal.SIGALRM, interrupt)
     sys.unraisablehook = interrupt_again
     try:
         from gpmpc.cli.terminal import usable_streams

@@ -1,20 +1,42 @@
-"""Arguments of commands, and the folders that they name: a user's mistake is one line."""
+"""Arguments of commands, what commands return, and the folders that they write to: a user's mistake is one line."""
 
 import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from gpmpc.exceptions import GpmpcError, SettingError
 
 
-class Parser(argparse.ArgumentParser):
-    """A parser that raises an error of this package instead of printing the usage and exiting."""
+class Result(NamedTuple):
+    """What a command returns.
 
-    def __init__(self, *arguments: Any, description: str | None = None, **settings: Any):
-        plain = description and description.replace("``", "")  # a module's docstring, without its markup
-        super().__init__(*arguments, description=plain, **settings)
+    Attributes:
+        data: Plain data, which ``--json`` prints.
+        code: The exit code.
+    """
+
+    data: Any = None
+    code: int = 0
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that raises an error of this package instead of printing the usage and exiting.
+
+    Attributes:
+        values: What the arguments take, by option or name: a list of choices, empty for any; None for a flag.
+    """
+
+    def __init__(self, *arguments: Any, **settings: Any):
+        self.values: dict[str, list[str] | None] = {}
+        super().__init__(*arguments, **settings)
+
+    def add_argument(self, *names: Any, **settings: Any) -> Any:
+        """Adds an argument as ``argparse`` does."""
+        flag = settings.get("action") in ("store_true", "help")
+        self.values |= dict.fromkeys(names, None if flag else [*settings.get("choices", ())])
+        return super().add_argument(*names, **settings)
 
     def error(self, message: str) -> NoReturn:
         """Raises instead of exiting.

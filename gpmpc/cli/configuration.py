@@ -1,18 +1,21 @@
-"""The folder of the settings, the choices that each command has, and their completion in a shell."""
+"""Composes the settings of a command with Hydra, and lists what can be set."""
 
-import io
 import os
 import sys
-from collections.abc import Iterable, Mapping
-from contextlib import redirect_stderr, redirect_stdout, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 import gpmpc
-from gpmpc.exceptions import GpmpcError
+from gpmpc.exceptions import GpmpcError, SettingError
 
 
 def config_folder() -> Path:
@@ -22,11 +25,15 @@ def config_folder() -> Path:
     return installed if installed.is_dir() else package.parent / "conf"
 
 
-def find_modules_here() -> None:
-    """Lets ``_target_`` name what stands in the working folder, behind everything that is installed.
+@contextmanager
+def settings(own: str | None = None) -> Iterator[None]:
+    """Lets Hydra find the package's settings, and those in a folder ``own`` behind them.
+
+    What stands in the working folder can be named by ``_target_`` inside, behind everything that is installed.
 
     Raises:
         GpmpcError: There is no working folder any more.
+        SettingError: There is no folder ``own``.
     """
     try:
         here = os.getcwd()
@@ -34,69 +41,59 @@ def find_modules_here() -> None:
         raise GpmpcError("the working folder is gone; change to one that exists") from error
     if here not in sys.path:
         sys.path.append(here)
+    if own is not None:
+        _search_also(Path(own))
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder())):
+        yield
 
 
-def settings_of(config_name: str) -> list[str]:
-    """Returns every setting of a command, dotted."""
+def _search_also(folder: Path) -> None:
+    if not folder.is_dir():
+        raise SettingError("--config-dir", f"{folder}: no such folder")
+
+    class OwnFolder(SearchPathPlugin):
+        def manipulate_search_path(self, search_path: Any) -> None:
+            search_path.append("command-line", f"file://{folder.absolute()}")
+
+    Plugins.instance().register(OwnFolder)
+
+
+def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
+    """Returns the settings of ``conf/NAME.yaml`` with overrides; Hydra's own are ``HydraConfig.get()`` from then on."""
+    config = hydra.compose(name, [*overrides], return_hydra_config=True)
+    HydraConfig.instance().set_config(config)
+    return without_hydra(config)
+
+
+def without_hydra(config: DictConfig) -> DictConfig:
+    """Returns settings without Hydra's own."""
+    config = config.copy()
+    with open_dict(config):
+        del config["hydra"]
+    return config
+
+
+def setting_names(name: str, overrides: Sequence[str] = ()) -> list[str]:
+    """Returns every setting of ``conf/NAME.yaml``, dotted; each after the node that holds it."""
 
     def keys(node: object, prefix: str = "") -> list[str]:
         if not isinstance(node, dict):
             return []
-        return [name for key, value in node.items() for name in (f"{prefix}{key}", *keys(value, f"{prefix}{key}."))]
+        return [key for k, value in node.items() for key in (f"{prefix}{k}", *keys(value, f"{prefix}{k}."))]
 
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder())):
-        return keys(OmegaConf.to_container(hydra.compose(config_name), resolve=False))
-
-
-def complete(arguments: list[str], configs: Mapping[str, str], others: Iterable[str]) -> None:
-    """Prints what a shell evaluates once (``-sc install=bash``), or what may come next (``-sc query=bash``).
-
-    Hydra completes settings, but has no subcommands.
-
-    Args:
-        arguments: All of the command line.
-        configs: Name of the configuration, by command.
-        others: Commands without one.
-
-    Raises:
-        GpmpcError: The arguments ask for neither.
-    """
-    asked = [argument for argument in arguments if argument.startswith(("install=", "uninstall=", "query="))]
-    if len(asked) != 1:
-        raise GpmpcError("-sc: takes one of install=SHELL, uninstall=SHELL and query=SHELL, with bash, zsh or fish")
-    if not asked[0].startswith("query="):
-        _complete_by_hydra(asked[0], configs["run"])
-        return
-    words = os.environ.get("COMP_LINE", "").split(" ")
-    if len(words) <= 2:
-        print("\n".join([*configs, *others]))
-    elif words[1] in configs:
-        config_name, found = configs[words[1]], io.StringIO()
-        os.environ["COMP_LINE"] = " ".join([words[0], *words[2:]])
-        # What is typed so far may be no setting yet: then there is nothing to say, least of all on the standard error.
-        with redirect_stdout(found), redirect_stderr(io.StringIO()), suppress(Exception, SystemExit):
-            _complete_by_hydra(asked[0], config_name)
-        ours, all_groups = _groups_of(config_name), {path.name for path in config_folder().iterdir() if path.is_dir()}
-        foreign = tuple(f"{group}=" for group in all_groups - {key.partition("@")[0] for key in ours})
-        print("\n".join(word for word in found.getvalue().split() if not word.startswith(foreign)))
+    return keys(OmegaConf.to_container(hydra.compose(name, [*overrides]), resolve=False))
 
 
-def _complete_by_hydra(asked: str, config_name: str) -> None:
-    sys.argv = ["gpmpc", "-sc", asked]
-    hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)(lambda config: None)()
-
-
-def _groups_of(config_name: str) -> list[str]:
-    """Returns the groups that a command chooses from; all commands share the folder, but not every group."""
-    defaults = OmegaConf.load(config_folder() / f"{config_name}.yaml").defaults
-    keys = [key for entry in defaults if OmegaConf.is_dict(entry) for key in entry]
-    return [key for key in keys if not key.startswith("override ")]
-
-
-def _choices_of(config_name: str) -> str:
-    """Returns a line a group, for the help."""
+def group_options(name: str) -> dict[str, list[str]]:
+    """Returns the options of every group that ``conf/NAME.yaml`` chooses from; not every command has every group."""
+    defaults = OmegaConf.load(config_folder() / f"{name}.yaml").defaults
+    keys = [key for entry in defaults if OmegaConf.is_dict(entry) for key in entry if not key.startswith("override ")]
     options = GlobalHydra.instance().config_loader().get_group_options
-    return "\n".join(f"{key}: {', '.join(options(key.partition('@')[0]))}" for key in sorted(_groups_of(config_name)))
+    return {key: options(key.partition("@")[0]) for key in sorted(keys)}
 
 
-OmegaConf.register_new_resolver("choices_of", _choices_of, replace=True)
+def help_text(name: str, overrides: Sequence[str] = ()) -> str:
+    """Returns what ``gpmpc COMMAND --help`` prints: how it is used, its choices, every setting with its value."""
+    choices = "\n".join(f"{key}: {', '.join(options)}" for key, options in group_options(name).items())
+    every, header = OmegaConf.to_yaml(compose(name, overrides)), HydraConfig.get().help.header
+    return f"{header}\n\nChoices:\n\n{choices}\n\nEvery setting, with its default:\n\n{every}"

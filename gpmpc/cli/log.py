@@ -1,73 +1,68 @@
 """``gpmpc log``: what is in a recording, rescue an unfinished one, its steps as a table, a layout to look at it."""
 
 import argparse
-import csv
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from gpmpc.cli.arguments import Parser
+from gpmpc.cli.arguments import Parser, Result, writing
 from gpmpc.exceptions import GpmpcError, SettingError
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
 
-FORMATS = (".csv", ".parquet")
+ENDINGS = {"recover": (".mcap",), "export": (".csv", ".parquet"), "layout": (".json",)}
 CUT = "unfinished or damaged; this is what could be read"
 
 
-def log(arguments: list[str]) -> None:
-    """The command line after ``gpmpc log``.
+def add_arguments(parser: Parser) -> None:
+    """Adds the arguments of the command."""
+    what = "info: channels, times, how the solves ended; recover: what is whole in an unfinished file, as a new one; "
+    what += "export: the steps as a table, a row each; layout: for Foxglove or Lichtblick, fitting the recording"
+    parser.add_argument("action", choices=["info", *ENDINGS], help=what)
+    parser.add_argument("file", type=Path, help="an MCAP file, finished or not")
+    endings = ".recovered.mcap, .csv (or .parquet), .layout.json"
+    parser.add_argument("output", type=Path, nargs="?", help=f"where it goes; FILE with {endings}")
+
+
+def log(given: argparse.Namespace) -> Result:
+    """Does what was asked for with a recording.
 
     Raises:
         GpmpcError: A mistake in the arguments, or a file that cannot be read or written.
     """
-    parser = Parser(prog="gpmpc log", description=__doc__)
-    commands = parser.add_subparsers(dest="command", required=True, metavar="info|recover|export|layout")
-    info_parser = commands.add_parser("info", help="channels, duration, metadata and how the solves ended")
-    recover_parser = commands.add_parser("recover", help="write what is whole in an unfinished file to a new one")
-    export_parser = commands.add_parser("export", help="write the steps as a table, one row each")
-    layout_parser = commands.add_parser(
-        "layout", help="write a layout for Foxglove or Lichtblick that fits the recording"
-    )
-    for each in (info_parser, recover_parser, export_parser, layout_parser):
-        each.add_argument("file", type=Path, help="an MCAP file, finished or not")
-    recover_parser.add_argument("output", type=Path, nargs="?", help="default: FILE with .recovered.mcap")
-    export_parser.add_argument("output", type=Path, nargs="?", help="ends in .csv or .parquet; default: FILE with .csv")
-    layout_parser.add_argument("output", type=Path, nargs="?", help="ends in .json; default: FILE with .layout.json")
-    given = parser.parse_args(arguments)
-    {"info": _info, "recover": _recover, "export": _export, "layout": _layout}[given.command](given)
+    if given.action == "info":
+        if given.output:
+            raise GpmpcError(f"log info: writes nothing; got {given.output}")
+        return _info(given.file)
+    endings = ENDINGS[given.action]
+    ending = {"recover": ".recovered.mcap", "export": ".csv", "layout": ".layout.json"}[given.action]
+    output = given.output or given.file.parent / f"{given.file.stem}{ending}"
+    if given.output and given.action != "recover" and output.suffix not in endings:
+        raise SettingError("output", f"must end in {' or '.join(endings)}; got {output.name!r}")
+    note = {"recover": _recover, "export": _export, "layout": _layout}[given.action](given.file, output)
+    print(f"written to {output}: {note}")
+    return Result({"output": str(output)})
 
 
-def _info(given: argparse.Namespace) -> None:
+def _info(file: Path) -> Result:
     from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
 
     from gpmpc.recording import read_run
+    from gpmpc.studies.document import Table, plain_text, terminal
 
-    run, console = read_run(given.file), Console()
-
-    def plain(text: str) -> str:  # nothing that a terminal, or rich, would obey
-        return escape("".join(sign if sign.isprintable() or sign == "\n" else "\ufffd" for sign in text))
-
+    run, console = read_run(file), Console()
+    facts = _facts(run)
     hint = "" if "recovered" in run.metadata else " (gpmpc log recover makes it readable for other tools)"
     state = "finished" if run.finished else f"{CUT}{hint}"
-    console.print(f"{given.file}: {state}", soft_wrap=True, highlight=False, markup=False)
-    channels = Table("topic", "schema", "messages")
-    for topic, (count, schema) in run.channels.items():
-        channels.add_row(plain(topic), plain(schema), str(count))
-    console.print(channels)
-    facts = Table(show_header=False)
-    for name, value in _facts(run).items():
-        facts.add_row(name, plain(value))
-    console.print(facts)
-    metadata = Table("metadata", "key", "value")
-    for name, pairs in run.metadata.items():
-        if name != "units":
-            for key, value in pairs.items():
-                metadata.add_row(*map(plain, (name, key, value)))
-    console.print(metadata)
+    console.print(f"{file}: {state}", soft_wrap=True, highlight=False, markup=False)
+    metadata = [(n, k, v) for n, pairs in run.metadata.items() if n != "units" for k, v in pairs.items()]
+    channels = [(topic, schema, str(count)) for topic, (count, schema) in run.channels.items()]
+    tables = [(("topic", "schema", "messages"), channels), (("", ""), [*facts.items()])]
+    tables += [(("metadata", "key", "value"), metadata)]
+    console.print(terminal([Table(head, [[*map(plain_text, row)] for row in rows]) for head, rows in tables if rows]))
+    counts = {topic: count for topic, (count, _) in run.channels.items()}
+    return Result({"finished": run.finished, "channels": counts, **facts, "metadata": dict(run.metadata)})
 
 
 def _facts(run: "Run") -> dict[str, str]:
@@ -91,65 +86,42 @@ def _facts(run: "Run") -> dict[str, str]:
     return facts
 
 
-def _recover(given: argparse.Namespace) -> None:
+def _recover(file: Path, output: Path) -> str:
     from gpmpc.recording import recover
 
-    output = given.output or _beside(given.file, ".recovered.mcap")
-    found = recover(given.file, output)
+    found = recover(file, output)
     note = "; the recording was finished, nothing was missing" if found.finished else ""
-    print(f"written to {output}: {found.messages} messages over {found.seconds:g} s{note}")
+    return f"{found.messages} messages over {found.seconds:g} s{note}"
 
 
-def _export(given: argparse.Namespace) -> None:
+def _export(file: Path, output: Path) -> str:
     from gpmpc.recording import read_run
 
-    output: Path = given.output or _beside(given.file, ".csv")
-    if given.output and output.suffix not in FORMATS:
-        raise SettingError("output", f"must end in {' or '.join(FORMATS)}; got {output.name!r}")
-    run = read_run(given.file)
-    _write(output, _csv(run) if output.suffix == ".csv" else _parquet(run))
+    run = read_run(file)
+    frame = run.to_pandas()
+    frame.attrs = {}  # pandas would store them, as text that others do not read
+    data: Any = io.BytesIO()
+    if output.suffix == ".csv":
+        frame.to_csv(data, index=False, lineterminator="\n", na_rep="nan")
+    else:
+        try:
+            frame.to_parquet(data, index=False)
+        except ImportError as error:
+            raise GpmpcError("Parquet needs pyarrow: pip install 'gpmpc[report]'") from error
+    _write(output, data.getvalue())
     note = "" if run.finished else f"; the recording is {CUT}"
-    print(f"written to {output}: {len(run.times)} rows, {len(run.columns)} columns{note}")
+    return f"{len(run.times)} rows, {len(run.columns)} columns{note}"
 
 
-def _layout(given: argparse.Namespace) -> None:
+def _layout(file: Path, output: Path) -> str:
     from gpmpc.recording import layout, read_run
 
-    output: Path = given.output or _beside(given.file, ".layout.json")
-    if given.output and output.suffix != ".json":
-        raise SettingError("output", f"must end in .json; got {output.name!r}")
-    _write(output, layout(read_run(given.file)))
-    print(f"written to {output}: open {given.file} in Foxglove or Lichtblick, then import it as a layout")
-
-
-def _beside(file: Path, ending: str) -> Path:
-    return file.parent / f"{file.stem}{ending}"  # of a folder too, which the reader refuses
+    _write(output, layout(read_run(file)))
+    return f"open {file} in Foxglove or Lichtblick, then import it as a layout"
 
 
 def _write(output: Path, content: str | bytes) -> None:
     from gpmpc.files import write_whole
 
-    try:
+    with writing(output, "output"):
         write_whole(output, content)
-    except OSError as error:
-        raise SettingError("output", f"cannot write to {output}: {error.strerror}") from error
-
-
-def _csv(run: "Run") -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    columns = run.columns
-    writer.writerow(columns)
-    writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
-    return text.getvalue()
-
-
-def _parquet(run: "Run") -> bytes:
-    frame = run.to_pandas()
-    frame.attrs = {}  # pandas would store them, as text that others do not read
-    data = io.BytesIO()
-    try:
-        frame.to_parquet(data, index=False)
-    except ImportError as error:
-        raise GpmpcError("Parquet needs pyarrow: pip install 'gpmpc[report]'") from error
-    return data.getvalue()

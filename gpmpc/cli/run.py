@@ -14,23 +14,22 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc.cli.arguments import folder_of, writing
+from gpmpc.cli.arguments import Result, folder_of, writing
+from gpmpc.cli.terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, check_number
 
 if TYPE_CHECKING:
     from gpmpc.studies.flight import Experiment
     from gpmpc.studies.run_folder import RunFolder
+    from gpmpc.systems import System
 
 ASIDE = ("launcher", "folder", "live")  # settings that a result does not depend on
-GROUPS = ("data", "trajectory", "subsystem", "plant", "model", "controller", "propagation", "solver")
-UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s") | {"ux": "1", "uy": "1"}
-UNITS |= dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys("pqr", "rad/s")
-UNITS |= dict.fromkeys(("U1", "U2", "U3", "U4"), "N")
+GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver")
 MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
 LOST = 3  # exit code of a run that is finished, and whose flight was lost
 
 
-def run(config: DictConfig) -> None:
+def run(config: DictConfig) -> Result:
     """Flies, prints the results and where they are kept; the task behind ``conf/run.yaml``."""
     from rich.console import Console
 
@@ -43,13 +42,12 @@ def run(config: DictConfig) -> None:
         experiment_of(config)  # what a user can get wrong is found before anything is written
         outcome = run_one(config)
     if "error" in outcome:
-        print(f"gpmpc: {outcome['error']} (traceback: {outcome['folder']}/error.json)", file=sys.stderr)
-        sys.exit(2 if outcome["mistake"] else 1)
+        print_error(f"{outcome['error']} (traceback: {outcome['folder']}/error.json)")
+        return Result(outcome, 2 if outcome["mistake"] else 1)
     console.print(terminal([summary(outcome["result"])]))
     state = "finished before" if outcome["skipped"] else "written to"
     console.print(f"{state}: {outcome['folder']}", soft_wrap=True, highlight=False, markup=False)
-    if outcome["result"].get("lost"):
-        sys.exit(LOST)
+    return Result(outcome["result"] | {"folder": outcome["folder"]}, LOST if outcome["result"].get("lost") else 0)
 
 
 def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
@@ -96,7 +94,7 @@ def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, abou
         def prepare(controller: Any, training: Any) -> Callable:
             recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller.problem, training))
             callback = partial(recorder.record, gp_size=0 if training is None else len(training.posterior))
-            return _in_real_time(callback, experiment.plant.time_step) if config.live else callback
+            return _in_real_time(callback, experiment.system.time_step) if config.live else callback
 
         flown = run_trial(experiment, prepare)
     return metrics(experiment, flown)
@@ -119,19 +117,21 @@ def _recorder(
     from gpmpc.recording import McapRecorder, RecordedSystem
     from gpmpc.studies.run_folder import RECORDING
 
-    dynamics = experiment.plant.dynamics
-    names = (*dynamics.state_names, *dynamics.input_names)
+    flown = experiment.system
     system = RecordedSystem(
-        dynamics.state_names,
-        dynamics.input_names,
-        time_step=experiment.plant.time_step,
-        units={name: unit for name, unit in UNITS.items() if name in names},
+        flown.state_names,
+        flown.input_names,
+        time_step=flown.time_step,
+        units=flown.units,
         input_bounds=[problem.input_lower, problem.input_upper],
+        z_down=flown.z_down,
     )
     metadata = {
         "seed": experiment.seed,
         "command": about["provenance"]["command"],
         "noise_std": " ".join(map(str, experiment.unplanned_noise(training).tolist())),
+        "system": flown.name,
+        "tracked": " ".join(flown.tracked),
     }
     path, text = folder.path / RECORDING, OmegaConf.to_yaml(config, resolve=True)
     recorder = McapRecorder(path, system, config=text, metadata=metadata, live=config.live)
@@ -162,12 +162,12 @@ def experiment_of(config: DictConfig) -> "Experiment":
         raise SettingError("live", f"must be true or false; got {config.live!r}")
     if config.live and config.recorder != "mcap":
         raise SettingError("live", f"needs recorder=mcap; got recorder={config.recorder}")
-    for group in ("data", "trajectory", "subsystem", "plant", "model", "controller"):
+    for group in ("data", "trajectory", "system", "model", "controller"):
         if not config.get(group):
             raise SettingError(group, "choose one")
-    for group in ("trajectory", "subsystem"):
-        if len(config[group]) != 1:
-            raise SettingError(group, f"choose one; got {', '.join(config[group])}")
+    if len(config.trajectory) != 1:
+        raise SettingError("trajectory", f"choose one; got {', '.join(config.trajectory)}")
+    system = system_of(config.system)
     for group, part in (("propagation", "propagator"), ("solver", "solver")):
         if config.get(group):
             if part not in config.controller:
@@ -175,19 +175,46 @@ def experiment_of(config: DictConfig) -> "Experiment":
             config.controller[part] = config[group]
     with open_dict(config):
         size = config.data.pop("size")
+        if config.controller.get("initial_input") is None:
+            config.controller.initial_input = list(system.initial_input)
+        weights = config.controller.get("problem")
+        if not weights:
+            raise SettingError("controller.problem", f"has no weights; give them in the settings of {system.name}")
+        for side in ("input_lower", "input_upper"):
+            if weights.get(side) is None:
+                weights[side] = list(getattr(system, side))
     ((name, trajectory),) = config.trajectory.items()
-    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "plant", "controller", "disturbances")}
+    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "controller", "disturbances")}
+    other = {key: value for key, value in (config.plant or {}).items() if value != config.system.get(key)}
     return Experiment(
         **parts,
         trajectory=instantiate(trajectory, _convert_="all"),
         train=instantiate(config.model, _convert_="all"),
-        subsystem=next(iter(config.subsystem)),
+        system=system,
+        plant=system_of(OmegaConf.merge(config.system, other)) if other else None,
         name=name,
         size=size,
         propagator=getattr(parts["controller"], "keywords", {}).get("propagator"),
         noise=Noise(**config.noise) if any(config.noise.values()) else None,
         **{key: config[key] for key in ("steps", "seed", "loop", "on_failure")},
     )
+
+
+def system_of(settings: Any) -> "System":
+    """Makes the system that the settings ``system`` describe.
+
+    Raises:
+        GpmpcError: They make something else, or a setting is wrong.
+    """
+    from hydra.utils import instantiate
+
+    from gpmpc.systems import System
+
+    system = instantiate(settings, _convert_="all")
+    if not isinstance(system, System):
+        what = "_target_ must name a function that returns a gpmpc.systems.System"
+        raise SettingError("system", f"{what}; got {type(system).__name__}")
+    return system
 
 
 def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, Any]:

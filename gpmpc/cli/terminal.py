@@ -68,6 +68,25 @@ def usable_streams() -> Iterator[None]:
             sys.exit(1)
 
 
+@contextmanager
+def redirected_output(to: str) -> Iterator[None]:
+    """Sends the standard output of this process and of those started inside to "output", "error" or "nowhere"."""
+    if to == "output":
+        yield
+        return
+    sys.stdout.flush()
+    before = os.dup(1)
+    target = os.dup(2) if to == "error" else os.open(os.devnull, os.O_WRONLY)
+    os.dup2(target, 1)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(before, 1)
+        os.close(before)
+        os.close(target)
+
+
 def print_error(line: str) -> None:
     """Writes a line to the standard error, where that is possible."""
     with suppress(OSError):

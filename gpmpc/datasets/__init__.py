@@ -1,8 +1,8 @@
-"""Where the transitions of an experiment come from: flights of our own, dithered flights, the authors' files."""
+"""Where transitions come from: random inputs, flights of our own, dithered flights, the authors' files."""
 
-from gpmpc.datasets.attitudes import rotational_states_along
 from gpmpc.datasets.excitation import Excitation, ExcitedData
-from gpmpc.datasets.flights import SUBSYSTEMS, DataSource, NMPCData, PaperData, Subsystem, Tracking
+from gpmpc.datasets.flights import SUBSYSTEMS, DataSource, NMPCData, PaperData, Tracking
+from gpmpc.datasets.random_data import RandomData
 
 __all__ = [
     "SUBSYSTEMS",
@@ -11,7 +11,6 @@ __all__ = [
     "ExcitedData",
     "NMPCData",
     "PaperData",
-    "Subsystem",
+    "RandomData",
     "Tracking",
-    "rotational_states_along",
 ]

@@ -20,23 +20,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpmpc.datasets.attitudes import approached
-from gpmpc.datasets.flights import SUBSYSTEMS, check_weights, transitions_of
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc.datasets.flights import SUBSYSTEMS, check_quadrotor, transitions_of
+from gpmpc.exceptions import SettingError, check_number, check_numbers
 from gpmpc.gp.transitions import Transitions
 from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.simulation import Noise, Rollout, closed_loop
-from gpmpc.systems import ATTITUDES, Plant, attitude_for_thrust_direction
-from gpmpc.trajectories import Trajectory, states_along
+from gpmpc.systems import ATTITUDES, System, attitude_for_thrust_direction, translational
+from gpmpc.systems.attitudes import approached
+from gpmpc.trajectories import Trajectory
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """How one subsystem is flown for data: NMPC on the true plant, which is shaken meanwhile.
+    """How one subsystem is flown for data: NMPC on the true system, which is shaken meanwhile.
 
     Attributes:
-        plant: The true system.
         Q: State weights, the diagonal (n,).
         R: Weights of the inputs' increments, the diagonal (m,).
         initial_input: First guess of the solver, and the input before the first (m,).
@@ -45,10 +44,9 @@ class Excitation:
         horizon: Of the NMPC.
 
     Raises:
-        SettingError: A weight has another length than the plant's states or inputs.
+        SettingError: A list has another length than the quadrotor's six states or three inputs.
     """
 
-    plant: Plant
     Q: Sequence[float]
     R: Sequence[float]
     initial_input: Sequence[float]
@@ -57,15 +55,17 @@ class Excitation:
     horizon: int = 1
 
     def __post_init__(self) -> None:
-        check_weights(self.plant, self.Q, self.R)
+        for key, length in (("Q", 6), ("noise", 6), ("R", 3), ("initial_input", 3), ("dither", 3)):
+            check_numbers(key, getattr(self, key), length, **({} if key == "initial_input" else {"least": 0}))
+        check_number("horizon", self.horizon, least=1, whole=True)
 
-    def fly(self, references: np.ndarray, steps: int, seed: int) -> Rollout:
+    def fly(self, system: System, references: np.ndarray, steps: int, seed: int) -> Rollout:
         """From the first of the references (steps + horizon, n) on."""
         problem = TrackingProblem(self.Q, self.R, penalized="increments")
-        controller = NMPC(self.plant, problem, self.horizon, self.initial_input)
+        controller = NMPC(system, problem, self.horizon, self.initial_input)
         noise = Noise(process=self.noise, input=self.dither)
         return closed_loop(
-            self.plant, controller, references, references[0], steps, noise=noise, seed=seed, on_failure="previous_plan"
+            system, controller, references, references[0], steps, noise=noise, seed=seed, on_failure="previous_plan"
         )
 
 
@@ -107,27 +107,31 @@ class ExcitedData:
         if self.attitude not in ATTITUDES:
             raise SettingError("data.attitude", f"must be one of {', '.join(ATTITUDES)}; got {self.attitude!r}")
 
-    def transitions(self, name: str, trajectory: Trajectory, subsystem: str) -> Transitions:
-        """Flies one subsystem; the inputs are those that acted, dither included.
+    check = staticmethod(check_quadrotor)
+
+    def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions:
+        """Flies the system; the inputs are those that acted, dither included.
+
+        The attitudes that the rotational one flies are those of a flight of ``translational()``.
 
         Raises:
-            SettingError: No such subsystem, negative dither or noise.
+            SettingError: The system is neither of the quadrotor's two, or there is no trajectory.
             SolverFailure: The controller's solver failed at the first step.
         """
-        if subsystem not in SUBSYSTEMS:
-            raise SettingError("subsystem", f"must be one of {', '.join(SUBSYSTEMS)}; got {subsystem!r}")
-        times = self.translational.plant.time_step * np.arange(self.samples + self.translational.horizon)
-        outer = self.translational.fly(states_along(trajectory, times), self.samples, self.seed)
-        if subsystem == "translational":
-            return transitions_of(outer, self.samples)
+        self.check(system, trajectory)
+        outer = system if system.name == "translational" else translational()
+        references = outer.reference_states(trajectory, self.samples + self.translational.horizon)
+        flight = self.translational.fly(outer, references, self.samples, self.seed)
+        if system is outer:
+            return transitions_of(flight, self.samples)
         streams = np.random.SeedSequence([self.seed, SUBSYSTEMS.index("rotational")])
-        angles = attitude_for_thrust_direction(outer.inputs[:, 1], outer.inputs[:, 2], self.attitude)
-        references = self._attitudes(angles, np.random.default_rng(streams))
+        angles = attitude_for_thrust_direction(flight.inputs[:, 1], flight.inputs[:, 2], self.attitude)
+        references = self._attitudes(angles, np.random.default_rng(streams), system.time_step)
         seed = int(streams.generate_state(1)[0])
-        return transitions_of(self.rotational.fly(references, self.samples, seed), self.samples)
+        return transitions_of(self.rotational.fly(system, references, self.samples, seed), self.samples)
 
-    def _attitudes(self, angles: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    def _attitudes(self, angles: np.ndarray, generator: np.random.Generator, time_step: float) -> np.ndarray:
         """Rotational states (samples + horizon, 6) that approach rows of ``angles`` (K, 2) [rad] one after another."""
         count = self.samples + self.rotational.horizon
         chosen = angles[generator.integers(len(angles), size=-(-count // self.hold))]
-        return approached(chosen, count, self.hold, self.rotational.plant.time_step, self.response_time)
+        return approached(chosen, count, self.hold, time_step, self.response_time)

@@ -6,59 +6,58 @@ the rotational one. ``PaperData`` reads the four files that the authors publishe
 trajectory and one subsystem at a time.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from gpmpc.exceptions import DataError, SettingError, check_number, check_numbers
-from gpmpc.gp import Scaling, Transitions
+from gpmpc.gp import Transitions
 from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.simulation import Rollout, closed_loop
-from gpmpc.systems import ATTITUDES, Plant, attitude_for_thrust_direction
+from gpmpc.systems import ATTITUDES, Plant, System, attitude_for_thrust_direction
 from gpmpc.trajectories import Trajectory
 
 SUBSYSTEMS = ("translational", "rotational")
 
 
-@dataclass(frozen=True)
-class Subsystem:
-    """Columns of a subsystem's data.
-
-    Attributes:
-        columns: Names of the columns x (n), u (m), x+ (n).
-        reported: The states whose variance is averaged in tables.
-        scaling: From columns (N, d) and their names to the scaling in whose units the model works.
+def check_quadrotor(system: System, trajectory: Trajectory | None) -> None:
+    """Raises unless the system is one of the quadrotor's two and there is a trajectory.
 
     Raises:
-        SettingError: A reported state that is no column.
+        SettingError: It is not, or there is none.
     """
-
-    columns: Sequence[str]
-    reported: Sequence[str]
-    scaling: Callable[[Tensor, Sequence[str]], Scaling]
-
-    def __post_init__(self) -> None:
-        for name in self.reported:
-            if name not in self.columns:
-                raise SettingError("reported", f"must be among {', '.join(self.columns)}; got {name!r}")
+    if system.name not in SUBSYSTEMS:
+        what = f"these data are of {' and '.join(SUBSYSTEMS)} alone; data=random is of any system"
+        raise SettingError("data", f"{what}; got {system.name!r}")
+    if trajectory is None:
+        raise SettingError("trajectory", "these data follow one; got none")
 
 
 class DataSource(Protocol):
-    """Transitions by the names of a trajectory and a subsystem."""
+    """Transitions of a system."""
 
     @property
     def note(self) -> str:
         """What a reader has to know who compares results on these data with the paper's."""
         ...
 
-    def transitions(self, name: str, trajectory: Trajectory, subsystem: str) -> Transitions:
-        """The transitions of one subsystem ("translational" or "rotational") along the trajectory called ``name``."""
+    def check(self, system: System, trajectory: Trajectory | None) -> None:
+        """Raises a ``SettingError`` where there are no such data of the system."""
+        ...
+
+    def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions:
+        """Returns transitions.
+
+        Args:
+            system: Whose they are; data that are flown are flown by it, unless their settings say otherwise.
+            trajectory: What it follows.
+            name: What the trajectory is called, which files are filed under.
+        """
         ...
 
 
@@ -121,25 +120,26 @@ class NMPCData:
         if self.attitude not in ATTITUDES:
             raise SettingError("data.attitude", f"must be one of {', '.join(ATTITUDES)}; got {self.attitude!r}")
 
-    def transitions(self, name: str, trajectory: Trajectory, subsystem: str) -> Transitions:
-        """Flies the trajectory, and for the rotational subsystem the attitude it asks for.
+    check = staticmethod(check_quadrotor)
+
+    def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions:
+        """Flies the trajectory by the plants of these settings, and for the rotational subsystem its attitude.
 
         Raises:
-            SettingError: No such subsystem.
+            SettingError: The system is neither of the quadrotor's two, or there is no trajectory.
             SolverFailure: The controller's solver failed.
         """
-        if subsystem not in SUBSYSTEMS:
-            raise SettingError("subsystem", f"must be one of {', '.join(SUBSYSTEMS)}; got {subsystem!r}")
+        self.check(system, trajectory)
         ahead = self.horizon  # the attitude's references reach this far beyond its last step
         outer = self._fly_translational(trajectory, self.samples + ahead)
-        if subsystem == "translational":
+        if system.name == "translational":
             return transitions_of(outer, self.samples)
         angles = attitude_for_thrust_direction(outer.inputs[:, 1], outer.inputs[:, 2], self.attitude)
         references = np.zeros((len(angles), 6))
         references[:, [0, 2]] = angles  # phi, theta; psi and the rates are to be zero
         return transitions_of(self.rotational.fly(references, self.horizon, self.samples), self.samples)
 
-    def _fly_translational(self, trajectory: Trajectory, steps: int) -> Rollout:
+    def _fly_translational(self, trajectory: Any, steps: int) -> Rollout:
         times = self.translational.plant.time_step * np.arange(steps + self.horizon)
         references = np.zeros((len(times), 6))
         references[:, ::2] = trajectory(times)  # x, y, z; the velocities are asked to be zero, with little weight
@@ -165,16 +165,17 @@ class PaperData:
         if not isinstance(self.folder, str | Path) or not Path(self.folder).is_dir():
             raise DataError(f"{self.folder}: no such folder; data.folder must hold the authors' four text files")
 
-    def transitions(self, name: str, trajectory: Trajectory, subsystem: str) -> Transitions:
+    check = staticmethod(check_quadrotor)
+
+    def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions:
         """Reads one file.
 
         Raises:
-            SettingError: No such subsystem.
+            SettingError: The system is neither of the quadrotor's two, or there is no trajectory.
             DataError: The file is missing, malformed, or shorter than ``samples``.
         """
-        if subsystem not in SUBSYSTEMS:
-            raise SettingError("subsystem", f"must be one of {', '.join(SUBSYSTEMS)}; got {subsystem!r}")
-        part = {"translational": "trans", "rotational": "rotate"}[subsystem]
+        self.check(system, trajectory)
+        part = {"translational": "trans", "rotational": "rotate"}[system.name]
         path = Path(self.folder) / f"ds_nmpc_{name.capitalize()}_{part}.txt"
         data = Transitions.from_text(path)
         if len(data) < self.samples:

@@ -266,23 +266,19 @@ class GPPosterior:
         total = weighted.sum(-1)[..., None, None] * torch.diag_embed(self.lengthscales[:, : self.state_dim] ** -2)
         return (weighted[..., None] * z).mT @ z - total
 
-    def variance_reduction(self, k: Tensor) -> Tensor:
+    def variance_reduction(self, k: Tensor, outputs: list[int] | slice = slice(None)) -> Tensor:
         """|L_a^-1 k_a|^2 (*batch, k) of correlations k (*batch, k, N): by how much the data reduce the variance.
 
         The batch goes to the right-hand side's columns: broadcast against it, L would be copied for every member.
         """
-        if k.dim() == 2:
-            return torch.linalg.solve_triangular(self.cholesky, k[..., None], upper=False)[..., 0].square().sum(-1)
-        columns = k.flatten(0, -3).movedim(0, -1)  # (k, N, batch)
-        squares = torch.linalg.solve_triangular(self.cholesky, columns, upper=False).square().sum(-2)
-        return squares.mT.unflatten(0, k.shape[:-2])
+        columns = k.unsqueeze(0).flatten(0, -3).movedim(0, -1)  # (k, N, batch)
+        squares = torch.linalg.solve_triangular(self.cholesky[outputs], columns, upper=False).square().sum(-2)
+        return squares.mT.reshape(k.shape[:-1])
 
     def solve(self, k: Tensor) -> Tensor:
         """(K_a + sn2_a I)^-1 k_a (*batch, k, N) of k (*batch, k, N); the batch becomes columns as above."""
-        if k.dim() == 2:
-            return torch.cholesky_solve(k[..., None], self.cholesky)[..., 0]
-        columns = k.flatten(0, -3).movedim(0, -1)  # (k, N, batch)
-        return torch.cholesky_solve(columns, self.cholesky).movedim(-1, 0).unflatten(0, k.shape[:-2])
+        columns = k.unsqueeze(0).flatten(0, -3).movedim(0, -1)  # (k, N, batch)
+        return torch.cholesky_solve(columns, self.cholesky).movedim(-1, 0).reshape(k.shape)
 
     def _correlations(self, state: Tensor, input: Tensor | None) -> tuple[Tensor, Tensor]:
         """k(x~_i, x~) (*batch, k, N) and (x~_i - x~) / l (*batch, k, N, d)."""

@@ -1,6 +1,6 @@
 """Predictions of Gaussian processes at certain and uncertain points with their derivatives, by compiled loops.
 
-``gpmpc.propagation.moment_matching`` states the mathematics and serves torch; here the closed forms and their first
+``gpmpc.propagation._moments`` states the mathematics and serves torch; here the closed forms and their first
 derivatives are evaluated for ``Packed`` arrays, on one thread. They belong to the k latent functions f of x~ = (x, u),
 with x ~ N(mu, S) and u certain; callers add the previous state, observation noise or a nearest semidefinite covariance.
 Every function but ``linearize`` takes one point, or H of them along a first dimension, which all results then have in
@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike
 
 from gpmpc.compiled import call_unchecked
 from gpmpc.exceptions import ShapeError
-from gpmpc.kernels import gp_moments, gp_moments_simd
 from gpmpc.kernels._packed import Array, Packed, pack
-from gpmpc.kernels.gp_moments import CROSS, JACOBIAN, VALUE
+from gpmpc.kernels.gp_moments import CROSS, JACOBIAN, VALUE, evaluate_moments
 from gpmpc.kernels.gp_point import expand_points, linearize_points
 
 __all__ = [
@@ -32,7 +31,7 @@ __all__ = [
 
 
 class Expansion(NamedTuple):
-    """f at a certain point (x, u); third derivatives are None where they were not asked for.
+    """f at a certain point (x, u).
 
     Attributes:
         M: The mean (k,).
@@ -43,8 +42,6 @@ class Expansion(NamedTuple):
         dvariance_du: (k, m).
         d2M_dx2: (k, n, n).
         d2M_dxdu: (k, n, m).
-        d3M_dx3: (k, n, n, n).
-        d3M_dx2du: (k, n, n, m).
     """
 
     M: Array
@@ -55,8 +52,6 @@ class Expansion(NamedTuple):
     dvariance_du: Array
     d2M_dx2: Array
     d2M_dxdu: Array
-    d3M_dx3: Array | None
-    d3M_dx2du: Array | None
 
 
 class Moments(NamedTuple):
@@ -127,25 +122,23 @@ def linearize(
     return M, A, B, V if covariance else None
 
 
-def point_with_jacobian(packed: Packed, x: ArrayLike, u: ArrayLike, hessian: bool = False) -> Expansion:
+def point_with_jacobian(packed: Packed, x: ArrayLike, u: ArrayLike) -> Expansion:
     """Mean and variance at a certain point, with the derivatives that linearised propagation needs.
 
     Args:
         packed: The GPs.
         x: State (n,) or (H, n).
         u: Control (m,) or (H, m).
-        hessian: Also gives third derivatives, for propagation to second order.
 
     Raises:
         ShapeError: x or u do not fit the model.
     """
     x, u, single = _points(packed, x, u)
     H, k, n, m = len(x), packed.output_dim, packed.state_dim, packed.input_dim
-    third = k if hessian else 0
-    shapes = [(k,), (k,), (k, n), (k, m), (k, n), (k, m), (k, n, n), (k, n, m), (third, n, n, n), (third, n, n, m)]
+    shapes = [(k,), (k,), (k, n), (k, m), (k, n), (k, m), (k, n, n), (k, n, m)]
     out = Expansion(*[np.empty((H, *shape)) for shape in shapes])
-    call_unchecked(expand_points, packed.arrays, packed.precision.inverse_cholesky, x, u, hessian, out)
-    return Expansion(*_computed(out, single, 10 if hessian else 8))
+    call_unchecked(expand_points, packed.arrays, packed.precision.inverse_cholesky, x, u, out)
+    return Expansion(*_computed(out, single, 8))
 
 
 def moments(
@@ -179,9 +172,9 @@ def moments_with_jacobian(
 
 
 def _moments(
-    packed: Packed, mu: ArrayLike, S: ArrayLike, u: ArrayLike, diagonal: bool, order: int, plain: bool = False
+    packed: Packed, mu: ArrayLike, S: ArrayLike, u: ArrayLike, diagonal: bool, order: int
 ) -> tuple[Moments, bool]:
-    """Moments with H in front, by the plain kernel or the fast one, and whether one belief was given."""
+    """Moments with H in front, and whether one belief was given."""
     mu, u, single = _points(packed, mu, u)
     S = np.array(S, dtype=np.float64, order="C", ndmin=3)
     H, k, n, m = len(mu), packed.output_dim, packed.state_dim, packed.input_dim
@@ -192,11 +185,7 @@ def _moments(
     first, second = (k if order >= JACOBIAN else 0), (k if order == CROSS else 0)
     shapes = [(k,), (k, k), (k, n), (first, n, n), (first, m), (first, k, n), (first, k, n, n), (first, k, m)]
     out = Moments(*[np.zeros((H, *shape)) for shape in [*shapes, (second, n, n, n), (second, n, m)]])
-    arguments = order, bool(diagonal), packed.arrays
-    if plain:
-        gp_moments.evaluate_moments(*arguments, packed.dense_precision, mu, S, u, out)
-    else:
-        call_unchecked(gp_moments_simd.evaluate_moments, *arguments, packed.precision, mu, S, u, out)
+    call_unchecked(evaluate_moments, order, bool(diagonal), packed.arrays, packed.precision, mu, S, u, out)
     return out, single
 
 

@@ -96,12 +96,6 @@ class Packed:
             centred.append(np.concatenate(blocks))
         return Precision(_aligned(np.stack(inverse)), _aligned(np.stack(centred)))
 
-    @property
-    def dense_precision(self) -> Array:
-        """(K + sn2 I)^-1 (k, N, N), for the plain moments."""
-        lower = [np.tril(scipy.linalg.lapack.dpotri(factor, lower=1)[0]) for factor in self.cholesky]
-        return np.stack([triangle + np.tril(triangle, -1).T for triangle in lower])
-
     def _centred_square(self, a: int) -> Array:
         padded, size = self.arrays.points.shape[1], self.arrays.size
         precision, _ = scipy.linalg.lapack.dpotri(self.cholesky[a], lower=1)  # the lower triangle

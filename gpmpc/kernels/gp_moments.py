@@ -1,131 +1,397 @@
-r"""The exact moments of k GPs at uncertain states x ~ N(mu, S) and their first derivatives: the specification.
+r"""The exact moments of k GPs at uncertain states x ~ N(mu, S) and their first derivatives, with explicit vectors.
 
-Letters as in ``gpmpc.propagation.moment_matching``: D_a = 1 / l_a^2 of the states, z_ai = D_a (x_i - mu),
-
-    G_a  = (I + S D_a)^-1                q_ai = E[k_a(x, x_i)]
-    G_ab = (I + S (D_a + D_b))^-1        Q_ij = E[k_a(x, x_i) k_b(x, x_j)] = q_ai q_bj exp(delta_ij)
-
-    M_a  = sum_i beta_ai q_ai
-    V_ab = sum_ij beta_ai beta_bj q_ai q_bj expm1(delta_ij)                       for a != b
-    V_aa = sf2_a - q_a' (K_a + sn2_a I)^-1 q_a + sum_ij E_ij q_ai q_aj expm1(delta_ij),
-    E    = beta_a beta_a' - (K_a + sn2_a I)^-1
-
-With J = E[df/dx] = dM/dmu (Stein, 1981) Cov[x, f] = S J', and dM/dS = 1/2 d2M/dmu2 (Price, 1958). Exponents change by
+Specification: ``gpmpc.propagation._moments``, whose letters these are. (Without explicit vectors the loops take four
+times as long.) With c_ai = D_a (u_i - u) of the controls and G_ab = (I + S (D_a + D_b))^-1, exponents change by
 
     dlog q_ai = w_ai . dmu + 1/2 <w_ai w_ai' - G_a' D_a, dS> + c_ai . du,                  w_ai = G_a' z_ai
     dlog Q_ij = y_ij . dmu + 1/2 <y_ij y_ij' - G_ab' (D_a + D_b), dS> + (c_ai + c_bj) . du,
-    y_ij = y_ai + y_bj,  y_ai = G_ab' z_ai = w_ai + f_ai,  f_ai = F_a z_ai,  F_a = G_ab' - G_a' = -G_ab' D_b G_a S
+    y_ij = y_ai + y_bj,  y_ai = G_ab' z_ai = w_ai + F_a z_ai,  F_a = G_ab' - G_a' = -G_ab' D_b G_a S
+    dV_ab = sum_ij P_ij dlog Q_ij + U_ij d(log Q_ij - log q_ai - log q_bj),   P_ij = U_ij expm1(delta_ij)
 
-The sums are written as they stand here: one pair of points after the other, in arrays that no cache plan has touched.
-``gpmpc.kernels.gp_moments_simd`` computes the same behind the same signature, some fifty times faster.
+with U_ij = beta_ai beta_bj q_ai q_bj, or E_ij q_ai q_aj, E = beta_a beta_a' - (K_a + sn2_a I)^-1, for a = b. One pass
+over the N^2 pairs of points of a pair of outputs collects row sums p_i, column sums p_j and g_j = sum_i R_ij z_ai of
+
+    P_ij = weight_i weight_j expm1(delta_ij),   delta_ij = rise_i + fall_j + left_i . z_bj,   left_i = T_ab z_ai
+
+with weights beta q and R = P for a != b, where the rest of the sum is a product of single sums. For a = b the weights
+are q, P_ij has the factor E_ij and runs over i >= j, and R = E q q exp(delta). Derivatives are algebra on the sums.
+Four rows i meet sixteen columns j in registers: eight independent chains are what two multiply-adds per cycle with a
+latency of four ask for. From delta = 300 on a pair counts for nothing, and the exponent may stay there. Where a bound
+says that delta is small for all pairs, as for beliefs that are narrow beside the length-scales, expm1 needs no
+reduction, a quarter of all instructions.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy import ndarray
 
-from gpmpc.compiled import compiled, njit_inner
-from gpmpc.kernels.linalg import condition
+from gpmpc.compiled import compiled, inline_njit, njit_inner, njit_noalloc
+from gpmpc.kernels._rows import (
+    add_products,
+    largest_size,
+    largest_square,
+    multiply,
+    project,
+    reduce_variance,
+    row_sum,
+    second_moments,
+    transform,
+)
+from gpmpc.kernels._simd import NEAR_ZERO, exp, expm1, expm1_near_zero, load, store, total, use_widest_registers, zeros
+from gpmpc.kernels.linalg import (
+    add_product,
+    aligned_rows,
+    condition,
+    congruence,
+    multiply_transposed,
+    product,
+    symmetrize,
+)
 
 VALUE, JACOBIAN, CROSS = 0, 1, 2  # derivatives of nothing, of M and V, of J as well
 
 
+class _Belief(NamedTuple):
+    """A belief, and the points relative to its mean and input."""
+
+    S: ndarray  # (n, n)
+    x: ndarray  # x_i - mu (n, P)
+    u: ndarray  # u_i - u (m, P)
+
+
+class _OutputTerms(NamedTuple):
+    """What each output has alone: vectors over the points, matrices, and sums over the points."""
+
+    z: ndarray  # (k, n, P)
+    Tz: ndarray  # T_a z_ai (k, n, P)
+    q: ndarray  # (k, P)
+    weighted: ndarray  # beta q (k, P)
+    G: ndarray  # (k, n, n)
+    T: ndarray  # (k, n, n)
+    half_logdet: ndarray  # 1/2 log|I + S D_a| (k,)
+    M: ndarray  # sum_i beta_i q_i (k,)
+    first: ndarray  # sum_i beta_i q_i z_i (k, n)
+    second: ndarray  # sum_i beta_i q_i z_i z_i' (k, n, n)
+    e: ndarray  # sum_i e_i (k,), e_i = q_i [(K + sn2 I)^-1 q]_i
+    e_first: ndarray  # sum_i e_i z_i (k, n)
+    e_second: ndarray  # sum_i e_i z_i z_i' (k, n, n)
+
+
+class _PairTerms(NamedTuple):
+    """What the sum over pairs of points reads, and the sums."""
+
+    rise: ndarray  # (P,)
+    fall: ndarray  # (P,)
+    left: ndarray  # (n, P)
+    weighted_z: ndarray  # weight_i z_i (n, P)
+    p_i: ndarray  # row sums (P,)
+    p_j: ndarray  # column sums (P,)
+    g: ndarray  # (n, P)
+
+
+class _Scratch(NamedTuple):
+    """Memory to work in: matrices (n, n) and rows (P,)."""
+
+    G_ab: ndarray
+    F: ndarray
+    x: ndarray
+    y: ndarray
+    H: ndarray
+    row: ndarray
+    other: ndarray
+
+
 @compiled
 def evaluate_moments(order, diagonal, gp, precision, mu, S, u, out):
-    """Writes the arrays of ``gpmpc.kernels.Moments`` at H beliefs.
+    """Writes the arrays of ``gpmpc.kernels.Moments`` at mu (H, n), S (H, n, n) and u (H, m).
 
-    Args:
-        order: ``VALUE``, ``JACOBIAN`` or ``CROSS``.
-        diagonal: Leaves the covariances between outputs at zero.
-        gp: ``GPArrays``.
-        precision: (K_a + sn2_a I)^-1 (k, N, N).
-        mu: (H, n).
-        S: (H, n, n).
-        u: (H, m).
-        out: The arrays, full of zeros; empty where ``order`` does not ask for them.
+    ``order`` is ``VALUE``, ``JACOBIAN`` or ``CROSS``; the arrays of ``out`` are full of zeros, or empty beyond that.
     """
-    n, k, N = mu.shape[1], len(gp.weights), gp.size
-    whiten, G_ab = np.empty((n, n)), np.empty((n, n))
+    use_widest_registers()
+    (k, padded), n, m = gp.weights.shape, mu.shape[1], u.shape[1]
+    rows = aligned_rows(n + m + 2, padded)
+    terms, pair = _make_terms(k, n, padded)
+    matrices = np.empty((5, n, n))
+    scratch = _Scratch(matrices[0], matrices[1], matrices[2], matrices[3], matrices[4], rows[n + m], rows[n + m + 1])
     for h in range(len(mu)):
-        x = np.ascontiguousarray(gp.points[:n, :N].T) - mu[h]
-        v = np.ascontiguousarray(gp.points[n:, :N].T) - u[h]
-        z, w, c = np.empty((k, N, n)), np.empty((k, N, n)), np.empty((k, N, len(u[h])))
-        q, G, half_logdet = np.empty((k, N)), np.empty((k, n, n)), np.empty(k)
+        belief = _Belief(S[h], rows[:n], rows[n : n + m])
+        for d in range(n + m):
+            at, row, point = mu[h, d] if d < n else u[h, d - n], rows[d], gp.points[d]
+            for j in range(padded):
+                row[j] = point[j] - at
         for a in range(k):
-            D, D_u = gp.inverse_squares[a, :n], gp.inverse_squares[a, n:]
-            # log q_ai = log sf2 - 1/2 log|I + S D| - 1/2 (x_i - mu)' D G (x_i - mu) - 1/2 (u_i - u)' D_u (u_i - u)
-            half_logdet[a] = condition(S[h], D, whiten, G[a])
-            z[a], c[a] = x * D, v * D_u
-            w[a] = z[a] @ G[a]
-            for i in range(N):
-                exponent = (w[a, i] * x[i]).sum() + (c[a, i] * v[i]).sum()
-                q[a, i] = math.exp(gp.log_signal[a] - half_logdet[a] - exponent / 2)
-            # M = sum beta q,   dM = sum beta q dlog q
-            weighted = gp.weights[a, :N] * q[a]
-            M = out.M[h, a] = weighted.sum()
-            for i in range(N):
-                out.J[h, a] += weighted[i] * w[a, i]
-            if order < JACOBIAN:
-                continue
-            GD = _symmetric(G[a].T * D)
-            for i in range(N):
-                out.dM_dS[h, a] += weighted[i] / 2 * np.outer(w[a, i], w[a, i])
-                out.dM_du[h, a] += weighted[i] * c[a, i]
-            out.dM_dS[h, a] -= M / 2 * GD
-            # dJ/dS = 1/2 sum beta q (w w w - three times G'D with w),   dJ/du = sum beta q w c'
-            for e in range(n if order == CROSS else 0):
-                J = out.J[h, a]
-                for i in range(N):
-                    out.dJ_dS[h, a, e] += weighted[i] * w[a, i, e] / 2 * np.outer(w[a, i], w[a, i])
-                    out.dJ_du[h, a, e] += weighted[i] * w[a, i, e] * c[a, i]
-                out.dJ_dS[h, a, e] -= (J[e] * GD + np.outer(GD[e], J) + np.outer(J, GD[e])) / 2
-
+            _evaluate_output(belief, gp, a, terms, scratch)
+            out.M[h, a] = terms.M[a]
+            multiply_transposed(terms.G[a], terms.first[a], out.J[h, a])
+            if order >= JACOBIAN:
+                to, sums = (out.J[h, a], out.dM_dS[h, a], out.dM_du[h, a]), (terms.first[a], terms.second[a])
+                _differentiate_sum(terms.weighted[a], 1.0, belief, gp, a, terms, *sums, scratch, to)
+            if order == CROSS:
+                _differentiate_J(belief, gp, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a])
         for a in range(k):
+            reduction = reduce_variance(precision.inverse_cholesky[a], terms.q[a], scratch.row)
+            out.V[h, a, a] = np.exp(gp.log_signal[a]) - reduction
+            if order >= JACOBIAN:
+                to, sums = (
+                    (out.dV_dmu[h, a, a], out.dV_dS[h, a, a], out.dV_du[h, a, a]),
+                    (terms.e_first[a], terms.e_second[a]),
+                )
+                multiply(scratch.row, terms.q[a], scratch.row)  # (K_a + sn2_a I)^-1 q_a becomes e
+                terms.e[a] = _differentiate_sum(scratch.row, -2.0, belief, gp, a, terms, *sums, scratch, to)
             for b in range(a, a + 1 if diagonal else k):
-                D_a, D_b = gp.inverse_squares[a, :n], gp.inverse_squares[b, :n]
-                r = half_logdet[a] + half_logdet[b] - condition(S[h], D_a + D_b, whiten, G_ab)
-                T_a, T_b, T_ab = G[a] @ S[h], G[b] @ S[h], G_ab @ S[h]
-                F_a, F_b = -(G_ab.T * D_b) @ T_a, -(G_ab.T * D_a) @ T_b
-                f_a, f_b, y_a, y_b = z[a] @ F_a.T, z[b] @ F_b.T, z[a] @ G_ab, z[b] @ G_ab
-                GD_ab, FD = G_ab.T * (D_a + D_b), F_a * D_a + F_b * D_b
-                # delta_ij = rise_i + fall_j + z_ai' T_ab z_bj: a difference of logarithms, so that nothing cancels
-                rise = r - ((z[a] @ T_ab * D_b) * (z[a] @ T_a)).sum(1) / 2
-                fall = -((z[b] @ T_ab * D_a) * (z[b] @ T_b)).sum(1) / 2
-                across = (z[a] @ T_ab) @ z[b].T
-                dV_dmu, dV_dS, dV_du = np.zeros(n), np.zeros((n, n)), np.zeros(len(u[h]))
-                total = 0.0
-                for i in range(N):
-                    for j in range(N):
-                        U = gp.weights[a, i] * gp.weights[b, j] * q[a, i] * q[b, j]
-                        if a == b:
-                            U -= precision[a, i, j] * q[a, i] * q[a, j]
-                        # from delta = 300 on Q_ij is below 1e-130 sf2_a sf2_b: the exponent may stay there
-                        P = U * math.expm1(min(rise[i] + fall[j] + across[i, j], 300.0))
-                        total += P
-                        if order < JACOBIAN:
-                            continue
-                        # dV = sum P dlog Q + sum U d(log Q - log q - log q)
-                        y = y_a[i] + y_b[j]
-                        dV_dmu += P * y + U * (f_a[i] + f_b[j])
-                        dV_du += P * (c[a, i] + c[b, j])
-                        difference = np.outer(f_a[i], y_a[i]) + np.outer(w[a, i], f_a[i]) + np.outer(y_a[i], y_b[j])
-                        difference += np.outer(f_b[j], y_b[j]) + np.outer(w[b, j], f_b[j]) + np.outer(y_b[j], y_a[i])
-                        dV_dS += P / 2 * (np.outer(y, y) - GD_ab) + U / 2 * (difference - FD)
-                if a == b:
-                    # dV_aa = -2 sum_i e_i dlog q_ai,   e_i = q_ai [(K_a + sn2_a I)^-1 q_a]_i
-                    e = q[a] * (precision[a] @ q[a])
-                    total += math.exp(gp.log_signal[a]) - e.sum()
-                    for i in range(N if order >= JACOBIAN else 0):
-                        dV_dmu -= 2 * e[i] * w[a, i]
-                        dV_dS -= e[i] * (np.outer(w[a, i], w[a, i]) - G[a].T * D_a)
-                        dV_du -= 2 * e[i] * c[a, i]
-                for s, t in ((a, b), (b, a)):
-                    out.V[h, s, t] = total
-                    if order >= JACOBIAN:
-                        out.dV_dmu[h, s, t], out.dV_du[h, s, t] = dV_dmu, dV_du
-                        out.dV_dS[h, s, t] = _symmetric(dV_dS)
+                P_sum = _evaluate_pair(belief, gp, a, b, terms, pair, precision.centred[a], order >= JACOBIAN, scratch)
+                out.V[h, a, b] += P_sum
+                out.V[h, b, a] = out.V[h, a, b]
+                if order >= JACOBIAN:
+                    to = out.dV_dmu[h, a, b], out.dV_dS[h, a, b], out.dV_du[h, a, b]
+                    _differentiate_pair(belief, gp, a, b, terms, pair, P_sum, scratch, to)
+                    out.dV_dmu[h, b, a], out.dV_dS[h, b, a], out.dV_du[h, b, a] = to
 
 
 @njit_inner
-def _symmetric(A):
-    return (A + A.T) / 2
+def _make_terms(k, n, padded):
+    vectors, rows = aligned_rows(2 * k * n, padded).reshape(2, k, n, padded), aligned_rows(2 * k, padded)
+    squares, sums, numbers = np.zeros((4, k, n, n)), np.zeros((2, k, n)), np.zeros((3, k))
+    G, T, second, e_second = squares[0], squares[1], squares[2], squares[3]
+    single = vectors[0], vectors[1], rows[:k], rows[k:], G, T, numbers[0], numbers[1]
+    pair = aligned_rows(3 * n + 4, padded)
+    blocks = pair[4 : 4 + n], pair[4 + n : 4 + 2 * n], pair[2], pair[3], pair[4 + 2 * n :]
+    return _OutputTerms(*single, sums[0], second, numbers[2], sums[1], e_second), _PairTerms(pair[0], pair[1], *blocks)
+
+
+@njit_inner
+def _evaluate_output(belief, gp, a, terms, scratch):
+    """Fills the terms of output a, but for ``second`` and the sums over e."""
+    use_widest_registers()
+    n, log_q, whiten = len(belief.S), scratch.row, scratch.x
+    D, D_u = gp.inverse_squares[a, :n], gp.inverse_squares[a, n:]
+    # log q_i = log sf2 - 1/2 log|I + S D| - 1/2 |W (x_i - mu)|^2 - 1/2 (u_i - u)' D_u (u_i - u)
+    terms.half_logdet[a] = condition(belief.S, D, whiten, terms.G[a])
+    log_q[:] = gp.log_signal[a] - terms.half_logdet[a]
+    transform(whiten, belief.x, terms.Tz[a])
+    add_products(np.full(n, -0.5), terms.Tz[a], terms.Tz[a], log_q)
+    add_products(D_u * -0.5, belief.u, belief.u, log_q)
+    for j in range(0, len(log_q), 8):
+        store(terms.q[a], j, exp(load(log_q, j)))
+    multiply(gp.weights[a], terms.q[a], terms.weighted[a])
+    terms.M[a] = row_sum(terms.weighted[a])
+    product(terms.G[a], belief.S, terms.T[a])
+    symmetrize(terms.T[a])
+    for d in range(n):
+        z, x = terms.z[a, d], belief.x[d]
+        for j in range(len(z)):
+            z[j] = D[d] * x[j]
+    transform(terms.T[a], terms.z[a], terms.Tz[a])
+    project(terms.weighted[a], terms.z[a], terms.first[a])
+
+
+@njit_noalloc
+def _differentiate_sum(v, factor, belief, gp, a, terms, first, second, scratch, to):
+    """Writes ``factor`` sum_i v_i dlog q_ai; fills the sums of v_i z_i and v_i z_i z_i', and returns that of v_i."""
+    dmu, dS, du = to
+    n, total, G, D, x = len(belief.S), row_sum(v), terms.G[a], gp.inverse_squares[a], scratch.x
+    project(v, terms.z[a], first)
+    project(v, belief.u, du)
+    second_moments(v, terms.z[a], scratch.other, second)
+    congruence(G, second, scratch.y, x)
+    multiply_transposed(G, first, dmu)
+    for c in range(n):
+        dmu[c] *= factor
+        for d in range(c + 1):
+            value = factor * (x[c, d] + x[d, c] - total * (G[d, c] * D[d] + G[c, d] * D[c])) / 4
+            dS[c, d] = dS[d, c] = value
+    for c in range(len(du)):
+        du[c] *= factor * D[n + c]
+    return total
+
+
+@njit_inner
+def _differentiate_J(belief, gp, a, terms, J, dJ_dS, dJ_du):
+    """dJ/dS = 1/2 sum beta q (w w w - three times G'D with w), dJ/du = sum beta q w c'."""
+    (n, padded), G, D = belief.x.shape, terms.G[a], gp.inverse_squares[a]
+    w, work, sums, A = aligned_rows(n, padded), aligned_rows(2, padded), np.empty(n), np.empty((n, n))
+    for c in range(n):
+        for d in range(n):
+            A[c, d] = G[d, c] * D[d]
+    transform(np.ascontiguousarray(G.T), terms.z[a], w)
+    for c in range(n):
+        multiply(terms.weighted[a], w[c], work[0])
+        project(work[0], belief.u, dJ_du[c])
+        for d in range(len(belief.u)):
+            dJ_du[c, d] *= D[n + d]
+        for d in range(c + 1):
+            multiply(work[0], w[d], work[1])
+            project(work[1], w, sums)
+            for e in range(d + 1):
+                value = (sums[e] - A[c, d] * J[e] - A[c, e] * J[d] - A[d, e] * J[c]) / 2
+                dJ_dS[c, d, e] = dJ_dS[c, e, d] = dJ_dS[d, c, e] = value
+                dJ_dS[d, e, c] = dJ_dS[e, c, d] = dJ_dS[e, d, c] = value
+
+
+@njit_inner
+def _evaluate_pair(belief, gp, a, b, terms, pair, E, derivatives, scratch):
+    """Returns sum_ij P_ij; its parts go to ``pair``, G_ab to ``scratch``."""
+    n, T_ab, whiten = len(belief.S), scratch.F, scratch.x
+    D_a, D_b = gp.inverse_squares[a, :n], gp.inverse_squares[b, :n]
+    r = terms.half_logdet[a] + terms.half_logdet[b] - condition(belief.S, D_a + D_b, whiten, scratch.G_ab)
+    product(scratch.G_ab, belief.S, T_ab)
+    symmetrize(T_ab)
+    # rise_i = r - 1/2 z_ai' T_ab D_b T_a z_ai,   fall_j = -1/2 z_bj' T_ab D_a T_b z_bj
+    pair.fall[:] = 0.0
+    transform(T_ab, terms.z[b], pair.left)
+    add_products(D_a * -0.5, pair.left, terms.Tz[b], pair.fall)
+    pair.rise[:] = r
+    transform(T_ab, terms.z[a], pair.left)
+    add_products(D_b * -0.5, pair.left, terms.Tz[a], pair.rise)
+    weights_i, weights_j = (terms.q[a], terms.q[b]) if a == b else (terms.weighted[a], terms.weighted[b])
+    for d in range(n):
+        multiply(weights_i, terms.z[a, d], pair.weighted_z[d])
+    across = math.sqrt(largest_square(pair.left) * largest_square(terms.z[b]))  # Cauchy and Schwarz
+    near = largest_size(pair.rise) + largest_size(pair.fall) + across <= NEAR_ZERO
+    _sum_pairs(gp.size, a == b, near, derivatives, pair, weights_i, weights_j, terms.z[b], E)
+    multiply(pair.p_i, weights_i, pair.p_i)
+    multiply(pair.p_j, weights_j, pair.p_j)
+    if derivatives:
+        for d in range(n):
+            multiply(pair.g[d], weights_j, pair.g[d])
+    return row_sum(pair.p_j)
+
+
+@njit_noalloc
+def _sum_pairs(size, same, near, derivatives, pair, weights_i, weights_j, z, E):
+    """Writes the sums over i and j of ``pair`` before they are multiplied by the weight of their own point."""
+    use_widest_registers()
+    n, padded = z.shape
+    pair.p_j[:] = 0.0
+    if derivatives:
+        pair.p_i[:], pair.g[:] = 0.0, 0.0
+    at = 0
+    for i in range(0, size, 4):
+        w0, w1, w2, w3 = weights_i[i], weights_i[i + 1], weights_i[i + 2], weights_i[i + 3]
+        s0 = s1 = s2 = s3 = zeros()
+        for j in range(0, i // 16 * 16 + 16 if same else padded, 16):
+            P = _expm1_of_block(near, pair.rise, pair.fall, pair.left, z, i, j)
+            if same:
+                R, P = _multiply_block(P, E, at)
+                at += 64
+            else:
+                R = P
+            (a0, b0), (a1, b1), (a2, b2), (a3, b3) = P
+            store(pair.p_j, j, load(pair.p_j, j) + w0 * a0 + w1 * a1 + w2 * a2 + w3 * a3)
+            store(pair.p_j, j + 8, load(pair.p_j, j + 8) + w0 * b0 + w1 * b1 + w2 * b2 + w3 * b3)
+            if derivatives:
+                u, v = load(weights_j, j), load(weights_j, j + 8)
+                s0, s1 = s0 + a0 * u + b0 * v, s1 + a1 * u + b1 * v
+                s2, s3 = s2 + a2 * u + b2 * v, s3 + a3 * u + b3 * v
+                (a0, b0), (a1, b1), (a2, b2), (a3, b3) = R
+                for d in range(n):
+                    g, y = pair.g[d], pair.weighted_z[d]
+                    y0, y1, y2, y3 = y[i], y[i + 1], y[i + 2], y[i + 3]
+                    store(g, j, load(g, j) + y0 * a0 + y1 * a1 + y2 * a2 + y3 * a3)
+                    store(g, j + 8, load(g, j + 8) + y0 * b0 + y1 * b1 + y2 * b2 + y3 * b3)
+        if derivatives:
+            pair.p_i[i], pair.p_i[i + 1], pair.p_i[i + 2], pair.p_i[i + 3] = total(s0), total(s1), total(s2), total(s3)
+
+
+@inline_njit
+def _expm1_of_block(near, rise, fall, left, z, i, j):
+    """expm1(delta) of the rows from i and the columns from j on."""
+    a, b = load(fall, j), load(fall, j + 8)
+    a0, a1, a2, a3 = a + rise[i], a + rise[i + 1], a + rise[i + 2], a + rise[i + 3]
+    b0, b1, b2, b3 = b + rise[i], b + rise[i + 1], b + rise[i + 2], b + rise[i + 3]
+    for d in range(len(z)):
+        a, b, x = load(z[d], j), load(z[d], j + 8), left[d]
+        a0, a1, a2, a3 = a0 + x[i] * a, a1 + x[i + 1] * a, a2 + x[i + 2] * a, a3 + x[i + 3] * a
+        b0, b1, b2, b3 = b0 + x[i] * b, b1 + x[i + 1] * b, b2 + x[i + 2] * b, b3 + x[i + 3] * b
+    if near:
+        a0, a1, a2, a3 = expm1_near_zero(a0), expm1_near_zero(a1), expm1_near_zero(a2), expm1_near_zero(a3)
+        b0, b1, b2, b3 = expm1_near_zero(b0), expm1_near_zero(b1), expm1_near_zero(b2), expm1_near_zero(b3)
+    else:
+        a0, a1, a2, a3 = expm1(a0), expm1(a1), expm1(a2), expm1(a3)
+        b0, b1, b2, b3 = expm1(b0), expm1(b1), expm1(b2), expm1(b3)
+    return (a0, b0), (a1, b1), (a2, b2), (a3, b3)
+
+
+@inline_njit
+def _multiply_block(values, E, at):
+    """E exp(delta) and E expm1(delta), from expm1(delta); ``at`` is where E of these rows and columns stands."""
+    (a0, b0), (a1, b1), (a2, b2), (a3, b3) = values
+    e0, e1, e2, e3 = load(E, at), load(E, at + 16), load(E, at + 32), load(E, at + 48)
+    f0, f1, f2, f3 = load(E, at + 8), load(E, at + 24), load(E, at + 40), load(E, at + 56)
+    a0, a1, a2, a3 = a0 * e0, a1 * e1, a2 * e2, a3 * e3
+    b0, b1, b2, b3 = b0 * f0, b1 * f1, b2 * f2, b3 * f3
+    P = (a0, b0), (a1, b1), (a2, b2), (a3, b3)
+    return ((a0 + e0, b0 + f0), (a1 + e1, b1 + f1), (a2 + e2, b2 + f2), (a3 + e3, b3 + f3)), P
+
+
+@njit_inner
+def _differentiate_pair(belief, gp, a, b, terms, pair, P_sum, scratch, to):
+    """Adds the derivatives of the pair's sum to those of V_ab."""
+    dmu, dS, du = to
+    n, same = len(belief.S), a == b
+    G_ab, x, y, H = scratch.G_ab, scratch.x, scratch.y, scratch.H
+    D_a, D_b = gp.inverse_squares[a], gp.inverse_squares[b]
+    sums, controls = np.empty((2, n)), np.empty((2, len(du)))
+    # y = sum_ij P_ij (z_ai + z_bj) (z_ai + z_bj)' + U_ij (z_ai z_bj' + z_bj z_ai')
+    second_moments(pair.p_i, terms.z[a], scratch.row, x)
+    second_moments(pair.p_j, terms.z[b], scratch.row, y)
+    for c in range(n):
+        project(pair.g[c], terms.z[b], H[c])
+        for d in range(n if not same else 0):  # in g of a = b is R, not P
+            H[c, d] += terms.first[a, c] * terms.first[b, d]
+    for c in range(n):
+        for d in range(n):
+            y[c, d] += x[c, d] + H[c, d] + H[d, c]
+    congruence(G_ab, y, x, H)
+    # dmu: sum_ij P_ij y_ij
+    project(pair.p_i, terms.z[a], sums[0])
+    project(pair.p_j, terms.z[b], sums[1])
+    for c in range(n):
+        sums[0, c] += sums[1, c]
+    multiply_transposed(G_ab, sums[0], sums[1])
+    for c in range(n):
+        dmu[c] += sums[1, c]
+        for d in range(n):
+            H[c, d] -= P_sum * G_ab[d, c] * (D_a[d] + D_b[d])
+    # U_ij = beta_ai beta_bj q_ai q_bj, or E_ij q_ai q_aj: what F_a and F_b make of the sums of each output alone
+    e_share = 1.0 if same else 0.0
+    U_sum = terms.M[a] * terms.M[b] - e_share * terms.e[a]
+    _add_difference(dmu, H, terms, a, U_sum, terms.M[b], e_share, D_a, D_b, scratch)
+    _add_difference(dmu, H, terms, b, U_sum, terms.M[a], e_share, D_b, D_a, scratch)
+    project(pair.p_i, belief.u, controls[0])
+    project(pair.p_j, belief.u, controls[1])
+    for c in range(len(du)):
+        du[c] += controls[0, c] * D_a[n + c] + controls[1, c] * D_b[n + c]
+    for c in range(n):
+        for d in range(c + 1):
+            value = dS[c, d] + (H[c, d] + H[d, c]) / 4
+            dS[c, d] = dS[d, c] = value
+
+
+@njit_noalloc
+def _add_difference(dmu, dS, terms, a, U_sum, M, e_share, D, D_other, scratch):
+    """Adds sum_i U_i F z_i to dmu and sum_i U_i (y_i y_i' - w_i w_i') - sum_ij U_ij F D to dS, F = G_ab' - G_a'.
+
+    U_i = sum_j U_ij = M beta_i q_i - e_share e_i, y_i = G_ab' z_i, w_i = G_a' z_i.
+    """
+    F, moment, x, G_a, G_ab = scratch.F, scratch.y, scratch.x, terms.G[a], scratch.G_ab
+    n = len(F)
+    for c in range(n):
+        for d in range(n):
+            F[c, d] = 0.0
+            for e in range(n):
+                F[c, d] -= G_ab[e, c] * D_other[e] * terms.T[a, e, d]
+            moment[c, d] = M * terms.second[a, c, d] - e_share * terms.e_second[a, c, d]
+    for c in range(n):
+        for d in range(n):
+            dmu[c] += F[c, d] * (M * terms.first[a, d] - e_share * terms.e_first[a, d])
+            dS[c, d] -= U_sum * F[c, d] * D[d]
+    # G_ab' X G_ab - G_a' X G_a = F X G_ab + (F X G_a)'
+    product(F, moment, x)
+    add_product(x, G_ab, dS)
+    product(x, G_a, moment)
+    for c in range(n):
+        for d in range(n):
+            dS[c, d] += moment[d, c]

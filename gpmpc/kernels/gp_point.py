@@ -5,7 +5,7 @@
 With z_i = D_a (x~_i - x~), over states and inputs together, dk_i = k_i z_i and every derivative of M is a moment of z
 under the weights beta_ai k_ai (Rasmussen and Williams, 2006, eqs. (2.25)-(2.26), differentiated):
 
-    dM = sum beta k z,   d2M = sum beta k (z z' - D),   d3M = sum beta k (z z z - three times D with z)
+    dM = sum beta k z,   d2M = sum beta k (z z' - D)
     dvar = -2 sum_i [(K_a + sn2_a I)^-1 k_a]_i k_i z_i
 
 The moments are summed over x~_i - x~, which all outputs share, and scaled by D_a afterwards.
@@ -99,14 +99,14 @@ def linearize_points(gp, columns, outer, x, u, memory, out):
 
 
 @compiled
-def expand_points(gp, inverse_cholesky, x, u, third, out):
-    """Writes the arrays of ``gpmpc.kernels.Expansion`` at K points; the third derivatives only if ``third``."""
+def expand_points(gp, inverse_cholesky, x, u, out):
+    """Writes the arrays of ``gpmpc.kernels.Expansion`` at K points."""
     use_widest_registers()
     d, (K, n) = len(gp.points), x.shape
     padded = gp.points.shape[1]
-    memory = aligned_rows(2 * d + 5, padded)
+    memory = aligned_rows(2 * d + 4, padded)
     offsets, squares, k, weighted = memory[:d], memory[d : 2 * d], memory[2 * d], memory[2 * d + 1]
-    solved, once, twice = memory[2 * d + 2], memory[2 * d + 3], memory[2 * d + 4]
+    solved, once = memory[2 * d + 2], memory[2 * d + 3]
     sums, moment = np.empty(d), np.empty(d)
     for h in range(K):
         _write_offsets(gp.points, x[h], u[h], offsets, squares)
@@ -137,24 +137,3 @@ def expand_points(gp, inverse_cholesky, x, u, third, out):
                     out.d2M_dx2[h, a, c, e] = D[c] * D[e] * moment[e] - (D[c] * out.M[h, a] if c == e else 0.0)
                 for e in range(n, d):
                     out.d2M_dxdu[h, a, c, e - n] = D[c] * D[e] * moment[e]
-                if third:
-                    for e in range(c + 1):
-                        multiply(once, offsets[e], twice)
-                        project(twice, offsets, moment)
-                        _write_third(h, a, c, e, D, sums, moment, out)
-
-
-@njit_noalloc
-def _write_third(h, a, c, e, D, dM, moment, out):
-    """Writes d3M = sum beta k (z z z - three times D with z) of the states c and e with all states and inputs."""
-    n = out.J.shape[2]
-    third, third_u = out.d3M_dx3[h, a], out.d3M_dx2du[h, a]
-    for f in range(n):
-        value = D[c] * D[e] * D[f] * moment[f]
-        value -= D[c] * dM[f] if c == e else 0.0
-        value -= D[c] * dM[e] if c == f else 0.0
-        value -= D[e] * dM[c] if e == f else 0.0
-        third[c, e, f] = third[e, c, f] = value
-    for f in range(n, len(D)):
-        value = D[c] * D[e] * D[f] * moment[f] - (D[c] * dM[f] if c == e else 0.0)
-        third_u[c, e, f - n] = third_u[e, c, f - n] = value

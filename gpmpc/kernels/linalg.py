@@ -1,6 +1,6 @@
 """Dense linear algebra for compiled loops: small vectors and matrices, for which a library call costs too much.
 
-All but ``aligned`` and ``square_root`` write into arrays of their caller and allocate nothing. Sizes come from the
+All but ``aligned_rows`` write into arrays of their caller and allocate nothing. Sizes come from the
 arrays; where rows are padded, a caller passes the number of entries that count.
 """
 
@@ -13,17 +13,11 @@ from gpmpc.kernels._simd import load, store, zeros
 
 
 @njit_inner
-def aligned(size):
-    """Uninitialised float64 numbers that start on a cache line."""
-    memory = np.empty(size + 8)
-    skip = (-(memory.ctypes.data >> 3)) % 8
-    return memory[skip : skip + size]
-
-
-@njit_inner
 def aligned_rows(rows, length):
     """An uninitialised matrix whose rows start on cache lines where ``length`` is a multiple of 8."""
-    return aligned(rows * length).reshape(rows, length)
+    memory = np.empty(rows * length + 8)
+    skip = (-(memory.ctypes.data >> 3)) % 8
+    return memory[skip : skip + rows * length].reshape(rows, length)
 
 
 @njit_noalloc
@@ -215,22 +209,6 @@ def solve_positive(A, X):
     solve_lower(A, X)
     solve_lower_transposed(A, X)
     return True
-
-
-@njit_inner
-def square_root(S, out):
-    """Writes the symmetric root of S; returns its eigenvalues, not below zero, and its eigenvectors."""
-    r, U = np.linalg.eigh(S)
-    n = len(r)
-    for i in range(n):
-        r[i] = math.sqrt(max(r[i], 0.0))
-    for i in range(n):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(n):
-                total += U[i, k] * r[k] * U[j, k]
-            out[i, j] = out[j, i] = total
-    return r, U.copy()
 
 
 @njit_noalloc

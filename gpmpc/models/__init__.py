@@ -1,17 +1,25 @@
 """Dynamics models: the protocol, and models made of a known part and a learned one."""
 
 from gpmpc.dynamics import DynamicsModel, Linearized, linearize, linearize_by_autograd
-from gpmpc.models.nominal import Affine, CasadiNominal
-from gpmpc.models.residual import ResidualModel, load_residual_model, save_residual_model
+from gpmpc.models.delay import DelayedModel
+from gpmpc.models.disturbance import DisturbedModel
+from gpmpc.models.features import Features, Lags
+from gpmpc.models.nominal import Affine, CasadiFunction
+from gpmpc.models.residual import ResidualModel
+from gpmpc.models.storage import load_model, save_model
 
 __all__ = [
     "Affine",
-    "CasadiNominal",
+    "CasadiFunction",
+    "DelayedModel",
+    "DisturbedModel",
     "DynamicsModel",
+    "Features",
+    "Lags",
     "Linearized",
     "ResidualModel",
     "linearize",
     "linearize_by_autograd",
-    "load_residual_model",
-    "save_residual_model",
+    "load_model",
+    "save_model",
 ]

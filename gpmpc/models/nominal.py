@@ -1,5 +1,6 @@
-"""Nominal models x+ = f0(x, u): an affine one, and one that is written in CasADi."""
+"""Nominal models x+ = f0(x, u): an affine one, and functions that are written in CasADi."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -8,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, to_array
+from gpmpc.dynamics import Array, batched_jacobian, tensors_for, to_array
 from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.gaussian import check_tensors
 
@@ -38,6 +39,12 @@ class Affine:
         if shapes[0] != (n, n) or self.B.dim() != 2 or len(self.B) != n or shapes[2] != (n,):
             raise ShapeError(f"A, B and c must be (n, n), (n, m) and (n,); got {', '.join(map(str, shapes))}")
 
+    @classmethod
+    def identity(cls, state_dim: int, input_dim: int) -> "Affine":
+        """The model x+ = x, whose residual is the difference of two states."""
+        n, m, dtype = state_dim, input_dim, torch.float64
+        return cls(torch.eye(n, dtype=dtype), torch.zeros(n, m, dtype=dtype), torch.zeros(n, dtype=dtype))
+
     def __call__(self, state: Tensor, input: Tensor) -> Tensor:
         """The nominal next state (*batch, n)."""
         return state @ self.A.mT + input @ self.B.mT + self.c
@@ -53,38 +60,91 @@ class Affine:
         return to_array(self.A), to_array(self.B), to_array(self.c)
 
 
-class CasadiNominal:
-    """A nominal model that is a CasADi function, linearised by CasADi's derivatives for all points in one call.
+class CasadiFunction:
+    """A function that is written in CasADi, linearised by CasADi's derivatives for all points in one call.
 
-    It is evaluated in double precision on the CPU, and torch cannot differentiate it.
+    It serves as nominal model, (state (n,), input (m,)) to the next state (n,), and as effect B(x), state (n,) to
+    (n, k). It is evaluated in double precision on the CPU, and torch cannot differentiate it.
 
     Args:
-        function: From (state (n,), input (m,)) to the next state (n,).
+        source: The CasADi function, or an importable Python function that makes one, which a saved model names.
+        parameters: Of the function that makes it.
 
     Raises:
-        UnsupportedModel: The function has other arguments.
+        UnsupportedModel: The function has no argument, or more than one value.
     """
 
-    def __init__(self, function: Any):
-        if (function.n_in(), function.n_out()) != (2, 1) or function.size1_in(0) != function.size1_out(0):
-            raise UnsupportedModel(f"a nominal CasADi function maps (state, input) to the next state; got {function}")
-        x, u, y = function.name_in(0), function.name_in(1), function.name_out(0)
-        self.function = function
-        self._expansion = function.factory("expansion", [x, u], [y, f"jac:{y}:{x}", f"jac:{y}:{u}"])
+    def __init__(self, source: Any, **parameters: Any):
+        is_casadi = hasattr(source, "n_in")
+        if is_casadi and parameters:
+            raise UnsupportedModel(f"parameters {list(parameters)} are for a function that makes a CasADi function")
+        function: Any = source if is_casadi else source(**parameters)
+        if not hasattr(function, "n_in") or function.n_out() != 1 or not function.n_in():
+            raise UnsupportedModel(f"CasadiFunction takes a CasADi function of one value; got {function!r}")
+        names, self._value = function.name_in(), function.name_out(0)
+        if any(function.size2_in(i) != 1 for i in range(len(names))):
+            raise UnsupportedModel(f"a CasADi function takes vectors (column by column); got {function!r}")
+        self.function, self.source, self.parameters = function, None if is_casadi else source, parameters
+        jacobians = [f"jac:{self._value}:{name}" for name in names]
+        self._expansion = function.factory("expansion", names, [self._value, *jacobians])
+        self._shape = function.size1_out(0), function.size2_out(0)
+        self._sizes = [function.size1_in(i) for i in range(len(names))]
         self._mapped: dict[int, Any] = {}
 
-    def __call__(self, state: Tensor, input: Tensor) -> Tensor:
-        """The nominal next state (*batch, n)."""
-        n, m = self.function.size1_in(0), self.function.size1_in(1)
-        x, u = to_array(state).reshape(-1, n), to_array(input).reshape(-1, m)
-        moved = self.function.map(len(x))(x.T, u.T).full().T
-        return torch.as_tensor(moved, dtype=state.dtype, device=state.device).reshape(state.shape)
+    def check_sizes(self, arguments: tuple[int, ...], value: tuple[int, int]) -> None:
+        """Raises ``UnsupportedModel`` unless arguments and value have these sizes."""
+        if (tuple(self._sizes), self._shape) != (arguments, value):
+            rule = f"must map vectors of {arguments} entries to a matrix of {value}"
+            raise UnsupportedModel(f"a CasADi function of this model {rule}; got {self.function}")
 
-    def linearize(self, states: Array, inputs: Array) -> tuple[Array, Array, Array]:
-        """The nominal next states (K, n) and their derivatives (K, n, n) and (K, n, m)."""
-        K, n = states.shape
+    def __call__(self, *arguments: Tensor) -> Tensor:
+        """The value (*batch, rows), or (*batch, rows, columns) of a matrix, at arguments (*batch, d_i)."""
+        batch = arguments[0].shape[:-1]
+        flat = [to_array(a).reshape(-1, size).T for a, size in zip(arguments, self._sizes, strict=True)]
+        value = self.function.map(flat[0].shape[1])(*flat).full()
+        value = torch.as_tensor(self._split(value, batch.numel()), dtype=arguments[0].dtype, device=arguments[0].device)
+        return value.reshape(*batch, *value.shape[1:])
+
+    def linearize(self, *arguments: Array) -> tuple[Array, ...]:
+        """The values at K points, and their derivatives by each argument (K, rows, d_i) or (K, rows, columns, d_i)."""
+        K, (rows, columns) = len(arguments[0]), self._shape
         if K not in self._mapped:
             self._mapped[K] = self._expansion.map(K)
-        mean, A, B = (part.full() for part in self._mapped[K](states.T, inputs.T))
-        A, B = (part.reshape(n, K, -1).transpose(1, 0, 2) for part in (A, B))
-        return np.ascontiguousarray(mean.T), np.ascontiguousarray(A), np.ascontiguousarray(B)
+        parts = self._mapped[K](*(argument.T for argument in arguments))
+        value, *jacobians = (part.full() for part in (parts if isinstance(parts, tuple | list) else [parts]))
+        found = [self._split(value, K)]
+        for jacobian in jacobians:  # rows of a derivative go through a matrix column by column
+            by = jacobian.reshape(columns, rows, K, -1).transpose(2, 1, 0, 3)
+            found.append(np.ascontiguousarray(by[:, :, 0] if columns == 1 else by))
+        return tuple(found)
+
+    def _split(self, value: Array, K: int) -> Array:
+        rows, columns = self._shape
+        split = value.reshape(rows, K, columns).transpose(1, 0, 2)
+        return np.ascontiguousarray(split[..., 0] if columns == 1 else split)
+
+
+def linearize_function(function: Callable[..., Tensor], model: Any, *arguments: Array) -> tuple[Array, ...]:
+    """Value and derivatives by each argument of a batched function at K points.
+
+    By the function's own method ``linearize``, such as that of ``Affine`` and ``CasadiFunction``; else by one batched
+    call of torch autograd.
+
+    Args:
+        function: Of tensors (*batch, d_i), to (*batch, k) or (*batch, n, k).
+        model: Its type and device are those of the tensors that the function takes.
+        arguments: Each (K, d_i).
+    """
+    method = getattr(function, "linearize", None)
+    if method is not None:
+        return method(*arguments)
+    shape: list[torch.Size] = []
+
+    def flat(*at: Tensor) -> tuple[Tensor]:
+        value = function(*at)
+        shape.append(value.shape[1:])
+        return (value.flatten(1),)
+
+    (value,), jacobians = batched_jacobian(flat, tensors_for(model, *arguments))
+    parts = [value.unflatten(1, shape[0]), *(by.unflatten(1, shape[0]) for by in jacobians)]
+    return tuple(to_array(part) for part in parts)

@@ -1,20 +1,18 @@
 """Residual models: a known nominal model and GPs that learn its error.
 
-    x[k+1] = f0(x[k], u[k]) + B d(x_s[k], u_s[k])
+    x[k+1] = f0(x[k], u[k]) + B(x[k]) d(phi(x[k], u[k]))
 
-f0 is the nominal model, d a GP over a selection of the states and inputs, and B its effect on the states (Hewing,
-Kabzan and Zeilinger, 2020, eq. (3)).
+f0 is the nominal model, d a GP, B its effect on the states, and phi what the GP sees of the state and the input:
+selected columns, angles as sine and cosine (Hewing, Kabzan and Zeilinger, 2020, eq. (3), with constant B and columns).
+With ``Affine.identity`` as nominal model d is the difference of two states, and the model a full one with features.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gpmpc.dynamics import (
@@ -23,18 +21,20 @@ from gpmpc.dynamics import (
     batched_jacobian,
     check_destination,
     check_query,
-    tensors_for,
+    predict_by_autograd,
     to_array,
 )
-from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, UnsupportedModel
+from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.gp._archive import existing_file, new_file
 from gpmpc.gp.online import SlidingWindow, append_points
 from gpmpc.gp.posterior import AffineForm, GPPosterior
-from gpmpc.gp.storage import posterior_of_parts, posterior_parts, read_model, write_model
 from gpmpc.gp.training import Trainer
 from gpmpc.gp.transitions import Transitions, check_transitions
-from gpmpc.models.nominal import Affine
+from gpmpc.models.features import Features
+from gpmpc.models.nominal import Affine, CasadiFunction, linearize_function
+
+Nominal = Callable[[Tensor, Tensor], Tensor]
+Effect = Tensor | Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -45,72 +45,85 @@ class ResidualModel:
         nominal: f0, from x (*batch, n) and u (*batch, m) to (*batch, n), in torch; an ``Affine`` one allows exact
             moment matching.
         residual: d, with ``predicts="value"``.
-        B: Where it acts (n, k).
+        B: Where it acts (n, k), or a function of the state (*batch, n) that gives it (*batch, n, k), in torch or by
+            ``CasadiFunction``; (*batch, n) will do where k = 1.
         states: The states that d depends on, in its order.
         inputs: The inputs that d depends on, in its order.
         input_dim: m, all of them.
+        angles: Those of ``states`` that d sees as (sine, cosine), at their place.
+        noise: Covariance of the observations (n, n); by default that of d's, B diag(sn2) B', which needs a constant B.
 
     Raises:
         ShapeError: The parts do not belong together.
-        SettingError: The residual predicts something else, or an index is out of range.
+        SettingError: The residual predicts something else, an index is out of range, or the noise is missing.
     """
 
-    nominal: Callable[[Tensor, Tensor], Tensor]
+    nominal: Nominal
     residual: GPPosterior
-    B: Tensor
+    B: Effect
     states: Sequence[int]
     inputs: Sequence[int]
     input_dim: int
+    angles: Sequence[int] = ()
+    noise: Tensor | None = None
 
     def __post_init__(self) -> None:
         gp = self.residual
-        check_tensors(B=self.B)
+        if not callable(self.B):
+            check_tensors(B=self.B)
         if getattr(gp, "predicts", None) != "value":
             raise SettingError("residual", f"must be a GP with predicts='value'; got {getattr(gp, 'predicts', gp)!r}")
-        if (len(self.states), len(self.inputs)) != (gp.state_dim, gp.input_dim):
+        if callable(self.B):
+            if self.noise is None:
+                raise SettingError("noise", "must be given (n, n) where B is a function of the state; got None")
+        elif self.B.dim() != 2 or self.B.shape[1] != gp.output_dim:
+            raise ShapeError(f"B must be (n, {gp.output_dim}); got {tuple(self.B.shape)}")
+        if (self.features.dim, len(self.inputs)) != (gp.state_dim, gp.input_dim):
             raise ShapeError(
                 f"the residual has {gp.state_dim} states and {gp.input_dim} inputs; "
-                f"got {len(self.states)} and {len(self.inputs)} selected"
+                f"got {self.features.dim} and {len(self.inputs)} selected"
             )
-        if self.B.dim() != 2 or self.B.shape[1] != gp.output_dim:
-            raise ShapeError(f"B must be (n, {gp.output_dim}); got {tuple(self.B.shape)}")
-        parts = {"B": (self.B, tuple(self.B.shape))}
-        if isinstance(self.nominal, Affine):
-            n, m = self.state_dim, self.input_dim
-            nominal = self.nominal
-            parts |= {
-                "nominal.A": (nominal.A, (n, n)),
-                "nominal.B": (nominal.B, (n, m)),
-                "nominal.c": (nominal.c, (n,)),
-            }
+        n, m, nominal = self.state_dim, self.input_dim, self.nominal
+        if isinstance(nominal, CasadiFunction):
+            nominal.check_sizes((n, m), (n, 1))
+        if isinstance(self.B, CasadiFunction):
+            self.B.check_sizes((n,), (n, gp.output_dim))
+        parts = {} if callable(self.B) else {"B": (self.B, tuple(self.B.shape))}
+        if self.noise is not None:
+            check_tensors(noise=self.noise)
+            parts["noise"] = (self.noise, (n, n))
+        if isinstance(nominal, Affine):
+            shapes = {"A": (n, n), "B": (n, m), "c": (n,)}
+            parts |= {f"nominal.{name}": (getattr(nominal, name), shape) for name, shape in shapes.items()}
         for name, (value, shape) in parts.items():
             if tuple(value.shape) != shape:
                 raise ShapeError(f"{name} must have shape {shape}; got {tuple(value.shape)}")
             if value.dtype != gp.dtype or value.device != gp.device:
                 raise SettingError(name, f"must be {gp.dtype} on {gp.device}; got {value.dtype} on {value.device}")
-        _check_chosen(self.states, self.state_dim, self.inputs, self.input_dim)
 
     @classmethod
     def train(
         cls,
-        nominal: Callable[[Tensor, Tensor], Tensor],
+        nominal: Nominal,
         transitions: Transitions,
-        B: Tensor | None = None,
+        B: Effect | None = None,
         states: Sequence[int] | None = None,
         inputs: Sequence[int] | None = None,
         trainer: Any = None,
         seed: int = 0,
+        angles: Sequence[int] = (),
     ) -> "ResidualModel":
         """Learns d from transitions: the part of x[k+1] - f0(x[k], u[k]) that B reaches (least squares).
 
         Args:
-            nominal: f0.
+            nominal: f0; ``Affine.identity(n, m)`` where nothing is known.
             transitions: What was observed.
-            B: Where d acts (n, k); on every state by default.
+            B: Where d acts (n, k), or a function of the state; on every state by default.
             states: The states that d depends on; all by default.
             inputs: The inputs that d depends on; all by default.
             trainer: A ``Trainer`` or ``SparseTrainer`` that does not learn differences.
             seed: Of the random starts.
+            angles: The states that d sees as sine and cosine.
 
         Raises:
             ShapeError: ``nominal`` or B do not fit the transitions.
@@ -127,15 +140,14 @@ class ResidualModel:
         states = list(range(n)) if states is None else list(states)
         inputs = list(range(m)) if inputs is None else list(inputs)
         B = torch.eye(n, dtype=torch.float64) if B is None else B
-        check_tensors(B=B)
-        if B.dim() != 2 or len(B) != n:
-            raise ShapeError(f"B must be ({n}, k), a row a state; got {tuple(B.shape)}")
-        if int(torch.linalg.matrix_rank(B)) < B.shape[1]:
-            raise SettingError("B", "must have linearly independent columns: equal effects cannot be distinguished")
-        _check_chosen(states, n, inputs, m)
-        features, targets = _residuals(nominal, B, states, inputs, transitions)
-        training = trainer.fit(features, targets, len(inputs), "value", seed)
-        return cls(nominal, training.posterior, B, states, inputs, m)
+        features = Features(states, inputs, list(angles), n, m)
+        observed = _residuals(nominal, B, features, transitions)
+        posterior = trainer.fit(*observed, len(inputs), "value", seed).posterior
+        noise = None
+        if callable(B):  # one covariance for all states: its mean over those that were observed
+            effect = _effect(B, transitions.states)
+            noise = (effect @ posterior.noise_covariance @ effect.mT).mean(0)
+        return cls(nominal, posterior, B, states, inputs, m, list(angles), noise)
 
     def append(self, transitions: Transitions, window: SlidingWindow | None = None) -> "ResidualModel":
         """Appends transitions to the data of the residual GP, held to a number of points where a window is given.
@@ -148,19 +160,25 @@ class ResidualModel:
                 f"the model has {self.state_dim} states and {self.input_dim} inputs; "
                 f"got transitions with {transitions.state_dim} and {transitions.input_dim}"
             )
-        points = _residuals(self.nominal, self.B, self.states, self.inputs, transitions)
+        points = _residuals(self.nominal, self.B, self.features, transitions, like=self.residual.weights)
         add = append_points if window is None else window.append
         return replace(self, residual=add(self.residual, *points))
+
+    @cached_property
+    def features(self) -> Features:
+        """What d sees of the state and the input."""
+        return Features(self.states, self.inputs, self.angles, self.state_dim, self.input_dim)
 
     @property
     def state_dim(self) -> int:
         """Number of states, n."""
-        return len(self.B)
+        known = self.noise if callable(self.B) else self.B
+        return 0 if known is None else len(known)
 
     @property
     def output_dim(self) -> int:
         """Number of outputs, n: the next state."""
-        return len(self.B)
+        return self.state_dim
 
     @property
     def dtype(self) -> torch.dtype:
@@ -175,141 +193,85 @@ class ResidualModel:
     @property
     def noise_covariance(self) -> Tensor:
         """Of the observations (n, n)."""
-        return self.B @ self.residual.noise_covariance @ self.B.mT
+        if self.noise is None and not callable(self.B):
+            return self.B @ self.residual.noise_covariance @ self.B.mT
+        return torch.as_tensor(self.noise)
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
         """The next state's distribution at a certain state and input: mean (*batch, n), covariance (*batch, n, n)."""
         input = state[..., :0] if input is None else input
         check_query(self, state, input)
-        d = self.residual.predict(state[..., list(self.states)], input[..., list(self.inputs)])
-        return self._combined(_nominal(self.nominal, state, input), d)
+        d = self.residual.predict(*self.features(state, input))
+        B = _effect(self.B, state)
+        mean = _nominal(self.nominal, state, input) + (B @ d.mean[..., None])[..., 0]
+        return Gaussian(mean, B @ d.covariance @ B.mT)
 
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
-        """Linearises the model at K points (K, n), (K, m): the nominal model's expansion plus B times the GP's.
+        """Linearises the model at K points (K, n), (K, m), by the chain rule around the GP's own ``linearize``.
 
-        A nominal model with a method ``linearize(states, inputs)``, such as ``Affine`` or ``CasadiNominal``, is
+        A nominal model or an effect with a method ``linearize``, such as ``Affine`` or ``CasadiFunction``, is
         linearised by it; any other by one batched call of torch autograd.
         """
-        mean, A, G = self._linearize_nominal(states, inputs)
-        states_seen, inputs_seen = self._columns
-        d = self.residual.linearize(states[:, states_seen], inputs[:, inputs_seen], covariance)
-        B = self._acts_on
-        A, G = np.array(A), np.array(G)
-        A[:, :, states_seen] += B @ d.A
-        G[:, :, inputs_seen] += B @ d.B
-        V = None if d.covariance is None else B @ d.covariance @ B.T
-        return Linearized(mean + d.mean @ B.T, A, G, V)
-
-    @cached_property
-    def _linearize_nominal(self) -> Callable[[Array, Array], tuple[Array, Array, Array]]:
-        return getattr(self.nominal, "linearize", self._linearize_torch)
-
-    def _linearize_torch(self, states: Array, inputs: Array) -> tuple[Array, Array, Array]:
-        arguments = tensors_for(self, states, inputs)
-        (mean,), (A, G) = batched_jacobian(lambda x, u: (_nominal(self.nominal, x, u),), arguments)
-        return to_array(mean), to_array(A), to_array(G)
-
-    @cached_property
-    def _columns(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        return np.array(self.states, dtype=np.intp), np.array(self.inputs, dtype=np.intp)
-
-    @cached_property
-    def _acts_on(self) -> Array:
-        return to_array(self.B)
+        if hasattr(self.nominal, "linearize"):
+            mean, A, G = linearize_function(self.nominal, self, states, inputs)
+        else:
+            mean, A, G = linearize_function(lambda x, u: _nominal(self.nominal, x, u), self, states, inputs)
+        features, selected, slope = self.features.linearize(states, inputs)
+        d = self.residual.linearize(features, selected, covariance)
+        by_state, by_input = self.features.chain(d.A, d.B, slope)
+        if callable(self.B):
+            B, dB = linearize_function(self.B, self, states)
+            if B.ndim == 2:  # one output
+                B, dB = B[..., None], dB[:, :, None]
+            A = A + (dB * d.mean[:, None, :, None]).sum(2)
+        else:
+            B = self._constant_effect
+        V = None if d.covariance is None else B @ d.covariance @ B.swapaxes(-1, -2)
+        mean = mean + (B @ d.mean[..., None])[..., 0]
+        return Linearized(mean, A + B @ by_state, G + B @ by_input, V)
 
     def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
-        """``predict``, and its mean's derivatives by the state (*batch, n, n) and by the input (*batch, n, m)."""
+        """``predict`` with its mean's derivatives by x (*batch, n, n) and u (*batch, n, m), which torch can follow."""
         input = state[..., :0] if input is None else input
-        check_query(self, state, input)
-        states, inputs = list(self.states), list(self.inputs)
-        d, by_state, by_input = self.residual.predict_with_jacobian(state[..., states], input[..., inputs])
+        if callable(self.B):
+            return predict_by_autograd(self, state, input)
+        belief = self.predict(state, input)
+        _, by_features, by_inputs = self.residual.predict_with_jacobian(*self.features(state, input))
         if isinstance(self.nominal, Affine):
-            nominal, A, G = self.nominal(state, input), self.nominal.A, self.nominal.B
-            A, G = A.expand(*state.shape[:-1], *A.shape), G.expand(*state.shape[:-1], *G.shape)
+            A, G = (part.expand(*state.shape[:-1], *part.shape) for part in (self.nominal.A, self.nominal.B))
         else:
-            (nominal,), (A, G) = batched_jacobian(lambda x, u: (_nominal(self.nominal, x, u),), (state, input))
-        places = [torch.tensor(chosen, dtype=torch.long, device=self.device) for chosen in (states, inputs)]
-        A, G = A.index_add(-1, places[0], self.B @ by_state), G.index_add(-1, places[1], self.B @ by_input)
-        return self._combined(nominal, d), A, G
+            (_,), (A, G) = batched_jacobian(lambda x, u: (self.nominal(x, u),), (state, input))
+        places = torch.tensor(list(self.inputs), dtype=torch.long, device=self.device)
+        return (
+            belief,
+            A + self.B @ by_features @ self.features.jacobian(state),
+            G.index_add(-1, places, self.B @ by_inputs),
+        )
+
+    @cached_property
+    def _constant_effect(self) -> Array:
+        return to_array(torch.as_tensor(self.B))
 
     @property
     def affine_form(self) -> AffineForm | None:
-        """The model as moments are composed of it; None where the nominal model is not ``Affine``."""
+        """The model as moments are composed of it; None unless ``Affine`` with a constant B and without angles."""
         nominal = self.nominal
-        if not isinstance(nominal, Affine):
+        if not isinstance(nominal, Affine) or callable(self.B) or self.angles:
             return None
         return AffineForm(self.residual, nominal.A, nominal.B, nominal.c, self.B, list(self.states), list(self.inputs))
 
     def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "ResidualModel":
-        """Copies the model to another device or type; a nominal model that is not ``Affine`` is taken as it is."""
+        """Copies the model to another device or type; functions (nominal model, effect) are taken as they are."""
         check_destination(device, dtype)
         nominal = self.nominal
         if isinstance(nominal, Affine):
             nominal = Affine(*(part.to(device=device, dtype=dtype) for part in (nominal.A, nominal.B, nominal.c)))
-        residual, B = self.residual.to(device, dtype), self.B.to(device=device, dtype=dtype)
-        return ResidualModel(nominal, residual, B, self.states, self.inputs, self.input_dim)
-
-    def _combined(self, nominal: Tensor, d: Gaussian) -> Gaussian:
-        return Gaussian(nominal + d.mean @ self.B.mT, self.B @ d.covariance @ self.B.mT)
+        B = self.B if callable(self.B) else self.B.to(device=device, dtype=dtype)
+        noise = None if self.noise is None else self.noise.to(device=device, dtype=dtype)
+        return replace(self, nominal=nominal, residual=self.residual.to(device, dtype), B=B, noise=noise)
 
 
-def save_residual_model(model: ResidualModel, path: str | Path, metadata: Mapping[str, Any] | None = None) -> None:
-    """Writes a residual model of an ``Affine`` nominal model to one file, in one piece or not at all.
-
-    Args:
-        model: On any device; float64 or float32.
-        path: The file; ``.safetensors`` by convention.
-        metadata: Kept in the header, such as names and units; what JSON can hold.
-
-    Raises:
-        UnsupportedModel: The nominal model is code, which a file of numbers cannot hold.
-        SettingError: A tensor is neither float64 nor float32, or the metadata are no JSON.
-        DataError: The folder does not exist.
-    """
-    path = new_file(path)
-    if not isinstance(model.nominal, Affine):
-        raise UnsupportedModel(
-            f"only an Affine nominal model is numbers and can be saved; got {type(model.nominal).__name__}. Save the "
-            "part that was learned (save_posterior(model.residual, ...)) and give ResidualModel the nominal model again"
-        )
-    header: dict[str, Any] = {
-        "input_dim": model.input_dim,
-        "states": [int(i) for i in model.states],
-        "inputs": [int(i) for i in model.inputs],
-    }
-    header["residual"], residual = posterior_parts(path, model.residual)
-    tensors = {"B": model.B, **{f"nominal/{name}": getattr(model.nominal, name) for name in ("A", "B", "c")}}
-    tensors |= {f"residual/{name}": value for name, value in residual.items()}
-    write_model(path, "ResidualModel", header, tensors, metadata)
-
-
-def load_residual_model(path: str | Path) -> ResidualModel:
-    """Reads a file of ``save_residual_model``, into host memory.
-
-    Raises:
-        DataError: The file is missing, damaged, of another kind or of a newer format.
-    """
-    path = existing_file(path, "a saved ResidualModel")
-    header, tensors = read_model(path, "ResidualModel")
-    residual = {name.partition("/")[2]: value for name, value in tensors.items() if name.startswith("residual/")}
-    gp = posterior_of_parts(path, header.get("residual"), residual)
-    try:
-        B, *nominal = (tensors[name] for name in ("B", "nominal/A", "nominal/B", "nominal/c"))
-        if not all(bool(torch.isfinite(part).all()) for part in (B, *nominal)):
-            raise DataError("B and the nominal model must be finite")
-        return ResidualModel(Affine(*nominal), gp, B, header["states"], header["inputs"], header["input_dim"])
-    except (GpmpcError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: not a consistent residual model ({error})") from error
-
-
-def _check_chosen(states: Sequence[int], n: int, inputs: Sequence[int], m: int) -> None:
-    for key, chosen, count in (("states", states, n), ("inputs", inputs, m)):
-        whole = all(isinstance(i, int) and not isinstance(i, bool) for i in chosen)
-        if not whole or any(not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
-            raise SettingError(key, f"must be different indices from 0 to {count - 1}; got {list(chosen)}")
-
-
-def _nominal(nominal: Callable[[Tensor, Tensor], Tensor], state: Tensor, input: Tensor) -> Tensor:
+def _nominal(nominal: Nominal, state: Tensor, input: Tensor) -> Tensor:
     """f0 (*batch, n), held against the rule that a wrong number of states would otherwise be broadcast."""
     value = nominal(state, input)
     if not isinstance(value, Tensor):
@@ -321,15 +283,35 @@ def _nominal(nominal: Callable[[Tensor, Tensor], Tensor], state: Tensor, input: 
     return value
 
 
+def _effect(B: Effect, state: Tensor) -> Tensor:
+    """B (*batch, n, k) at states (*batch, n), checked."""
+    n = state.shape[-1]
+    if not callable(B):
+        check_tensors(B=B)
+        if B.dim() != 2 or len(B) != n:
+            raise ShapeError(f"B must be ({n}, k), a row a state; got {tuple(B.shape)}")
+        return B
+    value = B(state)
+    check_tensors(B=value)
+    value = value[..., None] if value.shape == state.shape else value  # one output
+    if value.shape[:-1] != state.shape:
+        raise ShapeError(f"B must give (*batch, {n}, k) at {tuple(state.shape)}; got {tuple(value.shape)}")
+    return value
+
+
 def _residuals(
-    nominal: Callable[[Tensor, Tensor], Tensor],
-    B: Tensor,
-    states: Sequence[int],
-    inputs: Sequence[int],
-    transitions: Transitions,
+    nominal: Nominal, B: Effect, features: Features, transitions: Transitions, like: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Features (N, d) and targets (N, k) of the residual GP: the least-squares part of the error of f0."""
-    to_B = {"device": B.device, "dtype": B.dtype}
-    x, u, after = (t.to(**to_B) for t in (transitions.states, transitions.inputs, transitions.next_states))
-    targets = torch.linalg.lstsq(B, (after - _nominal(nominal, x, u)).mT).solution.mT
-    return torch.cat([x[:, list(states)], u[:, list(inputs)]], dim=1), targets
+    like = B if like is None and isinstance(B, Tensor) else transitions.states if like is None else like
+    to = {"device": like.device, "dtype": like.dtype}
+    x, u, after = (t.to(**to) for t in (transitions.states, transitions.inputs, transitions.next_states))
+    effect = _effect(B, x)
+    if int(torch.linalg.matrix_rank(effect).min()) < effect.shape[-1]:
+        raise SettingError("B", "must have linearly independent columns: equal effects cannot be distinguished")
+    missed = after - _nominal(nominal, x, u)
+    if callable(B):
+        targets = torch.linalg.lstsq(effect, missed[..., None]).solution[..., 0]
+    else:
+        targets = torch.linalg.lstsq(effect, missed.mT).solution.mT
+    return torch.cat(features(x, u), dim=1), targets

@@ -202,7 +202,7 @@ class GPMPC:
         p = len(linearizer.weight(self.problem.Q)) * n
         each = 8 * n * N * (d + 1) + 4 * p * (p + d)
         if not linearizer.at_points:
-            each += 8 * N * N + 4 * n * n * (N * (n + 1) + n * n + d)
+            each += 8 * N * N + 12 * n * n * (N * (n + 1) + n * n + d)
         return 8 * (self.prediction.points * each + 4 * size * (size + n * self.horizon))
 
     def build(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> QuadraticProgram:
@@ -296,7 +296,7 @@ def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> b
 
 def _violation(solution: QPSolution) -> float:
     """The largest violation of a hard row."""
-    softness, caps = solution.terms.softness
+    softness, caps = solution.softness
     return float(solution.violation()[(softness == 0.0) & np.isinf(caps)].max(initial=0.0))
 
 

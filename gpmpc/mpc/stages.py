@@ -20,10 +20,10 @@ from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.dynamics import DynamicsModel, linearize, tensors_for, to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
-from gpmpc.kernels.extended_state import square_roots
 from gpmpc.kernels.linalg import dot
 from gpmpc.propagation import Propagator, differentiate
 from gpmpc.propagation import linearize as linearize_belief
+from gpmpc.propagation.local_model import square_roots
 
 Array = np.ndarray
 
@@ -96,9 +96,7 @@ class StageLinearizer:
     def state(self, means: Array, covariances: Array) -> Array:
         """The vectors s (K, p) of beliefs (K, n), (K, n, n)."""
         if self.covariance == "full":
-            S = np.empty(covariances.shape)
-            square_roots(np.ascontiguousarray(covariances), S)
-            return np.concatenate((means, S.reshape(len(S), -1)), axis=1)
+            return np.concatenate((means, square_roots(covariances)[0].reshape(len(means), -1)), axis=1)
         if self.covariance == "diagonal":
             variances = np.diagonal(covariances, axis1=1, axis2=2)
             return np.concatenate([means, np.sqrt(np.clip(variances, 0, None))], axis=1)

@@ -17,7 +17,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from gpmpc.exceptions import UnsupportedModel
-from gpmpc.plotting.recorded import BOUND, FLOWN, REFERENCE, TUBE, positions_of
+from gpmpc.plotting.recorded import BOUND, FLOWN, REFERENCE, TUBE
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
@@ -55,7 +55,7 @@ def ffmpeg_exists() -> bool:
 
 def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
     """The figure, and the function of a step's number that draws it."""
-    x, y, z = positions_of(run)
+    x, y, z = (run.state_names.index(name) for name in "xyz")
     figure = Figure(figsize=(10, 5.4), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, width_ratios=[1, 1.15], height_ratios=[2.4, 1])

@@ -16,17 +16,15 @@ if TYPE_CHECKING:
     from gpmpc.recording import Run
 
 FLOWN, REFERENCE, TUBE, BOUND, FAILED = "#1f4e79", "#c0392b", "#9dc3e6", "0.45", "#e08e0b"
-POSITIONS, ANGLES = ("x", "y", "z"), ("phi", "theta", "psi")
 STAGES = ("model", "build", "solve")
 STAGE_COLOURS = ("#1f4e79", "#7fb2e5", "#c0392b")
 
 
-def positions_of(run: "Run") -> list[int]:
-    """Indices of the states x, y, z; without them of the angles phi, theta, psi; of all states without either."""
-    for names in (POSITIONS, ANGLES):
-        if found := [run.state_names.index(name) for name in names if name in run.state_names]:
-            return found
-    return list(range(len(run.state_names)))
+def tracked_of(run: "Run") -> list[int]:
+    """Indices of the states that errors are reported of, as the recording says; of all where it does not."""
+    tracked = run.metadata.get("run", {}).get("tracked", "").split()
+    found = [run.state_names.index(name) for name in tracked if name in run.state_names]
+    return found or list(range(len(run.state_names)))
 
 
 def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -53,7 +51,7 @@ def _noise(run: "Run") -> np.ndarray:
 
 def tracking_figure(run: "Run") -> Figure:
     """Every axis over time against its reference, and below it the error with the tube."""
-    states = positions_of(run)
+    states = tracked_of(run)
     units = run.metadata.get("units", {})
     mean, std = expected(run, states)
     figure = Figure(figsize=(3.6 * len(states), 4.6), layout="constrained")

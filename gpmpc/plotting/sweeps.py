@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 COLOURS = ("#1f4e79", "#c0392b", "#2e8b57", "#b8860b", "#6a3d9a", "#17858b", "#8c564b", "#555555")
 
@@ -30,27 +30,25 @@ def over_variable(
     label: str,
     lines: Sequence[Series],
     logarithmic: bool = False,
-    connected: bool = True,
 ) -> Figure:
     """Median and quartiles of a measure over the values of a variable, every run a dot.
 
     Args:
         title: Name of the variable.
-        positions: Its values, as text.
+        positions: Its values, as text and in their order. Numbers stand at their place on the axis, which is
+            logarithmic where they span a decade, and medians over them are joined; words stand side by side.
         label: Of the measure, with its unit.
         lines: What else was varied, a line each; those without a number are left out.
         logarithmic: Whether the axis is, where the values span enough for it.
-        connected: Whether the medians are joined, as over numbers; over words nothing lies between them.
     """
     drawn = [line for line in lines if any(line.values)]
     columns = max(1, 52 // (max((len(line.label) for line in drawn), default=0) + 8))  # 52 characters fill the width
     legend = -(-len(drawn) // columns) if len(drawn) > 1 else 0  # rows
     figure = Figure(figsize=(4.4, 3.2 + 0.22 * legend), layout="constrained")
     axis = figure.subplots()
-    _draw(axis, lines, len(positions), "-" if connected else "none")
+    _draw(axis, lines, positions)
     axis.set_title(label, fontsize="medium")
     axis.set_xlabel(title)
-    axis.set_xticks(range(len(positions)), list(positions))
     if max(map(len, positions)) * len(positions) > 40:
         axis.tick_params(axis="x", labelrotation=30)
     values = [v for line in lines for group in line.values for v in group]
@@ -72,19 +70,39 @@ def over_variable(
     return figure
 
 
-def _draw(axis: Axes, lines: Sequence[Series], count: int, linestyle: str) -> None:
-    width = min(0.14, 0.7 / max(len(lines), 1))
+def _draw(axis: Axes, lines: Sequence[Series], positions: Sequence[str]) -> None:
+    numbers = _numbers(positions)
+    wide = numbers is not None and numbers[0] > 0 and numbers[-1] >= 10 * numbers[0]
+    at = np.arange(float(len(positions))) if numbers is None else np.log10(numbers) if wide else numbers
+    gap = float(np.diff(at).min(initial=np.inf)) if len(at) > 1 else 1.0
+
+    def place(x: np.ndarray) -> np.ndarray:
+        return 10**x if wide else x
+
+    width = min(0.14, 0.7 / max(len(lines), 1)) * gap
     for i, line in enumerate(lines):
         colour = COLOURS[i % len(COLOURS)]
-        offset = (i - (len(lines) - 1) / 2) * width  # lines side by side: their quartiles do not hide each other
-        known = [(p + offset, np.quantile(group, [0.25, 0.5, 0.75])) for p, group in enumerate(line.values) if group]
+        middles = at + (i - (len(lines) - 1) / 2) * width  # side by side: their quartiles do not hide each other
+        known = [p for p, group in enumerate(line.values) if group]
         if not known:  # a line of failed runs alone
             continue
-        places, quartiles = np.array([p for p, _ in known]), np.array([q for _, q in known])
-        low, middle, high = quartiles.T
-        style = {"color": colour, "marker": "o", "markersize": 4, "linestyle": linestyle}
-        axis.errorbar(places, middle, np.array([middle - low, high - middle]), label=line.label, **style)
-        for p, group in enumerate(line.values):
+        low, middle, high = np.array([np.quantile(line.values[p], [0.25, 0.5, 0.75]) for p in known]).T
+        style = {"color": colour, "marker": "o", "markersize": 4, "linestyle": "none" if numbers is None else "-"}
+        axis.errorbar(place(middles[known]), middle, np.array([middle - low, high - middle]), label=line.label, **style)
+        for x, group in zip(middles, line.values, strict=True):
             aside = [0.25 * width * ((7 * j) % 11 / 5 - 1) for j in range(len(group))]
-            axis.plot([p + offset + a for a in aside], group, ".", color=colour, alpha=0.45, markersize=5, mew=0)
-    axis.set_xlim(-0.5, count - 0.5)
+            axis.plot(place(x + np.array(aside)), group, ".", color=colour, alpha=0.45, markersize=5, mew=0)
+    if wide:
+        axis.set_xscale("log")
+    axis.set_xticks(place(at), list(positions))
+    axis.xaxis.set_minor_locator(NullLocator())
+    margin = 0.5 * gap if numbers is None else max(0.5 * gap, 0.06 * (at[-1] - at[0]))
+    axis.set_xlim(*place(np.array([at[0] - margin, at[-1] + margin])))
+
+
+def _numbers(positions: Sequence[str]) -> np.ndarray | None:
+    try:
+        numbers = np.array([float(position) for position in positions])
+    except ValueError:
+        return None
+    return numbers if np.isfinite(numbers).all() and len(set(numbers)) == len(numbers) else None

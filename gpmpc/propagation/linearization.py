@@ -58,7 +58,7 @@ def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:
         batch = state.shape[:-1]
         flat = arrays[1].reshape(-1, gp.state_dim)
         found = kernels.point_with_jacobian(gp.packed, flat, arrays[2].reshape(len(flat), gp.input_dim))
-        parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found[:8]]
+        parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found]
     mean, A = parts[0] + gp.offset, parts[2]
     if form.A is not None:
         mean, A = mean + state, A + form.A
@@ -66,7 +66,7 @@ def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:
 
 
 def _by_torch(model: GPPosterior, state: Tensor, input: Tensor) -> list[Tensor]:
-    """The first eight entries of ``kernels.Expansion``."""
+    """The entries of ``kernels.Expansion``."""
     n, inverse_squares = model.state_dim, model.lengthscales**-2
     difference = (model.features - torch.cat([state, input], dim=-1)[..., None, :])[..., None, :, :]
     z = difference * inverse_squares[:, None, :]  # (*batch, k, N, d)

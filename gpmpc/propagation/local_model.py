@@ -11,18 +11,18 @@ Sigma+ depends on S to second order only; where Sigma+ is singular the root has 
 the null space.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import Array, tensors_for, to_array
 from gpmpc.exceptions import ShapeError
-from gpmpc.gaussian import Gaussian, check_tensors, square_root_differential
-from gpmpc.gp.backend import host_arrays
+from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.propagation.propagator import Propagator
-from gpmpc.propagation.sensitivity import Sensitivity, differentiate
+from gpmpc.propagation.sensitivity import differentiate
 
 
 @dataclass(frozen=True)
@@ -46,16 +46,15 @@ class LocalModel:
         return (self.A @ s[..., None] + self.B @ input[..., None])[..., 0] + self.c
 
 
-def extended_state(belief: Gaussian) -> tuple[Tensor, Tensor, Tensor]:
-    """The vector s = [mu; vec(S)] (*batch, p), and the eigenvalues (*batch, n) and eigenvectors (*batch, n, n) of S."""
-    eigenvalues, U = torch.linalg.eigh(belief.covariance)
-    r = eigenvalues.clamp_min(0).sqrt()
-    S = U @ (r[..., :, None] * U.mT)
-    return torch.cat([belief.mean, S.flatten(-2)], dim=-1), r, U
+def square_roots(covariances: Array) -> tuple[Array, Array, Array]:
+    """The symmetric roots (*batch, n, n) of covariances, their eigenvalues (*batch, n) and eigenvectors."""
+    eigenvalues, U = np.linalg.eigh(covariances)
+    r = np.sqrt(np.maximum(eigenvalues, 0.0))
+    return (U * r[..., None, :]) @ U.mT, r, U
 
 
 def linearize(propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None) -> LocalModel:
-    """The local model at a belief and an input, or along a plan when both have a leading dimension H.
+    """Linearises the next belief at a belief and an input, or along a plan when both have a leading dimension H.
 
     A local model is a constant: no gradient flows through it, and torch's function transforms do not apply.
 
@@ -70,47 +69,31 @@ def linearize(propagator: Propagator, model: Any, belief: Gaussian, input: Tenso
     if model.output_dim != belief.dim:
         raise ShapeError(f"a local model needs an output a state; got {belief.dim} states, {model.output_dim} outputs")
     moved, d = differentiate(propagator, model, belief, input)
-    batch, n, m = belief.mean.shape[:-1], belief.dim, input.shape[-1]
-    input = input.expand(*batch, m)
-    parts = belief.mean, belief.covariance, input, moved.belief.mean, moved.belief.covariance
-    derivatives = [getattr(d, field.name) for field in fields(d)]
-    arrays = host_arrays(*parts, *derivatives)
-    if arrays is None:
-        return LocalModel(*_extended(belief, input, moved.belief, d), moved.belief)
-    from gpmpc.kernels.extended_state import extended_models  # loads numba
-
-    H, p = batch.numel(), n + n * n
-    arrays = [np.ascontiguousarray(array.reshape(H, *array.shape[len(batch) :])) for array in arrays]
-    out = np.empty((H, p, p)), np.empty((H, p, m)), np.empty((H, p))
-    extended_models(*arrays[:5], tuple(arrays[5:]), *out)
-    A, B, c = (torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in out)
+    batch, n, p = belief.mean.shape[:-1], belief.dim, belief.dim + belief.dim**2
+    of_mean, mean_by_covariance, mean_by_input, by_mean, by_covariance, by_input = map(to_array, vars(d).values())
+    covariances = np.stack([to_array(belief.covariance), to_array(moved.belief.covariance)])
+    roots, (_, r), (_, U) = square_roots(covariances)
+    means, u = np.stack([to_array(belief.mean), to_array(moved.belief.mean)]), to_array(input.expand(*batch, -1))
+    s, s_next = np.concatenate([means, roots.reshape(2, *batch, n * n)], axis=-1)
+    # dSigma = E S + S E for a change E of the root: a derivative D by Sigma becomes 2 D S.
+    twice = 2 * roots[0][..., None, :, :]
+    mean_by_root = (mean_by_covariance @ twice).reshape(*batch, n, n * n)
+    by_root = (by_covariance @ twice[..., None, :, :]).reshape(*batch, n, n, n * n)
+    # In the basis U of the next root, entry ij of its derivative is that of dSigma+ over r_i + r_j.
+    total = r[..., :, None] + r[..., None, :]
+    inverse = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
+    change = _congruence(U.mT, np.concatenate([by_mean, by_root, by_input], axis=-1))
+    lower = _congruence(U, change * inverse[..., None]).reshape(*batch, n * n, -1)
+    A = np.concatenate([np.concatenate([of_mean, mean_by_root], axis=-1), lower[..., :p]], axis=-2)
+    B = np.concatenate([mean_by_input, lower[..., p:]], axis=-2)
+    c = s_next - (A @ s[..., None] + B @ u[..., None])[..., 0]
+    A, B, c = tensors_for(model, A, B, c)
     return LocalModel(A, B, c, moved.belief)
 
 
-def _extended(belief: Gaussian, input: Tensor, after: Gaussian, d: Sensitivity) -> tuple[Tensor, Tensor, Tensor]:
-    """A, B and c by torch."""
-    s, _, _ = extended_state(belief)
-    s_next, r_next, U_next = extended_state(after)
-    n = belief.dim
-    S = s[..., n:].unflatten(-1, (n, n))
-
-    # dSigma = E S' + S E' for a unit change E_kl of S: a derivative D by Sigma becomes 2 D S.
-    mean_by_root = 2 * d.mean_by_covariance @ S[..., None, :, :]
-    covariance_by_root = 2 * d.covariance_by_covariance @ S[..., None, None, :, :]
-    k = after.dim
-    covariance_rows = torch.cat(
-        [d.covariance_by_mean.flatten(-3, -2), covariance_by_root.flatten(-2).flatten(-3, -2)], dim=-1
-    )
-    by_input = d.covariance_by_input.flatten(-3, -2)
-    roots = square_root_differential(
-        r_next, U_next, torch.cat([covariance_rows, by_input], dim=-1).unflatten(-2, (k, k))
-    )
-    roots = roots.flatten(-3, -2)
-    p = n + n * n
-    A = torch.cat([torch.cat([d.mean_by_mean, mean_by_root.flatten(-2)], dim=-1), roots[..., :p]], dim=-2)
-    B = torch.cat([d.mean_by_input, roots[..., p:]], dim=-2)
-    c = s_next - (A @ s[..., None] + B @ input[..., None])[..., 0]
-    return A, B, c
+def _congruence(U: Array, X: Array) -> Array:
+    """U X U' for as many X as wanted along the last dimension (*batch, n, n, j)."""
+    return U[..., None, :, :] @ (U @ X.reshape(*X.shape[:-2], -1)).reshape(X.shape)
 
 
 def rollout(propagator: Propagator, model: Any, belief: Gaussian, inputs: Tensor) -> Gaussian:

@@ -87,7 +87,7 @@ class CvxpySolver:
             side.rows.value = columns[side.members]
             side.bound.value = ((lower if side.sign < 0 else upper) - offset)[side.members]
         warm = False
-        if isinstance(warm_start, QPSolution) and len(warm_start.q) == n:
+        if isinstance(warm_start, QPSolution) and len(warm_start.x) == n:
             warm = True
             form.y.value = factor @ (warm_start.x - free)
         built = perf_counter()
@@ -124,9 +124,7 @@ class CvxpySolver:
         if solution.status is Status.SOLVED and residual > self.tolerance:
             solution.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
             if self.options is None:  # its working set may be right all the same
-                solution.record[:] = rescue(
-                    solution.terms, problem.q, lower, upper, solution.record, LAST_CHANGES, lambda: False
-                )
+                solution.record[:] = rescue(problem, solution.softness, solution.record, LAST_CHANGES, lambda: False)
         return solution
 
     def _form(self, n: int, lower: Array, upper: Array) -> "_Form":

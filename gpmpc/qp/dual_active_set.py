@@ -15,7 +15,6 @@ from time import perf_counter
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solve_triangular
 
 from gpmpc.compiled import compile_for, unchecked_entry_point
 from gpmpc.exceptions import ProblemError
@@ -23,8 +22,8 @@ from gpmpc.qp import record as layout
 from gpmpc.qp.dual_kernels import SIGNATURE, solve
 from gpmpc.qp.dual_rescue import rescue
 from gpmpc.qp.problem import QuadraticProgram, SoftRows, stack_softness
-from gpmpc.qp.solution import QPSolution, Terms, WarmStart, proves_infeasibility
-from gpmpc.qp.workspace import PREPARED, factor_and_rows, new_memory, softness_in
+from gpmpc.qp.solution import QPSolution, WarmStart, proves_infeasibility
+from gpmpc.qp.workspace import new_memory, prepare_memory
 
 Array = NDArray[np.float64]
 _Arrays = tuple[Array, Array, Array, Array, Array]  # P, q, G, lower, upper
@@ -84,12 +83,23 @@ class DualActiveSet:
         Raises:
             ProblemError: The problem was not checked and breaks a rule of ``QuadraticProgram``.
         """
+        began = perf_counter()
         try:
             plan = self._plans[problem.G.shape] if soft is None else self._plan(problem.G.shape, soft)
         except (AttributeError, KeyError, TypeError):  # the first of its shape, or an unchecked one without a shape
             problem = QuadraticProgram.from_stacked(*problem)
             plan = self._plan(problem.G.shape, soft)
-        return _solve(problem, warm_start, plan, self)
+        (P, q, G, lower, upper), (softness, memory, size, where) = problem, plan
+        record, status = _empty(size), layout.MISUSE
+        try:
+            guess = _NO_RECORD if warm_start is None else warm_start.record  # pyright: ignore[reportAttributeAccessIssue]
+            if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
+                status = _run(P, q, G, lower, upper, guess, memory, record)
+                if not status:
+                    return _new(QPSolution, (record[where], problem, softness, record, 0.0, perf_counter() - began))
+        except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
+            pass
+        return _solve_again(problem, warm_start, plan, self, status, record, began)
 
     def prepare(self, P: ArrayLike, G: ArrayLike | None = None, soft: SoftRows | None = None) -> "Prepared":
         """Does once what depends on P, G and soft weights only.
@@ -127,21 +137,16 @@ class Prepared:
         build_seconds: Time that the preparation took [s].
     """
 
+    __slots__ = ("_G", "_P", "_memory", "_size", "_softness", "_solver", "_x", "build_seconds")
+
     def __init__(self, solver: DualActiveSet, problem: QuadraticProgram, soft: SoftRows | None):
         began = perf_counter()
         self._P, self._G, self._solver = problem.P, problem.G, solver
         m, n = problem.G.shape
-        self._plan = solver._plan((m, n), soft, prepared=True)
-        _, memory, size, _ = self._plan
-        P, q, G, lower, upper = problem
-        status = solve(
-            P, q, G, lower, upper, layout.NO_RECORD, memory, np.empty(size)
-        )  # factorises P, measures the rows of G
-        if status == layout.SOLVED:  # else numbers overflow, and every solve is to find that out by itself
-            L, rows = factor_and_rows(memory, n, m)
-            C = np.vstack([np.eye(n), problem.G])
-            rows[:] = solve_triangular(L, C.T, lower=True, trans="T", check_finite=False).T  # L^-T c_p
-            memory[0, PREPARED] = True
+        self._softness, self._memory, self._size, self._x = solver._plan((m, n), soft, prepared=True)
+        # factorises P and measures the rows of G; where numbers overflow, every solve is to find that out by itself
+        if solve(*problem, layout.NO_RECORD, self._memory, np.empty(self._size)) == layout.SOLVED:
+            prepare_memory(self._memory, problem.G)
         self.build_seconds = perf_counter() - began
 
     def solve(self, q: Array, lower: Array, upper: Array, warm_start: WarmStart = None) -> QPSolution:
@@ -156,56 +161,50 @@ class Prepared:
         Raises:
             ProblemError: Shapes that do not match, NaN, crossed bounds.
         """
-        return _solve((self._P, q, self._G, lower, upper), warm_start, self._plan, self._solver)
+        began = perf_counter()  # line by line as in ``DualActiveSet.solve``: a call costs a tenth of a small solve
+        P, G = self._P, self._G
+        record, status = _empty(self._size), layout.MISUSE
+        try:
+            guess = _NO_RECORD if warm_start is None else warm_start.record  # pyright: ignore[reportAttributeAccessIssue]
+            if q.dtype is lower.dtype is upper.dtype is _FLOAT:
+                status = _run(P, q, G, lower, upper, guess, self._memory, record)
+                if not status:
+                    problem = P, q, G, lower, upper
+                    return _new(
+                        QPSolution, (record[self._x], problem, self._softness, record, 0.0, perf_counter() - began)
+                    )
+        except (AttributeError, TypeError):
+            pass
+        plan = self._softness, self._memory, self._size, self._x
+        return _solve_again((P, q, G, lower, upper), warm_start, plan, self._solver, status, record, began)
 
 
-def _solve(problem: _Arrays, warm_start: WarmStart, plan: tuple, solver: DualActiveSet) -> QPSolution:
-    """Solves (P, q, G, lower, upper) in the memory of ``plan``."""
-    began = perf_counter()
-    P, q, G, lower, upper = problem
-    softness, memory, size, where = plan
-    record = _empty(size)
-    try:
-        guess = _NO_RECORD if warm_start is None else warm_start.record  # pyright: ignore[reportAttributeAccessIssue]
-        if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
-            status = _run(P, q, G, lower, upper, guess, memory, record)
-        else:  # may still be float64: a dtype that was pickled is another object
-            status = solve(P, q, G, lower, upper, guess, memory, record)
-    except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
-        status = layout.MISUSE
-    if status:
-        problem, record = _solve_again(problem, warm_start, memory, solver, status, record, began)
-        P, q, G, lower, upper = problem
-    return _new(
-        QPSolution, (record[where], _new(Terms, (P, G, softness)), q, lower, upper, record, 0.0, perf_counter() - began)
-    )
-
-
-def _solve_again(problem, warm_start, memory, solver, status, record, began) -> tuple[_Arrays, Array]:
+def _solve_again(problem: _Arrays, warm_start, plan, solver, status, record, began) -> QPSolution:
     """Continues a solve that did not end as ``SOLVED``: checks the problem, goes on, accepts the status or tries again.
-
-    Returns:
-        The problem's arrays as the kernel takes them, and the record.
 
     Raises:
         ProblemError: The problem breaks a rule of ``QuadraticProgram``.
     """
+    softness, memory, _, where = plan
     if status == layout.MISUSE:
         problem = QuadraticProgram.from_stacked(*problem)  # raises if it is misuse indeed
     P, q, G, lower, upper = problem
+    n, M = len(q), len(lower)
+
+    def solution(record: Array) -> QPSolution:
+        return QPSolution(record[where], problem, softness, record, 0.0, perf_counter() - began)
+
+    def late() -> bool:
+        return solver.time_limit is not None and perf_counter() - began > solver.time_limit
+
     if status == layout.MISUSE:
-        n, M = len(q), len(lower)
         status = solve(P, q, G, lower, upper, _as_record(warm_start, n, M), memory, record)
         if status == layout.MISUSE:  # a proper problem: rows that overflow, P at the edge of definiteness
             record[:] = 0.0
             record[[layout.STATUS, layout.VARIABLES, layout.CONSTRAINTS]] = layout.NUMERICAL_TROUBLE, n, M
         elif status == layout.SOLVED:
-            return problem, record
-    done, limit = record[layout.ITERATIONS], solver._limit(len(lower))
-
-    def late() -> bool:
-        return solver.time_limit is not None and perf_counter() - began > solver.time_limit
-
+            return solution(record)
+    done, limit = record[layout.ITERATIONS], solver._limit(M)
     while record[layout.STATUS] == layout.ITERATION_LIMIT and solver.time_limit is not None:
         if late() or done >= limit:
             record[layout.STATUS] = layout.TIME_LIMIT if late() else layout.ITERATION_LIMIT
@@ -216,15 +215,14 @@ def _solve_again(problem, warm_start, memory, solver, status, record, began) -> 
     record[layout.ITERATIONS] = done
     stopped = record[layout.STATUS] == layout.ITERATION_LIMIT and solver.iteration_limit is not None
     if stopped or _is_certain(record, G, lower, upper):
-        return problem, record
+        return solution(record)
     guess, record = record, np.empty_like(record)
     if solve(P, q, G, lower, upper, guess, memory, record) == layout.MISUSE:
         record = guess
     record[layout.ITERATIONS] += done
     if not _is_certain(record, G, lower, upper):
-        terms = Terms(P, G, softness_in(memory, len(lower)))
-        record = rescue(terms, q, lower, upper, record, limit, late)
-    return problem, record
+        record = rescue(problem, softness, record, limit, late)
+    return solution(record)
 
 
 def _is_certain(record: Array, G: Array, lower: Array, upper: Array) -> bool:

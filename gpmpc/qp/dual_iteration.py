@@ -31,6 +31,7 @@ from gpmpc.qp.violations import (
     most_violated,
     restore_limits,
 )
+from gpmpc.qp.workspace import UNCHANGED
 
 NEGLIGIBLE = 1e-26  # share of the length of q below which x, and a violation of a bound of zero, is none
 _GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
@@ -81,8 +82,9 @@ def iterate(work, active, k, count, margin, iterations, batches):
                 batches = _BATCHES  # caps may have changed x_u
         complete = several or work.soft or count == 1 or iterations >= work.limit
         if not complete:  # first satisfy those that were seen to be violated, then look at all
-            minimise(work, active, k)
-            count = keep_violated(work, margin, count)
+            if not work.prepared:
+                minimise(work, active, k)
+            count = keep_violated(work, active, k, margin, count)
             complete = count == 0
         if complete:
             evaluate(work, active, k)
@@ -108,7 +110,7 @@ def _satisfy_constraint(work, active, k, p):
     row, size = work.rows[place], int(work.end[p])
     free_value = dot(row, work.v, len(work.x))
     K_pp = dot(row, row, size) + work.softness[p]
-    multiply_rows(work.rows, active.place, k, row, size, solved)  # K_Wp
+    _multiply_working_rows(work, active, k, p, row)
     solve_lower(active.factor, k, solved)
     while True:
         _write_slot(work, active, k, p, above)
@@ -203,7 +205,13 @@ def add_constraints(work, active, k, count):
         p = abs(work.candidates[i]) - 1
         place = _make_row(work, active, first + i, p)
         row, size = work.rows[place], int(work.end[p])
-        multiply_rows(work.rows, active.place, k, row, size, solved)
+        if k < work.settings[UNCHANGED] and abs(active.name[k]) == p + 1:  # its row of the factor is there
+            _write_slot(work, active, k, p, work.candidates[i] > 0)
+            active.free_value[k] = dot(row, work.v, len(work.x))
+            k += 1
+            continue
+        work.settings[UNCHANGED] = min(work.settings[UNCHANGED], k)
+        _multiply_working_rows(work, active, k, p, row)
         solve_lower(active.factor, k, solved)
         K_pp = dot(row, row, size) + work.softness[p]
         pivot = K_pp - dot(solved, solved, k)
@@ -238,6 +246,16 @@ def _make_row(work, active, slot, p):
 
 
 @inline_njit
+def _multiply_working_rows(work, active, k, p, row):
+    """Writes K_Wp to ``solved``, where ``row`` is w_p."""
+    if work.prepared:
+        for i in range(k):
+            work.solved[i] = work.gram[p, active.place[i]]
+    else:
+        multiply_rows(work.rows, active.place, k, row, int(work.end[p]), work.solved)
+
+
+@inline_njit
 def _write_slot(work, active, k, p, above):
     """Writes constraint p, at its upper bound (``above``) or its lower one, and its multiplier's range to slot k."""
     cap, equality = work.cap[p], work.lower[p] == work.upper[p]
@@ -251,6 +269,7 @@ def _write_slot(work, active, k, p, above):
 def _drop_constraint(work, active, k, slot):
     """Drops the constraint in a slot from the working set of k, and from ``work.solved``; its place becomes free."""
     delete_row(active.factor, k, slot, work.solved, work.cosines, work.sines)
+    work.settings[UNCHANGED] = min(work.settings[UNCHANGED], slot)
     place = active.place[slot]
     for i in range(slot, k - 1):
         active.name[i], active.place[i], active.bound[i] = active.name[i + 1], active.place[i + 1], active.bound[i + 1]

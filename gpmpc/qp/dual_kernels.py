@@ -37,7 +37,7 @@ from gpmpc.qp.record import (
 )
 from gpmpc.qp.triangular import factorise, multiply_rows, solve_lower, solve_transposed, subtract_rows
 from gpmpc.qp.violations import choose_guess, list_violated, restore_limits
-from gpmpc.qp.workspace import all_finite, is_dense, is_dense_matrix, open_workspace, round_end
+from gpmpc.qp.workspace import UNCHANGED, all_finite, is_dense, is_dense_matrix, open_workspace, round_end
 
 SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 
@@ -136,8 +136,9 @@ def _solve_opened(work, active, guess, least):
 def start(work, active, guess):
     """Starts from a guess: x_u, soft rows that stay violated, and the working set; returns its size."""
     n, M = len(work.x), len(work.mu)
-    for i in range(work.capacity + 2):
-        active.place[i] = i
+    if not work.prepared:
+        for i in range(work.capacity + 2):
+            active.place[i] = i
     if work.soft and len(guess) > 0:
         for p in range(n, M):
             value, cap = guess[HEADER + n + p], work.cap[p]
@@ -152,7 +153,11 @@ def start(work, active, guess):
         return np.int64(0)
     first = HEADER + n + M
     count = choose_guess(work, guess[first : first + int(guess[WORKING])])
-    return drop_wrong_multipliers(work, active, add_constraints(work, active, np.int64(0), count))
+    if not work.prepared:
+        work.settings[UNCHANGED] = 0.0
+    k = add_constraints(work, active, np.int64(0), count)
+    work.settings[UNCHANGED] = k
+    return drop_wrong_multipliers(work, active, k)
 
 
 @inline_njit

@@ -19,7 +19,7 @@ from scipy.linalg import qr, solve_triangular
 
 from gpmpc.qp import record as layout
 from gpmpc.qp.problem import ABSENT
-from gpmpc.qp.solution import Terms, proves_infeasibility, zero_row_size
+from gpmpc.qp.solution import proves_infeasibility, zero_row_size
 
 Array = NDArray[np.float64]
 
@@ -33,23 +33,22 @@ _CORRECTIONS = 12
 
 
 @np.errstate(all="ignore")  # what is not finite does not convince
-def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, limit: int, late: Callable) -> Array:
+def rescue(problem: tuple, softness: Array, record: Array, limit: int, late: Callable) -> Array:
     """The record of a solve that starts from the working set of another, ``record``.
 
     Args:
-        terms: P, G and softness.
-        q: (n,).
-        lower: (M,), -1e20 or less where absent.
-        upper: (M,) likewise.
+        problem: P, q, G, lower and upper; bounds of 1e20 or more are absent.
+        softness: (2, M), see ``gpmpc.qp.problem.stack_softness``.
         record: What the kernel wrote.
         limit: Changes of the working set before ``ITERATION_LIMIT``.
         late: Whether it is time for ``TIME_LIMIT``.
     """
+    P, q, G, lower, upper = problem
     result = record.copy()
     try:
         lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
         for dependent in _DEPENDENT:
-            solve = _Solve(terms, q, lower, upper, dependent, late)
+            solve = _Solve((P, q, G, lower, upper), softness, dependent, late)
             result[layout.STATUS] = solve.run(_names(record, len(q), len(lower)), limit)
             if result[layout.STATUS] != layout.NUMERICAL_TROUBLE:
                 break
@@ -64,15 +63,16 @@ def rescue(terms: Terms, q: Array, lower: Array, upper: Array, record: Array, li
 class _Solve:
     """One program, scaled, and the state of the iteration: the working set, x, and the multipliers."""
 
-    def __init__(self, terms: Terms, q: Array, lower: Array, upper: Array, dependent: float, late: Callable):
+    def __init__(self, problem: tuple, softness: Array, dependent: float, late: Callable):
+        P, q, G, lower, upper = problem
         n, M = len(q), len(lower)
-        D = _power_of_two(np.sqrt(np.diagonal(terms.P)))
-        E = np.concatenate([1.0 / D, _power_of_two(np.abs(terms.G * D).max(axis=1, initial=0.0))])
+        D = _power_of_two(np.sqrt(np.diagonal(P)))
+        E = np.concatenate([1.0 / D, _power_of_two(np.abs(G * D).max(axis=1, initial=0.0))])
         self.D, self.E, self.n = D, E, n
-        self.P, self.q, self.C = terms.P * np.outer(D, D), q * D, np.vstack([np.eye(n), terms.G * D * E[n:, None]])
+        self.P, self.q, self.C = P * np.outer(D, D), q * D, np.vstack([np.eye(n), G * D * E[n:, None]])
         self.lower, self.upper = lower * E, upper * E
-        self.softness, self.caps = terms.softness[0] * E * E, terms.softness[1] / E
-        self.G, self.bounds, self.late = terms.G, (lower, upper), late
+        self.softness, self.caps = softness[0] * E * E, softness[1] / E
+        self.G, self.bounds, self.late = G, (lower, upper), late
         self.L = np.linalg.cholesky(self.P)
         self.columns = solve_triangular(self.L, self.C.T, lower=True)  # L^-1 C'
         self.norms = np.sqrt((self.columns**2).sum(axis=0) + self.softness)

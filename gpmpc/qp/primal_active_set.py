@@ -87,9 +87,7 @@ class PrimalActiveSet:
         def finish(status, x, multipliers, active, iterations):
             solution = make_solution(problem, status, x, multipliers, active_set=active, iterations=iterations)
             if status in (Status.SOLVED, Status.NUMERICAL_TROUBLE):  # checked, and its last digits found
-                solution.record[:] = rescue(
-                    solution.terms, problem.q, lower, upper, solution.record, LAST_CHANGES, lambda: False
-                )
+                solution.record[:] = rescue(problem, solution.softness, solution.record, LAST_CHANGES, lambda: False)
                 if solution.status is not Status.INFEASIBLE and not solution.is_optimal(self.tolerance):
                     solution.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
             return solution._replace(solve_seconds=perf_counter() - began)
@@ -149,7 +147,7 @@ def _read_warm_start(warm_start: WarmStart, n: int, M: int) -> tuple[Array, Arra
     """A point to start near, and an active set (M,) to start with; zeros where the warm start says nothing."""
     x, active = np.zeros(n), np.zeros(M)
     if isinstance(warm_start, QPSolution):
-        if len(warm_start.q) == n and len(warm_start.lower) == M:
+        if len(warm_start.x) == n and warm_start.softness.shape[1] == M:
             active = warm_start.active_set.astype(np.float64)
             x = np.where(np.isfinite(warm_start.x), warm_start.x, 0.0)
     elif warm_start is not None:

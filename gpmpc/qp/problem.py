@@ -156,10 +156,10 @@ class QuadraticProgram(_Arrays):
         _check_bounds("variable", lower[:n], upper[:n], ("lower", "upper"))
         return cls.unchecked(P, q, G, lower, upper)
 
-    @classmethod
-    def unchecked(cls, P: Array, q: Array, G: Array, lower: Array, upper: Array) -> "QuadraticProgram":
+    @staticmethod
+    def unchecked(P: Array, q: Array, G: Array, lower: Array, upper: Array) -> "QuadraticProgram":
         """Takes the arrays as they are, in 0.2 us; ``DualActiveSet.solve`` checks them in compiled code."""
-        return _new(cls, (P, q, G, lower, upper))
+        return _new(QuadraticProgram, (P, q, G, lower, upper))
 
     def __reduce__(self):
         return QuadraticProgram.unchecked, tuple(self)

@@ -12,20 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import record as layout
-from gpmpc.qp.problem import ABSENT, QuadraticProgram
+from gpmpc.qp.problem import ABSENT, QuadraticProgram, stack_softness
 from gpmpc.status import Status
 
 Array = NDArray[np.float64]
 
 _ROUNDING = 4e-15  # share of a sum's terms that counts as rounding
-
-
-class Terms(NamedTuple):
-    """What of a problem does not depend on q and the bounds."""
-
-    P: Array  # (n, n)
-    G: Array  # (m, n)
-    softness: Array  # (2, M), see gpmpc.qp.problem.SoftRows
 
 
 class Residuals(NamedTuple):
@@ -54,39 +46,55 @@ class QPSolution(NamedTuple):
 
     Attributes:
         x: (n,) the minimiser; the best iterate if the status is not ``SOLVED``. A view of the record.
-        terms: P, G and softness of the problem.
-        q: (n,).
-        lower: (M,) bounds of the stacked constraints ``[x; Gx]``.
-        upper: (M,).
+        arrays: P, q, G, and the bounds (M,) of the stacked constraints ``[x; Gx]``, as in ``QuadraticProgram``.
+        softness: (2, M), see ``gpmpc.qp.problem.stack_softness``.
         record: The solver's whole result in one array, and a warm start for the next solve; see ``gpmpc.qp.record``.
         build_seconds: Time spent on building or compiling the problem in this call [s].
         solve_seconds: Time spent on solving it [s].
     """
 
     x: Array
-    terms: Terms
-    q: Array
-    lower: Array
-    upper: Array
+    arrays: tuple[Array, Array, Array, Array, Array]
+    softness: Array
     record: Array
-    build_seconds: float
-    solve_seconds: float
+    build_seconds: float = 0.0
+    solve_seconds: float = 0.0
+
+    @property
+    def problem(self) -> QuadraticProgram:
+        """What was solved."""
+        return QuadraticProgram.unchecked(*self.arrays)
+
+    @property
+    def q(self) -> Array:
+        """(n,)."""
+        return self.arrays[1]
+
+    @property
+    def lower(self) -> Array:
+        """(M,) lower bounds of the stacked constraints."""
+        return self.arrays[3]
+
+    @property
+    def upper(self) -> Array:
+        """(M,) upper bounds likewise."""
+        return self.arrays[4]
 
     @property
     def multipliers(self) -> Array:
         """(M,) multipliers of the stacked constraints; Farkas' proof if the status is ``INFEASIBLE``."""
-        start = layout.HEADER + len(self.q)
-        return self.record[start : start + len(self.lower)]
+        start = layout.HEADER + len(self.x)
+        return self.record[start : start + self.softness.shape[1]]
 
     @property
     def z(self) -> Array:
         """(m,) multipliers of the rows of G: positive at h_upper, negative at h_lower."""
-        return self.multipliers[len(self.q) :]
+        return self.multipliers[len(self.x) :]
 
     @property
     def z_box(self) -> Array:
         """(n,) multipliers of the box: positive at ub, negative at lb."""
-        return self.multipliers[: len(self.q)]
+        return self.multipliers[: len(self.x)]
 
     @property
     def status(self) -> Status:
@@ -101,8 +109,8 @@ class QPSolution(NamedTuple):
     @property
     def active_set(self) -> NDArray[np.int8]:
         """(M,) -1 where a stacked constraint works at its lower bound, +1 at its upper bound, 0 elsewhere."""
-        active = np.zeros(len(self.lower), dtype=np.int8)
-        start = layout.HEADER + len(self.q) + len(self.lower)
+        M = self.softness.shape[1]
+        active, start = np.zeros(M, dtype=np.int8), layout.HEADER + len(self.x) + M
         codes = self.record[start : start + int(self.record[layout.WORKING])]
         active[np.abs(codes).astype(int) - 1] = np.sign(codes)
         return active
@@ -110,12 +118,12 @@ class QPSolution(NamedTuple):
     @property
     def objective(self) -> float:
         """1/2 x'Px + q'x, with the price of violated soft rows [the unit of the cost]."""
-        x = self.x
-        return float(0.5 * x @ self.terms.P @ x + self.q @ x + self._price(self.violation()))
+        x, (P, q, *_) = self.x, self.arrays
+        return float(0.5 * x @ P @ x + q @ x + self._price(self.violation()))
 
     def violation(self) -> Array:
         """(M,) how far each stacked constraint lies outside its bounds, in the constraint's own unit; soft ones too."""
-        return self._violation(self.terms.G @ self.x)
+        return self._violation(self.arrays[2] @ self.x)
 
     @np.errstate(all="ignore")  # the multipliers of a failed solve may be anything
     def residuals(self, zero: float = 1e-12) -> Residuals:
@@ -124,8 +132,8 @@ class QPSolution(NamedTuple):
         Args:
             zero: What counts as no x at all, as a share of the free minimiser.
         """
-        P, G, (softness, caps) = self.terms
-        x, q, multipliers = self.x, self.q, self.multipliers
+        (P, q, G, lower, upper), (softness, caps) = self.arrays, self.softness
+        x, multipliers = self.x, self.multipliers
         sizes, up, down = np.abs(multipliers), multipliers > 0, multipliers < 0
         rows, slope, n = G @ x, P @ x, len(x)
         units = np.sqrt(np.diagonal(P))
@@ -134,19 +142,19 @@ class QPSolution(NamedTuple):
 
         violation = self._violation(rows)
         beyond = np.maximum(0.0, violation - np.where(sizes >= caps, np.inf, softness * sizes))
-        bound = np.abs(np.where(np.concatenate([x, rows]) > self.upper, self.upper, self.lower))
+        bound = np.abs(np.where(np.concatenate([x, rows]) > upper, upper, lower))
         own = np.concatenate([np.maximum(np.abs(x), zero / units), np.abs(G) @ np.maximum(np.abs(x), zero / units)])
-        own[n:][~G.any(axis=1)] = zero_row_size(G, self.lower, self.upper)
+        own[n:][~G.any(axis=1)] = zero_row_size(G, lower, upper)
         primal = _largest_ratio(beyond, np.maximum(own, bound))
 
-        absent = (up & (self.upper >= ABSENT)) | (down & (self.lower <= -ABSENT))
+        absent = (up & (upper >= ABSENT)) | (down & (lower <= -ABSENT))
         stray = np.where(absent, sizes, np.maximum(0.0, sizes - caps))
         rest = np.abs(slope + q + G.T @ self.z + self.z_box) + stray[:n] + np.abs(G).T @ stray[n:]
         paid = sizes - stray
         own = np.abs(P) @ np.abs(x) + np.abs(q) + paid[:n] + np.abs(G).T @ paid[n:]
         dual = _largest_ratio(rest, np.maximum(own, zero * units))
 
-        support = multipliers[up] * self.upper[up], multipliers[down] * self.lower[down]
+        support = multipliers[up] * upper[up], multipliers[down] * lower[down]
         paying, capped = softness > 0.0, (sizes >= caps) & np.isfinite(caps)  # the squares of others may overflow
         soft = softness[paying] @ multipliers[paying] ** 2 + caps[capped] @ violation[capped]
         curvature, gain = x @ slope, q @ x
@@ -160,13 +168,13 @@ class QPSolution(NamedTuple):
         return all(residual <= eps for residual in self.residuals())  # which NaN is not
 
     def _violation(self, rows: Array) -> Array:
-        values = np.concatenate([self.x, rows])
-        above = np.where(self.upper < ABSENT, values - self.upper, 0.0)
-        below = np.where(self.lower > -ABSENT, self.lower - values, 0.0)
+        values, (lower, upper) = np.concatenate([self.x, rows]), self.arrays[3:]
+        above = np.where(upper < ABSENT, values - upper, 0.0)
+        below = np.where(lower > -ABSENT, lower - values, 0.0)
         return np.maximum(0.0, np.maximum(above, below))
 
     def _price(self, violation: Array) -> float:
-        softness, caps = self.terms.softness
+        softness, caps = self.softness
         soft, linear = softness > 0, np.isfinite(caps)
         return float(0.5 * np.sum(violation[soft] ** 2 / softness[soft]) + np.sum(caps[linear] * violation[linear]))
 
@@ -186,12 +194,6 @@ class QPSolver(Protocol):
 def _largest_ratio(rest: ArrayLike, own: ArrayLike) -> float:
     """The largest of ``rest / own``, zero where both are."""
     return float(np.max(np.divide(rest, own, out=np.zeros(np.shape(rest)), where=np.not_equal(rest, 0.0))))
-
-
-def _hard_terms(problem: QuadraticProgram) -> Terms:
-    """The terms of a problem without soft rows."""
-    M = sum(problem.G.shape)
-    return Terms(problem.P, problem.G, np.vstack([np.zeros(M), np.full(M, np.inf)]))
 
 
 def make_solution(
@@ -228,16 +230,8 @@ def make_solution(
     record[layout.STATUS] = layout.STATUSES.index(status)
     record[layout.ITERATIONS] = iterations
     record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
-    return QPSolution(
-        record[layout.HEADER : layout.HEADER + n],
-        _hard_terms(problem),
-        problem.q,
-        problem.lower,
-        problem.upper,
-        record,
-        build_seconds,
-        solve_seconds,
-    )
+    hard = stack_softness(None, n, M - n)
+    return QPSolution(record[layout.HEADER : layout.HEADER + n], problem, hard, record, build_seconds, solve_seconds)
 
 
 @np.errstate(all="ignore")  # what is not finite proves nothing

@@ -47,12 +47,16 @@ def list_violated(work, margin):
 
 
 @inline_njit
-def keep_violated(work, margin, count):
-    """Computes the listed constraints anew from x = y[:n]; keeps the violated ones, and returns how many."""
+def keep_violated(work, active, k, margin, count):
+    """Computes the listed constraints anew, from x = y[:n] or K; keeps the violated ones, and returns how many."""
     kept, n, y = 0, len(work.x), work.y
     for i in range(count):
         p = work.violated[i]
-        if p >= n:
+        if work.prepared:
+            y[p] = dot(work.rows[p], work.v, n)
+            for j in range(k):
+                y[p] -= work.gram[p, active.place[j]] * work.mu[active.place[j]]
+        elif p >= n:
             y[p] = dot(work.G[p - n], y, int(work.end[p]))
         work.excess[p] = max(y[p] - work.allowed_high[p], work.allowed_low[p] - y[p]) / work.scale[p] - margin
         if work.excess[p] > 0.0:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from gpmpc.compiled import inline_njit
 from gpmpc.kernels.linalg import aligned_rows
@@ -15,7 +16,7 @@ from gpmpc.qp.record import HEADER
 
 Array = NDArray[np.float64]
 
-_LIMIT, TOLERANCE, SOFT, PREPARED, SETTINGS = 0, 1, 2, 3, 4
+_LIMIT, TOLERANCE, SOFT, PREPARED, UNCHANGED, SETTINGS = 0, 1, 2, 3, 4, 5
 _REALS, _INTEGERS = 5, 26  # rows of ``memory`` at which vectors begin, after settings and traits,
 _REST = 30  # then integers, the factor of the working set, L and rows
 _END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
@@ -32,6 +33,7 @@ class Workspace(NamedTuple):
     G: Any  # (m, n)
     L: Any  # (n, n) with P = L'L
     rows: Any  # (capacity + 1, n) the w_p of the working set, by place; all M of a prepared problem
+    gram: Any  # (M, M) all K_pq of a prepared problem; empty otherwise
     v: Any  # (n,) -L^-T q: L x = v without working constraints
     lower: Any  # (M,) bounds, infinite where absent
     upper: Any
@@ -61,7 +63,8 @@ class Workspace(NamedTuple):
     limit: int  # changes of the working set
     tolerance: float
     soft: bool  # whether rows are soft
-    prepared: bool  # whether L, scale, end and rows are there
+    settings: Any  # of the memory; one is how many rows of the factor are as ``start`` made them from the last guess
+    prepared: bool  # whether L, scale, end, rows and gram are there
 
 
 class WorkingSet(NamedTuple):
@@ -85,28 +88,26 @@ def new_memory(softness: Array, n: int, limit: int, tolerance: float, soft: bool
     M = softness.shape[1]
     capacity = _most_working(n, M, soft)
     wide = padded(max(M, capacity + 2, SETTINGS)) + 8  # kernels write whole lanes
-    own = n * padded(n) + n * max(M if prepared else 0, capacity + 1)
+    own = n * padded(n) + (M * (n + M) if prepared else n * (capacity + 1))
     memory = aligned_rows(_REST + capacity + 1 - (-own // wide), wide)  # loads across cache lines take twice the time
     memory[:] = 0.0
     box = np.arange(M) < n
-    memory[0, :SETTINGS] = limit, tolerance, soft, False
+    memory[0, :SETTINGS] = limit, tolerance, soft, False, 0
     memory[1, :M], memory[2:4, :M] = box, softness
     memory[4, :M] = box * np.minimum(n, (np.arange(M) // _END_STEP + 1) * _END_STEP)
     return memory
 
 
-def softness_in(memory: Array, M: int) -> Array:
-    """Returns softness and caps (2, M), a view."""
-    return memory[2:4, :M]
-
-
-def factor_and_rows(memory: Array, n: int, m: int) -> tuple[Array, Array]:
-    """Returns L of P = L'L, a copy, and the rows w_p (M, n) of prepared memory, a view."""
-    settings, rest = memory[0], memory[_REST:]
-    start = rest[_most_working(n, n + m, settings[SOFT] != 0.0) + 1 :].reshape(-1)
-    L = np.tril(start[: n * padded(n)].reshape(n, padded(n))[:, :n])
+def prepare_memory(memory: Array, G: Array) -> None:
+    """Completes ``prepared`` memory, in which a solve has left the factor of P, with the rows w_p and K = C P^-1 C'."""
+    m, n = G.shape
+    rest = memory[_REST + _most_working(n, n + m, memory[0, SOFT] != 0.0) + 1 :].reshape(-1)
+    L = np.tril(rest[: n * padded(n)].reshape(n, padded(n))[:, :n])
     np.fill_diagonal(L, 1.0 / np.diagonal(L))
-    return L, start[n * padded(n) :][: (n + m) * n].reshape(n + m, n)
+    rows = solve_triangular(L, np.vstack([np.eye(n), G]).T, lower=True, trans="T", check_finite=False).T  # L^-T c_p
+    rest[n * padded(n) :][: rows.size] = rows.ravel()
+    rest[n * padded(n) + rows.size :][: len(rows) ** 2] = (rows @ rows.T).ravel()
+    memory[0, PREPARED] = True
 
 
 @inline_njit
@@ -135,15 +136,16 @@ def open_workspace(P, q, G, memory, out):
     soft = settings[SOFT] != 0.0
     capacity = _most_working(n, M, soft)
     factor, rest = memory[_REST : _REST + capacity + 1], memory[_REST + capacity + 1 :].reshape(-1)
-    count = M if settings[PREPARED] != 0.0 else capacity + 1
-    size = n * padded(n)
-    L, rows = rest[:size].reshape(n, padded(n)), rest[size : size + count * n].reshape(count, n)
+    prepared = settings[PREPARED] != 0.0
+    count, size = M if prepared else capacity + 1, n * padded(n)
+    end = size + count * n
+    L, rows = rest[:size].reshape(n, padded(n)), rest[size:end].reshape(count, n)
+    gram = rest[end : end + M * M * prepared].reshape(M * prepared, M)
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     work = Workspace(
-        P, q, G, L, rows, real[0], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2], memory[3],
+        P, q, G, L, rows, gram, real[0], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2], memory[3],
         memory[4], out, x, mu, real[6][:M], real[7], whole[0], whole[1], real[8], real[9], real[10], real[11], real[12],
-        real[13], real[14], real[15], capacity, int(settings[_LIMIT]), settings[TOLERANCE], soft,
-        settings[PREPARED] != 0.0,
+        real[13], real[14], real[15], capacity, int(settings[_LIMIT]), settings[TOLERANCE], soft, settings, prepared,
     )  # fmt: skip
     active = WorkingSet(whole[2], whole[3], real[16], real[17], real[18], real[19], real[20], factor)
     return work, active

@@ -58,9 +58,8 @@ def pack(step: Step, gp_size: int | None, n: int, m: int, record_problems: bool)
         arrays += [decision.inputs, decision.means, decision.covariances]
         expected += [(H, m), (H + 1, n), (H + 1, n, n)]
         if solution is not None:
-            P, G, softness = solution.terms
             arrays += [solution.x, solution.record]
-            given = (P, solution.q, G, solution.lower, solution.upper, softness)
+            given = (*solution.arrays, solution.softness)
         elif problem is not None:
             hard = np.vstack([np.zeros(len(problem.lower)), np.full(len(problem.lower), np.inf)])
             given = (problem.P, problem.q, problem.G, problem.lower, problem.upper, hard)

@@ -308,13 +308,13 @@ def _problem(message: Any) -> RecordedProblem:
 def _residuals(problem: RecordedProblem) -> tuple[float, float, float]:
     """Judges a recorded solution; NaN where there is none."""
     from gpmpc.qp import record
-    from gpmpc.qp.solution import QPSolution, Terms
+    from gpmpc.qp.solution import QPSolution
 
     if not len(problem.x):
         return np.nan, np.nan, np.nan
     P, q, G, lower, upper, softness, x, multipliers = problem
     values = np.concatenate([np.zeros(record.HEADER), x, multipliers])
-    return QPSolution(x, Terms(P, G, softness), q, lower, upper, values, 0.0, 0.0).residuals()
+    return QPSolution(x, (P, q, G, lower, upper), softness, values).residuals()
 
 
 class Recovery(NamedTuple):

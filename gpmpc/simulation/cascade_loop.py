@@ -52,7 +52,7 @@ def cascade_loop(
     """Flies a cascade.
 
     Args:
-        plant: The twelve states at the inner rate, such as ``Integrated(Coupled(), time_step=0.05)``.
+        plant: The twelve states at the inner rate, such as ``gpmpc.systems.coupled()``.
         cascade: The controllers.
         references: Of the outer loop: states x, vx, y, vy, z, vz (steps + horizon, 6) or more, one an outer step; as a
             ``Reference`` with the inputs that belong to them.

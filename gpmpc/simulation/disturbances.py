@@ -6,13 +6,15 @@ step begins: a window that opens within a step acts from the next one on.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 import numpy as np
 
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel, check_number
-from gpmpc.systems import Dynamics, Plant
+from gpmpc.systems import Plant, System
 
 
 class Disturbance(Protocol):
@@ -31,7 +33,7 @@ class Disturbance(Protocol):
 class Gust(Disturbance):
     """A constant push on single states over a time window, integrated by the plant like any other force.
 
-    (On a ``Map``, whose right-hand side is the next state, it is added to that.)
+    (Where the dynamics give the next state, it is added to that.)
 
     Attributes:
         rates: What is added to the derivative of a state, by its name: ``{"vx": 2.0}`` is an acceleration of
@@ -59,7 +61,7 @@ class Gust(Disturbance):
 
         Raises:
             SettingError: The plant has no such state.
-            UnsupportedModel: The plant is no dataclass over ``dynamics``, like ``Integrated``.
+            UnsupportedModel: The plant is no ``System``, or its dynamics are a simulator's.
         """
         names = plant.dynamics.state_names
         for name in self.rates:
@@ -67,12 +69,7 @@ class Gust(Disturbance):
                 raise SettingError("rates", f"must name states of the plant, {', '.join(names)}; got {name!r}")
         if not self.start <= time < self.stop:
             return plant
-        if not is_dataclass(plant):
-            raise UnsupportedModel(
-                f"a gust needs a plant that is a dataclass over its dynamics; got {type(plant).__name__}. "
-                "Possible with any plant: Replaced"
-            )
-        return replace(plant, dynamics=_Pushed(plant.dynamics, tuple(float(self.rates.get(s, 0.0)) for s in names)))
+        return _pushed(plant, tuple(float(self.rates.get(name, 0.0)) for name in names))
 
 
 @dataclass(frozen=True)
@@ -155,23 +152,20 @@ class Dropout(Disturbance):
         return lost
 
 
-@dataclass(frozen=True)
-class _Pushed:
-    """A right-hand side with constants added (n,)."""
+@lru_cache(maxsize=8)
+def _pushed(plant: Plant, rates: tuple[float, ...]) -> System:
+    """A system with constants (n,) added to its right-hand side, or to its next state."""
+    if not isinstance(plant, System) or getattr(plant.dynamics, "stateful", False):
+        what = "a gust needs a plant that is a System with dynamics of its own"
+        raise UnsupportedModel(f"{what}; got {type(plant).__name__}. Possible with any plant: Replaced")
+    method = "successor" if hasattr(plant.dynamics, "successor") else "derivative"
+    of = getattr(plant.dynamics, method)
 
-    dynamics: Dynamics
-    rates: tuple[float, ...]
+    def pushed(x: Any, u: Any) -> list[Any]:
+        return [entry + rate for entry, rate in zip(of(x, u), rates, strict=True)]
 
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        return self.dynamics.state_names
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        return self.dynamics.input_names
-
-    def derivative(self, x: Any, u: Any) -> Sequence[Any]:
-        return [d + rate for d, rate in zip(self.dynamics.derivative(x, u), self.rates, strict=True)]
+    names = {"state_names": plant.state_names, "input_names": plant.input_names}
+    return replace(plant, dynamics=SimpleNamespace(**names, **{method: pushed}))
 
 
 def _check_window(start: float, stop: float) -> None:

@@ -128,7 +128,7 @@ class PlantSimulator:
     ):
         check_number("seed", seed, least=0, whole=True)
         if not hasattr(plant, "dynamics"):
-            what = "must be a plant, such as Integrated(dynamics, 0.1), or a ModelLoop"
+            what = "must be a plant, such as System(dynamics, 0.1), or a ModelLoop"
             raise SettingError("system", f"{what}; got {type(plant).__name__}")
         if not isinstance(noise, Noise | None):
             raise SettingError("noise", f"must be Noise(...); got {noise!r}")

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from html import escape
 from itertools import zip_longest
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import pandas as pd
 from rich import box
@@ -75,6 +76,7 @@ class Document:
         lists: Items by their heading.
         code: Lines that are typed or data, by their heading.
         images: PNG files by name.
+        links: Addresses by their text, for HTML, folded.
         latex: Tables for LaTeX; by default the same.
     """
 
@@ -86,6 +88,7 @@ class Document:
     lists: Mapping[str, Sequence[str]] = field(default_factory=dict)
     code: Mapping[str, Sequence[str]] = field(default_factory=dict)
     images: Mapping[str, bytes] = field(default_factory=dict)
+    links: Mapping[str, str] = field(default_factory=dict)
     latex: Sequence[Table] | None = None
 
     def files(self, name: str) -> dict[str, str | bytes]:
@@ -151,6 +154,12 @@ class Document:
             parts.append(f"<h2>{heading}</h2><ul>{''.join(f'<li>{escape(item)}</li>' for item in items)}</ul>")
         for heading, lines in self.code.items():
             parts.append(f"<h2>{heading}</h2><pre>{escape(chr(10).join(lines))}</pre>")
+        if self.links:
+            items = (
+                f'<li><a href="{quote(to, errors="surrogateescape")}/">{escape(text)}</a></li>'
+                for text, to in self.links.items()
+            )
+            parts.append(f"<details><summary>The {len(self.links)} runs</summary><ul>{''.join(items)}</ul></details>")
         head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
         head += f"<title>{escape(self.title)}</title><style>{_STYLE}</style>"
         return f"<!doctype html>\n<html lang=en><head>{head}</head><body>\n" + "\n".join(parts) + "\n</body></html>\n"

@@ -1,12 +1,11 @@
-"""Flies one trial of one subsystem with a learned model, and measures it.
+"""Flies one trial of a system with a learned model, and measures it.
 
     data -> a random subset -> training -> controller -> closed loop -> metrics
 
-``Experiment`` holds everything that the numbers follow from, as objects; files and settings are not among them. It
-flies the translational subsystem along a trajectory, or the rotational one on its own, at its own rate, along the
-attitudes that the trajectory needs (``gpmpc.datasets.attitudes``). The seed is that of the subset, of the training's
-random starts and of the noise: one seed gives one result, and the subsets of one seed are nested, so that sizes can be
-compared in pairs.
+``Experiment`` holds everything that the numbers follow from, as objects; files and settings are not among them. What is
+learned follows what is flown: data come from the system, which the plant is as well unless a setting of its own makes
+it another. The seed is that of the subset, of the training's random starts and of the noise: one seed gives one result,
+and the subsets of one seed are nested, so that sizes can be compared in pairs.
 """
 
 import inspect
@@ -17,35 +16,33 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gpmpc.datasets import DataSource, rotational_states_along
+from gpmpc.datasets import DataSource
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
 from gpmpc.gp import GPPosterior, Training, Transitions
-from gpmpc.metrics import NEAR, find_loss, time_quantiles, tracking_error, violation_rate
+from gpmpc.metrics import find_loss, time_quantiles, tracking_error, violation_rate
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.policy import OnFailure, check_policy
 from gpmpc.propagation import MomentMatching, Propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
 from gpmpc.studies.document import Table
 from gpmpc.studies.study import random_rows
-from gpmpc.systems import Coupled, Map, Plant, Rotational, Translational
-from gpmpc.trajectories import Trajectory, states_along
+from gpmpc.systems import System
+from gpmpc.trajectories import Trajectory
 
-_NAMES = {"translational": Translational.state_names, "rotational": Rotational.state_names}
-_UNITS = {"translational": "m", "rotational": "rad"}  # of the positions and angles that errors are stated in
 _STAGES = ("model", "build", "solve", "total")  # of a decision's time
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """One flight of one subsystem, with everything that it depends on.
+    """One flight of one system, with everything that it depends on.
 
     Attributes:
         data: Where transitions come from.
-        trajectory: What is followed, from its beginning.
-        plant: What flies, and the true model of a controller that takes one.
+        trajectory: What is followed, from its beginning; None holds the system's goal.
+        system: Whose transitions are learned; names, units and references are its own.
         train: From transitions and a ``seed`` to a ``Training``.
         controller: From a model, or from a ``plant`` where its first argument is called so, to a ``Controller``.
-        subsystem: Which of the two is learned and flown.
+        plant: What flies, and the true model of a controller that takes one; the system by default.
         name: Of the trajectory, which data from files are filed under.
         size: Rows drawn for the training; None takes all.
         steps: Of the flight.
@@ -63,11 +60,11 @@ class Experiment:
     """
 
     data: DataSource
-    trajectory: Trajectory
-    plant: Plant
+    trajectory: Trajectory | None
+    system: System
     train: Callable[..., Training]
     controller: Callable[..., Any]
-    subsystem: Literal["translational", "rotational"] = "translational"
+    plant: System | None = None
     name: str = "elliptical"
     size: int | None = None
     steps: int = 100
@@ -86,17 +83,10 @@ class Experiment:
         check_policy(self.on_failure)
         if self.loop not in ("plant", "model"):
             raise SettingError("loop", f"must be 'plant' or 'model'; got {self.loop!r}")
-        if self.subsystem not in _NAMES:
-            raise SettingError("subsystem", f"must be one of {', '.join(_NAMES)}; got {self.subsystem!r}")
-        expected, names = _NAMES[self.subsystem], tuple(self.plant.dynamics.state_names)
-        if names != expected:
-            what = f"must have the states of the {self.subsystem} subsystem, {', '.join(expected)}"
-            whole = "; the whole quadrotor is flown by gpmpc.simulation.cascade_loop"
-            raise SettingError(
-                "plant", f"{what}; got {', '.join(names)}{whole if names == Coupled.state_names else ''}"
-            )
-        if self.subsystem == "rotational" and isinstance(self.plant, Map):
-            raise SettingError("plant", "the rotational subsystem is flown at its own rate; a Map has none")
+        plant, system = self.flown, self.system
+        shapes = [(p.state_names, p.input_names, p.time_step) for p in (system, plant)]
+        if shapes[0] != shapes[1]:
+            raise SettingError("plant", f"must have the states, inputs and time step of {system.name}; got {shapes[1]}")
         if self.loop == "model" and not self.learns:
             raise SettingError("loop", "a model loop needs a controller that learns a model; this one knows the plant")
         for disturbance in self.disturbances:
@@ -104,7 +94,20 @@ class Experiment:
                 what = "must each name what it is, such as {_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}}"
                 raise SettingError("disturbances", f"{what}; got {disturbance!r}")
         if self.loop == "plant":  # noise and disturbances that do not fit it are found before the training
-            PlantSimulator(self.plant, np.zeros(len(names)), self.disturbances, self.noise, self.seed)
+            PlantSimulator(plant, plant.goal, self.disturbances, self.noise, self.seed)
+        self.references(1)
+        problem = getattr(self.controller, "keywords", {}).get("problem")
+        shape = len(system.state_names), len(system.input_names)
+        if problem is not None and (problem.state_dim, problem.input_dim) != shape:
+            weighed = f"weighs {problem.state_dim} states and {problem.input_dim} inputs"
+            raise SettingError("controller.problem", f"{weighed}; {system.name} has {shape[0]} and {shape[1]}")
+        if self.learns and hasattr(self.data, "check"):
+            self.data.check(system, self.trajectory)
+
+    @property
+    def flown(self) -> System:
+        """The plant: the system, unless another one was given."""
+        return self.system if self.plant is None else self.plant
 
     @property
     def learns(self) -> bool:
@@ -118,28 +121,26 @@ class Experiment:
             SettingError: More rows are asked for than there are.
             ShapeError: The data have other dimensions than the plant.
         """
-        data = self.data.transitions(self.name, self.trajectory, self.subsystem)
-        expected = len(self.plant.dynamics.state_names), len(self.plant.dynamics.input_names)
+        system = self.system
+        data = self.data.transitions(system, self.trajectory, self.name)
+        expected = len(system.state_names), len(system.input_names)
         if (data.state_dim, data.input_dim) != expected:
-            raise ShapeError(f"data and plant must have the same dimensions; got {data.state_dim, data.input_dim}")
+            raise ShapeError(f"data and system must have the same dimensions; got {data.state_dim, data.input_dim}")
         size = len(data) if self.size is None else self.size
         if size > len(data):
             raise SettingError("data.size", f"must be at most {len(data)}, the rows of the data; got {size}")
         return data[random_rows(len(data), size, self.seed)]
 
     def references(self, count: int) -> np.ndarray:
-        """Returns the states to follow (count, n), one a step of the plant."""
-        time_step = self.plant.time_step
-        if self.subsystem == "rotational":
-            return rotational_states_along(self.trajectory, count, time_step)
-        return states_along(self.trajectory, time_step * np.arange(count))
+        """Returns the states to follow (count, n), one per time step."""
+        return self.system.reference_states(self.trajectory, count)
 
     def unplanned_noise(self, training: Training | None) -> np.ndarray:
         """Returns standard deviations (n,) of the noise of a next state that the covariances of a plan leave out.
 
         It is what the model has learned of it; a controller that knows the plant knows its noise as well.
         """
-        n = len(self.plant.dynamics.state_names)
+        n = len(self.system.state_names)
         if getattr(self.propagator, "process_noise", False) or self.loop == "model":
             return np.zeros(n)
         if training is not None:
@@ -185,25 +186,26 @@ def run_trial(
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
         Diverged: The system left the finite numbers in its first step.
     """
-    plant, training = experiment.plant, None
+    plant, training = experiment.flown, None
     if experiment.learns and model is None:
         training = experiment.train(experiment.training_rows(), seed=experiment.seed)
         model = training.posterior
     controller = experiment.controller(model if experiment.learns else plant)
-    system: Plant | ModelLoop = plant
+    system: System | ModelLoop = plant
     if experiment.loop == "model" and model is not None:
         system = ModelLoop(model, experiment.propagator or MomentMatching(), time_step=plant.time_step)
     states = experiment.references(experiment.steps + controller.horizon + 1)
     resting = np.asarray(controller.initial_input)  # falls back on it where the very first solve fails
     reference = Reference(states, np.tile(resting, (len(states) - 1, 1)))
-    rehearse(system, controller, reference, states[0])
+    start = states[0] if plant.start is None else plant.start
+    rehearse(system, controller, reference, start)
     on_step = None if prepare is None else prepare(controller, training)
     try:
         rollout = closed_loop(
             system,
             controller,
             reference,
-            states[0],
+            start,
             experiment.steps,
             noise=experiment.noise,
             disturbances=experiment.disturbances,
@@ -225,9 +227,10 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     diverged has no RMSE: None.
     """
     rollout, problem, training = flown.rollout, flown.controller.problem, flown.training
-    names = experiment.plant.dynamics.state_names[::2]
-    error = tracking_error(rollout.states, rollout.references)
-    rmse = {name: float(value) for name, value in zip(names, error.axes, strict=True)} | {"total": error.total}
+    system = experiment.system
+    error = tracking_error(rollout.states, rollout.references, system.tracked_indices, system.angle_indices)
+    rmse = {name: float(value) for name, value in zip(system.tracked, error.axes, strict=True)}
+    rmse["total"] = error.total
     if flown.diverged is not None or not np.isfinite(error.total):
         rmse = dict.fromkeys(rmse)
     violations = {"inputs": violation_rate(rollout.inputs, problem.input_lower, problem.input_upper)}
@@ -240,7 +243,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         learned = {"size": len(training.posterior), "evaluations": training.evaluations, "objective": objective}
     return {
         "steps": len(rollout.inputs),
-        "unit": _UNITS[experiment.subsystem],
+        "unit": system.unit,
         "rmse": rmse,
         "lost": _lost(experiment, flown),
         "violations": {name: asdict(rate) | {"rate": rate.rate} for name, rate in violations.items()},
@@ -255,8 +258,9 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
 
 def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
     """Returns step, time [s] and reason of a flight's loss; None where it was not lost."""
-    unit, found = _UNITS[experiment.subsystem], []
-    if loss := find_loss(flown.rollout.states, flown.rollout.references, NEAR[unit]):
+    system, rollout, found = experiment.system, flown.rollout, []
+    unit, axes, angles = system.unit, system.tracked_indices, system.angle_indices
+    if loss := find_loss(rollout.states, rollout.references, axes, system.lost, angles):
         far = f"{loss.distance:.3g} {unit} from its reference, more than {loss.limit:.3g} {unit}"
         found.append((loss.step, far))
     if flown.diverged is not None:
@@ -271,10 +275,14 @@ def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
 def summary(result: Mapping[str, Any]) -> Table:
     """Returns a run's metrics in words, a line each."""
     options, training, times = result["settings"]["options"], result["training"], result["times"]
-    along = options["trajectory"] if options["subsystem"] == "translational" else f"{options['trajectory']} attitude"
-    lines = [("flight", f"{result['steps']} steps of {along} with {options['controller']}")]
+    along = "" if options["trajectory"] == "goal" else f" along {options['trajectory']}"
+    lines = [("flight", f"{result['steps']} steps of {options['system']}{along} with {options['controller']}")]
+    other = _differences(result["settings"])
+    if other:
+        lines.append(("flown with", ", ".join(f"{key} {now} (learned: {then})" for key, then, now in other)))
     if training:
-        lines.append(("training", f"{training['size']} rows, {times['training']:.2f} s"))
+        from_what = f"{training['size']} rows of {options['data']} data"
+        lines.append(("learned from", f"{from_what}, in {times['training']:.2f} s"))
     if lost := result.get("lost"):
         lines.append(("lost", f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}"))
     axes = ", ".join(f"{k} {v:.3g}" for k, v in result["rmse"].items() if v is not None and k != "total")
@@ -291,6 +299,14 @@ def summary(result: Mapping[str, Any]) -> Table:
     median, most = (f"{1e3 * times['total'][key]:.3g}" for key in ("median", "p99"))
     lines.append(("decision [ms]", f"median {median}  ({stages}), 99 % below {most}"))
     return Table(("", ""), lines)
+
+
+def _differences(settings: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """Returns what distinguishes the plant from the system: setting, the system's value, the plant's."""
+    system = settings.get("system", {})
+    return [
+        (key, system.get(key), value) for key, value in settings.get("plant", {}).items() if value != system.get(key)
+    ]
 
 
 def _counted(statuses: Mapping[str, int]) -> str:

@@ -11,6 +11,7 @@ import math
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,6 +71,7 @@ class Run:
         unit: Of its errors.
         lost: Since when and why the flight was lost; None where it was not.
         error: Why the run failed; None where it did not.
+        origin: What made it: "date", "commit" and "machine", where it says so.
     """
 
     folder: Path
@@ -79,6 +81,7 @@ class Run:
     unit: str = ""
     lost: str | None = None
     error: str | None = None
+    origin: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -90,7 +93,7 @@ class Cell:
         runs: Those that finished, by seed.
         failed: Those that failed, by seed.
         missing: Seeds asked for of which there is nothing.
-        skipped: Seeds of which there is something that cannot be read.
+        skipped: Seeds asked for of which there is something that cannot be read.
     """
 
     values: tuple[str, ...]
@@ -127,6 +130,11 @@ class Report:
     cells: tuple[Cell, ...]
     skipped: tuple[str, ...] = ()
 
+    @property
+    def runs(self) -> list[Run]:
+        """Every run that finished or failed, cell by cell."""
+        return [run for cell in self.cells for run in (*cell.runs.values(), *cell.failed.values())]
+
     def measures(self) -> list[str]:
         """Returns those of which any run has a number."""
         return [name for name in MEASURES if any(cell.numbers(name) for cell in self.cells)]
@@ -136,6 +144,10 @@ class Report:
         units = {run.unit for cell in self.cells for run in cell.runs.values()}
         return MEASURES[measure].label.format(unit=" or ".join(sorted(units)) or "m")
 
+    def base_settings(self) -> list[str]:
+        """Returns the settings that all runs share, one ``key: value`` each."""
+        return [plain_text(f"{k}: {v}") for k, v in _leaves(reduce(_shared, (run.settings for run in self.runs)))]
+
     def commands(self) -> list[str]:
         """Returns the commands that fill the cells in which runs are missing or failed, one a cell.
 
@@ -143,8 +155,7 @@ class Report:
         """
         commands = []
         for cell in self.cells:
-            seeds = sorted([*cell.missing, *cell.failed], key=in_order)
-            if seeds:
+            if seeds := sorted([*cell.missing, *cell.failed], key=in_order):
                 chosen = [*self.constants.items(), *zip(self.variables, cell.values, strict=True)]
                 settings = _spelled({key: value for key, value in chosen if value != "default"})
                 sweep = [f"{SEED}={','.join(seeds)}", f"folder={self.tree}"]
@@ -159,40 +170,30 @@ def read_report(tree: str | Path) -> Report:
         DataError: There is no such folder, or no run in it that can be read.
     """
     tree = Path(tree)
-    runs, unread, skipped = _read_runs(tree)
-    plans, unread_plans = _read_plans(tree)
+    runs, plans, unread, skipped = _read(tree)
     keys = list(dict.fromkeys([*(key for chosen in [*(run.choices for run in runs), *plans] for key in chosen), SEED]))
     filled = [{key: run.choices.get(key) or _setting(run.settings, key) for key in keys} for run in runs]
     found = {frozenset(run.choices.items()): choices for run, choices in zip(runs, filled, strict=True)}
     planned = [found.get(frozenset(plan.items())) or _as_others(plan, keys, runs) for plan in plans]
-    values = {key: set() for key in keys}
-    for key, value in (item for choices in [*filled, *planned] for item in choices.items()):
-        values[key].add(value)
-    varied = tuple(sorted(key for key in keys if len(values[key]) > 1 and key != SEED))
-    constants = {key: next(iter(values[key])) for key in keys if len(values[key]) == 1 and key != SEED}
-
-    def place(choices: Choices) -> tuple[tuple[str, ...], str]:
-        return tuple(choices[key] for key in varied), choices[SEED]
-
+    values = {key: {choices[key] for choices in [*filled, *planned]} for key in keys if key != SEED}
+    varied = tuple(sorted(key for key in values if len(values[key]) > 1))
     cells: dict[tuple[str, ...], Cell] = {}
-    for run, choices in zip(runs, filled, strict=True):
-        where, seed = place(choices)
-        cell = cells.setdefault(where, Cell(where))
-        (cell.runs if run.error is None else cell.failed)[seed] = run
-    by_name = {folder_name(_spelled(plan)): plan for plan in plans}
-    named = [_choices_of(folder, by_name) for folder in unread]
-    damaged = [_as_others(choices, keys, runs) for choices in named if choices and set(choices) <= set(keys)]
-    damaged = [choices for choices in damaged if constants.items() <= choices.items()]
-    for attribute, those in (("skipped", damaged), ("missing", planned)):
-        for where, seed in sorted(set(map(place, those)), key=lambda place: in_order(place[1])):
-            cell = cells.setdefault(where, Cell(where))
-            if seed not in (*cell.runs, *cell.failed, *cell.skipped):
-                setattr(cell, attribute, (*getattr(cell, attribute), seed))
-    for cell in cells.values():
-        cell.runs, cell.failed = ({s: of[s] for s in sorted(of, key=in_order)} for of in (cell.runs, cell.failed))
+
+    def cell_of(choices: Choices) -> Cell:
+        where = tuple(choices[key] for key in varied)
+        return cells.setdefault(where, Cell(where))
+
+    for choices, run in sorted(zip(filled, runs, strict=True), key=lambda pair: in_order(pair[0][SEED])):
+        cell = cell_of(choices)
+        (cell.runs if run.error is None else cell.failed)[choices[SEED]] = run
+    for choices, plan in sorted(zip(planned, plans, strict=True), key=lambda pair: in_order(pair[0][SEED])):
+        cell, seed = cell_of(choices), choices[SEED]
+        kind = "skipped" if folder_name(_spelled(plan)) in unread else "missing"
+        if seed not in (*cell.runs, *cell.failed, *cell.skipped, *cell.missing):
+            setattr(cell, kind, (*getattr(cell, kind), seed))
     rows = sorted(cells, key=lambda values: [in_order(value) for value in values])
-    constants = {key: value for key, value in constants.items() if value != "default"}
-    return Report(tree, varied, constants, tuple(cells[row] for row in rows), (*skipped, *unread_plans))
+    single = {key: value for key, those in values.items() if len(those) == 1 for value in those if value != "default"}
+    return Report(tree, varied, single, tuple(cells[row] for row in rows), tuple(skipped))
 
 
 def in_order(value: str) -> tuple[int, float, str]:
@@ -203,36 +204,41 @@ def in_order(value: str) -> tuple[int, float, str]:
         return 1, 0.0, value
 
 
-def _read_runs(tree: Path) -> tuple[list[Run], list[Path], list[str]]:
-    """Returns every run, finished or failed; the folders of those that cannot be read, and the reasons."""
+def _read(tree: Path) -> tuple[list[Run], list[Choices], set[str], list[str]]:
+    """Returns every run, finished or failed, what sweeps asked for, names of unread folders, and the reasons."""
     if not tree.is_dir():
         raise DataError(f"{tree}: no such folder")
     results = {path.parent: path for name in (ERROR, METRICS) for path in sorted(tree.rglob(name))}
-    runs, unread, skipped = [], [], []
-    for path in results.values():
+    runs, plans, unread, skipped = [], [], set(), []
+    for path in [*results.values(), *sorted(tree.rglob(f"{PLAN}*.json"))]:
+        planned = path.name.startswith(PLAN)
         try:
-            runs.append(_read_run(path))
+            content = json.loads(path.read_text(encoding="utf-8"))
+            if planned:
+                plans += [_parsed(choices) for choices in content["runs"]]
+            else:
+                runs.append(_run(path, content))
         except _DAMAGE as error:
             lacking = f"it lacks {error}; of an older version?"
             reason = lacking if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
-            skipped.append(_skipping(path, reason))
-            unread.append(path.parent)
+            skipped.append(plain_text(f"{path}: is not what a {'sweep' if planned else 'run'} writes: {reason}"))
+            unread.add(path.parent.name)
     if not runs:
         raise DataError(skipped[0] if skipped else f"{tree}: holds no run, finished or failed")
-    return runs, unread, skipped
+    return runs, plans, unread, skipped
 
 
-def _read_run(path: Path) -> Run:
-    content = json.loads(path.read_text(encoding="utf-8"))
+def _run(path: Path, content: Mapping[str, Any]) -> Run:
     choices, settings = _parsed(content["choices"]), content["settings"]
     if not isinstance(settings, Mapping) or not isinstance(settings.get("options", {}), Mapping):
         raise TypeError("settings and their options are not by name")
+    origin = _origin(content)
     if path.name == ERROR:
-        return Run(path.parent, choices, settings, error=plain_text(content["error"]))
+        return Run(path.parent, choices, settings, error=plain_text(content["error"]), origin=origin)
     numbers, lost = {name: _number(name, content) for name in MEASURES}, content.get("lost")
     if lost:
         lost = plain_text(", ".join(f"{k} {v}" for k, v in lost.items()) if isinstance(lost, Mapping) else str(lost))
-    return Run(path.parent, choices, settings, numbers, plain_text(content["unit"]), lost or None)
+    return Run(path.parent, choices, settings, numbers, plain_text(content["unit"]), lost or None, origin=origin)
 
 
 def _number(name: str, content: Mapping[str, Any]) -> float | None:
@@ -245,34 +251,21 @@ def _number(name: str, content: Mapping[str, Any]) -> float | None:
     return None if value is None else float(value)
 
 
+def _origin(content: Mapping[str, Any]) -> dict[str, str]:
+    """Returns date, commit and machine of a run, as far as it tells them."""
+    about = content.get("provenance") or {}
+    git, machine, versions = about.get("git") or {}, about.get("machine") or {}, about.get("versions") or {}
+    commit = f"{git['commit'][:10]}{', changed' if git.get('dirty') else ''}" if git else versions.get("gpmpc")
+    named = {"date": about.get("created"), "commit": commit}
+    named["machine"] = ", ".join(f"{value} cores" if key == "cores" else str(value) for key, value in machine.items())
+    return {key: plain_text(str(value)) for key, value in named.items() if value}
+
+
 def _parsed(choices: Any) -> Choices:
     """Returns choices, ``key=value`` each, by key."""
     if not isinstance(choices, list):
         raise TypeError(f"choices must be a list; got {choices!r:.80}")
     return {key: value for key, _, value in (plain_text(choice).partition("=") for choice in choices)}
-
-
-def _skipping(path: Path, reason: str) -> str:
-    return plain_text(f"{path}: is not what a {'sweep' if path.name.startswith(PLAN) else 'run'} writes: {reason}")
-
-
-def _read_plans(tree: Path) -> tuple[list[Choices], list[str]]:
-    """Returns what sweeps asked for, and which of their plans cannot be read."""
-    planned, skipped = [], []
-    for path in sorted(tree.rglob(f"{PLAN}*.json")):
-        try:
-            planned += [_parsed(choices) for choices in json.loads(path.read_text(encoding="utf-8"))["runs"]]
-        except _DAMAGE as error:
-            skipped.append(_skipping(path, f"{type(error).__name__}: {error}"))
-    return planned, skipped
-
-
-def _choices_of(folder: Path, planned: Mapping[str, Choices]) -> Choices:
-    """Returns what was asked for of a run that cannot be read, by its folder's name; empty where that does not tell."""
-    if folder.name in planned:
-        return planned[folder.name]
-    choices = {key: value for key, _, value in (choice.partition("=") for choice in folder.name.split(","))}
-    return choices if folder_name(_spelled(choices)) == folder.name else {}
 
 
 def _spelled(choices: Choices) -> list[str]:
@@ -301,3 +294,21 @@ def _setting(settings: Mapping[str, Any], key: str) -> str:
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
     return plain_text(str(value)) if isinstance(value, int | float | str) else "default"
+
+
+def _shared(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what is equal in two settings."""
+    both = {key: (a[key], b[key]) for key in a if key in b}
+    return {
+        key: _shared(x, y) if isinstance(x, Mapping) and isinstance(y, Mapping) else x
+        for key, (x, y) in both.items()
+        if x == y or (isinstance(x, Mapping) and isinstance(y, Mapping))
+    }
+
+
+def _leaves(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    return [
+        leaf
+        for key, value in settings.items()
+        for leaf in (_leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [(f"{prefix}{key}", value)])
+    ]

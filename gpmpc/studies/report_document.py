@@ -1,34 +1,44 @@
 """Shows a tree of runs: a row a cell, figures over what was varied, what failed and what is missing."""
 
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from gpmpc.plotting import Series, over_variable, png
+from gpmpc.provenance import now
 from gpmpc.studies.document import MISSING, Document, Table, figure_label, plain_text, with_range
-from gpmpc.studies.report import MEASURES, Cell, Report, in_order
+from gpmpc.studies.report import MEASURES, Cell, Report, Run, in_order
 from gpmpc.studies.run_folder import LONGEST_NAME
 
 _DRAWN = ("rmse", "failed", "decision")  # a figure each
 _SHORT = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
+_ORIGIN = ("date", "commit", "machine")
 _MOST_LINES = 8  # in a figure; what is varied besides is pooled
 _LEGEND = "Median [first to third quartile] over the seeds. In figures, every run is a dot."
 
 
 def report_document(
-    report: Report, comparison: Sequence[str] = (), images: Mapping[str, bytes] | None = None
+    report: Report,
+    comparison: Sequence[str] = (),
+    folder: Path | None = None,
+    images: Mapping[str, bytes] | None = None,
 ) -> Document:
     """Returns everything that is written of a report; what is zero everywhere is left out of the LaTeX table.
 
     Args:
         report: All runs.
         comparison: Lines about two groups of them.
+        folder: Where it goes, for the links to the runs; by default ``report`` in the tree.
         images: Figures by file name; by default they are drawn.
     """
     constants = ", ".join(f"{key}={value}" for key, value in report.constants.items())
-    lists = {"Comparison": list(comparison)} | notes(report)
+    lists = {"Comparison": list(comparison), **notes(report), "Made": _made(report)}
+    code = {"To fill the gaps": report.commands(), "Settings of all runs": report.base_settings()}
+    start = (folder or report.tree / "report").resolve()
     return Document(
         plain_text(report.tree.resolve().name),
         [_table(report, report.measures())],
@@ -36,10 +46,24 @@ def report_document(
         lead=f"{counts(report)}." + (f" All of them: {constants}." if constants else ""),
         notes=[_LEGEND],
         lists={heading: items for heading, items in lists.items() if items},
-        code={"To fill the gaps": report.commands()} if report.commands() else {},
+        code={heading: lines for heading, lines in code.items() if lines},
         images=_figures(report) if images is None else images,
+        links={_name(report, run): os.path.relpath(run.folder.resolve(), start) for run in report.runs},
         latex=[_table(report, _telling(report))],
     )
+
+
+def _name(report: Report, run: Run) -> str:
+    return plain_text(str(run.folder.relative_to(report.tree)))
+
+
+def _made(report: Report) -> list[str]:
+    """Returns when, from which source and on which machines the runs were made."""
+    every = {key: sorted({run.origin[key] for run in report.runs if key in run.origin}) for key in _ORIGIN}
+    dates = every["date"][:1] + every["date"][-1:] if len(every["date"]) > 1 else every["date"]
+    shown = {"Runs made": " to ".join(dates), "Commit": "; ".join(every["commit"])}
+    shown |= {"Machine": "; ".join(every["machine"]), "Report made": now(), "Tree": str(report.tree.resolve())}
+    return [f"{key}: {plain_text(value)}" for key, value in shown.items() if value]
 
 
 def counts(report: Report) -> str:
@@ -113,7 +137,7 @@ def _figures(report: Report) -> dict[str, bytes]:
     drawn: dict[str, bytes] = {}
     for index, variable in enumerate(report.variables):
         positions = sorted({cell.values[index] for cell in report.cells}, key=in_order)
-        lines, numbers = _lines(report, index), all(in_order(position)[0] == 0 for position in positions)
+        lines = _lines(report, index)
         for name in (name for name in _DRAWN if name in _telling(report)):
             series = []
             for label, cells in lines.items():
@@ -122,7 +146,7 @@ def _figures(report: Report) -> dict[str, bytes]:
                 ]
                 series.append(Series(figure_label(label), values))
             title, label, *ticks = map(figure_label, (variable, report.label(name), *positions))
-            figure = over_variable(title, ticks, label, series, MEASURES[name].logarithmic, connected=numbers)
+            figure = over_variable(title, ticks, label, series, MEASURES[name].logarithmic)
             file = re.sub(r"[^\w.+-]", "-", f"{name}-over-{variable}"[:LONGEST_NAME], flags=re.ASCII)
             drawn[f"{file}.png" if f"{file}.png" not in drawn else f"{file}-{index}.png"] = png(figure)
     return drawn

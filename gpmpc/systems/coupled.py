@@ -17,15 +17,16 @@ from typing import Any
 import numpy as np
 
 from gpmpc.exceptions import check_number
-from gpmpc.systems.quadrotor import GRAVITY, Rotational, Translational, attitude_for_thrust_direction
+from gpmpc.systems.attitudes import GRAVITY, attitude_for_thrust_direction
+from gpmpc.systems.quadrotor import ANGLE_UNITS, POSITION_UNITS, Rotational, Translational
+from gpmpc.systems.system import System, cos, sin
 
 
 @dataclass(frozen=True)
 class Coupled:
     """Position, velocity, attitude and body rates, driven by the thrust and the moments' forces.
 
-    States x, vx, y, vy, z, vz [m, m/s], phi, p, theta, q, psi, r [rad, rad/s]; inputs U1, U2, U3, U4 [N]. Only the
-    integrated reading means anything here: in a ``Map`` the attitude of a step would not be that of its thrust.
+    States x, vx, y, vy, z, vz [m, m/s], phi, p, theta, q, psi, r [rad, rad/s]; inputs U1, U2, U3, U4 [N].
 
     Attributes:
         mass: Mass of the vehicle [kg].
@@ -37,7 +38,6 @@ class Coupled:
 
     state_names = Translational.state_names + Rotational.state_names
     input_names = ("U1", *Rotational.input_names)
-    integrated_only = True
 
     def __post_init__(self) -> None:
         check_number("mass", self.mass, above=0, unit="[kg]")
@@ -50,11 +50,46 @@ class Coupled:
         return [x[1], ux * thrust, x[3], uy * thrust, x[5], GRAVITY - vertical * thrust, *turning]
 
 
+def coupled(
+    mass: float = 0.74,
+    arm: float = 0.21,
+    inertia: tuple[float, float, float] = (0.005, 0.005, 0.0089),
+    gyroscopic: tuple[float, float] = (0.01102, 0.01102),
+    time_step: float = 0.05,
+    substeps: int = 2,
+) -> System:
+    """Makes the whole quadrotor at the rate of its inner loop; ``gpmpc.simulation.cascade_loop`` flies it.
+
+    Args:
+        mass: See ``Coupled``.
+        arm: See ``Rotational``.
+        inertia: See ``Rotational``.
+        gyroscopic: See ``Rotational``.
+        time_step: [s].
+        substeps: Runge-Kutta steps per time step.
+    """
+    return System(
+        Coupled(mass, Rotational(arm, inertia, gyroscopic)),
+        time_step,
+        substeps,
+        name="coupled",
+        units=POSITION_UNITS | ANGLE_UNITS | dict.fromkeys(("U1", "U2", "U3", "U4"), "N"),
+        input_lower=(0.0, -2.0, -2.0, -2.0),
+        input_upper=(20.0, 2.0, 2.0, 2.0),
+        initial_input=(7.26, 0.0, 0.0, 0.0),  # the weight m g
+        tracked=("x", "y", "z"),
+        rates={"vx": "x", "vy": "y", "vz": "z"},
+        region=((-2.0, -1.0) * 3 + (-0.3, -0.5) * 3, (2.0, 1.0) * 3 + (0.3, 0.5) * 3),
+        lost=10.0,
+        z_down=True,
+    )
+
+
 def thrust_direction(phi: Any, theta: Any, psi: Any) -> tuple[Any, Any, Any]:
     """(ux, uy) and cos(phi) cos(theta) [-] of an attitude [rad]; Cao, Lai and Alam (2017), eq. (2)."""
-    ux = _cos(phi) * _sin(theta) * _cos(psi) + _sin(phi) * _sin(psi)
-    uy = _cos(phi) * _sin(theta) * _sin(psi) - _sin(phi) * _cos(psi)
-    return ux, uy, _cos(phi) * _cos(theta)
+    ux = cos(phi) * sin(theta) * cos(psi) + sin(phi) * sin(psi)
+    uy = cos(phi) * sin(theta) * sin(psi) - sin(phi) * cos(psi)
+    return ux, uy, cos(phi) * cos(theta)
 
 
 def attitude_at_yaw(ux: np.ndarray, uy: np.ndarray, psi: np.ndarray, convention: str = "exact") -> np.ndarray:
@@ -65,12 +100,3 @@ def attitude_at_yaw(ux: np.ndarray, uy: np.ndarray, psi: np.ndarray, convention:
     """
     forward, sideways = ux * np.cos(psi) + uy * np.sin(psi), uy * np.cos(psi) - ux * np.sin(psi)
     return attitude_for_thrust_direction(forward, sideways, convention)
-
-
-def _sin(angle: Any) -> Any:
-    """Of a float, an array, or whatever knows its own sine (CasADi, torch)."""
-    return angle.sin() if hasattr(angle, "sin") else np.sin(angle)
-
-
-def _cos(angle: Any) -> Any:
-    return angle.cos() if hasattr(angle, "cos") else np.cos(angle)

@@ -2,20 +2,21 @@
 
 The model of Cao, Lai and Alam (2017), with the parameters decoded from their data. The z axis points downwards. The
 translational subsystem is driven by the total thrust U1 and by the direction (ux, uy) of the thrust, which the attitude
-has to provide; the rotational subsystem provides it, driven by the moments' forces U2, U3, U4. The plants that step
-these right-hand sides are in ``plant``.
+has to provide; the rotational subsystem provides it, driven by the moments' forces U2, U3, U4. ``translational`` and
+``rotational`` make the systems, integrated; ``Map`` reads a right-hand side as the paper's data do.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import cos
+from math import cos, pi
 from typing import Any
 
-import numpy as np
+from gpmpc.exceptions import check_number, check_numbers
+from gpmpc.systems.attitudes import GRAVITY, rotational_states_along
+from gpmpc.systems.system import System
 
-from gpmpc.exceptions import SettingError, check_number, check_numbers
-
-GRAVITY = 9.81  # [m/s^2]
-ATTITUDES = ("paper", "exact")  # how thrust direction becomes attitude
+POSITION_UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s")
+ANGLE_UNITS = dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys("pqr", "rad/s")
 
 
 @dataclass(frozen=True)
@@ -98,30 +99,90 @@ class Rotational:
         ]
 
 
-def attitude_for_thrust_direction(ux: np.ndarray, uy: np.ndarray, convention: str = "exact") -> np.ndarray:
-    """Roll and pitch that point the thrust along (ux, uy) at psi = 0; Cao, Lai and Alam (2017), eq. (2) inverted.
+@dataclass(frozen=True)
+class Map:
+    """Reads a right-hand side as the next state, x[k+1] = f(x[k], u[k]): the data of Cao, Lai and Alam (2017) do.
 
-    ux = cos(phi) sin(theta) and uy = -sin(phi) give phi = -asin(uy) and theta = asin(ux / cos(phi)). The authors' data
-    hold theta = sign(phi) asin(ux) instead. Arguments outside [-1, 1] saturate.
+    Attributes:
+        dynamics: The right-hand side f.
+    """
+
+    dynamics: Any
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the n states."""
+        return self.dynamics.state_names
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the m inputs."""
+        return self.dynamics.input_names
+
+    def successor(self, x: Any, u: Any) -> Sequence[Any]:
+        """x[k+1] = f(x[k], u[k])."""
+        return self.dynamics.derivative(x, u)
+
+
+def translational(
+    mass: float = 0.74,
+    frozen_attitude: tuple[float, float] | None = None,
+    time_step: float = 1.0,
+    substeps: int = 1,
+) -> System:
+    """Makes the translational subsystem; one substep is exact, since its acceleration depends on the input alone.
 
     Args:
-        ux: Thrust direction along x, any shape [-].
-        uy: Thrust direction along y, same shape [-].
-        convention: ``"exact"``, or ``"paper"`` for the authors' formula.
-
-    Returns:
-        Roll and pitch [rad], stacked along a new last axis of length 2.
-
-    Raises:
-        SettingError: The convention is neither of the two.
+        mass: Of the vehicle [kg].
+        frozen_attitude: See ``Translational``.
+        time_step: [s].
+        substeps: Runge-Kutta steps per time step.
     """
-    phi = -np.arcsin(np.clip(uy, -1, 1))
-    if convention == "paper":
-        theta = np.sign(phi) * np.arcsin(np.clip(ux, -1, 1))
-    elif convention == "exact":
-        horizontal = np.cos(phi)
-        ratio = np.divide(ux, horizontal, out=np.zeros_like(horizontal), where=horizontal > 1e-12)
-        theta = np.arcsin(np.clip(ratio, -1, 1))
-    else:
-        raise SettingError("attitude", f"must be 'paper' or 'exact'; got {convention!r}")
-    return np.stack([phi, theta], axis=-1)
+    return System(
+        Translational(mass, frozen_attitude),
+        time_step,
+        substeps,
+        name="translational",
+        units=POSITION_UNITS | {"U1": "N", "ux": "1", "uy": "1"},
+        input_lower=(0.0, -0.7, -0.7),
+        input_upper=(100.0, 0.7, 0.7),
+        initial_input=(7.26, 0.0, 0.0),  # the weight m g
+        tracked=("x", "y", "z"),
+        rates={"vx": "x", "vy": "y", "vz": "z"},
+        region=((-20.0, -2.0) * 3, (20.0, 2.0) * 3),
+        lost=10.0,  # a hundred times what a controlled one is off; twice where a fifth more mass than learned holds it
+        z_down=True,
+    )
+
+
+def rotational(
+    arm: float = 0.21,
+    inertia: tuple[float, float, float] = (0.005, 0.005, 0.0089),
+    gyroscopic: tuple[float, float] = (0.01102, 0.01102),
+    time_step: float = 0.05,
+    substeps: int = 10,
+) -> System:
+    """Makes the rotational subsystem at 20 Hz; a trajectory prescribes the attitudes that a flight along it needs.
+
+    Args:
+        arm: See ``Rotational``.
+        inertia: See ``Rotational``.
+        gyroscopic: See ``Rotational``.
+        time_step: [s].
+        substeps: Runge-Kutta steps per time step.
+    """
+    return System(
+        Rotational(arm, inertia, gyroscopic),
+        time_step,
+        substeps,
+        name="rotational",
+        units=ANGLE_UNITS | dict.fromkeys(("U2", "U3", "U4"), "N"),
+        input_lower=(-2.0,) * 3,
+        input_upper=(2.0,) * 3,
+        tracked=("phi", "theta", "psi"),
+        rates={"p": "phi", "q": "theta", "r": "psi"},
+        region=((-0.5, -1.0) * 3, (0.5, 1.0) * 3),
+        lost=pi / 2,  # a vehicle on its side carries itself no more
+        references=rotational_states_along,
+        z_down=True,
+    )

@@ -19,8 +19,7 @@ from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
-from gpmpc.systems import Integrated, Translational
-from gpmpc.systems.plant import step
+from gpmpc.systems import System, Translational, step
 
 H, HOVER = 3, np.array([7.26, 0.0, 0.0])
 PROBLEM = TrackingProblem(
@@ -30,7 +29,7 @@ PROBLEM = TrackingProblem(
 
 @pytest.fixture(scope="module")
 def gp():
-    random, plant = np.random.default_rng(0), Integrated(Translational(), 1.0, 1)
+    random, plant = np.random.default_rng(0), System(Translational(), 1.0, 1)
     states = random.uniform(-1.5, 1.5, (30, 6))
     inputs = HOVER + random.uniform(-1.0, 1.0, (30, 3)) * [0.6, 0.1, 0.1]
     changes = np.array([step(plant, x, u) for x, u in zip(states, inputs, strict=True)]) - states

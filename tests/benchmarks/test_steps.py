@@ -7,7 +7,7 @@ import torch
 from benchmarks.pendulums import Pendulums, pendulum_gp, pendulum_plant, pendulum_references
 from benchmarks.steps import WarmStarted, controllers, measure_size, record_steps, speed_figure, table
 from gpmpc.plotting import png
-from gpmpc.systems.plant import step
+from gpmpc.systems import step
 
 
 @pytest.mark.parametrize("n", [2, 6])

@@ -58,7 +58,7 @@ def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
         (["tables", "data.horizon=1.5"], "data.horizon: must be a whole number, 1 or more; got 1.5"),
         (["tables", "data.translational.Q=[1,2]"], "Q: must be a list of 6 numbers; got [1, 2]"),
         (
-            ["tables", "data.translational.plant.dynamics.mass=heavy"],
+            ["tables", "data.translational.plant.dynamics.dynamics.mass=heavy"],
             "mass: must be a number above 0 [kg]; got 'heavy'",
         ),
         (["tables", "folder=null"], "folder: must be the path of a folder; got None"),
@@ -156,6 +156,6 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
 
 
 def test_the_traceback_is_there_for_who_asks(tmp_path):
-    result = gpmpc("tables", "draws=0", cwd=tmp_path, HYDRA_FULL_ERROR="1")
+    result = gpmpc("tables", "draws=0", "--debug", cwd=tmp_path)
     assert result.returncode != 0
     assert "Traceback" in result.stderr

@@ -13,6 +13,7 @@ from mcap.writer import Writer
 sys.path.append(str(Path(__file__).resolve().parents[1] / "recording"))
 import runs
 
+from gpmpc.cli.command import COMMANDS
 from gpmpc.cli.log import log
 from gpmpc.exceptions import GpmpcError
 from gpmpc.recording import layout, read_run
@@ -123,13 +124,13 @@ def foreign(folder):
 
 def test_what_is_no_recording_is_refused_in_one_line_that_names_it(folder, tmp_path, monkeypatch):
     (tmp_path / "run.mcap").write_bytes((folder / "run.mcap").read_bytes())
-    reasons = foreign(tmp_path)
+    reasons, parser = foreign(tmp_path), COMMANDS["log"].parser("log")
     before = sorted(tmp_path.iterdir())
     monkeypatch.chdir(tmp_path)
     for name, reason in reasons.items():
         for command in ("info", "recover", "export", "layout"):
             with pytest.raises(GpmpcError) as caught:
-                log([command, name])
+                log(parser.parse_args([command, name]))
             assert str(caught.value).startswith(name)
             assert reason in str(caught.value)
             assert "\n" not in str(caught.value)
@@ -160,7 +161,7 @@ MISTAKES = [
     (["layout", "run.mcap", "run.yaml"], "output: must end in .json; got 'run.yaml'"),
     (["show", "run.mcap"], "invalid choice: 'show'"),
     (["info"], "the following arguments are required: file"),
-    ([], "the following arguments are required: info|recover|export|layout"),
+    ([], "the following arguments are required: action, file"),
 ]
 if importlib.util.find_spec("pandas") is None:
     MISTAKES.append((["export", "run.mcap", "run.parquet"], "pandas: pip install 'gpmpc[report]'"))

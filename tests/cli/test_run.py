@@ -11,14 +11,14 @@ from tests.cli.command import forked, gpmpc
 
 TINY = ["data.samples=25", "model.restarts=0", "horizon=2", "folder=tree"]
 NOISY = f"noise.process={[0.01] * 6}".replace(" ", "")
-GYROSCOPE = "plant.dynamics.gyroscopic"  # so strong a one that Runge and Kutta's step is unstable
+GYROSCOPE = "plant.gyroscopic"  # so strong a one that Runge and Kutta's step is unstable
 
 
 @pytest.mark.parametrize(
     ("choices", "reason"),
     [
-        (["plant.dynamics.mass=100", "trajectory=hover"], "m from its reference"),
-        (["subsystem=rotational", f"{GYROSCOPE}=[1e4,1e4]", "controller=lqr"], "state is not finite any more"),
+        (["plant.mass=100", "trajectory=hover"], "m from its reference"),
+        (["system=rotational", f"{GYROSCOPE}=[1e4,1e4]", "controller=lqr"], "state is not finite any more"),
     ],
     ids=["falls", "diverges"],
 )
@@ -42,7 +42,7 @@ def test_a_lost_flight_is_finished_and_readable_and_has_an_exit_code_of_its_own(
 
 
 def test_who_is_not_lost_is_not_called_so(tmp_path):
-    done = forked("run", "model.restarts=0", "plant.dynamics.mass=0.888", "steps=9", "folder=tree", cwd=tmp_path)
+    done = forked("run", "model.restarts=0", "plant.mass=0.888", "steps=9", "folder=tree", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "lost" not in done.stdout
     (path,) = tmp_path.glob("tree/*/metrics.json")

@@ -37,7 +37,7 @@ def single(tmp_path_factory):
 def test_a_run_leaves_a_folder_that_says_everything(single):
     cwd, done = single
     assert done.returncode == 0, done.stderr
-    for text in ("4 steps of elliptical with convex", "RMSE [m]", "INVALID_MEASUREMENT 1", "25 rows"):
+    for text in ("4 steps of translational along elliptical", "RMSE [m]", "INVALID_MEASUREMENT 1", "25 rows"):
         assert text in done.stdout
     (folder,) = (cwd / "tree").iterdir()
     assert sorted(path.name for path in folder.iterdir()) == ["config.yaml", "metrics.json", "run.mcap"]
@@ -80,10 +80,10 @@ def test_a_recorded_flight_is_drawn(single):
 
 
 def test_the_attitude_alone_is_flown_recorded_drawn_and_reported_in_radians(tmp_path):
-    settings = ["subsystem=rotational", "trajectory=lorenz", *TINY, "steps=70", "horizon=3", "folder=tree"]
+    settings = ["system=rotational", "trajectory=lorenz", *TINY, "steps=70", "horizon=3", "folder=tree"]
     done = forked("run", *settings, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "70 steps of lorenz attitude with convex" in done.stdout
+    assert "70 steps of rotational along lorenz with convex" in done.stdout
     assert "RMSE [rad]" in done.stdout
     (folder,) = (tmp_path / "tree").iterdir()
     run = read_run(folder / "run.mcap")
@@ -124,8 +124,11 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
         (["controller=lqr", "propagation=unscented"], "propagation: this controller has none to choose"),
         (["recorder=mpac"], "recorder: must be 'mcap' or 'none'; got 'mpac'"),
         (["horizon=1,2"], "horizon: a list is written in brackets, horizon=[1,2]; a sweep takes -m"),
-        (["plant=coupled"], "the whole quadrotor is flown by gpmpc.simulation.cascade_loop"),
-        (["subsystem=rotational", "plant=rotational_map"], "plant: the rotational subsystem is flown at its own rate"),
+        (["system=pendulum", "data=excited"], "data: these data are of translational and rotational alone"),
+        (["system=pendulum", "trajectory=lorenz"], "trajectory: must prescribe angle of pendulum; got positions of 3"),
+        (["system=pendulum", "controller.problem.Q=[1,1,1]"], "controller.problem: weighs 3 states and 1 inputs"),
+        (["system=pendulm"], "system: no such option 'pendulm'"),
+        (["system._target_=builtins.dict"], "system: _target_ must name a function that returns"),
         (["folder=null"], "folder: must be the path of a folder; got None"),
         (["folder="], "folder: must be the path of a folder; got ''"),
         (["horizon=0"], "horizon: must be a whole number, 1 or more; got 0"),
@@ -134,7 +137,7 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
         (["-m", "seed=range(0)"], "seed: holds no value to sweep over"),
         (["seed=range(3"], "'seed=range(3': cannot be read; a setting is written SETTING=VALUE"),
         (["controller=papre"], "state_form (did you mean 'paper'?)"),
-        (["--hlep"], "unknown option '--hlep' (did you mean '--help'?); gpmpc run --help lists the settings"),
+        (["--hlep"], "unknown option '--hlep' (did you mean '--help'?); gpmpc run --help lists what there is"),
         (["noise.process=0.1"], "noise.process: must be a list of standard deviations, one for every state; got 0.1"),
         (["noise.process=[0.1]"], "noise.process must have 6 standard deviations; got 1"),
         (["disturbances=gust"], "disturbances: must be a list; got 'gust'"),

@@ -1,13 +1,22 @@
 """What surrounds a command: pipes, full disks, folders that are gone, Ctrl-C, TAB, and where help is looked for."""
 
+import fcntl
+import json
 import os
+import pty
+import select
+import shutil
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import time
 
 import pytest
 
+from gpmpc.cli.command import COMMANDS
+from gpmpc.cli.completion import candidates
 from gpmpc.cli.terminal import Output
 from tests.cli.command import PATH, SECONDS, forked
 
@@ -22,7 +31,7 @@ def shell(line, cwd, **environment):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("command", ["--help", "run --info searchpath", "log --help"])
+@pytest.mark.parametrize("command", ["--help", "run --cfg", "log --help"])
 def test_a_standard_output_that_takes_nothing_ends_the_command_in_one_line(command, tmp_path):
     full = shell(f"$GPMPC {command} > /dev/full", tmp_path)
     assert (full.returncode, full.stderr) == (
@@ -102,10 +111,28 @@ def test_help_is_found_before_and_behind_a_command(command, tmp_path):
     assert f"gpmpc {command}" in answers[0].stdout
 
 
-def test_the_version_is_that_of_gpmpc_wherever_it_is_asked_for(tmp_path):
+def test_the_version_names_what_computes_wherever_it_is_asked_for(tmp_path):
     versions = {forked(*words, cwd=tmp_path).stdout for words in (["--version"], ["run", "--version"], ["plot", "-V"])}
-    assert len(versions) == 1
-    assert not any("Hydra" in version for version in versions)
+    (version,) = versions
+    named = dict(line.split(maxsplit=1) for line in version.splitlines())
+    assert {"gpmpc", "python", "torch", "numba", "BLAS", "CPU"} <= set(named)
+    assert json.loads(forked("version", "--json", cwd=tmp_path).stdout)["torch"] == named["torch"]
+
+
+def test_json_alone_stands_on_the_standard_output_and_quiet_leaves_it_empty(tmp_path):
+    run = ["run", *TINY, "folder=tree"]
+    flown = forked(*run, "--json", cwd=tmp_path)
+    assert flown.returncode == 0, flown.stderr
+    result = json.loads(flown.stdout)
+    assert result["steps"] == 2
+    assert json.loads((tmp_path / result["folder"] / "metrics.json").read_text())["rmse"] == result["rmse"]
+    assert "RMSE [m]" in flown.stderr
+    quiet = forked(*run, "--quiet", cwd=tmp_path)
+    assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
+    wrong = forked("run", "horizn=1", "--quiet", cwd=tmp_path)
+    assert (wrong.returncode, wrong.stdout, wrong.stderr.count("\n")) == (2, "", 1)
+    cells = json.loads(forked("report", "tree", "--json", cwd=tmp_path).stdout)["cells"]
+    assert [cell["finished"] for cell in cells] == [1]
 
 
 def test_help_and_tab_list_only_choices_that_the_command_has(tmp_path):
@@ -113,7 +140,7 @@ def test_help_and_tab_list_only_choices_that_the_command_has(tmp_path):
         listed = forked(command, "--help", cwd=tmp_path).stdout.partition("Choices:")[2].partition("Every setting")[0]
         assert f"\n{has}: " in listed
         assert f"\n{lacks}: " not in listed
-        offered = forked("-sc", "query=bash", cwd=tmp_path, COMP_LINE=f"gpmpc {command} ").stdout.split()
+        offered = candidates(f"gpmpc {command} ", COMMANDS)
         assert f"{has}=" in offered
         assert f"{lacks}=" not in offered
 
@@ -121,42 +148,103 @@ def test_help_and_tab_list_only_choices_that_the_command_has(tmp_path):
 @pytest.mark.parametrize(
     ("line", "offered"),
     [
-        ("gpmpc ", {"run", "tables", "figures", "report", "plot", "log"}),
-        ("gpmpc run trajectory=l", {"trajectory=lorenz"}),
-        ("gpmpc run -m steps=3 controller=c", {"controller=convex"}),
-        ("gpmpc figures study=h", {"study=horizon"}),
-        ("gpmpc run 'seed=range(", set()),
-        ("gpmpc run --nonsense x", set()),
-        ("gpmpc plot ", set()),
-        ("", {"run"}),
+        ("gpmpc ", [*COMMANDS]),
+        ("gpmpc p", ["plot"]),
+        ("gpmpc help rep", ["report"]),
+        ("gpmpc run trajectory=l", ["trajectory=lorenz"]),
+        ("gpmpc run -m steps=3 controller=c", ["controller=convex"]),
+        ("gpmpc run -m controller=convex,l", ["controller=convex,lqr"]),
+        ("gpmpc run controller=nonlin", ["controller=nonlinear"]),
+        ("gpmpc run noise.p", ["noise.process="]),
+        ("gpmpc run controller=lqr controller.d", []),
+        ("gpmpc run controller.d", ["controller.disturbance_gain="]),
+        ("gpmpc run folder=tr", ["folder=tree/"]),
+        ("gpmpc run --conf", ["--config-name", "--config-dir"]),
+        ("gpmpc figures study=h", ["study=horizon"]),
+        ("gpmpc plot t", ["tree/"]),
+        ("gpmpc plot tree/m", ["tree/my run.mcap"]),
+        ("gpmpc plot --format s", ["svg"]),
+        ("gpmpc report tree --to t", ["tree/"]),
+        ("gpmpc log ", ["info", "recover", "export", "layout"]),
+        ("gpmpc log info tree/m", ["tree/my run.mcap"]),
+        ("gpmpc run 'seed=range(", []),
+        ("gpmpc run --nonsense x", []),
+        ("gpmpc rnu ", []),
     ],
 )
-def test_tab_completes_commands_and_settings_and_never_complains(line, offered, tmp_path):
-    done = forked("-sc", "query=bash", cwd=tmp_path, COMP_LINE=line)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert offered <= set(done.stdout.split())
-    assert offered or not done.stdout.strip()
+def test_every_word_of_the_line_is_completed(line, offered, tmp_path, monkeypatch):
+    (tmp_path / "tree").mkdir()
+    (tmp_path / "tree" / "my run.mcap").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", sys.path[:])
+    assert candidates(line, COMMANDS) == offered
 
 
-def test_bash_completes_at_tab(tmp_path):
-    ask = (
-        'eval "$($GPMPC -sc install=bash)"; COMP_LINE="gpmpc run trajectory=l"; COMP_POINT=${#COMP_LINE}; COMP_CWORD=2'
-    )
+@pytest.mark.parametrize("shell_name", ["bash", "zsh"])
+def test_a_shell_completes_at_tab_in_a_terminal(shell_name, tmp_path):
+    """A pseudo-terminal: what is typed stands on the screen, and what TAB adds to it."""
+    if shutil.which(shell_name) is None:
+        pytest.skip(f"{shell_name} is not installed")
+    (tmp_path / "flights").mkdir()
+    quiet = {"bash": ["--norc", "--noprofile"], "zsh": ["-f"]}[shell_name]
     path = os.pathsep.join([os.path.dirname(PATH), os.environ["PATH"]])
-    done = shell(f'{ask}; hydra_bash_completion; echo "${{COMPREPLY[@]}}"', tmp_path, PATH=path)
-    assert (done.stdout.strip(), done.stderr) == ("trajectory=lorenz", "")
+    terminal = Terminal([shell_name, *quiet, "-i"], tmp_path, {"PATH": path, "PS1": "$ ", "TERM": "dumb"})
+    try:
+        terminal.type(f'eval "$(gpmpc completion {shell_name})"; echo re""ady\n', until="ready")
+        for typed, completed in (
+            ("gpmpc fig", "gpmpc figures "),
+            ("gpmpc run traj", "gpmpc run trajectory="),
+            ("gpmpc run trajectory=l", "gpmpc run trajectory=lorenz "),
+            ("gpmpc run controller.tol", "gpmpc run controller.tolerance="),
+            ("gpmpc plot --no", "gpmpc plot --no-animation "),
+            ("gpmpc plot fli", "gpmpc plot flights/"),
+        ):
+            terminal.type(f"{typed}\t", until=completed)
+            terminal.type("\x15", until="")  # clears the line
+    finally:
+        terminal.close()
+
+
+class Terminal:
+    """A program in a pseudo-terminal."""
+
+    def __init__(self, command, cwd, environment):
+        self._fd, inner = pty.openpty()
+        fcntl.ioctl(inner, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 200, 0, 0))
+        self._process = subprocess.Popen(
+            command, cwd=cwd, stdin=inner, stdout=inner, stderr=inner, start_new_session=True,
+            env=os.environ | environment,
+        )  # fmt: skip
+        os.close(inner)
+
+    def type(self, text, until):
+        os.write(self._fd, text.encode())
+        shown, deadline = "", time.monotonic() + 20
+        while until not in shown:
+            assert time.monotonic() < deadline, f"{until!r} was not shown after {text!r}: {shown!r}"
+            if select.select([self._fd], [], [], 0.1)[0]:
+                shown += os.read(self._fd, 4096).decode(errors="replace").replace("\x07", "")
+
+    def close(self):
+        self._process.kill()
+        self._process.wait()
+        os.close(self._fd)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["-sc"], "-sc: takes one of install=SHELL, uninstall=SHELL and query=SHELL"),
-        (["-sc", "install=nosh"], "No completion plugin for 'nosh'"),
+        (["completion"], "completion: name a shell: bash, zsh, fish"),
+        (["completion", "nosh"], "invalid choice: 'nosh'"),
         (["help", "rnu"], "unknown command 'rnu' (did you mean 'run'?)"),
-        (["tables", "-m", "draws=1,2"], "-m: only gpmpc run sweeps"),
+        (["tables", "-m", "draws=1,2"], "unknown option '-m'"),
+        (["run", "-m", "--cfg", "job", "seed=1,2"], "--cfg: shows the settings of one run; leave out -m"),
+        (["run", "tolerence=1"], "(did you mean 'model.tolerance' or 'controller.tolerance'"),
+        (["run", "controller.problem.q=1"], "(did you mean 'controller.problem.Q'?)"),
         (["run", "--experimental-rerun", "x"], "unknown option '--experimental-rerun'"),
         (["run", "-m", "--config-dir", "nowhere"], "--config-dir: nowhere: no such folder"),
         (["run", "-m", "--config-name", "nothing"], "Cannot find primary config 'nothing'"),
+        (["log", "info", "a.mcap", "b.mcap"], "log info: writes nothing; got b.mcap"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -172,12 +260,12 @@ def test_settings_and_classes_of_the_users_own_folder_are_found(sweep, tmp_path)
     (tmp_path / "own" / "controller").mkdir(parents=True)
     (tmp_path / "own" / "controller" / "mine.yaml").write_text("defaults: [convex]\ntolerance: 0.5\n")
     (tmp_path / "own" / "ours.yaml").write_text("defaults: [run, _self_]\nseed: 5\n")
-    (tmp_path / "vehicle.py").write_text("from gpmpc.systems import Translational\nclass Mine(Translational): pass\n")
-    found = ["--config-dir", "own", "--config-name", "ours", "controller=mine", "plant.dynamics._target_=vehicle.Mine"]
+    (tmp_path / "vehicle.py").write_text("from gpmpc.systems import translational as mine\n")
+    found = ["--config-dir", "own", "--config-name", "ours", "controller=mine", "system._target_=vehicle.mine"]
     done = forked("run", *sweep, *found, *TINY, "folder=tree", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (path,) = (tmp_path / "tree").glob("*/config.yaml")
-    for text in ("tolerance: 0.5", "seed: 5", "vehicle.Mine"):
+    for text in ("tolerance: 0.5", "seed: 5", "vehicle.mine"):
         assert text in path.read_text()
 
 

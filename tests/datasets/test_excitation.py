@@ -8,16 +8,13 @@ from hydra.utils import instantiate
 from gpmpc.cli.configuration import config_folder
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import SettingError
-from gpmpc.systems import Integrated, Rotational, Translational, step
+from gpmpc.systems import pendulum, rotational, step, translational
 from gpmpc.trajectories import Elliptical
 
-OUTER = Excitation(
-    Integrated(Translational(), 1.0, 1), [1] * 6, [1] * 3, [7.26, 0, 0], dither=[0.3, 0.03, 0.03], noise=[0.01] * 6
-)
-INNER = Excitation(
-    Integrated(Rotational(), 0.05, 1), [1] * 6, [1] * 3, [0, 0, 0], dither=[0.05] * 3, noise=[1e-4, 1e-3] * 3
-)
+OUTER = Excitation([1] * 6, [1] * 3, [7.26, 0, 0], dither=[0.3, 0.03, 0.03], noise=[0.01] * 6)
+INNER = Excitation([1] * 6, [1] * 3, [0, 0, 0], dither=[0.05] * 3, noise=[1e-4, 1e-3] * 3)
 DATA = ExcitedData(OUTER, INNER, samples=60)
+POSITION, ATTITUDE = translational(), rotational(substeps=1)
 
 
 def by_input(plant, x, u):
@@ -25,10 +22,10 @@ def by_input(plant, x, u):
     return np.array([(step(plant, x, u + e) - step(plant, x, u - e)) / 2e-6 for e in 1e-6 * np.eye(3)]).T
 
 
-@pytest.mark.parametrize(("subsystem", "flown"), [("translational", OUTER), ("rotational", INNER)])
-def test_transitions_are_the_plants_with_the_noise_and_inputs_that_acted(subsystem, flown):
-    data = DATA.transitions("elliptical", Elliptical(), subsystem)
-    stepped = [step(flown.plant, x, u) for x, u in zip(data.states.numpy(), data.inputs.numpy(), strict=True)]
+@pytest.mark.parametrize(("system", "flown"), [(POSITION, OUTER), (ATTITUDE, INNER)])
+def test_transitions_are_the_systems_with_the_noise_and_inputs_that_acted(system, flown):
+    data = DATA.transitions(system, Elliptical())
+    stepped = [step(system, x, u) for x, u in zip(data.states.numpy(), data.inputs.numpy(), strict=True)]
     left = data.next_states.numpy() - stepped
     assert np.abs(left.std(axis=0) / flown.noise - 1).max() < 0.5
     assert (data.inputs.numpy().std(axis=0) > 0.7 * np.array(flown.dither)).all()
@@ -37,8 +34,7 @@ def test_transitions_are_the_plants_with_the_noise_and_inputs_that_acted(subsyst
 
 def test_the_seed_decides_the_flight():
     first, again, other = (
-        replace(DATA, seed=seed).transitions("elliptical", Elliptical(), "rotational").states.numpy()
-        for seed in (0, 0, 1)
+        replace(DATA, seed=seed).transitions(ATTITUDE, Elliptical()).states.numpy() for seed in (0, 0, 1)
     )
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
@@ -47,12 +43,12 @@ def test_the_seed_decides_the_flight():
 def test_a_model_learns_from_dither_what_the_inputs_do_and_cannot_without():
     def error(dither):
         source = replace(DATA, translational=replace(OUTER, dither=dither))
-        data = source.transitions("elliptical", Elliptical(), "translational")
+        data = source.transitions(POSITION, Elliptical())
         features = np.hstack([data.features.numpy(), np.ones((60, 1))])
         learned = np.linalg.lstsq(features, data.next_states.numpy(), rcond=None)[0].T[
             :, 6:9
         ]  # near hover it is linear
-        true = by_input(OUTER.plant, np.zeros(6), np.array([0.74 * 9.81, 0, 0]))
+        true = by_input(POSITION, np.zeros(6), np.array([0.74 * 9.81, 0, 0]))
         return np.linalg.norm(learned - true) / np.linalg.norm(true)
 
     assert error(OUTER.dither) < 0.1
@@ -60,9 +56,8 @@ def test_a_model_learns_from_dither_what_the_inputs_do_and_cannot_without():
 
 
 def test_a_frozen_attitude_can_be_flown():
-    plant = Integrated(Translational(frozen_attitude=(np.pi / 4, np.pi / 4)), 1.0, 1)
-    source = replace(DATA, samples=20, translational=replace(OUTER, plant=plant, initial_input=[14.5, 0, 0]))
-    data = source.transitions("elliptical", Elliptical(), "translational")
+    source = replace(DATA, samples=20, translational=replace(OUTER, initial_input=[14.5, 0, 0]))
+    data = source.transitions(translational(frozen_attitude=(np.pi / 4, np.pi / 4)), Elliptical())
     assert abs(float(data.inputs[:, 0].mean()) - 2 * 0.74 * 9.81) < 0.5
 
 
@@ -71,8 +66,8 @@ def test_the_settings_that_ship_are_these():
         config = compose("tables", ["data=excited", "data.samples=60"])
     shipped = instantiate(config.data, _convert_="all")
     assert isinstance(shipped, ExcitedData)
-    ours = replace(shipped, rotational=INNER).transitions("elliptical", Elliptical(), "rotational")
-    assert np.array_equal(ours.states, DATA.transitions("elliptical", Elliptical(), "rotational").states)
+    ours = shipped.transitions(ATTITUDE, Elliptical())
+    assert np.array_equal(ours.states, DATA.transitions(ATTITUDE, Elliptical()).states)
 
 
 @pytest.mark.parametrize(
@@ -83,11 +78,14 @@ def test_the_settings_that_ship_are_these():
         ({"seed": -1}, "data.seed: must be a whole number, 0 or more; got -1"),
         ({"response_time": 0}, r"data.response_time: must be a number above 0 \[s\]; got 0"),
         ({"attitude": "level"}, "data.attitude: must be one of paper, exact; got 'level'"),
-        ({"translational": replace(OUTER, dither=[-1, 0, 0])}, "noise.input: must be a number, 0 or more; got -1"),
     ],
 )
 def test_misuse_is_refused_with_the_rule(change, message):
     with pytest.raises(SettingError, match=message):
-        replace(DATA, **change).transitions("elliptical", Elliptical(), "translational")
-    with pytest.raises(SettingError, match="must be one of translational, rotational; got 'yaw'"):
-        DATA.transitions("elliptical", Elliptical(), "yaw")
+        replace(DATA, **change)
+    with pytest.raises(SettingError, match="dither: must be a number, 0 or more; got -1"):
+        replace(OUTER, dither=[-1, 0, 0])
+    with pytest.raises(SettingError, match="are of translational and rotational alone; data=random is of any system"):
+        DATA.transitions(pendulum(), Elliptical())
+    with pytest.raises(SettingError, match="trajectory: these data follow one; got none"):
+        DATA.transitions(POSITION, None)

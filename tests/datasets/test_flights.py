@@ -3,23 +3,34 @@ import pytest
 
 from gpmpc.datasets import NMPCData, PaperData, Tracking
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.systems import Integrated, Map, Rotational, Translational, attitude_for_thrust_direction, step
+from gpmpc.systems import (
+    Map,
+    Rotational,
+    System,
+    Translational,
+    attitude_for_thrust_direction,
+    pendulum,
+    rotational,
+    step,
+    translational,
+)
 from gpmpc.trajectories import Elliptical, Hover, Lorenz
 
-TRANSLATIONAL = Map(Translational(frozen_attitude=(np.pi / 4, np.pi / 4)))
+SYSTEMS = {"translational": translational(), "rotational": rotational()}
+TRANSLATIONAL = System(Map(Translational(frozen_attitude=(np.pi / 4, np.pi / 4))))
 NMPC_DATA = NMPCData(
     Tracking(TRANSLATIONAL, [21000, 1, 27000, 1, 21000, 1], [1, 1, 1], [7.26, 0, 0]),
-    Tracking(Map(Rotational()), [27000, 1, 21000, 1, 51000, 1], [1.3, 1.5, 1.1], [0, 0, 0]),
+    Tracking(System(Map(Rotational())), [27000, 1, 21000, 1, 51000, 1], [1.3, 1.5, 1.1], [0, 0, 0]),
 )
 
 
 @pytest.fixture(scope="module")
 def elliptical():
-    return {part: NMPC_DATA.transitions("elliptical", Elliptical(), part) for part in ("translational", "rotational")}
+    return {system.name: NMPC_DATA.transitions(system, Elliptical()) for system in SYSTEMS.values()}
 
 
 def test_transitions_obey_the_plant_and_follow_each_other(elliptical):
-    for part, plant in (("translational", TRANSLATIONAL), ("rotational", Map(Rotational()))):
+    for part, plant in (("translational", TRANSLATIONAL), ("rotational", System(Map(Rotational())))):
         data = elliptical[part]
         assert len(data) == 189
         stepped = [step(plant, x, u) for x, u in zip(data.states.numpy(), data.inputs.numpy(), strict=True)]
@@ -40,12 +51,12 @@ def test_the_rotational_data_steer_to_the_attitude_of_the_controls_two_samples_a
 
 
 def test_the_same_flight_twice_is_the_same_to_the_bit(elliptical):
-    again = NMPC_DATA.transitions("elliptical", Elliptical(), "translational")
+    again = NMPC_DATA.transitions(SYSTEMS["translational"], Elliptical())
     assert np.array_equal(again.inputs.numpy(), elliptical["translational"].inputs.numpy())
 
 
 def test_lorenz_is_tracked_from_rest():
-    data = NMPC_DATA.transitions("lorenz", Lorenz(), "translational")
+    data = NMPC_DATA.transitions(SYSTEMS["translational"], Lorenz())
     assert np.abs(data.next_states[:, 1::2].numpy() - Lorenz()(np.arange(2.0, 191.0))).max() < 0.01
 
 
@@ -55,7 +66,7 @@ def test_our_flight_is_the_authors_elliptical_one(paper_data, elliptical):
         ("translational", range(15), 1e-5),
         ("rotational", [0, 1, 2, 3, 6, 7, 9, 10, 11, 12], 1e-4),
     ):
-        theirs, ours = source.transitions("elliptical", Elliptical(), part), elliptical[part]
+        theirs, ours = source.transitions(SYSTEMS[part], Elliptical(), "elliptical"), elliptical[part]
         theirs, ours = (
             np.hstack([d.features.numpy(), d.next_states.numpy()])[:, list(columns)] for d in (theirs, ours)
         )
@@ -64,18 +75,18 @@ def test_our_flight_is_the_authors_elliptical_one(paper_data, elliptical):
 
 def test_an_unknown_subsystem_is_refused(tmp_path):
     for source in (NMPC_DATA, PaperData(tmp_path)):
-        with pytest.raises(SettingError, match="must be one of translational, rotational; got 'yaw'"):
-            source.transitions("elliptical", Elliptical(), "yaw")
+        with pytest.raises(SettingError, match="these data are of translational and rotational alone"):
+            source.transitions(pendulum(), Elliptical(), "elliptical")
 
 
 def test_the_authors_files_are_asked_for_by_name(tmp_path):
     with pytest.raises(DataError, match="no such folder; data.folder must hold"):
         PaperData(tmp_path / "nowhere")
     with pytest.raises(DataError, match=r"ds_nmpc_Lorenz_rotate\.txt: no such file"):
-        PaperData(tmp_path).transitions("lorenz", Lorenz(), "rotational")
+        PaperData(tmp_path).transitions(SYSTEMS["rotational"], Lorenz(), "lorenz")
     (tmp_path / "ds_nmpc_Lorenz_rotate.txt").write_text("0 " * 15 + "\n")
     with pytest.raises(DataError, match="the file holds 1 rows; data.samples asks for 189"):
-        PaperData(tmp_path).transitions("lorenz", Lorenz(), "rotational")
+        PaperData(tmp_path).transitions(SYSTEMS["rotational"], Lorenz(), "lorenz")
 
 
 @pytest.mark.parametrize("samples", [0, -1, 1.5, None, "abc", True])
@@ -86,10 +97,10 @@ def test_samples_of_the_authors_files_are_a_positive_whole_number(samples, tmp_p
 
 def test_an_integrated_plant_can_be_flown():
     gentle = Tracking(
-        Integrated(Translational(), time_step=0.5, substeps=1), [1, 1, 1, 1, 1, 1], [0.1, 10, 10], [7.26, 0, 0]
+        System(Translational(), time_step=0.5, substeps=1), [1, 1, 1, 1, 1, 1], [0.1, 10, 10], [7.26, 0, 0]
     )
     flown = NMPCData(gentle, NMPC_DATA.rotational, samples=20, horizon=8)
-    data = flown.transitions("hover", Hover([1.0, -1.0, 2.0]), "translational")
+    data = flown.transitions(SYSTEMS["translational"], Hover([1.0, -1.0, 2.0]))
     assert np.abs(data.next_states[-1, ::2].numpy() - [1, -1, 2]).max() < 0.2
 
 

@@ -12,20 +12,18 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 
-from gpmpc.datasets import PaperData, Subsystem
+from gpmpc.datasets import PaperData
 from gpmpc.exceptions import SettingError
 from gpmpc.experiments.figures import Figures, Row
 from gpmpc.experiments.figures_tables import LOOPS, paper_seconds, summarise
-from gpmpc.gp import SoftLimits, identity, train
+from gpmpc.gp import SoftLimits, train
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.propagation import MomentMatching
-from gpmpc.systems import Integrated, Translational
 from gpmpc.trajectories import Elliptical, Lorenz
 from tests.cli.command import forked
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
-COLUMNS = ["x", "vx", "y", "vy", "z", "vz", "U1", "ux", "uy", "x+", "vx+", "y+", "vy+", "z+", "vz+"]
 BOUNDS = {
     "model": {
         "elliptical": {"lower": [0, -0.2, -0.2], "upper": [100, 0.2, 0.2]},
@@ -103,7 +101,6 @@ def test_a_run_goes_on_where_it_stopped(finished):
         ),
         (["+rows.convex.settings.foo=1"], "settings.foo: controller convex takes no such setting"),
         (["samples=15", "steps=3", "+rows.ours_convex.size=16"], "size: must be at most 15, the transitions at hand"),
-        (["plant=coupled"], "plant: must have the states of the translational subsystem"),
     ],
 )
 def test_a_mistake_is_answered_in_one_line_before_anything_is_trained(tmp_path, arguments, message):
@@ -185,10 +182,9 @@ def on_the_authors_data(folder, rows):
         rows={name: Row(**row) for name, row in rows.items()},
         data={"data": PaperData(folder)},
         trajectories={"elliptical": Elliptical(), "lorenz": Lorenz()},
-        subsystems={"translational": Subsystem(COLUMNS, ["x", "y", "z"], identity)},
+        subsystems="translational",
         models={"model": model, "plant": model},
         model_settings={"model": "paper", "plant": "paper"},
-        plant=Integrated(Translational(), 1.0, 1),
         bounds=BOUNDS,
         state_bounds={},
         workers=1,

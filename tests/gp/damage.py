@@ -19,7 +19,7 @@ import torch
 
 from gpmpc.exceptions import GpmpcError
 from gpmpc.gp import Transitions, load_posterior
-from gpmpc.models import load_residual_model
+from gpmpc.models import load_model
 from tests.gp.small_models import SAVE, as_before, posterior, residual_model
 
 MEMORY, SECONDS = 300 * 2**20, 5.0
@@ -265,7 +265,7 @@ def main(kind, count, seed):
     load = {
         "model": load_posterior,
         "old": load_posterior,
-        "residual": load_residual_model,
+        "residual": load_model,
         "transitions": Transitions.load,
         "csv": from_csv,
     }[kind]

@@ -3,10 +3,10 @@
 import torch
 
 from gpmpc.gp import GPPosterior, _archive, load_posterior, save_posterior, storage
-from gpmpc.models import Affine, ResidualModel, load_residual_model, save_residual_model
+from gpmpc.models import Affine, ResidualModel, load_model, save_model
 
-SAVE = {GPPosterior: save_posterior, ResidualModel: save_residual_model}
-LOAD = {GPPosterior: load_posterior, ResidualModel: load_residual_model}
+SAVE = {GPPosterior: save_posterior, ResidualModel: save_model}
+LOAD = {GPPosterior: load_posterior, ResidualModel: load_model}
 
 
 def posterior(size=12, n=2, m=1, predicts="next_state", seed=0):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc.dynamics import predict_with_jacobian
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.casadi_ import casadi_function
@@ -40,7 +41,7 @@ def test_values_and_jacobians_are_those_of_predict(make):
     )
     for _ in range(5):
         state, control = torch.randn(n), torch.randn(m)
-        at, by_state, by_input = model.predict_with_jacobian(state, control)
+        at, by_state, by_input = predict_with_jacobian(model, state, control)
         # The variance at a query that is one vector, whose derivatives torch can follow.
         spread = torch.autograd.functional.jacobian(
             lambda joint: model.predict(joint[:n], joint[n:]).variance, torch.cat([state, control])

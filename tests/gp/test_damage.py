@@ -12,7 +12,7 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gp import Transitions, load_posterior, save_posterior
-from gpmpc.models import load_residual_model
+from gpmpc.models import load_model
 from tests.gp.small_models import posterior
 
 
@@ -101,7 +101,7 @@ def test_parts_that_changed_places_are_noticed(one, other, tmp_path):
 
 @pytest.mark.parametrize(
     "load", [Transitions.load, Transitions.from_text, lambda p: Transitions.from_csv(p, ["x"], ["u"]),
-             load_posterior, load_residual_model,
+             load_posterior, load_model,
              lambda p: save_posterior(posterior(), p)]
 )  # fmt: skip
 def test_a_path_is_one_name(load):
@@ -110,7 +110,7 @@ def test_a_path_is_one_name(load):
             load(path)
 
 
-@pytest.mark.parametrize("load", [Transitions.load, Transitions.from_text, load_posterior, load_residual_model])
+@pytest.mark.parametrize("load", [Transitions.load, Transitions.from_text, load_posterior, load_model])
 def test_a_name_that_no_file_can_have_is_named(load):
     for path in ("x" * 5000, "zero\0"):
         with pytest.raises(DataError, match="expected a"):

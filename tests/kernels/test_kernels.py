@@ -17,8 +17,7 @@ from gpmpc.kernels import _simd, gp_point
 from gpmpc.kernels._packed import pack
 from gpmpc.kernels._rows import largest_size, largest_square, reduce_variance, reduce_variances
 from gpmpc.kernels._simd import NEAR_ZERO, load, store
-from gpmpc.kernels.gp_moments import CROSS
-from gpmpc.propagation._moments import moments
+from gpmpc.propagation._moments import moments, moments_with_jacobian
 from tests.propagation.test_moment_matching import belief, by_mpmath, model
 
 
@@ -39,12 +38,6 @@ def close(mine, other, tolerance):
     other = np.asarray(other)
     assert mine.shape == other.shape
     assert np.abs(mine - other).max(initial=0) <= tolerance * max(np.abs(other).max(initial=0), 1e-300)
-
-
-def plain_moments(*arguments):
-    """What the specification says."""
-    out, _ = kernels._moments(*arguments, diagonal=False, order=CROSS, plain=True)
-    return [array[0] for array in out]
 
 
 def symmetric(derivative):
@@ -104,7 +97,7 @@ def test_values_and_derivatives_agree_with_torch(name, arguments, at, shift):
     close(mine.dJ_du, dJ[2], 1e-9)
     for value, with_jacobian in zip(kernels.moments(packed(gp), *numbers(mu, S, u)), mine[:3], strict=True):
         close(value, with_jacobian, 1e-12)
-    for fast, plain in zip(mine, plain_moments(packed(gp), *numbers(mu, S, u)), strict=True):
+    for fast, plain in zip(mine, moments_with_jacobian(gp, at, u), strict=True):
         close(fast, plain, 1e-9)
 
 
@@ -124,8 +117,8 @@ def test_values_and_derivatives_agree_with_torch(name, arguments, at, shift):
 def test_the_moments_agree_with_a_fifty_digit_evaluation(arguments, at, shift, tolerance):
     gp, at, u = case({"size": 7} | arguments, at, shift)
     exact_M, exact_V, exact_cross = (exact.numpy() for exact in by_mpmath(gp, at, u))
-    arguments = packed(gp), *numbers(at.mean, at.covariance, u)
-    for M, V, J in (kernels.moments(*arguments), plain_moments(*arguments)[:3]):
+    by_torch = [part.numpy() for part in moments(gp, at, u)]
+    for M, V, J in (kernels.moments(packed(gp), *numbers(at.mean, at.covariance, u)), by_torch):
         assert np.abs(V - exact_V).max() < tolerance * np.abs(exact_V).max()
         assert np.abs(M - exact_M).max() < tolerance * max(1e-3, np.abs(exact_M).max())
         cross = at.covariance.numpy() @ J.T
@@ -225,7 +218,7 @@ def test_the_expansion_at_a_point_agrees_with_torch(n, m, size):
     def variance(x, u):
         return gp.predict(x, u).covariance.diagonal()
 
-    point = kernels.point_with_jacobian(packed(gp), *numbers(x, u), hessian=True)
+    point = kernels.point_with_jacobian(packed(gp), *numbers(x, u))
     jacrev, both = torch.func.jacrev, (0, 1)
     close(point.M, mean(x, u), 1e-12)
     close(point.variance, variance(x, u), 1e-10)
@@ -235,12 +228,6 @@ def test_the_expansion_at_a_point_agrees_with_torch(n, m, size):
         close(mine, other, 1e-9)
     for mine, other in zip((point.d2M_dx2, point.d2M_dxdu), jacrev(jacrev(mean), both)(x, u), strict=True):
         close(mine, other, 1e-10)
-    third = jacrev(jacrev(jacrev(mean)), both)(x, u)
-    for mine, other in zip((point.d3M_dx3, point.d3M_dx2du), third, strict=True):
-        close(mine, other, 1e-9)
-    without = kernels.point_with_jacobian(packed(gp), *numbers(x, u))
-    assert without.d3M_dx3 is None
-    assert all((mine == other).all() for mine, other in zip(without[:8], point[:8], strict=True))
     offset = np.arange(float(n))
     for adds_state in (False, True):
         M, A, B, V = kernels.linearize(packed(gp), *numbers(x[None], u[None]), True, offset, adds_state)
@@ -290,14 +277,14 @@ def test_many_points_are_the_loop_over_them():
     u = np.linspace(-1, 1, 8).reshape(4, 2)
     together = [
         kernels.linearize(gps, mu, u, True, np.zeros(3), False),
-        kernels.point_with_jacobian(gps, mu, u, hessian=True),
+        kernels.point_with_jacobian(gps, mu, u),
         kernels.moments(gps, mu, S, u, diagonal=True),
         kernels.moments_with_jacobian(gps, mu, S, u, cross=True),
     ]
     for h in range(4):
         alone = [
             [part[0] for part in kernels.linearize(gps, mu[h : h + 1], u[h : h + 1], True, np.zeros(3), False)],
-            kernels.point_with_jacobian(gps, mu[h], u[h], hessian=True),
+            kernels.point_with_jacobian(gps, mu[h], u[h]),
             kernels.moments(gps, mu[h], S[h], u[h], diagonal=True),
             kernels.moments_with_jacobian(gps, mu[h], S[h], u[h], cross=True),
         ]

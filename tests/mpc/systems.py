@@ -7,9 +7,9 @@ import torch
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.systems import Integrated, Translational, step
+from gpmpc.systems import System, Translational, step
 
-QUADROTOR = Integrated(Translational(), time_step=0.5, substeps=1)
+QUADROTOR = System(Translational(), time_step=0.5, substeps=1)
 HOVER = np.array([7.2594, 0.0, 0.0])  # U1 [N], ux, uy [-]
 
 

@@ -8,7 +8,7 @@ from gpmpc.mpc.nmpc import NMPC
 from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.simulation import closed_loop
 from gpmpc.status import Status
-from gpmpc.systems import Integrated, Map, Rotational, Translational, step
+from gpmpc.systems import Map, Rotational, System, Translational, step
 
 
 class DoubleIntegrator:
@@ -19,7 +19,7 @@ class DoubleIntegrator:
 
 
 def test_on_a_linear_plant_it_is_the_least_squares_solution(rng):
-    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
     H, Q, R = 5, np.array([3.0, 0.5]), np.array([0.2])
     state, reference = rng.normal(size=2), rng.normal(size=(H + 1, 2))
     A, B = np.array([[1, 0.5], [0, 1]]), np.array([0.125, 0.5])
@@ -39,12 +39,12 @@ def test_on_a_linear_plant_it_is_the_least_squares_solution(rng):
 
 
 @pytest.mark.parametrize(
-    "plant", [Map(Rotational()), Integrated(Translational(), time_step=0.5)], ids=["map", "integrated"]
+    "plant", [System(Map(Rotational())), System(Translational(), time_step=0.5)], ids=["map", "integrated"]
 )
 def test_no_small_change_of_the_plan_is_cheaper(plant, rng):
     H, Q, R = 4, np.array([20.0, 1, 20, 1, 20, 1]), np.array([1.0, 1, 1])
     state, reference = 0.1 * rng.normal(size=6), 0.3 * rng.normal(size=(H + 1, 6))
-    initial = [7.26, 0, 0] if isinstance(plant, Integrated) else [0, 0, 0]
+    initial = [7.26, 0, 0] if isinstance(plant, System) else [0, 0, 0]
     controller = NMPC(plant, TrackingProblem(Q, R), H, initial)
     decision = controller.control(Gaussian.certain(state), Reference(reference))
 
@@ -72,17 +72,17 @@ def test_no_small_change_of_the_plan_is_cheaper(plant, rng):
 def test_misuse_is_refused_at_construction(arguments, error, message):
     good = {"horizon": 3, "problem": TrackingProblem([1.0] * 6, [1.0] * 3), "initial_input": [0.0] * 3}
     with pytest.raises(error, match=message):
-        NMPC(Map(Rotational()), **(good | arguments))
+        NMPC(System(Map(Rotational())), **(good | arguments))
 
 
 def test_a_reference_of_another_shape_is_refused():
-    controller = NMPC(Map(Rotational()), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3)
+    controller = NMPC(System(Map(Rotational())), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3)
     with pytest.raises(ShapeError, match=r"shapes \(6,\) and \(4, 6\); got \(6,\) and \(2, 6\)"):
         controller.control(Gaussian.certain(np.zeros(6)), Reference(np.zeros((2, 6))))
 
 
 def test_bounds_on_inputs_rates_and_states_are_kept(rng):
-    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
     limits = StateBounds([-np.inf, -0.3], [np.inf, 0.3])
     bounds = {"input_lower": [-1.0], "input_upper": [0.4], "rate_lower": [-0.3], "rate_upper": [0.3]}
     problem = TrackingProblem([1.0, 0.0], [1e-3], state_bounds=limits, **bounds)
@@ -97,7 +97,7 @@ def test_bounds_on_inputs_rates_and_states_are_kept(rng):
 
 
 def test_soft_state_bounds_give_way_where_they_must():
-    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
     limits = StateBounds([-np.inf, -0.3], [np.inf, 0.3], l1=100.0)
     problem = TrackingProblem([1.0, 0.0], [1e-3], input_lower=[-0.2], input_upper=[0.2], state_bounds=limits)
     fast = Gaussian.certain(np.array([0.0, 0.5]))
@@ -125,7 +125,7 @@ class Scripted:
 
 def test_the_loop_hands_on_state_references_and_the_last_decision():
     controller = Scripted(Status.SOLVED, Status.SOLVED, Status.SOLVED)
-    plant, references = Integrated(DoubleIntegrator(), time_step=1.0, substeps=1), np.arange(10.0).reshape(5, 2)
+    plant, references = System(DoubleIntegrator(), time_step=1.0, substeps=1), np.arange(10.0).reshape(5, 2)
     rollout = closed_loop(plant, controller, references, np.zeros(2), 3)
     assert np.allclose(rollout.states, [[0, 0], [0.5, 1], [2, 2], [4.5, 3]])
     assert rollout.inputs.shape == (3, 1)
@@ -136,7 +136,7 @@ def test_the_loop_hands_on_state_references_and_the_last_decision():
 
 def test_a_failed_solve_stops_the_loop_and_is_not_applied():
     controller = Scripted(Status.SOLVED, Status.ITERATION_LIMIT)
-    plant = Integrated(DoubleIntegrator(), time_step=1.0, substeps=1)
+    plant = System(DoubleIntegrator(), time_step=1.0, substeps=1)
     with pytest.raises(SolverFailure, match="failed at step 1: stopped at the iteration limit") as caught:
         closed_loop(plant, controller, np.zeros((9, 2)), np.zeros(2), 3)
     assert caught.value.step == 1
@@ -145,11 +145,11 @@ def test_a_failed_solve_stops_the_loop_and_is_not_applied():
 
 def test_too_few_references_are_refused_before_the_first_step():
     with pytest.raises(ShapeError, match="3 steps with horizon 2 need 5 references; got 3"):
-        closed_loop(Map(DoubleIntegrator()), Scripted(), np.zeros((3, 2)), np.zeros(2), 3)
+        closed_loop(System(Map(DoubleIntegrator())), Scripted(), np.zeros((3, 2)), np.zeros(2), 3)
 
 
 def test_soft_bounds_of_one_state_leave_the_others_free():
-    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
     state, reference = Gaussian.certain(np.array([0.2, 0.1])), Reference(np.full((6, 2), 1.0))
     wide = StateBounds([-np.inf, -9.0], [np.inf, 9.0], l1=1.0, l2=1.0)
     free, bounded = (
@@ -160,7 +160,7 @@ def test_soft_bounds_of_one_state_leave_the_others_free():
 
 
 def test_a_bad_measurement_is_said_so_and_the_last_plan_is_handed_on():
-    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
     controller = NMPC(plant, TrackingProblem([1.0, 0.1], [0.1]), 3, [0.0])
     good = controller.control(Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros((4, 2))))
     decision = controller.control(Gaussian.certain(np.array([1.0, np.nan])), Reference(np.zeros((4, 2))), good)
@@ -169,7 +169,7 @@ def test_a_bad_measurement_is_said_so_and_the_last_plan_is_handed_on():
 
 
 def test_reference_inputs_of_another_number_are_refused():
-    controller = NMPC(Map(Rotational()), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3)
+    controller = NMPC(System(Map(Rotational())), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3)
     with pytest.raises(ShapeError, match=r"reference inputs must have shape \(3, 3\); got \(3, 2\)"):
         controller.control(Gaussian.certain(np.zeros(6)), Reference(np.zeros((4, 6)), np.zeros((3, 2))))
 
@@ -185,7 +185,7 @@ def test_a_soft_state_bound_costs_what_it_says_on_either_side(prices):
             return [x[0] + u[0]]
 
     limits = StateBounds([-0.5], [0.2], **prices)
-    controller = NMPC(Map(Shifted()), TrackingProblem([1.0], [1.0], state_bounds=limits), 1, [0.0])
+    controller = NMPC(System(Map(Shifted())), TrackingProblem([1.0], [1.0], state_bounds=limits), 1, [0.0])
     x = np.linspace(-3, 3, 600_001)
     outside = np.maximum(0, np.maximum(x - 0.2, -0.5 - x))
     for start, target in ((0.0, 2.0), (0.1, -3.0), (0.4, 0.1), (-2.0, -0.9)):
@@ -197,7 +197,7 @@ def test_a_soft_state_bound_costs_what_it_says_on_either_side(prices):
 
 
 def test_bounds_that_contradict_each_other_are_not_called_solved():
-    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
     limits = StateBounds([1.0, -np.inf], [np.inf, np.inf])
     problem = TrackingProblem([1.0, 0.0], [1.0], input_lower=[-0.1], input_upper=[0.1], state_bounds=limits)
     decision = NMPC(plant, problem, 3, [0.0]).control(Gaussian.certain(np.zeros(2)), Reference(np.zeros((4, 2))))
@@ -207,7 +207,7 @@ def test_bounds_that_contradict_each_other_are_not_called_solved():
 @pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
 def test_the_last_state_has_its_own_weight_and_inputs_are_weighed_as_asked(penalized, rng):
     """No small change of the plan is cheaper by the problem's own words."""
-    plant, H = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1), 4
+    plant, H = System(DoubleIntegrator(), time_step=0.5, substeps=1), 4
     Q, T, R = np.array([[2.0, 0.3], [0.3, 1.0]]), np.diag([9.0, 0.1]), np.array([[0.4]])
     controller = NMPC(plant, TrackingProblem(Q, R, penalized, T), H, [0.7])
     state, reference = rng.normal(size=2), Reference(rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1)))

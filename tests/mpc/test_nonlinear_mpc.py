@@ -16,7 +16,7 @@ from gpmpc.mpc.problem import StateBounds, TrackingProblem
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, rollout
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
-from gpmpc.systems import Integrated
+from gpmpc.systems import System
 from tests.mpc.small_models import double_integrator, pendulum_posterior
 
 PROPAGATORS = {
@@ -143,7 +143,7 @@ class DoubleIntegrator:
 def test_on_a_certain_model_it_is_nonlinear_mpc_of_the_true_plant(rng):
     H, limits = 5, StateBounds([-np.inf, -0.4], [np.inf, 0.4])
     problem = TrackingProblem(Q, R, "increments", state_bounds=limits, input_upper=[0.5])
-    plant = Integrated(DoubleIntegrator(), time_step=0.5, substeps=1)
+    plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
     state, reference = Gaussian.certain(np.array([0.1, 0.2])), Reference(rng.normal(size=(H + 1, 2)))
     ours = NonlinearGPMPC(double_integrator(), MeanEquivalence(), problem, H, [0.1]).control(state, reference)
     true = NMPC(plant, problem, H, [0.1]).control(state, reference)

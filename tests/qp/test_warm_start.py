@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gpmpc.qp import DualActiveSet, QPSolution
+from gpmpc.qp import DualActiveSet
 from gpmpc.qp import record as layout
 from gpmpc.status import Status
 from tests.qp.problems import (
@@ -52,7 +52,7 @@ def test_a_record_full_of_nonsense_is_a_harmless_warm_start(solve, rng):
         record = np.full_like(cold.record, filling)
         for count in (0.0, 3.0, 14.0, np.nan, -1.0, 1e9):
             record[layout.WORKING] = count
-            nonsense = QPSolution(cold.x, *cold[1:5], record, 0.0, 0.0)
+            nonsense = cold._replace(record=record)
             np.testing.assert_allclose(solve(problem, nonsense).x, cold.x, atol=1e-10)
 
 

@@ -1,13 +1,14 @@
-"""Reads thousands of damaged copies of a recording, each in a process of its own, and says what came of each.
+"""Reads thousands of damaged copies of a recording, and says what came of each.
 
-``python study.py RECORDING SEED COUNT`` writes a line of JSON per damaged file: the damage, what came of every
-operation, the processor time of the slowest [s], and the memory that they took together beyond that of the process.
+``python study.py RECORDING SEED FIRST END`` writes a line of JSON per damaged file: the damage, what came of every
+operation, the processor time of the slowest [s], and the largest memory of the process [MB]. All are read by one
+process, whose peak the kernel resets before each: memory that one file leaves behind counts for the next.
 """
 
 import contextlib
 import io
 import json
-import os
+import re
 import resource
 import signal
 import sys
@@ -18,6 +19,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 
+from gpmpc.cli.command import COMMANDS
 from gpmpc.cli.log import log
 from gpmpc.exceptions import GpmpcError
 from gpmpc.recording import layout, read_run, recover, replay
@@ -59,7 +61,11 @@ def outcome(operation, path, original):
     return "unfinished" if not run.finished else "same" if same(run, original) else "other"
 
 
-def operations(path, original):
+def given(*arguments):
+    return COMMANDS["log"].parser("log").parse_args(arguments)
+
+
+def operations(path):
     """Everything that is done with a recording."""
     recovered = path.with_suffix(".recovered.mcap")
 
@@ -72,57 +78,46 @@ def operations(path, original):
     yield "read", lambda: read_run(path)
     yield "layout", lambda: layout(read_run(path)) and None
     yield "replay", replays
-    yield "info", lambda: log(["info", str(path)])
-    yield "export", lambda: log(["export", str(path), str(path.with_suffix(".csv"))])
+    yield "info", lambda: log(given("info", str(path))) and None
+    yield "export", lambda: log(given("export", str(path), str(path.with_suffix(".csv")))) and None
     yield "recover", lambda: recover(path, recovered) and None
     if recovered.exists():
         yield "recovered", lambda: read_run(recovered)
 
 
-def study(recording, seed, count):
+def examine(path, original):
+    """What came of every operation, and what the largest of them took."""
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
+    found, slowest = {}, 0.0
+    for name, operation in operations(path):
+        signal.alarm(SECONDS)  # ends the process, and so the study
+        start = time.process_time()
+        found[name] = outcome(operation, path, original)
+        slowest = max(slowest, time.process_time() - start)
+    signal.alarm(0)
+    peak = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
+    for left in path.parent.iterdir():
+        left.unlink()
+    return {"outcomes": found, "seconds": slowest, "megabytes": int(peak[1]) / 1024}
+
+
+def study(recording, seed, first, end):
     original, data = read_run(recording), recording.read_bytes()
-    if original.problems:
-        replay(original, int(original.steps[0]))  # compiles
-    bare = _apart(None, None)["megabytes"]
     kinds = (*damage.DAMAGES, *damage.DAMAGES, *damage.EDITS)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "damaged.mcap"
-        for i in range(count):
+        path.write_bytes(data)
+        bare = examine(path, original)["megabytes"]  # imports and compiles
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        for i in range(first, end):
             rng = np.random.default_rng([seed, i])
             kind = kinds[i % len(kinds)]
             path.write_bytes(kind(data, rng))
-            found = {"seed": [seed, i], "damage": kind.__name__, "size": path.stat().st_size} | _apart(path, original)
+            found = {"seed": [seed, i], "damage": kind.__name__, "size": path.stat().st_size}
+            found |= examine(path, original)
             yield found | {"megabytes": found["megabytes"] - bare}
-            for left in path.parent.iterdir():
-                left.unlink()
-
-
-def _apart(path, original):
-    """In a process of its own."""
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-        with os.fdopen(writing, "w") as answer:
-            for name, operation in operations(path, original) if path else ():
-                signal.alarm(SECONDS)
-                start = time.process_time()
-                print(
-                    json.dumps([name, outcome(operation, path, original), time.process_time() - start]),
-                    file=answer,
-                    flush=True,
-                )
-        os._exit(0)
-    os.close(writing)
-    with os.fdopen(reading) as answers:
-        lines = [json.loads(line) for line in answers]
-    _, status, usage = os.wait4(child, 0)
-    found = {name: result for name, result, _ in lines}
-    if status:
-        found["process"] = f"signal {status}"
-    return {"outcomes": found, "seconds": max((s for *_, s in lines), default=0.0), "megabytes": usage.ru_maxrss / 1024}
 
 
 if __name__ == "__main__":
-    for line in study(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])):
+    for line in study(Path(sys.argv[1]), *map(int, sys.argv[2:])):
         print(json.dumps(line), flush=True)

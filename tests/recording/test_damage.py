@@ -27,9 +27,20 @@ def recorded(tmp_path_factory):
 
 
 def check_study(path, seed, count):
-    command = [sys.executable, str(STUDY), str(path), str(seed), str(count)]
-    result = subprocess.run(command, capture_output=True, text=True, check=True)
-    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    halves = [
+        subprocess.Popen(
+            [sys.executable, str(STUDY), str(path), *map(str, (seed, *span))],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for span in ((0, count // 2), (count // 2, count))
+    ]
+    lines = []
+    for half in halves:
+        output, errors = half.communicate()
+        assert half.returncode == 0, errors[-2000:]
+        lines += [json.loads(line) for line in output.splitlines()]
     assert len(lines) == count
     edits = {kind.__name__ for kind in damage.EDITS}
     for line in lines:

@@ -14,7 +14,7 @@ from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
 from gpmpc.simulation.trials import chunk_size
 from gpmpc.status import Status
-from gpmpc.systems import Coupled, Integrated, Map, Rotational, Translational, step, step_many
+from gpmpc.systems import Coupled, Map, Rotational, System, Translational, step, step_many
 from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 
 H, STEPS = 3, 8
@@ -150,7 +150,7 @@ class Proportional:
 
 
 def test_a_controller_that_answers_one_by_one_flies_many_too_and_divergence_is_one_trials_own():
-    plant, initial = Integrated(Explosive(), time_step=0.5), Gaussian(torch.zeros(1), 4 * torch.eye(1))
+    plant, initial = System(Explosive(), time_step=0.5), Gaussian(torch.zeros(1), 4 * torch.eye(1))
     asked = (plant, Proportional(), np.zeros((20, 1)), initial, 15)
     flown = closed_loops(*asked, 12)
     assert any("Diverged: step" in trial.error for trial in flown if trial.error)
@@ -160,11 +160,11 @@ def test_a_controller_that_answers_one_by_one_flies_many_too_and_divergence_is_o
 @pytest.mark.parametrize(
     "plant",
     [
-        Map(Translational(frozen_attitude=(0.7, 0.7))),
-        Integrated(Translational(), 0.3),
-        Integrated(Rotational(), 0.1, substeps=2),
-        Integrated(Coupled(), 0.05),
-        Map(Explosive()),
+        System(Map(Translational(frozen_attitude=(0.7, 0.7)))),
+        System(Translational(), 0.3),
+        System(Rotational(), 0.1, substeps=2),
+        System(Coupled(), 0.05),
+        System(Map(Explosive())),
     ],
     ids=lambda plant: f"{type(plant).__name__} {type(plant.dynamics).__name__}",
 )

@@ -9,7 +9,7 @@ from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.propagation import MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, Replaced, closed_loop
 from gpmpc.status import Status
-from gpmpc.systems import Integrated, Map, Translational, step
+from gpmpc.systems import Map, System, Translational, step
 
 
 class Cart:
@@ -49,7 +49,7 @@ class Feedback:
         return Decision(input, inputs, means, covariances, status, 5, Timing(0.1, 0.2, 0.3))
 
 
-PLANT = Integrated(Cart(), time_step=0.1, substeps=1)
+PLANT = System(Cart(), time_step=0.1, substeps=1)
 REFERENCES = np.zeros((100, 2))
 START = np.array([1.0, 0.0])
 ALL_NOISE = {"process": [0.01, 0.02], "measurement": [0.03, 0.01], "input": [0.1]}
@@ -117,14 +117,14 @@ def test_a_gust_acts_in_its_window_and_is_integrated():
 
 
 def test_a_plant_is_replaced_from_a_time_on():
-    heavy = Integrated(HeavyCart(), time_step=0.1, substeps=1)
+    heavy = System(HeavyCart(), time_step=0.1, substeps=1)
     flight = fly(disturbances=[Replaced(heavy, start=1.0)])
     for k, (x, u) in enumerate(zip(flight.states[:-1], flight.inputs, strict=True)):
         assert np.array_equal(step(PLANT if k < 10 else heavy, x, u), flight.states[k + 1])
 
 
 def test_disturbances_add_up_in_their_order():
-    heavy = Integrated(HeavyCart(), time_step=0.1, substeps=1)
+    heavy = System(HeavyCart(), time_step=0.1, substeps=1)
     flight = fly(3, disturbances=[Replaced(heavy), Gust({"v": 1.0})])
     expected = step(heavy, flight.states[0], flight.inputs[0]) + np.array([0.005, 0.1])
     assert np.allclose(flight.states[1], expected, atol=1e-14)
@@ -211,13 +211,13 @@ def test_a_model_loop_starts_from_a_given_belief(model):
 
 def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
     with pytest.raises(Diverged, match="step 1: the plant's state is not finite any more") as caught:
-        fly(plant=Integrated(Exploding(), substeps=1), initial=np.array([0.0, 1.0]))
+        fly(plant=System(Exploding(), substeps=1), initial=np.array([0.0, 1.0]))
     assert caught.value.step == 1
     flown = caught.value.flown
     assert flown.states[:, 1] == pytest.approx([1.0, 1e60], rel=1e300)  # what was flown before is kept
     assert len(flown.inputs) == 1
     with pytest.raises(Diverged) as caught:
-        fly(plant=Integrated(Exploding(), substeps=1), initial=np.array([0.0, 1e300]))
+        fly(plant=System(Exploding(), substeps=1), initial=np.array([0.0, 1e300]))
     assert caught.value.flown is None
 
 
@@ -234,7 +234,7 @@ def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
         ({"seed": -1}, SettingError, "seed: must be a whole number, 0 or more; got -1"),
         ({"disturbances": [Gust({"w": 1.0})]}, SettingError, "must name states of the plant, x, v; got 'w'"),
         ({"disturbances": [Dropout(5, 6, entries=[2])]}, SettingError, "must be indices of states, 0 to 1; got 2"),
-        ({"disturbances": [Replaced(Map(Translational()))]}, ShapeError, "replaced by one of the same states"),
+        ({"disturbances": [Replaced(System(Map(Translational())))]}, ShapeError, "replaced by one of the same states"),
     ],
 )
 def test_misuse_is_refused_with_the_rule(settings, error, message):

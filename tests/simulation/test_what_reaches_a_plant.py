@@ -12,7 +12,7 @@ from gpmpc.mpc.problem import TrackingProblem
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import ModelLoop, cascade_loop, closed_loop, closed_loops
 from gpmpc.status import Status
-from gpmpc.systems import Coupled, Integrated
+from gpmpc.systems import Coupled, System
 from tests.mpc.systems import QUADROTOR, quadrotor_gp
 
 H, STEPS = 3, 12
@@ -87,7 +87,7 @@ def test_in_a_loop_no_lie_is_applied(system, policy, status):
 
 def test_in_a_cascade_no_lie_is_applied_by_either_controller():
     cascade = Cascade(Liar({0: "nan", 2: "a leap"}), Liar({0: "two inputs", 3: "infinite", 4: "above the box"}), 2)
-    plant = Integrated(Coupled(), 0.05, 1)
+    plant = System(Coupled(), 0.05, 1)
     flight = cascade_loop(plant, cascade, REFERENCES, np.zeros(12), 4, on_failure="hold")
     check(flight.outer.inputs)
     assert [k for k, _ in flight.outer.failures] == [0, 2]

@@ -10,10 +10,10 @@ from gpmpc.status import Status
 from gpmpc.studies.flight import Experiment, Flown, metrics
 from gpmpc.studies.report_document import report_document
 from gpmpc.studies.run_folder import PLAN, RunFolder, folder_name, record
-from gpmpc.systems import Integrated, Translational
+from gpmpc.systems import translational
 
 SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
-PLANT = Integrated(Translational(), time_step=1.0, substeps=1)
+PLANT = translational()
 
 
 class Bounds:

@@ -10,7 +10,7 @@ from gpmpc.studies.flight import summary
 from gpmpc.studies.run_folder import record
 from tests.studies.made_up import metrics_of
 
-OPTIONS = {"trajectory": "lorenz", "subsystem": "translational", "controller": "convex"}
+OPTIONS = {"trajectory": "lorenz", "system": "translational", "data": "excited", "controller": "convex"}
 
 
 def said(result, **options):
@@ -25,7 +25,7 @@ def said(result, **options):
 def test_a_summary_has_a_line_for_each_thing_that_is_measured(failing):
     result = metrics_of(0.125, steps=20, failing=failing)
     lines = said(result)
-    assert lines["flight"] == "20 steps of lorenz with convex"
+    assert lines["flight"] == "20 steps of translational along lorenz with convex"
     assert lines["RMSE [m]"].startswith("0.125  (x 0.125, y 0, z 0)")
     assert lines["failed solves"] == (f"INFEASIBLE {failing}" if failing else "none")
     assert result["violations"]
@@ -34,4 +34,4 @@ def test_a_summary_has_a_line_for_each_thing_that_is_measured(failing):
             f"{rate['violations']} of {rate['steps']} steps outside (95 %: 0 to"
         )
     assert lines["decision [ms]"].startswith("median 3.1  (model 1, build 0.1, solve 2), 99 % below 3.1")
-    assert said(result, subsystem="rotational")["flight"] == "20 steps of lorenz attitude with convex"
+    assert said(result, trajectory="goal", system="pendulum")["flight"] == "20 steps of pendulum with convex"

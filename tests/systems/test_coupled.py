@@ -5,9 +5,8 @@ import pytest
 from gpmpc.exceptions import SettingError
 from gpmpc.systems import (
     Coupled,
-    Integrated,
-    Map,
     Rotational,
+    System,
     Translational,
     attitude_at_yaw,
     attitude_for_thrust_direction,
@@ -27,8 +26,8 @@ def test_the_attitude_turns_as_the_rotational_subsystem_does(rng):
     rotational = Rotational(inertia=(0.004, 0.005, 0.009))
     x, u = rng.normal(size=12), rng.normal(size=4)
     assert Coupled(rotational=rotational).derivative(x, u)[6:] == rotational.derivative(x[6:], u[1:])
-    whole = Integrated(Coupled(rotational=rotational), time_step=0.05)
-    part = Integrated(rotational, time_step=0.05)
+    whole = System(Coupled(rotational=rotational), time_step=0.05)
+    part = System(rotational, time_step=0.05)
     assert np.allclose(step(whole, x, u)[6:], step(part, x[6:], u[1:]), rtol=1e-13)
 
 
@@ -40,8 +39,8 @@ def test_an_attitude_held_for_a_thrust_direction_moves_it_as_the_translational_s
         angles = attitude_for_thrust_direction(np.array(ux), np.array(uy), "exact")
         position = rng.normal(size=6)
         x = np.concatenate([position, [angles[0], 0, angles[1], 0, 0, 0]])
-        moved = step(Integrated(Coupled(mass=mass), time_step=0.7), x, np.array([U1, 0, 0, 0]))
-        expected = step(Integrated(Translational(mass=mass), time_step=0.7), position, np.array([U1, ux, uy]))
+        moved = step(System(Coupled(mass=mass), time_step=0.7), x, np.array([U1, 0, 0, 0]))
+        expected = step(System(Translational(mass=mass), time_step=0.7), position, np.array([U1, ux, uy]))
         assert np.allclose(moved[:6], expected, atol=1e-9)
 
 
@@ -76,7 +75,7 @@ def test_the_attitude_for_a_direction_is_found_at_any_yaw(rng):
 
 
 def test_floats_numpy_and_casadi_pass_through_the_same_formula(rng):
-    plant = Integrated(Coupled(), time_step=0.05, substeps=2)
+    plant = System(Coupled(), time_step=0.05, substeps=2)
     x, u = casadi.SX.sym("x", 12), casadi.SX.sym("u", 4)
     symbolic = casadi.Function("f", [x, u], [casadi.vertcat(*plant.successor(x, u))])
     state, control = rng.normal(size=12), rng.normal(size=4)
@@ -85,7 +84,5 @@ def test_floats_numpy_and_casadi_pass_through_the_same_formula(rng):
 
 
 def test_misuse_is_refused_with_the_rule():
-    with pytest.raises(SettingError, match="plant: Coupled means nothing as a map; take Integrated"):
-        Map(Coupled())
     with pytest.raises(SettingError, match=r"mass: must be a number above 0 \[kg\]; got -1"):
         Coupled(mass=-1)

@@ -4,7 +4,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from gpmpc.exceptions import SettingError
-from gpmpc.systems import Integrated, Map, Rotational, Translational, attitude_for_thrust_direction, step
+from gpmpc.systems import Map, Rotational, System, Translational, attitude_for_thrust_direction, step
 
 FROZEN = Translational(frozen_attitude=(np.pi / 4, np.pi / 4))
 DYNAMICS = [FROZEN, Translational(), Rotational(), Rotational(inertia=(0.004, 0.005, 0.009))]
@@ -14,7 +14,7 @@ DYNAMICS = [FROZEN, Translational(), Rotational(), Rotational(inertia=(0.004, 0.
 @pytest.mark.parametrize("trajectory", ["Elliptical", "Lorenz"])
 def test_the_authors_data_obey_the_map(paper_data, trajectory, subsystem):
     rows = np.loadtxt(paper_data / f"ds_nmpc_{trajectory}_{subsystem}.txt")
-    plant = Map(FROZEN if subsystem == "trans" else Rotational())
+    plant = System(Map(FROZEN if subsystem == "trans" else Rotational()))
     predicted = np.array([step(plant, row[:6], row[6:9]) for row in rows])
     assert np.abs(predicted - rows[:, 9:]).max() < 1e-6 * np.abs(rows[:, 9:]).max()
 
@@ -23,7 +23,7 @@ def test_the_map_is_the_right_hand_side(rng):
     x, u = rng.normal(size=6), rng.normal(size=3)
     m, g = 0.74, 9.81
     expected = [x[1], u[1] * u[0] / m, x[3], u[2] * u[0] / m, x[5], g - 0.5 * u[0] / m]
-    assert np.allclose(step(Map(FROZEN), x, u), expected, rtol=1e-15)
+    assert np.allclose(step(System(Map(FROZEN)), x, u), expected, rtol=1e-15)
 
 
 def test_the_rotational_coefficients_are_the_decoded_ones():
@@ -41,7 +41,7 @@ def test_the_rotational_coefficients_are_the_decoded_ones():
 
 @pytest.mark.parametrize("dynamics", DYNAMICS, ids=repr)
 def test_the_integrated_plant_agrees_with_an_adaptive_integrator(dynamics, rng):
-    plant = Integrated(dynamics, time_step=0.3, substeps=10)
+    plant = System(dynamics, time_step=0.3, substeps=10)
     for _ in range(5):
         x, u = rng.normal(size=6), 0.1 * rng.normal(size=3)
         exact = solve_ivp(lambda _, s, u=u: dynamics.derivative(s, u), (0, 0.3), x, rtol=1e-12, atol=1e-12).y[:, -1]
@@ -52,12 +52,12 @@ def test_one_substep_is_exact_for_the_translational_subsystem(rng):
     x, u, h = rng.normal(size=6), np.array([8.0, 0.2, -0.1]), 1.3
     vertical = np.sqrt(1 - u[1] ** 2 - u[2] ** 2)
     acceleration = np.array([u[1] * u[0], u[2] * u[0], -vertical * u[0]]) / 0.74 + np.array([0, 0, 9.81])
-    moved = step(Integrated(Translational(), time_step=h, substeps=1), x, u)
+    moved = step(System(Translational(), time_step=h, substeps=1), x, u)
     assert np.allclose(moved[::2], x[::2] + h * x[1::2] + h**2 / 2 * acceleration, atol=1e-11)
     assert np.allclose(moved[1::2], x[1::2] + h * acceleration, atol=1e-11)
 
 
-@pytest.mark.parametrize("plant", [Map, Integrated], ids=["map", "integrated"])
+@pytest.mark.parametrize("plant", [Map, System], ids=["map", "integrated"])
 @pytest.mark.parametrize("dynamics", DYNAMICS, ids=repr)
 def test_casadi_and_numpy_pass_through_the_same_formula(plant, dynamics, rng):
     plant = plant(dynamics)
@@ -69,13 +69,15 @@ def test_casadi_and_numpy_pass_through_the_same_formula(plant, dynamics, rng):
 
 
 def test_no_thrust_direction_beyond_the_horizontal_exists():
-    assert step(Map(Translational()), np.zeros(6), np.array([7.0, 2.0, 2.0]))[5] == pytest.approx(9.81, abs=1e-4)
+    assert step(System(Map(Translational())), np.zeros(6), np.array([7.0, 2.0, 2.0]))[5] == pytest.approx(
+        9.81, abs=1e-4
+    )
 
 
 @pytest.mark.parametrize("u", [(7.0, 1.0, 0.0), (7.0, 0.9, 0.9), (0.0, 0.0, 0.0)])
 def test_the_derivative_exists_at_and_beyond_a_horizontal_thrust(u):
     x, control = casadi.SX.sym("x", 6), casadi.SX.sym("u", 3)
-    jacobian = casadi.jacobian(casadi.vertcat(*Map(Translational()).successor(x, control)), control)
+    jacobian = casadi.jacobian(casadi.vertcat(*System(Map(Translational())).successor(x, control)), control)
     assert np.isfinite(np.array(casadi.Function("J", [x, control], [jacobian])(np.zeros(6), u))).all()
 
 
@@ -99,8 +101,8 @@ def test_the_papers_attitude_has_its_slip_and_saturates():
         (lambda: Rotational(inertia=(1, 1, -1)), "inertia: must be a number above 0"),
         (lambda: Rotational(arm=-1), "arm: must be a number above 0"),
         (lambda: Rotational(gyroscopic=(1,)), "gyroscopic: must be a list of 2 numbers"),
-        (lambda: Map(Rotational(), time_step=0), "time_step: must be a number above 0"),
-        (lambda: Integrated(Rotational(), substeps=0), "substeps: must be a whole number, 1 or more; got 0"),
+        (lambda: System(Rotational(), time_step=0), "time_step: must be a number above 0"),
+        (lambda: System(Rotational(), substeps=0), "substeps: must be a whole number, 1 or more; got 0"),
         (lambda: attitude_for_thrust_direction(np.zeros(1), np.zeros(1), "papper"), "'paper' or 'exact'; got 'papper'"),
     ],
 )

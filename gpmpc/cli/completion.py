@@ -1,0 +1,113 @@
+"""``gpmpc completion``: what may come next on the command line, and the scripts that ask for it at TAB."""
+
+import argparse
+import glob
+import os
+import shlex
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+from gpmpc.cli.arguments import Parser, Result
+from gpmpc.cli.configuration import group_options, setting_names, settings
+from gpmpc.exceptions import GpmpcError
+
+SCRIPTS = {
+    "bash": r"""_gpmpc() {
+    local IFS=$'\n' word=${COMP_LINE:0:COMP_POINT} before
+    COMPREPLY=($(gpmpc completion --line "$word" 2>/dev/null))
+    word=${word##*[[:space:]]} before=${word%"${word##*[=:]}"}  # bash replaces what stands behind these signs only
+    COMPREPLY=("${COMPREPLY[@]#"$before"}")
+    [[ ${#COMPREPLY[@]} == 1 && ${COMPREPLY[0]} == *[=/.] ]] && compopt -o nospace
+}
+complete -F _gpmpc gpmpc
+""",
+    "zsh": r"""(( $+functions[compdef] )) || { autoload -Uz compinit && compinit -u }
+_gpmpc() {
+    local -a found=("${(@f)$(gpmpc completion --line "$LBUFFER" 2>/dev/null)}")
+    compadd -Q -S '' -- ${(M)found:#*[=/.]}
+    compadd -Q -- ${found:#*[=/.]}
+}
+compdef _gpmpc gpmpc
+""",
+    "fish": """complete -c gpmpc -f -a '(gpmpc completion --line (commandline -cp | string collect) 2>/dev/null)'
+""",
+}
+
+
+def add_arguments(parser: Parser) -> None:
+    """Adds the arguments of the command."""
+    parser.add_argument("shell", nargs="?", choices=[*SCRIPTS], help='for its profile: eval "$(gpmpc completion bash)"')
+    parser.add_argument("--line", metavar="LINE", help="print what may come next after this beginning of a line")
+
+
+def completion(given: argparse.Namespace, commands: Mapping[str, Any]) -> Result:
+    """Prints a shell's script, or what may come next.
+
+    Raises:
+        GpmpcError: Neither was asked for.
+    """
+    if given.line is not None:
+        found = candidates(given.line, commands)
+    elif given.shell:
+        found = [SCRIPTS[given.shell].rstrip()]
+    else:
+        raise GpmpcError(f"completion: name a shell: {', '.join(SCRIPTS)}")
+    print("\n".join(found))
+    return Result(found)
+
+
+def candidates(line: str, commands: Mapping[str, Any]) -> list[str]:
+    """Returns the words that the last word of a line, up to the cursor, may become."""
+    try:
+        words = shlex.split(line)
+    except ValueError:  # inside of quotes
+        return []
+    if not line or line[-1].isspace():
+        words.append("")
+    _, *middle, word = words if len(words) > 1 else ["gpmpc", *words]
+    if not middle or middle == ["help"]:
+        found: Sequence[str] = [*commands]
+    elif middle[0] not in commands:
+        found = []
+    else:
+        found = _after(middle[0], middle[1:], word, commands[middle[0]])
+    return [each for each in found if each.startswith(word)]
+
+
+def _after(name: str, before: Sequence[str], word: str, command: Any) -> Sequence[str]:
+    """Returns what may stand behind a command and the words before the last one."""
+    values = command.parser(name).values
+    if before and values.get(before[-1]) is not None:
+        return values[before[-1]] or _files(word)
+    if word.startswith("-"):
+        return [option for option in (*values, "--json", "--quiet", "--debug") if option.startswith("--")]
+    if command.settings:
+        return _settings(command.settings, before, word)
+    places = [key for key in values if not key.startswith("-")]
+    place = sum(not each.startswith("-") for each in before)
+    return (values[places[place]] if place < len(places) else None) or _files(word)
+
+
+def _settings(name: str, before: Sequence[str], word: str) -> list[str]:
+    """Returns settings, one level at a time, or the options of a group; of a sweep, behind the last comma."""
+    chosen = [each for each in before if "=" in each]
+    with settings():
+        groups, names = group_options(name), setting_names(name)
+        with suppress(Exception):  # what was typed before may be no setting yet, or a sweep
+            names = setting_names(name, chosen)
+    key, equals, value = word.partition("=")
+    if equals:
+        if key == "folder" or key.endswith(".folder"):
+            return [f"{key}={path}" for path in _files(value)]
+        head = value[: value.rfind(",") + 1]
+        return [f"{key}={head}{option}" for option in groups.get(key, [])]
+    nodes, parent = {each.rpartition(".")[0] for each in names}, key.rpartition(".")[0]
+    level = [each for each in names if each.rpartition(".")[0] == parent and not each.endswith("_")]  # as _target_
+    leaves = [f"{each}=" for each in dict.fromkeys([*groups, *level]) if each in groups or each not in nodes]
+    return leaves + [f"{each}." for each in level if each in nodes and (each not in groups or each == word)]
+
+
+def _files(word: str) -> list[str]:
+    found = sorted(glob.glob(f"{glob.escape(os.path.expanduser(word))}*"))
+    return [f"{path}/" if os.path.isdir(path) else path for path in found]

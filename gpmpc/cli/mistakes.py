@@ -1,0 +1,76 @@
+"""Turns a user's mistake into one line: which setting, what was got, what was expected."""
+
+import difflib
+import re
+from collections.abc import Iterable
+
+from hydra.errors import HydraException, OverrideParseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+from gpmpc.cli.configuration import setting_names, settings
+from gpmpc.cli.run import one_line, own_error
+from gpmpc.exceptions import GpmpcError
+
+EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher
+
+
+def explain(error: Exception, name: str) -> str | None:
+    """Returns a user's mistake in one line; None where the error is not the user's.
+
+    Args:
+        error: Any.
+        name: Of the command's file of settings; empty where it has none.
+    """
+    if isinstance(error, GpmpcError | HydraException | OmegaConfBaseException):
+        return _of_settings(error, name)
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    if name and isinstance(error, TypeError | ValueError | ArithmeticError):  # a value that no check foresaw
+        reason = " ".join(str(error).split()) or type(error).__name__
+        return f"{reason}; is a setting of the wrong kind? --debug shows where"
+    return None
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Returns the name that a misspelt one stands for, as a question; by its last part where only that was typed."""
+    known = sorted(known, key=lambda key: key.count("."))
+    for part in (str, lambda key: key.rpartition(".")[2]):
+        parts = {part(key).lower() for key in known}
+        if close := difflib.get_close_matches(part(name).lower(), parts, n=1):
+            meant = [repr(key) for key in known if part(key).lower() == close[0]]
+            return f" (did you mean {' or '.join(meant[:3])}?)"
+    return ""
+
+
+def _of_settings(error: Exception, name: str) -> str:
+    if own_error(error):
+        return one_line(error)
+    text = str(error)
+    if unknown := re.match(r"Could not override '([^']+)'", text):
+        return f"unknown setting {unknown[1]!r}{nearest(unknown[1], _names(name))}"
+    option = re.search(r"Could not find '([^'/]+)/([^']+)'\s+Available options in '[^']+':\n((?:\t.*\n)+)", text)
+    if option and (extra := EXTRAS.get(option[2].removeprefix("launcher/"))):
+        return f"launcher: this one is not installed: pip install 'gpmpc[{extra}]'"
+    if option:
+        known = option[3].split()
+        available = f"available are {', '.join(known)}{nearest(option[2], known)}"
+        return f"{option[1]}: no such option {option[2]!r}; {available}"
+    if isinstance(error, OverrideParseException):
+        if "=" not in error.override:
+            return f"{error.override!r}: a setting is written SETTING=VALUE"
+        quoted = "in single quotes where the value holds brackets, braces, commas or spaces"
+        return f"{error.override!r}: cannot be read; a setting is written SETTING=VALUE, {quoted}"
+    if unlocated := re.match(r"Error locating target '([^']+)'", text):
+        return f"_target_: no such class or function {unlocated[1]!r}"
+    if isinstance(error, MissingMandatoryValue):
+        return f"{error.full_key}: this setting has no default; give it as {error.full_key}=VALUE"
+    if ambiguous := re.match(r"Ambiguous value for argument '([^=]+)=([^']+)'", text):
+        listed = f"{ambiguous[1]}: a list is written in brackets, {ambiguous[1]}=[{ambiguous[2]}]"
+        return f"{listed}; a sweep takes -m" if name == "run" else listed
+    lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc" not in line]
+    return "; ".join(line.rstrip(".:;") for line in lines) or type(error).__name__
+
+
+def _names(name: str) -> list[str]:
+    with settings():
+        return setting_names(name)

@@ -1,0 +1,119 @@
+"""Records a system under random inputs, from random starts: data of any system, without a controller."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
+from gpmpc.gp.transitions import Transitions
+from gpmpc.systems import System, step
+from gpmpc.trajectories import Trajectory
+
+
+@dataclass(frozen=True)
+class RandomData:
+    """Transitions under inputs drawn uniformly within the system's limits.
+
+    Attributes:
+        samples: How many.
+        episode: Steps from one start; the next episode starts anew.
+        hold: Steps for which an input is held.
+        starts: Where episodes start: ``"region"``, uniformly in the system's region, or ``"start"``, where its flights
+            start.
+        amplitude: Part of the width of the input limits that is used.
+        around: What the inputs are drawn about: the ``"middle"`` of their limits or the system's ``"initial_input"``.
+        noise: Standard deviations of what is added to every next state (n,); None for none.
+        seed: Of starts, inputs and noise.
+
+    Raises:
+        SettingError: A number out of range, or an unknown word.
+    """
+
+    samples: int = 200
+    episode: int = 10
+    hold: int = 1
+    starts: str = "region"
+    amplitude: float = 1.0
+    around: str = "middle"
+    noise: Sequence[float] | None = None
+    seed: int = 0
+
+    note = "Data: our own, under random inputs."
+
+    def __post_init__(self) -> None:
+        for key, least in (("samples", 1), ("episode", 1), ("hold", 1), ("seed", 0)):
+            check_number(f"data.{key}", getattr(self, key), least=least, whole=True)
+        check_number("data.amplitude", self.amplitude, above=0)
+        for key, words in (("starts", ("region", "start")), ("around", ("middle", "initial_input"))):
+            if getattr(self, key) not in words:
+                raise SettingError(f"data.{key}", f"must be {' or '.join(words)}; got {getattr(self, key)!r}")
+        for value in self.noise or ():
+            check_number("data.noise", value, least=0)
+
+    def check(self, system: System, trajectory: Trajectory | None = None) -> None:
+        """Raises unless the system can be driven at random.
+
+        Raises:
+            SettingError: It has an input without limits, or no region to start from.
+            ShapeError: There are more or fewer deviations of noise than states.
+        """
+        for name, *limits in zip(system.input_names, system.input_lower, system.input_upper, strict=True):
+            if not np.isfinite(limits).all():
+                raise SettingError("data", f"random inputs need limits; {name} of {system.name} has none")
+        stateful = getattr(system.dynamics, "stateful", False)
+        if system.region is None and self.starts == "region" and not stateful:
+            raise SettingError("data.starts", f"{system.name} has no region; take starts=start, or give it one")
+        if self.noise is not None and len(self.noise) != len(system.state_names):
+            raise ShapeError(f"data.noise must have {len(system.state_names)} deviations; got {len(self.noise)}")
+
+    def transitions(self, system: System, trajectory: Trajectory | None = None, name: str = "") -> Transitions:
+        """Steps the system.
+
+        An episode ends early where it is farther outside the region than the region is wide, and where a simulator
+        ends it.
+
+        Raises:
+            SettingError: As ``check`` does.
+            ShapeError: As ``check`` does.
+            DataError: Its episodes end at once, over and over.
+        """
+        self.check(system, trajectory)
+        random = np.random.default_rng(self.seed)
+        lower, upper = np.array(system.input_lower), np.array(system.input_upper)
+        middle = (lower + upper) / 2 if self.around == "middle" else np.array(system.initial_input)
+        half = self.amplitude * (upper - lower) / 2
+        centre, reach = _surroundings(system)
+        rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        for _ in range(100 + 2 * self.samples):
+            state = self._start(system, random)
+            for k in range(min(self.episode, self.samples - len(rows))):
+                if k % self.hold == 0:
+                    input = np.clip(middle + random.uniform(-half, half), lower, upper)
+                with np.errstate(over="ignore", invalid="ignore"):
+                    after = step(system, state, input)
+                after = after if self.noise is None else after + random.normal(0, 1, len(after)) * self.noise
+                if not (np.abs(after - centre) <= reach).all():
+                    break
+                rows.append((state, input, after))
+                if getattr(system.dynamics, "ended", False):
+                    break
+                state = after
+            if len(rows) == self.samples:
+                return Transitions(*(np.array(column) for column in zip(*rows, strict=True)))
+        raise DataError(f"{system.name}: only {len(rows)} of {self.samples} random steps stayed near the region")
+
+    def _start(self, system: System, random: np.random.Generator) -> np.ndarray:
+        if getattr(system.dynamics, "stateful", False):
+            return system.dynamics.reset(int(random.integers(2**31)))
+        if self.starts == "start":
+            return np.array(system.goal if system.start is None else system.start)
+        return random.uniform(*system.region)
+
+
+def _surroundings(system: System) -> tuple[np.ndarray, np.ndarray]:
+    """Middle of the region (n,), and the distance from it within which steps count (n,)."""
+    if system.region is None:
+        return np.zeros(len(system.state_names)), np.full(len(system.state_names), np.finfo(float).max)
+    lower, upper = np.array(system.region)
+    return (lower + upper) / 2, 1.5 * (upper - lower)

@@ -1,0 +1,241 @@
+"""Tubes that hold: how many standard deviations a bound needs, from predictions that were compared with what happened.
+
+A chance constraint g'x <= f moves its bound inwards by kappa sd, and a Gaussian takes kappa = Phi^-1(eta). Models are
+wrong in ways that their covariance does not say. Here kappa of each stage k is a quantile of the scores
+
+    s = max_g g'(x_k - mu_k) / sqrt(g' Sigma_k g)
+
+of held-out k-step predictions: the ceil((N + 1) eta)-th smallest of N scores holds a new one with probability eta or
+more, whatever their distribution (split conformal prediction: Vovk, Gammerman and Shafer, 2005; Lei et al., 2018).
+**Guaranteed** where the new score and the N are exchangeable: windows that do not overlap, flown as the plant will be.
+In a closed loop with another controller it is a measured number, no more.
+
+``AdaptiveTube`` corrects it while it runs (Gibbs and Candes, 2021): with err = 1 where a prediction did not hold,
+
+    alpha <- alpha + rate (1 - eta - err),    kappa = quantile of the scores at 1 - alpha
+
+Whatever the plant does, the share of T predictions of stage k that did not hold exceeds 1 - eta by no more than
+(1 + rate (k + 1)) / (rate T), **guaranteed** as long as no score exceeds ``largest``. That is a promise of the long
+run, not of a moment.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from gpmpc.compiled import call_unchecked, compiled
+from gpmpc.dynamics import Array, DynamicsModel
+from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.propagation import Propagator, rollout
+
+
+@dataclass(frozen=True)
+class ConformalTube:
+    """Scores of held-out predictions, and the numbers of standard deviations that follow from them.
+
+    Attributes:
+        scores: Those of each stage in a column (N, H), which are sorted.
+        rows: The directions g (r, n) that were compared.
+    """
+
+    scores: Array
+    rows: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "scores", np.ascontiguousarray(np.sort(self.scores, axis=0), dtype=float))
+        object.__setattr__(self, "rows", np.ascontiguousarray(self.rows, dtype=float))
+
+    @classmethod
+    def calibrate(
+        cls,
+        model: DynamicsModel,
+        propagator: Propagator,
+        states: Any,
+        inputs: Any,
+        horizon: int,
+        rows: Any = None,
+    ) -> "ConformalTube":
+        """Compares predictions with a held-out log, over windows that do not overlap.
+
+        Args:
+            model: Was not trained on this log.
+            propagator: As the controller has it, with ``process_noise=True``.
+            states: x_0 .. x_T at equal time steps (T + 1, n).
+            inputs: u_0 .. u_{T-1} (T, m) or one more.
+            horizon: H.
+            rows: Directions g (r, n); both sides of every state by default. A bound on the first state from above alone
+                is [[1, 0, ..]]: fewer directions, a smaller kappa.
+
+        Raises:
+            ShapeError: States, inputs or rows do not belong together.
+            DataError: The log is shorter than the horizon, or a score is not finite.
+        """
+        check_number("horizon", horizon, least=1, whole=True)
+        x, u = (torch.as_tensor(np.asarray(part), dtype=model.dtype, device=model.device) for part in (states, inputs))
+        if x.dim() != 2 or u.dim() != 2 or len(u) not in (len(x) - 1, len(x)):
+            got = f"{tuple(x.shape)} and {tuple(u.shape)}"
+            raise ShapeError(f"states (T + 1, n) and inputs (T, m) must be one log; got {got}")
+        starts = range(0, len(x) - horizon, horizon)
+        if not len(starts):
+            raise DataError(f"a log of {len(x)} states has no window of {horizon} steps")
+        begin = Gaussian.certain(torch.stack([x[k] for k in starts]))
+        predicted = rollout(propagator, model, begin, torch.stack([u[k : k + horizon] for k in starts]))
+        after = torch.stack([x[k + 1 : k + horizon + 1] for k in starts])
+        return cls.of_predictions(predicted, after, rows)
+
+    @classmethod
+    def of_predictions(cls, predicted: Gaussian, states: Any, rows: Any = None) -> "ConformalTube":
+        """Compares predictions of any kind with what happened, such as the plans of a flight.
+
+        Args:
+            predicted: Mean (N, H, n), covariance (N, H, n, n) with the process noise.
+            states: What the states were then (N, H, n).
+            rows: As for ``calibrate``.
+
+        Raises:
+            ShapeError: The shapes do not belong together.
+            DataError: A score is not finite, or a direction has no variance.
+        """
+        mean, covariance = (part.detach().cpu().double().numpy() for part in (predicted.mean, predicted.covariance))
+        after, n = np.asarray(states, dtype=float), mean.shape[-1]
+        G = np.vstack([np.eye(n), -np.eye(n)]) if rows is None else np.atleast_2d(np.asarray(rows, dtype=float))
+        if mean.ndim != 3 or after.shape != mean.shape or G.shape[1] != n:
+            got = f"{mean.shape}, {after.shape} and {G.shape}"
+            raise ShapeError(f"predictions and states (N, H, n) and rows (r, n) must fit; got {got}")
+        deviation = np.sqrt(np.einsum("ri,khij,rj->khr", G, covariance, G))
+        if not (deviation > 0).all():
+            raise DataError("a direction has no variance: predict with the process noise")
+        scores = ((after - mean) @ G.T / deviation).max(-1)
+        if not np.isfinite(scores).all():
+            raise DataError("a score is not finite: a prediction or a state is not")
+        return cls(scores, G)
+
+    @property
+    def horizon(self) -> int:
+        """H."""
+        return self.scores.shape[1]
+
+    def kappas(self, probability: float) -> Array:
+        """The number of standard deviations of each stage that holds with a probability eta (H,).
+
+        Raises:
+            SettingError: The probability does not lie between 0 and 1.
+            DataError: There are fewer than eta / (1 - eta) scores: no number of them says so much.
+        """
+        _check_probability(probability)
+        rank, N = math.ceil((len(self.scores) + 1) * probability - 1e-9), len(self.scores)
+        if rank > N:
+            need = math.ceil(probability / (1 - probability) - 1e-9)
+            raise DataError(f"a probability of {probability:g} needs {need} windows or more; got {N}")
+        return self.scores[rank - 1].copy()
+
+
+class AdaptiveTube:
+    """Adapts the standard deviations of each stage to how often predictions hold.
+
+    Each step: ``observe`` the state, decide with ``kappas``, ``remember`` the plan.
+
+    Args:
+        tube: Scores to begin with.
+        probability: eta.
+        rate: By how much one prediction that did not hold moves alpha; larger adapts faster and varies more.
+        noise: Covariance of the measurements of what ``observe`` is given (n, n); none by default.
+        largest: The largest number of standard deviations; twice the largest score of all by default.
+
+    Raises:
+        SettingError: A probability not between 0 and 1, or a rate that is not positive.
+    """
+
+    def __init__(
+        self,
+        tube: ConformalTube,
+        probability: float,
+        rate: float = 0.01,
+        noise: Any = None,
+        largest: float | None = None,
+    ):
+        _check_probability(probability)
+        check_number("rate", rate, above=0)
+        H, (r, n) = tube.horizon, tube.rows.shape
+        largest = 2.0 * max(float(tube.scores.max()), 1.0) if largest is None else largest
+        check_number("largest", largest, above=0)
+        self.tube, self.probability = tube, float(probability)
+        self.rate, self.largest = float(rate), float(largest)
+        self.noise = np.zeros((n, n)) if noise is None else np.ascontiguousarray(noise, dtype=float)
+        self.kappas, self.alphas = np.empty(H), np.full(H, 1.0 - probability)
+        self.counts, self.misses = np.zeros(H), np.zeros(H)
+        self._bounds = np.full((H, H, r), np.nan)  # of the plans of the last H steps, by stage and direction
+        self._step = 0
+        self.observe(np.full(n, np.nan))  # nothing yet: kappas alone
+        self._step = 0
+
+    def observe(self, state: Any) -> Array:
+        """Compares a state (n,) with what the plans before it said; returns kappa of each stage (H,)."""
+        state = np.ascontiguousarray(state, dtype=np.float64)
+        self._step += 1
+        numbers = self.rate, 1.0 - self.probability, self.largest
+        parts = self.kappas, self.alphas, self.counts, self.misses
+        call_unchecked(_observe, state, self.tube.rows, self._bounds, self._step, *numbers, self.tube.scores, *parts)
+        return self.kappas
+
+    def remember(self, means: Array, covariances: Array) -> None:
+        """Remembers a plan from the current state on, as a decision has it: (H + 1, n) and (H + 1, n, n)."""
+        means, covariances = (np.ascontiguousarray(part, dtype=np.float64) for part in (means, covariances))
+        if means.shape != (self.tube.horizon + 1, self.tube.rows.shape[1]):
+            raise ShapeError(
+                f"means must be ({self.tube.horizon + 1}, {self.tube.rows.shape[1]}); got {np.shape(means)}"
+            )
+        bounds = self._bounds[self._step % self.tube.horizon]
+        call_unchecked(_remember, means, covariances, self.noise, self.tube.rows, self.kappas, bounds)
+
+    @property
+    def violations(self) -> Array:
+        """The share of the predictions that did not hold, by stage (H,); NaN before the first."""
+        return np.divide(self.misses, self.counts, out=np.full_like(self.misses, np.nan), where=self.counts > 0)
+
+
+def _check_probability(probability: float) -> None:
+    check_number("probability", probability)
+    if not 0 < probability < 1:
+        raise SettingError("probability", f"must lie between 0 and 1; got {probability}")
+
+
+@compiled(locked=True)
+def _observe(state, rows, bounds, step, rate, allowed, largest, scores, kappas, alphas, counts, misses):
+    """Updates alpha and kappa of each stage (H,) by a state (n,); ``bounds`` (H, H, r) hold the last plans."""
+    N, H = scores.shape
+    for k in range(H):  # the plan of k + 1 steps ago said where the state would be at its stage k
+        known, outside = True, False
+        plan = (step - k - 1) % H
+        for r in range(len(rows)):
+            value = 0.0
+            for i in range(len(state)):
+                value += rows[r, i] * state[i]
+            bound = bounds[plan, k, r]
+            known = known and bound == bound and value == value
+            outside = outside or value > bound
+        if known:
+            counts[k] += 1.0
+            misses[k] += 1.0 if outside else 0.0
+            alphas[k] = min(alphas[k] + rate * (allowed - (1.0 if outside else 0.0)), 1.0)
+        rank = math.ceil((N + 1) * (1.0 - alphas[k]) - 1e-9)
+        kappas[k] = largest if rank > N else scores[max(rank, 1) - 1, k]
+    bounds[step % H] = np.nan  # until a plan of this step is remembered
+
+
+@compiled(locked=True)
+def _remember(means, covariances, noise, rows, kappas, bounds):
+    """Writes the bounds g'mu + kappa sd of a plan, by stage and direction (H, r)."""
+    n = means.shape[1]
+    for k in range(len(kappas)):
+        for r in range(len(rows)):
+            value, variance = 0.0, 0.0
+            for i in range(n):
+                value += rows[r, i] * means[k + 1, i]
+                for j in range(n):
+                    variance += rows[r, i] * (covariances[k + 1, i, j] + noise[i, j]) * rows[r, j]
+            bounds[k, r] = value + kappas[k] * math.sqrt(max(variance, 0.0))

@@ -1,0 +1,109 @@
+"""Consistency of estimates: whether errors are as large as their covariances say.
+
+The normalised estimation error squared e' P^-1 e (NEES), e the error of an estimate of covariance P, and the normalised
+innovation squared nu' S^-1 nu (NIS) have the mean n, the number of entries, where an estimator is consistent; over N
+independent ones N times the mean is chi-square of N n degrees of freedom (Bar-Shalom, Li and Kirubarajan, 2001, section
+5.4). Too large a mean: the estimator is overconfident. Innovations of a consistent filter are white.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.stats import chi2
+from torch import Tensor
+
+from gpmpc.exceptions import DataError, ShapeError
+from gpmpc.gaussian import Gaussian
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Normalised squared errors, and the band that their mean should lie in.
+
+    Attributes:
+        values: One an error (N,); errors without a finite entry are left out.
+        degrees: Degrees of freedom of each: how many entries were finite (N,).
+        band: Lower and upper limit of the mean, per degree of freedom, for independent errors.
+        level: Probability of the band.
+    """
+
+    values: np.ndarray
+    degrees: np.ndarray
+    band: tuple[float, float]
+    level: float
+
+    @property
+    def mean(self) -> float:
+        """Per degree of freedom: 1 where errors are as large as their covariances say."""
+        return float(self.values.sum() / self.degrees.sum())
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the mean lies in the band."""
+        return self.band[0] <= self.mean <= self.band[1]
+
+
+def normalized_errors(
+    errors: Any, covariances: Any, level: float = 0.95, independent: int | None = None
+) -> Consistency:
+    """Computes normalised squared errors: NEES of estimation errors, NIS of innovations.
+
+    Args:
+        errors: (..., n); entries that are not finite (nothing was measured) are left out.
+        covariances: Of the errors (..., n, n).
+        level: Probability of the band.
+        independent: How many of the errors are independent, for the band; all by default. Estimates of one run are
+            correlated in time, those of different runs are not.
+
+    Raises:
+        ShapeError: The two do not belong together.
+        DataError: No error is finite.
+    """
+    e, P = (torch.as_tensor(part, dtype=torch.float64) for part in (errors, covariances))
+    if P.shape != (*e.shape, e.shape[-1]):
+        raise ShapeError(f"errors (..., n) need covariances (..., n, n); got {tuple(e.shape)} and {tuple(P.shape)}")
+    e, P = e.reshape(-1, e.shape[-1]), P.reshape(-1, *P.shape[-2:])
+    missing = ~torch.isfinite(e)
+    keep = ~missing.all(-1)
+    if not bool(keep.any()):
+        raise DataError("no error is finite")
+    e, P, missing = e[keep], P[keep], missing[keep]
+    P = torch.where(missing[:, :, None] | missing[:, None, :], torch.eye(e.shape[-1], dtype=P.dtype), P)
+    e = torch.where(missing, 0.0, e)
+    values = (e * torch.linalg.solve(P, e[..., None])[..., 0]).sum(-1).numpy()
+    degrees = (~missing).sum(-1).numpy()
+    total = float(degrees.mean()) * (len(values) if independent is None else independent)
+    low, high = chi2.ppf([(1 - level) / 2, (1 + level) / 2], total) / total
+    return Consistency(values, degrees, (float(low), float(high)), level)
+
+
+def estimation_errors(belief: Gaussian, states: Any, angles: Any = ()) -> Tensor:
+    """The errors x - mu (..., n) of beliefs, those of angles wrapped to [-pi, pi)."""
+    errors = torch.as_tensor(states, dtype=belief.mean.dtype) - belief.mean
+    for i in angles:
+        errors[..., i] = wrapped(errors[..., i])
+    return errors
+
+
+def wrapped(angle: Any) -> Any:
+    """The angle in [-pi, pi) that differs by whole turns [rad]."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def autocorrelation(innovations: Any, covariances: Any, lag: int = 1) -> tuple[float, float]:
+    """The autocorrelation of whitened innovations (T, p), and the 95 % limit of its size where they are white.
+
+    Raises:
+        DataError: Fewer than two pairs are finite.
+    """
+    e, S = (torch.as_tensor(part, dtype=torch.float64) for part in (innovations, covariances))
+    white = (e / S.diagonal(dim1=-2, dim2=-1).sqrt()).numpy()
+    first, second = white[:-lag], white[lag:]
+    pairs = np.isfinite(first) & np.isfinite(second)
+    if pairs.sum() < 2:
+        raise DataError("an autocorrelation needs two pairs of finite innovations or more")
+    a, b = first[pairs], second[pairs]
+    return float((a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum())), float(1.96 / np.sqrt(len(a)))

@@ -1,0 +1,301 @@
+"""Describes a system that is controlled: how it moves, what its states and inputs are called, how it is flown.
+
+A right-hand side f(x, u) is written once, with plain arithmetic on the entries of x and u, so that floats, NumPy arrays
+and CasADi expressions all pass through the same formula; ``gpmpc.systems`` has ``sin``, ``cos`` and ``exp`` for all of
+them. It is integrated over the time step with the input held constant. Whatever a run, a report, a recording or a
+figure says of a system comes from its ``System``.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import inf, isfinite
+from typing import Any, Protocol
+
+import numpy as np
+
+from gpmpc.exceptions import GpmpcError, SettingError, ShapeError, check_number, check_numbers
+from gpmpc.trajectories import Trajectory
+
+Array = np.ndarray
+UNKNOWN = "?"  # the unit of a state or an input that has none given
+
+
+class Dynamics(Protocol):
+    """How a system moves, with named states and inputs.
+
+    Besides the names it has one method of two: ``derivative(x, u)``, the n entries of dx/dt, or ``successor(x, u)``,
+    the n entries of the next state. x and u are indexed from 0 and know arithmetic.
+    """
+
+    @property
+    def state_names(self) -> Sequence[str]:
+        """Names of the n states, in order."""
+        ...
+
+    @property
+    def input_names(self) -> Sequence[str]:
+        """Names of the m inputs, in order."""
+        ...
+
+
+class Plant(Protocol):
+    """A discrete-time system; a ``System`` is one."""
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """The names of states and inputs, and how it moves."""
+        ...
+
+    @property
+    def time_step(self) -> float:
+        """Time of one step [s]."""
+        ...
+
+    def successor(self, x: Any, u: Any) -> Sequence[Any]:
+        """The n entries of x[k+1], symbolic or numeric."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """A discrete-time system, with everything that is said of it.
+
+    A right-hand side is integrated by the classical Runge-Kutta method of order four on equal substeps.
+
+    Attributes:
+        dynamics: Names of states and inputs, and ``derivative(x, u)`` or ``successor(x, u)``; see ``Dynamics``.
+        time_step: Sampling time [s].
+        substeps: Runge-Kutta steps per sampling time.
+        name: What it is called; by default as the class of its dynamics.
+        units: By name of state or input, such as ``{"x": "m"}``.
+        input_lower: Smallest inputs (m,); None where there is no limit.
+        input_upper: Largest inputs (m,).
+        initial_input: The input before the first step (m,), such as the one at rest; zero by default.
+        start: Where a flight begins (n,); on its reference by default.
+        goal: The state that is held where no trajectory is followed (n,); zero by default.
+        region: Smallest and largest states that random data start from (2, n).
+        angles: States whose errors are taken within half a turn [rad].
+        tracked: States that a trajectory prescribes and errors are reported of, in one unit; by default all states in
+            the unit of the first.
+        rates: For a state, the tracked one that it is the time derivative of, such as ``{"vx": "x"}``.
+        lost: A flight is not lost while its tracked states are nearer than this to their reference, in their unit; with
+            infinity only one that leaves the finite numbers is.
+        references: From a trajectory, a count K and the time step to reference states (K, n), where a trajectory
+            prescribes something other than tracked states.
+        z_down: Whether positions x, y, z have their z axis pointing downwards.
+
+    Raises:
+        SettingError: A number out of range, an unknown name, tracked states of several units, or dynamics without a
+            finite value where the system starts.
+        ShapeError: A list has another length than there are states or inputs, or the dynamics have.
+    """
+
+    dynamics: Any
+    time_step: float = 1.0  # [s]
+    substeps: int = 10
+    name: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+    input_lower: Any = None
+    input_upper: Any = None
+    initial_input: Any = None
+    start: Any = None
+    goal: Any = None
+    region: Any = None
+    angles: Sequence[str] = ()
+    tracked: Sequence[str] = ()
+    rates: Mapping[str, str] = field(default_factory=dict)
+    lost: float = inf
+    references: Callable[[Trajectory, int, float], Array] | None = None
+    z_down: bool = False
+
+    def __post_init__(self) -> None:
+        check_number("time_step", self.time_step, above=0, unit="[s]")
+        check_number("substeps", self.substeps, least=1, whole=True)
+        states, inputs = _names(self.dynamics, "state_names"), _names(self.dynamics, "input_names")
+        self._set("name", self.name or type(self.dynamics).__name__)
+        if unknown := set(self.units) - {*states, *inputs}:
+            known = ", ".join([*states, *inputs])
+            raise SettingError("units", f"must be of {known}; got {', '.join(sorted(unknown))}")
+        self._set("units", {name: self.units.get(name, UNKNOWN) for name in (*states, *inputs)})
+        if not self.tracked:
+            self._set("tracked", [name for name in states if self.units[name] == self.units[states[0]]])
+        for key in ("angles", "tracked", "rates"):
+            for name in getattr(self, key):
+                if name not in states:
+                    raise SettingError(key, f"must name states, {', '.join(states)}; got {name!r}")
+        for name in self.rates.values():
+            if name not in self.tracked:
+                raise SettingError("rates", f"must be of tracked states, {', '.join(self.tracked)}; got {name!r}")
+        for key in ("angles", "tracked"):
+            self._set(key, tuple(getattr(self, key)))
+        if len(found := {self.units[name] for name in self.tracked}) > 1:
+            raise SettingError("tracked", f"must be states of one unit; got {', '.join(sorted(found))}")
+        if self.lost != inf:
+            check_number("lost", self.lost, above=0)
+        n, m = len(states), len(inputs)
+        for key, length, default in (
+            ("input_lower", m, (-inf,) * m),
+            ("input_upper", m, (inf,) * m),
+            ("initial_input", m, (0.0,) * m),
+            ("goal", n, (0.0,) * n),
+            ("start", n, None),
+        ):
+            self._set(key, default if getattr(self, key) is None else _floats(key, getattr(self, key), length))
+        if any(low > high for low, high in zip(self.input_lower, self.input_upper, strict=True)):
+            raise SettingError("input_lower, input_upper", f"must not cross; got {self.input_lower, self.input_upper}")
+        if self.region is not None:
+            if len(self.region) != 2:
+                raise SettingError("region", f"must be the smallest and the largest states; got {self.region!r}")
+            self._set("region", tuple(_floats("region", side, n) for side in self.region))
+        self._check_dynamics()
+
+    def _set(self, key: str, value: Any) -> None:
+        object.__setattr__(self, key, value)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the n states."""
+        return tuple(self.dynamics.state_names)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the m inputs."""
+        return tuple(self.dynamics.input_names)
+
+    @property
+    def unit(self) -> str:
+        """The unit of the tracked states."""
+        return self.units[self.tracked[0]]
+
+    @cached_property
+    def tracked_indices(self) -> list[int]:
+        """Where the tracked states stand."""
+        return [self.state_names.index(name) for name in self.tracked]
+
+    @cached_property
+    def angle_indices(self) -> list[int]:
+        """Where the angles stand."""
+        return [self.state_names.index(name) for name in self.angles]
+
+    def successor(self, x: Any, u: Any) -> list[Any]:
+        """The n entries of x[k+1], from the entries of x[k] and u[k]: floats, arrays, or symbols.
+
+        Raises:
+            ShapeError: The dynamics have another number of entries than there are states.
+        """
+        if hasattr(self.dynamics, "successor"):
+            return list(self._check_length("successor", self.dynamics.successor(x, u)))
+        f, h = self.dynamics.derivative, self.time_step / self.substeps
+        n = len(self.dynamics.state_names)
+        x = [x[i] for i in range(n)]
+        for _ in range(self.substeps):
+            k1 = self._check_length("derivative", f(x, u))
+            k2 = f([x[i] + h / 2 * k1[i] for i in range(n)], u)
+            k3 = f([x[i] + h / 2 * k2[i] for i in range(n)], u)
+            k4 = f([x[i] + h * k3[i] for i in range(n)], u)
+            x = [x[i] + h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]) for i in range(n)]
+        return x
+
+    def reference_states(self, trajectory: Trajectory | None, count: int) -> Array:
+        """Computes the states to follow (count, n), one per time step; the goal where there is no trajectory.
+
+        Raises:
+            ShapeError: The trajectory prescribes another number of states than are tracked.
+        """
+        if trajectory is None:
+            return np.tile(np.array(self.goal), (count, 1))
+        if self.references is not None:
+            return self.references(trajectory, count, self.time_step)
+        times = self.time_step * np.arange(count)
+        positions, states = trajectory(times), np.tile(np.array(self.goal), (count, 1))
+        if positions.shape[1:] != (len(self.tracked),):
+            what = f"must prescribe {', '.join(self.tracked)} of {self.name}"
+            raise ShapeError(f"trajectory: {what}; got positions of {positions.shape[-1]} numbers")
+        states[:, self.tracked_indices] = positions
+        if self.rates:
+            velocities = trajectory.velocity(times)
+            for name, of in self.rates.items():
+                states[:, self.state_names.index(name)] = velocities[:, self.tracked.index(of)]
+        return states
+
+    def _check_length(self, method: str, entries: Any) -> Any:
+        n = len(self.dynamics.state_names)
+        if not hasattr(entries, "__len__") or len(entries) != n:
+            got = f"{len(entries)}" if hasattr(entries, "__len__") else type(entries).__name__
+            raise ShapeError(f"{method} must give {n} entries, one for each of state_names; got {got}")
+        return entries
+
+    def _check_dynamics(self) -> None:
+        """Evaluates the dynamics once, where the system starts."""
+        if not (hasattr(self.dynamics, "derivative") or hasattr(self.dynamics, "successor")):
+            what = "must have derivative(x, u), or successor(x, u) for the next state"
+            raise SettingError("dynamics", f"{what}; got {type(self.dynamics).__name__}")
+        if getattr(self.dynamics, "stateful", False):  # a simulator under way: a step would move it
+            return
+        x, u = list(self.goal if self.start is None else self.start), list(self.initial_input)
+        try:
+            entries = [float(entry) for entry in self.successor(x, u)]
+        except GpmpcError:
+            raise
+        except Exception as error:
+            what = f"must step from state {x} with input {u}"
+            raise SettingError("dynamics", f"{what}; got {type(error).__name__}: {error}") from error
+        for name, entry in zip(self.state_names, entries, strict=True):
+            if not isfinite(entry):
+                raise SettingError("dynamics", f"must be finite at state {x}, input {u}; {name} is {entry} after it")
+
+
+def step(plant: Plant, state: Array, input: Array) -> Array:
+    """The next state (n,) of a plant from a state (n,) and an input (m,).
+
+    Raises:
+        ShapeError: State or input are of another length.
+    """
+    shapes = ((len(plant.dynamics.state_names),), (len(plant.dynamics.input_names),))
+    if (np.shape(state), np.shape(input)) != shapes:
+        raise ShapeError(
+            f"state and input must have shapes {shapes[0]} and {shapes[1]}; got {np.shape(state)} and {np.shape(input)}"
+        )
+    return np.array(plant.successor(state, input), dtype=float)
+
+
+def step_many(plant: Plant, states: Array, inputs: Array) -> Array:
+    """The next states (T, n) of T copies of a plant, from states (T, n) and inputs (T, m), in one evaluation."""
+    entries = plant.successor(states.T, inputs.T)
+    return np.stack([np.broadcast_to(np.asarray(entry, dtype=float), len(states)) for entry in entries], axis=1)
+
+
+def sin(angle: Any) -> Any:
+    """Sine of a float, an array, or whatever knows its own (CasADi, torch)."""
+    return angle.sin() if hasattr(angle, "sin") else np.sin(angle)
+
+
+def cos(angle: Any) -> Any:
+    """Cosine of a float, an array, or whatever knows its own (CasADi, torch)."""
+    return angle.cos() if hasattr(angle, "cos") else np.cos(angle)
+
+
+def exp(value: Any) -> Any:
+    """Exponential of a float, an array, or whatever knows its own (CasADi, torch)."""
+    return value.exp() if hasattr(value, "exp") else np.exp(value)
+
+
+def _names(dynamics: Any, key: str) -> tuple[str, ...]:
+    names = getattr(dynamics, key, None)
+    listed = isinstance(names, Sequence) and not isinstance(names, str)
+    if not listed or not names or not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
+        raise SettingError(f"dynamics.{key}", f"must be a list of different names; got {names!r}")
+    return tuple(names)
+
+
+def _floats(key: str, values: Any, length: int) -> tuple[float, ...]:
+    """Numbers as floats; None stays for an infinite bound."""
+    absent = {"input_lower": -inf, "input_upper": inf}.get(key)
+    values = values.tolist() if isinstance(values, np.ndarray) else values
+    if absent is not None and hasattr(values, "__len__"):
+        given = [0.0 if value is None or value == absent else value for value in values]
+        check_numbers(key, given, length)
+        return tuple(absent if value is None else float(value) for value in values)
+    check_numbers(key, values, length)
+    return tuple(float(value) for value in values)

@@ -1,0 +1,112 @@
+"""Tubes from held-out predictions hold as often as they say, and an adaptive one does so against any plant."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.estimation import AdaptiveTube, ConformalTube
+from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.propagation import Linearization
+
+H, F = 5, torch.float64
+
+
+class Walk:
+    """x+ = 0.9 x + u, with a noise that the model believes in."""
+
+    state_dim = output_dim = 2
+    input_dim, dtype, device = 2, F, torch.device("cpu")
+
+    def __init__(self, std):
+        self.noise_covariance = std**2 * torch.eye(2, dtype=F)
+
+    def predict(self, state, input):
+        return Gaussian(0.9 * state + input, torch.zeros(*state.shape, 2, dtype=F))
+
+
+def log(steps, seed):
+    """A plant with noise of heavy tails and a standard deviation of three, where the model says one."""
+    rng = np.random.default_rng(seed)
+    x, u = [np.zeros(2)], rng.normal(size=(steps, 2))
+    for k in range(steps):
+        x.append(0.9 * x[-1] + u[k] + 3 / np.sqrt(3) * rng.standard_t(3, size=2))
+    return np.array(x), u
+
+
+MODEL, PROPAGATOR = Walk(1.0), Linearization(process_noise=True)
+
+
+def share_that_holds(kappas, seed, rows=None):
+    """Of fresh windows, by stage (H,)."""
+    fresh = ConformalTube.calibrate(MODEL, PROPAGATOR, *log(5000, seed), H, rows)
+    return (fresh.scores <= kappas).mean(0)
+
+
+@pytest.mark.parametrize("rows", [None, [[1.0, 0.0]]], ids=["all states", "one side"])
+@pytest.mark.parametrize("probability", [0.9, 0.95])
+def test_the_quantile_of_held_out_scores_holds_where_the_gaussian_does_not(probability, rows):
+    tubes = [ConformalTube.calibrate(MODEL, PROPAGATOR, *log(1000, seed), H, rows) for seed in range(6)]
+    held = np.mean([share_that_holds(tube.kappas(probability), 100 + s, rows) for s, tube in enumerate(tubes)], axis=0)
+    assert (held > probability - 0.015).all()
+    assert (held < probability + 0.03).all()
+    assert (share_that_holds(np.full(H, 1.65 if probability == 0.95 else 1.28), 100, rows) < 0.8).all()
+
+
+def test_too_few_windows_promise_nothing():
+    tube = ConformalTube.calibrate(MODEL, PROPAGATOR, *log(18 * H, 0), H)
+    assert (tube.kappas(0.9) == tube.scores[-1]).all()
+    with pytest.raises(DataError, match="a probability of 0.95 needs 19 windows or more; got 18"):
+        tube.kappas(0.95)
+
+
+@pytest.mark.parametrize("plant", ["noisy", "worse with time", "hostile"])
+def test_an_adaptive_tube_holds_in_the_long_run_whatever_the_plant_does(plant):
+    probability, rate, T = 0.9, 0.05, 1000
+    scores = np.abs(np.random.default_rng(0).normal(size=(99, H)))
+    tube = AdaptiveTube(ConformalTube(scores, [[1.0, 0.0]]), probability, rate, largest=10.0)
+    rng, covariances = np.random.default_rng(1), np.tile(np.eye(2), (H + 1, 1, 1))
+    for t in range(T):
+        size = {"noisy": 1.0, "worse with time": 1 + 2 * t / T, "hostile": 0.0}[plant]
+        x = size * rng.normal(size=2)
+        if plant == "hostile":  # just outside of the last bound of the first stage, where it is less than the largest
+            x = np.array([min(tube.kappas[0] + 1e-6, 9.99), 0.0])
+        tube.observe(np.clip(x, -9.99, 9.99))
+        tube.remember(np.zeros((H + 1, 2)), covariances)
+    allowed = 1 - probability + (1 + rate * (np.arange(1, H + 1) + 1)) / (rate * tube.counts)
+    assert (tube.violations <= allowed).all()
+    assert tube.counts.tolist() == [T - k for k in range(1, H + 1)]
+    if plant != "hostile":
+        assert np.allclose(tube.violations, 0.1, atol=0.02)
+
+
+def test_plans_are_compared_at_their_own_stage_and_those_of_failed_steps_are_left_out():
+    tube = AdaptiveTube(ConformalTube(np.ones((19, 3)), [[1.0]]), 0.9, largest=5.0)
+    covariances = np.ones((4, 1, 1))
+    for t in range(8):
+        tube.observe([float(t)])  # the plan of step s says s + k at stage k: it always holds
+        if t != 4:
+            tube.remember(t + np.arange(4.0)[:, None], covariances)
+    assert tube.misses.tolist() == [0, 0, 0]
+    assert tube.counts.tolist() == [6, 5, 4]
+    tube.observe([11.0])  # of the plans of steps 7, 6 and 5, at stages 1, 2 and 3
+    assert tube.misses.tolist() == [1, 1, 1]
+    tube.observe([np.nan])
+    assert tube.counts.tolist() == [7, 6, 5]
+
+
+def test_misuse_is_refused():
+    x, u = log(40, 0)
+    with pytest.raises(DataError, match="a log of 5 states has no window of 5 steps"):
+        ConformalTube.calibrate(MODEL, PROPAGATOR, x[:5], u[:4], H)
+    with pytest.raises(DataError, match="a direction has no variance: predict with the process noise"):
+        ConformalTube.calibrate(MODEL, Linearization(), x, u, H)
+    with pytest.raises(ShapeError, match=r"must be one log; got \(41, 2\) and \(30, 2\)"):
+        ConformalTube.calibrate(MODEL, PROPAGATOR, x, u[:30], H)
+    tube = ConformalTube.calibrate(MODEL, PROPAGATOR, x, u, H)
+    with pytest.raises(SettingError, match="probability: must lie between 0 and 1; got 1"):
+        tube.kappas(1.0)
+    with pytest.raises(SettingError, match="rate: must be a number above 0"):
+        AdaptiveTube(tube, 0.9, rate=0.0)
+    with pytest.raises(ShapeError, match=r"means must be \(6, 2\); got \(5, 2\)"):
+        AdaptiveTube(tube, 0.8).remember(np.zeros((5, 2)), np.zeros((5, 2, 2)))

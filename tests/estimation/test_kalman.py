@@ -1,0 +1,214 @@
+"""Filters and the smoother, against conditioning of the joint Gaussian, and their consistency on a pendulum."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.estimation import (
+    KalmanFilter,
+    LateMeasurements,
+    Measurement,
+    autocorrelation,
+    estimation_errors,
+    normalized_errors,
+    smooth,
+)
+from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.models import DelayedModel, DisturbedModel
+from gpmpc.propagation import Linearization, MeanEquivalence, Unscented
+from gpmpc.testing import check_model
+
+F, STEP = torch.float64, 0.05
+
+
+class Known:
+    """A known function of state and input with process noise."""
+
+    input_dim, dtype, device = 1, F, torch.device("cpu")
+
+    def __init__(self, function, noise):
+        self.function, self.noise_covariance = function, torch.diag(torch.tensor(noise, dtype=F) ** 2)
+        self.state_dim = self.output_dim = len(noise)
+
+    def predict(self, state, input):
+        mean = self.function(state, input)
+        return Gaussian(mean, mean.new_zeros(*mean.shape, len(self.noise_covariance)))
+
+
+A, B = torch.tensor([[1.0, 0.1], [-0.3, 0.9]], dtype=F), torch.tensor([[0.0], [0.1]], dtype=F)
+LINEAR = Known(lambda x, u: x @ A.mT + u @ B.mT, [0.05, 0.1])
+
+
+def pendulum(x, u):
+    rate = x[..., 1] + STEP * (-9.81 * x[..., 0].sin() - 0.2 * x[..., 1] + u[..., 0])
+    return torch.stack([x[..., 0] + STEP * rate, rate], dim=-1)
+
+
+PENDULUM = Known(pendulum, [1e-3, 0.02])
+PRIOR = Gaussian(torch.tensor([0.5, 0.0], dtype=F), torch.diag(torch.tensor([0.04, 0.09], dtype=F)))
+
+
+def simulated(model, steps, seed, measurement, prior=PRIOR):
+    rng = np.random.default_rng(seed)
+
+    def noise(covariance):
+        return torch.from_numpy(rng.multivariate_normal(np.zeros(len(covariance)), covariance.numpy()))
+
+    states, inputs = [prior.mean + noise(prior.covariance)], torch.from_numpy(rng.normal(size=(steps, 1)))
+    for u in inputs:
+        states.append(model.predict(states[-1], u).mean + noise(model.noise_covariance))
+    x = torch.stack(states)
+    measured = torch.stack([measurement.function(s) + noise(measurement.noise_covariance) for s in x])
+    return x, inputs, measured
+
+
+def conditioned(inputs, measured, H, R):
+    """Means and covariances of all states of the linear model given all measurements, from their joint Gaussian."""
+    T, n = len(measured), 2
+    mean, covariance = torch.zeros(T, n, dtype=F), torch.zeros(T, n, T, n, dtype=F)
+    mean[0], covariance[0, :, 0] = PRIOR.mean, PRIOR.covariance
+    for k in range(1, T):
+        mean[k] = A @ mean[k - 1] + B @ inputs[k - 1]
+        for j in range(k):
+            covariance[k, :, j] = A @ covariance[k - 1, :, j]
+            covariance[j, :, k] = covariance[k, :, j].mT
+        covariance[k, :, k] = A @ covariance[k - 1, :, k - 1] @ A.mT + LINEAR.noise_covariance
+    whole, big_H = covariance.reshape(T * n, T * n), torch.block_diag(*[H] * T)
+    seen = torch.isfinite(measured.flatten())
+    big_H, y = big_H[seen], measured.flatten()[seen]
+    S = big_H @ whole @ big_H.mT + torch.block_diag(*[R] * T)[seen][:, seen]
+    gain = torch.linalg.solve(S, big_H @ whole).mT
+    after = mean.flatten() + gain @ (y - big_H @ mean.flatten())
+    whole = whole - gain @ big_H @ whole
+    blocks = whole.reshape(T, n, T, n)
+    return after.reshape(T, n), torch.stack([blocks[k, :, k] for k in range(T)])
+
+
+@pytest.mark.parametrize("kind", [KalmanFilter.extended, KalmanFilter.unscented])
+def test_filter_and_smoother_of_a_linear_system_are_the_conditional_gaussian_also_where_values_are_missing(kind):
+    both = Measurement.of_states(2, [0, 1], [0.1, 0.3])
+    _, inputs, measured = simulated(LINEAR, 12, 0, both)
+    measured[3] = torch.nan
+    measured[5, 0], measured[7, 1], measured[8, 0] = torch.nan, torch.nan, torch.inf
+    run = kind(LINEAR, both).run(PRIOR, inputs, measured)
+    measured[8, 0] = torch.nan
+    mean, covariance = conditioned(inputs, measured, torch.eye(2, dtype=F), both.noise_covariance)
+    assert torch.allclose(run.filtered.mean[-1], mean[-1], atol=1e-10)
+    assert torch.allclose(run.filtered.covariance[-1], covariance[-1], atol=1e-10)
+    smoothed = smooth(run)
+    assert torch.allclose(smoothed.mean, mean, atol=1e-10)
+    assert torch.allclose(smoothed.covariance, covariance, atol=1e-10)
+    assert torch.isnan(run.innovations[3]).all()
+    assert torch.isnan(run.innovations).sum() == 5
+
+
+def test_a_late_measurement_counts_as_if_it_had_come_in_time():
+    first = Measurement.of_states(2, [0], [0.1])
+    filter = KalmanFilter(PENDULUM, first, Unscented(process_noise=True))
+    _, inputs, measured = simulated(PENDULUM, 12, 1, first)
+    in_time = filter.run(PRIOR, inputs, measured).filtered
+    late = LateMeasurements(filter, PRIOR, longest=4)
+    late.measure(measured[0])
+    for k, u in enumerate(inputs):
+        late.step(u)
+        if k + 1 in (5, 8):
+            continue  # comes two steps later, after a newer one
+        late.measure(measured[k + 1])
+        if k - 1 in (5, 8):
+            late.measure(measured[k - 1], age=2)
+    assert torch.allclose(late.belief.mean, in_time.mean[-1], atol=1e-12)
+    assert torch.allclose(late.belief.covariance, in_time.covariance[-1], atol=1e-12)
+    with pytest.raises(SettingError, match="age: must be at most 4 steps, which are remembered; got 5"):
+        late.measure(measured[0], age=5)
+
+
+@pytest.mark.parametrize("kind", [KalmanFilter.extended, KalmanFilter.unscented])
+def test_estimates_from_sine_and_cosine_of_an_angle_are_consistent(kind):
+    def bearing(x):
+        return torch.stack([x[..., 0].sin(), x[..., 0].cos()], dim=-1)
+
+    sensor = Measurement(2, 0.05**2 * torch.eye(2, dtype=F), bearing)
+    check_model(sensor)
+    filter, errors, covariances = kind(PENDULUM, sensor), [], []
+    for seed in range(12):
+        x, inputs, measured = simulated(PENDULUM, 40, seed, sensor)
+        measured[torch.rand(41, generator=torch.Generator().manual_seed(seed)) < 0.2] = torch.nan
+        run = filter.run(PRIOR, inputs, measured)
+        errors.append(estimation_errors(run.filtered, x)[-1])
+        covariances.append(run.filtered.covariance[-1])
+    nees = normalized_errors(torch.stack(errors), torch.stack(covariances))
+    assert nees.consistent, (nees.mean, nees.band)
+    assert float(torch.stack(errors)[:, 0].square().mean().sqrt()) < 0.05
+    whiteness, limit = autocorrelation(run.innovations, run.innovation_covariances)
+    assert abs(whiteness) < 1.5 * limit
+
+
+def test_an_angle_that_is_measured_modulo_one_turn_corrects_by_the_short_way():
+    sensor = Measurement.of_states(2, [0], [0.1], angles=[0])
+    before = Gaussian(torch.tensor([3.1, 0.0], dtype=F), PRIOR.covariance)
+    found = KalmanFilter.extended(PENDULUM, sensor).update(before, [-3.1])
+    assert float(found.innovation[0]) == pytest.approx(2 * np.pi - 6.2)
+    assert 3.1 < float(found.belief.mean[0]) < 3.2
+
+
+def test_many_beliefs_are_updated_at_once():
+    sensor = Measurement.of_states(2, [0, 1], [0.1, 0.2])
+    filter = KalmanFilter.extended(PENDULUM, sensor)
+    y = torch.tensor([[0.4, torch.nan], [0.3, 0.2], [torch.nan, torch.nan]], dtype=F)
+    many = Gaussian(PRIOR.mean.expand(3, 2), PRIOR.covariance.expand(3, 2, 2))
+    together = filter.update(many, y)
+    for k in range(3):
+        alone = filter.update(PRIOR, y[k]).belief
+        assert torch.allclose(together.belief.mean[k], alone.mean, atol=1e-13)
+        assert torch.allclose(together.belief.covariance[k], alone.covariance, atol=1e-13)
+    assert torch.allclose(together.belief.mean[2], PRIOR.mean)
+
+
+def test_a_disturbance_that_nobody_measures_is_estimated_through_a_delay():
+    disturbed = DisturbedModel(LINEAR, torch.tensor([[0.0], [1.0]], dtype=F), [0.001])
+    model = DelayedModel(disturbed, 2)
+    sensor = Measurement.of_states(5, [0], [0.01])
+    filter = KalmanFilter.extended(model, sensor)
+    x, queue = PRIOR.mean, torch.zeros(2, 1, dtype=F)
+    belief = model.augmented(disturbed.augmented(PRIOR, [1.0]), queue)
+    for k in range(80):
+        u = torch.sin(torch.tensor([0.3 * k], dtype=F))
+        x = LINEAR.predict(x, queue[0]).mean + torch.tensor([0.0, 0.2])
+        queue = torch.cat([queue[1:], u[None]])
+        belief = filter.update(filter.predict(belief, u), x[:1]).belief
+    assert float(belief.mean[2]) == pytest.approx(0.2, abs=0.01)
+    assert torch.allclose(belief.mean[3:], queue[:, 0])
+    assert 0 < float(belief.covariance[2, 2]) < 0.1
+
+
+def test_errors_that_are_too_large_or_too_small_for_their_covariance_are_inconsistent():
+    errors, P = torch.from_numpy(np.random.default_rng(0).normal(size=(200, 3))), torch.eye(3).expand(200, 3, 3)
+    assert normalized_errors(errors, P).consistent
+    assert normalized_errors(errors, P / 1.5).mean == pytest.approx(1.5 * normalized_errors(errors, P).mean)
+    assert not normalized_errors(errors, P / 1.5).consistent
+    assert not normalized_errors(errors, 1.5 * P).consistent
+    wide = normalized_errors(errors, P, independent=20)
+    assert wide.band[0] < normalized_errors(errors, P).band[0] < 1 < wide.band[1]
+    errors[5] = torch.nan
+    errors[6, 0] = torch.nan
+    assert normalized_errors(errors, P).degrees.sum() == 596
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "rule"),
+    [
+        (lambda m: KalmanFilter(LINEAR, Measurement.of_states(3, [0], [0.1])), SettingError, "measurement: must be of"),
+        (lambda m: KalmanFilter(LINEAR, m, Linearization()), SettingError, "propagator: must add the process noise"),
+        (lambda m: KalmanFilter(LINEAR, m, MeanEquivalence()), SettingError, "propagator: must add the process noise"),
+        (lambda m: KalmanFilter(LINEAR, m).update(PRIOR, [0.0, 1.0]), ShapeError, r"shape \(1,\); got \(2,\)"),
+        (lambda m: KalmanFilter(LINEAR, m).run(PRIOR, np.zeros((2, 1)), np.zeros((2, 1))), ShapeError, "got 2 and 2"),
+        (lambda m: Measurement.of_states(2, [2], [0.1]), SettingError, "states: must be indices from 0 to 1"),
+        (lambda m: Measurement.of_states(2, [1], [-0.1]), SettingError, "std: must be a number"),
+        (lambda m: Measurement(2, torch.eye(2), lambda x: x[..., :1]).predict(PRIOR.mean), ShapeError, "must give"),
+        (lambda m: normalized_errors([[np.nan]], [[[1.0]]]), DataError, "no error is finite"),
+    ],
+)  # fmt: skip
+def test_misuse_is_refused(make, error, rule):
+    with pytest.raises(error, match=rule):
+        make(Measurement.of_states(2, [0], [0.1]))

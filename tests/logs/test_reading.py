@@ -1,0 +1,314 @@
+"""Logs come out as they were measured: what is wrong with them is named, and no gap is bridged."""
+
+import struct
+
+import numpy as np
+import pandas
+import pytest
+
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.logs import read_log
+from gpmpc.logs.state_space import StateGroup, StateSpace, quaternion_from_euler, rotate, rotation_quaternion
+
+PENDULUM = {
+    "time": {"column": "t"},
+    "states": {"angle": {"columns": ["angle"], "unit": "rad"}, "rate": {"columns": ["rate"], "unit": "rad/s"}},
+    "inputs": {"torque": {"columns": ["torque"], "unit": "N m"}},
+}
+BODY = {
+    "time": "t",
+    "model": "rigid_body",
+    "states": {
+        "position": {"columns": ["px", "py", "pz"], "unit": "m"},
+        "attitude": {"columns": ["roll", "pitch", "yaw"], "kind": "euler", "unit": "rad"},
+        "velocity": {"columns": ["vx", "vy", "vz"], "unit": "m/s", "frame": "world"},
+        "rate": {"columns": ["wx", "wy", "wz"], "unit": "rad/s", "frame": "body"},
+    },
+    "inputs": {"thrust": ["u"]},
+}
+
+
+def pendulum_table(rows=400, seed=0):
+    rng = np.random.default_rng(seed)
+    angle, rate, table = 0.3, 0.0, []
+    torques = np.repeat(rng.uniform(-3, 3, rows // 5 + 1), 5)
+    for k in range(rows):
+        table.append((0.02 * k, angle, rate, torques[k]))
+        rate += 0.02 * (torques[k] - 0.3 * rate - 5 * np.sin(angle))
+        angle += 0.02 * rate
+    return pandas.DataFrame(table, columns=["t", "angle", "rate", "torque"])
+
+
+_NAMES = "px,py,pz,roll,pitch,yaw,vx,vy,vz,wx,wy,wz,u".split(",")  # noqa: SIM905
+
+
+def body_table(rows=300):
+    """A body that turns about all axes along a curve, at 100 Hz."""
+    t = 0.01 * np.arange(rows)
+    euler = np.column_stack([0.5 * np.sin(2 * t), 0.4 * np.cos(3 * t), 0.9 * np.sin(1.5 * t)])
+    p = np.column_stack([np.sin(2 * t), np.cos(1.5 * t), 1 + 0.3 * np.sin(3 * t)])
+    (r, q, _), (dr, dq, dy) = euler.T, np.gradient(euler, 0.01, axis=0).T
+    w = [dr - dy * np.sin(q), dq * np.cos(r) + dy * np.sin(r) * np.cos(q), -dq * np.sin(r) + dy * np.cos(r) * np.cos(q)]
+    columns = np.column_stack([t, p, euler, np.gradient(p, 0.01, axis=0), np.transpose(w), np.sin(9 * t)])
+    return pandas.DataFrame(
+        columns, columns=["t", "px", "py", "pz", "roll", "pitch", "yaw", "vx", "vy", "vz", "wx", "wy", "wz", "u"]
+    )
+
+
+def written(folder, table, name="log.csv"):
+    table.to_csv(folder / name, index=False)
+    return folder / name
+
+
+def changed(mapping, role, signal, **values):
+    return {**mapping, role: {**mapping[role], signal: {**mapping[role][signal], **values}}}
+
+
+def kinds(log):
+    return {finding.kind: finding.count for finding in log.findings}
+
+
+def test_no_transition_or_window_goes_over_a_gap(tmp_path):
+    table = pendulum_table()
+    with_gaps = table.drop(index=[*range(100, 115), 200, *range(301, 303)])
+    log, whole = (read_log(written(tmp_path, t, f"{len(t)}.csv"), PENDULUM) for t in (with_gaps, table))
+    assert [len(run.begins) for run in (*log, *whole)] == [4, 1]
+    assert kinds(log) == {"gap": 3}
+    steps = {tuple(row) for row in np.hstack([whole.transitions().features, whole.transitions().next_states]).tolist()}
+    rows = np.hstack([log.transitions().features, log.transitions().next_states]).tolist()
+    assert len(rows) == len(with_gaps) - 4
+    assert all(tuple(row) in steps for row in rows)
+    assert sum(len(episode) for episode in log.episodes()) == len(rows)
+    windows = log.windows(ahead=20, past=5, stride=3)
+    whole_windows = {w.tobytes() for w in whole.windows(ahead=20, past=5).states}
+    assert all(w.tobytes() in whole_windows for w in windows.states)
+
+
+def test_every_kind_of_file_gives_the_same_log(tmp_path):
+    table = pendulum_table()
+    log = read_log(written(tmp_path, table), PENDULUM)
+    table.to_csv(tmp_path / "a.csv.gz", index=False, sep=";")
+    table.to_parquet(tmp_path / "a.parquet")
+    np.savez(tmp_path / "a.npz", **{name: table[name].to_numpy() for name in table})
+    for name in ("a.csv.gz", "a.parquet", "a.npz"):
+        other = read_log(tmp_path / name, PENDULUM)
+        np.testing.assert_allclose(other.runs[0].states, log.runs[0].states, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(other.runs[0].inputs, log.runs[0].inputs)
+
+
+def test_runs_are_told_apart_by_file_or_by_column_and_splits_are_by_run(tmp_path):
+    one, other = pendulum_table(100), pendulum_table(120, seed=1)
+    files = [written(tmp_path, one, "one.csv"), written(tmp_path, other, "other.csv")]
+    log = read_log(files, PENDULUM)
+    train, held_out = log.split(["other"])
+    assert ([run.name for run in train], [run.name for run in held_out]) == (["one"], ["other"])
+    both = pandas.concat([one.assign(flight="a"), other.assign(flight="b")])
+    log = read_log(written(tmp_path, both), {**PENDULUM, "run": "flight"})
+    assert [len(run) for run in log] == [100, 120]
+    with pytest.raises(SettingError, match="no such run 'c'"):
+        log.split(["c"])
+
+
+def test_stamps_that_repeat_or_run_backwards_are_counted_and_left_out(tmp_path):
+    table = pendulum_table()
+    table.loc[50, "t"] = table.loc[49, "t"]
+    table.loc[[100, 101], "t"] -= 0.5
+    log = read_log(written(tmp_path, table), PENDULUM)
+    found = kinds(log)
+    assert (found["repeated stamp"], found["stamp runs backwards"], len(log)) == (1, 2, 397)
+    table["t"] = table["t"] % 2.0
+    with pytest.raises(DataError, match="time runs backwards in row 101"):
+        read_log(written(tmp_path, table), PENDULUM)
+
+
+def test_missing_values_are_boundaries(tmp_path):
+    table = pendulum_table()
+    table.loc[30:60, "rate"] = np.nan
+    log = read_log(written(tmp_path, table), PENDULUM)
+    assert len(log) == 369
+    assert log.runs[0].begins == (0, 30)
+    assert kinds(log)["missing value"] == 31
+
+
+def test_resampling_interpolates_states_holds_inputs_and_leaves_gaps_open(tmp_path):
+    table = pendulum_table(4000)
+    rng = np.random.default_rng(0)
+    t = table["t"] + rng.uniform(-0.004, 0.004, len(table))
+    jittered = pandas.DataFrame({"t": t, "angle": np.sin(t), "rate": np.cos(t), "torque": np.floor(t)})
+    jittered = jittered.drop(index=range(1000, 1030))
+    log = read_log(written(tmp_path, jittered), {**PENDULUM, "rate": 50, "max_gap": 0.05})
+    (run,) = log
+    np.testing.assert_allclose(run.states, np.column_stack([np.sin(run.time), np.cos(run.time)]), atol=1e-4)
+    assert set(run.inputs[:, 0]) <= set(jittered["torque"])
+    assert len(run.begins) == 2
+    assert not ((run.time > 20.01) & (run.time < 20.58)).any()
+
+
+def test_a_sample_that_is_repeated_while_the_system_moves_is_no_measurement(tmp_path):
+    table = body_table()
+    table.loc[[100, 101, 102], ["px", "py", "pz"]] = table.loc[99, ["px", "py", "pz"]].to_numpy(dtype=float)
+    log = read_log(written(tmp_path, table), BODY)
+    assert kinds(log) == {"held value": 3}
+    assert len(log.runs[0].begins) == 2
+    table = body_table().assign(
+        **{c: body_table()[c].iloc[np.arange(300) // 5 * 5].to_numpy() for c in ("px", "py", "pz")}
+    )
+    with pytest.raises(DataError, match=r"position changes in \d+ of 300 rows only"):
+        read_log(written(tmp_path, table), BODY)
+
+
+def test_parts_at_rest_are_left_out_unless_asked_for(tmp_path):
+    table = pendulum_table(600)
+    rest = pandas.DataFrame({"t": 0.02 * np.arange(211), "angle": 0.3, "rate": 0.0, "torque": 0.0})
+    both = pandas.concat([rest, table.assign(t=table["t"] + 4.22)])
+    log = read_log(written(tmp_path, both), PENDULUM)
+    assert 195 <= kinds(log)["at rest"] <= 211
+    assert len(read_log(written(tmp_path, both), {**PENDULUM, "rest": "use"})) == 811
+    with pytest.raises(DataError, match="211 of 211 rows where nothing moves"):
+        read_log(written(tmp_path, rest), PENDULUM)
+
+
+def test_a_quaternion_whose_sign_flips_is_the_attitude_that_it_is(tmp_path):
+    table = body_table()
+    q = quaternion_from_euler(table[["roll", "pitch", "yaw"]].to_numpy())
+    q[120:180] *= -1
+    table[["qw", "qx", "qy", "qz"]] = q[:, [3, 0, 1, 2]]
+    quaternion = {"columns": ["qw", "qx", "qy", "qz"], "kind": "quaternion", "order": "wxyz"}
+    log = read_log(written(tmp_path, table), {**BODY, "states": {**BODY["states"], "attitude": quaternion}})
+    expected = read_log(written(tmp_path, table), BODY)
+    assert kinds(log) == {"quaternion flips its sign": 2}
+    np.testing.assert_allclose(log.space.difference(log.runs[0].states, expected.runs[0].states), 0, atol=1e-12)
+    assert np.abs(np.diff(log.runs[0].states[:, 3:7], axis=0)).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("spoil", "mapping", "expected"),
+    [
+        (
+            lambda t: t.assign(vx=1e3 * t.vx, vy=1e3 * t.vy, vz=1e3 * t.vz),
+            BODY,
+            "velocity is 1e.03 times the derivative",
+        ),
+        (lambda t: np.degrees(t[["roll", "pitch", "yaw"]]), BODY, r"reaches .* rad: are these degrees"),
+        (
+            lambda t: t,
+            changed(BODY, "states", "attitude", unit="deg"),
+            "rate is 5.* times .*degrees instead of radians",
+        ),
+        (lambda t: t, changed(BODY, "states", "rate", frame="world"), "in body axes .*, not world"),
+        (
+            lambda t: t.assign(px=2 * t.px, qx=t.px),
+            changed(BODY, "states", "position", unit="mm"),
+            "velocity is .* times",
+        ),
+        (lambda t: t.drop(columns="wy"), BODY, "column 'wy' is missing"),
+        (lambda t: t.assign(wy=["off", *t.wy[1:]]), BODY, "row 1, column 'wy' is 'off'"),
+    ],
+)
+def test_what_contradicts_the_mapping_is_named(tmp_path, spoil, mapping, expected):
+    table = body_table()
+    spoiled = table.assign(**dict(spoil(table).items())) if len(spoil(table).columns) == 3 else spoil(table)
+    with pytest.raises(DataError, match=expected):
+        read_log(written(tmp_path, spoiled), mapping)
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path):
+    np.savetxt(tmp_path / "bare.csv", pendulum_table().to_numpy(), delimiter=",")
+    with pytest.raises(DataError, match="first line holds numbers"):
+        read_log(tmp_path / "bare.csv", PENDULUM)
+    (tmp_path / "a.parquet").write_bytes(b"nothing")
+    with pytest.raises(DataError, match="cannot be read"):
+        read_log(tmp_path / "a.parquet", PENDULUM)
+    with pytest.raises(DataError, match="no such file"):
+        read_log(tmp_path / "b.csv", PENDULUM)
+    with pytest.raises(SettingError, match=r"states.angle.colums: no such key"):
+        read_log(tmp_path / "b.csv", {**PENDULUM, "states": {"angle": {"colums": ["angle"]}}})
+
+
+def bag(path, rows=200):
+    from mcap_ros2.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        pose = writer.register_msgdef("my/Pose", "float64 angle\nfloat64[2] rate")
+        torque = writer.register_msgdef("my/Torque", "float32 torque")
+        for k in range(rows):
+            t = 10_000_000_000 + 20_000_000 * k
+            message = {"angle": np.sin(0.02 * k), "rate": [np.cos(0.02 * k), 0.0]}
+            writer.write_message("/pose", pose, message, t, t)
+            if k % 2:
+                writer.write_message("/torque", torque, {"torque": float(k % 7)}, t + 3_000_000, t + 3_000_000)
+        writer.finish()
+
+
+BAG = {
+    "rate": 50,
+    "max_gap": 0.1,
+    "states": {
+        "angle": {"topic": "/pose", "columns": ["angle"], "unit": "rad"},
+        "rate": {"topic": "/pose", "columns": ["rate[0]"], "unit": "rad/s"},
+    },
+    "inputs": {"torque": {"topic": "/torque", "columns": ["torque"]}},
+}
+
+
+def test_a_bag_of_several_topics_comes_to_one_grid(tmp_path):
+    bag(tmp_path / "bag.mcap")
+    (run,) = read_log(tmp_path / "bag.mcap", BAG)
+    seconds = run.time - 10
+    np.testing.assert_allclose(run.states[:, 0], np.sin(seconds), atol=1e-4)
+    np.testing.assert_array_equal(run.inputs[:, 0], (np.floor((seconds - 0.023) / 0.04 + 1e-4) * 2 + 1) % 7)
+
+
+def test_a_bag_without_the_topic_or_without_its_end_is_named(tmp_path):
+    bag(tmp_path / "bag.mcap")
+    with pytest.raises(DataError, match="topic '/force' is missing; it has"):
+        read_log(tmp_path / "bag.mcap", changed(BAG, "inputs", "torque", topic="/force"))
+    (tmp_path / "cut.mcap").write_bytes((tmp_path / "bag.mcap").read_bytes()[:-3000])
+    with pytest.raises(DataError, match=r"cut.mcap.*cannot be read to its end"):
+        read_log(tmp_path / "cut.mcap", BAG)
+
+
+def ulog(path, rows=100):
+    def message(kind, body):
+        return struct.pack("<Hc", len(body), kind) + body
+
+    data = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + message(b"B", bytes(40))
+    data += message(b"F", b"arm:uint64_t timestamp;float angle;float rate;float torque;")
+    data += message(b"A", struct.pack("<BH", 0, 0) + b"arm")
+    for k in range(rows):
+        row = (np.sin(k / 10), np.cos(k / 10), k % 5)
+        data += message(b"D", struct.pack("<HQfff", 0, 1_000_000 + 10_000 * k, *row))
+    path.write_bytes(data)
+
+
+def test_a_px4_log_is_read(tmp_path):
+    ulog(tmp_path / "flight.ulg")
+    topics = {role: {k: {**v, "topic": "arm"} for k, v in PENDULUM[role].items()} for role in ("states", "inputs")}
+    (run,) = read_log(tmp_path / "flight.ulg", topics)
+    assert len(run) == 100
+    np.testing.assert_allclose(np.diff(run.time), 0.01, rtol=1e-6)
+    np.testing.assert_allclose(run.states[:, 0], np.sin(np.arange(100) / 10), atol=1e-6)
+
+
+def test_differences_of_states_are_inverse_to_displacements_and_geodesic():
+    space = StateSpace(
+        (
+            StateGroup("p", ("x", "y"), "m"),
+            StateGroup("a", ("a",), "rad", "angle"),
+            StateGroup("q", tuple("xyzw"), "", "quaternion"),
+        )
+    )
+    rng = np.random.default_rng(0)
+    error = rng.uniform(-1.5, 1.5, (50, space.error_dim))
+    state = np.hstack(
+        [rng.normal(size=(50, 2)), rng.uniform(-3, 3, (50, 1)), rotation_quaternion(rng.normal(size=(50, 3)))]
+    )
+    moved = space.displace(state, error)
+    np.testing.assert_allclose(space.difference(moved, state), error, atol=1e-12)
+    moved[:, 3:] *= -1
+    np.testing.assert_allclose(space.difference(moved, state), error, atol=1e-12)
+    np.testing.assert_allclose(space.distances(error)[:, 2], np.linalg.norm(error[:, 3:], axis=1))
+    np.testing.assert_allclose(
+        rotate(rotation_quaternion(np.array([0, 0, np.pi / 2])), np.array([1.0, 0, 0])), [0, 1, 0], atol=1e-12
+    )

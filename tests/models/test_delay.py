@@ -1,0 +1,124 @@
+"""A model whose input acts late is a model; planning from where the inputs on their way lead is exact."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import GPPosterior
+from gpmpc.models import DelayedModel, DisturbedModel, load_model, save_model
+from gpmpc.propagation import Linearization, MonteCarlo
+from gpmpc.testing import check_model
+
+F = torch.float64
+
+
+def draw(seed, *shape):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=F)
+
+
+def gp(n=2, m=1, size=25):
+    ones = torch.ones(n, dtype=F)
+    scales = 1 + draw(3, n, n + m).abs()
+    targets = 0.3 * draw(2, size, n)
+    return GPPosterior.from_hyperparameters(draw(1, size, n + m), targets, scales, ones, 0.01 * ones, m, "difference")
+
+
+@pytest.mark.parametrize("m", [1, 2])
+@pytest.mark.parametrize("delay", [0.4, 1, 1.7, 3])
+def test_a_delayed_model_is_a_model(delay, m):
+    check_model(DelayedModel(gp(m=m), delay))
+
+
+@pytest.mark.parametrize("delay", [1, 3])
+def test_an_input_acts_as_many_steps_later_as_the_delay_is(delay):
+    model, inner, inputs = DelayedModel(gp(), delay), gp(), draw(5, 8, 1)
+    z, x = model.augmented(Gaussian.certain(torch.zeros(2)), np.zeros((delay, 1))).mean, torch.zeros(2)
+    for k in range(8):
+        z = model.predict(z, inputs[k]).mean
+        x = inner.predict(x, inputs[k - delay] if k >= delay else torch.zeros(1)).mean
+        assert torch.allclose(z[:2], x, atol=1e-13)
+
+
+def test_a_fraction_of_a_step_mixes_the_two_inputs_that_act_in_it():
+    class Integrator(torch.nn.Module):  # the exact answer is the mean of the input over the step
+        state_dim, input_dim, output_dim, dtype, device = 1, 1, 1, F, torch.device("cpu")
+        noise_covariance = torch.zeros(1, 1, dtype=F)
+
+        def predict(self, state, input):
+            return Gaussian(state + input, torch.zeros(*state.shape, 1, dtype=F))
+
+    model = DelayedModel(Integrator(), 1.25)
+    assert model.pending == 2
+    after = model.predict(torch.tensor([0.0, 4.0, 8.0]), torch.tensor([100.0])).mean
+    assert after.tolist() == [0.25 * 4 + 0.75 * 8, 8, 100]
+
+
+@pytest.mark.parametrize(
+    "propagator", [Linearization(process_noise=True), Linearization(hessian=True)], ids=["first", "second"]
+)
+@pytest.mark.parametrize("delay", [1, 3, 0.6, 2.3])
+def test_looking_ahead_is_what_the_delayed_model_does_with_the_inputs_on_their_way(delay, propagator):
+    model = DelayedModel(gp(), delay)
+    queue, now = 0.5 * draw(6, model.pending, 1), Gaussian(torch.tensor([0.1, -0.2]), 0.01 * torch.eye(2, dtype=F))
+    ahead, whole = model.ahead(propagator, now, queue), model.augmented(now, queue)
+    next_input = torch.zeros(1, dtype=F)
+    for _ in range(model.lead):
+        whole = propagator(model, whole, next_input)
+    n = model.remaining.state_dim
+    assert torch.allclose(ahead.mean[:2], whole.mean[:2], atol=1e-10)
+    assert torch.allclose(ahead.covariance[:2, :2], whole.covariance[:2, :2], atol=1e-10)
+    if delay % 1:
+        assert n == 3
+        assert float(ahead.mean[2]) == float(queue[-1])
+
+
+def test_disturbance_states_are_a_model_and_move_as_sampling_says():
+    effect = torch.tensor([[0.0, 0.1], [0.5, 0.0]], dtype=F)
+    model = DisturbedModel(gp(), effect, [0.1, 0.2], [1.0, 0.8])
+    check_model(model)
+    check_model(DelayedModel(model, 1.5))
+    prior = model.augmented(Gaussian(0.1 * draw(1, 2), 0.01 * torch.eye(2, dtype=F)), [0.3, 0.1])
+    found = Linearization(process_noise=True)(model, prior, torch.zeros(1))
+    sampled = MonteCarlo(50_000, process_noise=True)(model, prior, torch.zeros(1))
+    assert torch.allclose(found.mean, sampled.mean, atol=1e-2)
+    assert torch.allclose(found.covariance, sampled.covariance, atol=3e-3)
+    assert float(found.covariance[2, 2]) == pytest.approx(0.3**2 + 0.1**2)
+    fading = DisturbedModel(gp(), effect[:, 1:], [0.2], [0.8])
+    assert float(fading.augmented(prior.__class__.certain(torch.zeros(2))).covariance[2, 2]) == pytest.approx(
+        0.2**2 / 0.36
+    )
+
+
+@pytest.mark.parametrize(
+    "model",
+    [gp(), DelayedModel(DisturbedModel(gp(), torch.eye(2, dtype=F), [0.1, 0.1]), 2.5)],
+    ids=["posterior", "nested"],
+)
+def test_models_are_saved_and_loaded_whole(model, tmp_path):
+    save_model(model, tmp_path / "m.safetensors", {"states": ["a", "b"]})
+    loaded = load_model(tmp_path / "m.safetensors")
+    assert type(loaded) is type(model)
+    x, u = draw(8, 4, model.state_dim).numpy(), draw(9, 4, 1).numpy()
+    for ours, theirs in zip(model.linearize(x, u), loaded.linearize(x, u), strict=True):
+        assert np.array_equal(ours, theirs)
+    assert torch.equal(model.noise_covariance, loaded.noise_covariance)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "rule"),
+    [
+        (lambda: DelayedModel(gp(), 0), SettingError, "delay: must be a number above 0"),
+        (lambda: DelayedModel("gp", 1), SettingError, "model: must be a DynamicsModel"),
+        (lambda: DelayedModel(gp(), 2).augmented(Gaussian.certain(torch.zeros(2)), [[0.0]]), ShapeError, r"\(2, 1\)"),
+        (lambda: DisturbedModel(gp(), torch.eye(3, dtype=F), [1.0] * 3), ShapeError, r"effect must be \(2, q\)"),
+        (lambda: DisturbedModel(gp(), torch.eye(2, dtype=F), [1.0]), SettingError, "std: must be a list of 2"),
+        (lambda: DisturbedModel(gp(), torch.eye(2, dtype=F), [1.0] * 2, [1.0, 1.1]), SettingError, "decay: must lie"),
+        (lambda: DisturbedModel(gp(), torch.eye(2, dtype=F), [1, 1]).augmented(Gaussian.certain(torch.zeros(2))),
+         SettingError, "std: must be given for disturbances with decay 1"),
+    ],
+)  # fmt: skip
+def test_misuse_is_refused(make, error, rule):
+    with pytest.raises(error, match=rule):
+        make()

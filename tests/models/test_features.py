@@ -1,0 +1,211 @@
+"""A GP sees columns, angles as sine and cosine, and lagged values of a state; its effect may depend on the state."""
+
+import functools
+
+import casadi
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.dynamics import predict_with_jacobian
+from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import GPPosterior, Trainer, Transitions
+from gpmpc.models import Affine, CasadiFunction, Lags, ResidualModel, load_model, save_model
+from gpmpc.propagation import Linearization, MomentMatching, MonteCarlo, Unscented
+from gpmpc.testing import check_model
+
+STEP, F = 0.1, torch.float64
+
+
+def draw(seed, *shape):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=F)
+
+
+def pendulum(x, u, damping=0.2):
+    """Angle and rate [rad, rad/s] after a step, with a torque on it."""
+    turn = x[..., 1] + STEP * (-9.81 * x[..., 0].sin() - damping * x[..., 1] + u[..., 0])
+    return torch.stack([x[..., 0] + STEP * turn, turn], dim=-1)
+
+
+def pendulum_in_casadi(damping=0.2):
+    x, u = casadi.SX.sym("x", 2), casadi.SX.sym("u", 1)
+    turn = x[1] + STEP * (-9.81 * casadi.sin(x[0]) - damping * x[1] + u)
+    return casadi.Function("pendulum", [x, u], [casadi.vertcat(x[0] + STEP * turn, turn)])
+
+
+def rotation(x):
+    """A force in a frame that turns with the angle (*batch, 2, 1)."""
+    return torch.stack([x[..., 0].sin(), 1 + 0.5 * x[..., 0].cos()], dim=-1)[..., None]
+
+
+def rotation_in_casadi():
+    x = casadi.SX.sym("x", 2)
+    return casadi.Function("rotation", [x], [casadi.vertcat(casadi.sin(x[0]), 1 + 0.5 * casadi.cos(x[0]))])
+
+
+def gp(n, m, k, size=25):
+    ones = torch.ones(k, dtype=F)
+    scales = 1 + draw(3, k, n + m).abs()
+    return GPPosterior.from_hyperparameters(
+        draw(1, size, n + m), draw(2, size, k), scales, ones, 0.01 * ones, m, "value"
+    )
+
+
+def with_angles(n=4, B=None):
+    B = torch.eye(n, dtype=F) if B is None else B
+    return ResidualModel(Affine.identity(n, 2), gp(5, 1, B.shape[1]), B, [3, 1, 0], [1], 2, angles=[0, 3])
+
+
+def with_effect(nominal=pendulum, effect=rotation):
+    return ResidualModel(nominal, gp(3, 0, 1), effect, [0, 1], [], 1, [0], noise=0.01 * torch.eye(2, dtype=F))
+
+
+MODELS = {
+    "angles": with_angles,
+    "fewer outputs": lambda: with_angles(B=draw(5, 4, 2)),
+    "effect in torch": with_effect,
+    "all in CasADi": lambda: with_effect(CasadiFunction(pendulum_in_casadi), CasadiFunction(rotation_in_casadi)),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_with_features_is_a_model(name):
+    check_model(MODELS[name]())
+
+
+def test_torch_and_casadi_give_the_same_expansion():
+    x, u = draw(8, 6, 2).numpy(), draw(9, 6, 1).numpy()
+    for ours, theirs in zip(
+        MODELS["effect in torch"]().linearize(x, u), MODELS["all in CasADi"]().linearize(x, u), strict=True
+    ):
+        np.testing.assert_allclose(ours, theirs, atol=1e-12)
+
+
+def test_a_turn_more_changes_nothing_and_a_column_that_is_left_out_neither():
+    model, x, u = with_angles(), draw(8, 5, 4), draw(9, 5, 2)
+    moved = model.predict(x, u)
+    turn = x + torch.tensor([2 * torch.pi, 0, 7.0, -4 * torch.pi])  # state 2 is not seen
+    after = model.predict(turn, u)
+    assert torch.allclose(after.mean - turn, moved.mean - x, atol=1e-12)
+    assert torch.allclose(after.covariance, moved.covariance, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "propagator", [Linearization(), Linearization(hessian=True), Unscented()], ids=lambda p: type(p).__name__
+)
+@pytest.mark.parametrize("name", ["angles", "effect in torch"])
+def test_a_belief_moves_through_features_as_sampling_says(name, propagator):
+    model = MODELS[name]()
+    n, m = model.state_dim, model.input_dim
+    belief = Gaussian(0.3 * draw(1, n), 0.0003 * torch.eye(n, dtype=F))
+    sampled = MonteCarlo(50_000)(model, belief, draw(2, m))
+    found = propagator(model, belief, draw(2, m))
+    assert torch.allclose(found.mean, sampled.mean, atol=5e-3)
+    assert torch.allclose(found.covariance, sampled.covariance, atol=3e-4)
+    with pytest.raises(UnsupportedModel, match="Possible with any model"):
+        MomentMatching()(model, belief, draw(2, m))
+
+
+def observed(rows=60, seed=0):
+    x, u = draw(seed, rows, 2) * torch.tensor([3.0, 2.0]), draw(seed + 1, rows, 1)
+    return Transitions(x, u, pendulum(x, u))
+
+
+def test_with_sine_and_cosine_a_pendulum_is_predicted_at_angles_that_were_never_seen():
+    seen = observed()
+    model = ResidualModel.train(Affine.identity(2, 1), seen, angles=[0], trainer=Trainer(restarts=0))
+    x, u = observed(40, seed=5).states, observed(40, seed=5).inputs
+    far = x + torch.tensor([6 * torch.pi, 0.0])
+    error = (model.predict(far, u).mean - pendulum(far, u)).abs().max()
+    assert float(error) < 0.02
+    grown = model.append(observed(10, seed=7))
+    assert len(grown.residual) == 70
+    check_model(model, x, u)
+
+
+def test_an_effect_that_depends_on_the_state_is_learned():
+    x, u = draw(0, 60, 2), draw(1, 60, 1)
+    force = (0.5 * x[:, 1].sin())[:, None, None]
+    noise = 1e-3 * draw(3, 60, 2)
+    seen = Transitions(x, u, pendulum(x, u) + (rotation(x) * force)[..., 0] + noise)
+    model = ResidualModel.train(pendulum, seen, rotation, [1], [], trainer=Trainer(restarts=0))
+    speed = torch.linspace(-1.5, 1.5, 20)[:, None]
+    assert torch.allclose(model.residual.predict(speed).mean[:, 0], 0.5 * speed[:, 0].sin(), atol=3e-3)
+    assert 1e-8 < float(model.noise_covariance.diagonal().min()) < float(model.noise_covariance.diagonal().max()) < 1e-5
+
+
+def test_lags_are_shifted_and_a_velocity_that_is_not_measured_is_found_in_them():
+    lags = Lags(1, 1, states=1, inputs=2)
+    angles, inputs = np.arange(6.0)[:, None], 10 + np.arange(5.0)[:, None]
+    data = lags.transitions(angles, inputs)
+    assert data.states.tolist() == [[2, 1, 11, 10], [3, 2, 12, 11], [4, 3, 13, 12]]
+    assert data.inputs.tolist() == [[12], [13], [14]]
+    shifted = lags.nominal(data.states, data.inputs)  # the learned part moves the first entry only
+    assert shifted[:, 1:].tolist() == data.next_states[:, 1:].tolist()
+    x, u = [torch.tensor([0.5, 0.0], dtype=F)], draw(4, 150, 1)
+    for k in range(150):
+        x.append(pendulum(x[-1], u[k]))
+    measured = torch.stack(x)[:, :1].numpy()
+    lags = Lags(1, 1, states=1, inputs=1)
+    seen = lags.transitions(measured[:100], u[:99].numpy())
+    model = ResidualModel.train(lags.nominal, seen, lags.B, angles=[0], trainer=Trainer(restarts=0))
+    held_out = lags.transitions(measured[100:], u[100:].numpy())
+    moved = model.predict(held_out.states, held_out.inputs).mean
+    assert float((moved - held_out.next_states).abs().max()) < 0.01
+    check_model(model, held_out.states[:4], held_out.inputs[:4])
+
+
+@pytest.mark.parametrize(
+    ("nominal", "effect"),
+    [
+        (Affine.identity(2, 1), rotation),
+        (pendulum, rotation),
+        (functools.partial(pendulum, damping=0.3), CasadiFunction(rotation_in_casadi)),
+        (CasadiFunction(pendulum_in_casadi, damping=0.3), rotation),
+    ],
+    ids=["numbers", "function", "partial", "casadi"],
+)
+def test_a_nominal_model_and_an_effect_are_saved_by_the_path_they_are_imported_from(nominal, effect, tmp_path):
+    model = with_effect(nominal, effect)
+    save_model(model, tmp_path / "m.safetensors")
+    loaded = load_model(tmp_path / "m.safetensors")
+    x, u = draw(8, 6, 2), draw(9, 6, 1)
+    for ours, theirs in zip(model.linearize(x.numpy(), u.numpy()), loaded.linearize(x.numpy(), u.numpy()), strict=True):
+        assert np.array_equal(ours, theirs)
+
+
+def test_code_without_a_path_is_refused_and_so_is_a_path_that_leads_nowhere(tmp_path, monkeypatch):
+    with pytest.raises(UnsupportedModel, match="nominal is code that a file cannot name"):
+        save_model(with_effect(lambda x, u: x), tmp_path / "m")
+    save_model(with_effect(), tmp_path / "m")
+    monkeypatch.delitem(globals(), "rotation")
+    with pytest.raises(DataError, match="no function that can be imported here"):
+        load_model(tmp_path / "m")
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "rule"),
+    [
+        ({"angles": [2]}, SettingError, r"angles: must be different indices from 0 to 1; got \[2\]"),
+        ({"states": [1], "angles": [0]}, SettingError, r"angles: must be some of the selected states \[1\]"),
+        ({"angles": []}, ShapeError, "has 3 states and 0 inputs; got 2 and 0 selected"),
+        ({"noise": None}, SettingError, "noise: must be given"),
+    ],
+)
+def test_misuse_is_refused(settings, error, rule):
+    good = {"nominal": pendulum, "residual": gp(3, 0, 1), "B": rotation, "states": [0, 1], "inputs": [], "input_dim": 1}
+    good |= {"angles": [0], "noise": torch.eye(2, dtype=F)}
+    with pytest.raises(error, match=rule):
+        ResidualModel(**(good | settings))
+
+
+@pytest.mark.parametrize("name", ["angles", "effect in torch"])
+def test_torch_can_follow_the_jacobian_which_is_that_of_the_fast_road(name):
+    model = MODELS[name]()
+    x, u = draw(8, 5, model.state_dim), draw(9, 5, model.input_dim)
+    fast, A, B = predict_with_jacobian(model, x, u)
+    followed, slow_A, slow_B = predict_with_jacobian(model, x.clone().requires_grad_(), u)
+    for got, expected in ((followed.mean, fast.mean), (slow_A, A), (slow_B, B)):
+        assert torch.allclose(got, expected, atol=1e-10)
+    assert slow_A.requires_grad
