@@ -82,7 +82,7 @@ def sparse_posterior(
     """
     if jitter is not None:
         check_number("jitter", jitter, least=0)
-    _check_method(method)
+    check_method(method)
     check_tensors(inducing=inducing, features=features, targets=targets)
     offset = torch.zeros_like(targets[0]) if offset is None else offset
     if inducing.dim() != 2 or inducing.shape[1:] != features.shape[1:] or not len(inducing):
@@ -112,30 +112,10 @@ def sparse_posterior(
     return replace(shell, features=inducing.clone(), targets=pseudo_targets, cholesky=cholesky, weights=weights[..., 0])
 
 
-def _check_method(method: str) -> None:
+def check_method(method: str) -> None:
+    """Raises ``SettingError`` unless a method is known."""
     if method not in ("sgpr", "fitc"):
         raise SettingError("method", f"must be 'sgpr' or 'fitc'; got {method!r}")
-
-
-def collapsed_bound(
-    inducing: Tensor,
-    features: Tensor,
-    targets: Tensor,
-    hyperparameters: Hyperparameters,
-    method: Method = "sgpr",
-    jitter: float = JITTER,
-) -> Tensor:
-    """The bound on the log marginal likelihood (SGPR), or FITC's own log marginal likelihood, of every output (k,).
-
-    Differentiable by all of its tensors, in one piece; arguments as in ``sparse_posterior``.
-
-    Raises:
-        SettingError: Kzz is not positive definite, or the method is unknown.
-    """
-    _check_method(method)
-    Lz = inducing_factor(inducing, hyperparameters, jitter)
-    sums = _block_sums(Lz, inducing, features, targets, hyperparameters, method)
-    return _bound(sums, len(features), hyperparameters, method)
 
 
 def collapsed_bound_with_gradient(
@@ -146,16 +126,18 @@ def collapsed_bound_with_gradient(
     method: Method = "sgpr",
     jitter: float = JITTER,
 ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """``collapsed_bound`` (k,), and the derivatives of its sum over the outputs, in blocks.
+    """The bound on the log marginal likelihood (SGPR), or FITC's own log marginal likelihood, of every output (k,).
+
+    Arguments are as for ``sparse_posterior``.
 
     Returns:
-        The bound, and its sum's derivatives by inducing (M, d), lengthscales (k, d), signal_variance and noise_variance
-        (k,).
+        The bound, and the derivatives of its sum over the outputs by inducing (M, d), lengthscales (k, d),
+        signal_variance and noise_variance (k,).
 
     Raises:
         SettingError: Kzz is not positive definite, or the method is unknown.
     """
-    _check_method(method)
+    check_method(method)
     values, by_inducing, by_others = [], torch.zeros_like(inducing), []
     for a in range(targets.shape[1]):
         y = targets[:, a : a + 1]

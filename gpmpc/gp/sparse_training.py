@@ -27,6 +27,7 @@ from gpmpc.gp.scaling import Scaling, centre, identity
 from gpmpc.gp.sparse import (
     JITTER,
     Method,
+    check_method,
     collapsed_bound_with_gradient,
     inducing_factor,
     sparse_posterior,
@@ -103,8 +104,7 @@ class SparseTrainer:
             check_number(key, getattr(self, key), least=1, whole=True)
         check_number("iterations", self.iterations, least=0, whole=True)
         check_number("jitter", self.jitter, least=0)
-        if self.method not in ("sgpr", "fitc"):
-            raise SettingError("method", f"must be 'sgpr' or 'fitc'; got {self.method!r}")
+        check_method(self.method)
         replace(self._exact(), scaling=self.scaling)  # which checks the others
 
     def __call__(self, transitions: Transitions, seed: int = 0) -> SparseTraining:
