@@ -69,7 +69,7 @@ def _study(config: DictConfig, settings: dict[str, Any]) -> Any:
             raise SettingError(key, "choose at least one" if key in SEVERAL else "choose one")
 
     def flight(words: str) -> tuple[Any, dict[str, Any]]:
-        composed = without_hydra(hydra.compose("run", words.split()))
+        composed = hydra.compose("run", words.split())
         return experiment_of(composed), plain_settings(composed, {})
 
     made = hydra.utils.instantiate(config, _convert_="all")
