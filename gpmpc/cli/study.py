@@ -9,7 +9,6 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from gpmpc.cli.arguments import Result, folder_of, writing
-from gpmpc.cli.configuration import without_hydra
 from gpmpc.cli.run import experiment_of, plain_data, plain_settings
 from gpmpc.cli.terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
