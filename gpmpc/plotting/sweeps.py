@@ -61,7 +61,7 @@ def over_variable(
     elif not values or max(values) <= 0:
         axis.set_ylim(0, 1)
     elif min(values) >= 0:
-        axis.set_ylim(bottom=0)
+        axis.set_ylim(0, 1.08 * max(values))
     axis.grid(axis="y", color="0.9")
     axis.set_axisbelow(True)
     axis.spines[["top", "right"]].set_visible(False)
