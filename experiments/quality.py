@@ -62,8 +62,12 @@ INCREMENTS, STATES = "increments (paper)", "state form, Clarabel"
 MEAN, ZERO_ORDER = "trajectory, mean only", "trajectory, zero order"
 SPREAD, CONVERGED = "trajectory, diagonal or full", "trajectory, converged"
 NONLINEAR = "nonlinear GP-MPC"
-CONVEX, FULL, DIAGONAL = "controller=convex", "controller.covariance=full", "controller.covariance=diagonal"
-NONE, EXACT, POINTS = "controller.covariance=none", "propagation=moment_matching", "propagation=unscented"
+CONVEX, FULL, DIAGONAL = (
+    "controller=convex",
+    "controller.prediction.covariance=full",
+    "controller.prediction.covariance=diagonal",
+)
+NONE, EXACT, POINTS = "controller.prediction.covariance=none", "propagation=moment_matching", "propagation=unscented"
 MORE = "controller.iterations=100 controller.tolerance=1e-6"
 FIRST_ORDER = "propagation=linearization"
 FAMILIES = (
@@ -181,7 +185,12 @@ class Quality:
         before = controller.initial_input
         return {
             "cost": tracking_cost(
-                controller.problem.Q, controller.problem.R, rollout.states, rollout.references, rollout.inputs, before
+                controller.problem.cost.Q,
+                controller.problem.cost.R,
+                rollout.states,
+                rollout.references,
+                rollout.inputs,
+                before,
             ),
             "rmse": float(tracking_error(rollout.states, rollout.references, experiment.system.tracked_indices).total),
             "seconds": controller.seconds[-len(rollout.inputs) :],

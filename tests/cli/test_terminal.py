@@ -157,7 +157,7 @@ def test_help_and_tab_list_only_choices_that_the_command_has(tmp_path):
         ("gpmpc run controller=nonlin", ["controller=nonlinear"]),
         ("gpmpc run noise.p", ["noise.process="]),
         ("gpmpc run controller=lqr controller.d", []),
-        ("gpmpc run controller.d", ["controller.disturbance_gain="]),
+        ("gpmpc run controller.prediction.d", ["controller.prediction.disturbance_gain="]),
         ("gpmpc run folder=tr", ["folder=tree/"]),
         ("gpmpc run --conf", ["--config-name", "--config-dir"]),
         ("gpmpc figures study=h", ["study=horizon"]),
@@ -240,7 +240,7 @@ class Terminal:
         (["tables", "-m", "draws=1,2"], "unknown option '-m'"),
         (["run", "-m", "--cfg", "job", "seed=1,2"], "--cfg: shows the settings of one run; leave out -m"),
         (["run", "tolerence=1"], "(did you mean 'model.tolerance' or 'controller.tolerance'"),
-        (["run", "controller.problem.q=1"], "(did you mean 'controller.problem.Q'?)"),
+        (["run", "controller.problem.cost.q=1"], "(did you mean 'controller.problem.cost.Q'?)"),
         (["run", "--experimental-rerun", "x"], "unknown option '--experimental-rerun'"),
         (["run", "-m", "--config-dir", "nowhere"], "--config-dir: nowhere: no such folder"),
         (["run", "-m", "--config-name", "nothing"], "Cannot find primary config 'nothing'"),
@@ -267,6 +267,29 @@ def test_settings_and_classes_of_the_users_own_folder_are_found(sweep, tmp_path)
     (path,) = (tmp_path / "tree").glob("*/config.yaml")
     for text in ("tolerance: 0.5", "seed: 5", "vehicle.mine"):
         assert text in path.read_text()
+
+
+def test_kernels_are_compiled_when_asked_for(tmp_path):
+    done = forked("warmup", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["seconds"] > 0
+    assert "controller=lqr" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", ["run -m seed=1,2", "run"])
+def test_ctrl_c_in_the_middle_of_flights_is_one_line(command, tmp_path):
+    words = [PATH, *command.split(), *TINY, "steps=1000000", "recorder=none", "folder=tree"]
+    flying = subprocess.Popen(
+        words, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    deadline = time.monotonic() + SECONDS
+    while not list(tmp_path.glob("tree/*/config.yaml")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(flying.pid, signal.SIGINT)
+    _, shown = flying.communicate(timeout=SECONDS)
+    advice = "; the same command goes on where it stopped" if "-m" in words else ""
+    assert (flying.returncode, shown) == (130, f"\ninterrupted{advice}\n")
 
 
 POOL = """

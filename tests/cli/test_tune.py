@@ -11,7 +11,11 @@ from tests.cli.command import forked
 pytest.importorskip("optuna")
 
 TINY = ["data.samples=25", "model.restarts=0", "steps=4"]
-SEARCHED = ["controller=convex,lqr", "controller.problem.R.1=tag(log,interval(0.01,100))", "horizon=int(interval(1,4))"]
+SEARCHED = [
+    "controller=convex,lqr",
+    "controller.problem.cost.R.1=tag(log,interval(0.01,100))",
+    "horizon=int(interval(1,4))",
+]
 
 
 def tune(folder, trials, cwd):
@@ -34,7 +38,7 @@ def test_a_search_goes_on_where_it_stopped_and_its_best_settings_fly(tmp_path):
     composed = json.loads(forked("run", "--cfg", *arguments, "--json", cwd=tmp_path).stdout)
     assert composed["steps"] == 4
     assert composed["horizon"] == found["best"]["horizon"]
-    assert composed["controller"]["problem"]["R"][1] == found["best"]["controller.problem.R.1"]
+    assert composed["controller"]["problem"]["cost"]["R"][1] == found["best"]["controller.problem.cost.R.1"]
     kind = {"convex": "GPMPC", "lqr": "LQR"}[found["best"]["controller"]]
     assert composed["controller"]["_target_"].endswith(f".{kind}")
     again = forked("run", *arguments, "--json", "folder=again", cwd=tmp_path)
@@ -53,7 +57,10 @@ def test_a_search_goes_on_where_it_stopped_and_its_best_settings_fly(tmp_path):
         (["horizon=1,2", "steps=1"], "steps: must be 2 or more"),
         (["controller.tolerance=interval(2,1)"], "controller.tolerance: must rise; got"),
         (["controller.tolerance=tag(log,interval(0,1))"], "controller.tolerance: must rise, from above 0; got"),
-        (["controller.problem.R.7=interval(1,2)"], "controller.problem.R.7: controller.problem.R is no list with"),
+        (
+            ["controller.problem.cost.R.7=interval(1,2)"],
+            "controller.problem.cost.R.7: controller.problem.cost.R is no list with",
+        ),
         (["horizn=1,2"], "unknown setting 'horizn' (did you mean 'horizon'?)"),
         (["horizon=0,1", "--trials", "3"], "horizon: must be a whole number, 1 or more; got 0"),
     ],
