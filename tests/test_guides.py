@@ -98,7 +98,9 @@ def test_a_mistake_is_one_clear_line(arguments, message, tmp_path):
     for name, rates in (("short", "[x[1]]"), ("nan", "[x[1], 0 * float('nan')]"), ("weights", "[x[1], u[0]]")):
         text = f"state_names, input_names = ('a', 'b'), ('u',)\n    def derivative(self, x, u): return {rates}\n"
         limits = "name='nan', input_lower=[-1], input_upper=[1], region=[[-1, -1], [1, 1]]"
-        made = f"from gpmpc.systems import System\nclass D:\n    {text}\ndef make(): return System(D(), 0.1, {limits})\n"
+        made = (
+            f"from gpmpc.systems import System\nclass D:\n    {text}\ndef make(): return System(D(), 0.1, {limits})\n"
+        )
         (tmp_path / f"{name}_module.py").write_text(made)
         weights = "[1, 1, 1]" if name == "weights" else "[1, 1]"
         (tmp_path / "system" / f"{name}.yaml").write_text(

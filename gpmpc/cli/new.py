@@ -9,7 +9,12 @@ from gpmpc.exceptions import SettingError
 from gpmpc.files import write_whole
 
 TEMPLATES = Path(__file__).with_name("project")  # its files, named and written for a system called NAME
-FILES = {"NAME.py": "system.txt", "system/NAME.yaml": "settings.txt", "fly.py": "script.txt", "test_NAME.py": "test.txt"}
+FILES = {
+    "NAME.py": "system.txt",
+    "system/NAME.yaml": "settings.txt",
+    "fly.py": "script.txt",
+    "test_NAME.py": "test.txt",
+}
 
 
 def add_arguments(parser: Parser) -> None:
