@@ -23,7 +23,8 @@ from benchmarks.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, rec
 from benchmarks.quadrotor_sequences import TIGHT
 from benchmarks.timing import write_results
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.problem import StateBounds
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
@@ -53,7 +54,14 @@ def optimality(posteriors: dict, propagation: str, arguments: argparse.Namespace
     propagator, gaps, times, failed = PROPAGATIONS[propagation], [], [[], []], {"convex": 0, "nonlinear": 0}
     for trajectory, gp in posteriors.items():
         asked = (problem(), arguments.horizon, HOVER)
-        convex = GPMPC(gp, propagator, *asked, form="trajectory", covariance="full", iterations=100, tolerance=1e-7)
+        convex = GPMPC(
+            gp,
+            propagator,
+            *asked,
+            prediction=PredictionSettings(form="trajectory", covariance="full"),
+            iterations=100,
+            tolerance=1e-7,
+        )
         nonlinear = NonlinearGPMPC(gp, propagator, *asked, tolerance=1e-6, max_iterations=300)
         count = arguments.steps // len(posteriors)
         flown = recorded(GPMPC(gp, Linearization(), *asked), trajectory, count, std=0.01)
@@ -90,9 +98,9 @@ def solvers(posteriors: dict, count: int) -> dict:
     active, unsolved = 0, dict.fromkeys(found, 0)
     for trajectory, gp in posteriors.items():
         # Bounds that bite: of the inputs and their increments, and of positions.
-        bounds = StateBounds(*(0.95 * np.asarray(side) for side in STATE_BOUNDS[trajectory]), l1=1e3)
+        bounds = Box(*(0.95 * np.asarray(side) for side in STATE_BOUNDS[trajectory]), probability=0.95, penalty=1e3)
         tilt, rate = TIGHT[trajectory]
-        hard = (replace(problem(tilt=tilt), rate_lower=np.negative(rate), rate_upper=rate), 10, HOVER)
+        hard = (replace(problem(tilt=tilt), input_rates=Box(np.negative(rate), rate)), 10, HOVER)
         soft = (problem(bounds), 10, HOVER)
         for asked, kinds, steps in ((hard, tuple(found), count // 2), (soft, ("state_form",), count // 4)):
             ours = GPMPC(gp, Linearization(), *asked)
@@ -128,7 +136,7 @@ def solvers(posteriors: dict, count: int) -> dict:
 
 def long_horizon(gp, trajectory: str, l1: float | None) -> dict:
     """H = 50 with state bounds that the reference breaks, hard or at a price."""
-    limits = StateBounds(*STATE_BOUNDS[trajectory], l1=l1)
+    limits = Box(*STATE_BOUNDS[trajectory], probability=0.95, penalty=l1)
     flown = recorded(GPMPC(gp, Linearization(), problem(limits), 50, HOVER), trajectory, 189)
     statuses = [step.decision.status.name for step in flown]
     times = [step.decision.timing.total for step in flown]

@@ -24,6 +24,7 @@ from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, tra
 from benchmarks.timing import write_results
 from gpmpc.gp import GPPosterior, backend
 from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import closed_loop, closed_loops
 from gpmpc.trajectories import states_along
@@ -31,9 +32,9 @@ from gpmpc.trajectories import states_along
 HORIZON = 10
 TORCH_LIMIT = 2_000_000  # T N^2 of exact moments above which torch on the CPU is left out: minutes a flight
 MODES = {
-    "mean": {"propagator": Linearization(), "covariance": "none"},
-    "linearised": {"propagator": Linearization(), "covariance": "zero_order"},
-    "moment-matched": {"propagator": MomentMatching(), "covariance": "full", "form": "velocity"},
+    "mean": {"propagator": Linearization(), "prediction": PredictionSettings(covariance="none")},
+    "linearised": {"propagator": Linearization(), "prediction": PredictionSettings()},
+    "moment-matched": {"propagator": MomentMatching(), "prediction": PredictionSettings("velocity", "full")},
 }
 
 

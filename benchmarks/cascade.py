@@ -18,10 +18,11 @@ from benchmarks.quadrotor import HOVER, INNER, OUTER, TRAJECTORIES, problem, tra
 from benchmarks.timing import write_results
 from gpmpc.exceptions import GpmpcError
 from gpmpc.metrics import tracking_error
+from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Gust, Noise, Replaced, cascade_loop
 from gpmpc.systems import Coupled, System
@@ -30,7 +31,7 @@ from gpmpc.trajectories import states_along
 PLANT = System(Coupled(), time_step=0.05, substeps=2)
 HEAVY = System(Coupled(mass=1.2 * 0.74), time_step=0.05, substeps=2)
 NOISE = Noise(measurement=[0.01] * 6 + [0.002, 0.01] * 3)  # [m, m/s, rad, rad/s]
-INNER_PROBLEM = TrackingProblem([1] * 6, [1] * 3, penalized="increments")
+INNER_PROBLEM = Problem(Tracking([1] * 6, [1] * 3))
 CASES = {
     "as it is": (),
     "gust": (Gust({"vx": 0.5, "vy": -0.3}, start=40.0, stop=50.0),),
@@ -53,9 +54,13 @@ def main() -> None:
                 NMPC(OUTER, problem(), 1, HOVER), NMPC(INNER, INNER_PROBLEM, 1, [0.0] * 3, tolerance=1e-8)
             ),
         }
-        inner_gp = GPMPC(inner, Linearization(), INNER_PROBLEM, 1, [0.0] * 3, covariance="none")
+        inner_gp = GPMPC(
+            inner, Linearization(), INNER_PROBLEM, 1, [0.0] * 3, prediction=PredictionSettings(covariance="none")
+        )
         for name, gain in (("GP", 0.0), ("GP, error estimated", 1.0)):
-            outer_gp = GPMPC(outer, Linearization(), problem(), 1, HOVER, disturbance_gain=gain)
+            outer_gp = GPMPC(
+                outer, Linearization(), problem(), 1, HOVER, prediction=PredictionSettings(disturbance_gain=gain)
+            )
             cascades[name] = Cascade(outer_gp, inner_gp)
         for case in CASES:
             flown = {name: flights(cascade, trajectory, case, arguments) for name, cascade in cascades.items()}

@@ -25,6 +25,7 @@ from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc.controller import Decision, Request, Timing
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
+from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.status import Status
 
@@ -57,10 +58,12 @@ def ways(gp: GPPosterior, horizon: int) -> list[dict]:
     Whoever comes after a rival finds the caches full of it; so they take turns apart, each with the paper's form.
     """
     exact, asked = MomentMatching(), (problem(), horizon, HOVER)
-    paper = {"paper's form": GPMPC(gp, exact, *asked, form="velocity", covariance="full")}
+    paper = {
+        "paper's form": GPMPC(gp, exact, *asked, prediction=PredictionSettings(form="velocity", covariance="full"))
+    }
     convex = {
         "trajectory, linearised": GPMPC(gp, Linearization(), *asked),
-        "trajectory, mean": GPMPC(gp, Linearization(), *asked, covariance="none"),
+        "trajectory, mean": GPMPC(gp, Linearization(), *asked, prediction=PredictionSettings(covariance="none")),
     }
     rivals = {}
     for start in ("", COLD):
@@ -85,7 +88,7 @@ class PlainSLSQP(SLSQP):
                 memory[0] = self.evaluate(plan, request)
             return memory[0]
 
-        box = list(zip(self.problem.input_lower, self.problem.input_upper, strict=True)) * self.horizon
+        box = list(zip(self.problem.inputs.lower, self.problem.inputs.upper, strict=True)) * self.horizon
         options = {"ftol": 1e-6 * cost, "maxiter": 300}
         gradient = {"jac": lambda U: at(U).gradient, "bounds": box, "options": options}
         result = minimize(lambda U: at(U).cost, start, method="SLSQP", **gradient)

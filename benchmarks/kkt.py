@@ -24,7 +24,7 @@ from gpmpc.dynamics import DynamicsModel, predict_with_jacobian
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Problem
 
 Array = np.ndarray
 
@@ -56,7 +56,7 @@ class Instance:
         return self.reference.states[1:]
 
 
-def kkt_residual(model: DynamicsModel, problem: TrackingProblem, instance: Instance, inputs: Array) -> float:
+def kkt_residual(model: DynamicsModel, problem: Problem, instance: Instance, inputs: Array) -> float:
     """Computes how far a plan is from a KKT point; see the module's text.
 
     Args:
@@ -69,7 +69,7 @@ def kkt_residual(model: DynamicsModel, problem: TrackingProblem, instance: Insta
         SettingError: The problem bounds more than inputs, or weighs deviations.
         ShapeError: The plan has another shape.
     """
-    if problem.state_bounds is not None or problem.rate_limited or problem.penalized == "deviations":
+    if problem.constraints or problem.input_rates.finite or problem.cost.penalized == "deviations":
         raise SettingError("problem", "must bound nothing but inputs, and weigh inputs or increments")
     H, m = len(instance.targets), problem.input_dim
     if np.shape(inputs) != (H, m):
@@ -78,7 +78,7 @@ def kkt_residual(model: DynamicsModel, problem: TrackingProblem, instance: Insta
         return np.inf
     states, A, B = _rollout(model, instance.state, np.asarray(inputs, dtype=float))
     errors = states[1:] - instance.targets
-    weights = np.array([problem.Q] * (H - 1) + [problem.terminal])
+    weights = np.array([problem.cost.Q] * (H - 1) + [problem.cost.terminal])
     cost, gradient, curvature = _of_the_inputs(problem, instance.last, inputs)
     cost += np.einsum("ia,iab,ib->", errors, weights, errors)
     adjoint = np.zeros(problem.state_dim)
@@ -91,9 +91,9 @@ def kkt_residual(model: DynamicsModel, problem: TrackingProblem, instance: Insta
         for i in range(k, H):
             response = response if i == k else A[i] @ response
             curvature[k] += 2 * np.einsum("aj,ab,bj->j", response, weights[i], response)
-    above, below = curvature * (inputs - problem.input_lower), curvature * (inputs - problem.input_upper)
+    above, below = curvature * (inputs - problem.inputs.lower), curvature * (inputs - problem.inputs.upper)
     left = np.abs(np.maximum(below, np.minimum(gradient, above)))
-    sizes = np.minimum(np.maximum(1.0, np.abs(inputs)), problem.input_upper - problem.input_lower)
+    sizes = np.minimum(np.maximum(1.0, np.abs(inputs)), problem.inputs.upper - problem.inputs.lower)
     most = np.sqrt(2 * curvature * (cost + 0.5 * curvature * (SMALL * sizes) ** 2))
     return float(np.divide(left, most, out=np.where(left > 0, np.inf, 0.0), where=most > 0).max())
 
@@ -110,13 +110,13 @@ def _rollout(model: DynamicsModel, state: Array, inputs: Array) -> tuple[Array, 
     return np.array(states), np.array(A), np.array(B)
 
 
-def _of_the_inputs(problem: TrackingProblem, last: Array, inputs: Array) -> tuple[float, Array, Array]:
+def _of_the_inputs(problem: Problem, last: Array, inputs: Array) -> tuple[float, Array, Array]:
     """Value, gradient and diagonal of the Hessian (H, m) of sum_i |v_i|^2_R."""
-    curvature = np.tile(2 * problem.R.diagonal(), (len(inputs), 1))
-    v = inputs if problem.penalized == "inputs" else np.diff(inputs, axis=0, prepend=last[None])
-    slopes = 2 * v @ problem.R
+    curvature = np.tile(2 * problem.cost.R.diagonal(), (len(inputs), 1))
+    v = inputs if problem.cost.penalized == "inputs" else np.diff(inputs, axis=0, prepend=last[None])
+    slopes = 2 * v @ problem.cost.R
     cost = float(np.sum(slopes * v)) / 2
-    if problem.penalized == "increments":
+    if problem.cost.penalized == "increments":
         slopes[:-1] -= slopes[1:].copy()
         curvature[:-1] *= 2
     return cost, slopes, curvature

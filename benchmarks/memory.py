@@ -73,16 +73,18 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
     from gpmpc.gp import load_posterior
     from gpmpc.mpc.controller import Reference
     from gpmpc.mpc.gp_mpc import GPMPC
-    from gpmpc.mpc.problem import TrackingProblem
+    from gpmpc.mpc.prediction import PredictionSettings
+    from gpmpc.mpc.problem import Box, Problem, Tracking
     from gpmpc.propagation import Linearization
 
     torch.set_num_threads(1)
     libraries = resident()
     gp = load_posterior(file)
     n, m = gp.state_dim, gp.input_dim
-    box = {"input_lower": [-1] * m, "input_upper": [1] * m}
-    problem = TrackingProblem([1] * n, [1] * m, penalized="increments", **box)
-    controller = GPMPC(gp, Linearization(), problem, horizon, [0.0] * m, covariance=covariance)
+    box = {"inputs": Box([-1] * m, [1] * m)}
+    problem = Problem(Tracking([1] * n, [1] * m), **box)
+    settings = PredictionSettings(covariance=covariance)
+    controller = GPMPC(gp, Linearization(), problem, horizon, [0.0] * m, prediction=settings)
     reference = Reference(np.zeros((horizon + 1, n)))
     eye, generator = torch.eye(n, dtype=torch.float64), torch.Generator().manual_seed(0)
     decision, steady, risen, peak = None, 0, 0.0, 0.0

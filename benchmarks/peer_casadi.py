@@ -19,7 +19,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.casadi_ import casadi_function
 from gpmpc.interrupts import interrupts_after
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Problem
 
 Array = np.ndarray
 
@@ -74,7 +74,7 @@ class Casadi:
     def __init__(
         self,
         gp: GPPosterior,
-        problem: TrackingProblem,
+        problem: Problem,
         horizon: int,
         method: Literal["ipopt", "ipopt, gauss-newton", "sqpmethod", "fatrop"],
         tolerance: float,
@@ -84,7 +84,10 @@ class Casadi:
         plugin = method.split(",")[0]
         self._stagewise = plugin != "ipopt"
         carried = m if self._stagewise else 0  # of the last input in the state
-        step, Q, R, terminal = mean_function(gp), *map(casadi.DM, (problem.Q, problem.R, problem.terminal))
+        step, Q, R, terminal = (
+            mean_function(gp),
+            *map(casadi.DM, (problem.cost.Q, problem.cost.R, problem.cost.terminal)),
+        )
         u, r = casadi.SX.sym("u", m, H), casadi.SX.sym("r", n, H)
         x = casadi.SX.sym("x", n + carried, H + 1)  # the first one is given
         last = casadi.SX.sym("last", m)
@@ -105,8 +108,8 @@ class Casadi:
             options["hess_lag"] = hessian
         self._solver = casadi.nlpsol("peer", plugin, {"x": w, "p": p, "f": cost, "g": g}, options)
         free = np.full(n + carried, np.inf)
-        self._lower = np.tile(np.concatenate([problem.input_lower, -free]), H)
-        self._upper = np.tile(np.concatenate([problem.input_upper, free]), H)
+        self._lower = np.tile(np.concatenate([problem.inputs.lower, -free]), H)
+        self._upper = np.tile(np.concatenate([problem.inputs.upper, free]), H)
         self._shape = (H, n, m)
 
     def __call__(self, instance: Instance, last: Solution | None) -> Solution:
@@ -136,9 +139,9 @@ class Casadi:
         return Solution(unknowns[:, :m].copy(), unknowns, of_bounds, of_dynamics)
 
 
-def check_problem(problem: TrackingProblem) -> None:
+def check_problem(problem: Problem) -> None:
     """Raises where a problem has what the peers' formulations do not hand on."""
-    if problem.penalized != "increments" or problem.state_bounds is not None or problem.rate_limited:
+    if problem.cost.penalized != "increments" or problem.constraints or problem.input_rates.finite:
         raise SettingError("problem", "must weigh increments, and bound nothing but inputs")
 
 

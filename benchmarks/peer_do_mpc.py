@@ -17,7 +17,7 @@ from benchmarks.peer_casadi import IPOPT_WARM, MAX_ITERATIONS, check_problem, me
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.interrupts import interrupts_after
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Problem
 
 MISSING = "not installed: pip install 'gpmpc[bench]'"
 
@@ -46,18 +46,18 @@ class DoMpc:
         SettingError: do-mpc is not installed, or the problem has what this file does not hand on.
     """
 
-    def __init__(self, gp: GPPosterior, problem: TrackingProblem, horizon: int, tolerance: float):
+    def __init__(self, gp: GPPosterior, problem: Problem, horizon: int, tolerance: float):
         if not installed():
             raise SettingError("peers", f"do-mpc is {MISSING}")
         check_problem(problem)
-        if np.count_nonzero(problem.R - np.diag(problem.R.diagonal())):
+        if np.count_nonzero(problem.cost.R - np.diag(problem.cost.R.diagonal())):
             raise SettingError("R", "must be diagonal: do-mpc's penalty of the increments is")
         self._horizon = horizon
         with warnings.catch_warnings():  # about what else could be installed, and about CasADi's next version
             warnings.simplefilter("ignore")
             self._set_up(gp, problem, tolerance)
 
-    def _set_up(self, gp: GPPosterior, problem: TrackingProblem, tolerance: float) -> None:
+    def _set_up(self, gp: GPPosterior, problem: Problem, tolerance: float) -> None:
         toolbox = importlib.import_module("do_mpc")
         model = _model(toolbox, gp)
         self._mpc = mpc = toolbox.controller.MPC(model)
@@ -69,10 +69,10 @@ class DoMpc:
         mpc.settings.nlpsol_opts = {f"ipopt.{name}": value for name, value in settings.items()}
         mpc.settings.supress_ipopt_output()
         x, r = model.x["x"], model.tvp["r"]
-        Q, terminal = casadi.DM(problem.Q), casadi.DM(problem.terminal)
+        Q, terminal = casadi.DM(problem.cost.Q), casadi.DM(problem.cost.terminal)
         mpc.set_objective(mterm=casadi.bilin(terminal, x - r, x - r), lterm=casadi.bilin(Q, x - r, x - r))
-        mpc.set_rterm(u=problem.R.diagonal())
-        mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = problem.input_lower, problem.input_upper
+        mpc.set_rterm(u=problem.cost.R.diagonal())
+        mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = problem.inputs.lower, problem.inputs.upper
         self._references = mpc.get_tvp_template()
         mpc.set_tvp_fun(lambda time: self._references)
         mpc.setup()

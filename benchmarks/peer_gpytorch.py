@@ -16,7 +16,7 @@ from benchmarks.kkt import Instance
 from benchmarks.peer_casadi import check_problem
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Problem
 
 
 class Plan(NamedTuple):
@@ -38,12 +38,14 @@ class GPyTorchSlsqp:
         SettingError: The problem weighs something else than increments, or bounds more than inputs.
     """
 
-    def __init__(self, gp: GPPosterior, problem: TrackingProblem, horizon: int, tolerance: float):
+    def __init__(self, gp: GPPosterior, problem: Problem, horizon: int, tolerance: float):
         check_problem(problem)
         self._model, self._adds_state = to_gpytorch(gp).requires_grad_(False), gp.predicts == "difference"
         self._horizon, self._tolerance = horizon, tolerance
-        self._Q, self._R, self._terminal = map(torch.from_numpy, (problem.Q, problem.R, problem.terminal))
-        self._bounds = list(zip(problem.input_lower, problem.input_upper, strict=True)) * horizon
+        self._Q, self._R, self._terminal = map(
+            torch.from_numpy, (problem.cost.Q, problem.cost.R, problem.cost.terminal)
+        )
+        self._bounds = list(zip(problem.inputs.lower, problem.inputs.upper, strict=True)) * horizon
 
     def __call__(self, instance: Instance, last: Plan | None) -> Plan:
         """The plan from a state along a reference, started from the last one, shifted."""

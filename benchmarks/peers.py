@@ -42,7 +42,8 @@ from benchmarks.timing import (
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc.controller import Controller, Decision, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 
@@ -89,24 +90,29 @@ def main() -> None:
     (RESULTS / "peers.md").write_text("\n".join([f"{describe(here)}\n", *sections]))
 
 
-def peers_problem() -> TrackingProblem:
+def peers_problem() -> Problem:
     """Builds weights and bounds of the comparison."""
     return problem(thrust=(6.0, 8.0), tilt=0.05)
 
 
-def record_instances(gp: GPPosterior, task: TrackingProblem, horizon: int, steps: int) -> list[Instance]:
+def record_instances(gp: GPPosterior, task: Problem, horizon: int, steps: int) -> list[Instance]:
     """Flies with one program per step and returns the optimal control problems of the flight."""
-    flown = recorded(GPMPC(gp, Linearization(), task, horizon, HOVER, covariance="none"), TRAJECTORY, steps)
+    flown = recorded(
+        GPMPC(gp, Linearization(), task, horizon, HOVER, prediction=PredictionSettings(covariance="none")),
+        TRAJECTORY,
+        steps,
+    )
     before = [np.array(HOVER) if step.previous is None else step.previous.input for step in flown]
     return [Instance(step.belief, step.reference, last) for step, last in zip(flown, before, strict=True)]
 
 
-def converged(gp: GPPosterior, task: TrackingProblem, horizon: int) -> Cases:
+def converged(gp: GPPosterior, task: Problem, horizon: int) -> Cases:
     """Builds the solvers of the nonlinear problem."""
 
     def ours() -> Solve:
-        settings = {"covariance": "none", "iterations": 50, "tolerance": OURS}
-        return by_controller(GPMPC(gp, Linearization(), task, horizon, HOVER, **settings))
+        settings = PredictionSettings(covariance="none")
+        problem = task, horizon, HOVER
+        return by_controller(GPMPC(gp, Linearization(), *problem, settings, iterations=50, tolerance=OURS))
 
     def do_mpc() -> Solve:
         return peer_do_mpc.DoMpc(gp, task, horizon, IPOPT)
@@ -123,7 +129,7 @@ def converged(gp: GPPosterior, task: TrackingProblem, horizon: int) -> Cases:
     return cases
 
 
-def slow(gp: GPPosterior, task: TrackingProblem, horizon: int) -> Cases:
+def slow(gp: GPPosterior, task: Problem, horizon: int) -> Cases:
     """Builds what takes seconds, with ours beside it."""
     ours = converged(gp, task, horizon)
     return {
@@ -132,11 +138,11 @@ def slow(gp: GPPosterior, task: TrackingProblem, horizon: int) -> Cases:
     }
 
 
-def one_program(gp: GPPosterior, task: TrackingProblem, horizon: int) -> Cases:
+def one_program(gp: GPPosterior, task: Problem, horizon: int) -> Cases:
     """Builds the real-time iterations, with our QP solver and with DAQP."""
     cases: Cases = {}
     for name, covariance in (("mean only", "none"), ("zero order", "zero_order")):
-        settings: dict[str, Any] = {"covariance": covariance}
+        settings: dict[str, Any] = {"prediction": PredictionSettings(covariance=covariance)}
         common = (gp, Linearization(), task, horizon, HOVER)
         cases[f"gpmpc, {name}"] = lambda a=common, s=settings: by_controller(GPMPC(*a, **s))
         daqp = settings | {"solver": peer_daqp.Daqp()} if peer_daqp.installed() else None
@@ -188,7 +194,7 @@ class Run:
 
 
 def measure(
-    cases: Cases, gp: GPPosterior, task: TrackingProblem, instances: Sequence[Instance], seconds: float, cold: bool
+    cases: Cases, gp: GPPosterior, task: Problem, instances: Sequence[Instance], seconds: float, cold: bool
 ) -> list[dict]:
     """Times the solvers in turns and judges their plans."""
     runs = {name: Run(make(), instances, cold) for name, make in cases.items() if make is not None}

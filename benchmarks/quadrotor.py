@@ -10,7 +10,7 @@ from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, standardize
 from gpmpc.mpc.controller import Controller, Decision, Reference
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.simulation import Noise, closed_loop
 from gpmpc.systems import rotational, translational
 from gpmpc.trajectories import Elliptical, Lorenz, states_along
@@ -47,10 +47,10 @@ def trained(trajectory: str, subsystem: str = "translational", size: int = 189) 
     return TRAINER(data, seed=0).posterior
 
 
-def problem(bounds: StateBounds | None = None, thrust: Sequence[float] = (0.0, 100.0), tilt: float = 0.7):
+def problem(bounds: Box | None = None, thrust: Sequence[float] = (0.0, 100.0), tilt: float = 0.7):
     """Weights of the flights with the plant in the loop."""
-    box = {"input_lower": [thrust[0], -tilt, -tilt], "input_upper": [thrust[1], tilt, tilt]}
-    return TrackingProblem([1] * 6, [1] * 3, penalized="increments", state_bounds=bounds, **box)
+    box = Box([thrust[0], -tilt, -tilt], [thrust[1], tilt, tilt])
+    return Problem(Tracking([1] * 6, [1] * 3), box, constraints=[] if bounds is None else [bounds])
 
 
 def recorded(controller: Controller, trajectory: str, steps: int, std: float = 0.0, seed: int = 0) -> list[Asked]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks.quadrotor import HOVER, TRAJECTORIES, problem, recorded, trained
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import StateBounds
+from gpmpc.mpc.problem import Box
 from gpmpc.propagation import Linearization
 from gpmpc.trajectories import states_along
 
@@ -134,7 +134,7 @@ def flight_sequence(trajectory: str, horizon: int, length: int) -> list[Sequence
     """The QPs of a flight of the learned quadrotor with the plant in the loop, those without a solution left out."""
     states = states_along(TRAJECTORIES[trajectory], np.arange(length + horizon + 1.0))
     margin = 0.05 + 0.02 * np.ptp(states, axis=0)  # [m, m/s] around all that the reference visits
-    bounds = StateBounds(states.min(axis=0) - margin, states.max(axis=0) + margin)
+    bounds = Box(states.min(axis=0) - margin, states.max(axis=0) + margin, probability=0.95, penalty=None)
     bounded = problem(bounds, tilt=TIGHT[trajectory][0])
     controller = GPMPC(trained(trajectory), Linearization(), bounded, horizon, HOVER)
     steps = recorded(controller, trajectory, length)

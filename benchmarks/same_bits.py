@@ -20,12 +20,12 @@ import numpy as np
 import torch
 
 from benchmarks.quadrotor import HOVER, INNER, NOISE, OUTER, STATE_BOUNDS, TRAJECTORIES, problem, trained
+from gpmpc.mpc.baselines import LQR, NMPC
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.controller import Controller
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.lqr import LQR
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import cascade_loop, closed_loop
@@ -33,12 +33,21 @@ from gpmpc.systems import Coupled, System
 from gpmpc.trajectories import states_along
 
 STEPS, H, PATH = 8, 6, TRAJECTORIES["lorenz"]
-BOUNDS = StateBounds(*STATE_BOUNDS["lorenz"], l1=10.0, l2=10.0)
+BOUNDS = Box(*STATE_BOUNDS["lorenz"], probability=0.95, penalty=10.0)
 MATCHED, LINEARIZED = MomentMatching(), Linearization()
 CONTROLLERS: dict[str, Callable[[], Controller | Cascade]] = {
     "convex": lambda: GPMPC(trained("lorenz"), LINEARIZED, problem(), H, HOVER),
-    "paper": lambda: GPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, "velocity", "diagonal"),
-    "full": lambda: GPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER, covariance="full"),
+    "paper": lambda: GPMPC(
+        trained("lorenz"),
+        MATCHED,
+        problem(),
+        H,
+        HOVER,
+        prediction=PredictionSettings(form="velocity", covariance="diagonal"),
+    ),
+    "full": lambda: GPMPC(
+        trained("lorenz"), MATCHED, problem(), H, HOVER, prediction=PredictionSettings(covariance="full")
+    ),
     "iterated": lambda: GPMPC(trained("lorenz"), LINEARIZED, problem(BOUNDS), H, HOVER, iterations=30),
     "nonlinear": lambda: NonlinearGPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
     "state form": lambda: StateFormMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
@@ -46,7 +55,13 @@ CONTROLLERS: dict[str, Callable[[], Controller | Cascade]] = {
     "nmpc": lambda: NMPC(OUTER, problem(), H, HOVER),
     "cascade": lambda: Cascade(
         GPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
-        GPMPC(trained("lorenz", "rotational"), LINEARIZED, TrackingProblem([1] * 6, [1] * 3), H, [0.0] * 3),
+        GPMPC(
+            trained("lorenz", "rotational"),
+            LINEARIZED,
+            Problem(Tracking([1] * 6, [1] * 3, penalized="inputs")),
+            H,
+            [0.0] * 3,
+        ),
     ),
 }
 

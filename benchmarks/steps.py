@@ -23,7 +23,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc.controller import Controller, Decision, Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.simulation import closed_loop
@@ -62,12 +63,14 @@ def main() -> None:
 def controllers(gp: GPPosterior, horizon: int) -> dict[str, Controller]:
     """Builds the convex controllers that are compared."""
     m = gp.state_dim // 2
-    problem = TrackingProblem([10.0, 1.0] * m, [0.1] * m, input_lower=[-6.0] * m, input_upper=[6.0] * m)
+    problem = Problem(Tracking([10.0, 1.0] * m, [0.1] * m, penalized="inputs"), inputs=Box([-6.0] * m, [6.0] * m))
     common = (problem, horizon, [0.0] * m)
     return {
-        "paper's form": GPMPC(gp, MomentMatching(), *common, form="velocity", covariance="full"),
+        "paper's form": GPMPC(
+            gp, MomentMatching(), *common, prediction=PredictionSettings(form="velocity", covariance="full")
+        ),
         "zero order": GPMPC(gp, Linearization(), *common),
-        "mean only": GPMPC(gp, Linearization(), *common, covariance="none"),
+        "mean only": GPMPC(gp, Linearization(), *common, prediction=PredictionSettings(covariance="none")),
     }
 
 

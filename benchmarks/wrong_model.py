@@ -21,6 +21,7 @@ from benchmarks.timing import write_results
 from gpmpc.files import write_whole
 from gpmpc.metrics import tracking_error
 from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.plotting.image import png
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Replaced, Rollout, closed_loop
@@ -36,10 +37,10 @@ NOISES = {
     "measured 0.03": Noise(measurement=[0.03] * 6),
 }
 WAYS = {
-    "trajectory, L = 0": {},
-    "trajectory, L = 0.3": {"disturbance_gain": 0.3},
-    "trajectory, L = 1": {"disturbance_gain": 1.0},
-    "velocity": {"form": "velocity", "covariance": "none"},
+    "trajectory, L = 0": PredictionSettings(),
+    "trajectory, L = 0.3": PredictionSettings(disturbance_gain=0.3),
+    "trajectory, L = 1": PredictionSettings(disturbance_gain=1.0),
+    "velocity": PredictionSettings("velocity", "none"),
 }
 COLOURS = ("tab:red", "tab:orange", "tab:blue", "tab:gray")
 
@@ -58,7 +59,7 @@ def main() -> None:
     for trajectory in TRAJECTORIES:
         model = trained(trajectory)
         for way, settings in WAYS.items():
-            controller = GPMPC(model, Linearization(), problem(), HORIZON, HOVER, **settings)
+            controller = GPMPC(model, Linearization(), problem(), HORIZON, HOVER, settings)
             row = []
             for mass in MASSES:
                 for noise in NOISES:

@@ -5,7 +5,7 @@ import numpy as np
 
 from gpmpc.gp import Transitions, standardize, train
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import closed_loop
 from gpmpc.systems import System, step
@@ -27,7 +27,7 @@ states = np.column_stack([np.cos(angles), np.sin(angles), rng.uniform(-8, 8, 400
 measured = [step(plant, x, u) for x, u in zip(states, torques, strict=True)] + rng.normal(0, 0.001, (400, 3))
 gp = train(Transitions(states, torques, measured), predicts="difference", scaling=standardize).posterior
 
-problem = TrackingProblem(Q=[1.0, 1.0, 0.01], R=[0.01], input_lower=[-2.0], input_upper=[2.0])
+problem = Problem(Tracking([1.0, 1.0, 0.01], [0.01], penalized="inputs"), inputs=Box([-2.0], [2.0]))
 controller = GPMPC(gp, Linearization(), problem, horizon=30, initial_input=[0.0])
 flight = closed_loop(plant, controller, np.tile([1.0, 0.0, 0.0], (131, 1)), [-1.0, 0.0, 0.0], steps=100)
 

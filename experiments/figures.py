@@ -29,10 +29,11 @@ from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.experiments.subsystems import SCALINGS, SYSTEMS, check_subsystems
 from gpmpc.gp import Scaling, Transitions
 from gpmpc.metrics import tracking_error, violation_rate
+from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.controller import Controller, Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Constraint, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import ModelLoop, Noise, Rollout, closed_loop, rehearse
 from gpmpc.studies.document import Document, Table
@@ -54,7 +55,6 @@ PROPAGATIONS = {"moment_matching": MomentMatching, "linearization": Linearizatio
 CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "slsqp": SLSQP, "convex": GPMPC}
 LOOPS = ("model", "plant")
 PLANT = SYSTEMS["translational"]  # the plant in the loop
-PENALTIES = ("l1", "l2")  # of state bounds that cannot be kept, among a row's settings
 AT_BOUND = 1e-6  # [m, m/s] distance of a plan to a bound that counts as none
 
 
@@ -67,7 +67,7 @@ class Row:
         controller: ``"nmpc"`` (on the true plant), ``"nonlinear"`` or ``"convex"``.
         R: Input weights, the diagonal (m,).
         Q: State weights, the diagonal (n,).
-        penalized: What R weighs; see ``TrackingProblem``.
+        penalized: What R weighs; see ``Tracking``.
         bounded: Whether the inputs are bounded.
         horizon: H, or several.
         propagation: ``"moment_matching"`` or ``"linearization"``: how the controller's belief moves.
@@ -78,7 +78,7 @@ class Row:
         confidence: eta of the state bounds of the trajectory, or several; None without state bounds.
         subsystems: Which are flown; the plant in the loop is translational.
         trials: Seeds, for plants; None takes the study's.
-        settings: Further arguments of the controller.
+        settings: Further arguments of the controller, and the ``penalty`` of state bounds that cannot be kept.
         title: What it is called in tables and figures; its name by default.
 
     Raises:
@@ -109,7 +109,7 @@ class Row:
                 raise SettingError(key, f"must be one of {', '.join(possible)}; got {getattr(self, key)!r}")
         if self.loop == "model" and self.controller == "nmpc":
             raise SettingError("controller", "nmpc knows the true plant and needs it in the loop; got loop model")
-        parameters = {*inspect.signature(CONTROLLERS[self.controller]).parameters, *PENALTIES}
+        parameters = {*inspect.signature(CONTROLLERS[self.controller]).parameters, "penalty"}
         for key in self.settings:
             if key not in parameters:
                 raise SettingError(f"settings.{key}", f"controller {self.controller} takes no such setting")
@@ -126,7 +126,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Box:
+class Bounds:
     """Lower and upper bounds; None leaves an entry free."""
 
     lower: Sequence[float]
@@ -153,8 +153,8 @@ class Condition:
     model: Path | None
     reference: Reference
     scaling: Scaling
-    inputs: Box
-    states: Box | None
+    inputs: Bounds
+    states: Bounds | None
     noise: float
     steps: int
     drawn: bool = False
@@ -162,10 +162,12 @@ class Condition:
     def controller(self) -> Controller:
         """Makes the controller."""
         row, problem = self.row, tracking_problem(self.row, self.inputs, self.states)
-        settings = {key: value for key, value in row.settings.items() if key not in PENALTIES}
+        settings = {key: value for key, value in row.settings.items() if key != "penalty"}
+        if "prediction" in settings:
+            settings["prediction"] = PredictionSettings(**settings["prediction"])
         known = self.reference.inputs
         at_first = np.array([PLANT.dynamics.mass * GRAVITY, 0.0, 0.0]) if known is None else known[0]
-        at_first = np.clip(at_first, problem.input_lower, problem.input_upper)
+        at_first = np.clip(at_first, problem.inputs.lower, problem.inputs.upper)
         if self.model is None:
             return NMPC(PLANT, problem, row.horizon, at_first, **settings)
         propagator = PROPAGATIONS[row.propagation](process_noise=row.process_noise)
@@ -274,7 +276,7 @@ class Figures:
                 trials.append(Trial(labels | {"trial": trial}, flown, seed, fingerprint([named, trial, seed])))
         return trials
 
-    def _bounds(self, row: Row, trajectory: str, subsystem: str) -> tuple[Box, Box | None]:
+    def _bounds(self, row: Row, trajectory: str, subsystem: str) -> tuple[Bounds, Bounds | None]:
         """Returns the bounds of the inputs and of the states."""
         of_inputs = self.bounds.get(row.loop) or {}
         if row.loop == "model":
@@ -286,8 +288,8 @@ class Figures:
                 raise SettingError(key, what)
         if of_states is not None:
             absent = {"lower": -np.inf, "upper": np.inf}
-            of_states = Box(**{k: [absent[k] if v is None else float(v) for v in of_states[k]] for k in absent})
-        return Box(of_inputs["lower"], of_inputs["upper"]), of_states
+            of_states = Bounds(**{k: [absent[k] if v is None else float(v) for v in of_states[k]] for k in absent})
+        return Bounds(of_inputs["lower"], of_inputs["upper"]), of_states
 
     def _data(self, row: Row, trajectory: str, subsystem: str) -> tuple[Transitions | None, list[int]]:
         """Returns the transitions of a row, and those that its GP learns from; None for the true model's controller."""
@@ -336,7 +338,7 @@ class Figures:
             system, controller, reference, reference.states[0], condition.steps,
             noise=noise, on_failure="previous_plan", seed=trial.seed,
         )  # fmt: skip
-        return measure(rollout, condition, controller.problem.state_bounds)
+        return measure(rollout, condition, controller.problem.constraints)
 
     def summary(self, records: Sequence[dict]) -> tuple[list[Table], list[str]]:
         """Returns the tables for a terminal."""
@@ -376,17 +378,17 @@ def from_settings(made: Mapping[str, Any], settings: Mapping[str, Any], flight: 
     )
 
 
-def tracking_problem(row: Row, inputs: Box, states: Box | None) -> TrackingProblem:
+def tracking_problem(row: Row, inputs: Bounds, states: Bounds | None) -> Problem:
     """Returns the tracking problem of a row."""
-    bounds = {"input_lower": inputs.lower, "input_upper": inputs.upper} if row.bounded else {}
-    limits = None
+    box = Box(inputs.lower, inputs.upper) if row.bounded else Box()
+    limits = []
     if states is not None:
-        penalties = {key: row.settings[key] for key in PENALTIES if key in row.settings}
-        limits = StateBounds(states.lower, states.upper, confidence=row.confidence, **penalties)
-    return TrackingProblem(row.Q, row.R, row.penalized, state_bounds=limits, **bounds)
+        price = row.settings.get("penalty")
+        limits = [Box(states.lower, states.upper, probability=row.confidence, penalty=price)]
+    return Problem(Tracking(row.Q, row.R, penalized=row.penalized), box, constraints=limits)
 
 
-def measure(rollout: Rollout, condition: Condition, limits: StateBounds | None) -> dict:
+def measure(rollout: Rollout, condition: Condition, constraints: Sequence[Constraint]) -> dict:
     """Returns the record of a flight."""
     scale, inputs = condition.scaling, condition.inputs
     states, references = (scale.restore(torch.from_numpy(x)).numpy() for x in (rollout.states, rollout.references))
@@ -400,11 +402,11 @@ def measure(rollout: Rollout, condition: Condition, limits: StateBounds | None) 
         "iterations": float(rollout.iterations.mean()),
         "seconds": np.round(rollout.seconds, 7).tolist(),
     }
-    if limits is not None:
+    for limits in constraints:
         after, expected = rollout.states[1:], rollout.predicted_means
         std = np.sqrt(rollout.predicted_covariances.diagonal(axis1=1, axis2=2))
         beyond = np.maximum(limits.lower - after, after - limits.upper).max(axis=1)
-        planned = limits.kappa * std + np.maximum(limits.lower - expected, expected - limits.upper)
+        planned = limits.standard_deviations() * std + np.maximum(limits.lower - expected, expected - limits.upper)
         margin = planned.max(axis=1)  # of the program's own promise; NaN where nothing was solved
         at_bound = np.abs(margin) <= AT_BOUND
         measured["violations"] = [int((beyond > 0).sum()), len(after)]

@@ -26,7 +26,7 @@ from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.metrics import tracking_error
 from gpmpc.mpc.controller import Controller, Decision, Reference
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Problem
 from gpmpc.plotting import png, quality
 from gpmpc.studies.document import MISSING, Document, Table, number
 from gpmpc.studies.flight import Experiment, run_trial
@@ -63,8 +63,12 @@ INCREMENTS, STATES = "increments (paper)", "state form, Clarabel"
 MEAN, ZERO_ORDER = "trajectory, mean only", "trajectory, zero order"
 SPREAD, CONVERGED = "trajectory, diagonal or full", "trajectory, converged"
 NONLINEAR = "nonlinear GP-MPC"
-CONVEX, FULL, DIAGONAL = "controller=convex", "controller.covariance=full", "controller.covariance=diagonal"
-NONE, EXACT, POINTS = "controller.covariance=none", "propagation=moment_matching", "propagation=unscented"
+CONVEX, FULL, DIAGONAL = (
+    "controller=convex",
+    "controller.prediction.covariance=full",
+    "controller.prediction.covariance=diagonal",
+)
+NONE, EXACT, POINTS = "controller.prediction.covariance=none", "propagation=moment_matching", "propagation=unscented"
 MORE = "controller.iterations=100 controller.tolerance=1e-6"
 FIRST_ORDER = "propagation=linearization"
 FAMILIES = (
@@ -283,7 +287,7 @@ class AtPlant(NamedTuple):
 
 
 def stage_cost(
-    weights: TrackingProblem, states: np.ndarray, references: np.ndarray, inputs: np.ndarray, before: Sequence[float]
+    weights: Problem, states: np.ndarray, references: np.ndarray, inputs: np.ndarray, before: Sequence[float]
 ) -> float:
     """Returns the tracking cost on states and increments of a flight per step; see the module's text.
 
@@ -295,7 +299,9 @@ def stage_cost(
         before: u_{-1} (m,).
     """
     errors, increments = states[1:] - references[1:], np.diff(inputs, axis=0, prepend=[before])
-    cost = np.einsum("ki,ij,kj", errors, weights.Q, errors) + np.einsum("ki,ij,kj", increments, weights.R, increments)
+    cost = np.einsum("ki,ij,kj", errors, weights.cost.Q, errors) + np.einsum(
+        "ki,ij,kj", increments, weights.cost.R, increments
+    )
     return float(cost / len(inputs))
 
 

@@ -22,7 +22,7 @@ from gpmpc.dynamics import DynamicsModel, tensors_for, to_array
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Decision, Reference, Request, Timing, check_controller, check_dynamics
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Box, Problem
 from gpmpc.propagation import Propagator, differentiate
 from gpmpc.status import Status
 
@@ -77,25 +77,30 @@ class SLSQP:
         self,
         model: DynamicsModel,
         propagator: Propagator,
-        problem: TrackingProblem,
+        problem: Problem,
         horizon: int,
         initial_input: Sequence[float],
         tolerance: float = 1e-5,
         iterations: int = 300,
     ):
         self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
-        limits, H, m = problem.state_bounds, horizon, problem.input_dim
-        if limits is not None and limits.soft:
-            raise SettingError("problem", "must have hard state bounds or none; got prices")
+        H, m, cost = horizon, problem.input_dim, problem.cost
+        boxes = [box for box in problem.constraints if isinstance(box, Box) and box.penalty is None and not box.joint]
+        if len(boxes) < len(problem.constraints) or any(box.lower.ndim > 1 or box.stages for box in boxes):
+            raise SettingError("problem", "must have hard boxes (penalty=None) at all stages, or no constraints")
         self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
         self.tolerance, self.iterations = tolerance, iterations
         self._differences = np.kron(np.eye(H) - np.eye(H, k=-1), np.eye(m))  # U -> u_i - u_{i-1}, without u_{-1}
-        self._penalized = self._differences if problem.penalized == "increments" else np.eye(H * m)
-        self._R, self._weights = np.kron(np.eye(H), problem.R), np.array([problem.Q] * (H - 1) + [problem.terminal])
-        sides = [] if limits is None else [(limits.lower, -1.0), (limits.upper, 1.0)]
-        entries = [(j, sign, bound[j]) for bound, sign in sides for j in np.flatnonzero(np.isfinite(bound))]
-        state, self._sign, self._bound = np.array(entries, dtype=float).reshape(-1, 3).T
-        self._state, self._kappa = state.astype(int), 0.0 if limits is None else limits.kappa
+        self._penalized = self._differences if cost.penalized == "increments" else np.eye(H * m)
+        self._R, self._weights = np.kron(np.eye(H), cost.R), np.array([cost.Q] * (H - 1) + [cost.terminal])
+        sides = [(side, sign, box) for box in boxes for side, sign in ((box.lower, -1.0), (box.upper, 1.0))]
+        entries = [
+            (j, sign, bound[j], box.standard_deviations())
+            for bound, sign, box in sides
+            for j in np.flatnonzero(np.isfinite(bound))
+        ]
+        state, self._sign, self._bound, self._kappa = np.array(entries, dtype=float).reshape(-1, 4).T
+        self._state = state.astype(int)
 
     def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
         """Solves the problem from a belief along a reference; see ``Controller.control``."""
@@ -126,7 +131,7 @@ class SLSQP:
             "deviations": request.references.inputs.ravel(),
             "increments": self._first(request.references.previous_input),
         }
-        v = self._penalized @ plan - offset[self.problem.penalized]
+        v = self._penalized @ plan - offset[self.problem.cost.penalized]
         cost = (errors * weighted).sum() + (self._weights * covariances[1:]).sum() + v @ self._R @ v
         sd = np.sqrt(covariances[1:].diagonal(axis1=-2, axis2=-1)[:, self._state].clip(0))  # (H, r)
         slope = np.divide(self._kappa / 2, sd, out=np.zeros_like(sd), where=sd > 0)
@@ -148,7 +153,7 @@ class SLSQP:
 
     def _minimize(self, request: Request) -> tuple[Evaluation, Status, int]:
         """Rounds of SLSQP, each in inputs scaled by the Gauss-Newton Hessian, from the better of two plans."""
-        lower, upper = (np.tile(side, self.horizon) for side in (self.problem.input_lower, self.problem.input_upper))
+        lower, upper = (np.tile(side, self.horizon) for side in (self.problem.inputs.lower, self.problem.inputs.upper))
         starts = [plan.ravel().clip(lower, upper) for plan in (request.constant_guess, request.initial_guess)]
         found, used = min((self.evaluate(plan, request) for plan in starts), key=_rank), 0
         for _ in range(ROUNDS):
@@ -167,7 +172,8 @@ class SLSQP:
 
     def _keeps_rates(self, plan: Array, request: Request) -> bool:
         rates = (self._differences @ plan - self._first(request.references.previous_input)).reshape(self.horizon, -1)
-        return bool((np.maximum(rates - self.problem.rate_upper, self.problem.rate_lower - rates) <= FEASIBLE).all())
+        bounds = self.problem.input_rates
+        return bool((np.maximum(rates - bounds.upper, bounds.lower - rates) <= FEASIBLE).all())
 
     def _round(
         self, start: Evaluation, T: Array, scale: float, lower: Array, upper: Array, request: Request, limit: int
@@ -182,11 +188,11 @@ class SLSQP:
             return memory[0]
 
         rows, low, high = [np.eye(len(T))], [lower], [upper]
-        if self.problem.rate_limited:
+        if self.problem.input_rates.finite:
             first, H = self._first(request.references.previous_input), self.horizon
             rows.append(self._differences)
-            low.append(np.tile(self.problem.rate_lower, H) + first)
-            high.append(np.tile(self.problem.rate_upper, H) + first)
+            low.append(np.tile(self.problem.input_rates.lower, H) + first)
+            high.append(np.tile(self.problem.input_rates.upper, H) + first)
         C, low, high = (np.concatenate(parts) for parts in (rows, low, high))
         C, low, high = C @ T, low - C @ start.plan, high - C @ start.plan
         C, b = np.concatenate([C, -C]), np.concatenate([low, -high])

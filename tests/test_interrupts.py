@@ -10,9 +10,9 @@ import torch
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.interrupts import interrupts_after
+from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.systems import System, Translational
 
 
@@ -61,7 +61,7 @@ def test_an_error_inside_is_that_error():
 
 def test_ipopt_ends_a_solve_that_an_interrupt_meets_and_nmpc_passes_it_on():
     plant = System(Translational(), time_step=1.0, substeps=1)
-    controller = NMPC(plant, TrackingProblem([1.0] * 6, [1.0] * 3), 5, [7.26, 0.0, 0.0])
+    controller = NMPC(plant, Problem(Tracking([1.0] * 6, [1.0] * 3, penalized="inputs")), 5, [7.26, 0.0, 0.0])
     solver, statuses = controller._solver, []
 
     class Met:

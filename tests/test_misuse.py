@@ -14,7 +14,7 @@ from gpmpc.gp import GPPosterior, Trainer, Transitions, append_points, train
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching, rollout
 from gpmpc.qp import DualActiveSet
@@ -63,7 +63,7 @@ def controller(kind=GPMPC, **changed):
     given = {
         "model": posterior(),
         "propagator": Linearization(),
-        "problem": TrackingProblem(Q=[1.0, 1.0], R=[1.0]),
+        "problem": Problem(Tracking([1.0, 1.0], [1.0], penalized="inputs")),
         "horizon": 3,
         "initial_input": [0.0],
     }
@@ -145,12 +145,18 @@ def test_models_and_data_say_what_they_are_in_one_line():
         (lambda: train(data(), seed=1.5), "seed: must be a whole number, 0 or more; got 1.5"),
         (lambda: train((1, 2)), r"transitions: must be Transitions\(...\); got tuple"),
         (lambda: Transitions.from_csv("any.csv", "angle", []), "states: must be a list of column names; got .*'angle'"),
-        (lambda: TrackingProblem([1.0], [1.0], input_lower=[np.inf]), "input_lower: no number keeps it"),
-        (lambda: TrackingProblem([1.0], [1.0], state_bounds=(-1, 1)), r"must be StateBounds\(...\); got tuple"),
-        (lambda: StateBounds(None, [1.0]), "lower: must be a list of n numbers, infinite where unbounded; got None"),
-        (lambda: StateBounds([0.0], 1), "upper: must be a list of n numbers, infinite where unbounded; got 1"),
+        (
+            lambda: Problem(Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([np.inf])),
+            "lower: no number keeps it",
+        ),
+        (
+            lambda: Problem(Tracking([1.0], [1.0], penalized="inputs"), constraints=[(-1, 1)]),
+            r"must be Box\(...\) or Halfspaces\(...\); got tuple",
+        ),
+        (lambda: Box([0.0], 1), "upper: must be a list of numbers, infinite where unbounded; got 1"),
+        (lambda: Box([0.0, 0.0], [1.0]), "upper: must be a list of 2 numbers"),
         (lambda: controller(model="gp.npz"), "model: must be a DynamicsModel, such as GPPosterior; got str"),
-        (lambda: controller(problem={"Q": [1]}), r"problem: must be TrackingProblem\(...\); got dict"),
+        (lambda: controller(problem={"Q": [1]}), r"problem: must be Problem\(...\); got dict"),
         (
             lambda: controller(propagator=Linearization),
             "propagator: .*such as Linearization.*got the class Linearization",

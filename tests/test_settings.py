@@ -5,12 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from gpmpc.datasets import Excitation, Tracking
+from gpmpc import datasets
+from gpmpc.datasets import Excitation
 from gpmpc.exceptions import SettingError
+from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Dropout, Gust
 from gpmpc.systems import Coupled, Map, Rotational, System, Translational
@@ -18,7 +20,7 @@ from gpmpc.trajectories import Elliptical, Step, Waypoints
 from tests.mpc.small_models import double_integrator
 
 PLANT = System(Rotational(), 0.05, 1)
-PROBLEM = TrackingProblem([1.0] * 6, [1.0] * 3)
+PROBLEM = Problem(Tracking([1.0] * 6, [1.0] * 3, penalized="inputs"))
 
 
 def nmpc(**settings):
@@ -26,13 +28,13 @@ def nmpc(**settings):
 
 
 def convex(**settings):
-    problem = TrackingProblem([1.0, 1.0], [1.0])
+    problem = Problem(Tracking([1.0, 1.0], [1.0], penalized="inputs"))
     given = {"propagator": Linearization(), "problem": problem, "horizon": 2, "initial_input": [0.0]}
     return GPMPC(double_integrator(), **(given | settings))
 
 
 def flown(**settings):
-    return Tracking(**({"plant": PLANT, "Q": [1] * 6, "R": [1] * 3, "initial_input": [0] * 3} | settings))
+    return datasets.Tracking(**({"plant": PLANT, "Q": [1] * 6, "R": [1] * 3, "initial_input": [0] * 3} | settings))
 
 
 def excited(**settings):
@@ -44,7 +46,7 @@ CASES = [
     (nmpc, "tolerance", (0.0, -1e-6, math.nan)),
     (convex, "iterations", (0, 1.5, -1)),
     (convex, "tolerance", (0.0, math.inf, "small")),
-    (convex, "disturbance_gain", (-0.1, math.nan)),
+    (PredictionSettings, "disturbance_gain", (-0.1, math.nan)),
     (convex, "horizon", (0, 2.5)),
     (convex, "solver", ("daqp", int)),
     (convex, "propagator", (None, "linear", Linearization)),

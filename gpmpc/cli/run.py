@@ -92,7 +92,7 @@ def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, abou
     with ExitStack() as stack:
 
         def prepare(controller: Any, training: Any) -> Callable:
-            recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller.problem, training))
+            recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller, training))
             callback = partial(recorder.record, gp_size=0 if training is None else len(training.posterior))
             return _in_real_time(callback, experiment.system.time_step) if config.live else callback
 
@@ -112,7 +112,7 @@ def _in_real_time(callback: Callable, time_step: float) -> Callable:
 
 
 def _recorder(
-    experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict, problem: Any, training: Any
+    experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict, controller: Any, training: Any
 ) -> Any:
     from gpmpc.recording import McapRecorder, RecordedSystem
     from gpmpc.studies.run_folder import RECORDING
@@ -123,7 +123,7 @@ def _recorder(
         flown.input_names,
         time_step=flown.time_step,
         units=flown.units,
-        input_bounds=[problem.input_lower, problem.input_upper],
+        input_bounds=[side[0] for side in controller.problem.inputs.by_stage(controller.horizon)],
         z_down=flown.z_down,
     )
     metadata = {
@@ -180,9 +180,10 @@ def experiment_of(config: DictConfig) -> "Experiment":
         weights = config.controller.get("problem")
         if not weights:
             raise SettingError("controller.problem", f"has no weights; give them in the settings of {system.name}")
-        for side in ("input_lower", "input_upper"):
-            if weights.get(side) is None:
-                weights[side] = list(getattr(system, side))
+        box = weights.setdefault("inputs", {"_target_": "gpmpc.mpc.problem.Box"})
+        for side in ("lower", "upper"):
+            if box.get(side) is None:
+                box[side] = list(getattr(system, f"input_{side}"))
     ((name, trajectory),) = config.trajectory.items()
     parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "controller", "disturbances")}
     other = {key: value for key, value in (config.plant or {}).items() if value != config.system.get(key)}

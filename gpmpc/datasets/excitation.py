@@ -23,8 +23,8 @@ import numpy as np
 from gpmpc.datasets.flights import SUBSYSTEMS, check_quadrotor, transitions_of
 from gpmpc.exceptions import SettingError, check_number, check_numbers
 from gpmpc.gp.transitions import Transitions
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.baselines import NMPC
+from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.simulation import Noise, Rollout, closed_loop
 from gpmpc.systems import ATTITUDES, System, attitude_for_thrust_direction, translational
 from gpmpc.systems.attitudes import approached
@@ -61,7 +61,7 @@ class Excitation:
 
     def fly(self, system: System, references: np.ndarray, steps: int, seed: int) -> Rollout:
         """From the first of the references (steps + horizon, n) on."""
-        problem = TrackingProblem(self.Q, self.R, penalized="increments")
+        problem = Problem(Tracking(self.Q, self.R))
         controller = NMPC(system, problem, self.horizon, self.initial_input)
         noise = Noise(process=self.noise, input=self.dither)
         return closed_loop(

@@ -16,8 +16,8 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, check_number, check_numbers
 from gpmpc.gp import Transitions
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc import problem as mpc
+from gpmpc.mpc.baselines import NMPC
 from gpmpc.simulation import Rollout, closed_loop
 from gpmpc.systems import ATTITUDES, Plant, System, attitude_for_thrust_direction
 from gpmpc.trajectories import Trajectory
@@ -85,7 +85,9 @@ class Tracking:
 
     def fly(self, references: np.ndarray, horizon: int, steps: int) -> Rollout:
         """Unconstrained NMPC from rest along references (steps + horizon, n)."""
-        controller = NMPC(self.plant, TrackingProblem(self.Q, self.R), horizon, self.initial_input)
+        controller = NMPC(
+            self.plant, mpc.Problem(mpc.Tracking(self.Q, self.R, penalized="inputs")), horizon, self.initial_input
+        )
         return closed_loop(self.plant, controller, references, np.zeros(len(self.Q)), steps)
 
 

@@ -41,7 +41,7 @@ from gpmpc.mpc.linear_quadratic import (
     expand,
     optimal_feedback,
 )
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Problem
 
 Array = np.ndarray
 
@@ -90,14 +90,11 @@ class Condenser:
         terminal: W_H (p / n, n, n).
     """
 
-    def __init__(self, problem: TrackingProblem, horizon: int, weight: Array, terminal: Array):
-        rated = horizon if problem.rate_limited else 0
+    def __init__(self, problem: Problem, horizon: int, weight: Array, terminal: Array):
+        rated = horizon if problem.input_rates.finite else 0
         self.cost = TrackingCost.of(problem, weight, terminal)
         self.bounds = InputBounds(
-            np.tile(problem.input_lower, (horizon, 1)),
-            np.tile(problem.input_upper, (horizon, 1)),
-            np.tile(problem.rate_lower, (rated, 1)),
-            np.tile(problem.rate_upper, (rated, 1)),
+            *problem.inputs.by_stage(horizon), *[side[:rated] for side in problem.input_rates.by_stage(horizon)]
         )
         compile_for(_condense, _SIGNATURE)  # pyright: ignore[reportArgumentType]
         self._condense = unchecked_entry_point(_condense)

@@ -14,7 +14,7 @@ from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.linear_quadratic import References
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Problem
 from gpmpc.qp import QPSolution, QuadraticProgram
 from gpmpc.status import Status
 
@@ -150,7 +150,7 @@ class Request(NamedTuple):
     @classmethod
     def read(
         cls,
-        problem: TrackingProblem,
+        problem: Problem,
         horizon: int,
         initial_input: Array,
         belief: Gaussian,
@@ -190,7 +190,7 @@ class Request(NamedTuple):
         if previous is not None and previous.applicable and np.shape(previous.inputs) == (horizon, m):
             plan = _array(previous.inputs)
         last, guess = _array(last), np.empty((horizon, m))
-        bounds = problem.input_lower, problem.input_upper
+        bounds = problem.inputs.lower, problem.inputs.upper
         found = _run(state, covariance, states, inputs, last, plan, *bounds, guess)
         if found & _PREVIOUS:
             last = _array(initial_input)
@@ -241,7 +241,7 @@ def check_method(key: str, value: object, method: str, example: str) -> None:
         raise SettingError(key, f"must be an object with the method {method!r}, such as {example}; got {got}")
 
 
-def check_controller(problem: TrackingProblem, states: int, inputs: int, horizon: int, initial_input: Any) -> Array:
+def check_controller(problem: Problem, states: int, inputs: int, horizon: int, initial_input: Any) -> Array:
     """Checks the settings that every controller has against its model, and returns the initial input as an array (m,).
 
     Raises:
@@ -251,8 +251,8 @@ def check_controller(problem: TrackingProblem, states: int, inputs: int, horizon
     global _run
     compile_for(_check, _SIGNATURE)
     _run = unchecked_entry_point(_check)
-    if not isinstance(problem, TrackingProblem):
-        raise SettingError("problem", f"must be TrackingProblem(...); got {type(problem).__name__}")
+    if not isinstance(problem, Problem):
+        raise SettingError("problem", f"must be Problem(...); got {type(problem).__name__}")
     check_number("horizon", horizon, least=1, whole=True)
     check_numbers("initial_input", initial_input, inputs)
     if (problem.state_dim, problem.input_dim) != (states, inputs):

@@ -24,18 +24,19 @@ from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.condense import CondensedProgram, Condenser
-from gpmpc.mpc.constraints import price_violations
 from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_method
 from gpmpc.mpc.linear_quadratic import Stages, expand
-from gpmpc.mpc.prediction import Form, Prediction, PredictionModel
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.prediction import Prediction, PredictionModel, PredictionSettings
+from gpmpc.mpc.problem import Problem
 from gpmpc.mpc.sqp import FAILURES, FullStep, Globalization
-from gpmpc.mpc.stages import Covariance, Plan
+from gpmpc.mpc.stages import Covariance, Plan, price_violations
 from gpmpc.propagation import Propagator
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
 from gpmpc.status import Status
 
 Array = np.ndarray
+
+_DEFAULT = PredictionSettings()
 
 
 class GPMPC:
@@ -47,16 +48,11 @@ class GPMPC:
         problem: Weights and bounds.
         horizon: H, the number of predicted states.
         initial_input: The input before the first step, and the first guess of every planned one (m,).
-        form: ``"trajectory"`` or ``"velocity"``; see ``gpmpc.mpc.prediction``.
-        covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see ``gpmpc.mpc.stages``.
-        solver: Of the quadratic program; ``DualActiveSet()`` by default, which state bounds with a price need.
-        iterations: Quadratic programs a step at most; more than one for ``"trajectory"`` only.
+        prediction: Form, covariance mode, feedback and disturbance estimate.
+        solver: Of the quadratic program; ``DualActiveSet()`` by default, which soft constraints need.
+        iterations: Quadratic programs a step at most; more than one for the form ``"trajectory"`` only.
         tolerance: Of more iterations: relative offset and defects of a plan that counts as solved (``gpmpc.mpc.sqp``),
             estimated from the slower of the last two rates of convergence. 1e-8 may be out of reach.
-        feedback: Predicts the covariances of ``"zero_order"`` under a feedback, without which no long horizon with
-            state bounds is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"`` and
-            ``"diagonal"`` are those without feedback.
-        disturbance_gain: L in [0, 1], the observer gain of the constant-disturbance estimate; 0 disables it.
 
     Attributes:
         soft: Prices of the rows of the program's G, None where all are hard.
@@ -69,34 +65,33 @@ class GPMPC:
         self,
         model: DynamicsModel,
         propagator: Propagator,
-        problem: TrackingProblem,
+        problem: Problem,
         horizon: int,
         initial_input: Sequence[float],
-        form: Form = "trajectory",
-        covariance: Covariance = "zero_order",
+        prediction: PredictionSettings = _DEFAULT,
         solver: QPSolver | None = None,
         iterations: int = 1,
         tolerance: float = 1e-6,
-        feedback: bool = True,
-        disturbance_gain: float = 0.0,
     ):
-        settings = form, covariance, feedback, disturbance_gain
-        self.prediction = PredictionModel(model, propagator, problem, horizon, initial_input, *settings)
+        self.prediction = PredictionModel(model, propagator, problem, horizon, initial_input, prediction)
         check_number("iterations", iterations, least=1, whole=True)
         check_number("tolerance", tolerance, above=0)
-        if iterations > 1 and form != "trajectory":
-            raise SettingError("iterations", f"form {form!r} is one quadratic program, so 1; got {iterations}")
+        if iterations > 1 and prediction.form != "trajectory":
+            raise SettingError(
+                "iterations", f"form {prediction.form!r} is one quadratic program, so 1; got {iterations}"
+            )
         self.initial_input, self.problem, self.horizon = self.prediction.initial_input, problem, horizon
         self.iterations, self.tolerance = iterations, tolerance
         self.solver = DualActiveSet() if solver is None else solver
         check_method("solver", self.solver, "solve", "DualActiveSet()")
         weight = self.prediction.linearizer.weight
-        self._condenser = Condenser(problem, horizon, weight(problem.Q), weight(problem.terminal))
+        self._condenser = Condenser(problem, horizon, weight(problem.cost.Q), weight(problem.cost.terminal))
         self._rates = self._condenser.bounds.rate_lower.size
         self.soft = self.prediction.constraints.softness(self._rates)
         if self.soft is not None and not isinstance(self.solver, DualActiveSet):
             raise SettingError(
-                "solver", f"state bounds with a price (l1, l2) need DualActiveSet; got {type(self.solver).__name__}"
+                "solver",
+                f"soft constraints need DualActiveSet (penalty=None makes them hard); got {type(self.solver).__name__}",
             )
 
     def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
@@ -151,7 +146,7 @@ class GPMPC:
         suboptimal = not status.solved and prediction.plan is not guess and self._missed(prediction) <= FEASIBLE
         if not (status.solved or suboptimal):
             return replace(request.failed_decision(status, count, clock.timing), problem=program, solution=solution)
-        plan, disturbance = prediction.plan, request.disturbance if self.prediction.disturbance_gain else None
+        plan, disturbance = prediction.plan, request.disturbance if self.prediction.settings.disturbance_gain else None
         inputs, beliefs = plan.inputs.copy(), self.prediction.linearizer.moments(plan.states, prediction.covariances)
         found = program, solution, disturbance, suboptimal
         return Decision(inputs[0], inputs, *beliefs, status, count, clock.timing, *found)
@@ -199,7 +194,7 @@ class GPMPC:
         if features is None or getattr(linearizer.propagator, "hessian", False):
             return None
         (N, d), n, size = features.shape, model.state_dim, self.horizon * self.problem.input_dim
-        p = len(linearizer.weight(self.problem.Q)) * n
+        p = len(linearizer.weight(self.problem.cost.Q)) * n
         each = 8 * n * N * (d + 1) + 4 * p * (p + d)
         if not linearizer.at_points:
             each += 8 * N * N + 12 * n * n * (N * (n + 1) + n * n + d)
@@ -247,10 +242,9 @@ class GPMPC:
         return Plan(states, inputs, prediction.covariances)
 
     def _missed(self, prediction: Prediction) -> float:
-        """Violations of hard state bounds by a plan, summed."""
-        if self.soft is not None:
-            return 0.0
-        return price_violations(self.prediction.constraints.prices, prediction.rows, prediction.plan.states, 1.0)
+        """Violations of hard constraints by a plan, summed."""
+        prices = np.where(np.isinf(self.prediction.constraints.prices), np.inf, 0.0)
+        return price_violations(prices, prediction.rows, prediction.plan.states, 1.0)
 
 
 class NonlinearGPMPC(GPMPC):
@@ -271,15 +265,16 @@ class NonlinearGPMPC(GPMPC):
         self,
         model: DynamicsModel,
         propagator: Propagator,
-        problem: TrackingProblem,
+        problem: Problem,
         horizon: int,
         initial_input: Sequence[float],
         covariance: Covariance = "full",
         iterations: int = 100,
         tolerance: float = 1e-5,
     ):
-        settings = {"covariance": covariance, "iterations": iterations, "tolerance": tolerance}
-        super().__init__(model, propagator, problem, horizon, initial_input, **settings)
+        settings = PredictionSettings(covariance=covariance)
+        start = problem, horizon, initial_input
+        super().__init__(model, propagator, *start, settings, iterations=iterations, tolerance=tolerance)
 
 
 def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> bool:

@@ -9,14 +9,14 @@ For x_{k+1} = A_k x_k + B_k u_k and the cost sum_{k=0..H-1} |x_k|^2_Q + |u_k|^2_
 R is positive definite, so that every step exists whatever A and B are.
 """
 
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 
 from gpmpc.compiled import compiled, njit_noalloc
 from gpmpc.exceptions import SettingError
 from gpmpc.kernels.linalg import add_transposed_product, copy, copy_matrix, dot, product, solve_positive
-from gpmpc.mpc.problem import Penalized, TrackingProblem
+from gpmpc.mpc.problem import PENALIZED, Problem
 
 Array = np.ndarray
 
@@ -44,10 +44,10 @@ class TrackingCost(NamedTuple):
     penalized: int  # what R weighs: INPUTS, DEVIATIONS or INCREMENTS
 
     @classmethod
-    def of(cls, problem: TrackingProblem, weight: Array, terminal: Array) -> "TrackingCost":
+    def of(cls, problem: Problem, weight: Array, terminal: Array) -> "TrackingCost":
         """The cost of a problem whose Q and terminal weight are W of s (p / n, n, n)."""
-        W, T, R = (np.ascontiguousarray(part) for part in (weight, terminal, problem.R))
-        return cls(W, T, R, get_args(Penalized).index(problem.penalized))
+        W, T, R = (np.ascontiguousarray(part) for part in (weight, terminal, problem.cost.R))
+        return cls(W, T, R, PENALIZED.index(problem.cost.penalized))
 
 
 class References(NamedTuple):

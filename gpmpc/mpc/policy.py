@@ -16,7 +16,7 @@ import torch
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Controller, Decision, Reference, Timing
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Problem
 from gpmpc.status import Status
 
 OnFailure = Literal["previous_plan", "hold", "raise"]
@@ -162,7 +162,7 @@ def _conclude(
 def _has_right_shape(controller: Controller, decision: Decision, last: Command | None) -> bool:
     """Whether the inputs of a decision have the shapes (m,) and (H, m)."""
     problem = getattr(controller, "problem", None)
-    known = isinstance(problem, TrackingProblem)
+    known = isinstance(problem, Problem)
     m = problem.input_dim if known else (decision if last is None else last).input.size
     return decision.input.shape == (m,) == np.shape(decision.inputs)[1:] and len(decision.inputs) > 0
 
@@ -179,12 +179,12 @@ def _admit(controller: Controller, plan: Decision, last: Command | None) -> Deci
 def _within_bounds(controller: Controller, input: np.ndarray, last: Command | None) -> np.ndarray:
     """The nearest input in the box of the controller's problem, where it has one, and among these within its rates."""
     problem = getattr(controller, "problem", None)
-    if not isinstance(problem, TrackingProblem):
+    if not isinstance(problem, Problem):
         return input
     before = getattr(controller, "initial_input", None) if last is None else last.input
     if before is not None:
-        input = np.minimum(np.maximum(input, before + problem.rate_lower), before + problem.rate_upper)
-    return np.minimum(np.maximum(input, problem.input_lower), problem.input_upper)
+        input = np.minimum(np.maximum(input, before + problem.input_rates.lower), before + problem.input_rates.upper)
+    return np.minimum(np.maximum(input, problem.inputs.lower), problem.inputs.upper)
 
 
 def _with_first_input(plan: Decision, inputs: np.ndarray, first: np.ndarray) -> Decision:

@@ -25,6 +25,7 @@ finite-horizon LQR at the first stage. It is part of the covariances only: the b
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -35,11 +36,10 @@ from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.linalg import copy_matrix, product
 from gpmpc.mpc.condense import StateRows
-from gpmpc.mpc.constraints import ChanceConstraints
 from gpmpc.mpc.controller import Decision, Reference, Request, check_controller, check_dynamics, check_method
 from gpmpc.mpc.linear_quadratic import finite_horizon_lqr
-from gpmpc.mpc.problem import TrackingProblem
-from gpmpc.mpc.stages import Covariance, LinearizedStages, Plan, StageLinearizer
+from gpmpc.mpc.problem import Problem
+from gpmpc.mpc.stages import COVARIANCES, ConstraintRows, Covariance, LinearizedStages, Plan, StageLinearizer
 from gpmpc.propagation import Linearization, Propagator
 
 Array = np.ndarray
@@ -64,51 +64,73 @@ class Prediction(NamedTuple):
     rows: StateRows
 
 
+@dataclass(frozen=True)
+class PredictionSettings:
+    """How beliefs are predicted.
+
+    Attributes:
+        form: ``"trajectory"`` or ``"velocity"``; see the module's text.
+        covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see ``gpmpc.mpc.stages``.
+        feedback: Predicts the covariances of ``"zero_order"`` under a feedback, without which no long horizon with
+            state constraints is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"``
+            and ``"diagonal"`` are those without feedback.
+        disturbance_gain: L in [0, 1], the observer gain of the constant-disturbance estimate; 0 disables it.
+
+    Raises:
+        SettingError: An unknown form or covariance mode, a gain out of range, or one with ``"velocity"``.
+    """
+
+    form: Form = "trajectory"
+    covariance: Covariance = "zero_order"
+    feedback: bool = True
+    disturbance_gain: float = 0.0
+
+    def __post_init__(self) -> None:
+        for key, possible in (("form", FORMS), ("covariance", COVARIANCES)):
+            if getattr(self, key) not in possible:
+                names = ", ".join(map(repr, possible))
+                raise SettingError(key, f"must be one of {names}; got {getattr(self, key)!r}")
+        if not isinstance(self.feedback, bool):
+            raise SettingError("feedback", f"must be true or false; got {self.feedback!r}")
+        check_number("disturbance_gain", self.disturbance_gain, least=0)
+        if self.disturbance_gain > (self.form != "velocity"):
+            velocity = self.form == "velocity"
+            rule = "be 0 for form 'velocity', which needs none" if velocity else "lie between 0 and 1"
+            raise SettingError("disturbance_gain", f"must {rule}; got {self.disturbance_gain}")
+
+
 class PredictionModel:
-    """Predicts beliefs for one tracking problem.
+    """Predicts beliefs for one problem.
 
     Args:
         model: What was learned.
         propagator: How the belief moves.
-        problem: Weights of the feedback, and bounds.
+        problem: Weights of the feedback, and constraints.
         horizon: H.
         initial_input: The input before the first step (m,).
-        form: See the module's text.
-        covariance: See ``gpmpc.mpc.stages``.
-        feedback: Whether covariances of ``zero_order`` are predicted under a feedback.
-        disturbance_gain: L, from 0 (no disturbance is estimated) to 1 (it is what the last step showed).
+        settings: Form, covariance mode, feedback and disturbance estimate.
 
     Raises:
-        SettingError: An unknown form or covariance mode, no propagator, a gain out of range, or one with ``velocity``.
+        SettingError: No propagator, or settings that do not belong to the model.
     """
 
     def __init__(
         self,
         model: DynamicsModel,
         propagator: Propagator,
-        problem: TrackingProblem,
+        problem: Problem,
         horizon: int,
         initial_input: Sequence[float] | Array,
-        form: Form,
-        covariance: Covariance,
-        feedback: bool,
-        disturbance_gain: float,
+        settings: PredictionSettings,
     ):
         self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
-        if form not in FORMS:
-            raise SettingError("form", f"must be one of {', '.join(map(repr, FORMS))}; got {form!r}")
-        if not isinstance(feedback, bool):
-            raise SettingError("feedback", f"must be true or false; got {feedback!r}")
         check_method("propagator", propagator, "propagate", "Linearization()")
-        check_number("disturbance_gain", disturbance_gain, least=0)
-        if disturbance_gain > (form != "velocity"):
-            rule = "be 0 for form 'velocity', which needs none" if form == "velocity" else "lie between 0 and 1"
-            raise SettingError("disturbance_gain", f"must {rule}; got {disturbance_gain}")
+        if not isinstance(settings, PredictionSettings):
+            raise SettingError("prediction", f"must be PredictionSettings(...); got {type(settings).__name__}")
         self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
-        self.form, self.feedback, self.disturbance_gain = form, feedback, disturbance_gain
-        self.points = horizon if form == "trajectory" else 1
-        self.linearizer = StageLinearizer(model, propagator, covariance)
-        self.constraints = ChanceConstraints(problem.state_bounds, problem.state_dim, horizon, covariance)
+        self.settings, self.points = settings, horizon if settings.form == "trajectory" else 1
+        self.linearizer = StageLinearizer(model, propagator, settings.covariance)
+        self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
 
     def read(self, belief: Gaussian, reference: Reference, previous: Decision | None) -> Request:
@@ -119,9 +141,9 @@ class PredictionModel:
         """
         problem, H = self.problem, self.horizon
         request = Request.read(problem, H, self.initial_input, belief, reference, previous)
-        if reference.inputs is None and problem.penalized == "deviations":
+        if reference.inputs is None and problem.cost.penalized == "deviations":
             raise ShapeError(f"penalized 'deviations' needs reference inputs ({H}, {problem.input_dim}); got none")
-        if self.disturbance_gain and request.finite:
+        if self.settings.disturbance_gain and request.finite:
             return request._replace(disturbance=self._disturbance(request, previous))
         return request
 
@@ -137,7 +159,7 @@ class PredictionModel:
         means[0] = request.state
         if self.linearizer.covariance != "none":
             covariances[0] = request.covariance
-        if self.form == "velocity":
+        if self.settings.form == "velocity":
             means[1:], covariances[1:] = request.state, covariances[0]
             return Plan(self.linearizer.state(means, covariances), request.constant_guess, covariances)
         inputs, last = request.initial_guess, None
@@ -148,11 +170,11 @@ class PredictionModel:
         else:
             states, shares = request.references.states, np.linspace(1.0, 0.0, H + 1)[1:, None]
             means[1:] = states + shares * (request.state - states[0])
-            if problem.penalized == "deviations":
-                inputs = request.references.inputs.clip(problem.input_lower, problem.input_upper)
-        if problem.rate_limited:
+            if problem.cost.penalized == "deviations":
+                inputs = request.references.inputs.clip(problem.inputs.lower, problem.inputs.upper)
+        if problem.input_rates.finite:
             inputs = inputs.copy()
-            _keep_rates(inputs, request.references.previous_input, problem.rate_lower, problem.rate_upper)
+            _keep_rates(inputs, request.references.previous_input, problem.input_rates.lower, problem.input_rates.upper)
         if not self.linearizer.at_points:
             covariances[1:] = self._first_covariances(means, inputs, request) if last is None else last.covariances[1:]
         return Plan(self.linearizer.state(means, covariances), inputs, covariances)
@@ -197,10 +219,10 @@ class PredictionModel:
         if mode == "zero_order":
             covariances, K = np.empty_like(covariances), self.gain(stages)
             call_unchecked(_predict_covariances, *stages[:2], stages.V, request.covariance, K, covariances)
-        elif self.form == "velocity" and mode != "none":
+        elif self.settings.form == "velocity" and mode != "none":
             covariances = np.repeat(self.linearizer.moments(stages.next, covariances)[1], self.horizon + 1, axis=0)
             covariances[0] = request.covariance
-        if self.form == "velocity" and previous is not None and previous.applicable:
+        if self.settings.form == "velocity" and previous is not None and previous.applicable:
             stages = self._increments(plan, stages, request, previous)
         return Prediction(plan, stages, covariances, self.constraints.at(covariances, self.points))
 
@@ -231,8 +253,8 @@ class PredictionModel:
         last, disturbance = request.references.previous_input, request.disturbance if len(request.disturbance) else None
         for k in range(self.horizon):
             input = towards.inputs[k] + gains[k] @ (states[k, :n] - towards.states[k, :n])
-            input = np.clip(input, last + problem.rate_lower, last + problem.rate_upper)
-            last = inputs[k] = np.clip(input, problem.input_lower, problem.input_upper)
+            input = np.clip(input, last + problem.input_rates.lower, last + problem.input_rates.upper)
+            last = inputs[k] = np.clip(input, problem.inputs.lower, problem.inputs.upper)
             stage = self.linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance)
             states[k + 1] = stage.next[0]
             covariances[k + 1] = self.linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
@@ -243,11 +265,11 @@ class PredictionModel:
     def gain(self, stages: LinearizedStages) -> Array:
         """K (m, n) of the feedback u = u_k - K (x - mu_k); zero without feedback."""
         problem, n = self.problem, self.problem.state_dim
-        if not self.feedback:
+        if not self.settings.feedback:
             return np.zeros((problem.input_dim, n))
         A, B = np.ascontiguousarray(stages.A[:1, :n, :n]), np.ascontiguousarray(stages.B[:1, :n])
-        weights = problem.Q, problem.R, problem.terminal
-        return call_unchecked(finite_horizon_lqr, A, B, *weights, self.horizon)[0][0]
+        cost = problem.cost
+        return call_unchecked(finite_horizon_lqr, A, B, cost.Q, cost.R, cost.terminal, self.horizon)[0][0]
 
     def _first_covariances(self, means: Array, inputs: Array, request: Request) -> Array:
         """Sigma_1 .. Sigma_H (H, n, n) along a first guess, linearised at its points."""
@@ -264,7 +286,7 @@ class PredictionModel:
         before = np.zeros_like(request.state) if previous.disturbance is None else previous.disturbance
         applied = request.references.previous_input[None]
         predicted = linearize(self.model, previous.means[:1], applied, covariance=False).mean[0]
-        return before + self.disturbance_gain * (request.state - predicted - before)
+        return before + self.settings.disturbance_gain * (request.state - predicted - before)
 
 
 @compiled

@@ -1,16 +1,20 @@
-"""The tracking problem of all controllers: weights and bounds.
+"""Declares what a controller makes small and what it keeps: one problem for all controllers.
 
     minimise    sum_{i=1..H} E|x_i - r_i|^2_Q + sum_{i=0..H-1} |v_i|^2_R       (the last state's weight may be another)
-    subject to  input_lower <= u_i <= input_upper,   rate_lower <= u_i - u_{i-1} <= rate_upper,
-                P(x_ij >= lower_j) >= eta,  P(x_ij <= upper_j) >= eta          for every bounded state j
+    subject to  bounds on u_i and on u_i - u_{i-1}, and the constraints of the states x_1 .. x_H
 
 where v is the input itself, its deviation from the reference input, or its increment (Cao, Lai and Alam, 2017,
-sections 3.2-3.3). For a Gaussian x_i, E|x - r|^2_Q = |mu - r|^2_Q + tr(Q Sigma), and a chance constraint is mu_j within
-the bounds by kappa(eta) sqrt(Sigma_jj), kappa(eta) = Phi^-1(eta).
+sections 3.2-3.3). For a Gaussian x_i, E|x - r|^2_Q = |mu - r|^2_Q + tr(Q Sigma).
+
+A constraint g'x <= f of a Gaussian state holds with probability eta where g'mu + kappa sqrt(g'Sigma g) <= f,
+kappa = Phi^-1(eta). By default a constraint is soft: a violation pays a price, so that a program always has a solution.
+The penalty is exact (Fletcher, 1987, section 14.3): as long as the price exceeds what the cost can gain by a violation,
+no plan that can keep the constraint pays it.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from statistics import NormalDist
 from typing import Any, Literal
@@ -20,84 +24,186 @@ import numpy as np
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.qp.problem import ABSENT
 
+Array = np.ndarray
+
 Penalized = Literal["inputs", "deviations", "increments"]
+PENALIZED = ("inputs", "deviations", "increments")
+
+_EXACT = 1e6  # the exact price, in the cost's largest weight: more than any multiplier that a bound is worth
 
 
-@dataclass(frozen=True)
-class StateBounds:
-    """Bounds on single states, each to hold with probability eta.
+@dataclass(frozen=True, kw_only=True)
+class Constraint:
+    """What every constraint of the states has beside its sides.
 
     Attributes:
-        lower: List or array (n,), kept as an array; -inf where there is none.
-        upper: (n,); inf where there is none.
-        confidence: eta.
-        kappa: Standard deviations kept from a bound; Phi^-1(eta) unless given (the paper takes 2 for eta = 0.95).
-        l1: Exact penalty weight per unit of violation; where it is large enough, bounds that can be kept are kept.
-        l2: Quadratic penalty weight of the violation. Without either, the bounds are hard.
+        probability: eta in (0.5, 1), with which each side is to hold at each stage; None: the mean keeps it.
+        kappa: Standard deviations between the mean and a side; Phi^-1(eta) unless given (the paper takes 2 for 0.95).
+        penalty: Price of a violation per unit and stage; ``"exact"``: one that no plan pays which can keep the
+            constraint; None: hard.
+        stages: Those of 1 .. H that it holds at, such as ``range(5, 11)``; all by default.
+        joint: Whether eta is for all sides and stages together, by Boole's inequality: each gets its part of 1 - eta.
 
     Raises:
-        SettingError: Crossed bounds, eta outside (0.5, 1), or a weight that is not positive.
+        SettingError: A probability outside (0.5, 1), a negative kappa, a price that is not positive, or stages below 1.
     """
 
-    lower: Any
-    upper: Any
-    confidence: float = 0.95
-    kappa: Any = None
-    l1: float | None = None
-    l2: float | None = None
+    probability: float | None = None
+    kappa: float | None = None
+    penalty: float | Literal["exact"] | None = "exact"
+    stages: Iterable[int] | None = None
+    joint: bool = False
 
     def __post_init__(self) -> None:
-        for key in ("lower", "upper"):
-            if np.ndim(getattr(self, key)) != 1:
-                raise SettingError(
-                    key, f"must be a list of n numbers, infinite where unbounded; got {getattr(self, key)!r}"
-                )
-        _set_bounds(self, "lower", "upper", len(self.lower))
-        check_number("confidence", self.confidence)
-        if not 0.5 < self.confidence < 1:
-            raise SettingError("confidence", f"eta must lie in (0.5, 1); got {self.confidence}")
-        if self.kappa is None:
-            object.__setattr__(self, "kappa", NormalDist().inv_cdf(self.confidence))
-        check_number("kappa", self.kappa, least=0)
-        for key in ("l1", "l2"):
-            if getattr(self, key) is not None:
-                check_number(key, getattr(self, key), above=0)
+        if self.probability is not None:
+            check_number("probability", self.probability)
+            if not 0.5 < self.probability < 1:
+                raise SettingError("probability", f"must lie in (0.5, 1); got {self.probability}")
+        elif self.joint:
+            raise SettingError("joint", "needs a probability")
+        if self.kappa is not None:
+            check_number("kappa", self.kappa, least=0)
+        if self.penalty is not None and self.penalty != "exact":
+            check_number("penalty", self.penalty, above=0)
+        if self.stages is not None:
+            stages = tuple(self.stages) if isinstance(self.stages, Iterable) else ()
+            if not stages or not all(isinstance(stage, int) and stage > 0 for stage in stages):
+                raise SettingError("stages", f"must be whole numbers from 1 on; got {self.stages!r}")
+            object.__setattr__(self, "stages", stages)
 
     @property
-    def soft(self) -> bool:
-        """Whether a violation is priced instead of forbidden."""
-        return self.l1 is not None or self.l2 is not None
+    def size(self) -> int:
+        """Number of entries that are bounded, or of states."""
+        raise NotImplementedError
+
+    def rows(self, horizon: int) -> tuple[Array, Array, Array]:
+        """Returns F (r, n), lower and upper (H, r) of rows lower <= F x <= upper, of which each has one side only."""
+        raise NotImplementedError
+
+    def standard_deviations(self, sides: int = 1) -> float:
+        """Returns kappa of each of a number of sides, all stages counted."""
+        if self.kappa is not None:
+            return float(self.kappa)
+        if self.probability is None:
+            return 0.0
+        return NormalDist().inv_cdf(1.0 - (1.0 - self.probability) / (sides if self.joint else 1))
 
 
 @dataclass(frozen=True)
-class TrackingProblem:
-    """Weights and bounds; see the module's text.
+class Box(Constraint):
+    """Bounds lower <= x <= upper: of the states, and (without the keywords) of inputs or their increments.
+
+    Attributes:
+        lower: List or array (d,), or (H, d) by stage, kept as an array; -inf where there is none; None: none at all.
+        upper: Likewise; inf where there is none.
+
+    Raises:
+        SettingError: Crossed bounds, or as for ``Constraint``.
+    """
+
+    lower: Any = None
+    upper: Any = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        sides = [None if side is None else _numbers(key, side) for key, side in self._sides]
+        shape = next((side.shape for side in sides if side is not None), (0,))
+        for (key, value), side, absent in zip(self._sides, sides, (-math.inf, math.inf), strict=True):
+            array = np.full(shape, absent) if side is None else side
+            if array.ndim not in (1, 2) or array.shape != shape:
+                raise SettingError(key, f"must be a list of {shape[-1]} numbers, or one by stage; got {value!r}")
+            if (-np.sign(absent) * array >= ABSENT).any():
+                raise SettingError(
+                    key, f"no number keeps it: a bound of size {ABSENT:g} or more is none; got {value!r}"
+                )
+            object.__setattr__(self, key, array)
+        for at in np.argwhere(self.lower > self.upper)[:1]:
+            entry, at = at[-1], tuple(at)
+            raise SettingError(
+                "lower, upper", f"must not cross; entry {entry} has {self.lower[at]:g} above {self.upper[at]:g}"
+            )
+
+    @property
+    def _sides(self) -> list[tuple[str, Any]]:
+        return [("lower", self.lower), ("upper", self.upper)]
+
+    @property
+    def size(self) -> int:
+        """Number of bounded entries, d; 0 where both sides are None."""
+        return self.lower.shape[-1]
+
+    @cached_property
+    def finite(self) -> bool:
+        """Whether there is any bound."""
+        return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
+
+    def by_stage(self, horizon: int) -> tuple[Array, Array]:
+        """Returns lower and upper bounds of every stage (H, d)."""
+        return by_stage("lower", self.lower, horizon, 1), by_stage("upper", self.upper, horizon, 1)
+
+    def rows(self, horizon: int) -> tuple[Array, Array, Array]:
+        """Returns one row for each entry with a bound, upper ones first."""
+        lower, upper = self.by_stage(horizon)
+        above, below = (np.flatnonzero(np.isfinite(side).any(axis=0)) for side in (upper, lower))
+        F, none = np.eye(self.size)[np.concatenate([above, below])], np.full((horizon, self.size), math.inf)
+        return F, np.hstack([-none[:, above], lower[:, below]]), np.hstack([upper[:, above], none[:, below]])
+
+
+@dataclass(frozen=True)
+class Halfspaces(Constraint):
+    """Linear constraints F x <= f of the states.
+
+    Attributes:
+        F: (r, n).
+        f: (r,), or (H, r) by stage.
+
+    Raises:
+        SettingError: Shapes that do not belong together, numbers that are not finite, a zero row, or as for
+            ``Constraint``.
+    """
+
+    F: Any
+    f: Any
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        F, f = _numbers("F", self.F), _numbers("f", self.f)
+        if F.ndim != 2 or f.ndim not in (1, 2) or f.shape[-1] != len(F):
+            raise SettingError("F, f", f"must be (r, n) and (r,) or (H, r); got {F.shape} and {f.shape}")
+        if not (np.isfinite(F).all() and np.isfinite(f).all() and F.any(axis=1).all()):
+            raise SettingError("F, f", "must be finite, each row of F with an entry that is not zero")
+        object.__setattr__(self, "F", F)
+        object.__setattr__(self, "f", f)
+
+    @property
+    def size(self) -> int:
+        """Number of states, n."""
+        return self.F.shape[1]
+
+    def rows(self, horizon: int) -> tuple[Array, Array, Array]:
+        """Returns F, no lower bounds, and f of every stage."""
+        upper = by_stage("f", self.f, horizon, 1)
+        return self.F, np.full_like(upper, -math.inf), upper
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """Costs of the distance to a reference and of the inputs.
 
     Attributes:
         Q: State weights, the diagonal (n,) or the matrix (n, n).
         R: Input weights, the diagonal (m,) or the matrix (m, m).
-        penalized: What R weighs: ``"inputs"``, ``"deviations"`` from the reference inputs, or ``"increments"``.
         terminal: Weight of the last predicted state, like Q; Q itself by default.
-        input_lower: List or array (m,), kept as an array as the others; none by default.
-        input_upper: (m,).
-        rate_lower: Bound on u_i - u_{i-1} (m,) per step; none by default.
-        rate_upper: (m,).
-        state_bounds: Chance constraints; none by default.
+        penalized: What R weighs: ``"inputs"``, ``"deviations"`` from the reference inputs, or ``"increments"``.
 
     Raises:
-        SettingError: A weight is not symmetric positive semidefinite, R is zero in a direction, bounds are crossed, or
-            a length is wrong.
+        SettingError: A weight is not symmetric positive semidefinite, R is zero in a direction, or a length is wrong.
     """
 
     Q: Any
     R: Any
-    penalized: Penalized = "inputs"
     terminal: Any = None
-    input_lower: Any = None
-    input_upper: Any = None
-    rate_lower: Any = None
-    rate_upper: Any = None
-    state_bounds: StateBounds | None = None
+    penalized: Penalized = "increments"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "Q", _weight("Q", self.Q))
@@ -109,34 +215,101 @@ class TrackingProblem:
         object.__setattr__(self, "terminal", terminal)
         if terminal.shape != self.Q.shape:
             raise SettingError("terminal", f"must be a weight of {len(self.Q)} states; got {len(terminal)}")
-        if self.penalized not in ("inputs", "deviations", "increments"):
-            raise SettingError("penalized", f"must be 'inputs', 'deviations' or 'increments'; got {self.penalized!r}")
-        _set_bounds(self, "input_lower", "input_upper", self.input_dim)
-        _set_bounds(self, "rate_lower", "rate_upper", self.input_dim)
-        if not isinstance(self.state_bounds, StateBounds | None):
-            raise SettingError("state_bounds", f"must be StateBounds(...); got {type(self.state_bounds).__name__}")
-        if self.state_bounds is not None and len(self.state_bounds.lower) != self.state_dim:
-            raise SettingError(
-                "state_bounds", f"must bound {self.state_dim} states; got {len(self.state_bounds.lower)}"
-            )
+        if self.penalized not in PENALIZED:
+            raise SettingError("penalized", f"must be one of {', '.join(map(repr, PENALIZED))}; got {self.penalized!r}")
+
+    @property
+    def largest_weight(self) -> float:
+        """Returns the largest eigenvalue of all weights."""
+        return float(max(np.linalg.eigvalsh(weight)[-1] for weight in (self.Q, self.terminal, self.R)))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A cost, bounds of the inputs, and constraints of the states; see the module's text.
+
+    Attributes:
+        cost: What is made small.
+        inputs: Bounds of the inputs; none by default.
+        input_rates: Bounds of u_i - u_{i-1} per step; none by default.
+        constraints: Of the states, ``Box`` or ``Halfspaces``; none by default.
+
+    Raises:
+        SettingError: A part is of another kind or length than the cost asks for.
+    """
+
+    cost: Tracking
+    inputs: Box = field(default_factory=Box)
+    input_rates: Box = field(default_factory=Box)
+    constraints: Sequence[Constraint] = ()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.cost, Tracking):
+            raise SettingError("cost", f"must be Tracking(...); got {type(self.cost).__name__}")
+        for key in ("inputs", "input_rates"):
+            box = Box() if getattr(self, key) is None else getattr(self, key)
+            if not isinstance(box, Box):
+                raise SettingError(key, f"must be Box(lower, upper); got {type(box).__name__}")
+            if (box.probability, box.kappa, box.penalty, box.stages) != (None, None, "exact", None):
+                raise SettingError(key, "has bounds that are always kept: no probability, penalty or stages")
+            if not box.size:
+                box = Box(np.full(self.input_dim, -math.inf), np.full(self.input_dim, math.inf))
+            if box.size != self.input_dim:
+                raise SettingError(key, f"must bound {self.input_dim} inputs; got {box.size}")
+            object.__setattr__(self, key, box)
+        constraints = () if self.constraints is None else self.constraints
+        given = [constraints] if isinstance(constraints, Constraint) else list(constraints)
+        for constraint in given:
+            if not isinstance(constraint, Box | Halfspaces):
+                raise SettingError(
+                    "constraints", f"must be Box(...) or Halfspaces(...); got {type(constraint).__name__}"
+                )
+            if constraint.size != self.state_dim:
+                raise SettingError("constraints", f"must bound {self.state_dim} states; got {constraint.size}")
+        object.__setattr__(self, "constraints", tuple(given))
 
     @property
     def state_dim(self) -> int:
         """Number of states, n."""
-        return len(self.Q)
+        return len(self.cost.Q)
 
     @property
     def input_dim(self) -> int:
         """Number of inputs, m."""
-        return len(self.R)
+        return len(self.cost.R)
 
-    @cached_property
-    def rate_limited(self) -> bool:
-        """Whether there is any bound on the increments."""
-        return bool(np.isfinite(self.rate_lower).any() or np.isfinite(self.rate_upper).any())
+    def price(self, constraint: Constraint) -> float:
+        """Returns the price of violating a constraint, infinite for a hard one."""
+        if constraint.penalty == "exact":
+            return _EXACT * self.cost.largest_weight
+        return math.inf if constraint.penalty is None else float(constraint.penalty)
 
 
-def _weight(key: str, value: Any) -> np.ndarray:
+def by_stage(key: str, values: Array, horizon: int, dims: int) -> Array:
+    """Returns values of every stage, given of every stage or of one (whose array has ``dims`` axes).
+
+    Raises:
+        SettingError: Of another number of stages.
+    """
+    if values.ndim == dims:
+        return np.ascontiguousarray(np.broadcast_to(values, (horizon, *values.shape)))
+    if len(values) != horizon:
+        raise SettingError(key, f"must be given for one stage or all {horizon}; got {len(values)}")
+    return np.ascontiguousarray(values)
+
+
+def _numbers(key: str, value: Any) -> Array:
+    """An array from a list."""
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        array = np.empty(())
+    if array.ndim == 0 or not array.size or np.isnan(array).any():
+        raise SettingError(key, f"must be a list of numbers, infinite where unbounded; got {value!r}")
+    return array
+
+
+def _weight(key: str, value: Any) -> Array:
     """A weight from its diagonal or its matrix."""
     try:
         weight = np.array(value, dtype=float)
@@ -153,23 +326,3 @@ def _weight(key: str, value: Any) -> np.ndarray:
     if lowest < -1e-12 * max(1.0, np.abs(weight).max()):
         raise SettingError(key, f"must be positive semidefinite; its smallest eigenvalue is {lowest:.3g}")
     return weight
-
-
-def _set_bounds(owner: Any, lower_key: str, upper_key: str, length: int) -> None:
-    """Replaces a pair of bounds of a frozen dataclass by arrays; None becomes infinite."""
-    for key, absent in ((lower_key, -math.inf), (upper_key, math.inf)):
-        value = getattr(owner, key)
-        try:
-            array = np.full(length, absent) if value is None else np.array(value, dtype=float)
-        except (TypeError, ValueError):
-            array = np.empty(0)
-        if array.shape != (length,) or np.isnan(array).any():
-            raise SettingError(key, f"must be a list of {length} numbers; got {value!r}")
-        if (-np.sign(absent) * array >= ABSENT).any():
-            raise SettingError(key, f"no number keeps it: a bound of size {ABSENT:g} or more is none; got {value!r}")
-        object.__setattr__(owner, key, array)
-    lower, upper = getattr(owner, lower_key), getattr(owner, upper_key)
-    for j in np.flatnonzero(lower > upper)[:1]:
-        raise SettingError(
-            f"{lower_key}, {upper_key}", f"must not cross; entry {j} has {lower[j]:g} above {upper[j]:g}"
-        )

@@ -26,11 +26,10 @@ from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.exceptions import DataError, ProblemError
 from gpmpc.kernels.linalg import dot
 from gpmpc.mpc.condense import CondensedProgram
-from gpmpc.mpc.constraints import price_violations
 from gpmpc.mpc.controller import Request
 from gpmpc.mpc.linear_quadratic import References, TrackingCost, tracking_cost
 from gpmpc.mpc.prediction import Prediction, PredictionModel
-from gpmpc.mpc.stages import Plan
+from gpmpc.mpc.stages import Plan, price_violations
 from gpmpc.qp import QPSolution
 from gpmpc.status import Status
 
@@ -76,7 +75,7 @@ class Globalization:
         self._model, self._cost_terms, self._request, self._tolerance = model, cost, request, tolerance
         self._references = request.references
         problem = model.problem
-        weights = problem.R, problem.input_lower, problem.input_upper
+        weights = problem.cost.R, problem.inputs.lower, problem.inputs.upper
         self._smallest = call_unchecked(_smallest_cost, *weights, self._references.previous_input)
         self._defect_prices, self._row_price = np.zeros(len(cost.state) * problem.state_dim), 0.0
         self._size, self._rate, self._creeps = math.inf, 1.0, False

@@ -1,4 +1,4 @@
-"""Affine stage models of the belief's dynamics, s_{k+1} = A_k s_k + B_k u_k + c_k, of all stages of a plan in one call.
+"""Affine stage models of the belief's dynamics, s_{k+1} = A_k s_k + B_k u_k + c_k, and linear rows of its constraints.
 
 The *covariance* mode says what s holds of the belief N(mu, Sigma):
 
@@ -9,8 +9,15 @@ The *covariance* mode says what s holds of the belief N(mu, Sigma):
 * ``none``: s = mu, through the model's mean at a certain state.
 
 ``full`` and ``diagonal`` are linearised at the means and covariances of the plan, whatever the propagator.
+
+P(g'x <= f) >= eta is g'mu + kappa sd <= f for a Gaussian, sd = sqrt(g'Sigma g), and g'mu - kappa sd >= f on the other
+side. Where s holds the covariance, sd is in the row: |S g|, or |diag(g) sd|, linearised at the plan (both are
+homogeneous, so the row has no constant). (The paper writes S_jj for it, which is right for a diagonal S only.) Both are
+convex: the row asks for no more than the constraint itself. In the mode ``zero_order`` the bounds move inwards by
+kappa sd of the covariances predicted beside the program.
 """
 
+import math
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -21,9 +28,12 @@ from gpmpc.dynamics import DynamicsModel, linearize, tensors_for, to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.linalg import dot
+from gpmpc.mpc.condense import StateRows
+from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Propagator, differentiate
 from gpmpc.propagation import linearize as linearize_belief
 from gpmpc.propagation.local_model import square_roots
+from gpmpc.qp import SoftRows
 
 Array = np.ndarray
 
@@ -70,15 +80,9 @@ class StageLinearizer:
         model: Its mean, and where covariances count its variance.
         propagator: How the belief moves; ``none`` needs the model's mean only.
         covariance: See the module's text.
-
-    Raises:
-        SettingError: An unknown mode.
     """
 
     def __init__(self, model: DynamicsModel, propagator: Propagator, covariance: Covariance):
-        if covariance not in COVARIANCES:
-            possible = ", ".join(map(repr, COVARIANCES))
-            raise SettingError("covariance", f"must be one of {possible}; got {covariance!r}")
         self.model, self.propagator, self.covariance, self._n = model, propagator, covariance, model.state_dim
         first_order = getattr(propagator, "first_order", False)
         self.at_points = covariance == "none" or (covariance == "zero_order" and first_order)
@@ -182,3 +186,118 @@ def _constants(A, B, after, states, inputs):
         for i in range(c.shape[1]):
             c[k, i] -= dot(A[k, i], states[k], A.shape[2]) + dot(B[k, i], inputs[k], B.shape[2])
     return c
+
+
+class ConstraintRows:
+    """The rows of a problem's constraints: of a box one for each entry with a bound, upper ones first.
+
+    Args:
+        problem: With the constraints.
+        horizon: H.
+        covariance: What s holds of the belief.
+
+    Attributes:
+        per_stage: Number of rows of a stage, r.
+        soft: Whether a violation of any has a price.
+        prices: Of the rows (r,), infinite where they are hard.
+        signs: 1 where a row has upper bounds, -1 where it has lower ones (r,).
+        applies: Whether a row has a bound at a stage (H, r).
+
+    Raises:
+        SettingError: Sides or stages that the horizon does not have.
+    """
+
+    def __init__(self, problem: Problem, horizon: int, covariance: Covariance):
+        n, self._horizon, self._covariance = problem.state_dim, horizon, covariance
+        F, kappa, prices, lower, upper = [np.empty((0, n))], [], [], [np.empty((horizon, 0))], [np.empty((horizon, 0))]
+        for constraint in problem.constraints:
+            rows, below, above = constraint.rows(horizon)
+            if constraint.stages is not None:
+                if max(constraint.stages) > horizon:
+                    raise SettingError("stages", f"must be of 1 .. {horizon}; got {max(constraint.stages)}")
+                outside = [k for k in range(horizon) if k + 1 not in constraint.stages]
+                below[outside], above[outside] = -np.inf, np.inf
+            sides = int(np.isfinite(below).sum() + np.isfinite(above).sum())
+            F, lower, upper = [*F, rows], [*lower, below], [*upper, above]
+            kappa += [0.0 if covariance == "none" else constraint.standard_deviations(sides)] * len(rows)
+            prices += [problem.price(constraint)] * len(rows)
+        self._F, self._lower, self._upper = np.concatenate(F), np.hstack(lower), np.hstack(upper)
+        self._kappa, self.prices = np.array(kappa), np.array(prices)
+        self.signs = np.where(np.isfinite(self._upper).any(axis=0), 1.0, -1.0)
+        self.applies = np.isfinite(self._lower) | np.isfinite(self._upper)
+        self.per_stage, self.soft = len(kappa), bool(np.isfinite(self.prices).any())
+        self._margins = self._kappa if covariance == "zero_order" else np.zeros(self.per_stage)
+        mixed = bool((np.count_nonzero(self._F, axis=1) > 1).any())
+        moves = mixed if covariance == "diagonal" else covariance == "full" and self.per_stage > 0
+        self._constant = None if moves else self._rows(np.zeros((1, n, n)))
+        fixed = not (moves or self._margins.any())
+        self._fixed = StateRows(self._rows(np.zeros((1, n, n))), self._lower, self._upper) if fixed else None
+
+    def at(self, covariances: Array, stages: int) -> StateRows:
+        """The rows, tightened, at covariances of the states Sigma_0 .. Sigma_H (H + 1, n, n), of H stages or one."""
+        if self._fixed is not None:
+            return self._fixed
+        lower, upper = self._lower.copy(), self._upper.copy()
+        call_unchecked(_tighten, self._F, self._margins, covariances, lower, upper)
+        return StateRows(
+            self._rows(covariances[1 : stages + 1]) if self._constant is None else self._constant, lower, upper
+        )
+
+    def softness(self, hard_rows: int) -> SoftRows | None:
+        """The prices of all rows of a program's G, after ``hard_rows`` that have none; None where all are hard."""
+        if not self.soft:
+            return None
+        return SoftRows(linear=np.concatenate([np.full(hard_rows, np.inf), np.tile(self.prices, self._horizon)]))
+
+    def _rows(self, covariances: Array) -> Array:
+        """E (K, r, p) at covariances of the states (K, n, n)."""
+        F, (K, n, _), weight = self._F, covariances.shape, self.signs * self._kappa
+        if self._covariance not in ("full", "diagonal"):
+            return np.tile(F, (K, 1, 1))
+        if self._covariance == "diagonal":
+            moved = F * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).clip(0))[:, None]
+            norms = np.linalg.norm(moved, axis=-1, keepdims=True)
+            slopes = np.divide(F * moved, norms, out=np.tile(np.abs(F), (K, 1, 1)), where=norms > 0)
+            return np.concatenate([np.tile(F, (K, 1, 1)), weight[:, None] * slopes], axis=2)
+        slopes = F[:, :, None] * _directions(F, covariances)[:, :, None, :]  # of |S g| by S (K, r, n, n)
+        return np.concatenate(
+            [np.tile(F, (K, 1, 1)), (weight[:, None, None] * slopes).reshape(K, len(F), n * n)], axis=2
+        )
+
+
+@compiled
+def _tighten(F, kappa, covariances, lower, upper):
+    """Moves the bounds of the rows (H, r) inwards by kappa standard deviations."""
+    r, n = F.shape
+    for k in range(len(lower)):
+        for e in range(r):
+            variance = 0.0
+            for i in range(n):
+                if F[e, i] != 0.0:
+                    variance += F[e, i] * dot(covariances[k + 1, i], F[e], n)
+            margin = kappa[e] * math.sqrt(max(variance, 0.0))
+            lower[k, e] += margin
+            upper[k, e] -= margin
+
+
+@compiled
+def price_violations(prices, rows, states, hard_price):
+    """What violations along states s_0 .. s_H cost: their declared price, or ``hard_price`` per unit without one."""
+    E, lower, upper = rows
+    total = 0.0
+    for k in range(len(lower)):
+        at, s = min(k, len(E) - 1), states[k + 1]
+        for e in range(len(prices)):
+            value = dot(E[at, e], s, len(s))
+            outside = max(0.0, value - upper[k, e], lower[k, e] - value)
+            total += (hard_price if prices[e] == np.inf else prices[e]) * outside
+    return total
+
+
+def _directions(F: Array, covariances: Array) -> Array:
+    """S g / |S g| (K, r, n) for rows g of F (r, n) and the symmetric roots S of covariances (K, n, n)."""
+    eigenvalues, vectors = np.linalg.eigh(covariances)
+    roots = (vectors * np.sqrt(np.clip(eigenvalues, 0, None))[:, None, :]) @ vectors.mT
+    moved = F @ roots
+    norms = np.linalg.norm(moved, axis=-1, keepdims=True)
+    return np.divide(moved, norms, out=np.zeros_like(moved), where=norms > 0)

@@ -21,15 +21,16 @@ from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing
-from gpmpc.mpc.prediction import Form, Prediction, PredictionModel
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.prediction import Prediction, PredictionModel, PredictionSettings
+from gpmpc.mpc.problem import Problem
 from gpmpc.mpc.sqp import FAILURES
-from gpmpc.mpc.stages import Covariance
 from gpmpc.propagation import Propagator
 from gpmpc.qp.cvxpy_ import STATUSES, TIGHT
 from gpmpc.status import Status
 
 Array = np.ndarray
+
+_DEFAULT = PredictionSettings()
 
 
 class StateFormMPC:
@@ -41,10 +42,7 @@ class StateFormMPC:
         problem: Weights and bounds.
         horizon: H.
         initial_input: The input before the first step (m,).
-        form: As for ``GPMPC``.
-        covariance: As for ``GPMPC``.
-        feedback: As for ``GPMPC``.
-        disturbance_gain: As for ``GPMPC``.
+        prediction: As for ``GPMPC``.
         constraints: Of the states s_0 .. s_H (H + 1, p), whose first n columns are the means, and the inputs (H, m),
             two CVXPY variables: a list of constraints. Called once.
         solver: A CVXPY solver.
@@ -58,19 +56,15 @@ class StateFormMPC:
         self,
         model: DynamicsModel,
         propagator: Propagator,
-        problem: TrackingProblem,
+        problem: Problem,
         horizon: int,
         initial_input: Sequence[float],
-        form: Form = "trajectory",
-        covariance: Covariance = "zero_order",
-        feedback: bool = True,
-        disturbance_gain: float = 0.0,
+        prediction: PredictionSettings = _DEFAULT,
         constraints: Callable[[Any, Any], list] | None = None,
         solver: str = "CLARABEL",
         options: dict | None = None,
     ):
-        settings = form, covariance, feedback, disturbance_gain
-        self.prediction = PredictionModel(model, propagator, problem, horizon, initial_input, *settings)
+        self.prediction = PredictionModel(model, propagator, problem, horizon, initial_input, prediction)
         self.initial_input, self.problem, self.horizon = self.prediction.initial_input, problem, horizon
         self.solver, self.options = solver, TIGHT.get(solver, {}) if options is None else options
         self._program = _Program(self.prediction, constraints)
@@ -106,7 +100,7 @@ class StateFormMPC:
             return request.failed_decision(status, iterations, timing)
         inputs, states = np.array(self._program.inputs.value), np.array(self._program.states.value)
         beliefs = self.prediction.linearizer.moments(states, prediction.covariances)
-        disturbance = request.disturbance if self.prediction.disturbance_gain else None
+        disturbance = request.disturbance if self.prediction.settings.disturbance_gain else None
         found = status, iterations, timing
         return Decision(inputs[0], inputs, *beliefs, *found, disturbance=disturbance, suboptimal=suboptimal)
 
@@ -118,33 +112,33 @@ class _Program:
         import cvxpy
 
         problem, H, m, rows = model.problem, model.horizon, model.problem.input_dim, model.constraints
-        weight, terminal = (_factor(model.linearizer.weight(W)) for W in (problem.Q, problem.terminal))
+        weight, terminal = (_factor(model.linearizer.weight(W)) for W in (problem.cost.Q, problem.cost.terminal))
         p, K, r = len(weight), model.points, rows.per_stage
         self.states, self.inputs = s, u = cvxpy.Variable((H + 1, p)), cvxpy.Variable((H, m))
         self._stages = [[cvxpy.Parameter(shape) for shape in ((p, p), (p, m), (p,))] for _ in range(K)]
         self._start, self._targets = cvxpy.Parameter(p), cvxpy.Parameter((H, p), value=np.zeros((H, p)))
         self._wanted, self._last = cvxpy.Parameter((H, m)), cvxpy.Parameter(m)
         rates = u - cvxpy.vstack([cvxpy.reshape(self._last, (1, m), order="C"), *([u[:-1]] if H > 1 else [])])
-        penalized = {"inputs": u, "deviations": u - self._wanted, "increments": rates}[problem.penalized]
-        cost = cvxpy.sum_squares(penalized @ _factor(problem.R[None]))
+        penalized = {"inputs": u, "deviations": u - self._wanted, "increments": rates}[problem.cost.penalized]
+        cost = cvxpy.sum_squares(penalized @ _factor(problem.cost.R[None]))
         cost += cvxpy.sum_squares((s[H] - self._targets[H - 1]) @ terminal)
         if H > 1:
             cost += cvxpy.sum_squares((s[1:H] - self._targets[:-1]) @ weight)
-        rules = [s[0] == self._start, *_within(u, problem.input_lower, problem.input_upper)]
-        rules += _within(rates, problem.rate_lower, problem.rate_upper)
+        rules = [s[0] == self._start, *_within(u, *problem.inputs.by_stage(H))]
+        rules += _within(rates, *problem.input_rates.by_stage(H))
         for k in range(H):
             A, B, c = self._stages[min(k, K - 1)]
             rules.append(s[k + 1] == A @ s[k] + B @ u[k] + c)
-        self._rows = [cvxpy.Parameter((r, p)) for _ in range(K if r else 0)]
-        limits = problem.state_bounds
-        if r and limits is not None:
-            self._bounds = cvxpy.Parameter((H, r))
-            slack = cvxpy.Variable((H, r), nonneg=True) if rows.soft else np.zeros((H, r))
-            # Every bound as an upper one: the rows of lower bounds are handed over with their sign turned.
-            at = [self._rows[min(k, K - 1)] @ s[k + 1] for k in range(H)]
-            rules += [at[k] <= self._bounds[k] + slack[k] for k in range(H)]
+        self._rows, self._signs = [cvxpy.Parameter((r, p)) for _ in range(K if r else 0)], rows.signs
+        if r:
+            self._bounds, hard, applies = cvxpy.Parameter((H, r)), np.isinf(rows.prices), rows.applies
+            slack = np.zeros((H, r))
             if rows.soft:
-                cost += (limits.l1 or 0.0) * cvxpy.sum(slack) + (limits.l2 or 0.0) * cvxpy.sum_squares(slack)
+                slack = cvxpy.multiply(cvxpy.Variable((H, r), nonneg=True), np.tile(np.where(hard, 0.0, 1.0), (H, 1)))
+                cost += cvxpy.sum(slack @ np.where(hard, 0.0, rows.prices))
+            # Every bound as an upper one: the rows of lower bounds are handed over with their sign turned.
+            at = [self._rows[min(k, K - 1)] @ s[k + 1] - self._bounds[k] - slack[k] for k in range(H)]
+            rules += [at[k][np.flatnonzero(applies[k])] <= 0.0 for k in range(H) if applies[k].any()]
         rules += [] if constraints is None else list(constraints(s, u))
         self.problem = cvxpy.Problem(cvxpy.Minimize(cost), rules)
         if not self.problem.is_dpp():
@@ -168,13 +162,12 @@ class _Program:
         targets[:, : request.references.states.shape[1]] = request.references.states
         self._targets.value = targets
         if self._rows:
-            r = self._rows[0].shape[0]
-            E, lower, upper = (part[:, :r] for part in prediction.rows)
-            turned = np.where(np.isfinite(upper[0]), 1.0, -1.0)
-            E = np.broadcast_to(E, (len(self._rows), *E.shape[1:])) * turned[:, None]
-            for parameter, value in zip(self._rows, E, strict=True):
-                parameter.value = value
-            self._bounds.value = np.where(turned > 0, upper, -lower)
+            E, lower, upper = prediction.rows
+            sign = self._signs
+            for parameter, value in zip(self._rows, np.broadcast_to(E, (len(self._rows), *E.shape[1:])), strict=True):
+                parameter.value = sign[:, None] * value
+            bounds = np.where(sign > 0, upper, -lower)
+            self._bounds.value = np.where(np.isfinite(bounds), bounds, 0.0)
 
 
 def _factor(blocks: Array) -> Array:
@@ -188,7 +181,7 @@ def _factor(blocks: Array) -> Array:
 
 
 def _within(values: Any, lower: Array, upper: Array) -> list:
-    """Constraints for the finite entries of bounds (m,) on values (H, m)."""
-    below, above, tall = np.flatnonzero(np.isfinite(lower)), np.flatnonzero(np.isfinite(upper)), (values.shape[0], 1)
-    rules = [values[:, below] >= np.tile(lower[below], tall)] if len(below) else []
-    return rules + ([values[:, above] <= np.tile(upper[above], tall)] if len(above) else [])
+    """Constraints for the entries of bounds (H, m) on values (H, m) that are finite at every stage or at some."""
+    below, above = (np.nonzero(np.isfinite(side)) for side in (lower, upper))
+    rules = [values[below] >= lower[below]] if below[0].size else []
+    return rules + ([values[above] <= upper[above]] if above[0].size else [])

@@ -22,6 +22,7 @@ from gpmpc.gp import GPPosterior, Training, Transitions
 from gpmpc.metrics import find_loss, time_quantiles, tracking_error, violation_rate
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.policy import OnFailure, check_policy
+from gpmpc.mpc.problem import Box
 from gpmpc.propagation import MomentMatching, Propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
 from gpmpc.studies.document import Table
@@ -234,10 +235,12 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     rmse["total"] = error.total
     if flown.diverged is not None or not np.isfinite(error.total):
         rmse = dict.fromkeys(rmse)
-    violations = {"inputs": violation_rate(rollout.inputs, problem.input_lower, problem.input_upper)}
-    if problem.state_bounds is not None:
-        bounds = problem.state_bounds
-        violations["states"] = violation_rate(rollout.states[1:], bounds.lower, bounds.upper)
+    first = [side[0] for side in problem.inputs.by_stage(flown.controller.horizon)]
+    violations = {"inputs": violation_rate(rollout.inputs, *first)}
+    boxes = [bounds.by_stage(flown.controller.horizon) for bounds in problem.constraints if isinstance(bounds, Box)]
+    if boxes:
+        lower, upper = np.max([box[0][0] for box in boxes], axis=0), np.min([box[1][0] for box in boxes], axis=0)
+        violations["states"] = violation_rate(rollout.states[1:], lower, upper)
     learned = None
     if training is not None:
         objective = [float(value) for value in training.objective]

@@ -16,15 +16,13 @@ from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
 from gpmpc.systems import System, Translational, step
 
 H, HOVER = 3, np.array([7.26, 0.0, 0.0])
-PROBLEM = TrackingProblem(
-    [1.0] * 6, [1.0] * 3, "increments", input_lower=[7.2, -0.008, -0.008], input_upper=[7.4, 0.008, 0.008]
-)
+PROBLEM = Problem(Tracking([1.0] * 6, [1.0] * 3), inputs=Box([7.2, -0.008, -0.008], [7.4, 0.008, 0.008]))
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +67,7 @@ def optimum(gp, instances):
         cost.backward()
         return float(cost.detach()), (plan.grad.numpy() * [1.0, 0.1, 0.1]).ravel()
 
-    bounds = list(zip(PROBLEM.input_lower * [1, 10, 10], PROBLEM.input_upper * [1, 10, 10], strict=True)) * H
+    bounds = list(zip(PROBLEM.inputs.lower * [1, 10, 10], PROBLEM.inputs.upper * [1, 10, 10], strict=True)) * H
     plan = np.tile(HOVER, H)
     for _ in range(5):
         settings = {"ftol": 1e-16, "gtol": 1e-12, "maxiter": 2000, "maxcor": 30}
@@ -78,34 +76,32 @@ def optimum(gp, instances):
 
 
 def test_the_residual_vanishes_at_an_optimum_found_otherwise_and_nowhere_near_it(gp, instances, optimum):
-    at_bounds = (optimum == PROBLEM.input_lower) | (optimum == PROBLEM.input_upper)
+    at_bounds = (optimum == PROBLEM.inputs.lower) | (optimum == PROBLEM.inputs.upper)
     assert at_bounds.any()
     assert not at_bounds.all()
     assert kkt_residual(gp, PROBLEM, instances[0], optimum) < 1e-6
     assert kkt_residual(gp, PROBLEM, instances[1], optimum) > 1e-3
     for k, j in itertools.product(range(H), range(3)):
         moved = optimum.copy()
-        moved[k, j] += 0.01 * (PROBLEM.input_upper[j] - PROBLEM.input_lower[j]) * (-1 if moved[k, j] > HOVER[j] else 1)
+        moved[k, j] += (
+            0.01 * (PROBLEM.inputs.upper[j] - PROBLEM.inputs.lower[j]) * (-1 if moved[k, j] > HOVER[j] else 1)
+        )
         assert kkt_residual(gp, PROBLEM, instances[0], moved) > 1e-4
     assert kkt_residual(gp, PROBLEM, instances[0], np.full((H, 3), np.nan)) == np.inf
 
 
 def test_a_plan_beyond_its_bounds_is_no_optimum_even_where_the_slope_is_zero(gp, instances):
-    free = TrackingProblem(PROBLEM.Q, PROBLEM.R, "increments")
+    free = Problem(Tracking(PROBLEM.cost.Q, PROBLEM.cost.R))
     answer = converged(gp, free, H)[LOOP]()(instances[0], None)
-    assert ((answer.inputs < PROBLEM.input_lower) | (answer.inputs > PROBLEM.input_upper)).any()
+    assert ((answer.inputs < PROBLEM.inputs.lower) | (answer.inputs > PROBLEM.inputs.upper)).any()
     assert kkt_residual(gp, free, instances[0], answer.inputs) < 1e-5
     assert kkt_residual(gp, PROBLEM, instances[0], answer.inputs) > 1e-3
 
 
 def test_the_residual_knows_no_units_of_the_cost(gp, instances):
     plan = np.tile(HOVER, (H, 1))
-    scaled = TrackingProblem(
-        100 * PROBLEM.Q,
-        100 * PROBLEM.R,
-        "increments",
-        input_lower=PROBLEM.input_lower,
-        input_upper=PROBLEM.input_upper,
+    scaled = Problem(
+        Tracking(100 * PROBLEM.cost.Q, 100 * PROBLEM.cost.R), inputs=Box(PROBLEM.inputs.lower, PROBLEM.inputs.upper)
     )
     residual = kkt_residual(gp, PROBLEM, instances[0], plan)
     assert 1e-3 < residual <= 1.0
@@ -116,7 +112,7 @@ def test_all_contenders_that_are_here_agree(gp, instances, optimum):
     """Each stops by a measure of its own; what that leaves is less than a hundredth of the inputs' range."""
     makers = converged(gp, PROBLEM, H)
     assert (makers["do-mpc, IPOPT"] is None) == (not peer_do_mpc.installed())
-    accuracy = 1e-2 * (PROBLEM.input_upper - PROBLEM.input_lower)
+    accuracy = 1e-2 * (PROBLEM.inputs.upper - PROBLEM.inputs.lower)
     for name, make in makers.items():
         if make is None:
             continue
@@ -198,7 +194,10 @@ def test_ways_to_linearise_give_the_same_derivatives(gp):
 
 
 def test_what_the_measure_does_not_cover_is_refused(gp, instances):
-    bounded = TrackingProblem([1.0] * 6, [1.0] * 3, state_bounds=StateBounds([-1.0] * 6, [1.0] * 6))
+    bounded = Problem(
+        Tracking([1.0] * 6, [1.0] * 3, penalized="inputs"),
+        constraints=[Box([-1.0] * 6, [1.0] * 6, probability=0.95, penalty=None)],
+    )
     with pytest.raises(SettingError, match="problem: must bound nothing but inputs"):
         kkt_residual(gp, bounded, instances[0], np.tile(HOVER, (H, 1)))
     with pytest.raises(ShapeError, match=r"shape \(3, 3\); got \(2, 3\)"):

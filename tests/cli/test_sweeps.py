@@ -126,7 +126,7 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
         (["horizon=1,2"], "horizon: a list is written in brackets, horizon=[1,2]; a sweep takes -m"),
         (["system=pendulum", "data=excited"], "data: these data are of translational and rotational alone"),
         (["system=pendulum", "trajectory=lorenz"], "trajectory: must prescribe angle of pendulum; got positions of 3"),
-        (["system=pendulum", "controller.problem.Q=[1,1,1]"], "controller.problem: weighs 3 states and 1 inputs"),
+        (["system=pendulum", "controller.problem.cost.Q=[1,1,1]"], "controller.problem: weighs 3 states and 1 inputs"),
         (["system=pendulm"], "system: no such option 'pendulm'"),
         (["system._target_=builtins.dict"], "system: _target_ must name a function that returns"),
         (["folder=null"], "folder: must be the path of a folder; got None"),
@@ -226,7 +226,7 @@ def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(swee
     assert "4 runs: 0 flown, 4 finished before, 0 failed" in again.stdout
     path = sorted(tree.glob("*/metrics.json"))[2]
     found = json.loads(path.read_text())
-    found["settings"]["controller"]["problem"]["Q"][0] = 7.0
+    found["settings"]["controller"]["problem"]["cost"]["Q"][0] = 7.0
     found["settings"]["gone"] = 1
     path.write_text(json.dumps(found))
     (tree / path.parent.name.replace("seed=0", "seed=1") / "metrics.json").unlink()
@@ -234,7 +234,7 @@ def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(swee
     assert refused.returncode == 2
     assert refused.stderr.count("\n") == 1
     assert f"folder: tree/{path.parent.name} holds a finished run of other settings" in refused.stderr
-    assert "controller.problem.Q: [7.0, 1.0, 1.0, 1.0, 1.0, 1.0] then, [1.0, 1.0" in refused.stderr
+    assert "controller.problem.cost.Q: [7.0, 1.0, 1.0, 1.0, 1.0, 1.0] then, [1.0, 1.0" in refused.stderr
     assert "gone: 1 then, None now" in refused.stderr
     assert "choose another folder, or remove that one to fly it again" in refused.stderr
     assert json.loads(path.read_text()) == found  # nothing was overwritten, nothing else flown

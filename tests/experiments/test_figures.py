@@ -32,7 +32,7 @@ BOUNDS = {
     "plant": {"lower": [0, -0.7, -0.7], "upper": [100, 0.7, 0.7]},
 }
 OURS = {"loop": "model", "controller": "convex", "horizon": 10, "R": [0.1, 1000, 1000]}
-OURS["settings"] = {"form": "trajectory", "covariance": "none"}
+OURS["settings"] = {"prediction": {"form": "trajectory", "covariance": "none"}}
 FREE = {"loop": "model", "controller": "nonlinear", "R": [1e-10] * 3, "bounded": False}
 TINY = ["steps=3", "samples=15", "trials=1", "model.restarts=0", "flying.restarts=0", "workers=1", "trajectory=lorenz"]
 TINY += ["subsystem=[translational,rotational]", "folder=out"]
@@ -94,7 +94,7 @@ def test_a_run_goes_on_where_it_stopped(finished):
             ["bounds.plant=null"],
             "bounds: must hold lower and upper of the plant on elliptical, translational; got none",
         ),
-        (["bounds.plant.lower=[5,5]"], "input_lower: must be a list of 3 numbers; got [5, 5]"),
+        (["bounds.plant.lower=[5,5]"], "upper: must be a list of 2 numbers, or one by stage; got [100"),
         (
             ["rows.ours_convex.subsystems=[rolling]"],
             "subsystems: must be among translational, rotational; got 'rolling'",
@@ -207,7 +207,7 @@ def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
     """From the last input held, a nearly flat direction of this GP takes it hundreds of iterations."""
     from gpmpc.gaussian import Gaussian
     from gpmpc.gp import Transitions
-    from gpmpc.mpc.problem import TrackingProblem
+    from gpmpc.mpc.problem import Problem, Tracking
 
     rng = np.random.default_rng(0)
     states, inputs = rng.normal(size=(40, 2)), rng.normal(size=(40, 1))
@@ -215,7 +215,7 @@ def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
     import torch
 
     gp = train(Transitions(*map(torch.tensor, (states, inputs, after)))).posterior
-    problem = TrackingProblem([1, 1], [1e-8], penalized="deviations")
+    problem = Problem(Tracking([1, 1], [1e-8], penalized="deviations"))
     controller = NonlinearGPMPC(gp, MomentMatching(), problem, 1, [5.0])
     wanted = gp.predict(torch.tensor(states[0]), torch.tensor(inputs[0])).mean.numpy()
     decision = controller.control(Gaussian.certain(states[0]), Reference(np.stack([states[0], wanted]), inputs[:1]))

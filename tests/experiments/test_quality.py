@@ -15,14 +15,14 @@ from gpmpc.cli.run import experiment_of
 from gpmpc.exceptions import SettingError
 from gpmpc.experiments.quality import FAMILIES, TRUTH, Family, Quality, pareto_front, stage_cost
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.plotting import quality
 from gpmpc.propagation import Linearization
 from gpmpc.studies.study import TrialStore, run_study
 from gpmpc.trajectories import Elliptical
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
-CHEAP = Family("trajectory", "controller=convex controller.covariance=none")
+CHEAP = Family("trajectory", "controller=convex controller.prediction.covariance=none")
 
 few = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12)
 
@@ -49,12 +49,12 @@ def test_where_more_time_has_to_buy_something_every_member_does_and_nobody_else(
 
 def test_the_cost_is_the_sum_of_what_every_step_pays(rng):
     roots = rng.normal(size=(6, 6)), rng.normal(size=(3, 3))
-    weights = TrackingProblem(*(root @ root.T + np.eye(len(root)) for root in roots), penalized="increments")
+    weights = Problem(Tracking(*(root @ root.T + np.eye(len(root)) for root in roots)))
     x, r, u, before = rng.normal(size=(8, 6)), rng.normal(size=(8, 6)), rng.normal(size=(7, 3)), [1.0, -2.0, 0.5]
     paid = 0.0
     for k in range(7):
         e, v = x[k + 1] - r[k + 1], u[k] - (u[k - 1] if k else before)
-        paid += e @ weights.Q @ e + v @ weights.R @ v
+        paid += e @ weights.cost.Q @ e + v @ weights.cost.R @ v
     assert stage_cost(weights, x, r, u, before) == pytest.approx(paid / 7, rel=1e-12)
 
 
@@ -80,9 +80,7 @@ def test_every_controller_and_propagation_of_the_settings_is_among_the_contender
 
 def astray(model, horizon):
     """Hardly ever moves an input."""
-    problem = TrackingProblem(
-        [1] * 6, [1e12] * 3, "increments", input_lower=[0, -0.7, -0.7], input_upper=[20, 0.7, 0.7]
-    )
+    problem = Problem(Tracking([1] * 6, [1e12] * 3), inputs=Box([0, -0.7, -0.7], [20, 0.7, 0.7]))
     return GPMPC(model, Linearization(), problem, horizon, [7.26, 0, 0])
 
 

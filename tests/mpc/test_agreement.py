@@ -10,7 +10,8 @@ from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference, Request
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import PrimalActiveSet
@@ -20,8 +21,8 @@ H = 4
 
 
 def problem(tilt):
-    box = {"input_lower": [0.0, -tilt, -tilt], "input_upper": [15.0, tilt, tilt]}
-    return TrackingProblem([1] * 6, [1] * 3, penalized="increments", **box)
+    box = {"inputs": Box([0.0, -tilt, -tilt], [15.0, tilt, tilt])}
+    return Problem(Tracking([1] * 6, [1] * 3), **box)
 
 
 def questions(count, std):
@@ -35,7 +36,16 @@ def questions(count, std):
 @pytest.mark.parametrize("propagator", [Linearization(), MomentMatching()], ids=["linearisation", "moment matching"])
 def test_iterated_programs_reach_the_optimum_of_the_nonlinear_method(propagator):
     gp = quadrotor_gp()
-    convex = GPMPC(gp, propagator, problem(0.5), H, HOVER, covariance="full", iterations=100, tolerance=1e-7)
+    convex = GPMPC(
+        gp,
+        propagator,
+        problem(0.5),
+        H,
+        HOVER,
+        prediction=PredictionSettings(covariance="full"),
+        iterations=100,
+        tolerance=1e-7,
+    )
     generic = SLSQP(gp, propagator, problem(0.5), H, HOVER, tolerance=1e-6)
     for belief, reference in questions(4, 0.05):
         plans = [controller.control(belief, reference) for controller in (convex, generic)]
@@ -62,7 +72,7 @@ def test_a_bound_that_takes_a_large_step_of_the_inputs_is_kept_by_iterated_progr
     gp, limit = quadrotor_gp(150), 0.05
     sides = np.full(6, np.inf)
     sides[0] = limit
-    bounded = replace(problem(0.5), state_bounds=StateBounds(-np.inf * np.ones(6), sides, confidence=0.99, l1=100))
+    bounded = replace(problem(0.5), constraints=[Box(None, sides, probability=0.99, penalty=100)])
     start = np.array([0.0, 0.4, 0.0, 0.0, 0.0, -0.5])
     belief, reference = Gaussian.certain(start), Reference(np.stack([start, [0.2, 0.4, 0.0, 0.0, 0.3, 0.5]]))
     reached = []
@@ -71,6 +81,8 @@ def test_a_bound_that_takes_a_large_step_of_the_inputs_is_kept_by_iterated_progr
         plan = GPMPC(*asked, iterations=iterations, tolerance=1e-6).control(belief, reference)
         assert plan.status.solved
         after = Linearization(process_noise=True)(gp, belief, torch.tensor(plan.input))
-        reached.append(float(after.mean[0] + bounded.state_bounds.kappa * after.covariance[0, 0].sqrt()) - limit)
+        reached.append(
+            float(after.mean[0] + bounded.constraints[0].standard_deviations() * after.covariance[0, 0].sqrt()) - limit
+        )
     assert abs(reached[0]) > 0.01  # [m]
     assert abs(reached[1]) < 1e-5

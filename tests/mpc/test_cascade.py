@@ -5,16 +5,16 @@ import pytest
 
 from gpmpc.exceptions import SettingError, ShapeError, SolverFailure
 from gpmpc.metrics import tracking_error
+from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.cascade import Cascade
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.simulation import Dropout, Gust, Noise, Replaced, cascade_loop
 from gpmpc.status import Status
 from gpmpc.systems import Coupled, Map, Rotational, System, Translational, step, thrust_direction
 from gpmpc.trajectories import Elliptical, Lorenz, states_along
 
 PLANT = System(Coupled(), time_step=0.05, substeps=1)
-PROBLEM = TrackingProblem([1] * 6, [1] * 3, penalized="increments")
+PROBLEM = Problem(Tracking([1] * 6, [1] * 3))
 OUTER = NMPC(System(Translational(), 1.0, 1), PROBLEM, 1, [7.26, 0, 0])
 INNER = NMPC(System(Rotational(), 0.05, 1), PROBLEM, 1, [0, 0, 0])
 CASCADE = Cascade(OUTER, INNER)

@@ -8,7 +8,7 @@ import pytest
 from gpmpc.exceptions import ShapeError
 from gpmpc.mpc.condense import Condenser, StateRows, condense_with_feedback
 from gpmpc.mpc.linear_quadratic import References, Stages, expand, tracking_cost
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
 from gpmpc.status import Status
 from tests.mpc.double_pendulum import ACROBOT, PENDUBOT, UPRIGHT, DoublePendulum
@@ -59,7 +59,7 @@ def test_constant_stages_are_stages_that_vary_and_do_not(terminal, rng):
     n, m, r, blocks, H = 3, 2, 2, 4, 9
     Q, R = spd(rng, n), spd(rng, m)
     T = spd(rng, n) if terminal == "own" else Q
-    condenser = Condenser(TrackingProblem(Q, R, terminal=T), H, *weights(blocks, Q, T))
+    condenser = Condenser(Problem(Tracking(Q, R, terminal=T, penalized="inputs")), H, *weights(blocks, Q, T))
     stages, start = random_stages(rng, n * blocks, m, H, held=True), rng.normal(size=n * blocks)
     references = random_references(rng, H, n, m)
     rows = StateRows(rng.normal(size=(1, r, n * blocks)), -np.ones((H, r)), np.ones((H, r)))
@@ -77,7 +77,7 @@ def test_constant_stages_are_stages_that_vary_and_do_not(terminal, rng):
 def test_the_condensed_problem_is_the_stacked_one(H, blocks, held, penalized, rng):
     n, m, r, p = 3, 2, 4, 3 * blocks
     Q, T, R = spd(rng, n), spd(rng, n), spd(rng, m)
-    problem = TrackingProblem(Q, R, penalized, T, rate_lower=[-1.0, -2.0], rate_upper=[1.0, np.inf])
+    problem = Problem(Tracking(Q, R, terminal=T, penalized=penalized), input_rates=Box([-1.0, -2.0], [1.0, np.inf]))
     condenser = Condenser(problem, H, *weights(blocks, Q, T))
     stages, start, references = random_stages(rng, p, m, H, held), rng.normal(size=p), random_references(rng, H, n, m)
     rows = StateRows(rng.normal(size=(len(stages.A), r, p)), np.zeros((H, r)), np.ones((H, r)))
@@ -132,7 +132,7 @@ def test_in_increments_it_is_the_papers_problem(rng):
     A[0, :, n:] = 0.0  # as at a measured state
     s0, before, last = rng.normal(size=p), rng.normal(size=p), rng.normal(size=m)
     targets = rng.normal(size=(H, n))
-    condenser = Condenser(TrackingProblem(Q, R), H, *weights(n + 1, Q, Q))
+    condenser = Condenser(Problem(Tracking(Q, R, penalized="inputs")), H, *weights(n + 1, Q, Q))
     c = s0 - A[0] @ before - B[0] @ last
     references = References(targets, np.zeros((H, m)), last)
     P, q, *_ = condenser.condense(Stages(A, B, c[None]), s0, references, no_rows(p, H))
@@ -162,8 +162,8 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
     n, m, r, blocks, H = 3, 2, 2, 2, 8
     p, solver = n * blocks, DualActiveSet()
     Q, T, R = spd(rng, n), spd(rng, n), spd(rng, m)
-    rates = {"rate_lower": [-0.4, -0.3], "rate_upper": [0.4, np.inf]} if rated else {}
-    problem = TrackingProblem(Q, R, penalized, T, input_lower=[-0.5, -0.3], input_upper=[np.inf, 0.4], **rates)
+    rates = {"input_rates": Box([-0.4, -0.3], [0.4, np.inf])} if rated else {}
+    problem = Problem(Tracking(Q, R, terminal=T, penalized=penalized), inputs=Box([-0.5, -0.3], [np.inf, 0.4]), **rates)
     condenser = Condenser(problem, H, *weights(blocks, Q, T))
     stages, start, references = random_stages(rng, p, m, H, held), rng.normal(size=p), random_references(rng, H, n, m)
     rows = StateRows(rng.normal(size=(len(stages.A), r, p)), np.full((H, r), -3.0), np.full((H, r), 4.0))
@@ -176,7 +176,7 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
         solution = solver.solve(QuadraticProgram.unchecked(*program[:5]), soft=soft)
         assert solution.status is Status.SOLVED
         inputs, states = expand(stages, start, program.feedback, references.previous_input, solution.x)
-        z = solution.multipliers[-(len(problem.input_lower) * H * (2 if rated else 1) + H * r) :]
+        z = solution.multipliers[-(len(problem.inputs.lower) * H * (2 if rated else 1) + H * r) :]
         found.append((inputs, states, z))
     assert np.count_nonzero(found[0][2]) > 3
     for one, same in zip(*found, strict=True):
@@ -188,8 +188,8 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
 
 def test_an_unstable_plant_is_condensed_in_feedback_coordinates_and_the_plan_is_found(rng):
     """x+ = 2 x + u over 50 stages: 2^100 stands beside R in P, and nothing of R is left."""
-    H, cost = 50, TrackingProblem([1.0], [1.0], input_lower=[-3.0], input_upper=[3.0])
-    condenser = Condenser(cost, H, *weights(1, cost.Q, cost.terminal))
+    H, problem = 50, Problem(Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-3.0], [3.0]))
+    condenser = Condenser(problem, H, *weights(1, problem.cost.Q, problem.cost.terminal))
     stages = Stages(np.array([[[2.0]]]), np.array([[[1.0]]]), np.zeros((1, 1)))
     references = References(np.zeros((H, 1)), np.zeros((H, 1)), np.zeros(1))
     program = condenser.condense(stages, np.array([2.5]), references, no_rows(1, H))
@@ -203,7 +203,9 @@ def test_an_unstable_plant_is_condensed_in_feedback_coordinates_and_the_plan_is_
 
 
 def test_arrays_that_are_not_contiguous_are_refused(rng):
-    condenser = Condenser(TrackingProblem([1.0, 1.0], [1.0]), 3, *weights(1, np.eye(2), np.eye(2)))
+    condenser = Condenser(
+        Problem(Tracking([1.0, 1.0], [1.0], penalized="inputs")), 3, *weights(1, np.eye(2), np.eye(2))
+    )
     stages = random_stages(rng, 2, 1, 3, held=False)
     with pytest.raises(ShapeError, match="contiguous"):
         condenser.condense(
@@ -232,10 +234,13 @@ def programs_of_the_double_pendulum(starts, seed):
     Six poses count as upright, a turn apart. Every solution is checked against the stages and the bounds.
     """
     H, rng, solver, counts = 60, np.random.default_rng(seed), DualActiveSet(), np.zeros(2, dtype=int)
-    bounds = {"input_lower": [-6.0], "input_upper": [6.0]}
+    bounds = {"inputs": Box([-6.0], [6.0])}
     for joint, penalized, _ in product((ACROBOT, PENDUBOT), ("inputs", "increments"), range(starts)):
-        problem, model = TrackingProblem([100.0, 100.0, 1.0, 1.0], [1e-3], penalized, **bounds), DoublePendulum(joint)
-        condenser = Condenser(problem, H, *weights(1, problem.Q, problem.terminal))
+        problem, model = (
+            Problem(Tracking([100.0, 100.0, 1.0, 1.0], [1e-3], penalized=penalized), **bounds),
+            DoublePendulum(joint),
+        )
+        condenser = Condenser(problem, H, *weights(1, problem.cost.Q, problem.cost.terminal))
         start = np.concatenate([rng.uniform(-np.pi, np.pi, 2), rng.uniform(-15, 15, 2)])
         for turns in product((0, 1), (-1, 0, 1)):
             goal = UPRIGHT + 2 * np.pi * np.array([*turns, 0, 0])

@@ -12,7 +12,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.mpc.stages import StageLinearizer
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from gpmpc.status import Status
@@ -33,11 +34,19 @@ MODES = [
 FORMS = ["velocity", "trajectory"]
 
 
-def controller(form, covariance, propagator, model=GP, **settings):
-    box = {"input_lower": [0, -0.4, -0.4], "input_upper": [15, 0.4, 0.4]}
-    bounds = StateBounds([-2] * 6, [2] * 6, l1=50.0)
-    problem = TrackingProblem([1] * 6, [0.1] * 3, penalized="increments", state_bounds=bounds, **box)
-    return GPMPC(model, propagator, problem, H, HOVER, form=form, covariance=covariance, **settings)
+def controller(form, covariance, propagator, model=GP, feedback=True, **settings):
+    box = {"inputs": Box([0, -0.4, -0.4], [15, 0.4, 0.4])}
+    bounds = Box([-2] * 6, [2] * 6, probability=0.95, penalty=50.0)
+    problem = Problem(Tracking([1] * 6, [0.1] * 3), constraints=[bounds], **box)
+    return GPMPC(
+        model,
+        propagator,
+        problem,
+        H,
+        HOVER,
+        prediction=PredictionSettings(form, covariance, feedback),
+        **settings,
+    )
 
 
 def beliefs(count, spread=0.05, seed=0):

@@ -12,7 +12,8 @@ from gpmpc.gp import backend
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.policy import command
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.status import Status
@@ -20,13 +21,14 @@ from tests.mpc.small_models import double_integrator, pendulum_posterior
 
 H = 8
 PENDULUM = pendulum_posterior()
-PROBLEM = TrackingProblem([10.0, 1.0], [0.1], penalized="increments", input_lower=[-6.0], input_upper=[6.0])
+PROBLEM = Problem(Tracking([10.0, 1.0], [0.1]), inputs=Box([-6.0], [6.0]))
 AT_REST = Reference(np.tile([0.4, 0.0], (H + 1, 1)), np.zeros((H, 1)))
 UNKNOWN = np.array([0.0, 0.08])  # what the plant does that its model does not say [rad, rad/s]
 
 
 def controller(kind=GPMPC, model=PENDULUM, propagator=None, **settings):
-    return kind(model, propagator or Linearization(), PROBLEM, H, [0.0], **settings)
+    iterated = {"iterations": settings.pop("iterations")} if "iterations" in settings else {}
+    return kind(model, propagator or Linearization(), PROBLEM, H, [0.0], PredictionSettings(**settings), **iterated)
 
 
 def moved(model, state, input, unknown=UNKNOWN):

@@ -9,11 +9,11 @@ import torch
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
+from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.prediction import FORMS
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.prediction import FORMS, PredictionSettings
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.mpc.stages import COVARIANCES
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, rollout
 from gpmpc.qp import CvxpySolver, DualActiveSet
@@ -33,12 +33,11 @@ def quadrotor_problem(**changes):
     settings = {
         "Q": [10.0, 1.0] * 3,
         "R": [0.1, 1.0, 1.0],
-        "input_lower": [4.0, -0.4, -0.4],
-        "input_upper": [10.5, 0.4, 0.4],
-        "rate_lower": [-2.0, -0.3, -0.3],
-        "rate_upper": [2.0, 0.3, 0.3],
+        "inputs": Box([4.0, -0.4, -0.4], [10.5, 0.4, 0.4]),
+        "input_rates": Box([-2.0, -0.3, -0.3], [2.0, 0.3, 0.3]),
     }
-    return TrackingProblem(**(settings | {"penalized": "deviations"} | changes))
+    settings |= changes
+    return Problem(Tracking(settings.pop("Q"), settings.pop("R"), penalized="deviations"), **settings)
 
 
 def at_origin(horizon):
@@ -62,12 +61,14 @@ def fly(controller, start, reference, steps):
 @pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
 def test_on_a_linear_model_all_forms_are_the_nonlinear_benchmark(penalized, rng):
     model, H = linear_gaussian(3, 2), 6
-    bounds = StateBounds([-0.6, -np.inf, -0.6], [np.inf, 0.5, np.inf], kappa=0.0)
-    problem = TrackingProblem(
-        [2.0, 1.0, 0.5], [0.3, 0.2], penalized, [5.0, 5.0, 1.0], [-0.7, -0.5], [0.7, 0.4], [-0.5] * 2, [0.5] * 2, bounds
-    )  # fmt: skip
+    bounds = Box([-0.6, -np.inf, -0.6], [np.inf, 0.5, np.inf], probability=0.95, kappa=0.0, penalty=None)
+    cost = Tracking([2.0, 1.0, 0.5], [0.3, 0.2], terminal=[5.0, 5.0, 1.0], penalized=penalized)
+    box, rates = Box([-0.7, -0.5], [0.7, 0.4]), Box([-0.5] * 2, [0.5] * 2)
+    problem = Problem(cost, box, rates, [bounds])
     controllers = [
-        GPMPC(model, propagator(c), problem, H, [0.0, 0.0], f, c) for f, c in PAIRS if f != "velocity" or c != "full"
+        GPMPC(model, propagator(c), problem, H, [0.0, 0.0], prediction=PredictionSettings(form=f, covariance=c))
+        for f, c in PAIRS
+        if f != "velocity" or c != "full"
     ]
     benchmark = NMPC(LinearPlant(model), problem, H, [0.0, 0.0])
     state, last, worked = np.array([0.4, -0.3, 0.2]), None, 0
@@ -88,7 +89,7 @@ def test_on_a_linear_model_all_forms_are_the_nonlinear_benchmark(penalized, rng)
 
 def test_it_is_the_exact_least_squares_solution_and_predicts_the_exact_covariances(rng):
     model, H = linear_gaussian(2, 1), 5
-    problem, state = TrackingProblem([3.0, 0.5], [0.2]), rng.normal(size=2)
+    problem, state = Problem(Tracking([3.0, 0.5], [0.2], penalized="inputs")), rng.normal(size=2)
     reference = Reference(rng.normal(size=(H + 1, 2)))
     A, B, c, V = (part.numpy() for part in (model.A, model.B, model.c, model.V))
     free, gamma, x = [], np.zeros((H, 2, H)), state
@@ -104,7 +105,14 @@ def test_it_is_the_exact_least_squares_solution_and_predicts_the_exact_covarianc
     for _ in range(H):
         S = A @ S @ A.T + V
     for covariance in ("full", "zero_order"):
-        controller = GPMPC(model, Linearization(), problem, H, [0.0], covariance=covariance, feedback=False)
+        controller = GPMPC(
+            model,
+            Linearization(),
+            problem,
+            H,
+            [0.0],
+            prediction=PredictionSettings(covariance=covariance, feedback=False),
+        )
         decision = controller.control(Gaussian.certain(state), reference)
         assert np.allclose(decision.inputs[:, 0], best, atol=1e-9)
         assert np.allclose(decision.covariances[-1], S, atol=1e-12)
@@ -119,18 +127,21 @@ def test_it_is_the_exact_least_squares_solution_and_predicts_the_exact_covarianc
 
 @pytest.mark.parametrize(("form", "covariance"), PAIRS)
 def test_bounds_and_rates_are_kept_for_thirty_steps(form, covariance):
-    problem, H = quadrotor_problem(rate_lower=[-2, -0.1, -0.1], rate_upper=[2, 0.1, 0.1]), 4
+    problem, H = quadrotor_problem(input_rates=Box([-2, -0.1, -0.1], [2, 0.1, 0.1])), 4
     moves = propagator(covariance)
     if covariance in ("full", "diagonal") and form == "trajectory":
         moves = MeanEquivalence()  # half the time; the bounds do not care
-    controller, steps = GPMPC(gp(), moves, problem, H, HOVER, form, covariance), 30
+    controller, steps = (
+        GPMPC(gp(), moves, problem, H, HOVER, prediction=PredictionSettings(form=form, covariance=covariance)),
+        30,
+    )
     states, inputs, decisions = fly(controller, [0.8, 0.0, -0.6, 0.0, 0.5, 0.0], at_origin(H), steps)
     rates = np.diff(inputs, axis=0, prepend=HOVER[None])
     plans = np.concatenate([d.inputs for d in decisions])
-    assert (plans >= problem.input_lower - 1e-8).all()
-    assert (plans <= problem.input_upper + 1e-8).all()
-    assert (rates >= problem.rate_lower - 1e-8).all()
-    assert (rates <= problem.rate_upper + 1e-8).all()
+    assert (plans >= problem.inputs.lower - 1e-8).all()
+    assert (plans <= problem.inputs.upper + 1e-8).all()
+    assert (rates >= problem.input_rates.lower - 1e-8).all()
+    assert (rates <= problem.input_rates.upper + 1e-8).all()
     assert np.abs(rates[:, 1:]).max() > 0.1 - 1e-6  # they were needed
     assert np.abs(states[-5:, ::2]).max() < 0.1
     assert decisions[-1].means.shape == (H + 1, 6)
@@ -141,7 +152,7 @@ def test_bounds_and_rates_are_kept_for_thirty_steps(form, covariance):
 def expected_cost(problem, model, moves, state, inputs, reference, covariance):
     """The nonlinear problem's cost, chance margins (H, n) and inputs (H, m) with their graph."""
     u = torch.tensor(inputs, requires_grad=True)
-    belief, Q, means, variances, cost = Gaussian.certain(torch.tensor(state)), torch.tensor(problem.Q), [], [], 0.0
+    belief, Q, means, variances, cost = Gaussian.certain(torch.tensor(state)), torch.tensor(problem.cost.Q), [], [], 0.0
     for k, control in enumerate(u):
         if covariance == "diagonal":
             belief = Gaussian(belief.mean, torch.diag_embed(belief.variance))
@@ -150,7 +161,7 @@ def expected_cost(problem, model, moves, state, inputs, reference, covariance):
         error = belief.mean - torch.tensor(reference.states[k + 1])
         cost = cost + error @ Q @ error + (Q * belief.covariance).sum() * (covariance in ("full", "diagonal"))
         change = control - torch.tensor(reference.inputs[k])
-        cost = cost + change @ torch.tensor(problem.R) @ change
+        cost = cost + change @ torch.tensor(problem.cost.R) @ change
         means.append(belief.mean)
         variances.append(belief.variance)
     return cost, torch.stack(means), torch.stack(variances), u
@@ -164,14 +175,22 @@ def expected_cost(problem, model, moves, state, inputs, reference, covariance):
 )  # fmt: skip
 def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance, moves):
     H = 3
-    limits = StateBounds([-np.inf, -0.35] * 3, [np.inf, 0.9] * 3, confidence=0.9)
-    problem, reference = quadrotor_problem(state_bounds=limits), at_origin(H)
+    limits = Box([-np.inf, -0.35] * 3, [np.inf, 0.9] * 3, probability=0.9, penalty=None)
+    problem, reference = quadrotor_problem(constraints=[limits]), at_origin(H)
     state = np.array([0.8, -0.1, -0.4, 0.1, 0.3, 0.0])
     model = gp(20 if isinstance(moves, MomentMatching) else 60)
 
     settings = {"iterations": 40, "tolerance": 1e-8}
-    controller = GPMPC(model, moves, problem, H, HOVER, "trajectory", covariance, **settings)
-    kappa = 0.0 if covariance == "none" else limits.kappa
+    controller = GPMPC(
+        model,
+        moves,
+        problem,
+        H,
+        HOVER,
+        prediction=PredictionSettings(form="trajectory", covariance=covariance),
+        **settings,
+    )
+    kappa = 0.0 if covariance == "none" else limits.standard_deviations()
 
     def exact(inputs):
         cost, means, variances, u = expected_cost(problem, model, moves, state, inputs, reference, covariance)
@@ -197,18 +216,26 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
 
 
 def test_zero_order_ends_where_its_own_tightening_holds():
-    H, limits = 4, StateBounds([-np.inf, -0.5] * 3, [np.inf, 0.9] * 3, confidence=0.9)
-    problem, state = quadrotor_problem(state_bounds=limits), np.array([0.8, -0.1, -0.4, 0.1, 0.3, 0.0])
+    H, limits = 4, Box([-np.inf, -0.5] * 3, [np.inf, 0.9] * 3, probability=0.9, penalty=None)
+    problem, state = quadrotor_problem(constraints=[limits]), np.array([0.8, -0.1, -0.4, 0.1, 0.3, 0.0])
     controller = GPMPC(gp(), Linearization(), problem, H, HOVER, iterations=30, tolerance=1e-7)
     decision = controller.control(Gaussian.certain(state), at_origin(H))
     assert decision.status is Status.SOLVED
     sd = np.sqrt(np.diagonal(decision.covariances[1:], axis1=1, axis2=2))
-    margin = decision.means[1:, 1::2] - limits.kappa * sd[:, 1::2] + 0.5
+    margin = decision.means[1:, 1::2] - limits.standard_deviations() * sd[:, 1::2] + 0.5
     assert margin.min() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_too_few_iterations_say_so():
-    controller = GPMPC(gp(), MeanEquivalence(), quadrotor_problem(), 4, HOVER, "trajectory", "none", iterations=2)
+    controller = GPMPC(
+        gp(),
+        MeanEquivalence(),
+        quadrotor_problem(),
+        4,
+        HOVER,
+        prediction=PredictionSettings(form="trajectory", covariance="none"),
+        iterations=2,
+    )
     decision = controller.control(Gaussian.certain(np.array([0.8, 0, 0.8, 0, 0.8, 0])), at_origin(4))
     assert decision.status is Status.ITERATION_LIMIT
     assert decision.iterations == 2
@@ -220,26 +247,40 @@ def test_a_higher_confidence_keeps_further_from_the_bound(form, covariance):
     reference = Reference(np.tile([1.0, 1.0, 0, 0, 0, 0], (H + 1, 1)), np.tile(HOVER, (H, 1)))
     highest, last = [], None
     for confidence in (0.6, 0.9, 0.99):
-        limits = StateBounds([-np.inf] * 6, [0.9, np.inf, np.inf, np.inf, np.inf, np.inf], confidence)
-        problem = quadrotor_problem(Q=[10.0, 10.0, 1, 1, 1, 1], state_bounds=limits)
+        limits = Box([-np.inf] * 6, [0.9, np.inf, np.inf, np.inf, np.inf, np.inf], probability=confidence, penalty=None)
+        problem = quadrotor_problem(Q=[10.0, 10.0, 1, 1, 1, 1], constraints=[limits])
         count = 25 if form == "trajectory" else 1
         controller = GPMPC(
-            gp(), propagator(covariance), problem, H, HOVER, form, covariance, iterations=count, tolerance=1e-5
+            gp(),
+            propagator(covariance),
+            problem,
+            H,
+            HOVER,
+            prediction=PredictionSettings(form=form, covariance=covariance),
+            iterations=count,
+            tolerance=1e-5,
         )
         last = controller.control(Gaussian.certain(state), reference)
         assert last.status is Status.SOLVED
         highest.append(last.means[1:, 0].max())
         sd = np.sqrt(last.covariances[1:, 0, 0])
-        assert (last.means[1:, 0] + limits.kappa * sd).max() < 0.9 + 1e-4
+        assert (last.means[1:, 0] + limits.standard_deviations() * sd).max() < 0.9 + 1e-4
     assert highest[0] > highest[1] + 1e-3 > highest[2] + 2e-3
 
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("price", [None, 100.0], ids=["hard", "soft"])
 def test_a_horizon_of_fifty_with_state_bounds_stays_feasible(form, price):
-    H, limits = 50, StateBounds([-1.5, -0.8] * 3, [1.5, 0.8] * 3, confidence=0.95, l1=price)
+    H, limits = 50, Box([-1.5, -0.8] * 3, [1.5, 0.8] * 3, probability=0.95, penalty=price)
     covariance = "zero_order"
-    controller = GPMPC(gp(), MeanEquivalence(), quadrotor_problem(state_bounds=limits), H, HOVER, form, covariance)
+    controller = GPMPC(
+        gp(),
+        MeanEquivalence(),
+        quadrotor_problem(constraints=[limits]),
+        H,
+        HOVER,
+        prediction=PredictionSettings(form=form, covariance=covariance),
+    )
     states, _, decisions = fly(controller, [0.8, 0.0, -0.6, 0.0, 0.5, 0.0], at_origin(H), 2)
     assert np.isfinite(states).all()
     assert decisions[-1].inputs.shape == (50, 3)
@@ -248,22 +289,32 @@ def test_a_horizon_of_fifty_with_state_bounds_stays_feasible(form, price):
 def test_feedback_keeps_a_long_horizon_feasible_where_open_loop_is_not():
     model, H = linear_gaussian(2, 1), 50
     model = replace(model, A=torch.tensor([[1.0, 0.2], [0.0, 1.0]]), B=torch.tensor([[0.02], [0.2]]), c=torch.zeros(2))
-    problem = TrackingProblem([1.0, 0.1], [0.1], state_bounds=StateBounds([-1.5, -2.0], [1.5, 2.0]))
+    problem = Problem(
+        Tracking([1.0, 0.1], [0.1], penalized="inputs"),
+        constraints=[Box([-1.5, -2.0], [1.5, 2.0], probability=0.95, penalty=None)],
+    )
     belief, reference = Gaussian.certain(np.array([0.3, 0.0])), Reference(np.zeros((H + 1, 2)))
-    closed, opened = (GPMPC(model, Linearization(), problem, H, [0.0], feedback=f) for f in (True, False))
+    closed, opened = (
+        GPMPC(model, Linearization(), problem, H, [0.0], prediction=PredictionSettings(feedback=f))
+        for f in (True, False)
+    )
     assert closed.control(belief, reference).status is Status.SOLVED
     decision = opened.control(belief, reference)
     assert decision.status is Status.INFEASIBLE
     assert "soften" in decision.status.advice
-    priced = replace(problem, state_bounds=replace(problem.state_bounds, l1=10.0, l2=1.0))
-    softened = GPMPC(model, Linearization(), priced, H, [0.0], feedback=False).control(belief, reference)
+    priced = replace(problem, constraints=[replace(problem.constraints[0], penalty=10.0)])
+    softened = GPMPC(model, Linearization(), priced, H, [0.0], prediction=PredictionSettings(feedback=False)).control(
+        belief, reference
+    )
     assert softened.status is Status.SOLVED
 
 
 def test_soft_bounds_cost_what_they_are_said_to_cost():
     model, H = linear_gaussian(3, 2), 4
-    limits = StateBounds([-0.2] * 3, [0.2] * 3, kappa=0.0, l1=0.3, l2=2.0)
-    problem = TrackingProblem([1.0] * 3, [0.3] * 2, input_lower=[-0.3] * 2, input_upper=[0.3] * 2, state_bounds=limits)
+    limits = Box([-0.2] * 3, [0.2] * 3, probability=0.95, kappa=0.0, penalty=0.3)
+    problem = Problem(
+        Tracking([1.0] * 3, [0.3] * 2, penalized="inputs"), inputs=Box([-0.3] * 2, [0.3] * 2), constraints=[limits]
+    )
     belief, reference = Gaussian.certain(np.array([1.0, -0.5, 0.3])), Reference(np.zeros((H + 1, 3)))
     convex = GPMPC(model, Linearization(), problem, H, [0.0] * 2).control(belief, reference)
     benchmark = NMPC(LinearPlant(model), problem, H, [0.0] * 2).control(belief, reference)
@@ -273,9 +324,15 @@ def test_soft_bounds_cost_what_they_are_said_to_cost():
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_warm_start_changes_the_time_and_not_the_answer(form):
-    limits = StateBounds([-np.inf, -0.4] * 3, [np.inf, 0.4] * 3)
+    limits = Box([-np.inf, -0.4] * 3, [np.inf, 0.4] * 3, probability=0.95, penalty=None)
     controller = GPMPC(
-        gp(), MeanEquivalence(), quadrotor_problem(state_bounds=limits), 6, HOVER, form, "none", DualActiveSet()
+        gp(),
+        MeanEquivalence(),
+        quadrotor_problem(constraints=[limits]),
+        6,
+        HOVER,
+        prediction=PredictionSettings(form=form, covariance="none"),
+        solver=DualActiveSet(),
     )
     _, _, decisions = fly(controller, [0.8, 0, -0.6, 0, 0.5, 0], at_origin(6), 5)
     state = Gaussian.certain(decisions[-1].means[1])
@@ -301,7 +358,16 @@ def test_build_is_the_problem_that_control_solves():
 
 @pytest.mark.parametrize("iterations", [1, 5])
 def test_a_measurement_that_is_not_finite_is_not_given_to_the_solver(iterations):
-    controller = GPMPC(gp(), MeanEquivalence(), quadrotor_problem(), 3, HOVER, "trajectory", "none", None, iterations)
+    controller = GPMPC(
+        gp(),
+        MeanEquivalence(),
+        quadrotor_problem(),
+        3,
+        HOVER,
+        prediction=PredictionSettings(form="trajectory", covariance="none"),
+        solver=None,
+        iterations=iterations,
+    )
     for bad in (np.nan, np.inf):
         decision = controller.control(Gaussian.certain(np.array([0, 0, bad, 0, 0, 0])), at_origin(3))
         assert decision.status is Status.INVALID_MEASUREMENT
@@ -310,7 +376,14 @@ def test_a_measurement_that_is_not_finite_is_not_given_to_the_solver(iterations)
 
 
 def test_a_decision_that_was_not_solved_is_no_warm_start():
-    controller = GPMPC(gp(), MeanEquivalence(), quadrotor_problem(), 3, HOVER, "trajectory", "none")
+    controller = GPMPC(
+        gp(),
+        MeanEquivalence(),
+        quadrotor_problem(),
+        3,
+        HOVER,
+        prediction=PredictionSettings(form="trajectory", covariance="none"),
+    )
     belief = Gaussian.certain(np.full(6, 0.3))
     fresh = controller.control(belief, at_origin(3))
     nothing = {"inputs": np.full((3, 3), np.nan), "status": Status.NUMERICAL_TROUBLE, "solution": None}
@@ -319,8 +392,10 @@ def test_a_decision_that_was_not_solved_is_no_warm_start():
 
 
 def test_what_was_applied_at_a_failed_step_is_where_the_next_increment_starts():
-    problem = quadrotor_problem(rate_lower=[-0.05] * 3, rate_upper=[0.05] * 3)
-    controller = GPMPC(gp(), MeanEquivalence(), problem, 3, HOVER, "trajectory", "none")
+    problem = quadrotor_problem(input_rates=Box([-0.05] * 3, [0.05] * 3))
+    controller = GPMPC(
+        gp(), MeanEquivalence(), problem, 3, HOVER, prediction=PredictionSettings(form="trajectory", covariance="none")
+    )
     decision = controller.control(Gaussian.certain(np.full(6, 0.3)), at_origin(3))
     for _ in range(3):
         decision = controller.control(Gaussian.certain(np.full(6, 0.3)), at_origin(3), decision)
@@ -333,17 +408,16 @@ def test_what_was_applied_at_a_failed_step_is_where_the_next_increment_starts():
 
 @pytest.mark.parametrize("iterations", [1, 10])
 def test_bounds_that_cannot_be_kept_are_reported(iterations):
-    limits = StateBounds([-np.inf] * 6, [0.1] + [np.inf] * 5)
+    limits = Box([-np.inf] * 6, [0.1] + [np.inf] * 5, probability=0.95, penalty=None)
     controller = GPMPC(
         gp(),
         MeanEquivalence(),
-        quadrotor_problem(state_bounds=limits),
+        quadrotor_problem(constraints=[limits]),
         3,
         HOVER,
-        "trajectory",
-        "none",
-        None,
-        iterations,
+        prediction=PredictionSettings(form="trajectory", covariance="none"),
+        solver=None,
+        iterations=iterations,
     )
     decision = controller.control(Gaussian.certain(np.array([0.8, 0.5, 0, 0, 0, 0])), at_origin(3))
     assert decision.status is Status.INFEASIBLE
@@ -354,24 +428,28 @@ def test_bounds_that_cannot_be_kept_are_reported(iterations):
     ("changes", "message"),
     [
         ({"horizon": 0}, "horizon: must be a whole number, 1 or more; got 0"),
-        ({"problem": TrackingProblem([1.0] * 5, [1.0] * 3)}, "must weigh 6 states and 3 inputs; got 5 and 3"),
+        ({"problem": Problem(Tracking([1.0] * 5, [1.0] * 3))}, "must weigh 6 states and 3 inputs; got 5 and 3"),
         ({"initial_input": [0.0]}, "initial_input: must be a list of 3 numbers"),
-        ({"form": "ltv"}, "form: must be one of 'trajectory', 'velocity'; got 'ltv'"),
-        ({"covariance": "some"}, "covariance: must be one of 'full', 'diagonal', 'zero_order', 'none'; got 'some'"),
+        ({"prediction": {"form": "ltv"}}, "form: must be one of 'trajectory', 'velocity'; got 'ltv'"),
+        ({"prediction": {"covariance": "some"}}, "one of 'full', 'diagonal', 'zero_order', 'none'; got 'some'"),
         ({"iterations": 0}, "iterations: must be a whole number, 1 or more; got 0"),
-        ({"iterations": 2, "form": "velocity"}, "iterations: form 'velocity' is one quadratic program, so 1; got 2"),
+        ({"iterations": 2, "prediction": {"form": "velocity"}}, "velocity' is one quadratic program, so 1; got 2"),
         ({"tolerance": 0.0}, "tolerance: must be a number above 0"),
-        ({"feedback": "yes"}, "feedback: must be true or false; got 'yes'"),
+        ({"prediction": {"feedback": "yes"}}, "feedback: must be true or false; got 'yes'"),
         (
-            {"problem": quadrotor_problem(state_bounds=StateBounds([0] * 6, [1] * 6, l1=1.0)), "solver": CvxpySolver()},
-            "solver: state bounds with a price .* need DualActiveSet; got CvxpySolver",
+            {"problem": quadrotor_problem(constraints=[Box([0] * 6, [1] * 6)]), "solver": CvxpySolver()},
+            "solver: soft constraints need DualActiveSet .*; got CvxpySolver",
         ),
     ],
 )  # fmt: skip
 def test_misuse_is_refused_at_construction(changes, message):
     good = {"problem": quadrotor_problem(), "horizon": 3, "initial_input": HOVER}
+
+    def make(prediction=None, **settings):
+        GPMPC(gp(), Linearization(), prediction=PredictionSettings(**prediction or {}), **settings)
+
     with pytest.raises(SettingError, match=message):
-        GPMPC(gp(), Linearization(), **(good | changes))
+        make(**(good | changes))
 
 
 def test_a_reference_that_does_not_belong_is_refused():
@@ -390,8 +468,8 @@ def test_a_reference_that_does_not_belong_is_refused():
 @pytest.mark.parametrize("covariance", ["zero_order", "none"])
 def test_the_compiled_rollout_is_the_one_stage_by_stage(covariance, feedback, process_noise):
     H, propagator = 6, Linearization(process_noise=process_noise)
-    arguments = (gp(), propagator, quadrotor_problem(), H, HOVER, "trajectory", covariance)
-    compiled, by_torch = GPMPC(*arguments, feedback=feedback), GPMPC(*arguments, feedback=feedback)
+    settings = PredictionSettings(covariance=covariance, feedback=feedback)
+    compiled, by_torch = (GPMPC(gp(), propagator, quadrotor_problem(), H, HOVER, settings) for _ in range(2))
     belief = Gaussian(torch.full((6,), 0.2), 1e-3 * torch.eye(6))
     first = compiled.control(belief, at_origin(H))
     with backend("torch"):
@@ -408,7 +486,14 @@ def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_reque
     state, found = Gaussian.certain(np.array([0.3, 0.0, -0.2, 0.1, 0.2, 0.0])), []
     for noise in (False, True):
         how = Linearization(process_noise=noise)
-        controller = GPMPC(gp(), how, quadrotor_problem(), 3, HOVER, form, covariance, feedback=False)
+        controller = GPMPC(
+            gp(),
+            how,
+            quadrotor_problem(),
+            3,
+            HOVER,
+            prediction=PredictionSettings(form=form, covariance=covariance, feedback=False),
+        )
         with backend(evaluated):
             found.append(controller.control(state, at_origin(3)).covariances[1])
     assert np.allclose(found[1] - found[0], gp().noise_covariance, atol=1e-6)  # of 1e-4; the plans differ a little

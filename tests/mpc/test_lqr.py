@@ -7,11 +7,11 @@ import torch
 from gpmpc.dynamics import linearize_by_autograd
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.baselines import LQR
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.mpc.linear_quadratic import dlqr, finite_horizon_lqr
-from gpmpc.mpc.lqr import LQR
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import MeanEquivalence
 from gpmpc.status import Status
 from tests.mpc.small_models import LinearGaussian, double_integrator, pendulum_posterior
@@ -23,7 +23,7 @@ Q, R = np.array([[3.0, 0.4], [0.4, 0.5]]), np.array([[0.2]])
 @pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
 def test_without_bounds_it_is_the_optimum_of_a_linear_model(penalized, rng):
     H, model = 6, double_integrator(c=[0.1, -0.2])
-    problem = TrackingProblem(Q, R, penalized, terminal=3 * Q)
+    problem = Problem(Tracking(Q, R, terminal=3 * Q, penalized=penalized))
     reference = Reference(rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1)))
     state = Gaussian.certain(rng.normal(size=2))
     ours = LQR(model, problem, H, [0.3]).control(state, reference)
@@ -45,7 +45,10 @@ def test_the_stationary_gain_solves_the_riccati_equation():
 
 
 def test_a_long_horizon_gives_the_stationary_gain(rng):
-    controller, state = LQR(double_integrator(), TrackingProblem(Q, R), 60, [0.0]), rng.normal(size=2)
+    controller, state = (
+        LQR(double_integrator(), Problem(Tracking(Q, R, penalized="inputs")), 60, [0.0]),
+        rng.normal(size=2),
+    )
     decision = controller.control(Gaussian.certain(state), Reference(np.zeros((61, 2))))
     assert np.allclose(decision.input, -dlqr(A, B, Q, R) @ state, atol=1e-9)
 
@@ -66,14 +69,14 @@ def test_reference_inputs_feed_forward():
     states, wanted = [np.array([0.2, -0.1])], np.array([[0.3], [0.1], [-0.4], [0.2], [0.0]])
     for u in wanted:
         states.append(A @ states[-1] + B @ u)
-    controller = LQR(model, TrackingProblem(Q, R, "deviations"), H, [0.0])
+    controller = LQR(model, Problem(Tracking(Q, R, penalized="deviations")), H, [0.0])
     decision = controller.control(Gaussian.certain(states[0]), Reference(np.array(states), wanted))
     assert np.allclose(decision.inputs, wanted, atol=1e-10)
 
 
 def test_inputs_are_clipped_to_the_box_and_the_rates():
-    bounds = {"input_lower": [-0.5], "input_upper": [0.4], "rate_lower": [-0.3], "rate_upper": [0.3]}
-    controller = LQR(double_integrator(), TrackingProblem(Q, R, **bounds), 6, [0.0])
+    bounds = {"inputs": Box([-0.5], [0.4]), "input_rates": Box([-0.3], [0.3])}
+    controller = LQR(double_integrator(), Problem(Tracking(Q, R, penalized="inputs"), **bounds), 6, [0.0])
     decision = controller.control(Gaussian.certain(np.array([-3.0, 0.0])), Reference(np.zeros((7, 2))))
     rates = np.diff(decision.inputs[:, 0], prepend=0.0)
     assert rates[0] == pytest.approx(0.3)
@@ -84,14 +87,16 @@ def test_inputs_are_clipped_to_the_box_and_the_rates():
 
 def test_an_input_without_effect_stays_at_rest():
     model = LinearGaussian(A.tolist(), [[0.125, 0.0], [0.5, 0.0]])
-    controller = LQR(model, TrackingProblem(Q, [1e-3, 1e-3]), 3, [0.0, 0.0])
+    controller = LQR(model, Problem(Tracking(Q, [1e-3, 1e-3], penalized="inputs")), 3, [0.0, 0.0])
     decision = controller.control(Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros((4, 2))))
     assert np.allclose(decision.inputs[:, 1], 0)
 
 
 def test_it_brings_a_learned_pendulum_to_rest():
     model, state, decision = pendulum_posterior(), np.array([0.8, 0.0]), None
-    controller = LQR(model, TrackingProblem([5.0, 0.5], [0.05], input_lower=[-4.0], input_upper=[4.0]), 15, [0.0])
+    controller = LQR(
+        model, Problem(Tracking([5.0, 0.5], [0.05], penalized="inputs"), inputs=Box([-4.0], [4.0])), 15, [0.0]
+    )
     for _ in range(40):
         decision = controller.control(Gaussian.certain(state), Reference(np.zeros((16, 2))), decision)
         acceleration = -4 * np.sin(state[0]) - 0.3 * state[1] + decision.input[0]
@@ -100,22 +105,20 @@ def test_it_brings_a_learned_pendulum_to_rest():
 
 
 def test_a_bad_measurement_is_said_so_and_misuse_is_refused():
-    controller = LQR(double_integrator(), TrackingProblem(Q, R), 3, [0.2])
+    controller = LQR(double_integrator(), Problem(Tracking(Q, R, penalized="inputs")), 3, [0.2])
     decision = controller.control(Gaussian.certain(np.array([np.nan, 0.0])), Reference(np.zeros((4, 2))))
     assert decision.status is Status.INVALID_MEASUREMENT
     assert np.array_equal(decision.inputs, np.full((3, 1), 0.2))
     with pytest.raises(ShapeError, match=r"shapes \(2,\) and \(4, 2\)"):
         controller.control(Gaussian.certain(np.zeros(2)), Reference(np.zeros((3, 2))))
     with pytest.raises(SettingError, match="must weigh 2 states and 1 inputs; got 2 and 2"):
-        LQR(double_integrator(), TrackingProblem(Q, [1.0, 1.0]), 3, [0.2])
+        LQR(double_integrator(), Problem(Tracking(Q, [1.0, 1.0], penalized="inputs")), 3, [0.2])
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_where_rates_and_box_contradict_each_other_no_input_leaves_the_box(side, rng):
     """The input before was far outside, and the rates alone would keep the next ones there."""
-    problem = TrackingProblem(
-        Q, R, input_lower=[-0.5], input_upper=[0.4], rate_lower=[-0.1], rate_upper=[0.1], penalized="increments"
-    )
+    problem = Problem(Tracking(Q, R), inputs=Box([-0.5], [0.4]), input_rates=Box([-0.1], [0.1]))
     controller = LQR(double_integrator(), problem, 5, [side * 3.0])
     for _ in range(20):
         decision = controller.control(Gaussian.certain(rng.normal(size=2)), Reference(rng.normal(size=(6, 2))), None)
@@ -143,21 +146,26 @@ def test_the_local_models_are_taken_at_the_state_and_then_along_the_reference(kn
     model, H = Watched(A.tolist(), B.tolist()), 4
     states, wanted, state = rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1)), rng.normal(size=2)
     reference = Reference(states, wanted if known else None)
-    LQR(model, TrackingProblem(Q, R), H, [0.3]).control(Gaussian.certain(state), reference)
+    LQR(model, Problem(Tracking(Q, R, penalized="inputs")), H, [0.3]).control(Gaussian.certain(state), reference)
     assert np.array_equal(model.seen[0], np.vstack([state, states[1:-1]]))
     assert np.array_equal(model.seen[1], wanted if known else np.full((H, 1), 0.3))
 
 
 @pytest.mark.parametrize("factor", [np.nan, np.inf, 1e250])
 def test_a_model_that_is_not_finite_or_grows_beyond_all_numbers_is_numerical_trouble(factor):
-    controller = LQR(Watched(A.tolist(), B.tolist(), factor=factor), TrackingProblem(Q, R), 4, [0.2])
+    controller = LQR(
+        Watched(A.tolist(), B.tolist(), factor=factor), Problem(Tracking(Q, R, penalized="inputs")), 4, [0.2]
+    )
     decision = controller.control(Gaussian.certain(np.ones(2)), Reference(np.zeros((5, 2))))
     assert decision.status is Status.NUMERICAL_TROUBLE
     assert np.array_equal(decision.inputs, np.full((4, 1), 0.2))
 
 
 def test_a_state_that_is_part_of_a_graph_is_answered_like_any_other():
-    controller, reference = LQR(double_integrator(), TrackingProblem(Q, R), 3, [0.2]), Reference(np.zeros((4, 2)))
+    controller, reference = (
+        LQR(double_integrator(), Problem(Tracking(Q, R, penalized="inputs")), 3, [0.2]),
+        Reference(np.zeros((4, 2))),
+    )
     state = torch.tensor([0.3, -0.2], requires_grad=True)
     ours = controller.control(Gaussian(2 * state, torch.zeros(2, 2)), reference)
     assert np.array_equal(ours.inputs, controller.control(Gaussian.certain([0.6, -0.4]), reference).inputs)

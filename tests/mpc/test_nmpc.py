@@ -3,9 +3,9 @@ import pytest
 
 from gpmpc.exceptions import SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.controller import Decision, Reference, Timing
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.simulation import closed_loop
 from gpmpc.status import Status
 from gpmpc.systems import Map, Rotational, System, Translational, step
@@ -31,7 +31,7 @@ def test_on_a_linear_plant_it_is_the_least_squares_solution(rng):
     rows = (np.sqrt(Q)[None, :, None] * response).reshape(-1, H)
     right = (np.sqrt(Q) * (reference[1:] - free)).ravel()
     best = np.linalg.lstsq(np.vstack([rows, np.sqrt(R) * np.eye(H)]), np.append(right, np.zeros(H)), rcond=None)[0]
-    controller = NMPC(plant, TrackingProblem(Q, R), H, [0.0])
+    controller = NMPC(plant, Problem(Tracking(Q, R, penalized="inputs")), H, [0.0])
     decision = controller.control(Gaussian.certain(state), Reference(reference))
     assert decision.status is Status.SOLVED
     assert np.allclose(decision.inputs[:, 0], best, atol=1e-8)
@@ -45,7 +45,7 @@ def test_no_small_change_of_the_plan_is_cheaper(plant, rng):
     H, Q, R = 4, np.array([20.0, 1, 20, 1, 20, 1]), np.array([1.0, 1, 1])
     state, reference = 0.1 * rng.normal(size=6), 0.3 * rng.normal(size=(H + 1, 6))
     initial = [7.26, 0, 0] if isinstance(plant, System) else [0, 0, 0]
-    controller = NMPC(plant, TrackingProblem(Q, R), H, initial)
+    controller = NMPC(plant, Problem(Tracking(Q, R, penalized="inputs")), H, initial)
     decision = controller.control(Gaussian.certain(state), Reference(reference))
 
     def cost(inputs):
@@ -65,27 +65,37 @@ def test_no_small_change_of_the_plan_is_cheaper(plant, rng):
     ("arguments", "error", "message"),
     [
         ({"horizon": 0}, SettingError, "horizon: must be a whole number, 1 or more; got 0"),
-        ({"problem": TrackingProblem([1.0] * 5, [1.0] * 3)}, SettingError, "must weigh 6 states and 3 inputs; got 5"),
+        (
+            {"problem": Problem(Tracking([1.0] * 5, [1.0] * 3, penalized="inputs"))},
+            SettingError,
+            "must weigh 6 states and 3 inputs; got 5",
+        ),
         ({"initial_input": [0.0]}, SettingError, "initial_input: must be a list of 3 numbers"),
     ],
 )
 def test_misuse_is_refused_at_construction(arguments, error, message):
-    good = {"horizon": 3, "problem": TrackingProblem([1.0] * 6, [1.0] * 3), "initial_input": [0.0] * 3}
+    good = {
+        "horizon": 3,
+        "problem": Problem(Tracking([1.0] * 6, [1.0] * 3, penalized="inputs")),
+        "initial_input": [0.0] * 3,
+    }
     with pytest.raises(error, match=message):
         NMPC(System(Map(Rotational())), **(good | arguments))
 
 
 def test_a_reference_of_another_shape_is_refused():
-    controller = NMPC(System(Map(Rotational())), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3)
+    controller = NMPC(
+        System(Map(Rotational())), Problem(Tracking([1.0] * 6, [1.0] * 3, penalized="inputs")), 3, [0.0] * 3
+    )
     with pytest.raises(ShapeError, match=r"shapes \(6,\) and \(4, 6\); got \(6,\) and \(2, 6\)"):
         controller.control(Gaussian.certain(np.zeros(6)), Reference(np.zeros((2, 6))))
 
 
 def test_bounds_on_inputs_rates_and_states_are_kept(rng):
     plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
-    limits = StateBounds([-np.inf, -0.3], [np.inf, 0.3])
-    bounds = {"input_lower": [-1.0], "input_upper": [0.4], "rate_lower": [-0.3], "rate_upper": [0.3]}
-    problem = TrackingProblem([1.0, 0.0], [1e-3], state_bounds=limits, **bounds)
+    limits = Box([-np.inf, -0.3], [np.inf, 0.3], probability=0.95, penalty=None)
+    bounds = {"inputs": Box([-1.0], [0.4]), "input_rates": Box([-0.3], [0.3])}
+    problem = Problem(Tracking([1.0, 0.0], [1e-3], penalized="inputs"), constraints=[limits], **bounds)
     decision = NMPC(plant, problem, 8, [0.0]).control(Gaussian.certain(np.zeros(2)), Reference(np.full((9, 2), 1.0)))
     assert decision.status is Status.SOLVED
     rates = np.diff(decision.inputs[:, 0], prepend=0.0)
@@ -98,8 +108,8 @@ def test_bounds_on_inputs_rates_and_states_are_kept(rng):
 
 def test_soft_state_bounds_give_way_where_they_must():
     plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
-    limits = StateBounds([-np.inf, -0.3], [np.inf, 0.3], l1=100.0)
-    problem = TrackingProblem([1.0, 0.0], [1e-3], input_lower=[-0.2], input_upper=[0.2], state_bounds=limits)
+    limits = Box([-np.inf, -0.3], [np.inf, 0.3], probability=0.95, penalty=100.0)
+    problem = Problem(Tracking([1.0, 0.0], [1e-3], penalized="inputs"), inputs=Box([-0.2], [0.2]), constraints=[limits])
     fast = Gaussian.certain(np.array([0.0, 0.5]))
     decision = NMPC(plant, problem, 5, [0.0]).control(fast, Reference(np.zeros((6, 2))))
     assert decision.status is Status.SOLVED
@@ -151,17 +161,19 @@ def test_too_few_references_are_refused_before_the_first_step():
 def test_soft_bounds_of_one_state_leave_the_others_free():
     plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
     state, reference = Gaussian.certain(np.array([0.2, 0.1])), Reference(np.full((6, 2), 1.0))
-    wide = StateBounds([-np.inf, -9.0], [np.inf, 9.0], l1=1.0, l2=1.0)
+    wide = Box([-np.inf, -9.0], [np.inf, 9.0], probability=0.95, penalty=1.0)
     free, bounded = (
-        NMPC(plant, TrackingProblem([1.0, 0.1], [0.1], state_bounds=bounds), 5, [0.0]).control(state, reference)
-        for bounds in (None, wide)
+        NMPC(plant, Problem(Tracking([1.0, 0.1], [0.1], penalized="inputs"), constraints=bounds), 5, [0.0]).control(
+            state, reference
+        )
+        for bounds in ((), [wide])
     )
     assert np.allclose(free.inputs, bounded.inputs, atol=1e-6)
 
 
 def test_a_bad_measurement_is_said_so_and_the_last_plan_is_handed_on():
     plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
-    controller = NMPC(plant, TrackingProblem([1.0, 0.1], [0.1]), 3, [0.0])
+    controller = NMPC(plant, Problem(Tracking([1.0, 0.1], [0.1], penalized="inputs")), 3, [0.0])
     good = controller.control(Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros((4, 2))))
     decision = controller.control(Gaussian.certain(np.array([1.0, np.nan])), Reference(np.zeros((4, 2))), good)
     assert decision.status is Status.INVALID_MEASUREMENT
@@ -169,14 +181,16 @@ def test_a_bad_measurement_is_said_so_and_the_last_plan_is_handed_on():
 
 
 def test_reference_inputs_of_another_number_are_refused():
-    controller = NMPC(System(Map(Rotational())), TrackingProblem([1.0] * 6, [1.0] * 3), 3, [0.0] * 3)
+    controller = NMPC(
+        System(Map(Rotational())), Problem(Tracking([1.0] * 6, [1.0] * 3, penalized="inputs")), 3, [0.0] * 3
+    )
     with pytest.raises(ShapeError, match=r"reference inputs must have shape \(3, 3\); got \(3, 2\)"):
         controller.control(Gaussian.certain(np.zeros(6)), Reference(np.zeros((4, 6)), np.zeros((3, 2))))
 
 
-@pytest.mark.parametrize("prices", [{"l1": 0.3}, {"l2": 2.0}, {"l1": 0.3, "l2": 2.0}], ids=str)
-def test_a_soft_state_bound_costs_what_it_says_on_either_side(prices):
-    """One step of x+ = x + u: minimise (x - r)^2 + u^2 + l1 v + l2 v^2 on a grid finer than the answer."""
+@pytest.mark.parametrize("price", [0.3, 2.0])
+def test_a_soft_state_bound_costs_what_it_says_on_either_side(price):
+    """One step of x+ = x + u: minimise (x - r)^2 + u^2 + price v on a grid finer than the answer."""
 
     class Shifted:
         state_names, input_names = ("x",), ("u",)
@@ -184,13 +198,14 @@ def test_a_soft_state_bound_costs_what_it_says_on_either_side(prices):
         def derivative(self, x, u):
             return [x[0] + u[0]]
 
-    limits = StateBounds([-0.5], [0.2], **prices)
-    controller = NMPC(System(Map(Shifted())), TrackingProblem([1.0], [1.0], state_bounds=limits), 1, [0.0])
+    limits = Box([-0.5], [0.2], penalty=price)
+    controller = NMPC(
+        System(Map(Shifted())), Problem(Tracking([1.0], [1.0], penalized="inputs"), constraints=[limits]), 1, [0.0]
+    )
     x = np.linspace(-3, 3, 600_001)
     outside = np.maximum(0, np.maximum(x - 0.2, -0.5 - x))
     for start, target in ((0.0, 2.0), (0.1, -3.0), (0.4, 0.1), (-2.0, -0.9)):
-        price = prices.get("l1", 0.0) * outside + prices.get("l2", 0.0) * outside**2
-        best = x[np.argmin((x - target) ** 2 + (x - start) ** 2 + price)]
+        best = x[np.argmin((x - target) ** 2 + (x - start) ** 2 + price * outside)]
         decision = controller.control(Gaussian.certain(np.array([start])), Reference(np.full((2, 1), target)))
         assert decision.status is Status.SOLVED
         assert decision.means[1, 0] == pytest.approx(best, abs=2e-5)
@@ -198,8 +213,8 @@ def test_a_soft_state_bound_costs_what_it_says_on_either_side(prices):
 
 def test_bounds_that_contradict_each_other_are_not_called_solved():
     plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
-    limits = StateBounds([1.0, -np.inf], [np.inf, np.inf])
-    problem = TrackingProblem([1.0, 0.0], [1.0], input_lower=[-0.1], input_upper=[0.1], state_bounds=limits)
+    limits = Box([1.0, -np.inf], [np.inf, np.inf], probability=0.95, penalty=None)
+    problem = Problem(Tracking([1.0, 0.0], [1.0], penalized="inputs"), inputs=Box([-0.1], [0.1]), constraints=[limits])
     decision = NMPC(plant, problem, 3, [0.0]).control(Gaussian.certain(np.zeros(2)), Reference(np.zeros((4, 2))))
     assert not decision.status.solved
 
@@ -209,7 +224,7 @@ def test_the_last_state_has_its_own_weight_and_inputs_are_weighed_as_asked(penal
     """No small change of the plan is cheaper by the problem's own words."""
     plant, H = System(DoubleIntegrator(), time_step=0.5, substeps=1), 4
     Q, T, R = np.array([[2.0, 0.3], [0.3, 1.0]]), np.diag([9.0, 0.1]), np.array([[0.4]])
-    controller = NMPC(plant, TrackingProblem(Q, R, penalized, T), H, [0.7])
+    controller = NMPC(plant, Problem(Tracking(Q, R, terminal=T, penalized=penalized)), H, [0.7])
     state, reference = rng.normal(size=2), Reference(rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1)))
     decision = controller.control(Gaussian.certain(state), reference)
 

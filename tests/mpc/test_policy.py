@@ -5,7 +5,7 @@ from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.policy import command
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.status import Status
 
 STATE, FAR = Gaussian.certain(np.zeros(1)), Reference(np.zeros((5, 1)))
@@ -105,7 +105,7 @@ def test_a_misspelt_policy_is_refused():
 
 def test_before_the_first_plan_the_reference_input_is_applied_within_the_bounds_and_told_to_the_controller():
     planner = Planner()
-    planner.problem = TrackingProblem([1.0], [1.0], input_lower=[-2.0], input_upper=[2.0])
+    planner.problem = Problem(Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-2.0], [2.0]))
     reference = Reference(np.zeros((5, 1)), np.full((4, 1), 5.0))
     commands = run(planner, 3, "previous_plan", [LOST, LOST, STATE], reference)
     assert [c.input[0] for c in commands] == [2, 2, 0]

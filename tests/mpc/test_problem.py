@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import SettingError
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.problem import Box, Halfspaces, Problem, Tracking
 
 
 def test_diagonals_and_matrices_mean_the_same():
-    a = TrackingProblem([1.0, 2.0], [3.0])
-    b = TrackingProblem(np.diag([1.0, 2.0]), [[3.0]], terminal=[1.0, 2.0])
+    a = Tracking([1.0, 2.0], [3.0])
+    b = Tracking(np.diag([1.0, 2.0]), [[3.0]], terminal=[1.0, 2.0])
     assert all(np.array_equal(getattr(a, key), getattr(b, key)) for key in ("Q", "R", "terminal"))
-    assert (a.state_dim, a.input_dim, a.rate_limited) == (2, 1, False)
+    assert (Problem(a).state_dim, Problem(a).input_dim) == (2, 1)
 
 
 @pytest.mark.parametrize(
@@ -24,66 +24,105 @@ def test_diagonals_and_matrices_mean_the_same():
         ({"Q": [np.nan, 1.0]}, "Q: must be finite"),
         ({"R": [0.0]}, "R: must be positive definite; its smallest eigenvalue is 0"),
         ({"terminal": [1.0]}, "terminal: must be a weight of 2 states; got 1"),
-        ({"penalized": "rates"}, "penalized: must be 'inputs', 'deviations' or 'increments'; got 'rates'"),
-        ({"input_lower": [2.0], "input_upper": [1.0]}, "must not cross; entry 0 has 2 above 1"),
-        ({"input_lower": [math.inf]}, "input_lower: no number keeps it"),
-        ({"rate_upper": [-1e20]}, "rate_upper: no number keeps it"),
-        ({"rate_upper": [1.0, 2.0]}, "rate_upper: must be a list of 1 numbers"),
-        ({"state_bounds": StateBounds([0.0], [1.0])}, "state_bounds: must bound 2 states; got 1"),
+        ({"penalized": "rates"}, "penalized: must be one of 'inputs', 'deviations', 'increments'; got 'rates'"),
     ],
 )
-def test_a_problem_that_makes_no_sense_is_refused(arguments, message):
+def test_a_cost_that_makes_no_sense_is_refused(arguments, message):
     with pytest.raises(SettingError, match=message):
-        TrackingProblem(**({"Q": [1.0, 1.0], "R": [1.0]} | arguments))
+        Tracking(**({"Q": [1.0, 1.0], "R": [1.0]} | arguments))
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"lower": [2.0]}, "must not cross"),
-        ({"lower": [math.inf], "upper": [math.inf]}, "lower: no number keeps it"),
-        ({"lower": [-math.inf], "upper": [-math.inf]}, "upper: no number keeps it"),
-        ({"confidence": 0.5}, r"eta must lie in \(0.5, 1\); got 0.5"),
-        ({"confidence": 1.0}, r"eta must lie in \(0.5, 1\); got 1.0"),
-        ({"kappa": -1.0}, "kappa: must be a number, 0 or more"),
-        ({"l1": 0.0}, "l1: must be a number above 0"),
-        ({"l2": -3.0}, "l2: must be a number above 0"),
+        ({"cost": (1, 2)}, r"cost: must be Tracking\(...\); got tuple"),
+        ({"inputs": Box([1.0, 2.0])}, "inputs: must bound 1 inputs; got 2"),
+        ({"inputs": [-1, 1]}, r"inputs: must be Box\(lower, upper\); got list"),
+        ({"inputs": Box([-1.0], probability=0.9)}, "inputs: has bounds that are always kept"),
+        ({"input_rates": Box([-1.0], penalty=None)}, "input_rates: has bounds that are always kept"),
+        ({"constraints": [Box([0.0], [1.0])]}, "constraints: must bound 2 states; got 1"),
+        ({"constraints": [Halfspaces([[1.0]], [1.0])]}, "constraints: must bound 2 states; got 1"),
+        ({"constraints": [(-1, 1)]}, r"must be Box\(...\) or Halfspaces\(...\); got tuple"),
     ],
 )
-def test_state_bounds_that_make_no_sense_are_refused(arguments, message):
+def test_a_problem_that_makes_no_sense_is_refused(arguments, message):
     with pytest.raises(SettingError, match=message):
-        StateBounds(**({"lower": [0.0], "upper": [1.0]} | arguments))
-
-
-def test_kappa_is_the_quantile_of_the_confidence_unless_given():
-    assert StateBounds([0.0], [1.0], 0.95).kappa == pytest.approx(1.6448536269514722, abs=1e-12)
-    assert StateBounds([0.0], [1.0], 0.95, kappa=2.0).kappa == 2.0
-    assert not StateBounds([0.0], [math.inf]).soft
-    assert StateBounds([0.0], [math.inf], l2=1.0).soft
+        Problem(**({"cost": Tracking([1.0, 1.0], [1.0])} | arguments))
 
 
 @pytest.mark.parametrize(
-    ("bounds", "limited"),
+    ("arguments", "message"),
     [
-        ({}, False),
-        ({"rate_lower": [-1.0, -1.0], "rate_upper": [1.0, 1.0]}, True),
-        ({"rate_lower": [-math.inf, -1.0]}, True),
-        ({"rate_upper": [2.0, math.inf]}, True),
-        ({"rate_lower": [-math.inf] * 2, "rate_upper": [math.inf] * 2}, False),
-        ({"input_lower": [-1.0, -1.0]}, False),
+        ({"lower": [2.0]}, "must not cross; entry 0 has 2 above 1"),
+        ({"lower": [[0.0], [2.0]], "upper": [[1.0], [1.0]]}, "must not cross; entry 0 has 2 above 1"),
+        ({"lower": [math.inf], "upper": [math.inf]}, "lower: no number keeps it"),
+        ({"lower": [-math.inf], "upper": [-1e20]}, "upper: no number keeps it"),
+        ({"lower": [0.0, 0.0]}, "upper: must be a list of 2 numbers"),
+        ({"lower": 0.0}, "lower: must be a list of numbers"),
+        ({"lower": [math.nan]}, "lower: must be a list of numbers"),
+        ({"probability": 0.5}, r"probability: must lie in \(0.5, 1\); got 0.5"),
+        ({"probability": 1.0}, r"probability: must lie in \(0.5, 1\); got 1.0"),
+        ({"joint": True}, "joint: needs a probability"),
+        ({"kappa": -1.0}, "kappa: must be a number, 0 or more"),
+        ({"penalty": 0.0}, "penalty: must be a number above 0"),
+        ({"stages": range(3)}, "stages: must be whole numbers from 1 on"),
+        ({"stages": 4}, "stages: must be whole numbers from 1 on"),
     ],
 )
-def test_one_bound_on_one_increment_is_a_rate_limit(bounds, limited):
-    assert TrackingProblem([1.0], [1.0, 1.0], **bounds).rate_limited is limited
+def test_bounds_that_make_no_sense_are_refused(arguments, message):
+    with pytest.raises(SettingError, match=message):
+        Box(**({"lower": [0.0], "upper": [1.0]} | arguments))
+
+
+@pytest.mark.parametrize("arguments", [([1.0], [1.0]), ([[1.0]], [1.0, 2.0]), ([[0.0]], [1.0]), ([[1.0]], [math.inf])])
+def test_halfspaces_that_make_no_sense_are_refused(arguments):
+    with pytest.raises(SettingError, match="F, f: must be"):
+        Halfspaces(*arguments)
+
+
+def test_kappa_is_the_quantile_of_the_probability_unless_given():
+    assert Box([0.0], [1.0], probability=0.95).standard_deviations() == pytest.approx(1.6448536269514722, abs=1e-12)
+    assert Box([0.0], [1.0], probability=0.95, kappa=2.0).standard_deviations() == 2.0
+    assert Box([0.0], [1.0]).standard_deviations() == 0.0
+    joint = Box([0.0], [1.0], probability=0.9, joint=True).standard_deviations(sides=10)
+    assert joint == pytest.approx(2.3263478740408408, abs=1e-12)  # 0.99 each
+
+
+def test_a_violation_costs_nothing_to_forbid_what_is_asked_or_more_than_any_weight():
+    problem = Problem(Tracking([1.0, 200.0], [3.0]))
+    assert problem.price(Box([0.0] * 2, penalty=None)) == math.inf
+    assert problem.price(Box([0.0] * 2, penalty=7.0)) == 7.0
+    assert problem.price(Box([0.0] * 2)) >= 1e4 * 200.0
+
+
+@pytest.mark.parametrize(
+    ("rates", "limited"),
+    [
+        (Box(), False),
+        (Box([-1.0, -1.0], [1.0, 1.0]), True),
+        (Box([-math.inf, -1.0]), True),
+        (Box(None, [2.0, math.inf]), True),
+        (Box([-math.inf] * 2, [math.inf] * 2), False),
+    ],
+)
+def test_one_bound_on_one_increment_is_a_rate_limit(rates, limited):
+    problem = Problem(Tracking([1.0], [1.0, 1.0]), Box([-1.0, -1.0]), rates)
+    assert problem.input_rates.finite is limited
 
 
 def test_without_bounds_everything_is_free_and_bounds_may_touch():
-    free = TrackingProblem([1.0], [1.0, 1.0])
-    for key, value in (("input_lower", -math.inf), ("input_upper", math.inf), ("rate_lower", -math.inf)):
-        assert np.array_equal(getattr(free, key), [value, value])
-    assert np.array_equal(free.rate_upper, [math.inf, math.inf])
-    assert TrackingProblem([1.0], [1.0], input_lower=[0.3], input_upper=[0.3]).input_lower[0] == 0.3
-    assert StateBounds([0.3], [0.3]).upper[0] == 0.3
+    free = Problem(Tracking([1.0], [1.0, 1.0]))
+    for box in (free.inputs, free.input_rates):
+        assert np.array_equal(box.lower, [-math.inf] * 2)
+        assert np.array_equal(box.upper, [math.inf] * 2)
+    assert Problem(Tracking([1.0], [1.0]), Box([0.3], [0.3])).inputs.lower[0] == 0.3
+
+
+def test_bounds_of_one_stage_are_those_of_all_and_others_need_every_stage():
+    assert np.array_equal(Box([1.0, 2.0], [3.0, 4.0]).by_stage(3)[1], [[3.0, 4.0]] * 3)
+    assert np.array_equal(Box([[1.0], [2.0]]).by_stage(2)[0], [[1.0], [2.0]])
+    with pytest.raises(SettingError, match="lower: must be given for one stage or all 3; got 2"):
+        Box([[1.0], [2.0]]).by_stage(3)
 
 
 @pytest.mark.parametrize("skew", [1e-13, 1e-6])
@@ -91,7 +130,7 @@ def test_a_weight_may_be_skew_by_round_off_and_no_more(skew):
     for scale in (1e-6, 1.0, 1e6):
         weight = scale * np.array([[1.0, 0.5], [0.5 * (1 + skew), 1.0]])
         if skew < 1e-12:
-            assert TrackingProblem(weight, [1.0]).state_dim == 2
+            assert len(Tracking(weight, [1.0]).Q) == 2
         else:
             with pytest.raises(SettingError, match="Q: must be symmetric"):
-                TrackingProblem(weight, [1.0])
+                Tracking(weight, [1.0])

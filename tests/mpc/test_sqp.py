@@ -11,13 +11,14 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.qp import DualActiveSet
 from gpmpc.status import Status
 from tests.mpc.systems import HOVER, linear_gaussian, quadrotor_gp
 
-BOX = {"input_lower": [0.0, -0.7, -0.7], "input_upper": [20.0, 0.7, 0.7]}
+BOX = {"inputs": Box([0.0, -0.7, -0.7], [20.0, 0.7, 0.7])}
 
 
 @pytest.fixture(scope="module")
@@ -38,9 +39,16 @@ def reachable(quadrotor):
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-9, 1e-300])
 def test_a_reference_that_can_be_reached_at_no_cost_is_reached(quadrotor, reachable, tolerance):
     """1e-300 asks for more than there is: it ends where every step is lost in round-off."""
-    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
+    problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations"), **BOX)
     controller = GPMPC(
-        quadrotor, Linearization(), problem, 5, HOVER, covariance="none", iterations=40, tolerance=tolerance
+        quadrotor,
+        Linearization(),
+        problem,
+        5,
+        HOVER,
+        prediction=PredictionSettings(covariance="none"),
+        iterations=40,
+        tolerance=tolerance,
     )
     decision = controller.control(Gaussian.certain(np.zeros(6)), reachable)
     assert decision.status is Status.SOLVED
@@ -56,8 +64,17 @@ def test_a_regulator_at_its_origin_has_no_trouble(penalized, tolerance):
     features, targets = (torch.cat([part, -part]) for part in (half.features, half.targets))
     parts = half.lengthscales, half.signal_variance, half.noise_variance
     model = GPPosterior.from_hyperparameters(features, targets, *parts, 1, predicts="difference")
-    problem = TrackingProblem([10.0, 1.0], [0.1], penalized=penalized, input_lower=[-6.0], input_upper=[6.0])
-    controller = GPMPC(model, Linearization(), problem, 8, [0.0], covariance="none", iterations=20, tolerance=tolerance)
+    problem = Problem(Tracking([10.0, 1.0], [0.1], penalized=penalized), inputs=Box([-6.0], [6.0]))
+    controller = GPMPC(
+        model,
+        Linearization(),
+        problem,
+        8,
+        [0.0],
+        prediction=PredictionSettings(covariance="none"),
+        iterations=20,
+        tolerance=tolerance,
+    )
     state, last = np.array([0.8, 0.0]), None
     for _ in range(120):
         last = controller.control(Gaussian.certain(state), Reference(np.zeros((9, 2))), last)
@@ -72,7 +89,7 @@ def test_the_residual_vanishes_with_the_distance_where_the_cost_does(quadrotor):
     states = [np.zeros(6)]
     for u in inputs:
         states.append(quadrotor.predict(torch.tensor(states[-1]), torch.tensor(u)).mean.numpy())
-    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="increments", **BOX)
+    problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3), **BOX)
     question = Instance(Gaussian.certain(np.zeros(6)), Reference(np.array(states)), HOVER)
     far, near, nearer = (kkt_residual(quadrotor, problem, question, inputs + d) for d in (1e-1, 1e-6, 1e-8))
     assert far > 0.1
@@ -83,9 +100,16 @@ def test_the_residual_vanishes_with_the_distance_where_the_cost_does(quadrotor):
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
 def test_what_is_called_solved_is_within_ten_times_the_tolerance(quadrotor, tolerance):
     """The stop estimates the residual of a plan that it has not rolled out; here another measures it."""
-    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="increments", **BOX)
+    problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3), **BOX)
     controller = GPMPC(
-        quadrotor, Linearization(), problem, 5, HOVER, covariance="none", iterations=80, tolerance=tolerance
+        quadrotor,
+        Linearization(),
+        problem,
+        5,
+        HOVER,
+        prediction=PredictionSettings(covariance="none"),
+        iterations=80,
+        tolerance=tolerance,
     )
     random, last, before = np.random.default_rng(1), None, HOVER
     for _ in range(20):
@@ -102,10 +126,16 @@ def test_what_is_called_solved_is_within_ten_times_the_tolerance(quadrotor, tole
 def test_plans_of_the_program_keep_their_rates_whatever_the_unit_of_the_inputs(scale, bound):
     model = linear_gaussian(2, 1)
     model = replace(model, B=model.B / scale)
-    problem = TrackingProblem(
-        [10.0, 1.0], [0.1 / scale**2], penalized="increments", rate_lower=[-bound], rate_upper=[bound]
+    problem = Problem(Tracking([10.0, 1.0], [0.1 / scale**2]), input_rates=Box([-bound], [bound]))
+    controller = GPMPC(
+        model,
+        Linearization(),
+        problem,
+        8,
+        [1.234567 * scale],
+        prediction=PredictionSettings(covariance="none"),
+        iterations=10,
     )
-    controller = GPMPC(model, Linearization(), problem, 8, [1.234567 * scale], covariance="none", iterations=10)
     state, last, before, bitten = np.array([0.8, 0.0]), None, np.array([1.234567 * scale]), 0
     for _ in range(20):
         last = controller.control(Gaussian.certain(state), Reference(np.zeros((9, 2))), last)
@@ -124,19 +154,19 @@ class Other:
         return DualActiveSet().solve(problem, warm_start)
 
 
-BOUNDS = StateBounds([-np.inf, -0.3] * 3, [np.inf, 0.3] * 3, l1=20.0, l2=5.0)
+BOUNDS = Box([-np.inf, -0.3] * 3, [np.inf, 0.3] * 3, probability=0.95, penalty=20.0)
 
 
 @pytest.mark.parametrize("covariance", ["zero_order", "none"])
 @pytest.mark.parametrize(
     "limits",
-    [{}, {"rate_lower": [-0.5, -0.05, -0.05], "rate_upper": [0.5, 0.05, 0.05]}, {"state_bounds": BOUNDS}],
+    [{}, {"input_rates": Box([-0.5, -0.05, -0.05], [0.5, 0.05, 0.05])}, {"constraints": [BOUNDS]}],
     ids=["box", "rates", "soft states"],
 )
 def test_compiled_and_torch_and_another_solver_iterate_alike(quadrotor, covariance, limits):
-    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="increments", **BOX, **limits)
-    arguments = quadrotor, Linearization(), problem, 5, HOVER, "trajectory", covariance
-    told = {} if "state_bounds" in limits else {"solver": Other()}  # prices need our own solver
+    problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3), **BOX, **limits)
+    arguments = quadrotor, Linearization(), problem, 5, HOVER, PredictionSettings(covariance=covariance)
+    told = {} if "constraints" in limits else {"solver": Other()}  # prices need our own solver
     ours, other = (GPMPC(*arguments, **solver, iterations=60, tolerance=1e-7) for solver in ({}, told))
     random, last, before, programs = np.random.default_rng(2), None, None, 0
     for _ in range(8):
@@ -154,7 +184,7 @@ def test_compiled_and_torch_and_another_solver_iterate_alike(quadrotor, covarian
 
 
 def test_the_order_in_memory_of_what_is_asked_changes_nothing(quadrotor):
-    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
+    problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations"), **BOX)
     controller = GPMPC(quadrotor, Linearization(), problem, 5, HOVER, iterations=30)
     random = np.random.default_rng(3)
     states, inputs = 0.3 * random.uniform(-1, 1, (6, 6)), HOVER + 0.1 * random.uniform(-1, 1, (5, 3))
@@ -169,8 +199,10 @@ def test_the_order_in_memory_of_what_is_asked_changes_nothing(quadrotor):
 
 
 def test_the_parts_of_the_time_are_within_what_the_step_took(quadrotor, reachable):
-    problem = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations", **BOX)
-    controller = GPMPC(quadrotor, Linearization(), problem, 5, HOVER, covariance="none", iterations=30)
+    problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations"), **BOX)
+    controller = GPMPC(
+        quadrotor, Linearization(), problem, 5, HOVER, prediction=PredictionSettings(covariance="none"), iterations=30
+    )
     began = perf_counter()
     timing = controller.control(Gaussian.certain(np.zeros(6)), reachable).timing
     assert timing.total <= perf_counter() - began
@@ -180,8 +212,16 @@ def test_the_parts_of_the_time_are_within_what_the_step_took(quadrotor, reachabl
 @pytest.mark.parametrize("start", ["reference", "hover"])
 @pytest.mark.parametrize("horizon", [10, 30, 60])
 def test_from_no_plan_at_all_few_programs_reach_a_kkt_point_at_any_horizon(quadrotor, horizon, start):
-    problem = TrackingProblem([1.0] * 6, [1.0] * 3, penalized="increments", **BOX)
-    controller = GPMPC(quadrotor, Linearization(), problem, horizon, HOVER, covariance="none", iterations=8)
+    problem = Problem(Tracking([1.0] * 6, [1.0] * 3), **BOX)
+    controller = GPMPC(
+        quadrotor,
+        Linearization(),
+        problem,
+        horizon,
+        HOVER,
+        prediction=PredictionSettings(covariance="none"),
+        iterations=8,
+    )
     time = 0.5 * np.arange(horizon + 1)[:, None]
     references = np.hstack(
         [part for axis in range(3) for part in (0.3 * np.sin(time + axis), 0.3 * np.cos(time + axis))]

@@ -9,8 +9,8 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import FORMS
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.prediction import FORMS, PredictionSettings
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.mpc.stages import COVARIANCES
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MeanEquivalence
@@ -24,25 +24,27 @@ PENALIZED = {"velocity": "increments", "trajectory": "deviations"}
 REFERENCE = Reference(np.zeros((H + 1, 6)), np.tile(HOVER, (H, 1)))
 
 
-def problem(penalized="deviations", lower=-0.3, **prices):
-    return TrackingProblem(
-        [10.0, 1.0] * 3,
-        [0.1, 1.0, 1.0],
-        penalized,
-        [20.0, 1.0] * 3,
-        [4.0, -0.4, -0.4],
-        [10.5, 0.4, 0.4],
-        [-2.0, -0.3, -0.3],
-        [2.0, 0.3, 0.3],
-        StateBounds([-np.inf, lower] * 3, [2.0, 0.9] * 3, confidence=0.75, **prices),
+def problem(penalized="deviations", lower=-0.3, penalty=None):
+    return Problem(
+        Tracking([10.0, 1.0] * 3, [0.1, 1.0, 1.0], terminal=[20.0, 1.0] * 3, penalized=penalized),
+        inputs=Box([4.0, -0.4, -0.4], [10.5, 0.4, 0.4]),
+        input_rates=Box([-2.0, -0.3, -0.3], [2.0, 0.3, 0.3]),
+        constraints=[Box([-np.inf, lower] * 3, [2.0, 0.9] * 3, probability=0.75, penalty=penalty)],
     )
 
 
 @pytest.mark.parametrize(("form", "covariance"), list(product(FORMS, COVARIANCES)))
-@pytest.mark.parametrize("prices", [{}, {"lower": -0.05, "l1": 3.0, "l2": 10.0}], ids=["hard", "soft"])
+@pytest.mark.parametrize("prices", [{}, {"lower": -0.05, "penalty": 3.0}], ids=["hard", "soft"])
 def test_it_gives_the_inputs_of_the_condensed_program(form, covariance, prices):
     moves = MeanEquivalence() if covariance == "none" else Linearization()
-    arguments = (quadrotor_gp(), moves, problem(PENALIZED[form], **prices), H, HOVER, form, covariance)
+    arguments = (
+        quadrotor_gp(),
+        moves,
+        problem(PENALIZED[form], **prices),
+        H,
+        HOVER,
+        PredictionSettings(form, covariance),
+    )
     controllers = [GPMPC(*arguments), StateFormMPC(*arguments)]
     if not prices:
         controllers.append(GPMPC(*arguments, CvxpySolver()))
@@ -60,7 +62,7 @@ def test_it_gives_the_inputs_of_the_condensed_program(form, covariance, prices):
 
 
 def test_a_constraint_of_ones_own_takes_one_line():
-    arguments = quadrotor_gp(), MeanEquivalence(), problem(), H, HOVER, "trajectory", "none"
+    arguments = quadrotor_gp(), MeanEquivalence(), problem(), H, HOVER, PredictionSettings(covariance="none")
     belief = Gaussian.certain(np.array([0.5, 0.0, 0.5, 0.0, 0.0, 0.0]))
     free = StateFormMPC(*arguments).control(belief, REFERENCE)
     bound = StateFormMPC(*arguments, constraints=lambda s, u: [s[1:, 0] + s[1:, 2] >= 0.8]).control(belief, REFERENCE)
@@ -76,7 +78,7 @@ def test_a_constraint_that_is_not_convex_is_refused():
 
 
 def test_what_cannot_be_solved_is_reported():
-    arguments = quadrotor_gp(), MeanEquivalence(), problem(), H, HOVER, "trajectory", "none"
+    arguments = quadrotor_gp(), MeanEquivalence(), problem(), H, HOVER, PredictionSettings(covariance="none")
     controller = StateFormMPC(*arguments, constraints=lambda s, u: [u[0, 0] >= 100.0])
     assert controller.control(Gaussian.certain(np.zeros(6)), REFERENCE).status is Status.INFEASIBLE
     assert controller.control(Gaussian.certain(np.full(6, np.nan)), REFERENCE).status is Status.INVALID_MEASUREMENT

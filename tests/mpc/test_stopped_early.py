@@ -9,10 +9,11 @@ import torch
 
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization
 from gpmpc.qp import DualActiveSet, PrimalActiveSet
@@ -22,13 +23,13 @@ from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 
 GP, H, STEPS = quadrotor_gp(60), 12, 20
 LOWER, UPPER, RATE = np.array([3.0, -0.5, -0.5]), np.array([12.0, 0.5, 0.5]), np.array([2.0, 0.3, 0.3])
-PROBLEM = TrackingProblem([10.0, 1.0] * 3, [0.1] * 3, "increments", None, LOWER, UPPER, -RATE, RATE)
+PROBLEM = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3), inputs=Box(LOWER, UPPER), input_rates=Box(-RATE, RATE))
 REFERENCES = Reference(np.zeros((STEPS + H, 6)), np.tile(HOVER, (STEPS + H - 1, 1)))
 START = np.array([0.9, 0.0, -0.8, 0.2, 0.7, 0.0])
 
 
-def convex(problem=PROBLEM, **settings):
-    return GPMPC(GP, Linearization(), problem, H, HOVER, **settings)
+def convex(problem=PROBLEM, covariance="zero_order", **settings):
+    return GPMPC(GP, Linearization(), problem, H, HOVER, PredictionSettings(covariance=covariance), **settings)
 
 
 def nmpc(monkeypatch):
@@ -75,7 +76,7 @@ def test_the_plan_at_a_limit_is_the_best_that_the_iteration_got_to(limit):
         x, before, total = torch.tensor(START), HOVER, 0.0
         for u in plan:
             x = GP.predict(x, torch.tensor(u)).mean
-            total += x.numpy() @ PROBLEM.Q @ x.numpy() + (u - before) @ PROBLEM.R @ (u - before)
+            total += x.numpy() @ PROBLEM.cost.Q @ x.numpy() + (u - before) @ PROBLEM.cost.R @ (u - before)
             before = u
         return float(total)
 
@@ -97,8 +98,8 @@ def test_the_plan_at_a_limit_is_the_best_that_the_iteration_got_to(limit):
 
 def test_a_plan_that_breaks_a_hard_bound_is_not_applied():
     """There is no time to stop before the bound, so none of the programs can be solved."""
-    limits = StateBounds([-np.inf] * 6, [0.95, *[np.inf] * 5])
-    problem = replace(PROBLEM, state_bounds=limits)
+    limits = Box([-np.inf] * 6, [0.95, *[np.inf] * 5], probability=0.95, penalty=None)
+    problem = replace(PROBLEM, constraints=[limits])
     at = Gaussian.certain(np.array([0.9, 3.0, 0.0, 0.0, 0.0, 0.0]))
     reference = Reference(REFERENCES.states[: H + 1], REFERENCES.inputs[:H])
     for controller in (convex(problem, iterations=3), convex(problem)):
@@ -108,7 +109,7 @@ def test_a_plan_that_breaks_a_hard_bound_is_not_applied():
 
 
 def test_a_solver_that_stopped_outside_of_the_bounds_has_no_plan():
-    controller = convex(replace(PROBLEM, rate_upper=0.1 * RATE), solver=DualActiveSet(iteration_limit=1))
+    controller = convex(replace(PROBLEM, input_rates=Box(-RATE, 0.1 * RATE)), solver=DualActiveSet(iteration_limit=1))
     decision = controller.control(Gaussian.certain(START), Reference(REFERENCES.states[: H + 1], REFERENCES.inputs[:H]))
     assert decision.status is Status.ITERATION_LIMIT
     assert not decision.applicable

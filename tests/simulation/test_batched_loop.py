@@ -9,7 +9,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import StateBounds, TrackingProblem
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
 from gpmpc.simulation.trials import chunk_size
@@ -26,11 +27,21 @@ ARRAYS = ("states", "covariances", "measured", "inputs", "references", "predicte
 
 
 def controller(covariance="zero_order", propagator=None, model=GP, bound=2.0, **settings):
-    box = {"input_lower": [0, -0.4, -0.4], "input_upper": [15, 0.4, 0.4]}
-    problem = TrackingProblem(
-        [1] * 6, [0.1] * 3, penalized="increments", state_bounds=StateBounds([-bound] * 6, [bound] * 6), **box
+    box = {"inputs": Box([0, -0.4, -0.4], [15, 0.4, 0.4])}
+    problem = Problem(
+        Tracking([1] * 6, [0.1] * 3),
+        constraints=[Box([-bound] * 6, [bound] * 6, probability=0.95, penalty=None)],
+        **box,
     )
-    return GPMPC(model, propagator or Linearization(), problem, H, HOVER, covariance=covariance, **settings)
+    return GPMPC(
+        model,
+        propagator or Linearization(),
+        problem,
+        H,
+        HOVER,
+        prediction=PredictionSettings(covariance=covariance),
+        **settings,
+    )
 
 
 def fly(asked, seeds=4, plant=QUADROTOR, initial=START, **settings):

@@ -8,7 +8,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.policy import command, commands
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import ModelLoop, cascade_loop, closed_loop, closed_loops
 from gpmpc.status import Status
@@ -17,7 +17,7 @@ from tests.mpc.systems import QUADROTOR, quadrotor_gp
 
 H, STEPS = 3, 12
 LOWER, UPPER, RATE = np.array([5.0, -0.2, -0.2]), np.array([9.0, 0.2, 0.2]), np.array([0.5, 0.1, 0.1])
-PROBLEM = TrackingProblem([1] * 6, [1] * 3, "increments", None, LOWER, UPPER, -RATE, RATE)
+PROBLEM = Problem(Tracking([1] * 6, [1] * 3), inputs=Box(LOWER, UPPER), input_rates=Box(-RATE, RATE))
 FIRST = np.array([7.0, 0.0, 0.0])
 FAR = np.array([1e6, 1.0, 1.0])  # the inputs that belong to the reference, outside of everything
 REFERENCES = Reference(np.zeros((STEPS + H, 6)), np.tile(FAR, (STEPS + H - 1, 1)))

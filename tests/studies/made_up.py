@@ -5,6 +5,7 @@ import json
 import numpy as np
 
 from gpmpc.mpc.controller import Timing
+from gpmpc.mpc.problem import Box
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
 from gpmpc.studies.flight import Experiment, Flown, metrics
@@ -17,7 +18,7 @@ PLANT = translational()
 
 
 class Bounds:
-    input_lower, input_upper, state_bounds = np.zeros(3), np.full(3, 10.0), None
+    inputs, constraints = Box(np.zeros(3), np.full(3, 10.0)), ()
 
 
 class Steering:

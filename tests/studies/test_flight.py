@@ -13,10 +13,10 @@ from gpmpc.cli.run import experiment_of
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import Diverged, SettingError
 from gpmpc.gp import Trainer
+from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.nmpc import NMPC
-from gpmpc.mpc.problem import TrackingProblem
+from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise
 from gpmpc.status import Status
@@ -28,9 +28,7 @@ from gpmpc.trajectories import Elliptical, Hover, Lorenz, Step
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 PLANT = translational()
-PROBLEM = TrackingProblem(
-    [10, 1] * 3, [0.1, 1, 1], penalized="increments", input_lower=[0, -0.7, -0.7], input_upper=[20, 0.7, 0.7]
-)
+PROBLEM = Problem(Tracking([10, 1] * 3, [0.1, 1, 1]), inputs=Box([0, -0.7, -0.7], [20, 0.7, 0.7]))
 HOVER = [7.26, 0, 0]
 EXCITED = Excitation([1] * 6, [1] * 3, HOVER, [0.3, 0.03, 0.03], [0.01] * 6)
 CONVEX = partial(GPMPC, propagator=Linearization(), problem=PROBLEM, horizon=2, initial_input=HOVER)
@@ -40,7 +38,7 @@ ON_THE_PLANT = partial(NMPC, problem=PROBLEM, horizon=2, initial_input=HOVER)
 class Blind:
     """Applies a law of the state, whatever it is asked for; a call takes the seconds that ``seconds`` gives."""
 
-    horizon, problem, initial_input = 1, replace(PROBLEM, input_lower=None, input_upper=None), HOVER
+    horizon, problem, initial_input = 1, replace(PROBLEM, inputs=Box()), HOVER
 
     def __init__(self, plant, law, seconds=lambda: 0.0):
         self.law, self.seconds = law, seconds
@@ -115,7 +113,7 @@ def test_what_cannot_be_flown_is_refused(changes, message):
 
 def test_the_rotational_subsystem_follows_the_attitudes_of_the_trajectory_at_its_own_rate():
     excited = Excitation([1] * 6, [1] * 3, [0] * 3, [0.05] * 3, [1e-4, 1e-3] * 3)
-    problem = TrackingProblem([100, 1] * 3, [1] * 3, penalized="increments", input_lower=[-2] * 3, input_upper=[2] * 3)
+    problem = Problem(Tracking([100, 1] * 3, [1] * 3), inputs=Box([-2] * 3, [2] * 3))
     settings = {"propagator": Linearization(), "problem": problem, "horizon": 5, "initial_input": [0] * 3}
     turning = experiment(
         system=rotational(substeps=5), trajectory=Lorenz(), data=ExcitedData(EXCITED, excited, samples=60),
@@ -146,7 +144,7 @@ def test_a_flight_that_no_longer_follows_is_lost_and_says_since_when(trajectory,
 @pytest.mark.parametrize("trajectory", [Elliptical(), Lorenz(), Hover((0, 0, -5))])
 def test_an_offset_and_a_short_flight_are_no_loss(trajectory):
     heavy = translational(mass=0.888)
-    problem = replace(PROBLEM, Q=[1] * 6, R=[1] * 3)
+    problem = replace(PROBLEM, cost=Tracking([1] * 6, [1] * 3))
     sagging = experiment(
         trajectory=trajectory, data=None, controller=lambda plant: ON_THE_PLANT(PLANT, problem=problem), plant=heavy,
         steps=20,
@@ -192,7 +190,7 @@ def composed():
 
 
 CHOSEN = ("controller", "propagation", "solver")
-MORE = ["loop=model", "controller.iterations=5", "controller.disturbance_gain=0.3", "system=rotational"]
+MORE = ["loop=model", "controller.iterations=5", "controller.prediction.disturbance_gain=0.3", "system=rotational"]
 
 
 @pytest.fixture(scope="module")
