@@ -19,7 +19,7 @@ def follow(page, folder, monkeypatch):
     monkeypatch.syspath_prepend(str(folder))
     names, printed = {}, []
     for language, text in BLOCK.findall((DOCS / page).read_text()):
-        path = re.match(r"# ([\w/]+\.(?:py|yaml|xml))\n", text)
+        path = re.match(r"(?:# @package _global_\n)?# ([\w/]+\.(?:py|yaml|xml))\n", text)
         if path:
             (folder / path[1]).parent.mkdir(exist_ok=True)
             (folder / path[1]).write_text(text)

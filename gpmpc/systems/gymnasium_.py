@@ -1,7 +1,7 @@
 """Takes a gymnasium environment as a system, and offers this package's systems as gymnasium environments.
 
 An environment moves on by itself: it is stepped from where it stands, and set to another state only where it can be (a
-MuJoCo environment whose observation is qpos, qvel). Where it ends an episode, a flight is lost. Needs the extra ``sim``.
+MuJoCo environment whose observation is qpos, qvel). Where it ends an episode, a flight is lost. Needs ``gpmpc[sim]``.
 """
 
 from collections.abc import Callable, Sequence
@@ -111,7 +111,7 @@ def gymnasium_system(
         input_names: Of the action.
         time_step: [s]; by default the environment's ``dt``.
         make: Further arguments of ``gymnasium.make``.
-        settings: Of ``System``, such as ``units``, ``tracked`` and ``goal``; limits of the inputs are the environment's.
+        settings: Of ``System``, such as ``units``, ``tracked`` and ``goal``; the environment limits the inputs.
 
     Raises:
         SettingError: The environment cannot be taken, or gives no time step.

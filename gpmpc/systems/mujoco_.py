@@ -138,8 +138,8 @@ class Sensors(_Model, Simulator):
         sizes = [int(model.sensor_dim[i]) for i in found]
         places = [np.arange(d) + model.sensor_adr[i] for i, d in zip(found, sizes, strict=True)]
         self._places, self._observe, self.substeps, self._delay = np.concatenate(places), observe, substeps, input_delay
-        several = [[name] if d == 1 else [f"{name}{k + 1}" for k in range(d)] for name, d in zip(sensors, sizes)]
-        self.state_names = tuple(state_names or [name for names in several for name in names])
+        own = [f"{name}{k + 1}" if d > 1 else name for name, d in zip(sensors, sizes, strict=True) for k in range(d)]
+        self.state_names = tuple(state_names or own)
         self.input_names = tuple(actuators)
         if len(self.reset(0)) != len(self.state_names):
             raise SettingError("state_names", f"must be {len(self.reset(0))} names; got {len(self.state_names)}")
