@@ -24,9 +24,8 @@ import pandas as pd
 
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.metrics import tracking_error
+from gpmpc.metrics import tracking_cost, tracking_error
 from gpmpc.mpc.controller import Controller, Decision, Reference
-from gpmpc.mpc.problem import Problem
 from gpmpc.plotting import png, quality
 from gpmpc.studies.document import MISSING, Document, Table, number
 from gpmpc.studies.flight import Experiment, run_trial
@@ -185,7 +184,14 @@ class Quality:
             raise GpmpcError(f"{LOST:g} m off its path after {int(np.argmax(~(distance <= LOST)))} steps")
         before = controller.initial_input
         return {
-            "cost": stage_cost(controller.problem, rollout.states, rollout.references, rollout.inputs, before),
+            "cost": tracking_cost(
+                controller.problem.cost.Q,
+                controller.problem.cost.R,
+                rollout.states,
+                rollout.references,
+                rollout.inputs,
+                before,
+            ),
             "rmse": float(tracking_error(rollout.states, rollout.references, experiment.system.tracked_indices).total),
             "seconds": controller.seconds[-len(rollout.inputs) :],
             "failed": len(rollout.failures),
@@ -284,25 +290,6 @@ class AtPlant(NamedTuple):
     def __call__(self, plant: Any) -> Clocked:
         """Makes the controller."""
         return Clocked(self.make(plant, horizon=self.horizon))
-
-
-def stage_cost(
-    weights: Problem, states: np.ndarray, references: np.ndarray, inputs: np.ndarray, before: Sequence[float]
-) -> float:
-    """Returns the tracking cost on states and increments of a flight per step; see the module's text.
-
-    Args:
-        weights: Q and R.
-        states: x_0 .. x_K (K + 1, n); the initial one costs nothing.
-        references: r_0 .. r_K (K + 1, n).
-        inputs: u_0 .. u_{K-1} (K, m).
-        before: u_{-1} (m,).
-    """
-    errors, increments = states[1:] - references[1:], np.diff(inputs, axis=0, prepend=[before])
-    cost = np.einsum("ki,ij,kj", errors, weights.cost.Q, errors) + np.einsum(
-        "ki,ij,kj", increments, weights.cost.R, increments
-    )
-    return float(cost / len(inputs))
 
 
 def pareto_front(times: Sequence[float], costs: Sequence[float], least: float = 0.0) -> list[bool]:

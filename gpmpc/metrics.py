@@ -228,3 +228,26 @@ def time_quantiles(seconds: np.ndarray) -> TimeQuantiles:
     if np.ndim(seconds) != 1 or not len(seconds):
         raise ShapeError(f"seconds must be (K,), K of 1 or more; got {np.shape(seconds)}")
     return TimeQuantiles(*(float(q) for q in np.quantile(seconds, [0.5, 0.95, 0.99, 1.0])))
+
+
+def tracking_cost(
+    Q: np.ndarray,
+    R: np.ndarray,
+    states: np.ndarray,
+    references: np.ndarray,
+    inputs: np.ndarray,
+    previous_input: Sequence[float] | np.ndarray,
+) -> float:
+    """Computes the cost of a flight per step: 1/K (sum_k |x_k - r_k|^2_Q + sum_k |u_k - u_{k-1}|^2_R).
+
+    Args:
+        Q: Weights of the states (n, n).
+        R: Weights of the increments of the inputs (m, m).
+        states: x_0 .. x_K (K + 1, n); the initial one costs nothing.
+        references: r_0 .. r_K (K + 1, n).
+        inputs: u_0 .. u_{K-1} (K, m).
+        previous_input: u_{-1} (m,).
+    """
+    errors, increments = states[1:] - references[1:], np.diff(inputs, axis=0, prepend=np.atleast_2d(previous_input))
+    cost = np.einsum("ki,ij,kj", errors, Q, errors) + np.einsum("ki,ij,kj", increments, R, increments)
+    return float(cost / len(inputs))

@@ -6,17 +6,18 @@ Heavy libraries are imported inside the tasks, so help and completion stay quick
 import argparse
 import sys
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 import gpmpc
-from gpmpc.cli import completion, log, new, reports, study, warmup
+from gpmpc.cli import completion, log, new, reports, study, tune, warmup
 from gpmpc.cli.arguments import Parser, Result
 from gpmpc.cli.configuration import compose, help_text, settings
 from gpmpc.cli.mistakes import explain, nearest
 from gpmpc.cli.run import run
+from gpmpc.cli.sweep import sweep
 from gpmpc.cli.terminal import print_error, redirected_output
 from gpmpc.exceptions import GpmpcError
 
@@ -44,7 +45,8 @@ class Command(NamedTuple):
         if self.settings:
             for names in (("-h", "--help"), ("--resolve",)):
                 parser.add_argument(*names, action="store_true")
-            parser.add_argument("--cfg", "-c", nargs="?", const="job", choices=["job", "hydra", "all"])
+            parser.add_argument("--cfg", "-c", nargs="?", const="job")
+            parser.values["--cfg"] = [*SHOWN]
             for names in (("--config-name", "-cn"), ("--config-dir", "-cd")):
                 parser.add_argument(*names)
             parser.add_argument("overrides", nargs="*")
@@ -73,6 +75,9 @@ def _add_multirun(parser: Parser) -> None:
 COMMANDS = {
     "run": Command(
         "Trains a model, flies with it, records; with -m a sweep of many flights", run, "run", _add_multirun
+    ),
+    "tune": Command(
+        "Searches settings for the least closed-loop cost", lambda given: Result(), "tune", tune.add_arguments
     ),
     "tables": Command(
         "Computes Tables 1 and 2 of Cao, Lai and Alam (2017) beside the printed ones", study.run, "tables"
@@ -110,6 +115,7 @@ COMMANDS = {
     "version": Command("Prints the versions of what computes, and the processor", version),
     "help": Command("Explains a command", _show_usage),
 }
+SHOWN = ("job", "hydra", "all")  # parts of the settings
 FLAGS = ("--json", "--quiet", "--debug")
 USAGE = """gpmpc {version}: Gaussian process model predictive control
 
@@ -172,20 +178,20 @@ def _run(arguments: list[str], debug: bool) -> Result:
 
 def _with_settings(name: str, command: Command, given: argparse.Namespace) -> Result:
     """Composes the settings, and shows them or runs the command with them."""
-    config_name, swept = given.config_name or command.settings, getattr(given, "multirun", False)
+    config_name, swept = given.config_name or command.settings, name == "tune" or getattr(given, "multirun", False)
     with settings(given.config_dir):
         if given.help:
             print(help_text(command.settings, []))
             return Result()
+        if given.cfg not in (None, *SHOWN):  # a setting behind --cfg
+            given.overrides, given.cfg = [given.cfg, *given.overrides], "job"
         if swept and given.cfg:
             raise GpmpcError("--cfg: shows the settings of one run; leave out -m, and give each setting one value")
         if swept:
-            from gpmpc.cli.sweep import sweep
-
-            return sweep(given, config_name)
+            return tune.tune(given, config_name) if name == "tune" else sweep(given, config_name)
         config = compose(config_name, given.overrides)
         if given.cfg:
-            parts = [config] * (given.cfg != "hydra") + [HydraConfig.instance().cfg] * (given.cfg != "job")
+            parts = [config] * (given.cfg != "hydra") + [cast(Any, HydraConfig.instance().cfg)] * (given.cfg != "job")
             shown = OmegaConf.create({key: part for each in parts for key, part in each.items()})
             print(OmegaConf.to_yaml(shown, resolve=given.resolve), end="")
             return Result(OmegaConf.to_container(shown, resolve=given.resolve))

@@ -89,7 +89,10 @@ def group_options(name: str) -> dict[str, list[str]]:
     defaults = OmegaConf.load(config_folder() / f"{name}.yaml").defaults
     keys = [key for entry in defaults if OmegaConf.is_dict(entry) for key in entry if not key.startswith("override ")]
     options = GlobalHydra.instance().config_loader().get_group_options
-    return {key: options(key.partition("@")[0]) for key in sorted(keys)}
+    found = {key: options(key.partition("@")[0]) for key in sorted(keys)}
+    for other in (entry for entry in defaults if isinstance(entry, str) and entry != "_self_"):
+        found |= group_options(other)
+    return found
 
 
 def help_text(name: str, overrides: Sequence[str] = ()) -> str:

@@ -148,15 +148,19 @@ class Sweep:
             sys.exit(1)
 
     @contextmanager
-    def progress(self, jobs: Sequence[Job]) -> Iterator[None]:
-        """Shows one bar for many runs, drawn by a thread that looks at the folders."""
+    def progress(self, jobs: Sequence[Job], total: int) -> Iterator[Callable[[str], None]]:
+        """Shows one bar for many runs, drawn by a thread that looks at the folders; yields what names it.
+
+        Args:
+            jobs: May grow meanwhile.
+            total: Runs in the end.
+        """
         with progress_bar(self.console) as bar:
-            task, over, open_jobs = bar.add_task("flying", total=len(jobs)), Event(), list(jobs)
+            task, over, done = bar.add_task("flying", total=total), Event(), set()
 
             def look() -> None:
-                nonlocal open_jobs
-                open_jobs = [job for job in open_jobs if not job.done]
-                bar.update(task, completed=len(jobs) - len(open_jobs))
+                done.update(i for i, job in enumerate([*jobs]) if i not in done and job.done)
+                bar.update(task, completed=len(done))
 
             def watch() -> None:
                 while not over.wait(LOOK):
@@ -166,7 +170,7 @@ class Sweep:
             look()
             watcher.start()
             try:
-                yield
+                yield lambda text: bar.update(task, description=text)
             finally:
                 over.set()
                 watcher.join()
@@ -191,7 +195,7 @@ def sweep(given: Namespace, name: str) -> Result:
     finished = sum(job.folder.finished for job in jobs)
     runs.check(jobs)
     runs.keep_plan(jobs)
-    with runs.progress(jobs):
+    with runs.progress(jobs, len(jobs)):
         outcomes = runs.fly(jobs)
     failed = [outcome for outcome in outcomes if "error" in outcome]
     total = "1 run" if len(jobs) == 1 else f"{len(jobs)} runs"

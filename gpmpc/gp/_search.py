@@ -13,7 +13,7 @@ theta = (log length-scales, log sf, log(sf / sn)), in a wide box around the data
 import logging
 import time
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +24,6 @@ from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._kernel import IGNORED, check_posterior
 from gpmpc.gp._likelihood import FAILED, NegativeLogMarginalLikelihood, Objective
-from gpmpc.gp.gpytorch_ import GPyTorchLikelihood
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.scaling import Scaling
 
@@ -34,15 +33,8 @@ _FINALISTS = 2  # ... this many of the best go on to convergence
 _ITERATIONS = 1000  # of the search to convergence, at most
 _LONGER = 1.0  # mean of log l over log std(x~) at the random starts: smooth dynamics prefer long length-scales
 _CONSTANT = 3e-9  # of its magnitude: a column that moves by no more holds a solver's residue (1e-9); 1e8 +- 0.5 moves
+LENGTHSCALE_LIMIT = 1e4  # the box holds length-scales within this factor of their input's standard deviation
 _LOG_INTERVAL = 5.0  # [s]
-
-
-class Penalty(Protocol):
-    """A term added to an output's negative log marginal likelihood."""
-
-    def __call__(self, theta: np.ndarray, log_std: np.ndarray) -> tuple[float, np.ndarray]:
-        """Value and gradient (d + 2,) at theta, given the logarithms of the inputs' standard deviations (d,)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -70,7 +62,7 @@ class SoftLimits:
             raise SettingError("power", f"must be even; got {self.power}")
 
     def __call__(self, theta: np.ndarray, log_std: np.ndarray) -> tuple[float, np.ndarray]:
-        """Value and gradient (d + 2,) at theta."""
+        """Value and gradient (d + 2,) at theta, given the logarithms of the inputs' standard deviations (d,)."""
         width = np.full(len(theta), np.log(self.lengthscale_factor))
         width[-1] = np.log(self.signal_to_noise)
         position = np.append(theta[:-2] - log_std, [0.0, theta[-1]]) / width
@@ -123,7 +115,7 @@ def find_hyperparameters(problem: SearchProblem, settings: Any) -> SearchResult:
     log_inputs, log_output = np.log(problem.std), np.log(column_std(targets[:, None])[0])
     centre = np.append(log_inputs, [log_output, 0.0])
     reach = np.append(
-        np.full(inputs.shape[1], np.log(settings.lengthscale_limit)),
+        np.full(inputs.shape[1], np.log(LENGTHSCALE_LIMIT)),
         [np.log(1e6), np.log(settings.signal_to_noise_limit)],
     )
 
@@ -236,8 +228,7 @@ def log_hyperparameters(posterior: GPPosterior, features: Scaling, targets: Scal
 
 def _penalized(settings: Any, inputs: np.ndarray, targets: np.ndarray, log_std: np.ndarray) -> Objective:
     """Negative log marginal likelihood plus penalty of one output over theta."""
-    backends = {"closed_form": NegativeLogMarginalLikelihood, "gpytorch": GPyTorchLikelihood}
-    likelihood, penalty = backends[settings.likelihood](inputs, targets), settings.penalty
+    likelihood, penalty = NegativeLogMarginalLikelihood(inputs, targets), settings.penalty
 
     def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
         with np.errstate(over="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Exact GPs in GPyTorch: one per output as one batch, and their likelihood.
+"""Exact GPs in GPyTorch: one per output as one batch, and what is taken of those that others trained.
 
 Everything is float64, and the Cholesky factorisation is exact at every size: left alone, GPyTorch turns to an iterative
 solver above 800 points, adds jitter without a word, and keeps the noise above 1e-4.
@@ -9,13 +9,11 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import gpytorch
-import numpy as np
 import torch
 from gpytorch.constraints import Positive
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
-from gpmpc.gp._kernel import centred
 from gpmpc.gp.posterior import GPPosterior
 
 
@@ -52,21 +50,6 @@ class BatchExactGP(gpytorch.models.ExactGP):
         """The prior over all outputs at inputs (N, d)."""
         return gpytorch.distributions.MultivariateNormal(self.mean_module(features), self.covar_module(features))
 
-    @property
-    def lengthscales(self) -> Tensor:
-        """(n, d)."""
-        return self.covar_module.base_kernel.lengthscale.detach()[:, 0]
-
-    @property
-    def signal_variance(self) -> Tensor:
-        """(n,)."""
-        return self.covar_module.outputscale.detach()
-
-    @property
-    def noise_variance(self) -> Tensor:
-        """(n,)."""
-        return self.likelihood.noise.detach()[:, 0]
-
     def set_hyperparameters(self, theta: Tensor) -> None:
         """Takes rows (log l (d), log sf, log(sf / sn)), one an output: (n, d + 2)."""
         with torch.no_grad():
@@ -84,36 +67,6 @@ def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
     theta = torch.cat([posterior.lengthscales.log(), torch.stack([deviation, deviation - noise], 1)], 1)
     model.set_hyperparameters(theta)
     return model.eval()
-
-
-class GPyTorchLikelihood:
-    """Evaluates the negative log marginal likelihood by GPyTorch, as ``NegativeLogMarginalLikelihood`` does.
-
-    Args:
-        features: x~ (N, d).
-        targets: y (N,).
-    """
-
-    def __init__(self, features: np.ndarray, targets: np.ndarray):
-        self._model = BatchExactGP(torch.from_numpy(centred(features)), torch.from_numpy(targets)[:, None]).train()
-        self._likelihood = gpytorch.mlls.ExactMarginalLogLikelihood(self._model.likelihood, self._model)
-
-    def __call__(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
-        """Value and gradient (d + 2,) at theta; infinite where K is not positive definite."""
-        model = self._model
-        model.set_hyperparameters(torch.from_numpy(theta)[None])
-        model.zero_grad()
-        try:
-            with exact_inference():
-                # GPyTorch divides by the number of points.
-                value = -self._likelihood(model(*model.train_inputs), model.train_targets) * len(model.train_inputs[0])
-            value.sum().backward()
-        except (gpytorch.utils.errors.NotPSDError, gpytorch.utils.errors.NanError):
-            return np.inf, np.zeros_like(theta)
-        by_lengthscale = model.covar_module.base_kernel.raw_lengthscale.grad[0, 0].numpy()
-        by_signal = float(2 * model.covar_module.raw_outputscale.grad[0])
-        by_noise = float(2 * model.likelihood.noise_covar.raw_noise.grad[0, 0])
-        return float(value.detach()), np.append(by_lengthscale, [by_signal + by_noise, -by_noise])
 
 
 def _log_parameter() -> Positive:

@@ -82,7 +82,7 @@ def sparse_posterior(
     """
     if jitter is not None:
         check_number("jitter", jitter, least=0)
-    _check_method(method)
+    check_method(method)
     check_tensors(inducing=inducing, features=features, targets=targets)
     offset = torch.zeros_like(targets[0]) if offset is None else offset
     if inducing.dim() != 2 or inducing.shape[1:] != features.shape[1:] or not len(inducing):
@@ -100,7 +100,7 @@ def sparse_posterior(
         if jitter is not None:
             raise
         Lz = inducing_factor(inducing, hyperparameters, JITTER)
-    sums = _data_sums(Lz, inducing, features, targets - offset, hyperparameters, method)
+    sums = data_sums(Lz, inducing, features, targets - offset, hyperparameters, method)
     # Ascending: the largest rows of what is factorised come first, as QR needs.
     b, U = torch.linalg.eigh(sums.gram)
     b = b.clamp_min(_UNINFORMED)
@@ -112,30 +112,10 @@ def sparse_posterior(
     return replace(shell, features=inducing.clone(), targets=pseudo_targets, cholesky=cholesky, weights=weights[..., 0])
 
 
-def _check_method(method: str) -> None:
+def check_method(method: str) -> None:
+    """Raises ``SettingError`` unless a method is known."""
     if method not in ("sgpr", "fitc"):
         raise SettingError("method", f"must be 'sgpr' or 'fitc'; got {method!r}")
-
-
-def collapsed_bound(
-    inducing: Tensor,
-    features: Tensor,
-    targets: Tensor,
-    hyperparameters: Hyperparameters,
-    method: Method = "sgpr",
-    jitter: float = JITTER,
-) -> Tensor:
-    """The bound on the log marginal likelihood (SGPR), or FITC's own log marginal likelihood, of every output (k,).
-
-    Differentiable by all of its tensors, in one piece; arguments as in ``sparse_posterior``.
-
-    Raises:
-        SettingError: Kzz is not positive definite, or the method is unknown.
-    """
-    _check_method(method)
-    Lz = inducing_factor(inducing, hyperparameters, jitter)
-    sums = _block_sums(Lz, inducing, features, targets, hyperparameters, method)
-    return _bound(sums, len(features), hyperparameters, method)
 
 
 def collapsed_bound_with_gradient(
@@ -146,16 +126,18 @@ def collapsed_bound_with_gradient(
     method: Method = "sgpr",
     jitter: float = JITTER,
 ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """``collapsed_bound`` (k,), and the derivatives of its sum over the outputs, in blocks.
+    """The bound on the log marginal likelihood (SGPR), or FITC's own log marginal likelihood, of every output (k,).
+
+    Arguments are as for ``sparse_posterior``.
 
     Returns:
-        The bound, and its sum's derivatives by inducing (M, d), lengthscales (k, d), signal_variance and noise_variance
-        (k,).
+        The bound, and the derivatives of its sum over the outputs by inducing (M, d), lengthscales (k, d),
+        signal_variance and noise_variance (k,).
 
     Raises:
         SettingError: Kzz is not positive definite, or the method is unknown.
     """
-    _check_method(method)
+    check_method(method)
     values, by_inducing, by_others = [], torch.zeros_like(inducing), []
     for a in range(targets.shape[1]):
         y = targets[:, a : a + 1]
@@ -164,7 +146,7 @@ def collapsed_bound_with_gradient(
         with torch.enable_grad():
             Lz = inducing_factor(Z, kernel, jitter)
         cut = Lz.detach().requires_grad_()
-        sums = [s.requires_grad_() for s in _data_sums(cut, Z, features, y, kernel, method)]
+        sums = [s.requires_grad_() for s in data_sums(cut, Z, features, y, kernel, method)]
         with torch.enable_grad():
             value = _bound(_Sums(*sums), len(features), kernel, method)
             direct = torch.autograd.grad(value.sum(), [*sums, *variables[2:]], materialize_grads=True)
@@ -190,7 +172,7 @@ def collapsed_bound_with_gradient(
     return torch.cat(values), (by_inducing, by_lengthscales, by_signal, by_noise)
 
 
-def _data_sums(
+def data_sums(
     Lz: Tensor,
     inducing: Tensor,
     features: Tensor,
@@ -198,7 +180,10 @@ def _data_sums(
     hyperparameters: Hyperparameters,
     method: Method,
 ) -> _Sums:
-    """The sums over all points, of every output, in blocks; no derivatives."""
+    """The sums over all points, of every output, in blocks; no derivatives.
+
+    tr(A A') is, in units of the noise, the variance of the data that the inducing points explain.
+    """
     outputs = []
     with torch.no_grad():
         for a in range(targets.shape[1]):
@@ -209,14 +194,6 @@ def _data_sums(
                 total = part if total is None else _Sums(*(t.add_(p) for t, p in zip(total, part, strict=True)))
             outputs.append(total)
     return _Sums(*(torch.cat(of_one) for of_one in zip(*outputs, strict=True)))
-
-
-def variance_reductions(
-    Lz: Tensor, inducing: Tensor, features: Tensor, targets: Tensor, hyperparameters: Hyperparameters, method: Method
-) -> Tensor:
-    """tr(A A') (k,): in units of the noise, the variance of the data that the inducing points explain."""
-    sums = _data_sums(Lz, inducing, features, targets, hyperparameters, method)
-    return sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
 
 
 def inducing_factor(inducing: Tensor, hyperparameters: Hyperparameters, jitter: float) -> Tensor:

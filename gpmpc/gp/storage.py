@@ -26,7 +26,7 @@ from torch import Tensor
 
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, UnsupportedModel
 from gpmpc.files import write_whole
-from gpmpc.gp import _archive as archive
+from gpmpc.gp._archive import existing_file, new_file, read_npz
 from gpmpc.gp._kernel import check_posterior
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.provenance import now, versions
@@ -49,7 +49,7 @@ def save_posterior(posterior: GPPosterior, path: str | Path, metadata: Mapping[s
         SettingError: It is in another floating-point type, or the metadata are no JSON.
         DataError: The folder does not exist, or the posterior is inconsistent and could not be read again.
     """
-    path = archive.new_file(path)
+    path = new_file(path)
     write_model(path, "GPPosterior", *posterior_parts(path, posterior), metadata)
 
 
@@ -59,13 +59,13 @@ def load_posterior(path: str | Path) -> GPPosterior:
     Raises:
         DataError: The file is missing, damaged, of another kind or of a newer format.
     """
-    path = archive.existing_file(path, "a saved GPPosterior")
+    path = existing_file(path, "a saved GPPosterior")
     return posterior_of_parts(path, *read_model(path, "GPPosterior"))
 
 
 def load_metadata(path: str | Path) -> dict[str, Any]:
     """Reads the header of a model file: kind, dimensions, versions, and the metadata it was saved with."""
-    path = archive.existing_file(path, "a saved model")
+    path = existing_file(path, "a saved model")
     return _checked_header(path, "model", _content(path, "model", header_only=True)[0])
 
 
@@ -175,11 +175,7 @@ def _content(path: Path, kind: str, header_only: bool = False) -> tuple[Any, dic
     """The header and the arrays of a file of either format; damage makes libraries raise whatever they meet first."""
     try:
         if _is_npz(path):
-            header = archive.read_header(path)
-            if header_only or not isinstance(header, dict):
-                return header, {}
-            archive.check_whole(path, header)
-            return header, dict(archive.read_arrays(path))
+            return read_npz(path)
         with safetensors.safe_open(path, framework="numpy") as file:
             text = (file.metadata() or {}).get("gpmpc", "null")
             if len(text) > _LONGEST:

@@ -9,7 +9,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +19,6 @@ from gpmpc.exceptions import DataError, SettingError, TrainingError, Unsupported
 from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
 from gpmpc.gp._likelihood import FAILED
 from gpmpc.gp._search import (
-    Penalty,
     SearchProblem,
     column_std,
     constant_columns,
@@ -34,8 +33,6 @@ from gpmpc.gp.transitions import Transitions, check_transitions
 from gpmpc.memory import GIB, available_memory
 
 _log = logging.getLogger(__name__)
-# N x N matrices that one evaluation of the likelihood holds, measured; the posterior holds one an output.
-_MATRICES = {"closed_form": 1, "gpytorch": 13}
 _MANY = 1000  # points: from here on the log has a line an output
 
 
@@ -70,29 +67,25 @@ class Trainer:
         scaling: How features and targets are scaled for training; what comes out is in the units of the data all the
             same. The prior mean is what it maps to zero: the targets' mean by default and with ``standardize``, zero
             with ``identity``.
-        penalty: Added to every output's negative log marginal likelihood; none by default.
+        penalty: Added to every output's negative log marginal likelihood, such as ``SoftLimits()``; none by default.
         restarts: Random starts besides the first, which has l = std(x~), sf = std(y), sn = std(y) / 10.
         subset: Of more points than this a random subset of as many is searched first, from all starts; the search over
             all points goes on from its best. None searches over all of them from every start.
-        likelihood: How it is evaluated: in closed form, or by GPyTorch's automatic differentiation (slower; the same).
         tolerance: Relative decrease of the objective at which L-BFGS stops.
-        lengthscale_limit: The box holds length-scales within this factor of their input's spread.
         signal_to_noise_limit: The box holds sf / sn within this factor of one. Moment matching needs sf2 / sn2 below
             about 1e10 in double precision.
 
     Raises:
-        SettingError: Fewer than no restarts, a subset of none, an unknown ``likelihood`` or ``predicts``, a tolerance
+        SettingError: Fewer than no restarts, a subset of none, an unknown ``predicts``, a tolerance
             that is not positive, or a limit of 1 or less.
     """
 
     predicts: Predicts = "next_state"
     scaling: Callable[[Tensor, Sequence[str]], Scaling] = centre
-    penalty: Penalty | None = None
+    penalty: Callable[[np.ndarray, np.ndarray], tuple[float, np.ndarray]] | None = None
     restarts: int = 3
     subset: int | None = 1000
-    likelihood: Literal["closed_form", "gpytorch"] = "closed_form"
     tolerance: float = 1e-8
-    lengthscale_limit: float = 1e4
     signal_to_noise_limit: float = 1e4
 
     def __post_init__(self) -> None:
@@ -101,13 +94,11 @@ class Trainer:
         check_number("restarts", self.restarts, least=0, whole=True)
         if self.subset is not None:
             check_number("subset", self.subset, least=1, whole=True)
-        if self.likelihood not in ("closed_form", "gpytorch"):
-            raise SettingError("likelihood", f"must be 'closed_form' or 'gpytorch'; got {self.likelihood!r}")
         for key in ("scaling", "penalty"):
             if not (callable(value := getattr(self, key)) or (key == "penalty" and value is None)):
                 example = "standardize" if key == "scaling" else "SoftLimits()"
                 raise SettingError(key, f"must be a function such as {example} of gpmpc.gp; got {value!r}")
-        for key, least in (("tolerance", 0), ("lengthscale_limit", 1), ("signal_to_noise_limit", 1)):
+        for key, least in (("tolerance", 0), ("signal_to_noise_limit", 1)):
             check_number(key, getattr(self, key), above=least)
 
     def __call__(self, transitions: Transitions, seed: int = 0, start: GPPosterior | None = None) -> Training:
@@ -173,7 +164,7 @@ class Trainer:
         predicts = self.predicts if predicts is None else predicts
         features, targets = training_data(features, targets, input_dim, predicts)
         (size, d), outputs = features.shape, targets.shape[1]
-        _check_memory(size, outputs, self.likelihood)
+        _check_memory(size, outputs)
         names = [f"x{i + 1}" for i in range(d - input_dim)] + [f"u{i + 1}" for i in range(input_dim)]
         feature_scaling = self.scaling(features, names)
         target_scaling = self.scaling(targets, [f"y{a + 1}" for a in range(outputs)])
@@ -231,10 +222,10 @@ def _check_start(key: str, posterior: Any) -> None:
         raise UnsupportedModel(f"{key} must be a GPPosterior; got {type(posterior).__name__}")
 
 
-def _check_memory(size: int, outputs: int, likelihood: str) -> None:
+def _check_memory(size: int, outputs: int) -> None:
     """Raises ``DataError`` where a training of N points and k outputs would not fit the available memory."""
     free = available_memory()
-    needed = 8 * size**2 * max(_MATRICES[likelihood], outputs + 2)  # two more while a factor is made
+    needed = 8 * size**2 * (outputs + 2)  # of the posterior's factors, and two more while one is made
     if free is None or needed <= free:
         return
     raise DataError(

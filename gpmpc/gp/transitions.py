@@ -6,7 +6,7 @@ published their data, and are finite float64 of matching shapes; errors name fil
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,10 +17,9 @@ from torch import Tensor
 
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, UnsupportedModel, check_number
 from gpmpc.files import write_whole
-from gpmpc.gp._archive import check_whole, existing_file, new_file, pack, read_arrays, read_header
+from gpmpc.gp._archive import existing_file, new_file, read_npz, write_npz
 
-FORMAT, VERSION = "gpmpc transitions", 1
-NAMES = ("states", "inputs", "next_states")
+_NAMES = ("states", "inputs", "next_states")
 _EXPECTED = "a file of transitions"
 
 
@@ -47,7 +46,7 @@ class Transitions:
         def __init__(self, states: Any, inputs: Any, next_states: Any) -> None: ...
 
     def __post_init__(self) -> None:
-        for name in NAMES:
+        for name in _NAMES:
             try:
                 value = _real(getattr(self, name))
             except (TypeError, ValueError) as error:
@@ -67,7 +66,7 @@ class Transitions:
             )
         if len(self.states) == 0:
             raise DataError("transitions need at least one row; got none")
-        for name in NAMES:
+        for name in _NAMES:
             bad = torch.nonzero(~torch.isfinite(getattr(self, name)))
             if len(bad):
                 row, column = bad[0].tolist()
@@ -114,8 +113,8 @@ class Transitions:
 
     def save(self, path: str | Path) -> None:
         """Writes an uncompressed ``.npz`` (no pickle), in one piece or not at all."""
-        arrays = ((name, getattr(self, name).numpy(force=True)) for name in NAMES)
-        write_whole(new_file(path), pack({"format": FORMAT, "format_version": VERSION}, arrays))
+        arrays = {name: getattr(self, name).numpy(force=True) for name in _NAMES}
+        write_whole(new_file(path), write_npz({"format": "gpmpc transitions", "format_version": 1}, arrays))
 
     @classmethod
     def load(cls, path: str | Path) -> "Transitions":
@@ -126,18 +125,13 @@ class Transitions:
         """
         path = existing_file(path, _EXPECTED)
         try:
-            header = read_header(path)
-            if header is not None:
-                if (header["format"], header["format_version"]) != (FORMAT, VERSION):
-                    raise ValueError(f"it holds a {header['format']}, format {header['format_version']}")
-                check_whole(path, header)
-            arrays = dict(read_arrays(path, NAMES))
+            _, arrays = read_npz(path, _NAMES)
         except Exception as error:
             raise DataError(f"{path}: not a readable .npz file of transitions ({error})") from error
-        missing = [name for name in NAMES if name not in arrays]
+        missing = [name for name in _NAMES if name not in arrays]
         if missing:
-            raise DataError(f"{path}: array {missing[0]!r} is missing; expected {', '.join(NAMES)}")
-        return _with_path(path, *(arrays[name] for name in NAMES))
+            raise DataError(f"{path}: array {missing[0]!r} is missing; expected {', '.join(_NAMES)}")
+        return _with_path(path, *(arrays[name] for name in _NAMES))
 
     @classmethod
     def from_text(cls, path: str | Path, state_dim: int = 6, input_dim: int = 3) -> "Transitions":
@@ -148,23 +142,11 @@ class Transitions:
         """
         check_number("state_dim", state_dim, least=1, whole=True)
         check_number("input_dim", input_dim, least=0, whole=True)
-        path = existing_file(path, _EXPECTED)
-        columns = 2 * state_dim + input_dim
-        rows = []
-        for line, text in enumerate(_text(path).splitlines(), start=1):
-            fields = text.split()
-            if not fields:
-                continue
-            if len(fields) != columns:
-                raise DataError(
-                    f"{path}: row {line} has {len(fields)} columns; expected {columns} "
-                    f"({state_dim} states, {input_dim} inputs, {state_dim} next states)"
-                )
-            rows.append([_number(path, line, column, field) for column, field in enumerate(fields, start=1)])
-        if not rows:
-            raise DataError(f"{path}: the file holds no rows; expected {columns} columns of numbers")
-        table = np.array(rows)
-        n, m = state_dim, input_dim
+        path, n, m = existing_file(path, _EXPECTED), state_dim, input_dim
+        lines = enumerate(map(str.split, _text(path).splitlines()), start=1)
+        columns = {number: number - 1 for number in range(1, 2 * n + m + 1)}
+        said = f"{2 * n + m} ({n} states, {m} inputs, {n} next states)"
+        table = _table(path, lines, columns, 2 * n + m, said, least=1)
         return _with_path(path, table[:, :n], table[:, n : n + m], table[:, n + m :])
 
     @classmethod
@@ -191,31 +173,20 @@ class Transitions:
         path = existing_file(path, _EXPECTED)
         text = _text(path)
         header = text.partition("\n")[0]
-        delimiter = max(",;\t", key=header.count)
-        reader = csv.reader(io.StringIO(text), delimiter=delimiter)
+        reader = csv.reader(io.StringIO(text), delimiter=max(",;\t", key=header.count))
         lines = _lines(path, reader)
-        names = [name.strip() for name in next(lines, [])]
+        names = [name.strip() for name in next(lines, (1, []))[1]]
         wanted = [*states, *inputs, *(next_states or ())]
         for name in wanted:
             if names.count(name) != 1:
                 problem = "is missing" if name not in names else "stands there twice"
                 raise DataError(f"{path}: column {name!r} {problem}; the header has {', '.join(names) or 'no columns'}")
-        positions = [names.index(name) for name in wanted]
-        rows = []
-        for fields in lines:
-            line = reader.line_num
-            if not fields:
-                continue
-            if len(fields) != len(names):
-                raise DataError(f"{path}: row {line} has {len(fields)} columns; expected {len(names)} as in the header")
-            rows.append([_number(path, line, names[i], fields[i]) for i in positions])
-        least = 1 if next_states else 2
-        if len(rows) < least:
-            raise DataError(f"{path}: the file holds {len(rows)} rows; expected {least} or more below the header")
-        n, m, table = len(states), len(inputs), np.array(rows)
-        if next_states:
-            return _with_path(path, table[:, :n], table[:, n : n + m], table[:, n + m :])
-        return _with_path(path, table[:-1, :n], table[:-1, n:], table[1:, :n])
+        places = {name: names.index(name) for name in wanted}
+        table = _table(path, lines, places, len(names), f"{len(names)} as in the header", least=1 if next_states else 2)
+        x, u, after = (
+            table[:, [list(places).index(name) for name in part]] for part in (states, inputs, next_states or states)
+        )
+        return _with_path(path, x, u, after) if next_states else _with_path(path, x[:-1], u[:-1], after[1:])
 
 
 def check_transitions(transitions: Any) -> None:
@@ -247,11 +218,32 @@ def _text(path: Path) -> str:
         raise DataError(f"{path}: not a readable text file ({error})") from error
 
 
-def _lines(path: Path, reader: Any) -> Iterator[list[str]]:
+def _lines(path: Path, reader: Any) -> Iterator[tuple[int, list[str]]]:
     try:
-        yield from reader
+        for fields in reader:
+            yield reader.line_num, fields
     except csv.Error as error:
         raise DataError(f"{path}: row {reader.line_num} cannot be read ({error})") from error
+
+
+def _table(
+    path: Path,
+    lines: Iterable[tuple[int, list[str]]],
+    columns: Mapping[Any, int],
+    width: int,
+    expected: str,
+    least: int,
+) -> np.ndarray:
+    """The numbers in the columns, at the places by their names, of ``least`` or more lines that are not empty."""
+    rows = []
+    for line, fields in lines:
+        if fields and len(fields) != width:
+            raise DataError(f"{path}: row {line} has {len(fields)} columns; expected {expected}")
+        if fields:
+            rows.append([_number(path, line, name, fields[place]) for name, place in columns.items()])
+    if len(rows) < least:
+        raise DataError(f"{path}: the file holds {len(rows)} rows; expected {least} or more, of {width} columns")
+    return np.array(rows)
 
 
 def _number(path: Path, row: int, column: int | str, field: str) -> float:

@@ -1,20 +1,41 @@
 """Logs of real systems: reading, checking, learning from them, and judging what was learned."""
 
+from gpmpc.logs.fitting import NominalFit, fit_nominal
+from gpmpc.logs.judging import Judgement, judge
+from gpmpc.logs.kinematics import Increments, Kinematics, RigidBody
+from gpmpc.logs.learning import Candidate, Learned, learn
 from gpmpc.logs.log import Finding, Log, LogRun, Windows
 from gpmpc.logs.mapping import LogMapping, Signal
+from gpmpc.logs.noise import OutputNoise
+from gpmpc.logs.nominal import MultirotorNominal, Nominal
 from gpmpc.logs.readers import read_streams
 from gpmpc.logs.reading import read_log
+from gpmpc.logs.rollouts import LogModel
 from gpmpc.logs.state_space import StateGroup, StateSpace
 
 __all__ = [
+    "Candidate",
     "Finding",
+    "Increments",
+    "Judgement",
+    "Kinematics",
+    "Learned",
     "Log",
     "LogMapping",
+    "LogModel",
     "LogRun",
+    "MultirotorNominal",
+    "Nominal",
+    "NominalFit",
+    "OutputNoise",
+    "RigidBody",
     "Signal",
     "StateGroup",
     "StateSpace",
     "Windows",
+    "fit_nominal",
+    "judge",
+    "learn",
     "read_log",
     "read_streams",
 ]

@@ -1,6 +1,7 @@
 """Makes runs of tables: applies a mapping, resamples, and finds gaps, repeated samples and parts at rest."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,7 +13,7 @@ from gpmpc.logs.log import Finding, Log, LogRun
 from gpmpc.logs.mapping import TIME_UNITS, UNITS, LogMapping, Signal
 from gpmpc.logs.readers import STAMP, read_streams
 from gpmpc.logs.sampling import ordered_stamps, resample
-from gpmpc.logs.state_space import Array, quaternion_from_euler
+from gpmpc.logs.state_space import Array, quaternion_from_euler, quaternion_inverse, rotate
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -72,7 +73,20 @@ def read_log(
         said = "; ".join(f"{f.run}: {f.text}" for f in findings[-3:])
         raise DataError(f"{files[0]}{' and others' * (len(files) > 1)}: no row can be used ({said})")
     check_plausible(usable, step, mapping)
+    if mapping.model == "rigid_body":
+        usable = tuple(_in_one_frame(run, mapping) for run in usable)
     return Log(mapping, step, usable, tuple(findings))
+
+
+def _in_one_frame(run: LogRun, mapping: LogMapping) -> LogRun:
+    """Turns a rigid body's velocity to world axes and its rate to body axes."""
+    _, _, velocity, rate = mapping.of("states")
+    states, q = run.states.copy(), run.states[:, 3:7]
+    if velocity.frame == "body":
+        states[:, 7:10] = rotate(q, states[:, 7:10])
+    if rate.frame == "world":
+        states[:, 10:13] = rotate(quaternion_inverse(q), states[:, 10:13])
+    return replace(run, states=states)
 
 
 def _split_runs(
@@ -163,7 +177,7 @@ def _values(file: Path, table: "DataFrame", signal: Signal, run: str, findings: 
         raise DataError(f"{file}: column {missing[0]!r}{where} is missing; there are {_some(table)}")
     values = np.column_stack([_numbers(str(file), table, column) for column in signal.columns]) * signal.scale
     values[~np.isfinite(values)] = np.nan
-    absent = np.isnan(values).any(axis=1)
+    absent = np.asarray(np.isnan(values).any(axis=1))
     if absent.any():
         text = f"{int(absent.sum())} rows of {signal.name} without a value: left out"
         findings.append(Finding("missing value", run, int(absent.sum()), text))
@@ -237,7 +251,7 @@ def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping, fi
     leave_out(table.outside, "outside of keep", "outside the ranges of keep")
     if mapping.rest == "drop":
         leave_out(_at_rest(states, inputs, spread, step), "at rest", "where nothing moves")
-    absent = np.isnan(np.concatenate([states, inputs, context], axis=1)).any(axis=1)
+    absent = np.asarray(np.isnan(np.concatenate([states, inputs, context], axis=1)).any(axis=1))
     leave_out(absent, "missing value", "in a gap or without a value")
     if mapping.held == "drop":
         for signal, at in zip(mapping.of("states"), mapping.space.columns, strict=True):

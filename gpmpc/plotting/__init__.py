@@ -8,7 +8,7 @@ from gpmpc.plotting.image import png
 from gpmpc.plotting.quality import quality
 from gpmpc.plotting.recorded import inputs_figure, timing_figure, tracking_figure
 from gpmpc.plotting.results import Curve, Panel, calibration_figure, error_over_size, over_settings, tracking
-from gpmpc.plotting.sweeps import Series, over_variable
+from gpmpc.plotting.sweeps import Series, over_variable, search_figure
 
 __all__ = [
     "Curve",
@@ -23,6 +23,7 @@ __all__ = [
     "over_variable",
     "png",
     "quality",
+    "search_figure",
     "timing_figure",
     "tracking",
     "tracking_figure",

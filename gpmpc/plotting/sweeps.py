@@ -1,12 +1,12 @@
 """Draws the results of a sweep's runs over a variable."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 COLOURS = ("#1f4e79", "#c0392b", "#2e8b57", "#b8860b", "#6a3d9a", "#17858b", "#8c564b", "#555555")
 
@@ -106,3 +106,40 @@ def _numbers(positions: Sequence[str]) -> np.ndarray | None:
     except ValueError:
         return None
     return numbers if np.isfinite(numbers).all() and len(set(numbers)) == len(numbers) else None
+
+
+def search_figure(costs: Sequence[float], importances: Mapping[str, float], unchanged: float | None) -> Figure:
+    """Draws the costs of a search over its candidates, and beside them how much each setting mattered.
+
+    Args:
+        costs: In the order of the candidates; infinite ones stand at the upper edge.
+        importances: Shares by setting, the most first; may be empty.
+        unchanged: Cost of the settings without the search; None leaves it out.
+    """
+    figure = Figure(figsize=(4.4 + 4.0 * bool(importances), 3.4), layout="constrained")
+    axes = figure.subplots(1, 1 + bool(importances), squeeze=False)[0]
+    values = np.array(costs)
+    finite, best = np.isfinite(values), np.minimum.accumulate(values)
+    axes[0].plot(np.flatnonzero(finite), values[finite], ".", color=COLOURS[0], alpha=0.6, label="candidate")
+    known = np.isfinite(best)
+    axes[0].step(np.flatnonzero(known), best[known], color=COLOURS[1], where="post", label="best so far")
+    if not finite.all():
+        edge = axes[0].get_xaxis_transform()
+        lost = np.flatnonzero(~finite)
+        axes[0].plot(lost, np.full(len(lost), 0.98), "x", color="0.5", transform=edge, label="lost or failed")
+    if unchanged is not None:
+        axes[0].axhline(unchanged, color="0.4", linestyle="--", label="settings as they are")
+    if finite.any() and values[finite].min() > 0:
+        axes[0].set_yscale("log")
+    axes[0].set(xlabel="candidate", ylabel="closed-loop cost per step")
+    axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes[0].grid(axis="y", color="0.9")
+    axes[0].legend(loc="upper center", bbox_to_anchor=(0.5, 1.25), ncols=2, frameon=False, fontsize="small")
+    if importances:
+        names = [*importances][::-1]
+        bars = axes[1].barh(names, [100 * importances[name] for name in names], color=COLOURS[0], height=0.5)
+        axes[1].bar_label(bars, fmt="%.0f %%", padding=3)
+        axes[1].set(xlabel="importance [%]", xlim=(0, 115))
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
+    return figure

@@ -312,9 +312,9 @@ def _residuals(problem: RecordedProblem) -> tuple[float, float, float]:
 
     if not len(problem.x):
         return np.nan, np.nan, np.nan
-    *arrays, softness, x, multipliers = problem
+    P, q, G, lower, upper, softness, x, multipliers = problem
     values = np.concatenate([np.zeros(record.HEADER), x, multipliers])
-    return QPSolution(x, tuple(arrays), softness, values).residuals()
+    return QPSolution(x, (P, q, G, lower, upper), softness, values).residuals()
 
 
 class Recovery(NamedTuple):

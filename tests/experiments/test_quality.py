@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from gpmpc.cli.run import experiment_of
 from gpmpc.exceptions import SettingError
-from gpmpc.experiments.quality import FAMILIES, TRUTH, Family, Quality, pareto_front, stage_cost
+from gpmpc.experiments.quality import FAMILIES, TRUTH, Family, Quality, pareto_front
+from gpmpc.metrics import tracking_cost
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.plotting import quality
@@ -55,7 +56,7 @@ def test_the_cost_is_the_sum_of_what_every_step_pays(rng):
     for k in range(7):
         e, v = x[k + 1] - r[k + 1], u[k] - (u[k - 1] if k else before)
         paid += e @ weights.cost.Q @ e + v @ weights.cost.R @ v
-    assert stage_cost(weights, x, r, u, before) == pytest.approx(paid / 7, rel=1e-12)
+    assert tracking_cost(weights.cost.Q, weights.cost.R, x, r, u, before) == pytest.approx(paid / 7, rel=1e-12)
 
 
 def flight(family, **changes):

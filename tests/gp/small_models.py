@@ -39,4 +39,4 @@ def as_before(model, path):
     SAVE[type(model)](model, new)
     header, arrays = storage._content(new, "model")
     header = {key: value for key, value in header.items() if key not in ("checksum", "metadata")}
-    path.write_bytes(_archive.pack(header | {"format_version": 1}, arrays.items()))
+    path.write_bytes(_archive.write_npz(header | {"format_version": 1}, arrays))

@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy.optimize import approx_fprime
 
+from benchmarks.gpytorch_likelihood import GPyTorchLikelihood
 from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
-from gpmpc.gp.gpytorch_ import GPyTorchLikelihood
 
 
 def problem(size, d=4, outputs=2, seed=0):

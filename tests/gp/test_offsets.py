@@ -26,11 +26,10 @@ from gpmpc.gp import (
 from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
 from gpmpc.gp._search import column_std, constant_columns
 from gpmpc.gp.casadi_ import casadi_function
-from gpmpc.gp.gpytorch_ import GPyTorchLikelihood
 from gpmpc.gp.module import PosteriorModule
-from gpmpc.gp.sparse import collapsed_bound
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, linearize
 from gpmpc.propagation.sensitivity import differentiate
+from tests.gp.whole_bound import collapsed_bound
 
 FEATURES = [1e8, torch.tensor([-1e8, 1e7, 13.75])]
 TARGETS = [-1e8, torch.tensor([1e8, 0.0])]
@@ -51,7 +50,6 @@ TRAINERS = {
     "exact": Trainer(restarts=0),
     "exact, standardized": Trainer(restarts=0, scaling=standardize),
     "exact, on an interval": Trainer(restarts=0, scaling=min_max),
-    "GPyTorch": Trainer(restarts=0, likelihood="gpytorch"),
     "sparse": SparseTrainer(inducing=15, restarts=0, iterations=15),
     "fitc": SparseTrainer(inducing=15, restarts=0, iterations=15, method="fitc"),
 }
@@ -104,8 +102,6 @@ def test_every_evidence_is_that_of_the_shifted_features(by):
         there, slopes = NegativeLogMarginalLikelihood(shifted.numpy(), y[:, 0].numpy(), in_place)(theta)
         assert there == pytest.approx(value, rel=1e-10)
         assert np.allclose(slopes, gradient, rtol=1e-7)
-    here, there = (GPyTorchLikelihood(p.numpy(), y[:, 0].numpy())(theta)[0] for p in (x, shifted))
-    assert there == pytest.approx(here, abs=0.01)  # GPyTorch divides by the length-scales first: round-off remains
     kernel = [torch.tensor(theta[None, :3]).exp(), torch.ones(1), torch.full((1,), 1e-4)]
     bounds = [collapsed_bound(p[:20], p, y[:, :1], Hyperparameters(*kernel)) for p in (x, shifted)]
     assert torch.allclose(*bounds, rtol=1e-10)

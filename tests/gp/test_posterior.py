@@ -4,7 +4,7 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gp import GPPosterior, Scaling
-from gpmpc.gp.gpytorch_ import BatchExactGP, exact_inference
+from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
 
 
 def posterior(size=30, n=2, m=1, predicts="next_state", seed=0):
@@ -27,21 +27,10 @@ def posterior(size=30, n=2, m=1, predicts="next_state", seed=0):
 @pytest.mark.parametrize("size", [1, 10, 189, 900])
 def test_predictions_are_gpytorchs_at_every_size(size):
     gp = posterior(size, n=3, m=2)
-    model = BatchExactGP(gp.features, gp.targets)
-    noise_free = torch.cat(
-        [
-            gp.lengthscales.log(),
-            gp.signal_variance[:, None].log() / 2,
-            (gp.signal_variance / gp.noise_variance)[:, None].log() / 2,
-        ],
-        dim=1,
-    )
-    model.set_hyperparameters(noise_free)
-    for name in ("lengthscales", "signal_variance", "noise_variance"):
-        assert torch.allclose(getattr(model, name), getattr(gp, name), rtol=1e-12)
+    model = to_gpytorch(gp)
     states, inputs = torch.rand(6, 3), torch.rand(6, 2)
     with exact_inference(), torch.no_grad(), gpytorch.settings.skip_posterior_variances(False):
-        theirs = model.eval()(torch.cat([states, inputs], dim=1).expand(3, -1, -1))
+        theirs = model(torch.cat([states, inputs], dim=1).expand(3, -1, -1))
     ours = gp.predict(states, inputs)
     assert torch.allclose(ours.mean, theirs.mean.T, rtol=0, atol=1e-10)
     assert torch.allclose(ours.variance, theirs.variance.T, rtol=0, atol=1e-10)

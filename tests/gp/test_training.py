@@ -52,11 +52,6 @@ def test_the_same_seed_gives_the_same_numbers_and_more_starts_never_a_worse_opti
     assert single.evaluations < first.evaluations
 
 
-def test_gpytorchs_likelihood_leads_to_the_same_optimum():
-    closed, automatic = train(pendulum(30), restarts=0), train(pendulum(30), restarts=0, likelihood="gpytorch")
-    assert np.allclose(closed.objective, automatic.objective, rtol=1e-7)
-
-
 def test_the_gpytorch_model_of_a_training_predicts_the_same():
     training, states, inputs = train(pendulum(30)), torch.rand(4, 2), torch.rand(4, 1)
     with torch.no_grad():
@@ -150,8 +145,6 @@ def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(
         "exact GPs of 400 points and 2 outputs need 0.00477 GiB, 0.00119 GiB a kernel matrix; 0.00195 GiB are "
         "available: train on 256 points or fewer, or sparse GPs (SparseTrainer)"
     )
-    with pytest.raises(DataError, match="exact GPs of 160 points"):  # GPyTorch's likelihood holds more
-        train(pendulum(160), likelihood="gpytorch")
     assert len(train(pendulum(250), restarts=0, tolerance=1e-3).posterior) == 250
     monkeypatch.setattr("gpmpc.gp.training.available_memory", lambda: None)
     assert len(train(pendulum(20), restarts=0).posterior) == 20
@@ -163,7 +156,6 @@ def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(
         ({"subset": 0}, "subset: must be a whole number, 1 or more; got 0"),
         ({"restarts": -1}, "restarts: must be a whole number, 0 or more; got -1"),
         ({"predicts": "delta"}, "'next_state', 'difference', 'value'; got 'delta'"),
-        ({"likelihood": "exact"}, "'closed_form' or 'gpytorch'; got 'exact'"),
         ({"signal_to_noise_limit": 1.0}, "signal_to_noise_limit: must be a number above 1; got 1.0"),
         ({"tolerance": 0.0}, "tolerance: must be a number above 0; got 0.0"),
     ],

@@ -84,7 +84,7 @@ def test_the_authors_text_format_is_read(tmp_path):
         (f"{ROW}\n\n{ROW.replace('3.0', 'NaN', 1)}\n", "data.txt: row 3, column 4 is 'NaN'; expected a finite number"),
         (ROW.replace("7.0", "-inf"), "data.txt: row 1, column 8 is '-inf'; expected a finite number"),
         (ROW.replace("7.0", "7,0"), "data.txt: row 1, column 8 is '7,0'; expected a finite number"),
-        ("\n \n", "data.txt: the file holds no rows; expected 15 columns"),
+        ("\n \n", "data.txt: the file holds 0 rows; expected 1 or more, of 15 columns"),
     ],
 )
 def test_what_is_wrong_with_a_text_file_is_said_with_its_place(tmp_path, text, message):

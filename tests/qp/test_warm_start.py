@@ -104,3 +104,20 @@ def test_a_solution_is_a_copy_that_later_solves_leave_alone(solve, rng):
     kept = first.x.copy()
     solve(feasible_problem(rng, 5, 5), first)
     np.testing.assert_array_equal(first.x, kept)
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (6, 9), (20, 40)])
+def test_a_prepared_program_that_has_solved_others_gives_the_bits_of_a_new_one(n, m, rng):
+    """It keeps the factor of the last working set, and must notice where the guess is another one."""
+    problem = feasible_problem(rng, n, m)
+    used, last, changes = DualActiveSet().prepare(problem.P, problem.G), None, 0
+    for k in range(60):
+        q = problem.q + (0.0 if k % 3 == 0 else 2.0) * rng.standard_normal(n)
+        guess = rng.integers(-1, 2, n + m) if k % 7 == 6 else last
+        new = DualActiveSet().prepare(problem.P, problem.G).solve(q, problem.lower, problem.upper, guess)
+        last = used.solve(q, problem.lower, problem.upper, guess)
+        assert last.status is new.status is Status.SOLVED
+        np.testing.assert_array_equal(last.x, new.x)
+        np.testing.assert_array_equal(last.multipliers, new.multipliers)
+        changes += last.iterations > 0
+    assert changes > 0

@@ -1,0 +1,140 @@
+"""Searches settings for the least cost by tree-structured Parzen estimators (Bergstra et al., 2011), with Optuna.
+
+Candidates come in batches, whose costs are all told before the next one. The random numbers of a candidate follow from
+the seed and from its number, and its proposal from the costs told before: a search that is repeated, or that goes on
+where it was killed with costs from files, proposes the same candidates bit for bit.
+"""
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from gpmpc.exceptions import GpmpcError
+from gpmpc.plotting import png, search_figure
+from gpmpc.studies.document import MISSING, Document, Table, figure_label, number, plain_text
+from gpmpc.studies.study import derived_seed
+
+FEWEST = 8  # candidates of which an importance is told
+SHOWN = 10  # best candidates in the table
+LEGEND = (
+    "cost: of states and increments of the inputs along the true flight, per step, mean over the seeds, with the "
+    "weights that the settings have which are not searched. Importance: share of the variance of being among the best "
+    "tenth (PED-ANOVA; Watanabe, Bansal and Hutter, 2023)."
+)
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Numbers from ``low`` to ``high``, both included."""
+
+    low: float
+    high: float
+    logarithmic: bool = False
+    whole: bool = False
+
+
+class Search:
+    """A search for the candidate of least cost.
+
+    Args:
+        space: By setting, an ``Interval`` or a list of values as text.
+        seed: Of all random numbers.
+
+    Raises:
+        GpmpcError: Optuna is not installed.
+    """
+
+    def __init__(self, space: Mapping[str, Interval | Sequence[str]], seed: int):
+        try:
+            import optuna
+        except ImportError as error:
+            raise GpmpcError("tune: needs Optuna: pip install 'gpmpc[tune]'") from error
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self._optuna, self._seed = optuna, seed
+        self._study = optuna.create_study(direction="minimize")
+        self._space = {key: self._distribution(values) for key, values in space.items()}
+        self._asked: list[Any] = []
+        self.candidates: list[dict[str, Any]] = []
+        self.costs: list[float] = []
+
+    def _distribution(self, values: Interval | Sequence[str]) -> Any:
+        kinds = self._optuna.distributions
+        if not isinstance(values, Interval):
+            return kinds.CategoricalDistribution([*values])
+        if values.whole:
+            return kinds.IntDistribution(int(values.low), int(values.high), log=values.logarithmic)
+        return kinds.FloatDistribution(values.low, values.high, log=values.logarithmic)
+
+    def ask(self, count: int) -> list[dict[str, Any]]:
+        """Returns the next candidates, values by setting."""
+        for number_ in range(len(self.candidates), len(self.candidates) + count):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", self._optuna.exceptions.ExperimentalWarning)
+                sampler = self._optuna.samplers.TPESampler(
+                    seed=derived_seed(self._seed, number_), multivariate=True, constant_liar=True
+                )
+            self._study.sampler = sampler
+            self._asked.append(self._study.ask(self._space))
+            self.candidates.append(dict(self._asked[-1].params))
+        return self.candidates[-count:]
+
+    def tell(self, costs: Sequence[float]) -> None:
+        """Tells the costs of the candidates asked for last; infinite where a flight was lost or failed."""
+        for trial, cost in zip(self._asked, costs, strict=True):
+            self._study.tell(trial, cost)
+        self.costs += costs
+        self._asked = []
+
+    @property
+    def best(self) -> int:
+        """Number of the best candidate; the first of several."""
+        return min(range(len(self.costs)), key=self.costs.__getitem__)
+
+    def importances(self) -> dict[str, float]:
+        """Returns by setting how much it matters, the most first; nothing where too few candidates say so."""
+        finite = [cost for cost in self.costs if math.isfinite(cost)]
+        if len(finite) < FEWEST or len(self._space) < 2 or min(finite) == max(finite):
+            return {}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", self._optuna.exceptions.ExperimentalWarning)
+            evaluator = self._optuna.importance.PedAnovaImportanceEvaluator()
+        return self._optuna.importance.get_param_importances(self._study, evaluator=evaluator)
+
+    def document(self, base: float | None, command: str) -> Document:
+        """Returns the candidates, what mattered, and how the best one is flown.
+
+        Args:
+            base: Cost of the settings as they are without the search; None where that flight was lost.
+            command: That flies the best candidate.
+        """
+        order = sorted(range(len(self.costs)), key=lambda i: (self.costs[i], i))
+        keys, matter = [*self._space], self.importances()
+        rows = [[str(i), _shown(self.costs[i]), *(_text(self.candidates[i][k]) for k in keys)] for i in order[:SHOWN]]
+        tables = [Table(["candidate", "cost", *keys], rows, "Best candidates")]
+        if matter:
+            share = [[key, f"{100 * value:.0f} %"] for key, value in matter.items()]
+            tables.append(Table(["setting", "importance"], share, "What mattered"))
+        data = [{"candidate": i, "cost": self.costs[i], **self.candidates[i]} for i in range(len(self.costs))]
+        labels = {figure_label(key): value for key, value in matter.items()}
+        return Document(
+            "Tuning",
+            tables,
+            pd.DataFrame(data, dtype=object),
+            lead=f"{len(self.costs)} candidates; cost of the best {_shown(self.costs[self.best])}, "
+            f"of the settings as they are {MISSING if base is None else number(base)}.",
+            notes=[LEGEND],
+            code={"To fly the best one": [command]},
+            images={"tuning.png": png(search_figure(self.costs, labels, base))},
+        )
+
+
+def _shown(cost: float) -> str:
+    return number(cost) if math.isfinite(cost) else "lost or failed"
+
+
+def _text(value: Any) -> str:
+    return number(value) if isinstance(value, float) else plain_text(str(value))

@@ -1,0 +1,183 @@
+"""What is learned from logs is judged by rollouts: parameters, noise and structure of simulated flights come back."""
+
+import os
+import runpy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.logs import (
+    LogMapping,
+    LogModel,
+    MultirotorNominal,
+    RigidBody,
+    fit_nominal,
+    judge,
+    learn,
+    read_log,
+)
+from gpmpc.logs.learning import choose_rows
+from gpmpc.logs.log import Log, LogRun
+from gpmpc.logs.state_space import rotation_quaternion
+
+EXAMPLE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "own_log.py"))
+MAPPING = LogMapping.from_dict(EXAMPLE["MAPPING"])
+FORCE_ONLY = (20, 20, 20, 0, 0, 0)
+
+
+def as_log(tables, gaps=()):
+    """A log of simulated flights, with rows left out."""
+    runs = []
+    for number, table in enumerate(tables):
+        rows = np.setdiff1d(np.arange(len(table)), [row + i for row in gaps for i in range(30)])
+        values = table.to_numpy()[rows]
+        begins = (0, *(np.flatnonzero(np.diff(rows) > 1) + 1).tolist())
+        runs.append(
+            LogRun(f"flight {number}", values[:, 0], values[:, 1:14], values[:, 14:], np.empty((len(rows), 0)), begins)
+        )
+    return Log(MAPPING, 0.01, tuple(runs))
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return EXAMPLE["simulate_flights"](3, 1500, seed=3)
+
+
+def test_the_outputs_of_a_rigid_body_are_those_that_moved_it():
+    rng = np.random.default_rng(0)
+    body = RigidBody(MAPPING.space)
+    states = np.hstack(
+        [rng.normal(size=(40, 3)), rotation_quaternion(rng.normal(size=(40, 3))), rng.normal(size=(40, 6))]
+    )
+    outputs = rng.normal(size=(40, 6)) * 5
+    np.testing.assert_allclose(body.outputs(states, body.step(states, outputs, 0.01), 0.01), outputs, atol=1e-9)
+    free = body.coast(states, 0.3)
+    np.testing.assert_allclose(body.space.difference(free, states)[:, 3:6], 0.3 * states[:, 10:13], atol=1e-9)
+
+
+def test_parameters_come_back_from_rollouts_within_their_standard_errors_also_with_outliers(flights):
+    log = as_log(flights, gaps=(700,))
+    model = LogModel(RigidBody(log.space), MultirotorNominal(4, torque=True), np.empty(0), FORCE_ONLY)
+    truth = {"drag_xy": EXAMPLE["DRAG"], "torque_x1": 30.0, "torque_y2": -30.0}
+    spoiled = [flight.copy() for flight in flights]
+    for flight in spoiled:
+        flight.loc[300::500, ["vx", "vy", "vz"]] += 5.0
+    for data in (log, as_log(spoiled)):
+        fit = fit_nominal(model, None, data, steps=20)
+        found = {name: (value, error) for name, value, error in fit.to_rows()}
+        for name, value in truth.items():
+            assert abs(found[name][0] - value) < 4 * found[name][1] + 0.05 * abs(value), (name, found[name])
+        assert 0 < found["torque_x1"][1] < 5
+        assert fit.cost < fit.start_cost
+
+
+def test_learning_chooses_the_motors_finds_the_noise_and_beats_what_costs_nothing(flights):
+    log = as_log(flights, gaps=(500,))
+    train, held_out = log.split(["flight 2"])
+    learned = learn(train, points=40, steps=20)
+    (chosen,) = [candidate for candidate in learned.candidates if candidate.chosen]
+    assert "motor torque" in chosen.name
+    judgement = judge(learned, held_out, train, steps=(1, 10, 20))
+    assert not [loss for loss in judgement.losses if " 1 steps" not in loss and "ridge" not in loss]
+    assert np.all((judgement.coverage[1:] > 0.9) & (judgement.coverage[1:] < 0.985))
+    assert np.all((judgement.width[1:] > 0.8) & (judgement.width[1:] < 1.3))
+    table = judgement.to_pandas()
+    assert set(table["unit"]) == {"m", "rad", "m/s", "rad/s"}
+    white = np.sqrt(learned.noise.outputs[0])
+    np.testing.assert_allclose(white[:3].mean(), EXAMPLE["FORCE_NOISE"], rtol=0.1)
+    np.testing.assert_allclose(white[3:].mean(), EXAMPLE["TORQUE_NOISE"], rtol=0.1)
+
+
+def pendulum_log(friction, rows=900, seed=0, noise=0.02):
+    rng = np.random.default_rng(seed)
+    runs = []
+    for number in range(3):
+        x, table = np.array([0.3, 0.0]), []
+        torques = np.repeat(rng.uniform(-8, 8, rows // 10), 10)
+        for u in torques:
+            table.append((*x, u))
+            x = x + 0.02 * np.array([x[1], u - friction(x)]) + rng.normal(0, noise, 2) * [0, 1]
+        table = np.array(table)
+        time = 0.02 * np.arange(rows)
+        runs.append(LogRun(f"run {number}", time, table[:, :2], table[:, 2:], np.empty((rows, 0))))
+    mapping = LogMapping.from_dict({"states": {"angle": ["angle"], "rate": ["rate"]}, "inputs": {"torque": ["u"]}})
+    return Log(mapping, 0.02, tuple(runs))
+
+
+def test_an_output_keeps_its_gp_only_where_held_out_rollouts_get_better():
+    curved = learn(pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1]), points=60, steps=20)
+    assert [gp.outputs for gp in curved.model.gps][-1] == (1,)
+    linear = learn(pendulum_log(lambda x: 4 * x[0] + 0.5 * x[1], noise=0.1), points=60, steps=20)
+    assert not linear.model.gps
+    (chosen,) = [candidate.name for candidate in linear.candidates if candidate.chosen]
+    assert chosen == "increments, least squares"
+
+
+def test_a_model_that_loses_to_a_baseline_is_called_so():
+    log = pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1])
+    train, held_out = log.split(["run 2"])
+    learned = learn(train, points=60, steps=20)
+    assert not judge(learned, held_out, train, steps=(1, 10)).losses
+    wrong = replace(learned, model=replace(learned.model, theta=-learned.model.theta, gps=()))
+    losses = judge(wrong, held_out, train, steps=(1, 10)).losses
+    assert any("rate 10 steps ahead" in loss and "constant state" in loss for loss in losses)
+
+
+def test_the_same_rows_in_pieces_of_one_run_or_another_log_give_the_same_model(flights):
+    one = as_log(flights[:2], gaps=(700,))
+    other = replace(one, runs=tuple(replace(run, time=run.time + 100 * (run.time > 7)) for run in one))
+    model = LogModel(RigidBody(one.space), MultirotorNominal(4), np.empty(0), FORCE_ONLY)
+    fits = [fit_nominal(model, None, log, steps=10).model.theta for log in (one, other)]
+    np.testing.assert_allclose(*fits, rtol=0, atol=1e-9)
+
+
+def test_chosen_rows_cover_what_is_rare():
+    rng = np.random.default_rng(0)
+    frequent, rare = rng.normal(0, 0.01, (3000, 2)), rng.uniform(-1, 1, (150, 2))
+    rows = choose_rows(np.vstack([frequent, rare]), 40)
+    assert (rows >= 3000).sum() > 12
+    assert len(set(rows.tolist())) == len(rows) <= 40
+
+
+def test_misuse_is_named(flights):
+    log = as_log(flights[:1])
+    model = LogModel(RigidBody(log.space), MultirotorNominal(4), np.empty(0), FORCE_ONLY)
+    with pytest.raises(ShapeError, match="theta0 must have 6 entries"):
+        fit_nominal(model, np.zeros(3), log)
+    with pytest.raises(DataError, match="the longest has 1500"):
+        fit_nominal(model, None, log, steps=3000)
+    with pytest.raises(SettingError, match="past"):
+        model.with_theta(model.nominal.start).rollout(log.windows(10))
+
+
+FLIGHTS = os.environ.get("GPMPC_FLIGHTS")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not FLIGHTS, reason="GPMPC_FLIGHTS names no folder of flights")
+def test_real_flights_are_predicted_better_than_by_anything_that_costs_nothing():
+    from gpmpc.logs.judging import NEEDED
+
+    mapping = {
+        "time": "t",
+        "keep": {"pz": [0.2, None]},
+        "model": "rigid_body",
+        "states": {
+            "position": {"columns": ["px", "py", "pz"], "unit": "m"},
+            "attitude": {"columns": ["qx", "qy", "qz", "qw"], "kind": "quaternion"},
+            "velocity": {"columns": ["vx", "vy", "vz"], "unit": "m/s", "frame": "world"},
+            "rate": {"columns": [f"w{axis}_vicon" for axis in "xyz"], "unit": "rad/s", "frame": "body"},
+        },
+        "inputs": {"motors": {"columns": [f"motor_motor_m{i}" for i in range(1, 5)], "scale": 1 / 65535}},
+        "context": {"battery": {"columns": ["pwr_pm_vbat"], "unit": "V"}},
+    }
+    log = read_log(sorted(Path(FLIGHTS).glob("*.csv.gz")), mapping)
+    train, held_out = log.split(["B2_circle_medium_rep1", "B3_figure8_fast_rep2"])
+    judgement = judge(learn(train), held_out, train)
+    for name in NEEDED:
+        assert (judgement.mean["model"][1:] < judgement.mean[name][1:]).all()
+    assert ((judgement.coverage[1:] > 0.9) & (judgement.coverage[1:] < 0.98)).all()
+    assert ((judgement.width[1:] > 0.8) & (judgement.width[1:] < 1.3)).all()
