@@ -19,7 +19,7 @@ def follow(page, folder, monkeypatch):
     monkeypatch.syspath_prepend(str(folder))
     names, printed = {}, []
     for language, text in BLOCK.findall((DOCS / page).read_text()):
-        path = re.match(r"(?:# @package _global_\n)?# ([\w/]+\.(?:py|yaml|xml))\n", text)
+        path = re.match(r"(?:# @package _global_\n)?(?:#|<!--) ([\w/]+\.(?:py|yaml|xml))(?: -->)?\n", text)
         if path:
             (folder / path[1]).parent.mkdir(exist_ok=True)
             (folder / path[1]).write_text(text)
@@ -58,6 +58,16 @@ def test_a_system_of_ones_own_is_flown_learned_swept_reported_recorded_and_calib
     assert "state.angle" in (tmp_path / "outputs/run/system=arm/run.layout.json").read_text()
 
 
+def test_simulators_are_systems(tmp_path, monkeypatch):
+    pytest.importorskip("gymnasium")
+    pytest.importorskip("mujoco")
+    names, (flown,) = follow("guide_simulator.md", tmp_path, monkeypatch)
+    assert abs(names["flown"].rollout.states[-20:] - [1.0, 0.0, 0.0]).max() < 0.05
+    assert "5 steps of gymnasium with convex" in flown
+    assert names["cart"].state_names == ("slider", "hinge", "slider_rate", "hinge_rate", "push_activation")
+    assert names["seen"].state_names == ("position", "angle")
+
+
 def test_a_new_project_runs_at_once(tmp_path, monkeypatch):
     done = forked("new", "arm", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -87,7 +97,7 @@ def test_a_new_project_runs_at_once(tmp_path, monkeypatch):
         (["new", "arm", "--to", "."], "to: . is not an empty folder; nothing was written"),
         (["run", "--config-dir", ".", "system=hand"], "system: no such option 'hand'"),
         (["run", "--config-dir", ".", "system=short"], "derivative must give 2 entries, one for each of state_names"),
-        (["run", "--config-dir", ".", "system=nan"], "must be finite at state [0.0, 0.0]"),
+        (["run", "--config-dir", ".", "system=hollow"], "must be finite at state [0.0, 0.0]"),
         (["run", "--config-dir", ".", "system=weights"], "controller.problem: weighs 3 states and 1 inputs; nan has 2"),
         (["run", "system=gymnasium"], "system.environment: this setting has no default"),
     ],
@@ -95,7 +105,7 @@ def test_a_new_project_runs_at_once(tmp_path, monkeypatch):
 )
 def test_a_mistake_is_one_clear_line(arguments, message, tmp_path):
     (tmp_path / "system").mkdir()
-    for name, rates in (("short", "[x[1]]"), ("nan", "[x[1], 0 * float('nan')]"), ("weights", "[x[1], u[0]]")):
+    for name, rates in (("short", "[x[1]]"), ("hollow", "[x[1], 0 * float('nan')]"), ("weights", "[x[1], u[0]]")):
         text = f"state_names, input_names = ('a', 'b'), ('u',)\n    def derivative(self, x, u): return {rates}\n"
         limits = "name='nan', input_lower=[-1], input_upper=[1], region=[[-1, -1], [1, 1]]"
         made = (

@@ -147,9 +147,10 @@ class PlantSimulator:
         self._streams = dict(zip(sources, streams, strict=True))
         self.plant, self.disturbances, self.noise = plant, tuple(disturbances), noise
         if initial is None:
-            if not getattr(plant.dynamics, "stateful", False):
+            dynamics: Any = plant.dynamics
+            if not getattr(dynamics, "stateful", False):
                 raise SettingError("initial", "must be a state; a simulator alone starts by itself")
-            initial = plant.dynamics.reset(seed)
+            initial = dynamics.reset(seed)
         mean, covariance = (initial.mean, initial.covariance) if isinstance(initial, Gaussian) else (initial, None)
         self.mean = _check_state(mean, n)
         if covariance is not None:

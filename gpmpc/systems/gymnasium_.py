@@ -80,7 +80,7 @@ class Environment(Simulator):
     def _set(self, state: Array) -> bool:
         """Sets a MuJoCo environment to a state."""
         inner = self.environment.unwrapped
-        model = getattr(inner, "model", None)
+        model: Any = getattr(inner, "model", None)
         if self._observe is not None or not hasattr(inner, "set_state") or len(state) != model.nq + model.nv:
             return False
         inner.set_state(state[: model.nq], state[model.nq :])
@@ -154,8 +154,8 @@ def make_environment(system: System | str, **settings: Any) -> Any:
         def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Array, dict]:
             """Starts where the system starts, or from its region."""
             super().reset(seed=seed)
-            drawn = flown.start is None and flown.region is not None
-            start = self.np_random.uniform(*flown.region) if drawn else flown.start or flown.goal
+            region: Any = flown.region if flown.start is None else None
+            start: Any = flown.start or flown.goal if region is None else self.np_random.uniform(*region)
             self.state = np.array(start, dtype=float)
             self._limit = max(flown.lost, 1.001 * self._distance())
             return self.state.copy(), {}
