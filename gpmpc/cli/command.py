@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 import gpmpc
-from gpmpc.cli import completion, log, reports, study, tune, warmup
+from gpmpc.cli import completion, log, new, reports, study, tune, warmup
 from gpmpc.cli.arguments import Parser, Result
 from gpmpc.cli.configuration import compose, help_text, settings
 from gpmpc.cli.mistakes import explain, nearest
@@ -87,6 +87,11 @@ COMMANDS = {
     ),
     "quality": Command(
         "Measures closed-loop cost over the time of a decision, for every controller", study.run, "quality"
+    ),
+    "new": Command(
+        "Writes a project of your own: a system, its settings, a script and a test",
+        new.new,
+        add_arguments=new.add_arguments,
     ),
     "report": Command(
         "Puts a tree of runs into one table with figures; compares two groups",
