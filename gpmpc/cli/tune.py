@@ -151,7 +151,7 @@ def _cost(job: Job, controller: Mapping[str, Any]) -> float:
         run = read_run(job.folder.path / RECORDING)
     except RecordingError:
         return math.inf
-    Q, R, before = controller["problem"].Q, controller["problem"].R, controller["initial_input"]
+    Q, R, before = controller["problem"].cost.Q, controller["problem"].cost.R, controller["initial_input"]
     return tracking_cost(Q, R, run.states, run.references, run.inputs[:-1], before)
 
 
