@@ -133,7 +133,8 @@ class ControlLoop:
 
     def __init__(self, controller: Controller, on_failure: OnFailure = "previous_plan"):
         check_policy(on_failure)
-        self.controller, self.on_failure = controller, on_failure
+        self.controller = controller
+        self.on_failure: OnFailure = on_failure
         self.last: Command | None = None
         self.failures, self._steps = 0, 0
 

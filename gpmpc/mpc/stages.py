@@ -237,8 +237,9 @@ class ConstraintRows:
         moves = mixed if covariance == "diagonal" else covariance == "full" and self.per_stage > 0
         self.smooth, moves = bool(self._smooth), moves or bool(self._smooth)
         self._constant = None if moves else self._rows(self._F[None], np.zeros((1, n, n)))
-        fixed = not (moves or self._margins.any())
-        self._fixed = StateRows(self._constant, self._lower, self._upper) if fixed else None
+        self._fixed = None
+        if self._constant is not None and not self._margins.any():
+            self._fixed = StateRows(self._constant, self._lower, self._upper)
 
     def at(self, states: Array, covariances: Array, stages: int, parameters: Array | None = None) -> StateRows:
         """The rows, tightened, at means x_0 .. x_H (H + 1, n) and covariances (H + 1, n, n), of H stages or one.
