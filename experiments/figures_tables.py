@@ -13,9 +13,9 @@ from gpmpc.metrics import binomial_interval, time_quantiles
 from gpmpc.plotting import Curve, over_settings, png, tracking
 from gpmpc.studies.document import MISSING, Document, Table, number
 
-ERRORS = ("x - reference [m]", "y - reference [m]", "z - reference [m]")
-POSITIONS, ANGLES = ("x [m]", "y [m]", "z [m]"), ("roll [rad]", "pitch [rad]", "yaw [rad]")
-INPUTS = ("U1 [N]", "ux [-]", "uy [-]")
+ERRORS = ("x - reference [m]", "y - reference [m]", "z - reference [m], downwards")
+POSITIONS, ANGLES = ("x [m]", "y [m]", "z, downwards [m]"), ("roll [rad]", "pitch [rad]", "yaw [rad]")
+INPUTS = ("thrust U1 [N]", "direction ux", "direction uy")
 LOOPS = {
     "model": "The paper's reading: the GP rolled on itself",
     "plant": "The plant in the loop",
@@ -169,7 +169,9 @@ def _images(rows: pd.DataFrame, records: Sequence[dict]) -> dict[str, bytes]:
                 elif here:
                     panels.append((labels, [_curve(r, "states", range(0, 6, 2)) for r in here]))
             if panels:
-                found[f"{figure}{suffix}.png"] = png(tracking(panels))
+                found[f"{figure}{suffix}.png"] = png(
+                    tracking(panels, f"{trajectory} trajectory: {LOOPS[loop].lower()}")
+                )
         flown = [r for r in chosen if r["subsystem"] == "translational"]
         inputs = [
             (
@@ -179,11 +181,13 @@ def _images(rows: pd.DataFrame, records: Sequence[dict]) -> dict[str, bytes]:
             for trajectory in dict.fromkeys(r["trajectory"] for r in flown)
         ]
         if inputs:
-            found[f"figure4{suffix}.png"] = png(tracking(inputs))
+            found[f"figure4{suffix}.png"] = png(tracking(inputs, f"inputs: {LOOPS[loop].lower()}"))
     if panels := _over_horizon(rows):
-        found["horizon.png"] = png(over_settings(panels, "horizon H", logarithmic=True))
+        found["horizon.png"] = png(over_settings(panels, "horizon H", logarithmic=True, title="the plant in the loop"))
     if panels := _over_confidence(rows):
-        found["confidence.png"] = png(over_settings(panels, "allowed rate 1 - eta", diagonal=True))
+        found["confidence.png"] = png(
+            over_settings(panels, "allowed rate 1 - eta", diagonal=True, title="State bounds that may be broken")
+        )
     return found
 
 

@@ -394,7 +394,7 @@ def _figure(records: Sequence[dict]) -> bytes:
             panel.draws.setdefault(record["size"], []).append(record["test_mse"])
         if printed := paper_figures().get((*name, record["size"])):
             panel.paper[record["size"]] = float(printed["test_mse"])
-    return png(error_over_size(list(panels.values()), "test MSE"))
+    return png(error_over_size(list(panels.values()), "test MSE", "Tables 1 and 2: error of held-out predictions"))
 
 
 def _digits(value: Decimal) -> str:

@@ -33,6 +33,7 @@ _FINALISTS = 2  # ... this many of the best go on to convergence
 _ITERATIONS = 1000  # of the search to convergence, at most
 _LONGER = 1.0  # mean of log l over log std(x~) at the random starts: smooth dynamics prefer long length-scales
 _CONSTANT = 3e-9  # of its magnitude: a column that moves by no more holds a solver's residue (1e-9); 1e8 +- 0.5 moves
+LENGTHSCALE_LIMIT = 1e4  # the box holds length-scales within this factor of their input's standard deviation
 _LOG_INTERVAL = 5.0  # [s]
 
 
@@ -114,7 +115,7 @@ def find_hyperparameters(problem: SearchProblem, settings: Any) -> SearchResult:
     log_inputs, log_output = np.log(problem.std), np.log(column_std(targets[:, None])[0])
     centre = np.append(log_inputs, [log_output, 0.0])
     reach = np.append(
-        np.full(inputs.shape[1], np.log(settings.lengthscale_limit)),
+        np.full(inputs.shape[1], np.log(LENGTHSCALE_LIMIT)),
         [np.log(1e6), np.log(settings.signal_to_noise_limit)],
     )
 

@@ -57,7 +57,7 @@ def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPo
 
 def append_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
     """Appends points x~ = (x, u) (p, n + m) with targets (p, k) to a posterior's data, in O(N^2) a point."""
-    features, targets = (_checked(posterior, *given) for given in _expected(posterior, features, targets))
+    features, targets = _checked_points(posterior, features, targets)
     size, p = len(posterior), len(features)
     scales, sf2 = posterior.lengthscales, posterior.signal_variance
     old_targets = (posterior.targets - posterior.offset).mT[..., None]  # (k, N, 1)
@@ -262,25 +262,20 @@ def _remove(factor: np.ndarray, smaller: np.ndarray, kept: np.ndarray, removed: 
             row[i] = radius
 
 
-def _expected(posterior: GPPosterior, features: Tensor, targets: Tensor) -> tuple[tuple, tuple]:
+def _checked_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+    """New points (p, d) and their targets (p, k) in a posterior's type and on its device, after a look at them."""
     check_tensors(features=features, targets=targets)
     if features.dim() != 2 or targets.dim() != 2 or len(features) != len(targets) or not len(features):
         raise ShapeError(
             "features (p, d) and targets (p, k) need two dimensions and the same number of rows, one or more; "
             f"got {tuple(features.shape)} and {tuple(targets.shape)}"
         )
-    return (
-        ("features", features, posterior.features.shape[1]),
-        ("targets", targets, posterior.output_dim),
-    )
-
-
-def _checked(posterior: GPPosterior, name: str, value: Tensor, columns: int) -> Tensor:
-    if value.shape[1] != columns:
-        raise ShapeError(f"{name} must have {columns} columns like the posterior's; got {value.shape[1]}")
-    if not bool(torch.isfinite(value).all()):
-        raise DataError(f"{name} must be finite; got {value[~torch.isfinite(value)][0]}")
-    return value.to(posterior.features)
+    for name, value, own in (("features", features, posterior.features), ("targets", targets, posterior.targets)):
+        if value.shape[1] != own.shape[1]:
+            raise ShapeError(f"{name} must have {own.shape[1]} columns like the posterior's; got {value.shape[1]}")
+        if not bool(torch.isfinite(value).all()):
+            raise DataError(f"{name} must be finite; got {value[~torch.isfinite(value)][0]}")
+    return features.to(posterior.features), targets.to(posterior.features)
 
 
 def _indices(indices: Sequence[int] | Tensor, size: int) -> list[int]:

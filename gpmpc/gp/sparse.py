@@ -100,7 +100,7 @@ def sparse_posterior(
         if jitter is not None:
             raise
         Lz = inducing_factor(inducing, hyperparameters, JITTER)
-    sums = _data_sums(Lz, inducing, features, targets - offset, hyperparameters, method)
+    sums = data_sums(Lz, inducing, features, targets - offset, hyperparameters, method)
     # Ascending: the largest rows of what is factorised come first, as QR needs.
     b, U = torch.linalg.eigh(sums.gram)
     b = b.clamp_min(_UNINFORMED)
@@ -146,7 +146,7 @@ def collapsed_bound_with_gradient(
         with torch.enable_grad():
             Lz = inducing_factor(Z, kernel, jitter)
         cut = Lz.detach().requires_grad_()
-        sums = [s.requires_grad_() for s in _data_sums(cut, Z, features, y, kernel, method)]
+        sums = [s.requires_grad_() for s in data_sums(cut, Z, features, y, kernel, method)]
         with torch.enable_grad():
             value = _bound(_Sums(*sums), len(features), kernel, method)
             direct = torch.autograd.grad(value.sum(), [*sums, *variables[2:]], materialize_grads=True)
@@ -172,7 +172,7 @@ def collapsed_bound_with_gradient(
     return torch.cat(values), (by_inducing, by_lengthscales, by_signal, by_noise)
 
 
-def _data_sums(
+def data_sums(
     Lz: Tensor,
     inducing: Tensor,
     features: Tensor,
@@ -180,7 +180,10 @@ def _data_sums(
     hyperparameters: Hyperparameters,
     method: Method,
 ) -> _Sums:
-    """The sums over all points, of every output, in blocks; no derivatives."""
+    """The sums over all points, of every output, in blocks; no derivatives.
+
+    tr(A A') is, in units of the noise, the variance of the data that the inducing points explain.
+    """
     outputs = []
     with torch.no_grad():
         for a in range(targets.shape[1]):
@@ -191,14 +194,6 @@ def _data_sums(
                 total = part if total is None else _Sums(*(t.add_(p) for t, p in zip(total, part, strict=True)))
             outputs.append(total)
     return _Sums(*(torch.cat(of_one) for of_one in zip(*outputs, strict=True)))
-
-
-def variance_reductions(
-    Lz: Tensor, inducing: Tensor, features: Tensor, targets: Tensor, hyperparameters: Hyperparameters, method: Method
-) -> Tensor:
-    """tr(A A') (k,): in units of the noise, the variance of the data that the inducing points explain."""
-    sums = _data_sums(Lz, inducing, features, targets, hyperparameters, method)
-    return sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
 
 
 def inducing_factor(inducing: Tensor, hyperparameters: Hyperparameters, jitter: float) -> Tensor:

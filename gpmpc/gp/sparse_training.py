@@ -21,7 +21,7 @@ from torch import Tensor
 from gpmpc.exceptions import SettingError, TrainingError, check_number
 from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
 from gpmpc.gp._likelihood import FAILED
-from gpmpc.gp._search import column_std, log_hyperparameters, training_data
+from gpmpc.gp._search import LENGTHSCALE_LIMIT, column_std, log_hyperparameters, training_data
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.scaling import Scaling, centre, identity
 from gpmpc.gp.sparse import (
@@ -29,9 +29,9 @@ from gpmpc.gp.sparse import (
     Method,
     check_method,
     collapsed_bound_with_gradient,
+    data_sums,
     inducing_factor,
     sparse_posterior,
-    variance_reductions,
 )
 from gpmpc.gp.training import Trainer
 from gpmpc.gp.transitions import Transitions, check_transitions
@@ -76,7 +76,6 @@ class SparseTrainer:
         predicts: What the GPs learn, as in ``Trainer``.
         scaling: How features and targets are scaled for training, as in ``Trainer``.
         iterations: Of L-BFGS, at most.
-        learn_locations: Whether the inducing points move; else only the hyperparameters are fitted.
         subset: Number of random transitions in the first, exact, training.
         restarts: Random starts of that one.
         tolerance: Relative decrease of the objective at which L-BFGS stops.
@@ -92,7 +91,6 @@ class SparseTrainer:
     predicts: Predicts = "next_state"
     scaling: Callable[[Tensor, Sequence[str]], Scaling] = centre
     iterations: int = 100
-    learn_locations: bool = True
     subset: int = 200
     restarts: int = 1
     tolerance: float = 1e-7
@@ -173,7 +171,8 @@ class SparseTrainer:
             return theta
         current = Hyperparameters.from_theta(torch.from_numpy(theta))
         _, sf2, sn2 = current
-        explained = variance_reductions(inducing_factor(Z, current, self.jitter), Z, x, y, current, self.method)
+        Lz = inducing_factor(Z, current, self.jitter)
+        explained = data_sums(Lz, Z, x, y, current, self.method).gram.diagonal(dim1=-2, dim2=-1).sum(-1)
         sn2 = sn2 + (sf2 - explained * sn2 / len(x)).clamp_min(0)
         return np.column_stack([theta[:, :-1], (sf2 / sn2).log().numpy() / 2])
 
@@ -244,25 +243,21 @@ class _Bound:
         self.evaluations, self.iteration, self._last, self._least = 0, 0, np.nan, np.inf
         outputs, d = targets.shape[1], features.shape[1]
         log_inputs, log_outputs = self.unit.log().numpy(), np.log(column_std(targets.numpy()))
-        reach = np.append(np.full(d, np.log(1e4)), [np.log(1e6), np.log(trainer.signal_to_noise_limit)])
+        reach = np.append(np.full(d, np.log(LENGTHSCALE_LIMIT)), [np.log(1e6), np.log(trainer.signal_to_noise_limit)])
         centre = np.array([np.append(log_inputs, [own, 0.0]) for own in log_outputs]).ravel()
         reach = np.tile(reach, outputs)
         self.shape = (outputs, d + 2)
         low, high = centre - reach, centre + reach
         # A feature that the subset saw at rest has a length-scale beyond any box (IGNORED); it stays there.
-        if trainer.learn_locations:
-            smallest, largest = ((edge / self.unit).numpy() for edge in (features.amin(0), features.amax(0)))
-            margin = 0.1 * (largest - smallest)
-            low = np.append(low, np.tile(smallest - margin, count))
-            high = np.append(high, np.tile(largest + margin, count))
+        smallest, largest = ((edge / self.unit).numpy() for edge in (features.amin(0), features.amax(0)))
+        margin = 0.1 * (largest - smallest)
+        low = np.append(low, np.tile(smallest - margin, count))
+        high = np.append(high, np.tile(largest + margin, count))
         self.box = np.column_stack([low, high])
 
     def vector(self, theta: np.ndarray, Z: Tensor) -> np.ndarray:
         """The start; it widens the box where it must."""
-        self.fixed = Z
-        start = theta.ravel()
-        if self.trainer.learn_locations:
-            start = np.append(start, (Z / self.unit).numpy().ravel())
+        start = np.append(theta.ravel(), (Z / self.unit).numpy().ravel())
         self.box[:, 0] = np.minimum(self.box[:, 0], start)
         self.box[:, 1] = np.maximum(self.box[:, 1], start)
         return start
@@ -270,10 +265,7 @@ class _Bound:
     def parts(self, vector: Tensor) -> tuple[Tensor, Tensor]:
         """Rows of theta (k, d + 2) and Z (M, d)."""
         split = self.shape[0] * self.shape[1]
-        theta = vector[:split].reshape(self.shape)
-        if not self.trainer.learn_locations:
-            return theta, self.fixed
-        return theta, vector[split:].reshape(self.count, -1) * self.unit
+        return vector[:split].reshape(self.shape), vector[split:].reshape(self.count, -1) * self.unit
 
     def __call__(self, vector: np.ndarray) -> tuple[float, np.ndarray]:
         """The sum over the outputs, and its gradient."""
@@ -286,8 +278,7 @@ class _Bound:
             bounds, slopes = self._bounds(tuple(t.detach() for t in tensors))
         except (SettingError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
             return FAILED, np.zeros_like(vector)
-        chain = [(t, -slope) for t, slope in zip(tensors, slopes, strict=True) if t.requires_grad]
-        (gradient,) = torch.autograd.grad([t for t, _ in chain], variables, [slope for _, slope in chain])
+        (gradient,) = torch.autograd.grad(tensors, variables, [-slope for slope in slopes])
         value, gradient = -float(bounds.sum()), gradient.numpy()
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             return FAILED, np.zeros_like(vector)

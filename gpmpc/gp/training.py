@@ -72,7 +72,6 @@ class Trainer:
         subset: Of more points than this a random subset of as many is searched first, from all starts; the search over
             all points goes on from its best. None searches over all of them from every start.
         tolerance: Relative decrease of the objective at which L-BFGS stops.
-        lengthscale_limit: The box holds length-scales within this factor of their input's spread.
         signal_to_noise_limit: The box holds sf / sn within this factor of one. Moment matching needs sf2 / sn2 below
             about 1e10 in double precision.
 
@@ -87,7 +86,6 @@ class Trainer:
     restarts: int = 3
     subset: int | None = 1000
     tolerance: float = 1e-8
-    lengthscale_limit: float = 1e4
     signal_to_noise_limit: float = 1e4
 
     def __post_init__(self) -> None:
@@ -100,7 +98,7 @@ class Trainer:
             if not (callable(value := getattr(self, key)) or (key == "penalty" and value is None)):
                 example = "standardize" if key == "scaling" else "SoftLimits()"
                 raise SettingError(key, f"must be a function such as {example} of gpmpc.gp; got {value!r}")
-        for key, least in (("tolerance", 0), ("lengthscale_limit", 1), ("signal_to_noise_limit", 1)):
+        for key, least in (("tolerance", 0), ("signal_to_noise_limit", 1)):
             check_number(key, getattr(self, key), above=least)
 
     def __call__(self, transitions: Transitions, seed: int = 0, start: GPPosterior | None = None) -> Training:

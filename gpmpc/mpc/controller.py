@@ -34,13 +34,16 @@ class Reference:
     Attributes:
         states: r_0 .. r_H (H + 1, n); r_0 belongs to the current time. Or a set point (n,), for any horizon.
         inputs: u*_0 .. u*_{H-1} (H, m), the inputs that belong to it where they are known; (m,) for a set point.
+        kappas: Standard deviations (H,) between the means and the sides of chance constraints, by stage, in the place
+            of the problem's, such as those of an ``AdaptiveTube``; for covariances of ``zero_order``.
 
     Raises:
-        ShapeError: The two do not belong together.
+        ShapeError: They do not belong together.
     """
 
     states: Array
     inputs: Array | None = None
+    kappas: Array | None = None
 
     def __post_init__(self) -> None:
         if np.ndim(self.states) == 1:
@@ -51,6 +54,8 @@ class Reference:
             raise ShapeError(f"reference states must be (H + 1, n), H of 1 or more; got {np.shape(self.states)}")
         if self.inputs is not None and (np.ndim(self.inputs) != 2 or len(self.inputs) != len(self.states) - 1):
             raise ShapeError(f"reference inputs must be ({len(self.states) - 1}, m); got {np.shape(self.inputs)}")
+        if self.kappas is not None and np.shape(self.kappas) != (self.horizon,):
+            raise ShapeError(f"kappas must be ({self.horizon},); got {np.shape(self.kappas)}")
 
     def over(self, horizon: int) -> "Reference":
         """The reference itself, or a set point repeated over a horizon."""
@@ -151,6 +156,7 @@ class Request(NamedTuple):
         finite: Whether the belief is. A belief that is not is a bad measurement, not misuse.
         disturbance: Added to the model's mean at every stage (n,), or nothing (0,).
         parameters: Of the smooth constraints, by stage (H, q); None where there are none.
+        kappas: Of the reference (H,), where it has some.
     """
 
     state: Array
@@ -160,6 +166,7 @@ class Request(NamedTuple):
     finite: bool
     disturbance: Array = _NO_DISTURBANCE
     parameters: Array | None = None
+    kappas: Array | None = None
 
     @classmethod
     def read(
@@ -212,9 +219,13 @@ class Request(NamedTuple):
         for part, name, values in ((_STATES, "states", states), (_INPUTS, "inputs", inputs)):
             if found & part:
                 raise DataError(f"reference {name} must be finite; got {values[~np.isfinite(values)][0]}")
+        kappas = None if reference.kappas is None else _array(reference.kappas)
+        if kappas is not None and not np.isfinite(kappas).all():
+            raise DataError(f"reference kappas must be finite; got {kappas}")
         if problem.cost.angles and not found & _BELIEF:
             states = _unwrapped(states, state, previous, problem.cost.angles)
-        return cls(state, covariance, References(states[1:], inputs, last), guess, not found & _BELIEF)
+        references = References(states[1:], inputs, last)
+        return cls(state, covariance, references, guess, not found & _BELIEF, kappas=kappas)
 
     @property
     def constant_guess(self) -> Array:

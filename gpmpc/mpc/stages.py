@@ -151,8 +151,7 @@ class StageLinearizer:
     def _full(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
         belief, input = self._tensors(states[:, : self._n], covariances, inputs)
         local = linearize_belief(self.propagator, self.model, belief, input)
-        after = self.state(to_array(local.next.mean), to_array(local.next.covariance))
-        return after, to_array(local.A), to_array(local.B), np.zeros_like(covariances)
+        return *map(to_array, (local.next_state, local.A, local.B)), np.zeros_like(covariances)
 
     def _diagonal(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
         n = self._n
@@ -232,7 +231,8 @@ class ConstraintRows:
         self.signs = np.where(np.isfinite(self._upper).any(axis=0), 1.0, -1.0)
         self.applies = np.isfinite(self._lower) | np.isfinite(self._upper)
         self.per_stage, self.soft = len(kappa), bool(np.isfinite(self.prices).any())
-        self._margins = self._kappa if covariance == "zero_order" else np.zeros(self.per_stage)
+        margins = self._kappa if covariance == "zero_order" else np.zeros(self.per_stage)
+        self._margins = np.tile(margins, (horizon, 1))
         mixed = bool((np.count_nonzero(self._F, axis=1) > 1).any())
         moves = mixed if covariance == "diagonal" else covariance == "full" and self.per_stage > 0
         self.smooth, moves = bool(self._smooth), moves or bool(self._smooth)
@@ -241,8 +241,22 @@ class ConstraintRows:
         if self._constant is not None and not self._margins.any():
             self._fixed = StateRows(self._constant, self._lower, self._upper)
 
-    def at(self, states: Array, covariances: Array, stages: int, parameters: Array | None = None) -> StateRows:
-        """The rows, tightened, at means x_0 .. x_H (H + 1, n) and covariances (H + 1, n, n), of H stages or one.
+    def at(
+        self,
+        states: Array,
+        covariances: Array,
+        stages: int,
+        parameters: Array | None = None,
+        kappas: Array | None = None,
+    ) -> StateRows:
+        """The rows, tightened, at means and covariances of the states.
+
+        Args:
+            states: Means x_0 .. x_H (H + 1, n), where smooth constraints are linearised.
+            covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
+            stages: H, or 1.
+            parameters: Of the smooth constraints (H, q).
+            kappas: By stage (H,), in the place of those of the constraints that have some.
 
         Raises:
             ShapeError: A smooth constraint gives another shape.
@@ -256,7 +270,8 @@ class ConstraintRows:
             for constraint, where in self._smooth:
                 values, F[:, where] = constraint.linearize(states[1:], parameters)
                 upper[:, where] += np.einsum("kri,ki->kr", F[:, where], states[1:]) - values
-        call_unchecked(_tighten, F, self._margins, covariances, lower, upper)
+        margins = self._margins if kappas is None else np.where(self._margins > 0, kappas[:, None], 0.0)
+        call_unchecked(_tighten, F, margins, covariances, lower, upper)
         E = self._rows(F, covariances[1 : stages + 1]) if self._constant is None else self._constant
         return StateRows(np.ascontiguousarray(E), lower, upper)
 
@@ -283,7 +298,7 @@ class ConstraintRows:
 
 @compiled
 def _tighten(F, kappa, covariances, lower, upper):
-    """Moves the bounds of the rows (H, r) inwards by kappa standard deviations."""
+    """Moves the bounds of the rows (H, r) inwards by kappa (H, r) standard deviations."""
     held, r, n = F.shape
     for k in range(len(lower)):
         at = min(k, held - 1)
@@ -292,7 +307,7 @@ def _tighten(F, kappa, covariances, lower, upper):
             for i in range(n):
                 if F[at, e, i] != 0.0:
                     variance += F[at, e, i] * dot(covariances[k + 1, i], F[at, e], n)
-            margin = kappa[e] * math.sqrt(max(variance, 0.0))
+            margin = kappa[k, e] * math.sqrt(max(variance, 0.0))
             lower[k, e] += margin
             upper[k, e] -= margin
 

@@ -17,14 +17,15 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from gpmpc.exceptions import UnsupportedModel
-from gpmpc.plotting.recorded import BOUND, FLOWN, REFERENCE, TUBE
+from gpmpc.plotting.recorded import FLOWN, REFERENCE, TUBE
+from gpmpc.plotting.style import DASHED, GREEN, styled
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
 
 FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 VISIBLE = 0.06  # an ellipse's half axis, as a share of the view, from which on it is large enough
-PLAN = "#2e8b57"
+PLAN = GREEN
 
 
 def animate(run: "Run", path: str | Path, frames: int = 150, rate: int = 15) -> None:
@@ -53,6 +54,7 @@ def ffmpeg_exists() -> bool:
     return shutil.which("ffmpeg") is not None
 
 
+@styled
 def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
     """The figure, and the function of a step's number that draws it."""
     x, y, z = (run.state_names.index(name) for name in "xyz")
@@ -61,15 +63,13 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
     grid = figure.add_gridspec(2, 2, width_ratios=[1, 1.15], height_ratios=[2.4, 1])
     above, height, near = (figure.add_subplot(grid[place]) for place in ((0, 0), (1, 0), (slice(None), 1)))
     for axis in (above, near):
-        axis.plot(run.references[:, x], run.references[:, y], color=REFERENCE, linewidth=1, linestyle=(0, (4, 3)))
+        axis.plot(run.references[:, x], run.references[:, y], color=REFERENCE, linewidth=1, linestyle=DASHED)
         axis.set_xlabel("x [m]")
         axis.set_ylabel("y [m]")
         axis.set_aspect("equal", adjustable="box")
-    height.plot(
-        run.times, -run.references[:, z], color=REFERENCE, linewidth=1, linestyle=(0, (4, 3)), label="reference"
-    )
+    height.plot(run.times, -run.references[:, z], color=REFERENCE, linewidth=1, linestyle=DASHED, label="reference")
     height.set_xlabel("time [s]")
-    height.set_ylabel("height -z [m]")
+    height.set_ylabel("height, -z [m]")
     drawn = np.concatenate([run.states[:, [x, y]], run.references[:, [x, y]], _planned(run, x, y)])
     low, high = drawn.min(axis=0), drawn.max(axis=0)
     span = 0.56 * max((high - low).max(), 1.0)
@@ -115,12 +115,6 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
         clock.set_text(f"{run.times[k]:.4g} s: {distance:.1f} cm from the reference{failed}")
         return []
 
-    for axis in (above, height, near):
-        axis.grid(color="0.93")
-        axis.set_axisbelow(True)
-        axis.spines[["top", "right"]].set_visible(False)
-    for axis in (above, near):
-        axis.tick_params(colors=BOUND, labelcolor="black")
     draw(0)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # once is enough: nothing that needs room changes

@@ -7,42 +7,62 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
+from gpmpc.plotting.style import BLACK, COLOURS, DASHED, styled
+
 SIZE = (9.0, 6.2)  # [in]: at 100 dots an inch as wide as a README
-COLOURS = (
-    "#111111", "#8c6d31", "#c0392b", "#e8871e", "#2e8b57", "#1f6fb4", "#79b8e8", "#12a5a5", "#d070b0", "#6a3d9a",
-)  # fmt: skip
+CURVES = 5
 MARKERS = ("o", "^", "s", "D", "v", "P", "X")
+OTHERS = "0.75"
 FRONT = "0.35"
 TICKS = (-1, 0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # [%]
 LINEAR = 1.0  # [%] of cost up to which the axis is linear
 
 
+@styled
 def quality(rows: Sequence[Mapping]) -> Figure:
     """Cost above NMPC on the true model over milliseconds a decision, with the front of the best.
 
-    A line is one choice of settings at growing horizons. The members of the front are numbered, and
-    named by what is typed after ``gpmpc run``.
+    A curve is one choice of settings at growing horizons: of each controller the one of least cost, of at most five
+    controllers. All others are grey dots. The members of the front are numbered, and named by what is typed after
+    ``gpmpc run``.
 
     Args:
         rows: Of the quality study; lost ones are counted in the corner.
     """
-    flown = [row for row in rows if row["lost"] is None]
-    families, horizons = list(dict.fromkeys(row["family"] for row in rows)), sorted({row["H"] for row in rows})
-    colours = {family: COLOURS[i % len(COLOURS)] for i, family in enumerate(families)}
+    flown, horizons = [row for row in rows if row["lost"] is None], sorted({row["H"] for row in rows})
     markers = {horizon: MARKERS[i % len(MARKERS)] for i, horizon in enumerate(horizons)}
     figure = Figure(figsize=SIZE, layout="constrained")
     axis = figure.subplots()
-    axis.axhline(0, color=COLOURS[0], linewidth=0.8, linestyle=(0, (5, 3)), zorder=1)
-    for words in dict.fromkeys(row["what"] for row in flown):
-        line = sorted((row for row in flown if row["what"] == words), key=lambda row: row["H"])
-        colour, at = colours[line[0]["family"]], [(row["median"], _excess(row)) for row in line]
-        axis.plot(*zip(*at, strict=True), color=colour, linewidth=0.9, alpha=0.4, zorder=2)
+    axis.set_title(f"gpmpc quality: {len({row['what'] for row in rows})} choices of settings over the horizon")
+    axis.axhline(0, color=BLACK, linewidth=0.8, linestyle=DASHED, zorder=1)
+    for row in flown:
+        axis.plot(row["median"], _excess(row), markers[row["H"]], color=OTHERS, markersize=4, zorder=2)
+    curves = _curves(flown)
+    for (_, line), colour in zip(curves.items(), COLOURS, strict=False):
+        at = [(row["median"], _excess(row)) for row in line]
+        axis.plot(*zip(*at, strict=True), color=colour, zorder=3)
         for row, (x, y) in zip(line, at, strict=True):
-            axis.plot(x, y, markers[row["H"]], color=colour, markersize=5.5, zorder=3)
+            axis.plot(x, y, markers[row["H"]], color=colour, markersize=6, zorder=3)
     _scales(axis, flown)
     _front(axis, [row for row in flown if row["front"]])
-    _legends(axis, colours, markers, len(rows) - len(flown))
+    _legends(axis, dict(zip(curves, COLOURS, strict=False)), markers, len(rows) - len(flown))
     return figure
+
+
+def _curves(rows: Sequence[Mapping]) -> dict[str, list[Mapping]]:
+    """Of each controller the settings of least cost, the fastest of those equal to 0.1 %; at most ``CURVES``."""
+    lines: dict[str, list[Mapping]] = {}
+    for row in sorted(rows, key=lambda row: row["H"]):
+        lines.setdefault(row["what"], []).append(row)
+
+    def merit(what: str) -> tuple[float, float]:
+        cost = min(round(row["cost"], 3) for row in lines[what])
+        return cost, min(row["median"] for row in lines[what] if round(row["cost"], 3) == cost)
+
+    best: dict[str, str] = {}
+    for what in sorted(lines, key=merit):
+        best.setdefault(what.split()[0], what)
+    return {what: lines[what] for what in list(best.values())[:CURVES]}
 
 
 def _excess(row: Mapping) -> float:
@@ -66,9 +86,6 @@ def _scales(axis: Axes, rows: Sequence[Mapping]) -> None:
     axis.set_ylim(min(1.5 * low, 0) - 0.4, 1.7 * max(high, LINEAR))
     times = [row["median"] for row in rows] or [1.0]
     axis.set_xlim(min(times) / 1.7, max(times) * 1.6)
-    axis.grid(color="0.92")
-    axis.set_axisbelow(True)
-    axis.spines[["top", "right"]].set_visible(False)
 
 
 def _front(axis: Axes, members: Sequence[Mapping]) -> None:
@@ -87,24 +104,31 @@ def _front(axis: Axes, members: Sequence[Mapping]) -> None:
     for number, (x, y) in enumerate(at, 1):
         axis.plot(x, y, "o", markersize=11, markerfacecolor="none", markeredgecolor=FRONT, markeredgewidth=1.2)
         # Below and left of a member of the front there is nobody.
-        axis.annotate(str(number), (x, y), (-6, -8), textcoords="offset points", ha="right", va="center", weight="bold")
+        axis.annotate(
+            str(number),
+            (x, y),
+            (-9 - 9 * (number % 2), -9),
+            textcoords="offset points",
+            ha="right",
+            va="center",
+            weight="bold",
+        )
     names = [f"{number}  {row['what']} horizon={row['H']}" for number, row in enumerate(members, 1)]
     axis.figure.legend(
         handles=[Line2D([], [], linestyle="none", label=name) for name in names],
         loc="outside lower left",
-        frameon=False,
         handlelength=0,
         prop={"family": "monospace", "size": 8.5},
     )
 
 
 def _legends(axis: Axes, colours: Mapping[str, str], markers: Mapping[int, str], lost: int) -> None:
-    """Families by colour above, horizons by marker inside."""
+    """Curves by colour above, horizons by marker beside them."""
     plain = {"linestyle": "none", "markersize": 5.5}
-    families = [Line2D([], [], color=colour, marker="o", **plain, label=name) for name, colour in colours.items()]
-    families.append(Line2D([], [], color=FRONT, linewidth=1.4, label="front: none is better and faster"))
-    axis.figure.legend(handles=families, loc="outside upper center", ncols=4, frameon=False, fontsize=8.5)
-    horizons = [Line2D([], [], color="0.4", marker=kind, **plain, label=f"H = {H}") for H, kind in markers.items()]
-    axis.legend(handles=horizons, loc="upper right", ncols=len(markers), frameon=False, fontsize=8.5, handletextpad=0.1)
+    lines = [Line2D([], [], color=colour, marker="o", markersize=5.5, label=name) for name, colour in colours.items()]
+    lines.append(Line2D([], [], color=OTHERS, marker="o", **plain, label="other settings"))
+    lines.append(Line2D([], [], color=FRONT, linewidth=1.4, label="front: none is better and faster"))
+    lines += [Line2D([], [], color="0.4", marker=kind, **plain, label=f"H = {H}") for H, kind in markers.items()]
+    axis.figure.legend(handles=lines, loc="outside upper center", ncols=3, fontsize=8.5)
     if lost:
-        axis.text(0.99, 0.9, f"lost: {lost}", transform=axis.transAxes, ha="right", va="top", color=FRONT)
+        axis.text(0.99, 0.98, f"lost: {lost}", transform=axis.transAxes, ha="right", va="top", color=FRONT)

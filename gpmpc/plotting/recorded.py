@@ -4,7 +4,7 @@ Cao, Lai and Alam (2017), figures 2 to 4, show positions and inputs over time. T
 expected one step before, with two standard deviations.
 """
 
-from collections.abc import Iterable
+import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,12 +12,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from gpmpc.plotting.style import BLUE, DASHED, GREY, ORANGE, SKY, VERMILION, legend_below, name_of, styled
+
 if TYPE_CHECKING:
     from gpmpc.recording import Run
 
-FLOWN, REFERENCE, TUBE, BOUND, FAILED = "#1f4e79", "#c0392b", "#9dc3e6", "0.45", "#e08e0b"
+FLOWN, REFERENCE, TUBE, BOUND, FAILED = BLUE, VERMILION, SKY, GREY, ORANGE
 STAGES = ("model", "build", "solve")
-STAGE_COLOURS = ("#1f4e79", "#7fb2e5", "#c0392b")
+STAGE_COLOURS = (BLUE, SKY, VERMILION)
 
 
 def tracked_of(run: "Run") -> list[int]:
@@ -49,21 +51,22 @@ def _noise(run: "Run") -> np.ndarray:
     return noise if noise.shape == (n,) and np.isfinite(noise).all() else np.zeros(n)
 
 
+@styled
 def tracking_figure(run: "Run") -> Figure:
     """Every axis over time against its reference, and below it the error with the tube."""
     states = tracked_of(run)
-    units = run.metadata.get("units", {})
     mean, std = expected(run, states)
-    figure = Figure(figsize=(3.6 * len(states), 4.6), layout="constrained")
+    figure = Figure(figsize=(2.9 * max(len(states), 2), 4.8), layout="constrained")
+    figure.suptitle(title_of(run))
     axes = figure.subplots(2, len(states), squeeze=False, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
     for column, i in enumerate(states):
         above, below = axes[:, column]
         reference = run.references[:, i]
         above.plot(run.times, run.states[:, i], color=FLOWN, linewidth=1.6, label="flown")
-        above.plot(run.times, reference, color=REFERENCE, linewidth=1.2, linestyle=(0, (4, 3)), label="reference")
-        above.set_title(f"{run.state_names[i]}{_unit(units, run, i)}")
+        above.plot(run.times, reference, color=REFERENCE, linewidth=1.2, linestyle=DASHED, label="reference")
+        above.set_title(_state_name(run, i))
         error, band = mean[:, column] - reference, 2 * std[:, column]
-        below.axhline(0, color=REFERENCE, linewidth=1, linestyle=(0, (4, 3)))
+        below.axhline(0, color=REFERENCE, linewidth=1, linestyle=DASHED)
         below.fill_between(
             run.times,
             error - band,
@@ -76,37 +79,37 @@ def tracking_figure(run: "Run") -> Figure:
         below.plot(run.times, run.states[:, i] - reference, color=FLOWN, linewidth=1.2)
         _failures(run, (above, below))
         below.set_xlabel("time [s]")
-    axes[1, 0].set_ylabel(f"error{_unit(units, run, states[0])}")
-    _legend(figure, axes.ravel())
-    for axis in axes.ravel():
-        _plain(axis)
+    axes[1, 0].set_ylabel(f"error{_unit(run, states[0])}")
+    legend_below(figure, axes.ravel())
     figure.align_ylabels(axes[:, 0])
     return figure
 
 
+@styled
 def inputs_figure(run: "Run") -> Figure:
     """What acted, over time, with its bounds."""
     m, units = len(run.input_names), run.metadata.get("units", {})
-    figure = Figure(figsize=(7.2, 1.6 * m + 0.6), layout="constrained")
+    figure = Figure(figsize=(7.2, 1.6 * m + 1.0), layout="constrained")
+    figure.suptitle(title_of(run))
     axes = figure.subplots(m, 1, squeeze=False, sharex=True)[:, 0]
     for i, axis in enumerate(axes):
-        unit = units.get(f"input.{run.input_names[i]}", "")
         held = np.append(run.inputs[:, i], run.inputs[-1:, i])  # the last one until its step ends
         axis.step(_edges(run), held, where="post", color=FLOWN, linewidth=1.4, label="applied")
         _bounds(axis, run.inputs[:, i], run.input_bounds[:, i])
-        axis.set_ylabel(f"{run.input_names[i]} [{unit}]" if unit not in ("", "1") else run.input_names[i])
+        axis.set_ylabel(name_of(run.input_names[i], units.get(f"input.{run.input_names[i]}", "")))
         _failures(run, (axis,))
-        _plain(axis)
     axes[-1].set_xlabel("time [s]")
-    _legend(figure, axes)
+    legend_below(figure, axes)
     figure.align_ylabels(axes)
     return figure
 
 
+@styled
 def timing_figure(run: "Run") -> Figure:
     """Where the time of every decision went, and how the totals are distributed."""
     milliseconds = 1e3 * run.timings
-    figure = Figure(figsize=(8.4, 3.2), layout="constrained")
+    figure = Figure(figsize=(8.4, 3.6), layout="constrained")
+    figure.suptitle(title_of(run))
     over_time, distribution = figure.subplots(1, 2, gridspec_kw={"width_ratios": [3, 2]})
     edges, bottom = _edges(run), np.zeros(len(run.times))
     for j, (name, colour) in enumerate(zip(STAGES, STAGE_COLOURS, strict=True)):
@@ -122,7 +125,7 @@ def timing_figure(run: "Run") -> Figure:
     if beyond:
         over_time.set_title(f"{beyond} of {len(total)} steps above, up to {_duration(total[-1])}", fontsize="small")
     over_time.set_xlabel("time [s]")
-    over_time.set_ylabel("decision [ms]")
+    over_time.set_ylabel("time of a decision [ms]")
     distribution.step(total, np.arange(1, len(total) + 1) / len(total), where="post", color=FLOWN)
     if total[0] > 0 and total[-1] > 5 * total[0]:
         distribution.set_xscale("log")
@@ -134,14 +137,12 @@ def timing_figure(run: "Run") -> Figure:
         distribution.xaxis.set_minor_formatter(NullFormatter())
     median, most = (float(np.quantile(total, share)) for share in (0.5, 0.99))
     for value in (median, most):
-        distribution.axvline(value, color=BOUND, linewidth=1, linestyle=(0, (4, 3)))
+        distribution.axvline(value, color=BOUND, linewidth=1, linestyle=DASHED)
     distribution.set_title(f"median {_duration(median)}, 99 % below {_duration(most)}", fontsize="small")
     distribution.set_ylim(0, 1.02)
-    distribution.set_xlabel("decision [ms]")
+    distribution.set_xlabel("time of a decision [ms]")
     distribution.set_ylabel("share of the steps")
-    for axis in (over_time, distribution):
-        _plain(axis)
-    _legend(figure, [over_time])
+    legend_below(figure, [over_time])
     return figure
 
 
@@ -155,16 +156,23 @@ def _duration(milliseconds: float) -> str:
     return f"{milliseconds:.3g} ms" if milliseconds < 999.5 else f"{milliseconds / 1e3:.3g} s"
 
 
-def _unit(units: dict[str, str], run: "Run", state: int) -> str:
+def title_of(run: "Run") -> str:
+    """Returns what was run: the command, or the file."""
+    command = run.metadata.get("run", {}).get("command", "")
+    return textwrap.shorten(command if command.startswith("gpmpc") else str(run.path), 90, placeholder=" ...")
+
+
+def _state_name(run: "Run", state: int) -> str:
+    z_down = run.metadata.get("frames", {}).get("z axis") != "up"
+    return name_of(
+        run.state_names[state], run.metadata.get("units", {}).get(f"state.{run.state_names[state]}", ""), z_down
+    )
+
+
+def _unit(run: "Run", state: int) -> str:
     """The unit of a state, in brackets."""
-    unit = units.get(f"state.{run.state_names[state]}", "")
+    unit = run.metadata.get("units", {}).get(f"state.{run.state_names[state]}", "")
     return f" [{unit}]" if unit else ""
-
-
-def _legend(figure: Figure, axes: Iterable[Axes]) -> None:
-    """One for the whole figure, below it; nothing twice."""
-    found = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=len(found), frameon=False)
 
 
 def _bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
@@ -174,7 +182,7 @@ def _bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
     limits = [limit for limit in bounds if np.isfinite(limit)]
     near = [limit for limit in limits if low - 2 * span <= limit <= high + 2 * span]
     for limit in near:
-        axis.axhline(limit, color=BOUND, linestyle=(0, (4, 3)), linewidth=1, label="bound")
+        axis.axhline(limit, color=BOUND, linestyle=DASHED, linewidth=1, label="bound")
     low, high = min([low, *near]), max([high, *near])
     axis.set_ylim(low - 0.12 * max(high - low, span), high + 0.25 * max(high - low, span))
     if len(near) < len(limits):
@@ -190,9 +198,3 @@ def _failures(run: "Run", axes: tuple[Axes, ...]) -> None:
     for axis in axes:
         for j, time in enumerate(times):
             axis.axvline(time, color=FAILED, linewidth=1, alpha=0.6, label="failed solve" if j == 0 else None, zorder=0)
-
-
-def _plain(axis: Axes) -> None:
-    axis.grid(axis="y", color="0.9")
-    axis.set_axisbelow(True)
-    axis.spines[["top", "right"]].set_visible(False)

@@ -9,6 +9,8 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter, NullLocator, PercentFormatter
 
+from gpmpc.plotting.style import BLUE, COLOURS, DASHED, DASHES, SKY, VERMILION, add_legend, legend_below, styled
+
 if TYPE_CHECKING:
     from gpmpc.calibration import Calibration
 
@@ -28,15 +30,18 @@ class Panel:
     paper: dict[int, float]
 
 
-def error_over_size(panels: Sequence[Panel], label: str) -> Figure:
+@styled
+def error_over_size(panels: Sequence[Panel], label: str, title: str = "") -> Figure:
     """Boxes and draws of an error over the training size, with the paper's points on them; logarithmic."""
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
+    figure.suptitle(title)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis, panel in zip(axes, panels, strict=False):
         sizes = sorted(panel.draws)
         axis.set_title(panel.title)
+        axis.set_xlabel("training points N")
         if not sizes:  # every fit failed
             axis.set_axis_off()
             continue
@@ -47,36 +52,31 @@ def error_over_size(panels: Sequence[Panel], label: str) -> Figure:
             whis=(0, 100),
             widths=0.5,
             patch_artist=True,
-            boxprops={"facecolor": "#cfe0f3", "edgecolor": "#1f4e79"},
-            whiskerprops={"color": "#1f4e79"},
-            capprops={"color": "#1f4e79"},
-            medianprops={"color": "#1f4e79", "linewidth": 1.8},
+            boxprops={"facecolor": SKY, "edgecolor": BLUE},
+            whiskerprops={"color": BLUE},
+            capprops={"color": BLUE},
+            medianprops={"color": BLUE, "linewidth": 1.8},
         )
         for position, size in enumerate(sizes):  # the draws themselves: a box hides that there are two modes
             draws = list(panel.draws[size])
             aside = [0.18 * ((7 * i) % 11 / 5 - 1) for i in range(len(draws))]
             named = {} if position else {"label": "our draws, in boxes of their quartiles"}
-            axis.plot([position + a for a in aside], draws, ".", color="#1f4e79", alpha=0.55, markersize=4, **named)
+            axis.plot([position + a for a in aside], draws, ".", color=BLUE, alpha=0.55, markersize=4, **named)
         known = [(position, panel.paper[size]) for position, size in enumerate(sizes) if size in panel.paper]
         if known:
-            axis.plot(*zip(*known, strict=True), "o", color="#c0392b", markersize=6, zorder=3, label="paper")
+            axis.plot(*zip(*known, strict=True), "o", color=VERMILION, markersize=6, zorder=3, label="paper")
         axis.set_yscale("log")
         axis.yaxis.set_minor_locator(NullLocator())
         axis.yaxis.set_minor_formatter(NullFormatter())
         axis.set_xticks(list(positions), [str(size) for size in sizes])
-        axis.grid(axis="y", color="0.9")
-        axis.set_axisbelow(True)
-        axis.spines[["top", "right"]].set_visible(False)
     for axis in axes[len(panels) :]:
         axis.set_visible(False)
-    named = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    if named:
-        figure.legend(named.values(), named, loc="outside upper center", ncols=2, frameon=False)
-    figure.supxlabel("training points N")
+    legend_below(figure, axes)
     figure.supylabel(label)
     return figure
 
 
+@styled
 def calibration_figure(calibration: "Calibration") -> Figure:
     """Coverage against its nominal level (dashed), log density and error over the steps ahead, a column a state."""
     n, steps = len(calibration.names), range(1, calibration.horizon + 1)
@@ -88,7 +88,7 @@ def calibration_figure(calibration: "Calibration") -> Figure:
     for (above, density, error), i in zip(axes.T, range(n), strict=True):
         above.set_title(calibration.names[i], fontsize="medium")
         for j, colour in zip(order, colours, strict=True):
-            above.axhline(calibration.levels[j], color=colour, linestyle=(0, (4, 3)), linewidth=1)
+            above.axhline(calibration.levels[j], color=colour, linestyle=DASHED, linewidth=1)
             above.plot(steps, calibration.coverage[:, i, j], color=colour, **line)
         density.plot(steps, calibration.nlpd[:, i], color=colours[-1], **line)
         error.plot(steps, calibration.rmse[:, i], color=colours[-1], **line)
@@ -99,10 +99,6 @@ def calibration_figure(calibration: "Calibration") -> Figure:
         error.set_ylim(bottom=0)
         error.yaxis.set_major_locator(MaxNLocator(nbins=5))
         error.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6, min_n_ticks=1))
-        for axis in (above, density, error):
-            axis.grid(axis="y", color="0.9")
-            axis.set_axisbelow(True)
-            axis.spines[["top", "right"]].set_visible(False)
     lowest = 0.0
     for j, colour in zip(
         order, colours, strict=True
@@ -140,14 +136,12 @@ class Curve:
     interval: np.ndarray | None = None
 
 
-COLOURS = ("#c0392b", "#1f4e79", "#2e8b57", "#b8860b", "#6a3d9a", "#555555")
-DASHES = ("-", (0, (5, 2)), (0, (1.2, 1.6)), (0, (6, 2, 1.2, 2)), (0, (3, 3)), "-")
-
-
-def tracking(groups: Sequence[tuple[Sequence[str], Sequence[Curve]]]) -> Figure:
+@styled
+def tracking(groups: Sequence[tuple[Sequence[str], Sequence[Curve]]], title: str = "") -> Figure:
     """Values over the time steps, a row of panels a group and a panel a column; references grey, bounds dotted."""
     columns = max(len(labels) for labels, _ in groups)
     figure = Figure(figsize=(4.0 * columns, 2.7 * len(groups) + 0.7), layout="constrained")
+    figure.suptitle(title)
     axes = figure.subplots(len(groups), columns, squeeze=False, sharex=True)
     handles: dict[str, Any] = {}
     for row, (labels, curves) in zip(axes, groups, strict=True):
@@ -168,32 +162,30 @@ def tracking(groups: Sequence[tuple[Sequence[str], Sequence[Curve]]]) -> Figure:
                 (line,) = axis.plot(curve.at, curve.values[:, j], color=colour, linestyle=dash, linewidth=1.3)
                 handles.setdefault(curve.label, line)
             axis.set_ylabel(label)
-            axis.grid(color="0.92")
-            axis.set_axisbelow(True)
-            axis.spines[["top", "right"]].set_visible(False)
     for axis in axes[-1]:
         axis.set_xlabel("time step k")
-    figure.legend(
-        handles.values(),
-        handles.keys(),
-        loc="outside upper center",
-        ncols=min(5 if columns > 2 else 3, len(handles)),
-        frameon=False,
-    )
+    add_legend(figure, list(handles.values()), list(handles))
     return figure
 
 
+@styled
 def over_settings(
-    panels: Mapping[str, Sequence[Curve]], label: str, logarithmic: bool = False, diagonal: bool = False
+    panels: Mapping[str, Sequence[Curve]],
+    label: str,
+    logarithmic: bool = False,
+    diagonal: bool = False,
+    title: str = "",
 ) -> Figure:
     """One measure over a setting, a panel a title, with intervals; logarithmic, or with the diagonal drawn in."""
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(4.8 * columns, 3.3 * rows + 0.8), layout="constrained")
+    figure.suptitle(title)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     handles: dict[str, Any] = {}
-    for axis, (title, curves) in zip(axes, panels.items(), strict=False):
-        axis.set_title(title, fontsize="medium")
+    for axis, (heading, curves) in zip(axes, panels.items(), strict=False):
+        axis.set_title(heading)
+        axis.set_xlabel(label)
         for i, curve in enumerate(curves):
             colour, dash, value = COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)], curve.values[:, 0]
             if curve.interval is None:
@@ -217,14 +209,10 @@ def over_settings(
             axis.xaxis.set_minor_locator(NullLocator())
         if diagonal:
             end = max(float(curve.at.max()) for curve in curves)
-            (line,) = axis.plot([0, end], [0, end], color="0.4", linestyle=(0, (4, 3)), linewidth=1)
+            (line,) = axis.plot([0, end], [0, end], color="0.4", linestyle=DASHED, linewidth=1)
             handles.setdefault("what is allowed", line)
             axis.set_ylim(bottom=0)
-        axis.grid(color="0.92")
-        axis.set_axisbelow(True)
-        axis.spines[["top", "right"]].set_visible(False)
     for axis in axes[len(panels) :]:
         axis.set_visible(False)
-    figure.supxlabel(label, fontsize="medium")
-    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=2, frameon=False)
+    add_legend(figure, list(handles.values()), list(handles))
     return figure

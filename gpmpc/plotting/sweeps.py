@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-COLOURS = ("#1f4e79", "#c0392b", "#2e8b57", "#b8860b", "#6a3d9a", "#17858b", "#8c564b", "#555555")
+from gpmpc.plotting.style import COLOURS, add_legend, styled
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class Series:
     values: Sequence[Sequence[float]]
 
 
+@styled
 def over_variable(
     title: str,
     positions: Sequence[str],
@@ -42,9 +43,7 @@ def over_variable(
         logarithmic: Whether the axis is, where the values span enough for it.
     """
     drawn = [line for line in lines if any(line.values)]
-    columns = max(1, 52 // (max((len(line.label) for line in drawn), default=0) + 8))  # 52 characters fill the width
-    legend = -(-len(drawn) // columns) if len(drawn) > 1 else 0  # rows
-    figure = Figure(figsize=(4.4, 3.2 + 0.22 * legend), layout="constrained")
+    figure = Figure(figsize=(4.8, 3.4 + 0.11 * len(drawn)), layout="constrained")
     axis = figure.subplots()
     _draw(axis, lines, positions)
     axis.set_title(label, fontsize="medium")
@@ -61,12 +60,9 @@ def over_variable(
     elif not values or max(values) <= 0:
         axis.set_ylim(0, 1)
     elif min(values) >= 0:
-        axis.set_ylim(bottom=0)
-    axis.grid(axis="y", color="0.9")
-    axis.set_axisbelow(True)
-    axis.spines[["top", "right"]].set_visible(False)
-    if legend:
-        figure.legend(loc="outside lower center", ncols=min(columns, len(drawn)), frameon=False)
+        axis.set_ylim(0, 1.06 * max(values))
+    if len(drawn) > 1:
+        add_legend(figure, *axis.get_legend_handles_labels())
     return figure
 
 
@@ -90,7 +86,7 @@ def _draw(axis: Axes, lines: Sequence[Series], positions: Sequence[str]) -> None
         style = {"color": colour, "marker": "o", "markersize": 4, "linestyle": "none" if numbers is None else "-"}
         axis.errorbar(place(middles[known]), middle, np.array([middle - low, high - middle]), label=line.label, **style)
         for x, group in zip(middles, line.values, strict=True):
-            aside = [0.25 * width * ((7 * j) % 11 / 5 - 1) for j in range(len(group))]
+            aside = [0.3 * width * ((j + 0.5) / len(group) * 2 - 1) for j in range(len(group))]
             axis.plot(place(x + np.array(aside)), group, ".", color=colour, alpha=0.45, markersize=5, mew=0)
     if wide:
         axis.set_xscale("log")
@@ -108,6 +104,7 @@ def _numbers(positions: Sequence[str]) -> np.ndarray | None:
     return numbers if np.isfinite(numbers).all() and len(set(numbers)) == len(numbers) else None
 
 
+@styled
 def search_figure(costs: Sequence[float], importances: Mapping[str, float], unchanged: float | None) -> Figure:
     """Draws the costs of a search over its candidates, and beside them how much each setting mattered.
 
@@ -133,13 +130,10 @@ def search_figure(costs: Sequence[float], importances: Mapping[str, float], unch
         axes[0].set_yscale("log")
     axes[0].set(xlabel="candidate", ylabel="closed-loop cost per step")
     axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes[0].grid(axis="y", color="0.9")
-    axes[0].legend(loc="upper center", bbox_to_anchor=(0.5, 1.25), ncols=2, frameon=False, fontsize="small")
+    add_legend(figure, *axes[0].get_legend_handles_labels())
     if importances:
         names = [*importances][::-1]
         bars = axes[1].barh(names, [100 * importances[name] for name in names], color=COLOURS[0], height=0.5)
         axes[1].bar_label(bars, fmt="%.0f %%", padding=3)
         axes[1].set(xlabel="importance [%]", xlim=(0, 115))
-    for axis in axes:
-        axis.spines[["top", "right"]].set_visible(False)
     return figure

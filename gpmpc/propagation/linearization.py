@@ -8,6 +8,7 @@ The terms in brackets are those of the second-order filter (Jazwinski, 1970, sec
 Candela and Murray-Smith, 2003, for GPs). Mean equivalence leaves A S A' out (Hewing, Kabzan and Zeilinger, 2020).
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -149,28 +150,20 @@ class MeanEquivalence(Propagator):
 
     def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``. State and next state come out uncorrelated."""
-        return self._propagation(model, belief, model.predict(belief.mean, checked_input(model, belief, input)))
+        moved = model.predict(belief.mean, checked_input(model, belief, input))
+        cross = torch.zeros_like(belief.mean[..., :, None].expand(*belief.mean.shape, moved.dim))
+        return projected((moved.mean, moved.covariance, cross), model.noise_covariance if self.process_noise else None)
 
     def differentiate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity] | None:
         """``propagate`` with all derivatives in closed form; None where the model has none."""
-        expansion = expand(model, belief.mean, checked_input(model, belief, input))
-        if expansion is None:
+        certain = Gaussian(belief.mean, torch.zeros_like(belief.covariance))
+        found = Linearization(process_noise=self.process_noise).differentiate(model, certain, input)
+        if found is None:
             return None
-        sensitivity = Sensitivity(
-            expansion.A,
-            torch.zeros_like(expansion.mean_by_state2),
-            expansion.B,
-            torch.diag_embed(expansion.variance_by_state.mT).movedim(-3, -1),
-            torch.zeros_like(expansion.mean_by_state2)[..., None, :, :].repeat_interleave(expansion.belief.dim, -3),
-            torch.diag_embed(expansion.variance_by_input.mT).movedim(-3, -1),
-        )
-        return self._propagation(model, belief, expansion.belief), sensitivity
-
-    def _propagation(self, model: Any, belief: Gaussian, moved: Gaussian) -> Propagation:
-        cross = torch.zeros_like(belief.mean[..., :, None].expand(*belief.mean.shape, moved.dim))
-        return projected((moved.mean, moved.covariance, cross), model.noise_covariance if self.process_noise else None)
+        moved, d = found
+        return moved, replace(d, covariance_by_covariance=torch.zeros_like(d.covariance_by_covariance))
 
 
 def _mean_hessian(model: Any, state: Tensor, input: Tensor) -> Tensor:

@@ -6,12 +6,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation._composition import Composition, Latent
 from gpmpc.propagation._moments import moments, moments_with_jacobian
-from gpmpc.propagation.propagator import Propagation, Propagator, checked_input, projected, unsupported
+from gpmpc.propagation.propagator import Propagation, Propagator, checked_input, projected
 from gpmpc.propagation.sensitivity import Sensitivity
 
 
@@ -63,7 +64,11 @@ class MomentMatching(Propagator):
     def _composition(self, model: Any) -> Composition:
         composition = Composition.of(model)
         if composition is None:
-            raise unsupported(self, model, "a GPPosterior, or a ResidualModel of an Affine nominal model and one")
+            raise UnsupportedModel(
+                "MomentMatching needs a GPPosterior, or a ResidualModel of an Affine nominal model and one; "
+                f"got {type(model).__name__}. "
+                "Possible with any model: MeanEquivalence, Linearization, Unscented, MonteCarlo"
+            )
         return composition
 
     def _latent(self, f: GPPosterior, belief: Gaussian, input: Tensor) -> Latent:

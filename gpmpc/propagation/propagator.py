@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.dynamics import check_query
-from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
+from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian, check_tensors, nearest_positive_semidefinite
 
 
@@ -111,11 +111,3 @@ def _check_semidefinite(covariance: np.ndarray) -> None:
                 f"the belief's covariance must be positive semidefinite; got an eigenvalue of {lowest:.3g} "
                 f"(largest entry {float(largest):.3g})"
             ) from None
-
-
-def unsupported(method: Any, model: Any, possible: str) -> UnsupportedModel:
-    """The error of a method that has no formula for a model."""
-    return UnsupportedModel(
-        f"{type(method).__name__} needs {possible}; got {type(model).__name__}. "
-        "Possible with any model: MeanEquivalence, Linearization, Unscented, MonteCarlo"
-    )

@@ -1,22 +1,20 @@
-"""Defines the protobuf messages of a recording and serialises many of them at a time.
+"""Defines the protobuf messages of a recording.
 
 States and inputs become scalar fields with the plant's own names (``state.x``, ``input.U1``), because a plot tool draws
 an array as one line. The descriptors are therefore built at run time and travel in the file. A descriptor loses
 comments, so units stand in the file's metadata record ``units``, by field path.
 
-Packed ``repeated double`` has the wire format of ``bytes`` that hold the little-endian float64 values, and a nested
-message that of ``bytes`` that hold it serialised. The reader and the recorder use twins of the declared messages with
-``bytes`` in these places (``READ``, ``WRITTEN``): a thousand numbers then cost one copy.
+Packed ``repeated double`` has the wire format of ``bytes`` that hold the little-endian float64 values. The package
+reads and writes its messages with ``bytes`` in these places: a thousand numbers then cost one copy.
 """
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
@@ -24,10 +22,8 @@ from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.status import Status
 
 STEP, PLAN, QP = "/step", "/plan", "/qp"
-TOPICS = {STEP: "gpmpc.Step", PLAN: "gpmpc.Plan", QP: "gpmpc.QuadraticProgram"}
+TOPICS = {STEP: "Step", PLAN: "Plan", QP: "QuadraticProgram"}
 TIMING = ("model", "build", "solve", "total")
-READ = {"repeated double": "bytes"}
-WRITTEN = READ | dict.fromkeys(("State", "Input", "Timing"), "bytes") | {"repeated Stage": "repeated bytes"}
 QP_ARRAYS = ("P", "q", "G", "lower", "upper", "softness", "x", "multipliers")
 
 _FIELDS = {
@@ -56,12 +52,6 @@ _FIELDS = {
     "Plan": {"time": "double", "k": "int64", "stages": "repeated Stage", "covariances": "repeated double"},
     "QuadraticProgram": {"time": "double", "k": "int64", "variables": "int64", "rows": "int64"}
     | dict.fromkeys(QP_ARRAYS, "repeated double"),
-}
-_SCALARS = {
-    "double": FieldDescriptorProto.TYPE_DOUBLE,
-    "int64": FieldDescriptorProto.TYPE_INT64,
-    "bool": FieldDescriptorProto.TYPE_BOOL,
-    "bytes": FieldDescriptorProto.TYPE_BYTES,
 }
 _LARGEST = 1000  # states or inputs
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -99,7 +89,19 @@ class RecordedSystem:
         check_number("time_step", self.time_step, above=0, unit="[s]")
         if self.input_bounds is not None and np.shape(self.input_bounds) != (2, len(self.input_names)):
             raise ShapeError(f"input bounds must be (2, {len(self.input_names)}); got {np.shape(self.input_bounds)}")
-        units_by_field(self.units, self.state_names, self.input_names)
+        if unknown := sorted({*self.units} - {*self.state_names, *self.input_names}):
+            names = ", ".join([*self.state_names, *self.input_names])
+            raise SettingError("units", f"must be of {names}; got {', '.join(unknown)}")
+
+    @property
+    def field_units(self) -> dict[str, str]:
+        """Units of the scalar fields by path, of ``Step`` and, after ``stages``, of ``Plan``; unknown ones are "?"."""
+        found = {"time": "s", "stages.time": "s"} | {f"timing.{name}": "s" for name in TIMING}
+        for message, prefix in (("Step", ""), ("Stage", "stages.")):
+            for key, kind in _FIELDS[message].items():
+                names = {"State": self.state_names, "Input": self.input_names}.get(kind, ())
+                found |= {f"{prefix}{key}.{name}": self.units.get(name, "?") for name in names}
+        return found
 
 
 def check_names(kind: str, names: Sequence[str]) -> tuple[str, ...]:
@@ -114,39 +116,36 @@ def check_names(kind: str, names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if not isinstance(name, str) or not _NAME.fullmatch(name):
             raise SettingError(kind, f"a name must be letters, digits and _, a letter first; got {name!r}")
-        if names.count(name) > 1:
-            raise SettingError(kind, f"a name must be unique; {name!r} comes {names.count(name)} times")
+    if len(set(names)) < len(names):
+        raise SettingError(kind, f"a name must be unique; got {', '.join(names)}")
     return names
 
 
-def descriptor(
-    states: Sequence[str], inputs: Sequence[str], twin: Mapping[str, str] = MappingProxyType({})
-) -> FileDescriptorProto:
+def descriptor(states: Sequence[str], inputs: Sequence[str], packed: str = "repeated double") -> FileDescriptorProto:
     """Describes all messages.
 
     Args:
         states: Names of the n states.
         inputs: Names of the m inputs.
-        twin: Kinds of fields to replace by others with equal wire format: ``READ`` or ``WRITTEN``.
+        packed: Kind of the arrays: "repeated double", or "bytes" for the package itself.
     """
     file = FileDescriptorProto(name="gpmpc/recording.proto", package="gpmpc", syntax="proto3")
     status = file.enum_type.add(name="Status")
     for number, value in enumerate(Status):
         status.value.add(name=value.name, number=number)
-    named = {"State": states, "Input": inputs, "Timing": TIMING}
-    for name, fields in ({k: dict.fromkeys(v, "double") for k, v in named.items()} | _FIELDS).items():
+    groups = {"State": states, "Input": inputs, "Timing": TIMING}
+    for name, fields in ({k: dict.fromkeys(v, "double") for k, v in groups.items()} | _FIELDS).items():
         message = file.message_type.add(name=name)
         for number, (key, kind) in enumerate(fields.items(), start=1):
-            if kind:
-                *repeated, kind = twin.get(kind, kind).split()
-                label = FieldDescriptorProto.LABEL_REPEATED if repeated else FieldDescriptorProto.LABEL_OPTIONAL
-                added = message.field.add(name=key, number=number, label=label)
-                if kind in _SCALARS:
-                    added.type = _SCALARS[kind]
-                else:
-                    is_enum = kind == "Status"
-                    added.type = FieldDescriptorProto.TYPE_ENUM if is_enum else FieldDescriptorProto.TYPE_MESSAGE
-                    added.type_name = f".gpmpc.{kind}"
+            *repeated, kind = (packed if kind == "repeated double" else kind or "none").split()
+            if kind == "none":
+                continue
+            label = FieldDescriptorProto.LABEL_REPEATED if repeated else FieldDescriptorProto.LABEL_OPTIONAL
+            added = message.field.add(name=key, number=number, label=label)
+            if kind in groups or kind in _FIELDS or kind == "Status":
+                added.type_name = f".gpmpc.{kind}"
+                kind = "enum" if kind == "Status" else "message"
+            added.type = FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}")
     return file
 
 
@@ -162,29 +161,3 @@ def message_classes(file: FileDescriptorProto) -> dict[str, Any]:
     except TypeError as error:
         raise SettingError("state_names", f"and input_names cannot be fields of a message: {error}") from error
     return {m.name: GetMessageClass(pool.FindMessageTypeByName(f"gpmpc.{m.name}")) for m in file.message_type}
-
-
-def schema_data(file: FileDescriptorProto) -> bytes:
-    """Serialises the descriptor as the schema of an MCAP file."""
-    return FileDescriptorSet(file=[file]).SerializeToString()
-
-
-def units_by_field(units: Mapping[str, str], states: Sequence[str], inputs: Sequence[str]) -> dict[str, str]:
-    """Finds the unit of every scalar field by its path: of ``gpmpc.Step``, and of ``gpmpc.Plan`` after ``stages``.
-
-    Args:
-        units: By name of state or input; a name without unit gets "?".
-        states: Names of the n states.
-        inputs: Names of the m inputs.
-
-    Raises:
-        SettingError: A unit for a name that is neither.
-    """
-    if unknown := set(units) - set(states) - set(inputs):
-        raise SettingError("units", f"must be of {', '.join([*states, *inputs])}; got {', '.join(sorted(unknown))}")
-    fields = {"time": "s", "stages.time": "s"}
-    for message, prefix in (("Step", ""), ("Stage", "stages.")):
-        for key, kind in _FIELDS[message].items():
-            names = {"State": states, "Input": inputs}.get(kind, ())
-            fields |= {f"{prefix}{key}.{name}": units.get(name, "?") for name in names}
-    return fields | {f"timing.{name}": "s" for name in TIMING}

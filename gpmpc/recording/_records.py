@@ -1,30 +1,28 @@
 """Reads the records of an MCAP file that was cut off, damaged, or made by somebody else.
 
-Records are read from the file's start up to the first that does not fit into the file, a chunk whose checksum is
-wrong, or a reference to what was not declared. Metadata and attachments that are damaged are left out. A footer is
-yielded only if nothing is missing and every checksum of the file (of chunks, attachments, data and index) is right.
-(MCAP's own stream reader believes every length, reads a record that is cut off as a shorter one, unfolds whatever a
-chunk holds, and skips the checksums of attachments and index.)
+Records are parsed by MCAP's library, up to the first that does not fit into the file, a chunk whose checksum is wrong,
+or a reference to what was not declared. Metadata and attachments that are damaged are left out. A footer is yielded
+only if nothing is missing and every checksum of the file (of chunks, attachments, data and index) is right. (The
+library alone believes every length, unfolds whatever a chunk holds, and skips the checksums of attachments and index.)
 
 Nothing is unfolded before it is known to be small: a record or chunk has at most ``LARGEST`` bytes, and all of them
 together take at most ``room``.
 """
 
-import stat
 import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import lz4.frame
 import zstandard
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema, Statistics
+from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from gpmpc.exceptions import RecordingError
@@ -34,14 +32,8 @@ LARGEST = 32 * 2**20  # [bytes]
 _ROOM, _RATIO = 64 * 2**20, 300  # [bytes], and bytes a byte of the file; runs are compressed 2 to 10 times
 _OBJECT = 2000  # [bytes] that a message takes besides its content
 _HEAD = struct.Struct("<BQ")  # kind and length
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_CLASSES: dict[int, Any] = {
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.ATTACHMENT: Attachment,
-    Opcode.METADATA: Metadata,
-}
-_BROKEN = (McapError, struct.error, UnicodeDecodeError, OverflowError, zstandard.ZstdError)
+_IN_DATA = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA}
+_BROKEN = (McapError, struct.error, UnicodeDecodeError, OverflowError, zstandard.ZstdError, RuntimeError)
 
 
 def room(path: Path) -> int:
@@ -56,7 +48,7 @@ def whole_records(path: Path) -> Iterator[McapRecord]:
         RecordingError: There is no such file, it is no MCAP file, or its chunks unfold to more than there is ``room``.
     """
     try:
-        if not stat.S_ISREG(path.stat().st_mode):
+        if path.exists() and not path.is_file():
             raise RecordingError(f"{path}: is not a file")
         with path.open("rb") as file:
             magic = file.read(len(MCAP0_MAGIC))
@@ -64,7 +56,7 @@ def whole_records(path: Path) -> Iterator[McapRecord]:
                 reason = "is empty: its recording was killed before it began" if not magic else "is not an MCAP file"
                 raise RecordingError(f"{path}: {reason}")
             declared: dict[tuple[type, int], McapRecord | None] = {(Schema, 0): None}
-            for record in _sound(file, path):
+            for record in _sound_records(file, path):
                 if isinstance(record, Message) and (Channel, record.channel_id) not in declared:
                     return
                 if isinstance(record, Channel) and (Schema, record.schema_id) not in declared:
@@ -77,10 +69,10 @@ def whole_records(path: Path) -> Iterator[McapRecord]:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def _sound(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
+def _sound_records(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
     """Yields the records behind the magic bytes, as far as lengths and checksums are right."""
     left, size, checksum = room(path), path.stat().st_size, zlib.crc32(MCAP0_MAGIC)
-    counts: Counter[int] = Counter()
+    counts: Counter[type] = Counter()
     whole, in_data = True, True
     while len(head := file.read(_HEAD.size)) == _HEAD.size:
         kind, length = _HEAD.unpack(head)
@@ -90,86 +82,70 @@ def _sound(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
         before, checksum = checksum, zlib.crc32(content, zlib.crc32(head, checksum))
         try:
             if kind == Opcode.DATA_END:
-                whole = whole and _agree(struct.unpack_from("<I", content)[0], before)
+                whole = whole and _agrees(content[:4], before)
                 in_data, checksum = False, 0
             elif kind == Opcode.FOOTER:
-                footer = Footer.read(_stream(content))
-                index = zlib.crc32(content[:16], zlib.crc32(head, before))  # its last field is the checksum
                 ends = file.read(len(MCAP0_MAGIC) + 1) == MCAP0_MAGIC
-                if whole and ends and not in_data and _agree(footer.summary_crc, index):
-                    yield footer
+                index = zlib.crc32(content[:16], zlib.crc32(head, before))  # the last field is the checksum
+                if whole and ends and not in_data and _agrees(content[16:20], index):
+                    yield Footer(*struct.unpack("<QQI", content))
                 return
-            elif kind == Opcode.STATISTICS:
-                said = Statistics.read(_stream(content))
-                whole = whole and [
-                    said.message_count,
-                    said.attachment_count,
-                    said.metadata_count,
-                    said.chunk_count,
-                ] == [counts[k] for k in (Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.CHUNK)]
-            elif not in_data:
-                continue  # schemas and channels are repeated
-            elif kind == Opcode.CHUNK:
-                counts[kind] += 1
-                for inner, part in _split(_unfold(Chunk.read(_stream(content)))):
-                    counts[inner] += 1
-                    left -= _OBJECT + len(part)
-                    if left < 0:
-                        raise RecordingError(f"{path}: its chunks unfold to more than {room(path) / 1e6:.0f} MB")
-                    if (record := _parse(inner, part)) is not None:
+            elif kind == Opcode.STATISTICS or (in_data and kind in _IN_DATA):  # schemas and channels are repeated
+                for record in _parsed(head + content):
+                    counts[type(record)] += 1
+                    if isinstance(record, Statistics):
+                        whole = whole and _counts_all(record, counts)
+                    elif isinstance(record, Chunk):
+                        for inner in _parsed(_unfolded(record)):
+                            counts[type(inner)] += 1
+                            left -= _OBJECT + (len(inner.data) if isinstance(inner, Message | Schema) else 0)
+                            if left < 0:
+                                limit = f"{room(path) / 1e6:.0f} MB"
+                                raise RecordingError(f"{path}: its chunks unfold to more than {limit}")
+                            yield inner
+                    elif isinstance(record, Attachment) and not _agrees(content[-4:], zlib.crc32(content[:-4])):
+                        whole = False
+                    else:
                         yield record
-            elif (record := _parse(kind, content)) is not None:
-                counts[kind] += 1
-                yield record
         except _BROKEN:
             if kind not in (Opcode.ATTACHMENT, Opcode.METADATA):
                 return
             whole = False
 
 
-def _agree(stored: int, computed: int) -> bool:
-    return stored in (0, computed)  # 0: there is no checksum
+def _agrees(stored: bytes, computed: int) -> bool:
+    return struct.unpack("<I", stored)[0] in (0, computed)  # 0: there is no checksum
 
 
-class _Whole(BytesIO):
-    """A stream whose ``read`` gives all of the length, or raises."""
+def _counts_all(said: Statistics, counts: Counter[type]) -> bool:
+    expected = (said.message_count, said.attachment_count, said.metadata_count, said.chunk_count)
+    return expected == tuple(counts[kind] for kind in (Message, Attachment, Metadata, Chunk))
+
+
+class _Bounded(BytesIO):
+    """A stream whose ``read`` gives all of the length, or raises ``EndOfFile``."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        data = super().read(size)
-        if len(data) < (size or 0):
+        if (size or 0) > len(self.getbuffer()) - self.tell():
             raise EndOfFile
-        return data
+        return super().read(size)
 
 
-def _stream(content: bytes | memoryview) -> ReadDataStream:
-    return ReadDataStream(_Whole(content))
+def _parsed(data: bytes) -> Iterator[McapRecord]:
+    """Parses records that follow each other; those of an unknown kind are left out.
+
+    Raises:
+        EndOfFile: The last one is cut off; and whatever else MCAP's library raises.
+    """
+    stream = _Bounded(data)
+    try:
+        yield from StreamReader(stream, skip_magic=True, emit_chunks=True).records
+    except EndOfFile:
+        if stream.tell() < len(data):
+            raise
 
 
-def _parse(kind: int, content: bytes | memoryview) -> McapRecord | None:
-    """Parses a record; None of another kind than is yielded."""
-    if kind == Opcode.MESSAGE:
-        channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(content)
-        return Message(channel, log_time, bytes(content[_MESSAGE.size :]), publish_time, sequence)
-    if kind not in _CLASSES:
-        return None
-    if kind == Opcode.ATTACHMENT and not _agree(struct.unpack("<I", content[-4:])[0], zlib.crc32(content[:-4])):
-        raise EndOfFile
-    return _CLASSES[kind].read(_stream(content))
-
-
-def _split(content: bytes) -> Iterator[tuple[int, memoryview]]:
-    """Yields kinds and contents of the records in a chunk."""
-    view, start = memoryview(content), 0
-    while start < len(view):
-        kind, length = _HEAD.unpack_from(view, start)
-        start += _HEAD.size
-        if not kind or length > len(view) - start:
-            raise EndOfFile
-        yield kind, view[start : start + length]
-        start += length
-
-
-def _unfold(chunk: Chunk) -> bytes:
+def _unfolded(chunk: Chunk) -> bytes:
     """Decompresses a chunk, if it is as long as it says and its checksum is right."""
     size, data = chunk.uncompressed_size, chunk.data
     if size > LARGEST or chunk.compression not in ("zstd", "lz4", ""):
@@ -179,10 +155,7 @@ def _unfold(chunk: Chunk) -> bytes:
             raise EndOfFile
         data = zstandard.decompress(data, max_output_size=size)
     elif chunk.compression == "lz4":
-        try:
-            data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
-        except RuntimeError as error:
-            raise EndOfFile from error
-    if len(data) != size or not _agree(chunk.uncompressed_crc, zlib.crc32(data)):
+        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
+    if len(data) != size or not _agrees(struct.pack("<I", chunk.uncompressed_crc), zlib.crc32(data)):
         raise EndOfFile
     return data

@@ -21,7 +21,7 @@ from mcap.writer import CompressionType, Writer
 from gpmpc.exceptions import GpmpcError, RecordingError, SettingError
 from gpmpc.files import whole_file
 from gpmpc.recording import _messages
-from gpmpc.recording._messages import PLAN, QP, QP_ARRAYS, STEP
+from gpmpc.recording._messages import PLAN, QP, QP_ARRAYS, STEP, TIMING, TOPICS
 from gpmpc.recording._records import CONFIG, RECOVERED, room, whole_records
 from gpmpc.status import Status
 
@@ -99,7 +99,7 @@ class Run:
             table |= {f"{group}.{name}": values[:, i] for i, name in enumerate(names)}
         table |= {"status": np.array([status.name for status in self.statuses], dtype=object)}
         table |= {"iterations": self.iterations, "active_set_size": self.active_set_sizes}
-        table |= {f"timing.{name}": self.timings[:, i] for i, name in enumerate(_messages.TIMING)}
+        table |= {f"timing.{name}": self.timings[:, i] for i, name in enumerate(TIMING)}
         residuals = self.residuals.reshape(-1, 3)
         table |= {f"residuals.{name}": residuals[:, i] for i, name in enumerate(("primal", "dual", "gap"))}
         return table | {"gp_size": self.gp_sizes, "gp_version": self.gp_versions, "failed": self.failed}
@@ -149,88 +149,93 @@ def read_run(path: str | Path) -> Run:
     """
     path = Path(path)
     metadata: dict[str, dict[str, str]] = {}
-    names: dict[int, str] = {}
+    schemas: dict[int, str] = {}
     channels: dict[int, Channel] = {}
     counts: Counter[int] = Counter()
-    messages: dict[str, list] = {STEP: [], PLAN: [], QP: []}
-    decoder: _Decoder | None = None
+    messages: dict[str, list[Any]] = {STEP: [], PLAN: [], QP: []}
+    described: _Described | None = None
     config, finished = "", False
     for record in whole_records(path):
         if isinstance(record, Message):
             counts[record.channel_id] += 1
             topic = channels[record.channel_id].topic
-            if topic in messages:
-                if decoder is None and "run" not in metadata:  # another tool has moved them behind the messages
-                    metadata |= {more.name: more.metadata for more in whole_records(path) if isinstance(more, Metadata)}
-                decoder = decoder or _Decoder(path, metadata)
-                messages[topic].append(decoder.decode(topic, record))
+            if topic in messages:  # parsed at once, so that one that is damaged ends it before more are in memory
+                if described is None:  # another tool may have moved the metadata behind the messages
+                    everything = whole_records(path) if "run" not in metadata else ()
+                    behind = {more.name: more.metadata for more in everything if isinstance(more, Metadata)}
+                    described = _describe(path, metadata | behind)
+                messages[topic].append(_decode(path, topic, described, record))
         elif isinstance(record, Schema):
-            names[record.id] = record.name
+            schemas[record.id] = record.name
         elif isinstance(record, Channel):
             channels[record.id] = record
         elif isinstance(record, Metadata):
             metadata.setdefault(record.name, record.metadata)
         elif isinstance(record, Attachment) and record.name == CONFIG:
             config = record.data.decode(errors="replace")
-        finished = finished or isinstance(record, Footer)
-    decoder = decoder or _Decoder(path, metadata)
+        finished = isinstance(record, Footer)
+    states, inputs, _ = described or _describe(path, metadata)
+    steps, plans = messages[STEP], messages[PLAN]
     return Run(
         path=path,
         finished=finished and RECOVERED not in metadata,
-        state_names=decoder.states,
-        input_names=decoder.inputs,
-        statuses=tuple(_STATUSES[step.status] for step in messages[STEP]),
-        **_steps(messages[STEP], decoder.states, decoder.inputs),
-        **_plans(path, messages[PLAN], messages[STEP], decoder.states, decoder.inputs),
-        channels={channel.topic: (counts[i], names.get(channel.schema_id, "")) for i, channel in channels.items()},
+        state_names=states,
+        input_names=inputs,
+        statuses=tuple(_STATUSES[step.status] for step in steps),
+        **_steps(steps, states, inputs),
+        **_plans(path, plans, steps, states, inputs),
+        channels={channel.topic: (counts[i], schemas.get(channel.schema_id, "")) for i, channel in channels.items()},
         metadata=metadata,
         config=config,
         problems=dict(messages[QP]),
     )
 
 
-class _Decoder:
-    """Parses messages, and checks that they fit the names of states and inputs.
+class _Described(NamedTuple):
+    """What the metadata say of the messages."""
+
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    classes: dict[str, Any]
+
+
+def _describe(path: Path, metadata: dict[str, dict[str, str]]) -> _Described:
+    """Finds the names of states and inputs, and builds the classes of the messages.
 
     Raises:
         RecordingError: The metadata do not tell of a run.
     """
+    about = metadata.get("run", {})
+    if not {"state_names", "input_names"} <= about.keys():
+        raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
+    try:
+        states, inputs = (_messages.check_names(key, about[key].split()) for key in ("state_names", "input_names"))
+        classes = _messages.message_classes(_messages.descriptor(states, inputs, "bytes"))
+    except SettingError as error:
+        raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
+    return _Described(states, inputs, classes)
 
-    def __init__(self, path: Path, metadata: dict[str, dict[str, str]]):
-        self._path, about = path, metadata.get("run", {})
-        if not {"state_names", "input_names"} <= about.keys():
-            raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
-        try:
-            self.states = _messages.check_names("state_names", about["state_names"].split())
-            self.inputs = _messages.check_names("input_names", about["input_names"].split())
-            described = _messages.descriptor(self.states, self.inputs, _messages.READ)
-            classes = _messages.message_classes(described)
-        except SettingError as error:
-            raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
-        self._classes = {topic: classes[name.removeprefix("gpmpc.")] for topic, name in _messages.TOPICS.items()}
 
-    def decode(self, topic: str, record: Message) -> Any:
-        """Parses a message; of a quadratic program it returns its step's number k and itself.
+def _decode(path: Path, topic: str, described: _Described, record: Message) -> Any:
+    """Parses a message; of a quadratic program it returns its step's number k and itself.
 
-        Raises:
-            RecordingError: It does not parse, or its arrays do not belong together.
-        """
-        n = len(self.states)
-        try:
-            message = self._classes[topic].FromString(record.data)
-            if topic == QP:
-                return message.k, _problem(message)
-            if topic == STEP:
-                _numbers(message, "belief_covariance", n, n)
-                if not 0 <= message.status < len(Status):
-                    raise ValueError(f"status {message.status} is unknown")
-            elif not message.stages:
+    Raises:
+        RecordingError: It does not parse, or its arrays do not belong together.
+    """
+    n = len(described.states)
+    try:
+        message = described.classes[TOPICS[topic]].FromString(record.data)
+        if topic == STEP:
+            _numbers(message, "belief_covariance", n, n)
+            if not 0 <= message.status < len(_STATUSES):
+                raise ValueError(f"status {message.status} is unknown")
+        elif topic == PLAN:
+            _numbers(message, "covariances", len(message.stages), n, n)
+            if not message.stages:
                 raise ValueError("it has no stage")
-            else:
-                _numbers(message, "covariances", len(message.stages), n, n)
-        except (DecodeError, ValueError) as error:
-            raise RecordingError(f"{self._path}: message {record.sequence} of {topic} is damaged: {error}") from error
-        return message
+        return (message.k, _problem(message)) if topic == QP else message
+    except (DecodeError, ValueError) as error:
+        raise RecordingError(f"{path}: message {record.sequence} of {topic} is damaged: {error}") from error
 
 
 def _numbers(message: Any, field: str, *shape: int) -> Array:
@@ -250,24 +255,33 @@ def _table(messages: Sequence[Any], fields: tuple[str, ...]) -> Array:
     return np.array([numbers(message) for message in messages], dtype=float).reshape(len(messages), len(fields))
 
 
-def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Any]:
-    n = len(states)
-    groups = {"references": "reference", "states": "state", "measured": "measured", "innovations": "innovation"}
-    arrays = {name: _table([getattr(step, group) for step in steps], states) for name, group in groups.items()}
-    integers = {"steps": "k", "iterations": "iterations", "active_set_sizes": "active_set_size"}
-    integers |= {"gp_sizes": "gp_size", "gp_versions": "gp_version"}
-    arrays |= {name: np.array([getattr(step, field) for step in steps], int) for name, field in integers.items()}
+def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Array]:
+    def column(field: str, kind: type) -> Array:
+        return np.array([getattr(step, field) for step in steps], dtype=kind)
+
+    def table(field: str, names: tuple[str, ...]) -> Array:
+        return _table([getattr(step, field) for step in steps], names)
+
+    bounds = np.tile([[-np.inf], [np.inf]], len(inputs))
     if steps and steps[0].HasField("input_lower"):  # they are equal in all steps
         bounds = _table([steps[0].input_lower, steps[0].input_upper], inputs)
-    else:
-        bounds = np.tile([[-np.inf], [np.inf]], len(inputs))
-    return arrays | {
-        "times": np.array([step.time for step in steps], dtype=float),
-        "inputs": _table([step.input for step in steps], inputs),
+    covariances = np.frombuffer(b"".join(step.belief_covariance for step in steps))
+    return {
+        "times": column("time", float),
+        "steps": column("k", int),
+        "references": table("reference", states),
+        "states": table("state", states),
+        "measured": table("measured", states),
+        "innovations": table("innovation", states),
+        "inputs": table("input", inputs),
         "input_bounds": bounds,
-        "belief_covariances": np.frombuffer(b"".join(s.belief_covariance for s in steps)).reshape(len(steps), n, n),
-        "timings": _table([step.timing for step in steps], _messages.TIMING),
-        "failed": np.array([step.failed for step in steps], dtype=bool),
+        "belief_covariances": covariances.reshape(len(steps), len(states), len(states)),
+        "iterations": column("iterations", int),
+        "active_set_sizes": column("active_set_size", int),
+        "timings": table("timing", TIMING),
+        "gp_sizes": column("gp_size", int),
+        "gp_versions": column("gp_version", int),
+        "failed": column("failed", bool),
     }
 
 
@@ -287,14 +301,13 @@ def _plans(path: Path, plans: list, steps: list, states: tuple[str, ...], inputs
     arrays = {f"plan_{name}": np.full((len(steps), *shape), np.nan) for name, shape in shapes.items()}
     rows = {key: row for row, key in enumerate(_numbered(steps))}
     for key, plan in zip(_numbered(plans), plans, strict=True):
-        if (row := rows.get(key)) is None:
+        row, stages = rows.get(key), list(plan.stages)
+        if row is None:
             continue  # the step is lost
-        stages = list(plan.stages)
-        length = len(stages)
-        arrays["plan_means"][row, :length] = _table([stage.mean for stage in stages], states)
-        arrays["plan_stds"][row, :length] = _table([stage.std for stage in stages], states)
-        arrays["plan_inputs"][row, : length - 1] = _table([stage.input for stage in stages[:-1]], inputs)
-        arrays["plan_covariances"][row, :length] = _numbers(plan, "covariances", length, n, n)
+        arrays["plan_means"][row, : len(stages)] = _table([stage.mean for stage in stages], states)
+        arrays["plan_stds"][row, : len(stages)] = _table([stage.std for stage in stages], states)
+        arrays["plan_inputs"][row, : len(stages) - 1] = _table([stage.input for stage in stages[:-1]], inputs)
+        arrays["plan_covariances"][row, : len(stages)] = _numbers(plan, "covariances", len(stages), n, n)
     return arrays
 
 

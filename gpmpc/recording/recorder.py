@@ -13,20 +13,21 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import foxglove
 from foxglove.channels import LogChannel
 from foxglove.mcap import MCAPWriteOptions
+from foxglove.messages import Log, LogLevel, Timestamp
 
 from gpmpc.exceptions import RecordingError, check_number
 from gpmpc.provenance import provenance
-from gpmpc.recording._messages import RecordedSystem, units_by_field
+from gpmpc.recording._encoding import Encoder, PackedStep, StepCopy, pack
+from gpmpc.recording._messages import RecordedSystem
 from gpmpc.recording._records import CONFIG, LARGEST
 from gpmpc.recording._scene import Scene
-from gpmpc.recording._steps import Encoder, Packed, failure_log, pack, unpack
 from gpmpc.step import Step
 
 _INTERVAL = 1.0  # [s] after which the next step ends a chunk
@@ -67,38 +68,38 @@ class McapRecorder:
     ):
         check_number("start_time_ns", start_time_ns, least=0, whole=True, unit="[ns]")
         check_number("chunk_size", chunk_size, least=1, whole=True, unit="[bytes]")
-        states, inputs = system.state_names, system.input_names
         about = _flat(provenance() | {"host": platform.node()} | dict(metadata or {}))
-        about |= {"state_names": " ".join(states), "input_names": " ".join(inputs)}
-        units = units_by_field(system.units, states, inputs)
+        about |= {"state_names": " ".join(system.state_names), "input_names": " ".join(system.input_names)}
         frames = {"positions": system.frame, "z axis": "down" if system.z_down else "up", "display": "z axis up"}
         config = config if isinstance(config, str) else json.dumps(config, indent=2, default=str)
 
         self.path, self.address = Path(path), None
-        self._n, self._m = len(states), len(inputs)
+        self._n, self._m = len(system.state_names), len(system.input_names)
         self._start, self._record_problems, self._chunk_size = start_time_ns, record_problems, chunk_size
         self._encoder = Encoder(system)
-        self._waiting: list[Packed] = []
+        self._waiting: list[PackedStep] = []
         self._bytes, self._steps, self._last = 0, 0, time.perf_counter()
         self._error: str | None = None
+        self._failed = False
         self._server: Any = None
-        self._file = _File(self.path)
+        self._sink = _Sink(self.path)
         self._context = context = foxglove.Context()  # its channels live as long as it does
         options = MCAPWriteOptions(
             profile="gpmpc",
-            chunk_size=None,  # ``_flush`` ends them
+            chunk_size=None,  # ``_end_chunk`` ends them
             disable_seeking=True,  # a chunk is written in one piece
             compression_threads=0,
             compression_level=1,
         )
-        self._writer = foxglove.open_mcap(self._file, context=context, writer_options=options)
-        with self._writing(sync=True):
-            for name, pairs in (("run", about), ("units", units), ("frames", frames)):
-                self._writer.write_metadata(name, pairs)
-            stamps = {"log_time": start_time_ns, "create_time": start_time_ns}
-            self._writer.attach(name=CONFIG, media_type="application/yaml", data=config.encode(), **stamps)
+        self._writer = foxglove.open_mcap(self._sink, context=context, writer_options=options)
+        for name, pairs in (("run", about), ("units", system.field_units), ("frames", frames)):
+            self._writer.write_metadata(name, pairs)
+        stamps = {"log_time": start_time_ns, "create_time": start_time_ns}
+        self._writer.attach(name=CONFIG, media_type="application/yaml", data=config.encode(), **stamps)
+        self._writer.flush()
+        self._save(sync=True)
         self._channels, self._log = self._encoder.channels(context), LogChannel("/log", context=context)
-        self._scene = Scene(context, states, system.frame, system.z_down)
+        self._scene = Scene(context, system)
         if live:
             self._serve(context)
 
@@ -124,8 +125,7 @@ class McapRecorder:
         if self._server is not None:
             self._serialise()
         if self._bytes > self._chunk_size or time.perf_counter() - self._last > _INTERVAL:
-            with self._writing():
-                self._serialise()
+            self._end_chunk()
 
     def close(self, outcome: str = "complete") -> None:
         """Writes what waits and finishes the file.
@@ -136,16 +136,14 @@ class McapRecorder:
         Raises:
             RecordingError: It could not be written; the file is left unfinished.
         """
-        if self._file.error is not None:
+        if self._failed:
             raise RecordingError(self._error)
         if self._error is not None:
             return
-        with self._writing():
-            self._serialise()
-        with self._writing(sync=True):
-            self._writer.write_metadata("end", {"steps": str(self._steps), "outcome": outcome})
-        with self._writing(sync=True, last=True):
-            pass
+        self._end_chunk()
+        self._writer.write_metadata("end", {"steps": str(self._steps), "outcome": outcome})
+        self._writer.close()
+        self._save(sync=True)
         self._end("the recording is closed")
 
     def __enter__(self) -> "McapRecorder":
@@ -158,45 +156,42 @@ class McapRecorder:
         with contextlib.suppress(RecordingError):  # most likely the same error
             self.close(f"{kind.__name__}: {error}")  # a run that ended in an error has been recorded up to there
 
+    def _end_chunk(self) -> None:
+        self._serialise()
+        self._writer.flush()
+        self._save()
+
     def _serialise(self) -> None:
         """Logs the steps that wait: into the open chunk, and to viewers."""
-        if not self._waiting:
-            return
-        steps = [unpack(packed) for packed in self._waiting]
-        stamps = [self._start + round(kept.step.time * 1e9) for kept in steps]
-        for topic, row, message in self._encoder.encode(steps):
-            self._channels[topic].log(message, log_time=stamps[row])
-        self._scene.log(steps, stamps)
-        for kept, nanoseconds in zip(steps, stamps, strict=True):
-            if kept.step.failed or not kept.status.solved:
-                self._log.log(failure_log(kept, nanoseconds), log_time=nanoseconds)
+        for copy in map(StepCopy, self._waiting):
+            stamp = self._start + round(copy.step.time * 1e9)
+            for topic, message in self._encoder.encode(copy):
+                self._channels[topic].log(message, log_time=stamp)
+            self._scene.log(copy, stamp)
+            if copy.step.failed or not copy.status.solved:
+                self._log.log(_failure(copy, stamp), log_time=stamp)
         self._steps += len(self._waiting)
         self._waiting.clear()
 
-    @contextlib.contextmanager
-    def _writing(self, sync: bool = False, last: bool = False) -> Iterator[None]:
-        """Ends the chunk, or the whole file: what it holds is safe from now on if this process dies.
-
-        Args:
-            sync: Put it on the disk as well.
-            last: Finish the file.
+    def _save(self, sync: bool = False) -> None:
+        """Saves what was written: it is safe from now on if this process dies, with ``sync`` if the machine does.
 
         Raises:
             RecordingError: It could not be written.
         """
-        with self._file.accepting(sync):
-            yield
-            self._writer.close() if last else self._writer.flush()
-        if self._file.error is not None:
-            self._end(f"the recording stopped and is unfinished: {self._file.error.strerror}")
-            raise RecordingError(self._error) from self._file.error
+        try:
+            self._sink.save(sync)
+        except OSError as error:
+            self._end(f"the recording stopped and is unfinished: {error.strerror}")
+            self._failed = True
+            raise RecordingError(self._error) from error
         self._bytes, self._last = 0, time.perf_counter()
 
     def _end(self, reason: str) -> None:
         self._error = f"{self.path}: {reason}"
         if self._server is not None:
             self._server.stop()
-        self._file.close()
+        self._sink.close()
 
     def _serve(self, context: foxglove.Context) -> None:
         try:
@@ -206,19 +201,17 @@ class McapRecorder:
         self.address = f"ws://127.0.0.1:{self._server.port}"
 
 
-class _File:
-    """The file that the library writes to; takes nothing after an error, nor outside of ``accepting``.
+class _Sink:
+    """Collects what the library writes until it is saved in one piece.
 
-    (A writer that is not closed adds a footer when it is collected, and the file would look finished.)
+    (A writer that is not closed adds a footer when it is collected: what is never saved does no harm.)
 
     Raises:
         RecordingError: The file cannot be written, or another process is writing it.
     """
 
     def __init__(self, path: Path):
-        self.error: OSError | None = None
-        self._position = self._whole = 0
-        self._accepts = True
+        self._data, self._position, self._saved = bytearray(), 0, 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o666)
@@ -231,31 +224,9 @@ class _File:
             os.close(self._descriptor)
             raise RecordingError(f"{path}: another process is recording to this file") from error
 
-    @contextlib.contextmanager
-    def accepting(self, sync: bool) -> Iterator[None]:
-        """Takes what is written; where that fails, the file is cut to what it held before."""
-        self._accepts = True
-        try:
-            yield
-            if sync and self.error is None:
-                os.fsync(self._descriptor)
-        except OSError as error:
-            self.error = error
-        finally:
-            self._accepts = False
-            if self.error is None:
-                self._whole = self._position
-            else:
-                os.ftruncate(self._descriptor, self._whole)
-
     def write(self, data: bytes | bytearray) -> int:
-        """Writes all of the data."""
-        left = memoryview(data)
-        try:
-            while left and self._accepts and self.error is None:
-                left = left[os.write(self._descriptor, left) :]
-        except OSError as error:
-            self.error = error
+        """Takes all of the data."""
+        self._data += data
         self._position += len(data)
         return len(data)
 
@@ -264,11 +235,41 @@ class _File:
         return self._position
 
     def flush(self) -> None:
-        """Does nothing: nothing is held back."""
+        """Does nothing: see ``save``."""
+
+    def save(self, sync: bool) -> None:
+        """Writes what was collected, and puts it on the disk if asked to; where that fails, nothing of it stays.
+
+        Raises:
+            OSError: It failed.
+        """
+        left, self._data = memoryview(self._data), bytearray()
+        size = len(left)
+        try:
+            while left:
+                left = left[os.write(self._descriptor, left) :]
+            if sync:
+                os.fsync(self._descriptor)
+        except OSError:
+            os.ftruncate(self._descriptor, self._saved)
+            raise
+        self._saved += size
 
     def close(self) -> None:
         """Lets other processes write the file."""
         os.close(self._descriptor)
+
+
+def _failure(copy: StepCopy, nanoseconds: int) -> Log:
+    """Says what went wrong at a step."""
+    status, failed = copy.status, copy.step.failed
+    policy = "; the policy for failures chose the input" if failed else ""
+    return Log(
+        timestamp=Timestamp(sec=nanoseconds // 10**9, nsec=nanoseconds % 10**9),
+        level=LogLevel.Error if failed else LogLevel.Warning,
+        name="gpmpc",
+        message=f"step {copy.step.k}: {status.name}: {status.advice}{policy}",
+    )
 
 
 def _flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

@@ -169,9 +169,7 @@ def transitions(rows, noise=1e-2, seed=0):
     return Transitions(x, u, moved + noise * torch.randn(rows, 2, generator=generator))
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"method": "fitc"}, {"learn_locations": False}, {"predicts": "difference", "scaling": standardize}]
-)
+@pytest.mark.parametrize("settings", [{}, {"method": "fitc"}, {"predicts": "difference", "scaling": standardize}])
 def test_training_sums_up_many_transitions_in_a_few_points(settings, caplog):
     data, held_out = transitions(600), transitions(200, noise=0.0, seed=1)
     trainer = SparseTrainer(inducing=40, subset=50, restarts=0, iterations=15, **settings)
@@ -262,7 +260,7 @@ def test_by_default_more_is_learned_than_noise_whatever_the_seed(d, noise, seed)
     assert explained(SparseTrainer(inducing=50).fit(x, y, 0, "value", seed).posterior, x, y) > 0.6
 
 
-@pytest.mark.parametrize("settings", [{}, {"method": "fitc"}, {"learn_locations": False}, {"scaling": standardize}])
+@pytest.mark.parametrize("settings", [{}, {"method": "fitc"}, {"scaling": standardize}])
 def test_no_iterations_leave_everything_where_it_began(settings):
     x, y = sines(300, 3, 0.1, seed=1)
     training = SparseTrainer(inducing=20, iterations=0, **settings).fit(x, y, 0, "value")

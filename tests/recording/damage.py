@@ -231,7 +231,7 @@ def renumber(data, rng):
 
 def edit_message(data, rng):
     """Fields of a message that no longer belong together."""
-    classes = _messages.message_classes(_messages.descriptor(runs.STATES, runs.INPUTS, _messages.READ))
+    classes = _messages.message_classes(_messages.descriptor(runs.STATES, runs.INPUTS, "bytes"))
 
     def change(found):
         messages = [i for i, (opcode, content) in enumerate(found) if opcode == MESSAGE and content[0] in (1, 2, 3)]

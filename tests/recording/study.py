@@ -103,12 +103,14 @@ def examine(path, original):
 
 def study(recording, seed, first, end):
     original, data = read_run(recording), recording.read_bytes()
+    replay(original, int(original.steps[0]))  # compiles
     kinds = (*damage.DAMAGES, *damage.DAMAGES, *damage.EDITS)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "damaged.mcap"
         path.write_bytes(data)
-        bare = examine(path, original)["megabytes"]  # imports and compiles
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        bare = examine(path, original)["megabytes"]  # imports
+        mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()  # libraries take much
+        resource.setrlimit(resource.RLIMIT_AS, (mapped + MEMORY, resource.RLIM_INFINITY))
         for i in range(first, end):
             rng = np.random.default_rng([seed, i])
             kind = kinds[i % len(kinds)]

@@ -77,7 +77,7 @@ def test_a_viewer_receives_every_step_at_once_and_the_file_holds_it_as_well(reco
     steps, seen, rng = [], {"/step": [], "/plan/tube": []}, np.random.default_rng(0)
     with Viewer(recorder.address) as viewer:
         topics = viewer.subscribe(*seen)
-        while len(seen["/step"]) < 10 and len(steps) < 200:
+        while min(map(len, seen.values())) < 10 and len(steps) < 200:
             steps.append(runs.make_step(len(steps), rng))
             recorder.record(steps[-1])
             while select.select([viewer.stream], [], [], 0.1)[0]:  # at first the subscription is on its way
@@ -85,9 +85,10 @@ def test_a_viewer_receives_every_step_at_once_and_the_file_holds_it_as_well(reco
                 if isinstance(message, bytes) and message[0] == 1:
                     seen[topics[struct.unpack_from("<I", message, 1)[0]]].append(message[13:])
     received = [classes["Step"].FromString(message) for message in seen["/step"]]
-    assert [step.k for step in received] == list(range(len(steps) - 10, len(steps)))
-    assert [step.state.vx for step in received] == [step.state[1] for step in steps[-10:]]
-    assert len(seen["/plan/tube"]) == 10
+    first = received[0].k
+    assert [step.k for step in received] == list(range(first, first + len(received)))
+    assert [step.state.vx for step in received] == [steps[step.k].state[1] for step in received]
+    assert len(seen["/plan/tube"]) >= 10
     recorder.close()
     assert read_run(recorder.path).steps.tolist() == list(range(len(steps)))
 

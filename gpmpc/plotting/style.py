@@ -1,0 +1,62 @@
+"""Sets how every figure looks: colours, lines, grid, type, names with units, legends below the axes, titles.
+
+The colours are those of Okabe and Ito (2008), which people who are colour-blind tell apart; lines differ in their
+dashes as well, so that a black and white print can be read.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import matplotlib as mpl
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+BLUE, VERMILION, GREEN, PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
+ORANGE, SKY, BLACK, GREY = "#e69f00", "#56b4e9", "#000000", "0.45"
+COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK, GREY)
+DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.6)), (0, (6, 2, 1.2, 2)), (0, (3, 3)), (0, (8, 2)))
+DASHED = (0, (4, 3))  # of references and bounds
+STYLE: Any = {
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.prop_cycle": cycler(color=COLOURS),
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlesize": "medium",
+    "figure.titlesize": "medium",
+    "grid.color": "0.92",
+    "legend.frameon": False,
+    "lines.linewidth": 1.4,
+}
+NAMES = {
+    "z": "z, downwards",
+    "phi": "roll",
+    "theta": "pitch",
+    "psi": "yaw",
+    "U1": "thrust U1",
+    "ux": "direction ux",
+    "uy": "direction uy",
+}
+
+styled = mpl.rc_context(STYLE)  # a decorator of what makes a figure
+
+
+def name_of(name: str, unit: str = "", z_down: bool = True) -> str:
+    """Returns the full name of a state or input with its unit, such as ``z, downwards [m]``."""
+    full = name if name == "z" and not z_down else NAMES.get(name, name)
+    return f"{full} [{unit}]" if unit not in ("", "1", "?") else full
+
+
+def legend_below(figure: Figure, axes: Iterable[Axes]) -> None:
+    """Puts one legend for all axes below them, each label once, in as many columns as the width holds."""
+    found = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    add_legend(figure, list(found.values()), list(found))
+
+
+def add_legend(figure: Figure, handles: Sequence[Any], labels: Sequence[str], **options: Any) -> None:
+    """Puts a legend below all axes, in as many columns as the figure's width holds."""
+    if labels:
+        characters = 11.0 * figure.get_figwidth()  # that fit into a line
+        columns = max(1, min(len(labels), int(characters / (max(map(len, labels)) + 6))))
+        figure.legend(handles, labels, loc="outside lower center", ncols=columns, **options)
