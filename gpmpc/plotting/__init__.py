@@ -4,6 +4,7 @@ Every function returns a ``Figure`` made without pyplot, so nothing global is to
 """
 
 from gpmpc.plotting.animation import animate, ffmpeg_exists
+from gpmpc.plotting.consistency import innovations_figure
 from gpmpc.plotting.image import png
 from gpmpc.plotting.quality import quality
 from gpmpc.plotting.recorded import inputs_figure, timing_figure, tracking_figure
@@ -18,6 +19,7 @@ __all__ = [
     "calibration_figure",
     "error_over_size",
     "ffmpeg_exists",
+    "innovations_figure",
     "inputs_figure",
     "over_settings",
     "over_variable",
