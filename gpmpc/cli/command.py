@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 import gpmpc
-from gpmpc.cli import completion, log, new, reports, study, tune, warmup
+from gpmpc.cli import completion, learn, log, new, reports, study, tune, warmup
 from gpmpc.cli.arguments import Parser, Result
 from gpmpc.cli.configuration import compose, help_text, settings
 from gpmpc.cli.mistakes import explain, nearest
@@ -100,6 +100,11 @@ COMMANDS = {
     ),
     "plot": Command(
         "Draws a recorded flight as figures and an animation", reports.plot, add_arguments=reports.add_plot_arguments
+    ),
+    "learn": Command(
+        "Learns a model from logs, judges it on held-out runs, and writes it with a report and a card",
+        learn.learn,
+        add_arguments=learn.add_arguments,
     ),
     "log": Command(
         "Shows, rescues or exports a recording, or writes a Foxglove layout for it",
