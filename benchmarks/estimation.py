@@ -33,7 +33,7 @@ from gpmpc.estimation import (
 )
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
-from gpmpc.models import Affine, DelayedModel, ResidualModel
+from gpmpc.models import Affine, DelayedModel, DisturbedModel, ResidualModel
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
@@ -89,6 +89,8 @@ class Loop(NamedTuple):
         noise: Factor of the noise of the plant.
         task: The reference, ``"swing"`` or ``"steps"``.
         against: The loop that the error is compared with.
+        drift: Standard deviation by which an angular acceleration, estimated beside the state, may change in a step
+            [rad/s per step]; 0 for none.
     """
 
     delay: int = 0
@@ -99,6 +101,7 @@ class Loop(NamedTuple):
     noise: float = 1.0
     task: str = "swing"
     against: str = "state measured"
+    drift: float = 0.0
 
 
 def all_states(rng: np.random.Generator) -> Array:
@@ -134,6 +137,7 @@ LOOPS = {
     FULL: Loop(measures=all_states, filtered=True),
     "angle only, filtered": Loop(measures=angle_only, filtered=True, against=FULL),
     "20 % lost, filtered": Loop(measures=one_in_five_lost, filtered=True, against=FULL),
+    "angle only, with a disturbance": Loop(measures=angle_only, filtered=True, against=FULL, drift=1e-3),
     f"angle only, {LATE}": Loop(DELAY, DELAY, angle_only, True, True, against=FULL),
 }
 
@@ -172,14 +176,20 @@ def fly(model: ResidualModel, loop: Loop, steps: int, seed: int) -> Flown:
     problem = Problem(cost, Box([-LIMIT], [LIMIT]))
     propagator = Linearization(process_noise=True)
     controller = GPMPC(planned, propagator, problem, HORIZON, [0.0])
-    sensor = Measurement.of_states(2, [0, 1], SENSOR.tolist())
-    kalman = KalmanFilter.extended(model, sensor)
+    estimated: Any = model
+    if loop.drift:
+        effect = torch.tensor([[STEP], [1.0]], dtype=torch.float64)
+        estimated = DisturbedModel(model, effect, [loop.drift])
+    sensor = Measurement.of_states(estimated.state_dim, [0, 1], SENSOR.tolist())
+    kalman = KalmanFilter.extended(estimated, sensor)
     references = reference_states(loop.task, steps + HORIZON + 20)
     lead = delayed.lead if delayed is not None and not loop.augmented else 0
     x = references[0].copy()
     queue = deque([np.zeros(1)] * loop.delay, loop.delay)
     believed = deque([np.zeros(1)] * loop.assumed, loop.assumed)
     belief = Gaussian(torch.from_numpy(x.copy()), torch.diag(torch.tensor([0.01, 0.1], dtype=torch.float64) ** 2))
+    if loop.drift:
+        belief = estimated.augmented(belief, [5 * loop.drift])
     decision, errors, decisions, filters, wrong, doubts = None, [], [], [], [], []
     for k in range(steps):
         begin = perf_counter()
@@ -189,10 +199,10 @@ def fly(model: ResidualModel, loop: Loop, steps: int, seed: int) -> Flown:
             measured = x + rng.normal(0, SENSOR) + loop.measures(rng)
             belief = kalman.update(belief, measured).belief if loop.filtered else Gaussian.certain(measured)
         at = perf_counter()
-        start = belief
+        start = Gaussian(belief.mean[:2], belief.covariance[:2, :2])
         if delayed is not None:
             pending = np.array(believed)
-            start = delayed.augmented(belief, pending) if loop.augmented else delayed.ahead(propagator, belief, pending)
+            start = delayed.augmented(start, pending) if loop.augmented else delayed.ahead(propagator, start, pending)
         window = references[k + lead : k + lead + HORIZON + 1]
         reference = Reference(np.hstack([window, np.zeros((HORIZON + 1, extra))]))
         decision = controller.control(start, reference, decision)
@@ -202,8 +212,9 @@ def fly(model: ResidualModel, loop: Loop, steps: int, seed: int) -> Flown:
         queue.append(decision.input)
         believed.append(decision.input)
         if k % 50 == 49:
-            wrong.append(estimation_errors(belief, x).numpy())
-            doubts.append(belief.covariance.numpy())
+            state = Gaussian(belief.mean[:2], belief.covariance[:2, :2])
+            wrong.append(estimation_errors(state, x).numpy())
+            doubts.append(state.covariance.numpy())
         again = perf_counter()
         if loop.filtered:
             belief = kalman.predict(belief, now)

@@ -40,7 +40,7 @@ def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
         (["tables", "model.restart=3"], "unknown setting 'model.restart' (did you mean 'model.restarts'?)"),
         (
             ["tables", "trajectory=lorens"],
-            "trajectory: no such option 'lorens'; available are elliptical, hover, lorenz",
+            "trajectory: no such option 'lorens'; available are elliptical, goal, hover, lorenz",
         ),
         (["tables", "data=paper"], "data.folder: this setting has no default"),
         (["tables", "data=paper", "data.folder=nowhere"], "nowhere: no such folder"),
