@@ -151,8 +151,7 @@ class StageLinearizer:
     def _full(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
         belief, input = self._tensors(states[:, : self._n], covariances, inputs)
         local = linearize_belief(self.propagator, self.model, belief, input)
-        after = self.state(to_array(local.next.mean), to_array(local.next.covariance))
-        return after, to_array(local.A), to_array(local.B), np.zeros_like(covariances)
+        return *map(to_array, (local.next_state, local.A, local.B)), np.zeros_like(covariances)
 
     def _diagonal(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
         n = self._n

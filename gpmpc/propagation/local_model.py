@@ -33,13 +33,15 @@ class LocalModel:
         A: (*batch, p, p), p = n + n^2.
         B: (*batch, p, m).
         c: (*batch, p).
-        next: The next belief itself, F(s, u).
+        next: The next belief itself.
+        next_state: It as an extended state, F(s, u) (*batch, p).
     """
 
     A: Tensor
     B: Tensor
     c: Tensor
     next: Gaussian
+    next_state: Tensor
 
     def __call__(self, s: Tensor, input: Tensor) -> Tensor:
         """The next extended state (*batch, p)."""
@@ -81,14 +83,14 @@ def linearize(propagator: Propagator, model: Any, belief: Gaussian, input: Tenso
     by_root = (by_covariance @ twice[..., None, :, :]).reshape(*batch, n, n, n * n)
     # In the basis U of the next root, entry ij of its derivative is that of dSigma+ over r_i + r_j.
     total = r[..., :, None] + r[..., None, :]
-    inverse = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
+    inverse = (total > 0) / np.maximum(total, np.finfo(float).tiny)
     change = _congruence(U.mT, np.concatenate([by_mean, by_root, by_input], axis=-1))
     lower = _congruence(U, change * inverse[..., None]).reshape(*batch, n * n, -1)
     A = np.concatenate([np.concatenate([of_mean, mean_by_root], axis=-1), lower[..., :p]], axis=-2)
     B = np.concatenate([mean_by_input, lower[..., p:]], axis=-2)
     c = s_next - (A @ s[..., None] + B @ u[..., None])[..., 0]
-    A, B, c = tensors_for(model, A, B, c)
-    return LocalModel(A, B, c, moved.belief)
+    A, B, c, after = tensors_for(model, A, B, c, s_next)
+    return LocalModel(A, B, c, moved.belief, after)
 
 
 def _congruence(U: Array, X: Array) -> Array:

@@ -1,0 +1,54 @@
+"""Holds a cart as near to a wall as a probability of 95 % allows, on a learned model, while gusts push it.
+
+Run as `python examples/wall.py FOLDER` (the present folder by default); it writes wall.png there.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from gpmpc.gp import Transitions, standardize, train
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.propagation import Linearization
+from gpmpc.simulation import Noise, closed_loop
+from gpmpc.systems import System, step
+
+WALL, STEPS, GUSTS = 1.0, 400, Noise(process=[0.005, 0.05])  # [m], [-], standard deviations a step [m, m/s]
+
+
+class Cart:
+    """A cart with drag that is pushed along a rail."""
+
+    state_names, input_names = ("position", "velocity"), ("push",)
+
+    def derivative(self, x, u):
+        """d/dt of the state."""
+        return [x[1], 2.0 * u[0] - 0.5 * x[1] - 0.2 * x[1] ** 3]
+
+
+cart, rng = System(Cart(), time_step=0.1, units={"position": "m", "velocity": "m/s"}), np.random.default_rng(0)
+states, pushes = rng.uniform([-1.5, -2.0], [1.5, 2.0], (300, 2)), rng.uniform(-2, 2, (300, 1))
+after = [step(cart, x, u) for x, u in zip(states, pushes, strict=True)] + rng.normal(0, GUSTS.process, (300, 2))
+gp = train(Transitions(states, pushes, after), predicts="difference", scaling=standardize).posterior
+
+flights = {}
+for name, probability in (("mean behind the wall", None), ("95 % of what may come", 0.95)):
+    behind = Box(upper=[WALL, np.inf], probability=probability)
+    problem = Problem(Tracking([10.0, 0.1], [0.1]), inputs=Box([-2.0], [2.0]), constraints=[behind])
+    controller = GPMPC(gp, Linearization(process_noise=True), problem, horizon=10, initial_input=[0.0])
+    goal = np.tile([WALL, 0.0], (STEPS + 11, 1))
+    flights[name] = closed_loop(cart, controller, goal, [-1.0, 0.0], STEPS, noise=GUSTS)
+    beyond = (flights[name].states[1:, 0] > WALL).mean()
+    print(f"{name:24} beyond the wall in {beyond:4.1%} of the steps")
+
+axis = (figure := Figure(figsize=(7, 3.4), layout="constrained")).subplots()
+for (name, flight), color in zip(flights.items(), ("#d55e00", "#0072b2"), strict=True):
+    axis.plot(flight.times, flight.states[:, 0], color=color, linewidth=1, label=name)
+axis.axhline(WALL, color="black", linewidth=2, label="wall")
+axis.set(xlabel="time [s]", ylabel="position [m]", ylim=(0.9, 1.04), title="A cart at a wall, gusts of 0.05 m/s a step")
+axis.spines[["top", "right"]].set_visible(False)
+axis.legend(frameon=False, loc="lower right", ncols=3)
+figure.savefig(Path(sys.argv[1] if len(sys.argv) > 1 else ".") / "wall.png", dpi=150)
