@@ -74,7 +74,7 @@ def spoil(table: pandas.DataFrame, rng: np.random.Generator) -> pandas.DataFrame
 
 def main(folder: Path) -> None:
     """Writes the log, learns from two flights and judges on the third."""
-    for number, flight in enumerate(simulate_flights(3, 2500), start=1):
+    for number, flight in enumerate(simulate_flights(3, 1500), start=1):
         spoil(flight, np.random.default_rng(number)).to_csv(folder / f"flight_{number}.csv", index=False)
 
     # With a log of one's own it starts here.
@@ -83,7 +83,7 @@ def main(folder: Path) -> None:
     for finding in log.findings:
         print(f"  {finding.run}: {finding.kind}: {finding.text}")
     train, held_out = log.split(["flight_3"])
-    learned = learn(train, points=100)
+    learned = learn(train, points=60)
     judgement = judge(learned, held_out, train)
     print(next(candidate.name for candidate in learned.candidates if candidate.chosen))
     for name, value, error in learned.fit.to_rows()[:3]:

@@ -75,7 +75,7 @@ class SolverFailure(GpmpcError, RuntimeError):
 
 
 class Diverged(GpmpcError, ArithmeticError):
-    """A simulated system left the finite numbers.
+    """A simulated system left the finite numbers, or its simulator ended the episode.
 
     Attributes:
         step: The time step (from 0) that it did so in.

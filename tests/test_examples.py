@@ -37,3 +37,14 @@ def test_the_example_of_the_readme_swings_a_pendulum_up(tmp_path, monkeypatch, c
     assert printed == "upright after 3.0 s"
     assert f"`{printed}`" in readme
     assert (tmp_path / "swing_up.png").exists()
+
+
+def test_the_example_of_a_log_learns_from_its_own_files_and_leaves_a_figure(tmp_path, capsys):
+    names = runpy.run_path(str(EXAMPLES / "own_log.py"))
+    names["main"](tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {*(f"flight_{i}.csv" for i in (1, 2, 3)), "own_log.png"}
+    printed = capsys.readouterr().out
+    assert "gaps, up to 0.3" in printed
+    assert "held value" in printed
+    assert "motor torque" in printed
+    assert (tmp_path / "own_log.png").stat().st_size > 10_000

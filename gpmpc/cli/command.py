@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 import gpmpc
-from gpmpc.cli import completion, log, reports, study, tune, warmup
+from gpmpc.cli import completion, learn, log, new, reports, study, tune, warmup
 from gpmpc.cli.arguments import Parser, Result
 from gpmpc.cli.configuration import compose, help_text, settings
 from gpmpc.cli.mistakes import explain, nearest
@@ -88,6 +88,11 @@ COMMANDS = {
     "quality": Command(
         "Measures closed-loop cost over the time of a decision, for every controller", study.run, "quality"
     ),
+    "new": Command(
+        "Writes a project of your own: a system, its settings, a script and a test",
+        new.new,
+        add_arguments=new.add_arguments,
+    ),
     "report": Command(
         "Puts a tree of runs into one table with figures; compares two groups",
         reports.report,
@@ -95,6 +100,11 @@ COMMANDS = {
     ),
     "plot": Command(
         "Draws a recorded flight as figures and an animation", reports.plot, add_arguments=reports.add_plot_arguments
+    ),
+    "learn": Command(
+        "Learns a model from logs, judges it on held-out runs, and writes it with a report and a card",
+        learn.learn,
+        add_arguments=learn.add_arguments,
     ),
     "log": Command(
         "Shows, rescues or exports a recording, or writes a Foxglove layout for it",

@@ -11,18 +11,21 @@ from gpmpc.exceptions import GpmpcError, SettingError
 if TYPE_CHECKING:
     from gpmpc.recording import Run
 
-ENDINGS = {"recover": (".mcap",), "export": (".csv", ".parquet"), "layout": (".json",)}
+ENDINGS = {"recover": (".mcap",), "export": (".csv", ".parquet"), "layout": (".json",), "inspect": (".html",)}
+SUFFIXES = {"recover": ".recovered.mcap", "export": ".csv", "layout": ".layout.json", "inspect": ".inspection.html"}
 CUT = "unfinished or damaged; this is what could be read"
 
 
 def add_arguments(parser: Parser) -> None:
     """Adds the arguments of the command."""
     what = "info: channels, times, how the solves ended; recover: what is whole in an unfinished file, as a new one; "
-    what += "export: the steps as a table, a row each; layout: for Foxglove or Lichtblick, fitting the recording"
+    what += "export: the steps as a table, a row each; layout: for Foxglove or Lichtblick, fitting the recording; "
+    what += "inspect: rates, gaps, repeated values, noise, delays and excitation of any log, on one page"
     parser.add_argument("action", choices=["info", *ENDINGS], help=what)
-    parser.add_argument("file", type=Path, help="an MCAP file, finished or not")
-    endings = ".recovered.mcap, .csv (or .parquet), .layout.json"
+    parser.add_argument("file", type=Path, help="an MCAP file, finished or not; inspect: any log")
+    endings = ".recovered.mcap, .csv (or .parquet), .layout.json, .inspection.html"
     parser.add_argument("output", type=Path, nargs="?", help=f"where it goes; FILE with {endings}")
+    parser.add_argument("--mapping", type=Path, help="inspect: a YAML file that says what the columns mean")
 
 
 def log(given: argparse.Namespace) -> Result:
@@ -36,10 +39,11 @@ def log(given: argparse.Namespace) -> Result:
             raise GpmpcError(f"log info: writes nothing; got {given.output}")
         return _info(given.file)
     endings = ENDINGS[given.action]
-    ending = {"recover": ".recovered.mcap", "export": ".csv", "layout": ".layout.json"}[given.action]
-    output = given.output or given.file.parent / f"{given.file.stem}{ending}"
+    output = given.output or given.file.parent / f"{given.file.stem}{SUFFIXES[given.action]}"
     if given.output and given.action != "recover" and output.suffix not in endings:
         raise SettingError("output", f"must end in {' or '.join(endings)}; got {output.name!r}")
+    if given.action == "inspect":
+        return _inspect(given.file, output, given.mapping)
     note = {"recover": _recover, "export": _export, "layout": _layout}[given.action](given.file, output)
     print(f"written to {output}: {note}")
     return Result({"output": str(output)})
@@ -118,6 +122,64 @@ def _layout(file: Path, output: Path) -> str:
 
     _write(output, layout(read_run(file)))
     return f"open {file} in Foxglove or Lichtblick, then import it as a layout"
+
+
+def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:
+    import pandas as pd
+    from rich.console import Console
+
+    from gpmpc.logs import LogMapping, inspect_log, read_log
+    from gpmpc.plotting import inspection_figure, png
+    from gpmpc.studies.document import Document, Table, number, terminal
+
+    mapping = LogMapping.load(mapping_file) if mapping_file else None
+    found = inspect_log(file, mapping, read_log(file, mapping) if mapping else None)
+    head = ["stream", "rows", "rate [Hz]", "jitter", "gaps", "longest gap [s]", "repeated stamps", "backward stamps"]
+    streams = [[name, str(rows), *map(number, rest)] for name, rows, *rest in found.streams]
+    head_of_channels = [
+        "channel",
+        "lowest",
+        "highest",
+        "std",
+        "white noise",
+        "repeated",
+        "longest [rows]",
+        "smoothness",
+    ]
+    channels = [
+        [
+            c.name,
+            *map(number, (c.low, c.high, c.std, c.noise)),
+            f"{c.repeated:.0%}",
+            str(c.longest),
+            number(c.smoothness),
+        ]
+        for c in found.channels
+    ]
+    delays = [
+        [d.first, d.second, *map(number, (d.rows, *d.range)), f"{d.agreement:.0%}", number(d.correlation)]
+        for d in found.delays
+    ]
+    head_of_delays = ["channel", "later channel", "rows", "lowest", "highest", "agreement", "correlation"]
+    tables = [Table(head, streams, "Streams"), Table(head_of_channels, channels, "Channels")]
+    tables += [Table(head_of_delays, delays, "Delays between correlated channels")] if delays else []
+    if found.follows:
+        shares = [[name, f"{share:.0%}"] for name, share in found.follows.items()]
+        tables.append(Table(["input", "explained by the states"], shares, "Excitation"))
+    warnings = found.warnings
+    page = Document(
+        found.title,
+        tables,
+        pd.DataFrame([vars(channel) for channel in found.channels]).drop(columns=["time", "values"]),
+        lists={"Beware": warnings or ["nothing was found"]},
+        images={"inspection.png": png(inspection_figure(found), dpi=100)},
+    )
+    _write(output, page.html())
+    console = Console()
+    console.print(terminal(tables[:2]))
+    for line in [*warnings, f"written to {output}"]:
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    return Result({"output": str(output), "warnings": list(warnings), "channels": page.data.to_dict("records")})
 
 
 def _write(output: Path, content: str | bytes) -> None:

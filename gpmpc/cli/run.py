@@ -177,10 +177,10 @@ def experiment_of(config: DictConfig) -> "Experiment":
         size = config.data.pop("size")
         if config.controller.get("initial_input") is None:
             config.controller.initial_input = list(system.initial_input)
-        weights = config.controller.get("problem")
-        if not weights:
-            raise SettingError("controller.problem", f"has no weights; give them in the settings of {system.name}")
-        box = weights.setdefault("inputs", {"_target_": "gpmpc.mpc.problem.Box"})
+        problem = config.controller.problem
+        if problem.cost.get("Q") is None or problem.cost.get("R") is None:
+            raise SettingError("controller.problem.cost", f"has no weights Q and R; {system.name} is to bring them")
+        box = problem.inputs
         for side in ("lower", "upper"):
             if box.get(side) is None:
                 box[side] = list(getattr(system, f"input_{side}"))

@@ -9,7 +9,6 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from gpmpc.cli.arguments import Result, folder_of, writing
-from gpmpc.cli.configuration import without_hydra
 from gpmpc.cli.run import experiment_of, plain_data, plain_settings
 from gpmpc.cli.terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
@@ -69,7 +68,7 @@ def _study(config: DictConfig, settings: dict[str, Any]) -> Any:
             raise SettingError(key, "choose at least one" if key in SEVERAL else "choose one")
 
     def flight(words: str) -> tuple[Any, dict[str, Any]]:
-        composed = without_hydra(hydra.compose("run", words.split()))
+        composed = hydra.compose("run", words.split())
         return experiment_of(composed), plain_settings(composed, {})
 
     made = hydra.utils.instantiate(config, _convert_="all")

@@ -85,7 +85,10 @@ def tune(given: Namespace, name: str) -> Result:
     best = [*fixed, *_overrides(search.candidates[search.best], base)]
     command = shlex.join(["gpmpc", "run", "--config-dir", str(runs.tree), "--config-name", BEST.removesuffix(".yaml")])
     document = search.document(unchanged if math.isfinite(unchanged) else None, command)
-    written = document.files("tuning") | {"tuning.html": document.html(), BEST: _config(best, name)}
+    written = document.files("tuning") | {
+        "tuning.html": document.html(),
+        BEST: _config(best, name, str(runs.tree / "best")),
+    }
     with writing(runs.tree):
         for file, content in written.items():
             write_whole(runs.tree / file, content)
@@ -151,12 +154,12 @@ def _cost(job: Job, controller: Mapping[str, Any]) -> float:
         run = read_run(job.folder.path / RECORDING)
     except RecordingError:
         return math.inf
-    Q, R, before = controller["problem"].Q, controller["problem"].R, controller["initial_input"]
+    Q, R, before = controller["problem"].cost.Q, controller["problem"].cost.R, controller["initial_input"]
     return tracking_cost(Q, R, run.states, run.references, run.inputs[:-1], before)
 
 
-def _config(overrides: Sequence[str], name: str) -> str:
-    """Returns the settings as a file that ``gpmpc run --config-name`` takes."""
+def _config(overrides: Sequence[str], name: str, folder: str) -> str:
+    """Returns the settings as a file that ``gpmpc run --config-name`` takes; its runs go to ``folder``."""
     name = "run" if name == "tune" else name
     groups, own = group_options("run"), OmegaConf.create()
     defaults: list[Any] = [name, "_self_"]
@@ -166,5 +169,5 @@ def _config(overrides: Sequence[str], name: str) -> str:
             defaults.append({f"override /{key}": override.value()})
         elif key not in (*ASIDE, "seed") and not key.startswith("hydra"):
             OmegaConf.update(own, key, override.value(), force_add=True)
-    text = OmegaConf.to_yaml(OmegaConf.merge({"defaults": defaults}, own))
+    text = OmegaConf.to_yaml(OmegaConf.merge({"defaults": defaults}, own, {"folder": folder}))
     return f"# The best settings that gpmpc tune found.\n{text}"

@@ -86,7 +86,7 @@ class RandomData:
         centre, reach = _surroundings(system)
         rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for _ in range(100 + 2 * self.samples):
-            state = self._start(system, random)
+            state, input = self._start(system, random), middle
             for k in range(min(self.episode, self.samples - len(rows))):
                 if k % self.hold == 0:
                     input = np.clip(middle + random.uniform(-half, half), lower, upper)

@@ -17,6 +17,7 @@ import numpy as np
 from gpmpc.exceptions import DataError, SettingError
 
 _HEADER = "header.json"
+_EXPANSION = 20  # times what a file holds: more than numbers shrink by
 
 
 def existing_file(path: str | Path, expected: str) -> Path:
@@ -63,7 +64,11 @@ def read_npz(path: Path, names: tuple[str, ...] | None = None) -> tuple[Any, dic
     Damage makes zipfile, json and NumPy raise whatever they come upon first: callers take any exception for one and
     name the file.
     """
+    size = path.stat().st_size
     with zipfile.ZipFile(path) as archive:
+        declared = sum(info.file_size for info in archive.infolist())
+        if declared > _EXPANSION * size:
+            raise ValueError(f"declares {declared} bytes, more than a file of {size} bytes can hold")
         header = json.loads(archive.read(_HEADER)) if _HEADER in archive.namelist() else None
         if isinstance(header, dict) and "checksum" in header and header["checksum"] != _checksum(header, archive):
             raise ValueError("the checksum of its parts differs from the one in its header")

@@ -9,6 +9,7 @@ Jacobians and Hessians from it (Andersson, Gillis, Horn, Rawlings and Diehl, 201
 Importing this file loads CasADi; ``gpmpc.gp`` does not import it.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import casadi
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 
 from gpmpc.exceptions import UnsupportedModel
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp.posterior import AffineForm, GPPosterior
 
 
 def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
@@ -25,7 +26,8 @@ def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
     Over a horizon use ``function.map(H)``, which takes columns (n, H) and (m, H).
 
     Args:
-        model: A posterior, or a residual model with an affine nominal part; it is evaluated in double precision.
+        model: A posterior, or a residual model whose nominal model and effect are numbers (``Affine``, a tensor) or
+            written in CasADi (``CasadiFunction``); it is evaluated in double precision.
         name: Of the function.
 
     Returns:
@@ -34,25 +36,55 @@ def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
         has added the state), or of the value that the model predicts.
 
     Raises:
-        UnsupportedModel: The model has no ``affine_form``: its nominal part is a Python function, or it is another one.
+        UnsupportedModel: The nominal model or the effect is a Python function, or it is another model.
     """
     form = getattr(model, "affine_form", None)
-    if form is None:
-        nominal = getattr(model, "nominal", None)
-        got = type(model).__name__ + (f" of a nominal {type(nominal).__name__}" if nominal is not None else "")
-        raise UnsupportedModel(f"CasADi can take a GPPosterior, or a ResidualModel with an Affine nominal; got {got}")
     x, u = casadi.MX.sym("state", model.state_dim), casadi.MX.sym("input", model.input_dim)
-    states, inputs = (form.states, form.inputs) if form.states is not None else (slice(None), slice(None))
-    mean, variance = _moments(form.f, x[states], u[inputs])
+    mean, variance = _residual(model, x, u) if form is None else _affine(form, x, u)
+    return casadi.Function(name, [x, u], [mean, variance], ["state", "input"], ["mean", "variance"])
+
+
+def _affine(form: AffineForm, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:
+    """Mean and variance (k,) of a model with an affine form."""
+    seen = (x, u) if form.states is None else (_selected(x, form.states), _selected(u, form.inputs or []))
+    mean, variance = _moments(form.f, *seen)
     if form.B is not None:
         B = _numbers(form.B)
         mean, variance = B @ mean, B**2 @ variance
     for factor, vector in ((form.A, x), (form.G, u)):
         if factor is not None:
             mean = mean + _numbers(factor) @ vector
-    if form.c is not None:
-        mean = mean + _numbers(form.c)
-    return casadi.Function(name, [x, u], [mean, variance], ["state", "input"], ["mean", "variance"])
+    return mean if form.c is None else mean + _numbers(form.c), variance
+
+
+def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:
+    """Mean and variance (n,) of a residual model with angles, or with functions that are written in CasADi."""
+    nominal: Any = getattr(model, "nominal", None)
+    B: Any = getattr(model, "B", None)
+    known: Any = getattr(nominal, "function", None)
+    effect: Any = getattr(B, "function", None)
+    affine = all(hasattr(nominal, part) for part in "ABc")
+    if not (known is not None or affine) or not (effect is not None or isinstance(B, torch.Tensor)):
+        got = type(model).__name__ + (f" of a nominal {type(nominal).__name__}" if nominal is not None else "")
+        raise UnsupportedModel(
+            f"CasADi can take a GPPosterior, or a ResidualModel of Affine, CasadiFunction and numbers; got {got}"
+        )
+    entries = []
+    for i in model.states:
+        entries += [casadi.sin(x[i]), casadi.cos(x[i])] if i in model.angles else [x[i]]
+    mean, variance = _moments(model.residual, casadi.vertcat(*entries), _selected(u, model.inputs))
+    matrix = _numbers(B) if effect is None else effect(x)
+    if affine:
+        A, G, c = (_numbers(getattr(nominal, part)) for part in "ABc")
+        moved = A @ x + G @ u + c
+    else:
+        moved = nominal.function(x, u)
+    return moved + matrix @ mean, matrix**2 @ variance
+
+
+def _selected(vector: casadi.MX, entries: Sequence[int]) -> casadi.MX:
+    """Some entries of a vector, perhaps none."""
+    return vector[list(entries)] if len(entries) else casadi.MX(0, 1)
 
 
 def _moments(gp: GPPosterior, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:

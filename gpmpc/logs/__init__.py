@@ -1,6 +1,7 @@
 """Logs of real systems: reading, checking, learning from them, and judging what was learned."""
 
 from gpmpc.logs.fitting import NominalFit, fit_nominal
+from gpmpc.logs.inspection import Inspection, inspect_log
 from gpmpc.logs.judging import Judgement, judge
 from gpmpc.logs.kinematics import Increments, Kinematics, RigidBody
 from gpmpc.logs.learning import Candidate, Learned, learn
@@ -12,11 +13,13 @@ from gpmpc.logs.readers import read_streams
 from gpmpc.logs.reading import read_log
 from gpmpc.logs.rollouts import LogModel
 from gpmpc.logs.state_space import StateGroup, StateSpace
+from gpmpc.logs.storage import load_learned, save_learned
 
 __all__ = [
     "Candidate",
     "Finding",
     "Increments",
+    "Inspection",
     "Judgement",
     "Kinematics",
     "Learned",
@@ -34,8 +37,11 @@ __all__ = [
     "StateSpace",
     "Windows",
     "fit_nominal",
+    "inspect_log",
     "judge",
     "learn",
+    "load_learned",
     "read_log",
     "read_streams",
+    "save_learned",
 ]

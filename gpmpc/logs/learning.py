@@ -5,8 +5,9 @@ averaged over 1, 5 or 10 rows, stays only where the rollouts of held-out runs ge
 rollouts as well.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from gpmpc.gp import Trainer, standardize
 from gpmpc.logs.baselines import fit_least_squares
 from gpmpc.logs.fitting import NominalFit, fit_nominal
 from gpmpc.logs.kinematics import Increments, Kinematics, RigidBody
-from gpmpc.logs.log import Log, LogRun
+from gpmpc.logs.log import Log
 from gpmpc.logs.noise import OutputNoise, fit_noise
 from gpmpc.logs.nominal import AffineNominal, MultirotorNominal, Still
 from gpmpc.logs.rollouts import PAST, STEPS, LogModel, OutputGP, choose_stride, rollout_errors
@@ -31,6 +32,7 @@ LOSS = 0.05  # most relative loss in any group at any step
 WINDOWS = 200  # of a fold
 Progress = Callable[[str], None]
 Grow = Callable[[Any], LogModel | None]
+Memory = MutableMapping[str, Any]  # from a stage's name to plain data; for example of a file
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,12 @@ class _Folds:
 
 
 def learn(
-    log: Log, points: int = 300, steps: int = STEPS, seed: int = 0, progress: Progress = lambda text: None
+    log: Log,
+    points: int = 300,
+    steps: int = STEPS,
+    seed: int = 0,
+    progress: Progress = lambda text: None,
+    memory: Memory | None = None,
 ) -> Learned:
     """Learns a model of the outputs behind a log.
 
@@ -103,6 +110,7 @@ def learn(
         steps: Of the rollouts.
         seed: Of every random number.
         progress: Called with a line at each stage.
+        memory: Holds the outcome of stages that an earlier call with equal arguments went through.
 
     Raises:
         DataError: The log is too short for rollouts of that many steps.
@@ -112,6 +120,7 @@ def learn(
     check_number("steps", steps, least=2, whole=True)
     kinematics: Kinematics = RigidBody(log.space) if log.mapping.model == "rigid_body" else Increments(log.space)
     folds = _Folds(_split(log, 2), steps)
+    memory = {} if memory is None else memory
     name, structure, options = _structures(kinematics, log)
     candidates: list[Candidate] = []
     best, models = 0, []
@@ -121,7 +130,9 @@ def learn(
             continue
         trial_name = f"{name}, {words}" if words else name
         progress(f"{trial_name}: fitted on rollouts of {steps} steps")
-        fitted = [_fit(trial, train, steps).model for train, _ in folds.parts]
+        if trial_name not in memory:
+            memory[trial_name] = [_fit(trial, train, steps).model.theta.tolist() for train, _ in folds.parts]
+        fitted = [_with_parameters(trial, theta) for theta in memory[trial_name]]
         candidates.append(folds.judge(trial_name, fitted))
         if not models or is_better(candidates[-1], candidates[best]):
             best, models, name, structure = len(candidates) - 1, fitted, trial_name, trial
@@ -129,15 +140,17 @@ def learn(
     for group, outputs in kinematics.output_groups.items():
         base = models
         for average in AVERAGES:
-            progress(f"GP on {group}, residuals averaged over {average} rows")
-            trained = [
-                replace(m, gps=(*m.gps, _train(m, train, outputs, average, points, seed)))
-                for m, (train, _) in zip(base, folds.parts, strict=True)
-            ]
-            candidates.append(folds.judge(f"{name}, GP on {_words({**choice, group: average})}", trained))
+            grown = partial(_with_gp, outputs=outputs, average=average, points=points, seed=seed)
+            words = f"{name}, GP on {_words({**choice, group: average})}"
+            progress(words)
+            trained: list[LogModel] = []
+            if words not in memory:
+                trained = [grown(m, train) for m, (train, _) in zip(base, folds.parts, strict=True)]
+                memory[words] = folds.judge(words, trained).errors.tolist()
+            candidates.append(Candidate(words, np.array(memory[words])))
             if is_better(candidates[-1], candidates[best]):
-                best, models = len(candidates) - 1, trained
-                choice[group] = average
+                models = trained or [grown(m, train) for m, (train, _) in zip(base, folds.parts, strict=True)]
+                best, choice[group] = len(candidates) - 1, average
     progress(f"chosen: {candidates[best].name}")
     progress("noise from the errors of held-out rollouts")
     errors = folds.errors(models)
@@ -204,18 +217,11 @@ def _structures(kinematics: Kinematics, log: Log) -> tuple[str, LogModel, dict[s
 def _split(log: Log, count: int) -> list[tuple[Log, Log]]:
     """Folds by run; of a single run by time."""
     if len(log.runs) == 1:
-        run, half = log.runs[0], len(log) // 2
-        log = replace(log, runs=(_part(run, 0, half, "first half"), _part(run, half, len(run), "second half")))
+        halves = log.split_by_time(0.5)
+        log = replace(log, runs=tuple(half.runs[0] for half in halves))
     names = [run.name for run in sorted(log.runs, key=len)]
     groups = [names[i::count] for i in range(count)]
     return [log.split(group) for group in groups]
-
-
-def _part(run: LogRun, begin: int, end: int, name: str) -> LogRun:
-    inner = tuple(b - begin for b in run.begins if begin < b < end)
-    rows = slice(begin, end)
-    parts = (getattr(run, key)[rows] for key in ("time", "states", "inputs", "context"))
-    return LogRun(f"{run.name}, {name}", *parts, begins=(0, *inner))
 
 
 def _fit(structure: LogModel, log: Log, steps: int) -> NominalFit:
@@ -224,6 +230,17 @@ def _fit(structure: LogModel, log: Log, steps: int) -> NominalFit:
     affine = fit_least_squares(structure.kinematics, log)  # linear in its many parameters
     unknown = np.full(len(affine.theta), np.nan)
     return NominalFit(replace(affine, history=structure.history), unknown, np.nan, np.nan, 1)
+
+
+def _with_parameters(structure: LogModel, theta: Sequence[float]) -> LogModel:
+    nominal = structure.nominal
+    if isinstance(nominal, AffineNominal):
+        structure = replace(structure, nominal=replace(nominal, feature_dim=len(theta) // nominal.output_dim - 1))
+    return structure.with_theta(np.array(theta, dtype=float))
+
+
+def _with_gp(model: LogModel, log: Log, outputs: tuple[int, ...], average: int, points: int, seed: int) -> LogModel:
+    return replace(model, gps=(*model.gps, _train(model, log, outputs, average, points, seed)))
 
 
 def _train(model: LogModel, log: Log, outputs: tuple[int, ...], average: int, points: int, seed: int) -> OutputGP:

@@ -57,6 +57,12 @@ class LogRun:
         """First row, and row after the last, of each piece."""
         return list(zip(self.begins, (*self.begins[1:], len(self)), strict=True))
 
+    def part(self, begin: int, end: int, name: str) -> "LogRun":
+        """The rows from ``begin`` to before ``end`` as a run of its own."""
+        inner = tuple(b - begin for b in self.begins if begin < b < end)
+        parts = (getattr(self, key)[begin:end] for key in ("time", "states", "inputs", "context"))
+        return LogRun(f"{self.name}, {name}", *parts, begins=(0, *inner))
+
 
 @dataclass(frozen=True)
 class Windows:
@@ -158,6 +164,15 @@ class Log:
     def select(self, names: Sequence[str]) -> "Log":
         """A log of the named runs."""
         return replace(self, runs=tuple(run for run in self.runs if run.name in set(names)))
+
+    def split_by_time(self, share: float) -> tuple["Log", "Log"]:
+        """Splits every run: a log of the first ``share`` of its rows, and one of the others."""
+        check_number("share", share, above=0)
+        cuts = [(run, min(max(round(share * len(run)), 1), len(run) - 1)) for run in self.runs]
+        first = tuple(run.part(0, cut, "first part") for run, cut in cuts)
+        return replace(self, runs=first), replace(
+            self, runs=tuple(run.part(cut, len(run), "last part") for run, cut in cuts)
+        )
 
     def transitions(self) -> Transitions:
         """All transitions from one row to the next inside a piece, as data of GPs."""

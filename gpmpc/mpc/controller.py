@@ -33,19 +33,24 @@ class Reference:
     Attributes:
         states: r_0 .. r_H (H + 1, n); r_0 belongs to the current time.
         inputs: u*_0 .. u*_{H-1} (H, m), the inputs that belong to it where they are known.
+        kappas: Standard deviations (H,) between the means and the sides of chance constraints, by stage, in the place
+            of the problem's, such as those of an ``AdaptiveTube``; for covariances of ``zero_order``.
 
     Raises:
-        ShapeError: The two do not belong together.
+        ShapeError: They do not belong together.
     """
 
     states: Array
     inputs: Array | None = None
+    kappas: Array | None = None
 
     def __post_init__(self) -> None:
         if np.ndim(self.states) != 2 or len(self.states) < 2:
             raise ShapeError(f"reference states must be (H + 1, n), H of 1 or more; got {np.shape(self.states)}")
         if self.inputs is not None and (np.ndim(self.inputs) != 2 or len(self.inputs) != len(self.states) - 1):
             raise ShapeError(f"reference inputs must be ({len(self.states) - 1}, m); got {np.shape(self.inputs)}")
+        if self.kappas is not None and np.shape(self.kappas) != (self.horizon,):
+            raise ShapeError(f"kappas must be ({self.horizon},); got {np.shape(self.kappas)}")
 
     @property
     def horizon(self) -> int:
@@ -138,6 +143,7 @@ class Request(NamedTuple):
             plan may be applied. Within the input bounds.
         finite: Whether the belief is. A belief that is not is a bad measurement, not misuse.
         disturbance: Added to the model's mean at every stage (n,), or nothing (0,).
+        kappas: Of the reference (H,), where it has some.
     """
 
     state: Array
@@ -146,6 +152,7 @@ class Request(NamedTuple):
     initial_guess: Array
     finite: bool
     disturbance: Array = _NO_DISTURBANCE
+    kappas: Array | None = None
 
     @classmethod
     def read(
@@ -198,7 +205,11 @@ class Request(NamedTuple):
         for part, name, values in ((_STATES, "states", states), (_INPUTS, "inputs", inputs)):
             if found & part:
                 raise DataError(f"reference {name} must be finite; got {values[~np.isfinite(values)][0]}")
-        return cls(state, covariance, References(states[1:], inputs, last), guess, not found & _BELIEF)
+        kappas = None if reference.kappas is None else _array(reference.kappas)
+        if kappas is not None and not np.isfinite(kappas).all():
+            raise DataError(f"reference kappas must be finite; got {kappas}")
+        references = References(states[1:], inputs, last)
+        return cls(state, covariance, references, guess, not found & _BELIEF, kappas=kappas)
 
     @property
     def constant_guess(self) -> Array:

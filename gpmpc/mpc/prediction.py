@@ -143,6 +143,9 @@ class PredictionModel:
         request = Request.read(problem, H, self.initial_input, belief, reference, previous)
         if reference.inputs is None and problem.cost.penalized == "deviations":
             raise ShapeError(f"penalized 'deviations' needs reference inputs ({H}, {problem.input_dim}); got none")
+        if request.kappas is not None and self.linearizer.covariance != "zero_order":
+            mode = self.linearizer.covariance
+            raise SettingError("kappas", f"are for covariances of 'zero_order'; this controller has {mode!r}")
         if self.settings.disturbance_gain and request.finite:
             return request._replace(disturbance=self._disturbance(request, previous))
         return request
@@ -224,7 +227,7 @@ class PredictionModel:
             covariances[0] = request.covariance
         if self.settings.form == "velocity" and previous is not None and previous.applicable:
             stages = self._increments(plan, stages, request, previous)
-        return Prediction(plan, stages, covariances, self.constraints.at(covariances, self.points))
+        return Prediction(plan, stages, covariances, self.constraints.at(covariances, self.points, request.kappas))
 
     def _increments(
         self, plan: Plan, stages: LinearizedStages, request: Request, previous: Decision

@@ -225,19 +225,27 @@ class ConstraintRows:
         self.signs = np.where(np.isfinite(self._upper).any(axis=0), 1.0, -1.0)
         self.applies = np.isfinite(self._lower) | np.isfinite(self._upper)
         self.per_stage, self.soft = len(kappa), bool(np.isfinite(self.prices).any())
-        self._margins = self._kappa if covariance == "zero_order" else np.zeros(self.per_stage)
+        margins = self._kappa if covariance == "zero_order" else np.zeros(self.per_stage)
+        self._margins = np.tile(margins, (horizon, 1))
         mixed = bool((np.count_nonzero(self._F, axis=1) > 1).any())
         moves = mixed if covariance == "diagonal" else covariance == "full" and self.per_stage > 0
         self._constant = None if moves else self._rows(np.zeros((1, n, n)))
         fixed = not (moves or self._margins.any())
         self._fixed = StateRows(self._rows(np.zeros((1, n, n))), self._lower, self._upper) if fixed else None
 
-    def at(self, covariances: Array, stages: int) -> StateRows:
-        """The rows, tightened, at covariances of the states Sigma_0 .. Sigma_H (H + 1, n, n), of H stages or one."""
+    def at(self, covariances: Array, stages: int, kappas: Array | None = None) -> StateRows:
+        """The rows, tightened, at covariances of the states.
+
+        Args:
+            covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
+            stages: H, or 1.
+            kappas: By stage (H,), in the place of those of the constraints that have some.
+        """
         if self._fixed is not None:
             return self._fixed
         lower, upper = self._lower.copy(), self._upper.copy()
-        call_unchecked(_tighten, self._F, self._margins, covariances, lower, upper)
+        margins = self._margins if kappas is None else np.where(self._margins > 0, kappas[:, None], 0.0)
+        call_unchecked(_tighten, self._F, margins, covariances, lower, upper)
         return StateRows(
             self._rows(covariances[1 : stages + 1]) if self._constant is None else self._constant, lower, upper
         )
@@ -266,7 +274,7 @@ class ConstraintRows:
 
 @compiled
 def _tighten(F, kappa, covariances, lower, upper):
-    """Moves the bounds of the rows (H, r) inwards by kappa standard deviations."""
+    """Moves the bounds of the rows (H, r) inwards by kappa (H, r) standard deviations."""
     r, n = F.shape
     for k in range(len(lower)):
         for e in range(r):
@@ -274,7 +282,7 @@ def _tighten(F, kappa, covariances, lower, upper):
             for i in range(n):
                 if F[e, i] != 0.0:
                     variance += F[e, i] * dot(covariances[k + 1, i], F[e], n)
-            margin = kappa[e] * math.sqrt(max(variance, 0.0))
+            margin = kappa[k, e] * math.sqrt(max(variance, 0.0))
             lower[k, e] += margin
             upper[k, e] -= margin
 

@@ -5,6 +5,7 @@ Every function returns a ``Figure`` made without pyplot, so nothing global is to
 
 from gpmpc.plotting.animation import animate, ffmpeg_exists
 from gpmpc.plotting.image import png
+from gpmpc.plotting.logs import inspection_figure, judgement_figure
 from gpmpc.plotting.quality import quality
 from gpmpc.plotting.recorded import inputs_figure, timing_figure, tracking_figure
 from gpmpc.plotting.results import Curve, Panel, calibration_figure, error_over_size, over_settings, tracking
@@ -19,6 +20,8 @@ __all__ = [
     "error_over_size",
     "ffmpeg_exists",
     "inputs_figure",
+    "inspection_figure",
+    "judgement_figure",
     "over_settings",
     "over_variable",
     "png",

@@ -104,6 +104,7 @@ def _numbers(positions: Sequence[str]) -> np.ndarray | None:
     return numbers if np.isfinite(numbers).all() and len(set(numbers)) == len(numbers) else None
 
 
+@styled
 def search_figure(costs: Sequence[float], importances: Mapping[str, float], unchanged: float | None) -> Figure:
     """Draws the costs of a search over its candidates, and beside them how much each setting mattered.
 
@@ -129,13 +130,10 @@ def search_figure(costs: Sequence[float], importances: Mapping[str, float], unch
         axes[0].set_yscale("log")
     axes[0].set(xlabel="candidate", ylabel="closed-loop cost per step")
     axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes[0].grid(axis="y", color="0.9")
-    axes[0].legend(loc="upper center", bbox_to_anchor=(0.5, 1.25), ncols=2, frameon=False, fontsize="small")
+    add_legend(figure, *axes[0].get_legend_handles_labels())
     if importances:
         names = [*importances][::-1]
         bars = axes[1].barh(names, [100 * importances[name] for name in names], color=COLOURS[0], height=0.5)
         axes[1].bar_label(bars, fmt="%.0f %%", padding=3)
         axes[1].set(xlabel="importance [%]", xlim=(0, 115))
-    for axis in axes:
-        axis.spines[["top", "right"]].set_visible(False)
     return figure

@@ -107,7 +107,8 @@ class PlantSimulator:
 
     Args:
         plant: What the controller believes in, and what is there where no disturbance says otherwise.
-        initial: The state (n,), or a belief that it is drawn from.
+        initial: The state (n,), or a belief that it is drawn from; None where the plant is a simulator, which then
+            starts an episode.
         disturbances: Each changes the plant, and the measurement, that the one before left.
         noise: On states, measurements and inputs.
         seed: Of all random numbers.
@@ -145,6 +146,11 @@ class PlantSimulator:
         sources: list[str] = ["initial", "process", "measurement", "input"]
         self._streams = dict(zip(sources, streams, strict=True))
         self.plant, self.disturbances, self.noise = plant, tuple(disturbances), noise
+        if initial is None:
+            dynamics: Any = plant.dynamics
+            if not getattr(dynamics, "stateful", False):
+                raise SettingError("initial", "must be a state; a simulator alone starts by itself")
+            initial = dynamics.reset(seed)
         mean, covariance = (initial.mean, initial.covariance) if isinstance(initial, Gaussian) else (initial, None)
         self.mean = _check_state(mean, n)
         if covariance is not None:
@@ -188,6 +194,8 @@ class PlantSimulator:
         if not np.isfinite(state).all():
             before = f"it was {self.mean}, input {applied}"
             raise Diverged(self._steps, f"the plant's state is not finite any more; {before}")
+        if getattr(self.plant.dynamics, "ended", False):
+            raise Diverged(self._steps, f"the simulator has ended its episode, at state {state}")
         self.mean = self._add_noise("process", state)
         self._steps += 1
 

@@ -71,6 +71,8 @@ def closed_loops(
     """
     if isinstance(plant, ModelLoop):
         raise SettingError("plant", "a model loop draws no random numbers, all seeds are one flight; take closed_loop")
+    if getattr(plant.dynamics, "stateful", False):
+        raise SettingError("plant", "a simulator flies one seed after another; take closed_loop")
     check_number("steps", steps, least=1, whole=True)
     check_policy(on_failure)
     seeds, horizon = _check_seeds(seeds), controller.horizon

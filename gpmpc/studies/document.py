@@ -29,6 +29,7 @@ _LATEX = str.maketrans(
 )
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
 _POWER = re.compile(r"(?<![\w.])(-?\d(?:\.\d+)?)e(-?\d+)(?![\w.])")
+_FOLDED = 10  # lines that a page shows without being asked
 _LONGEST = 60  # characters of a label in a figure
 _STYLE = """
 :root { color-scheme: light; }
@@ -39,8 +40,8 @@ th, td { padding: .3rem .7rem; text-align: right; vertical-align: top; border-bo
 th { border-bottom: 2px solid #1f4e79; vertical-align: bottom; } td:first-child, th:first-child { text-align: left; }
 td, td small { white-space: nowrap; } td small { display: block; color: #666; }
 .wide { overflow-x: auto; margin: 1rem 0; }
-.figures { display: flex; flex-wrap: wrap; gap: 1rem; align-items: flex-start; margin-bottom: 1rem; }
-.figures img { flex: 1 1 20rem; min-width: 0; max-width: min(32rem, 100%); }
+.figures { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(20rem, 100%), 1fr)); gap: 1rem;
+  align-items: start; margin-bottom: 1rem; } .figures img { width: 100%; max-width: 32rem; }
 code, pre { background: #f5f5f5; padding: .1rem .3rem; overflow-wrap: anywhere; white-space: pre-wrap; }
 pre { padding: .6rem; } li { overflow-wrap: anywhere; }
 @media (max-width: 40rem) { th, td { padding: .3rem .4rem; } ul { padding-left: 1.2rem; } }
@@ -153,13 +154,17 @@ class Document:
         for heading, items in self.lists.items():
             parts.append(f"<h2>{heading}</h2><ul>{''.join(f'<li>{escape(item)}</li>' for item in items)}</ul>")
         for heading, lines in self.code.items():
-            parts.append(f"<h2>{heading}</h2><pre>{escape(chr(10).join(lines))}</pre>")
+            text = f"<pre>{escape(chr(10).join(lines))}</pre>"
+            if len(lines) > _FOLDED:
+                text = f"<details><summary>{len(lines)} lines</summary>{text}</details>"
+            parts.append(f"<h2>{heading}</h2>{text}")
         if self.links:
             items = (
                 f'<li><a href="{quote(to, errors="surrogateescape")}/">{escape(text)}</a></li>'
                 for text, to in self.links.items()
             )
-            parts.append(f"<details><summary>The {len(self.links)} runs</summary><ul>{''.join(items)}</ul></details>")
+            summary = f"<summary>{len(self.links)} folders</summary>"
+            parts.append(f"<h2>Runs</h2><details>{summary}<ul>{''.join(items)}</ul></details>")
         head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
         head += f"<title>{escape(self.title)}</title><style>{_STYLE}</style>"
         return f"<!doctype html>\n<html lang=en><head>{head}</head><body>\n" + "\n".join(parts) + "\n</body></html>\n"

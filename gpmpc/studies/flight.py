@@ -199,6 +199,7 @@ def run_trial(
     resting = np.asarray(controller.initial_input)  # falls back on it where the very first solve fails
     reference = Reference(states, np.tile(resting, (len(states) - 1, 1)))
     start = states[0] if plant.start is None else plant.start
+    start = None if getattr(plant.dynamics, "stateful", False) else start
     rehearse(system, controller, reference, start)
     on_step = None if prepare is None else prepare(controller, training)
     try:

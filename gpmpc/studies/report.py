@@ -146,7 +146,10 @@ class Report:
 
     def base_settings(self) -> list[str]:
         """Returns the settings that all runs share, one ``key: value`` each."""
-        return [plain_text(f"{k}: {v}") for k, v in _leaves(reduce(_shared, (run.settings for run in self.runs)))]
+        return [
+            plain_text(f"{k}: {json.dumps(v)}")
+            for k, v in _leaves(reduce(_shared, (run.settings for run in self.runs)))
+        ]
 
     def commands(self) -> list[str]:
         """Returns the commands that fill the cells in which runs are missing or failed, one a cell.

@@ -212,7 +212,7 @@ def acrobot(
         torque: Its largest [N m].
     """
     return System(
-        Acrobot(tuple(masses), first_length),
+        Acrobot((masses[0], masses[1]), first_length),
         time_step,
         4,
         name="acrobot",
@@ -285,4 +285,5 @@ def planar_quadrotor(mass: float = 0.74, arm: float = 0.21, inertia: float = 0.0
 
 def _check_positive(dynamics: Any, *may_be_zero: str) -> None:
     for key, value in vars(dynamics).items():
-        check_number(key, value, **({"least": 0} if key in may_be_zero else {"above": 0}))
+        lowest: dict[str, Any] = {"least": 0} if key in may_be_zero else {"above": 0}
+        check_number(key, value, **lowest)

@@ -40,7 +40,7 @@ def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
         (["tables", "model.restart=3"], "unknown setting 'model.restart' (did you mean 'model.restarts'?)"),
         (
             ["tables", "trajectory=lorens"],
-            "trajectory: no such option 'lorens'; available are elliptical, hover, lorenz",
+            "trajectory: no such option 'lorens'; available are elliptical, goal, hover, lorenz",
         ),
         (["tables", "data=paper"], "data.folder: this setting has no default"),
         (["tables", "data=paper", "data.folder=nowhere"], "nowhere: no such folder"),
@@ -49,6 +49,7 @@ def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
         (["tables", "sizes=[0]"], "sizes: must be a whole number, 1 or more; got 0"),
         (["tables", "sizes=10,50"], "sizes: a list is written in brackets, sizes=[10,50]"),
         (["tables", "sizes=[500]"], "sizes: must be at most 189, the rows of elliptical translational; got 500"),
+        (["quality", "only=lqr", "steps=0"], "steps: must be a whole number, 1 or more; got 0"),
         (["tables", "data.samples=0"], "data.samples: must be a whole number, 1 or more; got 0"),
         (["tables", "data.attitude=exakt"], "data.attitude: must be one of paper, exact; got 'exakt'"),
         (["tables", "model.restarts=-1"], "restarts: must be a whole number, 0 or more; got -1"),

@@ -269,6 +269,29 @@ def test_settings_and_classes_of_the_users_own_folder_are_found(sweep, tmp_path)
         assert text in path.read_text()
 
 
+def test_kernels_are_compiled_when_asked_for(tmp_path):
+    done = forked("warmup", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["seconds"] > 0
+    assert "controller=lqr" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", ["run -m seed=1,2", "run"])
+def test_ctrl_c_in_the_middle_of_flights_is_one_line(command, tmp_path):
+    words = [PATH, *command.split(), *TINY, "steps=1000000", "recorder=none", "folder=tree"]
+    flying = subprocess.Popen(
+        words, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    deadline = time.monotonic() + SECONDS
+    while not list(tmp_path.glob("tree/*/config.yaml")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(flying.pid, signal.SIGINT)
+    _, shown = flying.communicate(timeout=SECONDS)
+    advice = "; the same command goes on where it stopped" if "-m" in words else ""
+    assert (flying.returncode, shown) == (130, f"\ninterrupted{advice}\n")
+
+
 POOL = """
 import os, sys, time
 from gpmpc.parallel import in_processes

@@ -75,6 +75,13 @@ def test_arrays_of_others_and_of_any_real_type_are_read(kind, save, tmp_path):
     assert data.inputs.dtype == torch.float64
 
 
+def test_a_file_that_declares_more_than_it_can_hold_is_refused(tmp_path):
+    path = tmp_path / "data.npz"
+    np.savez_compressed(path, **arrays(states=np.zeros((400_000, 2))))
+    with pytest.raises(DataError, match=r"declares \d+ bytes, more than a file of \d+ bytes can hold"):
+        Transitions.load(path)
+
+
 def test_an_array_that_declares_more_than_it_holds_is_refused(tmp_path):
     path, header = tmp_path / "data.npz", "{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 2), }"
     with zipfile.ZipFile(path, "w") as archive:

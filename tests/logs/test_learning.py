@@ -17,10 +17,13 @@ from gpmpc.logs import (
     fit_nominal,
     judge,
     learn,
+    load_learned,
     read_log,
+    save_learned,
 )
 from gpmpc.logs.learning import choose_rows
 from gpmpc.logs.log import Log, LogRun
+from gpmpc.logs.noise import error_variances
 from gpmpc.logs.state_space import rotation_quaternion
 
 EXAMPLE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "own_log.py"))
@@ -124,6 +127,27 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     wrong = replace(learned, model=replace(learned.model, theta=-learned.model.theta, gps=()))
     losses = judge(wrong, held_out, train, steps=(1, 10)).losses
     assert any("rate 10 steps ahead" in loss and "constant state" in loss for loss in losses)
+
+
+def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path):
+    log = pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1])
+    memory = {}
+    learned = learn(log, points=40, steps=20, memory=memory)
+    assert learned.model.gps
+    save_learned(learned, tmp_path / "model.safetensors")
+    loaded = load_learned(tmp_path / "model.safetensors")
+    windows = log.windows(20, 20, 100)
+    expected = learned.model.rollout(windows)
+    np.testing.assert_allclose(loaded.model.rollout(windows), expected, rtol=0, atol=1e-9)
+    variances = [error_variances(one.model, windows, one.noise, (1, 20)) for one in (learned, loaded)]
+    np.testing.assert_allclose(*variances, rtol=1e-6)
+    assert [c.name for c in loaded.candidates] == [c.name for c in learned.candidates]
+    (tmp_path / "cut.safetensors").write_bytes((tmp_path / "model.safetensors").read_bytes()[:-100])
+    with pytest.raises(DataError, match="not a readable"):
+        load_learned(tmp_path / "cut.safetensors")
+    # What an earlier call has gone through is not done again, and changes nothing.
+    again = learn(log, points=40, steps=20, memory=dict(memory))
+    np.testing.assert_array_equal(again.model.rollout(windows), expected)
 
 
 def test_the_same_rows_in_pieces_of_one_run_or_another_log_give_the_same_model(flights):

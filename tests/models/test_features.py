@@ -11,6 +11,7 @@ from gpmpc.dynamics import predict_with_jacobian
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, Transitions
+from gpmpc.gp.casadi_ import casadi_function
 from gpmpc.models import Affine, CasadiFunction, Lags, ResidualModel, load_model, save_model
 from gpmpc.propagation import Linearization, MomentMatching, MonteCarlo, Unscented
 from gpmpc.testing import check_model
@@ -209,3 +210,13 @@ def test_torch_can_follow_the_jacobian_which_is_that_of_the_fast_road(name):
     for got, expected in ((followed.mean, fast.mean), (slow_A, A), (slow_B, B)):
         assert torch.allclose(got, expected, atol=1e-10)
     assert slow_A.requires_grad
+
+
+@pytest.mark.parametrize("name", ["angles", "fewer outputs", "all in CasADi"])
+def test_a_model_with_features_is_exported_to_casadi(name):
+    model = MODELS[name]()
+    function, x, u = casadi_function(model), draw(8, model.state_dim), draw(9, model.input_dim)
+    belief = model.predict(x, u)
+    mean, variance = function(x.numpy(), u.numpy())
+    np.testing.assert_allclose(mean.full()[:, 0], belief.mean.numpy(), atol=1e-11)
+    np.testing.assert_allclose(variance.full()[:, 0], belief.variance.numpy(), atol=1e-11)

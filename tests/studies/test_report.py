@@ -3,9 +3,11 @@
 import csv
 import io
 import json
+import re
 import time
 import tracemalloc
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -13,6 +15,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from gpmpc.exceptions import DataError, SettingError
+from gpmpc.plotting import Series, over_variable
+from gpmpc.provenance import provenance
 from gpmpc.studies.comparison import compare, sentences
 from gpmpc.studies.report import read_report as report
 from gpmpc.studies.report_document import terminal_table
@@ -268,3 +272,39 @@ def test_a_thousand_runs_are_put_together_quickly_and_in_little_memory(tmp_path)
     assert len(found.cells) == 20
     assert seconds < 20
     assert peak < 1e9
+
+
+def test_a_page_says_what_made_the_runs_and_links_them(tree):
+    settings = SETTINGS | {"horizon": 5, "options": {"controller": "nmpc"}}
+    made_up_run(tree, ["controller=nmpc", "horizon=5"], settings, result=metrics_of(0.1))
+    found = report(tree)
+    html = documents(found)["report.html"]
+    links = re.findall(r'href="([^"]*)"', html)
+    assert len(links) == len(found.runs) == 16
+    assert all((tree / "report" / unquote(link)).resolve().is_dir() for link in links)
+    made = provenance()
+    for text in (made["created"][:10], made["machine"]["processor"], "Settings of all runs", "data.size: null"):
+        assert text in html
+    assert "horizon: " not in "\n".join(found.base_settings())  # it was varied
+
+
+@pytest.mark.parametrize(
+    ("positions", "scale", "places"),
+    [
+        (["1", "5", "20"], "log", [1, 5, 20]),
+        (["25", "50", "100"], "linear", [25, 50, 100]),
+        (["0", "0.5"], "linear", [0, 0.5]),
+        (["-1", "10"], "linear", [-1, 10]),
+        (["convex", "lqr"], "linear", [0, 1]),
+        (["5", "null"], "linear", [0, 1]),
+        (["7"], "linear", [7]),
+    ],
+)
+def test_numbers_stand_at_their_place_on_an_axis_and_words_side_by_side(positions, scale, places):
+    lines = [Series(name, [[1.0, 2.0]] * len(positions)) for name in ("a", "b")]
+    (axis,) = over_variable("x", positions, "y", lines).axes
+    assert axis.get_xscale() == scale
+    assert axis.get_xticks() == pytest.approx(places)
+    assert [label.get_text() for label in axis.get_xticklabels()] == positions
+    low, high = axis.get_xlim()
+    assert all(low < x < high for line in axis.lines for x in line.get_xdata())

@@ -1,0 +1,187 @@
+"""Takes a gymnasium environment as a system, and offers this package's systems as gymnasium environments.
+
+An environment moves on by itself: it is stepped from where it stands, and set to another state only where it can be (a
+MuJoCo environment whose observation is qpos, qvel). Where it ends an episode, a flight is lost. Needs ``gpmpc[sim]``.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from gpmpc import systems
+from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.systems.simulators import Simulator, library
+from gpmpc.systems.system import System, step
+
+Array = np.ndarray
+OURS = ("acrobot", "cart_pole", "double_integrator", "pendulum", "planar_quadrotor", "stirred_tank", "translational")
+
+
+class Environment(Simulator):
+    """The dynamics of a gymnasium environment.
+
+    Args:
+        name: Of the environment, such as ``"InvertedPendulum-v5"``, or one that was made.
+        observe: From an observation to the state (n,); the observation itself by default.
+        state_names: Of the state; x1, x2, ... by default.
+        input_names: Of the action; u1, u2, ... by default.
+        settings: Further arguments of ``gymnasium.make``.
+
+    Raises:
+        SettingError: There is no such environment, or its spaces are not boxes of one dimension.
+    """
+
+    def __init__(
+        self,
+        name: Any,
+        observe: Callable[[Any], Array] | None = None,
+        state_names: Sequence[str] = (),
+        input_names: Sequence[str] = (),
+        **settings: Any,
+    ):
+        gymnasium = library("gymnasium")
+        self.environment = name
+        if isinstance(name, str):
+            try:
+                made = {"max_episode_steps": -1, "disable_env_checker": True} | settings
+                self.environment = gymnasium.make(name, **made)
+            except (gymnasium.error.Error, ImportError, TypeError) as error:
+                raise SettingError("environment", f"{name!r}: {' '.join(str(error).split())}") from error
+        action = self._check_box("action", self.environment.action_space)
+        if observe is None:
+            self._check_box("observation", self.environment.observation_space)
+        self._observe, self.limits = observe, (action.low.astype(float), action.high.astype(float))
+        state = self.reset(0)
+        states = state_names or [f"x{i + 1}" for i in range(len(state))]
+        inputs = input_names or [f"u{i + 1}" for i in range(len(action.low))]
+        for key, names, count in (("state_names", states, len(state)), ("input_names", inputs, len(action.low))):
+            if len(names) != count:
+                raise ShapeError(f"{key} must be {count} names; got {len(names)}")
+        self.state_names, self.input_names = tuple(states), tuple(inputs)
+
+    @staticmethod
+    def _check_box(kind: str, space: Any) -> Any:
+        if not isinstance(space, library("gymnasium").spaces.Box) or len(space.shape) != 1:
+            what = f"the {kind} space must be a Box of one dimension"
+            remedy = "; name a function with observe" if kind == "observation" else ""
+            raise SettingError("environment", f"{what}; got {space}{remedy}")
+        return space
+
+    def _reset(self, seed: int) -> Array:
+        observation, _ = self.environment.reset(seed=seed)
+        return self._state(observation)
+
+    def _step(self, input: Array) -> tuple[Array, bool]:
+        space = self.environment.action_space
+        observation, _, terminated, _, _ = self.environment.step(np.clip(input, *self.limits).astype(space.dtype))
+        return self._state(observation), bool(terminated)
+
+    def _set(self, state: Array) -> bool:
+        """Sets a MuJoCo environment to a state."""
+        inner = self.environment.unwrapped
+        model: Any = getattr(inner, "model", None)
+        if self._observe is not None or not hasattr(inner, "set_state") or len(state) != model.nq + model.nv:
+            return False
+        inner.set_state(state[: model.nq], state[model.nq :])
+        return True
+
+    def _state(self, observation: Any) -> Array:
+        state = np.array(observation if self._observe is None else self._observe(observation), dtype=float)
+        if state.ndim != 1:
+            raise ShapeError(f"observe must give a state (n,); got {state.shape}")
+        return state
+
+
+def gymnasium_system(
+    environment: Any,
+    observe: Callable[[Any], Array] | None = None,
+    state_names: Sequence[str] = (),
+    input_names: Sequence[str] = (),
+    time_step: float | None = None,
+    make: dict[str, Any] | None = None,
+    **settings: Any,
+) -> System:
+    """Makes a system of a gymnasium environment.
+
+    Args:
+        environment: Its name, or one that was made.
+        observe: From an observation to the state (n,).
+        state_names: Of the state.
+        input_names: Of the action.
+        time_step: [s]; by default the environment's ``dt``.
+        make: Further arguments of ``gymnasium.make``.
+        settings: Of ``System``, such as ``units``, ``tracked`` and ``goal``; the environment limits the inputs.
+
+    Raises:
+        SettingError: The environment cannot be taken, or gives no time step.
+        ShapeError: Names do not fit it.
+    """
+    dynamics = Environment(environment, observe, state_names, input_names, **(make or {}))
+    time_step = getattr(dynamics.environment.unwrapped, "dt", None) if time_step is None else time_step
+    if time_step is None:
+        raise SettingError("time_step", "is not known of this environment; say it [s]")
+    lower, upper = dynamics.limits
+    given = {"name": str(environment), "input_lower": lower, "input_upper": upper} | settings
+    return System(dynamics, float(time_step), 1, **given)
+
+
+def make_environment(system: System | str, **settings: Any) -> Any:
+    """Makes a gymnasium environment of a system whose observation is the state.
+
+    The reward is minus the squared distance of the tracked states from the goal; an episode ends where they are farther
+    from it than at the start, and than ``System.lost``.
+
+    Args:
+        system: Or the name of one of this package's.
+        settings: Of the one that is named.
+    """
+    gymnasium = library("gymnasium")
+    flown: System = getattr(systems, system)(**settings) if isinstance(system, str) else system
+
+    class Environment(gymnasium.Env):
+        """A system as an environment."""
+
+        metadata = {"render_modes": []}  # noqa: RUF012
+
+        def __init__(self) -> None:
+            n = len(flown.state_names)
+            lower, upper = np.array(flown.input_lower), np.array(flown.input_upper)
+            self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float64)
+            self.action_space = gymnasium.spaces.Box(lower, upper, dtype=np.float64)
+            self.state = np.array(flown.goal)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Array, dict]:
+            """Starts where the system starts, or from its region."""
+            super().reset(seed=seed)
+            region: Any = flown.region if flown.start is None else None
+            start: Any = flown.start or flown.goal if region is None else self.np_random.uniform(*region)
+            self.state = np.array(start, dtype=float)
+            self._limit = max(flown.lost, 1.001 * self._distance())
+            return self.state.copy(), {}
+
+        def step(self, action: Array) -> tuple[Array, float, bool, bool, dict]:
+            """Takes one step; the action is clipped."""
+            action = np.clip(np.asarray(action, dtype=float), flown.input_lower, flown.input_upper)
+            with np.errstate(over="ignore", invalid="ignore"):
+                self.state = step(flown, self.state, action)
+            distance = self._distance()
+            return self.state.copy(), -(distance**2), not distance <= self._limit, False, {}
+
+        def _distance(self) -> float:
+            errors = self.state - flown.goal
+            errors[flown.angle_indices] = (errors[flown.angle_indices] + np.pi) % (2 * np.pi) - np.pi
+            return float(np.linalg.norm(errors[flown.tracked_indices]))
+
+    return Environment()
+
+
+def register_environments() -> list[str]:
+    """Registers this package's systems as gymnasium environments, such as ``gpmpc/cart_pole-v0``; returns the names."""
+    gymnasium = library("gymnasium")
+    names = [f"gpmpc/{name}-v0" for name in OURS]
+    for name, system in zip(names, OURS, strict=True):
+        if name not in gymnasium.registry:
+            entry = f"{__name__}:make_environment"
+            gymnasium.register(name, entry_point=entry, max_episode_steps=500, kwargs={"system": system})
+    return names

@@ -1,0 +1,197 @@
+"""Takes a MuJoCo model as a system: the state is that of named joints, or what named sensors measure.
+
+The joints' positions, then their velocities, then the activations of the actuators that have one, are a state that the
+model can be set to, so that many are stepped at once by ``mujoco.rollout``. Sensors show a part of it: the model then
+moves on by itself, from where it stands. Needs the extra ``sim``.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.systems.simulators import Simulator, library
+from gpmpc.systems.system import System
+
+Array = np.ndarray
+
+
+class _Model:
+    """A loaded MJCF file, and its named actuators."""
+
+    def __init__(self, path: str | Path, actuators: Sequence[str]):
+        self.mujoco = library("mujoco")
+        try:
+            self.model = self.mujoco.MjModel.from_xml_path(str(path))
+        except (ValueError, OSError) as error:
+            raise DataError(f"{path}: is no MJCF model ({' '.join(str(error).split())})") from error
+        self.path, self.data = path, self.mujoco.MjData(self.model)
+        self.controls = self.indices("actuators", self.mujoco.mjtObj.mjOBJ_ACTUATOR, self.model.nu, actuators)
+        limited = self.model.actuator_ctrllimited.astype(bool)[self.controls]
+        low, high = self.model.actuator_ctrlrange[self.controls].T
+        self.limits = np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
+
+    def indices(self, key: str, kind: Any, count: int, names: Sequence[str]) -> list[int]:
+        """Finds named parts of the model.
+
+        Raises:
+            SettingError: There is none, or one is not there.
+        """
+        known = [self.mujoco.mj_id2name(self.model, kind, i) for i in range(count)]
+        if not names:
+            raise SettingError(key, f"name at least one of {', '.join(map(str, known)) or 'none'} of {self.path}")
+        for name in names:
+            if name not in known:
+                raise SettingError(key, f"must be among {', '.join(map(str, known))} of {self.path}; got {name!r}")
+        return [known.index(name) for name in names]
+
+
+class Joints(_Model):
+    """Dynamics of a model by its joints.
+
+    Args:
+        path: Of the MJCF file.
+        joints: Names of all joints, hinges and slides.
+        actuators: Names of those that are steered; others stay at zero.
+        substeps: Steps of the model per step.
+
+    Raises:
+        DataError: The file is no MJCF model.
+        SettingError: A joint or an actuator is not there, is no hinge or slide, or a joint is left out.
+    """
+
+    def __init__(self, path: str | Path, joints: Sequence[str], actuators: Sequence[str], substeps: int = 1):
+        super().__init__(path, actuators)
+        model, joint = self.model, self.mujoco.mjtJoint
+        found = self.indices("joints", self.mujoco.mjtObj.mjOBJ_JOINT, model.njnt, joints)
+        for name, i in zip(joints, found, strict=True):
+            if joint(int(model.jnt_type[i])) not in (joint.mjJNT_SLIDE, joint.mjJNT_HINGE):
+                raise SettingError("joints", f"must be hinges or slides; {name!r} of {path} is neither; name sensors")
+        if model.nv != len(found):
+            raise SettingError("joints", f"must name all {model.njnt} joints of {path}; got {len(found)}")
+        self.substeps, q, v = substeps, model.jnt_qposadr[found], model.jnt_dofadr[found]
+        # Where the states stand in MuJoCo's own: time, qpos, qvel, act.
+        self._order = np.concatenate([1 + q, 1 + model.nq + v, 1 + model.nq + model.nv + np.arange(model.na)])
+        activated = [self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nu)]
+        activated = [name for name, address in zip(activated, model.actuator_actadr, strict=True) if address >= 0]
+        rates = [f"{name}_rate" for name in joints]
+        self.state_names = (*joints, *rates, *(f"{name}_activation" for name in activated))
+        self.input_names = tuple(actuators)
+
+    def successor(self, x: Any, u: Any) -> Array:
+        """The next state (n,) or states (n, T) from a state and an input, or T of each.
+
+        Raises:
+            SettingError: They are no numbers.
+        """
+        try:
+            states, inputs = np.array(x, dtype=float), np.array(u, dtype=float)
+        except (TypeError, ValueError, NotImplementedError) as error:
+            what = "a simulator has no equations: take a controller on a learned model"
+            raise SettingError("controller", what) from error
+        single = states.ndim == 1
+        states, inputs = states.reshape(len(states), -1), inputs.reshape(len(inputs), -1)
+        count, model = states.shape[1], self.model
+        initial = np.zeros((count, 1 + model.nq + model.nv + model.na))
+        initial[:, self._order] = states.T
+        control = np.zeros((count, self.substeps, model.nu))
+        control[:, :, self.controls] = inputs.T[:, None]
+        if not np.isfinite(initial).all() or not np.isfinite(control).all():
+            return np.full(states.shape, np.nan)[:, 0] if single else np.full(states.shape, np.nan)
+        moved, _ = library("mujoco.rollout").rollout(model, self.data, initial, control)
+        after = moved[:, -1, self._order].T
+        return after[:, 0] if single else after
+
+
+class Sensors(_Model, Simulator):
+    """Dynamics of a model by its sensors, from its initial pose.
+
+    Args:
+        path: Of the MJCF file.
+        sensors: Names, in the order of the state.
+        actuators: Names of those that are steered; others stay at zero.
+        state_names: Of what the sensors measure; by default a sensor's own, numbered where it has several values.
+        observe: From what the sensors measure to the state (n,).
+        substeps: Steps of the model per step.
+        input_delay: Steps after which an input acts.
+
+    Raises:
+        DataError: The file is no MJCF model.
+        SettingError: A sensor or an actuator is not there.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        sensors: Sequence[str],
+        actuators: Sequence[str],
+        state_names: Sequence[str] = (),
+        observe: Callable[[Array], Array] = np.array,
+        substeps: int = 1,
+        input_delay: int = 0,
+    ):
+        super().__init__(path, actuators)
+        model = self.model
+        found = self.indices("sensors", self.mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor, sensors)
+        sizes = [int(model.sensor_dim[i]) for i in found]
+        places = [np.arange(d) + model.sensor_adr[i] for i, d in zip(found, sizes, strict=True)]
+        self._places, self._observe, self.substeps, self._delay = np.concatenate(places), observe, substeps, input_delay
+        own = [f"{name}{k + 1}" if d > 1 else name for name, d in zip(sensors, sizes, strict=True) for k in range(d)]
+        self.state_names = tuple(state_names or own)
+        self.input_names = tuple(actuators)
+        if len(self.reset(0)) != len(self.state_names):
+            raise SettingError("state_names", f"must be {len(self.reset(0))} names; got {len(self.state_names)}")
+
+    def _reset(self, seed: int) -> Array:
+        self.mujoco.mj_resetData(self.model, self.data)
+        self.mujoco.mj_forward(self.model, self.data)
+        self._waiting = [np.zeros(len(self.controls))] * self._delay
+        return self._measure()
+
+    def _step(self, input: Array) -> tuple[Array, bool]:
+        self._waiting = [*self._waiting, np.clip(input, *self.limits)]
+        self.data.ctrl[self.controls] = self._waiting.pop(0)
+        self.mujoco.mj_step(self.model, self.data, self.substeps)
+        self.mujoco.mj_forward(self.model, self.data)
+        return self._measure(), False
+
+    def _measure(self) -> Array:
+        return np.array(self._observe(self.data.sensordata[self._places]), dtype=float)
+
+
+def mujoco_system(
+    path: str | Path,
+    actuators: Sequence[str],
+    joints: Sequence[str] = (),
+    sensors: Sequence[str] = (),
+    substeps: int = 1,
+    observation: dict[str, Any] | None = None,
+    **settings: Any,
+) -> System:
+    """Makes a system of a MuJoCo model, of named joints or of named sensors.
+
+    Args:
+        path: Of the MJCF file.
+        actuators: Names of those that are steered.
+        joints: Names of all joints.
+        sensors: Names, in the order of the state; without joints.
+        substeps: Steps of the model per time step.
+        observation: Further arguments of ``Sensors``.
+        settings: Of ``System``, such as ``units``, ``tracked`` and ``goal``; limits of the inputs are the actuators'.
+
+    Raises:
+        DataError: The file is no MJCF model.
+        SettingError: A name is not there, or both joints and sensors are named, or neither.
+    """
+    if bool(joints) == bool(sensors):
+        raise SettingError("joints, sensors", "name either the joints or the sensors that are the state")
+    if joints:
+        dynamics: Joints | Sensors = Joints(path, joints, actuators, substeps)
+        settings = {"rates": {f"{name}_rate": name for name in settings.get("tracked") or ()}} | settings
+    else:
+        dynamics = Sensors(path, sensors, actuators, substeps=substeps, **(observation or {}))
+    lower, upper = dynamics.limits
+    given = {"name": Path(path).stem, "input_lower": lower, "input_upper": upper} | settings
+    return System(dynamics, substeps * float(dynamics.model.opt.timestep), 1, **given)

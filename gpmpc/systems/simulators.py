@@ -1,0 +1,72 @@
+"""What systems of foreign simulators have in common: they move on by themselves, from where they stand."""
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from gpmpc.exceptions import SettingError
+
+Array = np.ndarray
+
+
+def library(name: str) -> Any:
+    """Imports a library of the extra ``sim``.
+
+    Raises:
+        SettingError: It is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise SettingError("system", f"needs {name}, which is not installed: pip install 'gpmpc[sim]'") from error
+
+
+class Simulator:
+    """Dynamics that a simulator steps: a subclass has ``_reset``, ``_step`` and, where it can be set, ``_set``.
+
+    Attributes:
+        stateful: A step moves the simulator.
+        ended: Whether the simulator has ended its episode.
+    """
+
+    stateful = True
+    ended = False
+    state_names: tuple[str, ...] = ()
+    input_names: tuple[str, ...] = ()
+    _now: Array | None = None
+
+    def reset(self, seed: int) -> Array:
+        """Starts an episode; returns its first state (n,)."""
+        self._now, self.ended = self._reset(seed), False
+        return self._now.copy()
+
+    def successor(self, x: Any, u: Any) -> Array:
+        """Steps the simulator from a state (n,) with an input (m,); returns the next state.
+
+        Raises:
+            SettingError: It does not stand in that state and cannot be set to it, or x and u are no numbers.
+        """
+        try:
+            state, input = np.array(x, dtype=float), np.array(u, dtype=float)
+        except (TypeError, ValueError, NotImplementedError) as error:
+            what = "a simulator has no equations: take a controller on a learned model"
+            raise SettingError("controller", what) from error
+        if state.ndim != 1:
+            raise SettingError("plant", "a simulator takes one step at a time; take closed_loop for each seed")
+        moved = self._now is None or not np.array_equal(state, self._now)
+        if moved and not self._set(state):
+            what = "this simulator cannot be set to a state"
+            raise SettingError("system", f"{what}: it takes no process noise and starts where it starts")
+        self._now, self.ended = self._step(input)
+        return self._now.copy()
+
+    def _reset(self, seed: int) -> Array:
+        raise NotImplementedError
+
+    def _step(self, input: Array) -> tuple[Array, bool]:
+        raise NotImplementedError
+
+    def _set(self, state: Array) -> bool:
+        """Sets the simulator to a state; returns whether it can be."""
+        return False

@@ -1,0 +1,100 @@
+"""An inspection finds what was put into a log: delays, noise, repeated values, gaps, inputs that teach nothing."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pytest
+
+from gpmpc.exceptions import DataError
+from gpmpc.logs import LogMapping, inspect_log, read_log
+from gpmpc.plotting import inspection_figure, png
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from tests.cli.command import forked
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def table():
+    rng = np.random.default_rng(0)
+    rows = 12_000
+    motion = np.convolve(rng.normal(size=rows + 200), np.hanning(30), "same")
+    signal = motion[100:-100]
+    return pandas.DataFrame(
+        {
+            "t": 0.004 * np.arange(rows),
+            "a": signal,
+            "late": motion[93:-107],
+            "noisy": rng.normal(0, 0.5, rows) + 3 * np.sin(0.001 * np.arange(rows)),
+            "slow": np.repeat(rng.normal(size=rows // 10), 10),
+            "u": 2 * signal + 1e-3 * rng.normal(size=rows),
+        }
+    )
+
+
+def test_what_was_put_in_is_found(table, tmp_path):
+    table = table.drop(index=range(5000, 5075))
+    table.loc[7000, "t"] = table.loc[6999, "t"]
+    table.to_csv(tmp_path / "log.csv", index=False)
+    found = inspect_log(tmp_path / "log.csv")
+    ((_, rows, rate, jitter, gaps, longest, repeated, backwards),) = found.streams
+    assert (rows, gaps, repeated, backwards) == (11_925, 2, 1, 0)  # a row that is left out leaves a gap
+    assert (rate, longest) == (pytest.approx(250), pytest.approx(0.304))
+    assert jitter < 0.1
+    channels = {channel.name: channel for channel in found.channels}
+    assert channels["noisy"].noise == pytest.approx(0.5, rel=0.05)
+    assert channels["noisy"].smoothness == pytest.approx(-2 / 3, abs=0.03)
+    assert "smoothed" in channels["a"].remark
+    assert "a new value every 10.0 rows" in channels["slow"].remark
+    delays = {(d.first, d.second): d for d in found.delays}
+    assert delays["a", "late"].rows == 7
+    assert delays["a", "late"].agreement > 0.9
+    assert len(png(inspection_figure(found), dpi=50)) > 5000
+
+
+def test_an_input_that_follows_the_states_is_named(table, tmp_path):
+    table.to_csv(tmp_path / "log.csv", index=False)
+    mapping = LogMapping.from_dict({"time": "t", "states": {"x": ["a"]}, "inputs": {"u": ["u"], "free": ["noisy"]}})
+    found = inspect_log(tmp_path / "log.csv", mapping, read_log(tmp_path / "log.csv", mapping))
+    assert found.follows["u"] > 0.99
+    assert found.follows["noisy"] < 0.1
+    assert any("u follows the states" in warning for warning in found.warnings)
+    table.drop(columns="t").to_csv(tmp_path / "bare.csv", index=False)
+    with pytest.raises(DataError, match="no column of the time"):
+        inspect_log(tmp_path / "bare.csv")
+
+
+def test_the_command_writes_a_page(table, tmp_path):
+    table.to_csv(tmp_path / "log.csv", index=False)
+    result = forked("log", "inspect", "log.csv", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "late comes 7 rows after a" in result.stdout
+    page = (tmp_path / "log.inspection.html").read_text()
+    assert "Delays between correlated channels" in page
+    missing = forked("log", "inspect", "no.csv", cwd=tmp_path)
+    assert (missing.returncode, missing.stderr) == (2, "gpmpc: no.csv: no such file\n")
+
+
+def test_learn_writes_a_model_a_report_and_a_card_and_names_mistakes(tmp_path):
+    import yaml
+
+    example = runpy.run_path(str(ROOT / "examples" / "own_log.py"))
+    for number, flight in enumerate(example["simulate_flights"](2, 600)):
+        flight.to_csv(tmp_path / f"{number}.csv", index=False)
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(example["MAPPING"], sort_keys=False))
+    arguments = ["map.yaml", "0.csv", "1.csv", "--points", "20", "--steps", "10", "--held-out", "1"]
+    result = forked("learn", *arguments, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "loses: " in result.stdout or "ridge" in result.stdout
+    written = {path.name for path in (tmp_path / "learned").iterdir()}
+    documents = {"report.md", "report.csv", "report.tex", "report.html", "report.png", "card.md"}
+    assert written == documents | {"model.safetensors", "progress.json"}
+    card = (tmp_path / "learned" / "card.md").read_text()
+    assert "What must not be trusted" in card
+    assert "| thrust |" in card
+    wrong = forked("learn", "map.yaml", "0.csv", "1.csv", "--held-out", "7", cwd=tmp_path)
+    assert (wrong.returncode, wrong.stderr) == (2, "gpmpc: held_out: no such run '7'; there are 0, 1\n")

@@ -1,0 +1,82 @@
+"""The standard deviations that a bound is moved by can come with the reference, by stage: of a conformal tube, say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.estimation import AdaptiveTube, ConformalTube
+from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.propagation import Linearization
+from tests.mpc.small_models import double_integrator
+
+H, UPPER, STD = 6, 0.3, np.array([0.01, 0.02])
+FAR = Reference(np.tile([1.0, 0.0], (H + 1, 1)), np.zeros((H, 1)))  # beyond the bound
+START = Gaussian.certain(np.zeros(2))
+
+
+def controller(probability=0.95, **settings):
+    bounds = Box([-np.inf, -np.inf], [UPPER, np.inf], probability=probability)
+    problem = Problem(Tracking([10.0, 0.1], [1e-3]), Box([-20.0], [20.0]), constraints=[bounds])
+    propagator = Linearization()
+    return GPMPC(
+        double_integrator(W=np.diag(STD**2).tolist()), propagator, problem, H, [0.0], PredictionSettings(**settings)
+    )
+
+
+def test_bounds_are_moved_by_the_kappas_of_the_reference():
+    asked, plain = controller(), None
+    for kappas in (np.full(H, 1.6448536269514722), np.linspace(1.0, 4.0, H)):
+        found = asked.control(START, replace(FAR, kappas=kappas))
+        sd = np.sqrt(found.covariances[1:, 0, 0])
+        assert sd.min() > 0
+        margins = (UPPER - found.means[1:, 0]) / sd
+        assert (margins > kappas - 1e-6).all()
+        assert np.isclose(margins, kappas, atol=1e-5).any()
+        plain = asked.control(START, FAR) if plain is None else plain
+        assert np.allclose(found.inputs, plain.inputs, atol=1e-9) == (kappas[0] == kappas[-1])
+
+
+def test_a_bound_on_the_mean_stays_one():
+    asked = controller(probability=None)
+    moved = asked.control(START, replace(FAR, kappas=np.full(H, 4.0)))
+    assert np.array_equal(moved.inputs, asked.control(START, FAR).inputs)
+
+
+def test_an_adaptive_tube_brings_the_violations_to_what_is_allowed_where_the_noise_is_larger_than_learned():
+    asked, rng = controller(), np.random.default_rng(0)
+    outside = {}
+    for name in ("as learned", "adapted"):
+        tube = ConformalTube(np.abs(np.random.default_rng(1).normal(size=(200, H))), [[1.0, 0.0]])
+        adaptive, x, last, count = AdaptiveTube(tube, 0.95, rate=0.05), np.zeros(2), None, 0
+        for _ in range(250):
+            adaptive.observe(x)
+            kappas = adaptive.kappas if name == "adapted" else None
+            last = asked.control(Gaussian.certain(x), replace(FAR, kappas=kappas), last)
+            adaptive.remember(last.means, last.covariances)
+            moved = asked.prediction.model.predict(torch.from_numpy(x), torch.from_numpy(last.input)).mean.numpy()
+            x = moved + 3 * STD * rng.normal(size=2)
+            count += x[0] > UPPER
+        outside[name] = count / 250
+    assert outside["as learned"] > 0.15
+    assert outside["adapted"] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "rule"),
+    [
+        (lambda: replace(FAR, kappas=np.ones(H + 1)), ShapeError, r"kappas must be \(6,\); got \(7,\)"),
+        (lambda: controller().control(START, replace(FAR, kappas=np.full(H, np.nan))), DataError, "must be finite"),
+        (lambda: controller(covariance="full").control(START, replace(FAR, kappas=np.ones(H))),
+         SettingError, "kappas: are for covariances of 'zero_order'; this controller has 'full'"),
+    ],
+)  # fmt: skip
+def test_misuse_is_refused(make, error, rule):
+    with pytest.raises(error, match=rule):
+        make()

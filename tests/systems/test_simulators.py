@@ -1,0 +1,203 @@
+"""Foreign simulators are systems like any other, and this package's systems are environments."""
+
+import sys
+from functools import partial
+
+import numpy as np
+import pytest
+
+from gpmpc.datasets import RandomData
+from gpmpc.exceptions import DataError, Diverged, SettingError
+from gpmpc.gp import Trainer, standardize
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.propagation import Linearization
+from gpmpc.simulation import closed_loop, closed_loops
+from gpmpc.studies.flight import Experiment, run_trial
+from gpmpc.systems import planar_quadrotor, step, step_many
+from gpmpc.systems.gymnasium_ import OURS, gymnasium_system, make_environment, register_environments
+from gpmpc.systems.mujoco_ import mujoco_system
+
+gymnasium = pytest.importorskip("gymnasium")
+pytest.importorskip("mujoco")
+
+CART = """
+<mujoco model="cart">
+  <option timestep="0.01"/>
+  <worldbody>
+    <body name="cart">
+      <joint name="slider" type="slide" axis="1 0 0" damping="0.1"/>
+      <geom type="box" size="0.1 0.1 0.05" mass="1"/>
+      <body name="pole">
+        <joint name="hinge" type="hinge" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 0.6" size="0.02" mass="0.2"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <general name="push" joint="slider" ctrllimited="true" ctrlrange="-10 10" DYNTYPE/>
+    <motor name="unused" joint="hinge"/>
+  </actuator>
+  <sensor>
+    <jointpos name="position" joint="slider"/>
+    <jointpos name="angle" joint="hinge"/>
+    <jointvel name="velocity" joint="slider"/>
+    <jointvel name="rate" joint="hinge"/>
+    <framepos name="tip" objtype="body" objname="pole"/>
+  </sensor>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def cart(tmp_path):
+    path = tmp_path / "cart.xml"
+    path.write_text(CART.replace("DYNTYPE", ""))
+    return path
+
+
+@pytest.fixture
+def lagging(tmp_path):
+    path = tmp_path / "lagging.xml"
+    path.write_text(CART.replace("DYNTYPE", 'dyntype="filter" dynprm="0.05"'))
+    return path
+
+
+@pytest.mark.parametrize("name", OURS)
+@pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space.*:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is -?infinity.*:UserWarning")
+def test_our_systems_are_environments_that_pass_gymnasiums_checker(name):
+    from gymnasium.utils.env_checker import check_env
+
+    assert f"gpmpc/{name}-v0" in register_environments()
+    check_env(gymnasium.make(f"gpmpc/{name}-v0").unwrapped, skip_render_check=True)
+
+
+def test_an_environment_of_ours_moves_as_its_system_and_ends_where_it_is_lost():
+    environment, system = make_environment("planar_quadrotor"), planar_quadrotor()
+    state, _ = environment.reset(seed=0)
+    assert np.array_equal(state, system.start)
+    for _ in range(200):
+        expected = step(system, state, np.zeros(2))
+        state, reward, terminated, truncated, _ = environment.step(np.zeros(2))
+        assert np.array_equal(state, expected)
+        assert reward == pytest.approx(-(np.hypot(state[0], state[2]) ** 2))
+        assert not truncated
+        if terminated:
+            break
+    assert terminated
+    assert np.hypot(state[0], state[2]) > 10
+
+
+def taken(**settings):
+    names = {"state_names": ["cosine", "sine", "rate"], "tracked": ["cosine", "sine"]}
+    return gymnasium_system("Pendulum-v1", goal=[1, 0, 0], **(names | settings))
+
+
+def test_an_environment_is_learned_and_swung_up_like_any_other_system():
+    system = taken(units={"rate": "rad/s", "cosine": "1", "sine": "1"})
+    assert (system.time_step, system.input_lower, system.input_upper) == (0.05, (-2.0,), (2.0,))
+    problem = Problem(Tracking([1, 1, 0.01], [0.01], penalized="inputs"), inputs=Box([-2], [2]))
+    experiment = Experiment(
+        RandomData(samples=400, episode=40), None, system, Trainer(predicts="difference", scaling=standardize),
+        partial(GPMPC, propagator=Linearization(), problem=problem, horizon=25, initial_input=[0.0]), steps=150,
+    )  # fmt: skip
+    first, again = (run_trial(experiment).rollout for _ in range(2))
+    assert np.abs(first.states[-20:] - [1, 0, 0]).max() < 0.05
+    assert np.array_equal(first.states, again.states)
+
+
+class Pushing:
+    """Always applies the same input."""
+
+    horizon, initial_input = 1, [1.0]
+
+    def control(self, belief, reference, previous=None):
+        from gpmpc.mpc.controller import Decision, Timing
+        from gpmpc.status import Status
+
+        n = len(belief.mean)
+        return Decision(
+            [1.0], np.ones((1, 1)), np.zeros((2, n)), np.zeros((2, n, n)), Status.SOLVED, 1, Timing(0, 0, 0)
+        )
+
+
+def test_where_an_environment_ends_its_episode_the_flight_ends_as_lost():
+    system = gymnasium_system(make_environment("double_integrator"), time_step=0.1, tracked=["x1"])
+    with pytest.raises(Diverged, match="the simulator has ended its episode, at state") as caught:
+        closed_loop(system, Pushing(), np.zeros((203, 2)), None, 200)
+    assert np.abs(caught.value.flown.states[-1, 0]) < 10
+    with pytest.raises(SettingError, match="a simulator flies one seed after another"):
+        closed_loops(system, Pushing(), np.zeros((3, 2)), None, 2, seeds=2)
+
+
+def test_a_mujoco_model_moves_alike_by_joints_and_by_sensors_one_or_many_at_a_time(cart, rng):
+    joints = mujoco_system(cart, ["push"], joints=["slider", "hinge"], substeps=4)
+    sensors = mujoco_system(cart, ["push"], sensors=["position", "angle", "velocity", "rate"], substeps=4)
+    assert joints.state_names == ("slider", "hinge", "slider_rate", "hinge_rate")
+    assert sensors.state_names == ("position", "angle", "velocity", "rate")
+    assert joints.time_step == 0.04
+    assert joints.input_upper == (10.0,)
+    state = other = sensors.dynamics.reset(0)
+    for k in range(20):
+        input = np.array([np.sin(k)])
+        state, other = step(joints, state, input), step(sensors, other, input)
+        assert np.array_equal(state, other)
+    states, inputs = 0.1 * rng.normal(size=(7, 4)), rng.normal(size=(7, 1))
+    alone = [step(joints, x, u) for x, u in zip(states, inputs, strict=True)]
+    assert np.array_equal(step_many(joints, states, inputs), alone)
+    assert len(RandomData(samples=20, starts="start").transitions(joints)) == 20
+
+
+def test_an_actuators_lag_is_a_state_and_a_delay_waits(cart, lagging):
+    lag = mujoco_system(lagging, ["push"], joints=["slider", "hinge"], substeps=1)
+    assert lag.state_names[-1] == "push_activation"
+    state = np.zeros(5)
+    for _ in range(5):
+        state = step(lag, state, np.array([10.0]))
+    assert state[4] == pytest.approx(10 * (1 - 0.8**5))  # Euler's method: 0.01 s of 0.05 s, five times
+    late = mujoco_system(cart, ["push"], sensors=["velocity", "tip"], observation={"input_delay": 2})
+    assert late.state_names == ("velocity", "tip1", "tip2", "tip3")
+    state, speeds = late.dynamics.reset(0), []
+    for _ in range(4):
+        state = step(late, state, np.array([10.0]))
+        speeds.append(state[0])
+    assert np.abs(speeds[:2]).max() < 1e-12 < 0.01 < speeds[2] < speeds[3]
+
+
+def test_misuse_of_simulators_is_one_clear_line(cart, tmp_path, monkeypatch):
+    class Worded(gymnasium.Env):
+        action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float64)
+        observation_space = gymnasium.spaces.Dict({"a": action_space})
+
+        def reset(self, *, seed=None, options=None):
+            return {"a": np.zeros(1)}, {}
+
+        def step(self, action):
+            return {"a": action}, 0.0, False, False, {}
+
+    named = gymnasium_system(Worded(), observe=lambda observation: observation["a"], time_step=0.1)
+    assert step(named, np.zeros(1), np.array([3.0])) == 1.0
+    system = taken()
+    started = system.dynamics.reset(0)
+    for misuse, error, message in (
+        (lambda: gymnasium_system(Worded(), time_step=1), SettingError, "observation space must be a Box.*observe"),
+        (lambda: gymnasium_system("CartPole-v1"), SettingError, "the action space must be a Box of one dimension"),
+        (lambda: gymnasium_system("Pendlum-v1"), SettingError, "environment: 'Pendlum-v1': "),
+        (lambda: gymnasium_system(Worded(), observe=lambda o: o["a"]), SettingError, "time_step: is not known"),
+        (lambda: step(system, started + 0.1, np.zeros(1)), SettingError, "cannot be set to a state"),
+        (
+            lambda: mujoco_system(cart, ["push"], joints=["slider", "hing"]),
+            SettingError,
+            "among slider, hinge of .*'hing'",
+        ),
+        (lambda: mujoco_system(cart, ["pull"], joints=["slider", "hinge"]), SettingError, "actuators: .*'pull'"),
+        (lambda: mujoco_system(cart, ["push"], joints=["slider"]), SettingError, "must name all 2 joints"),
+        (lambda: mujoco_system(cart, ["push"]), SettingError, "name either the joints or the sensors"),
+        (lambda: mujoco_system(tmp_path / "no.xml", ["push"], joints=["a"]), DataError, "no.xml: is no MJCF model"),
+    ):
+        with pytest.raises(error, match=message):
+            misuse()
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(SettingError, match=r"needs mujoco, which is not installed: pip install 'gpmpc\[sim\]'"):
+        mujoco_system(cart, ["push"], joints=["slider", "hinge"])
