@@ -39,6 +39,16 @@ def test_the_example_of_the_readme_swings_a_pendulum_up(tmp_path, monkeypatch, c
     assert (tmp_path / "swing_up.png").exists()
 
 
+def test_the_example_of_a_system_of_ones_own_follows_its_waypoints(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["own_system.py", str(tmp_path)])
+    names = runpy.run_path(str(EXAMPLES / "own_system.py"), run_name="__main__")
+    assert names["result"]["rmse"]["total"] < 0.05
+    assert names["result"]["lost"] is None
+    assert float(names["calibration"].coverage[0, :, 2].min()) > 0.85
+    assert "RMSE" in capsys.readouterr().out
+    assert (tmp_path / "own_system.png").stat().st_size > 10_000
+
+
 def test_the_example_of_a_log_learns_from_its_own_files_and_leaves_a_figure(tmp_path, capsys):
     names = runpy.run_path(str(EXAMPLES / "own_log.py"))
     names["main"](tmp_path)

@@ -151,7 +151,7 @@ def test_models_and_data_say_what_they_are_in_one_line():
         ),
         (
             lambda: Problem(Tracking([1.0], [1.0], penalized="inputs"), constraints=[(-1, 1)]),
-            r"must be Box\(...\) or Halfspaces\(...\); got tuple",
+            r"must be Box\(...\), Halfspaces\(...\) or Inequality\(...\); got tuple",
         ),
         (lambda: Box([0.0], 1), "upper: must be a list of numbers, infinite where unbounded; got 1"),
         (lambda: Box([0.0, 0.0], [1.0]), "upper: must be a list of 2 numbers"),

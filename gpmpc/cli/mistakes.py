@@ -33,12 +33,16 @@ def explain(error: Exception, name: str) -> str | None:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Returns the name that a misspelt one stands for, as a question; by its last part where only that was typed."""
-    known = sorted(known, key=lambda key: key.count("."))
-    for part in (str, lambda key: key.rpartition(".")[2]):
+    known, leaf = sorted(known, key=lambda key: key.count(".")), lambda key: key.rpartition(".")[2]
+    alone = "." not in name or leaf(name).lower() in {leaf(key).lower() for key in known}
+    for part in (leaf,) if alone else (str, leaf):
         parts = {part(key).lower() for key in known}
         if close := difflib.get_close_matches(part(name).lower(), parts, n=1):
-            meant = [repr(key) for key in known if part(key).lower() == close[0]]
-            return f" (did you mean {' or '.join(meant[:3])}?)"
+            meant = [key for key in known if part(key).lower() == close[0]]
+            if "." in name:
+                meant = difflib.get_close_matches(name, meant, n=1, cutoff=0.0)
+            meant = [key for key in meant if "." not in key] or meant
+            return f" (did you mean {' or '.join(map(repr, meant[:3]))}?)"
     return ""
 
 

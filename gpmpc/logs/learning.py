@@ -205,11 +205,11 @@ def _structures(kinematics: Kinematics, log: Log) -> tuple[str, LogModel, dict[s
         {
             "force disturbance": lambda model: replace(model, history=(PAST,) * 3 + (0,) * 3),
             "motor torque": lambda model: replace(model, nominal=replace(model.nominal, torque=True)),
+            "feedback": lambda model: replace(model, nominal=replace(model.nominal, feedback=True)),
             f"inputs {LATE} rows late": lambda model: replace(model, lag=LATE) if model.nominal.torque else None,
             "torque disturbance": lambda model: (
                 replace(model, history=(*model.history[:3], PAST, PAST, PAST)) if model.nominal.torque else None
             ),
-            "feedback": lambda model: replace(model, nominal=replace(model.nominal, feedback=True)),
         },
     )
 

@@ -7,6 +7,7 @@ for each measured entry white measurement noise. Non-negative least squares on t
 find the variances. Errors one step ahead alone, on filtered rows, would understate them many times.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,7 @@ from gpmpc.logs.state_space import Array
 TIME_CONSTANTS = (0.0, 0.05, 0.25, 1.0)  # [s]; zero is white
 FITTED = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps
 DIFFERENCE = 1e-6
+ALIKE = 0.05  # weight of differences within a group of outputs
 
 
 @dataclass(frozen=True)
@@ -76,11 +78,24 @@ def fit_noise(models: Sequence[LogModel], folds: Sequence[Windows], errors: Sequ
     mean = np.maximum(squares.mean(axis=0), 1e-300)
     relative = (responses.mean(axis=0) / mean[..., None]).reshape(-1, responses.shape[-1])
     factor = np.maximum(relative.max(axis=0), 1e-300)
-    found = nnls(relative / factor, np.ones(len(relative)))[0] / factor
     count = len(TIME_CONSTANTS) * outputs
+    alike = _alike(models[0], factor)
+    found = nnls(np.vstack([relative / factor, alike]), np.r_[np.ones(len(relative)), np.zeros(len(alike))])[0] / factor
     ratio = (squares / np.maximum(responses @ found, 1e-300)).mean(axis=(1, 2))
     level = _fit_level(np.concatenate([_regressors(model, cut) for model, cut in pairs]), ratio)
     return OutputNoise(found[:count].reshape(-1, outputs), found[count:], level)
+
+
+def _alike(model: LogModel, factor: Array) -> Array:
+    """Rows that draw neighbouring outputs of a group together where the errors do not tell them apart, as x and y."""
+    rows, o = [], len(model.kinematics.output_names)
+    for start in range(0, len(TIME_CONSTANTS) * o, o):
+        for group in model.kinematics.output_groups.values():
+            for i, j in itertools.pairwise(group):
+                row, pair = np.zeros(len(factor)), [start + i, start + j]
+                row[pair] = ALIKE * factor[pair].mean() / factor[pair] * [1.0, -1.0]
+                rows.append(row)
+    return np.array(rows).reshape(-1, len(factor))
 
 
 def _fit_level(z: Array, ratio: Array) -> Array:

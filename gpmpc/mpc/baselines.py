@@ -19,7 +19,7 @@ import casadi
 import numpy as np
 
 from gpmpc.dynamics import DynamicsModel, linearize
-from gpmpc.exceptions import check_number
+from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.interrupts import interrupts_after
 from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_controller, check_dynamics
@@ -111,7 +111,7 @@ class LQR:
 
     The first local model is taken at the state itself, the others at the reference; their inputs are the reference's
     where it has them, else the last input. Every input of the plan is clipped to the input box and to the rate bounds,
-    each seen from the one before; constraints of the states are ignored.
+    each seen from the one before; it takes no constraints of states.
 
     Args:
         model: What was learned; its variance is not used.
@@ -126,6 +126,8 @@ class LQR:
 
     def __init__(self, model: DynamicsModel, problem: Problem, horizon: int, initial_input: Sequence[float]):
         self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
+        if problem.constraints:
+            raise SettingError("constraints", "LQR knows the bounds of inputs only; leave those of states out")
         self.model, self.problem, self.horizon = model, problem, horizon
         self._cost = TrackingCost.of(problem, problem.cost.Q[None], problem.cost.terminal[None])
 
@@ -192,8 +194,10 @@ def _build(
     unknowns, states = [casadi.vec(x), casadi.vec(u)], np.stack([np.full((H, n), -np.inf), np.full((H, n), np.inf)])
     box = [np.empty((2, 0)), np.array(problem.inputs.by_stage(H)).reshape(2, -1)]
     rows = ConstraintRows(problem, H, "none")
+    if rows.smooth:
+        raise SettingError("constraints", "NMPC takes Box and Halfspaces; Inequality is for GPMPC")
     soft = np.isfinite(rows.prices)
-    E, lower, upper = rows.at(np.empty(0), H)
+    E, lower, upper = rows.at(np.empty((0, n)), np.empty(0), H)
     single = (np.count_nonzero(E[0], axis=1) == 1) & (E[0].max(axis=1) == 1.0)
     for e in np.flatnonzero(single & ~soft):
         j = int(np.argmax(E[0, e]))

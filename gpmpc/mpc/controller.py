@@ -4,6 +4,7 @@ A controller keeps nothing between calls: what it needs of its last plan is part
 and is handed to it again as ``previous``.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -31,8 +32,8 @@ class Reference:
     """What a controller is to follow over its horizon H, from the current time on.
 
     Attributes:
-        states: r_0 .. r_H (H + 1, n); r_0 belongs to the current time.
-        inputs: u*_0 .. u*_{H-1} (H, m), the inputs that belong to it where they are known.
+        states: r_0 .. r_H (H + 1, n); r_0 belongs to the current time. Or a set point (n,), for any horizon.
+        inputs: u*_0 .. u*_{H-1} (H, m), the inputs that belong to it where they are known; (m,) for a set point.
         kappas: Standard deviations (H,) between the means and the sides of chance constraints, by stage, in the place
             of the problem's, such as those of an ``AdaptiveTube``; for covariances of ``zero_order``.
 
@@ -45,6 +46,10 @@ class Reference:
     kappas: Array | None = None
 
     def __post_init__(self) -> None:
+        if np.ndim(self.states) == 1:
+            if self.inputs is not None and np.ndim(self.inputs) != 1:
+                raise ShapeError(f"inputs of a set point must be (m,); got {np.shape(self.inputs)}")
+            return
         if np.ndim(self.states) != 2 or len(self.states) < 2:
             raise ShapeError(f"reference states must be (H + 1, n), H of 1 or more; got {np.shape(self.states)}")
         if self.inputs is not None and (np.ndim(self.inputs) != 2 or len(self.inputs) != len(self.states) - 1):
@@ -52,10 +57,17 @@ class Reference:
         if self.kappas is not None and np.shape(self.kappas) != (self.horizon,):
             raise ShapeError(f"kappas must be ({self.horizon},); got {np.shape(self.kappas)}")
 
+    def over(self, horizon: int) -> "Reference":
+        """The reference itself, or a set point repeated over a horizon."""
+        if np.ndim(self.states) == 2:
+            return self
+        inputs = None if self.inputs is None else np.tile(_array(self.inputs), (horizon, 1))
+        return Reference(np.tile(_array(self.states), (horizon + 1, 1)), inputs)
+
     @property
     def horizon(self) -> int:
-        """H."""
-        return len(self.states) - 1
+        """H; 1 for a set point."""
+        return len(self.states) - 1 if np.ndim(self.states) == 2 else 1
 
 
 @dataclass(frozen=True)
@@ -143,6 +155,7 @@ class Request(NamedTuple):
             plan may be applied. Within the input bounds.
         finite: Whether the belief is. A belief that is not is a bad measurement, not misuse.
         disturbance: Added to the model's mean at every stage (n,), or nothing (0,).
+        parameters: Of the smooth constraints, by stage (H, q); None where there are none.
         kappas: Of the reference (H,), where it has some.
     """
 
@@ -152,6 +165,7 @@ class Request(NamedTuple):
     initial_guess: Array
     finite: bool
     disturbance: Array = _NO_DISTURBANCE
+    parameters: Array | None = None
     kappas: Array | None = None
 
     @classmethod
@@ -183,7 +197,7 @@ class Request(NamedTuple):
                 "control takes a Gaussian (Gaussian.certain(x) for a measured state) and a Reference(states); "
                 f"got {type(belief).__name__} and {type(reference).__name__}"
             )
-        n, m = problem.state_dim, problem.input_dim
+        reference, n, m = reference.over(horizon), problem.state_dim, problem.input_dim
         state, covariance, states = _array(belief.mean), _array(belief.covariance), _array(reference.states)
         if state.shape != (n,) or states.shape != (horizon + 1, n):
             raise ShapeError(
@@ -208,6 +222,8 @@ class Request(NamedTuple):
         kappas = None if reference.kappas is None else _array(reference.kappas)
         if kappas is not None and not np.isfinite(kappas).all():
             raise DataError(f"reference kappas must be finite; got {kappas}")
+        if problem.cost.angles and not found & _BELIEF:
+            states = _unwrapped(states, state, previous, problem.cost.angles)
         references = References(states[1:], inputs, last)
         return cls(state, covariance, references, guess, not found & _BELIEF, kappas=kappas)
 
@@ -282,6 +298,41 @@ def _array(value: Any) -> Array:
         except (RuntimeError, TypeError):  # on another device, or part of a graph
             value = value.numpy(force=True)
     return np.ascontiguousarray(value, dtype=np.float64)
+
+
+def read_parameters(parameters: Any, horizon: int) -> Array:
+    """Returns parameters of every stage (H, q).
+
+    Raises:
+        ShapeError: They are neither (q,) nor (H, q).
+        DataError: They are not finite.
+    """
+    values = np.atleast_1d(_array(parameters))
+    if values.ndim == 1:
+        values = np.tile(values, (horizon, 1))
+    if values.ndim != 2 or len(values) != horizon:
+        raise ShapeError(f"parameters must be (q,) or ({horizon}, q); got {np.shape(parameters)}")
+    if not np.isfinite(values).all():
+        raise DataError("parameters must be finite")
+    return values
+
+
+def full_turns(difference: Array, angles: Sequence[int]) -> Array:
+    """Returns the full turns (n,) in a difference of states, zero where they are no angles."""
+    turns, index = np.zeros_like(difference), list(angles)
+    turns[index] = 2.0 * np.pi * np.round(difference[index] / (2.0 * np.pi))
+    return turns
+
+
+def _unwrapped(states: Array, state: Array, previous: Decision | None, angles: Sequence[int]) -> Array:
+    """References (H + 1, n) whose angles are moved by full turns towards the last plan, or the state where none is."""
+    plan = np.tile(state, (len(states), 1))
+    if previous is not None and previous.applicable and np.shape(previous.means) == states.shape:
+        plan[1:] = np.concatenate([previous.means[2:], previous.means[-1:]])
+        plan[1:] += full_turns(state - previous.means[1], angles)
+    moved, index = states.copy(), list(angles)
+    moved[:, index] += 2.0 * np.pi * np.round((plan[:, index] - states[:, index]) / (2.0 * np.pi))
+    return moved
 
 
 @compiled(locked=True)

@@ -16,6 +16,7 @@ nonlinear problem itself. Where the iteration ends, in the covariance modes of `
 from collections.abc import Sequence
 from dataclasses import replace
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -94,7 +95,9 @@ class GPMPC:
                 f"soft constraints need DualActiveSet (penalty=None makes them hard); got {type(self.solver).__name__}",
             )
 
-    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+    def control(
+        self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
+    ) -> Decision:
         """Decides the input for one step; see ``Controller.control``.
 
         A belief that is not finite gives ``INVALID_MEASUREMENT``. ``iterations`` of the decision counts quadratic
@@ -105,11 +108,13 @@ class GPMPC:
             belief: What is known of the state.
             reference: Over the horizon, with inputs where the weights ask for them.
             previous: The last decision; one that is not applicable is ignored.
+            parameters: Of the smooth constraints, (q,) or by stage (H, q), such as where an obstacle will be.
 
         Raises:
-            ShapeError: Belief or reference have other dimensions, or reference inputs are missing.
+            ShapeError: Belief, reference or parameters have other dimensions, or reference inputs are missing.
+            DataError: Reference or parameters are not finite.
         """
-        request, clock = self.prediction.read(belief, reference, previous), _Stopwatch()
+        request, clock = self.prediction.read(belief, reference, previous, parameters), _Stopwatch()
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
@@ -152,7 +157,11 @@ class GPMPC:
         return Decision(inputs[0], inputs, *beliefs, status, count, clock.timing, *found)
 
     def control_many(
-        self, beliefs: Sequence[Gaussian], references: Sequence[Reference], previous: Sequence[Decision | None]
+        self,
+        beliefs: Sequence[Gaussian],
+        references: Sequence[Reference],
+        previous: Sequence[Decision | None],
+        parameters: Sequence[Any] | None = None,
     ) -> list[Decision]:
         """``control`` for T questions, with the first stages of all of them linearised in one call.
 
@@ -162,11 +171,13 @@ class GPMPC:
             beliefs: T, one a question.
             references: T.
             previous: T decisions, None where there is none.
+            parameters: T, one a question.
 
         Raises:
             ShapeError: As for ``control``.
         """
-        asked = list(zip(beliefs, references, previous, strict=True))
+        own = [None] * len(beliefs) if parameters is None else parameters
+        asked = list(zip(beliefs, references, previous, own, strict=True))
         requests = [self.prediction.read(*question) for question in asked]
         known, clock = [t for t, request in enumerate(requests) if request.finite], _Stopwatch()
         decisions = [request.failed_decision(Status.INVALID_MEASUREMENT) for request in requests]
@@ -200,7 +211,9 @@ class GPMPC:
             each += 8 * N * N + 12 * n * n * (N * (n + 1) + n * n + d)
         return 8 * (self.prediction.points * each + 4 * size * (size + n * self.horizon))
 
-    def build(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> QuadraticProgram:
+    def build(
+        self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
+    ) -> QuadraticProgram:
         """The (first) quadratic program of a step, checked.
 
         Its unknowns are the inputs u_0 .. u_{H-1}, one after the other. Rows of G: increments u_k - u_{k-1} where they
@@ -210,13 +223,14 @@ class GPMPC:
             belief: As for ``control``.
             reference: As for ``control``.
             previous: As for ``control``.
+            parameters: As for ``control``.
 
         Raises:
             ShapeError: As for ``control``.
             DataError: The belief is not finite, or it does not stay so.
             ProblemError: The program is malformed, numerically.
         """
-        request = self.prediction.read(belief, reference, previous)
+        request = self.prediction.read(belief, reference, previous, parameters)
         plan = self.prediction.initial_guess(request, previous)
         prediction = self.prediction.linearize(plan, request, previous)
         return QuadraticProgram.from_stacked(*self._condense(prediction, request)[:5])

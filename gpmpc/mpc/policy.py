@@ -8,7 +8,7 @@ of a decision says otherwise: inputs beyond a bound by rounding are put onto it,
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -56,26 +56,29 @@ def command(
     last: Command | None = None,
     on_failure: OnFailure = "raise",
     step: int = 0,
+    parameters: Any = None,
 ) -> Command:
     """Decides one step's input by a controller, or by the policy where it has none.
 
     Args:
         controller: Called where the belief is finite.
         belief: Of the state (n,).
-        reference: Over the controller's horizon.
+        reference: Over the controller's horizon, or a set point.
         last: The command of the step before; None at the first.
         on_failure: ``"previous_plan"`` goes on along the last applicable plan, ``"hold"`` keeps the last input applied,
             ``"raise"`` stops. Before the first such plan, the first two take the reference's own input if there is
-            one, within the controller's input and rate bounds, and stop otherwise.
+            one, else the controller's initial input, within its input and rate bounds.
         step: Number of the step, for the message.
+        parameters: Of the controller's smooth constraints, where it has any.
 
     Raises:
         SettingError: No such policy.
         SolverFailure: The policy is ``"raise"``, or there is nothing to fall back on.
     """
     check_policy(on_failure)
-    plan = None if last is None else last.plan
-    decision = controller.control(belief, reference, plan) if _is_finite(belief) else None
+    plan, reference = None if last is None else last.plan, reference.over(controller.horizon)
+    known = {} if parameters is None else {"parameters": parameters}
+    decision = controller.control(belief, reference, plan, **known) if _is_finite(belief) else None
     return _conclude(controller, decision, reference, last, on_failure, step)
 
 
@@ -107,6 +110,57 @@ def commands(
         except SolverFailure as failure:
             outcomes.append(failure)
     return outcomes
+
+
+class ControlLoop:
+    """Steers a plant that is not ours: holds what one step needs of the last, and returns an input that may be applied.
+
+    What ``input`` returns is finite, and within the bounds and rates of the controller's problem, whatever happened: a
+    measurement that is not finite, a program without a solution, an error of the numbers. Before the first plan that
+    is the reference's input, or the controller's initial one.
+
+    Args:
+        controller: With a problem and an initial input.
+        on_failure: ``"previous_plan"`` or ``"hold"``; see ``command``. ``"raise"`` stops instead.
+
+    Attributes:
+        last: Command of the last step: its input, decision and status; None before the first.
+        failures: Number of steps whose input the policy chose.
+
+    Raises:
+        SettingError: No such policy.
+    """
+
+    def __init__(self, controller: Controller, on_failure: OnFailure = "previous_plan"):
+        check_policy(on_failure)
+        self.controller = controller
+        self.on_failure: OnFailure = on_failure
+        self.last: Command | None = None
+        self.failures, self._steps = 0, 0
+
+    def input(self, state: Any, reference: Any, parameters: Any = None) -> np.ndarray:
+        """Returns the input to apply now (m,).
+
+        Args:
+            state: Measured (n,), or a ``Gaussian``.
+            reference: A set point (n,), states (H + 1, n), or a ``Reference``.
+            parameters: Of the controller's smooth constraints, where it has any.
+
+        Raises:
+            ShapeError: State, reference or parameters have other dimensions than the controller.
+            SolverFailure: The policy is ``"raise"``.
+        """
+        belief = state if isinstance(state, Gaussian) else Gaussian.certain(np.asarray(state, dtype=float))
+        wanted = reference if isinstance(reference, Reference) else Reference(np.asarray(reference, dtype=float))
+        self.last = command(self.controller, belief, wanted, self.last, self.on_failure, self._steps, parameters)
+        self.failures, self._steps = self.failures + self.last.failed, self._steps + 1
+        return self.last.input.copy()
+
+    def warm_up(self, state: Any, reference: Any, parameters: Any = None) -> None:
+        """Decides twice and forgets it, so that everything is compiled before the loop starts."""
+        rehearsal = ControlLoop(self.controller, "previous_plan")
+        for _ in range(2):
+            rehearsal.input(state, reference, parameters)
 
 
 def check_policy(on_failure: str) -> None:
@@ -150,9 +204,10 @@ def _conclude(
         shifted = _admit(controller, shifted, last)
         if shifted is not None:
             return Command(shifted.input, status, decision, shifted)
-    if reference.inputs is None or not np.isfinite(reference.inputs[0]).all():
+    known = getattr(controller, "initial_input", None) if reference.inputs is None else reference.inputs[0]
+    if known is None or not np.isfinite(known).all():
         raise SolverFailure(step, f"{reason} (no earlier plan and no reference input to fall back on)")
-    input = _within_bounds(controller, np.array(reference.inputs[0], dtype=float), last)
+    input = _within_bounds(controller, np.array(known, dtype=float), last)
     H, n = reference.horizon, reference.states.shape[1]
     unknown = np.full((H + 1, n), np.nan), np.full((H + 1, n, n), np.nan)
     applied = Decision(input, np.tile(input, (H, 1)), *unknown, status, 0, Timing(0.0, 0.0, 0.0))

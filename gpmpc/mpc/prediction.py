@@ -26,7 +26,7 @@ finite-horizon LQR at the first stage. It is part of the covariances only: the b
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -36,7 +36,16 @@ from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.linalg import copy_matrix, product
 from gpmpc.mpc.condense import StateRows
-from gpmpc.mpc.controller import Decision, Reference, Request, check_controller, check_dynamics, check_method
+from gpmpc.mpc.controller import (
+    Decision,
+    Reference,
+    Request,
+    check_controller,
+    check_dynamics,
+    check_method,
+    full_turns,
+    read_parameters,
+)
 from gpmpc.mpc.linear_quadratic import finite_horizon_lqr
 from gpmpc.mpc.problem import Problem
 from gpmpc.mpc.stages import COVARIANCES, ConstraintRows, Covariance, LinearizedStages, Plan, StageLinearizer
@@ -133,7 +142,9 @@ class PredictionModel:
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
 
-    def read(self, belief: Gaussian, reference: Reference, previous: Decision | None) -> Request:
+    def read(
+        self, belief: Gaussian, reference: Reference, previous: Decision | None, parameters: Any = None
+    ) -> Request:
         """The checked arguments of a controller's ``control``, with the disturbance estimate.
 
         Raises:
@@ -141,6 +152,8 @@ class PredictionModel:
         """
         problem, H = self.problem, self.horizon
         request = Request.read(problem, H, self.initial_input, belief, reference, previous)
+        if parameters is not None:
+            request = request._replace(parameters=read_parameters(parameters, H))
         if reference.inputs is None and problem.cost.penalized == "deviations":
             raise ShapeError(f"penalized 'deviations' needs reference inputs ({H}, {problem.input_dim}); got none")
         if request.kappas is not None and self.linearizer.covariance != "zero_order":
@@ -170,6 +183,8 @@ class PredictionModel:
             last = previous
         if last is not None:
             means[1:H], means[H] = last.means[2:], last.means[H]
+            if problem.cost.angles:  # a sensor may have taken a turn off
+                means[1:] += full_turns(request.state - last.means[1], problem.cost.angles)
         else:
             states, shares = request.references.states, np.linspace(1.0, 0.0, H + 1)[1:, None]
             means[1:] = states + shares * (request.state - states[0])
@@ -227,7 +242,8 @@ class PredictionModel:
             covariances[0] = request.covariance
         if self.settings.form == "velocity" and previous is not None and previous.applicable:
             stages = self._increments(plan, stages, request, previous)
-        return Prediction(plan, stages, covariances, self.constraints.at(covariances, self.points, request.kappas))
+        means, known = plan.states[:, : self.problem.state_dim], (request.parameters, request.kappas)
+        return Prediction(plan, stages, covariances, self.constraints.at(means, covariances, self.points, *known))
 
     def _increments(
         self, plan: Plan, stages: LinearizedStages, request: Request, previous: Decision

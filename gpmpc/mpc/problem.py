@@ -7,21 +7,23 @@ where v is the input itself, its deviation from the reference input, or its incr
 sections 3.2-3.3). For a Gaussian x_i, E|x - r|^2_Q = |mu - r|^2_Q + tr(Q Sigma).
 
 A constraint g'x <= f of a Gaussian state holds with probability eta where g'mu + kappa sqrt(g'Sigma g) <= f,
-kappa = Phi^-1(eta). By default a constraint is soft: a violation pays a price, so that a program always has a solution.
-The penalty is exact (Fletcher, 1987, section 14.3): as long as the price exceeds what the cost can gain by a violation,
-no plan that can keep the constraint pays it.
+kappa = Phi^-1(eta); smooth ones, h(x, p) <= 0, are linearised along the plan. By default a constraint is soft: a
+violation pays a price, so that a program always has a solution. The penalty is exact (Fletcher, 1987, section 14.3): as
+long as the price exceeds what the cost can gain by a violation, no plan that can keep the constraint pays it.
 """
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from statistics import NormalDist
 from typing import Any, Literal
 
 import numpy as np
+import torch
 
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc.dynamics import batched_jacobian, to_array
+from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.qp.problem import ABSENT
 
 Array = np.ndarray
@@ -72,9 +74,9 @@ class Constraint:
             object.__setattr__(self, "stages", stages)
 
     @property
-    def size(self) -> int:
-        """Number of entries that are bounded, or of states."""
-        raise NotImplementedError
+    def size(self) -> int | None:
+        """Number of states that it is for; None where any will do."""
+        return None
 
     def rows(self, horizon: int) -> tuple[Array, Array, Array]:
         """Returns F (r, n), lower and upper (H, r) of rows lower <= F x <= upper, of which each has one side only."""
@@ -82,10 +84,8 @@ class Constraint:
 
     def standard_deviations(self, sides: int = 1) -> float:
         """Returns kappa of each of a number of sides, all stages counted."""
-        if self.kappa is not None:
-            return float(self.kappa)
-        if self.probability is None:
-            return 0.0
+        if self.kappa is not None or self.probability is None:
+            return float(self.kappa or 0.0)
         return NormalDist().inv_cdf(1.0 - (1.0 - self.probability) / (sides if self.joint else 1))
 
 
@@ -106,9 +106,10 @@ class Box(Constraint):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        sides = [None if side is None else _numbers(key, side) for key, side in self._sides]
+        given = [("lower", self.lower), ("upper", self.upper)]
+        sides = [None if side is None else _numbers(key, side) for key, side in given]
         shape = next((side.shape for side in sides if side is not None), (0,))
-        for (key, value), side, absent in zip(self._sides, sides, (-math.inf, math.inf), strict=True):
+        for (key, value), side, absent in zip(given, sides, (-math.inf, math.inf), strict=True):
             array = np.full(shape, absent) if side is None else side
             if array.ndim not in (1, 2) or array.shape != shape:
                 raise SettingError(key, f"must be a list of {shape[-1]} numbers, or one by stage; got {value!r}")
@@ -122,10 +123,6 @@ class Box(Constraint):
             raise SettingError(
                 "lower, upper", f"must not cross; entry {entry} has {self.lower[at]:g} above {self.upper[at]:g}"
             )
-
-    @property
-    def _sides(self) -> list[tuple[str, Any]]:
-        return [("lower", self.lower), ("upper", self.upper)]
 
     @property
     def size(self) -> int:
@@ -187,6 +184,75 @@ class Halfspaces(Constraint):
 
 
 @dataclass(frozen=True)
+class Inequality(Constraint):
+    """Smooth constraints h(x, p) <= 0 of the states, such as obstacles, linearised along the plan.
+
+    Its standard deviation is the one along the gradient, sqrt(dh Sigma dh'). A gradient that vanishes says nothing of
+    where to go: prefer ``radius - distance`` to ``radius**2 - distance**2``.
+
+    Attributes:
+        h: A function of tensors, states (H, n) and, where ``parameters`` are handed to the controller, these (H, q),
+            that gives (H, count), each row of its own state; or a CasADi function of one state and one vector of
+            parameters.
+        count: Number of values of h at a state.
+
+    Raises:
+        SettingError: h is no function, or as for ``Constraint``.
+    """
+
+    h: Any
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_number("count", self.count, least=1, whole=True)
+        if not callable(self.h):
+            raise SettingError("h", f"must be a function; got {type(self.h).__name__}")
+
+    def rows(self, horizon: int) -> tuple[Array, Array, Array]:
+        """Returns the places of its rows: gradients zero, no lower bounds, and upper ones 0."""
+        upper = np.zeros((horizon, self.count))
+        return np.zeros((self.count, 0)), np.full_like(upper, -math.inf), upper
+
+    def linearize(self, states: Array, parameters: Array | None) -> tuple[Array, Array]:
+        """Returns h (H, count) and its gradients (H, count, n) at states (H, n).
+
+        Raises:
+            ShapeError: h gives another shape.
+            DataError: h or a gradient is not finite.
+        """
+        arguments = [states] if parameters is None else [states, parameters]
+        if hasattr(self.h, "n_in"):
+            values, gradients = _linearize_casadi(self.h, arguments)
+        else:
+            x, *rest = (torch.as_tensor(argument) for argument in arguments)
+
+            def h(x: torch.Tensor) -> tuple[torch.Tensor]:
+                value = self.h(x, *rest)
+                return (value.unsqueeze(-1) if value.dim() == 1 else value,)
+
+            (value,), (gradient,) = batched_jacobian(h, (x,))
+            values, gradients = to_array(value), to_array(gradient)
+        if values.shape != (len(states), self.count):
+            raise ShapeError(f"h must give ({len(states)}, {self.count}); got {values.shape}")
+        if not (np.isfinite(values).all() and np.isfinite(gradients).all()):
+            raise DataError("h or its gradient is not finite along the plan")
+        return values, gradients
+
+
+@lru_cache(maxsize=64)
+def _casadi_expansion(function: Any, points: int) -> Any:
+    x, y = function.name_in(0), function.name_out(0)
+    return function.factory("expansion", function.name_in(), [y, f"jac:{y}:{x}"]).map(points)
+
+
+def _linearize_casadi(function: Any, arguments: Sequence[Array]) -> tuple[Array, Array]:
+    (K, n), expansion = arguments[0].shape, _casadi_expansion(function, len(arguments[0]))
+    value, jacobian = expansion(*[argument.T for argument in arguments])
+    return value.full().T.copy(), jacobian.full().reshape(-1, K, n).transpose(1, 0, 2).copy()
+
+
+@dataclass(frozen=True)
 class Tracking:
     """Costs of the distance to a reference and of the inputs.
 
@@ -195,6 +261,7 @@ class Tracking:
         R: Input weights, the diagonal (m,) or the matrix (m, m).
         terminal: Weight of the last predicted state, like Q; Q itself by default.
         penalized: What R weighs: ``"inputs"``, ``"deviations"`` from the reference inputs, or ``"increments"``.
+        angles: Indices of states whose error is modulo 2 pi: their references move by full turns towards the plan.
 
     Raises:
         SettingError: A weight is not symmetric positive semidefinite, R is zero in a direction, or a length is wrong.
@@ -204,6 +271,7 @@ class Tracking:
     R: Any
     terminal: Any = None
     penalized: Penalized = "increments"
+    angles: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "Q", _weight("Q", self.Q))
@@ -217,6 +285,10 @@ class Tracking:
             raise SettingError("terminal", f"must be a weight of {len(self.Q)} states; got {len(terminal)}")
         if self.penalized not in PENALIZED:
             raise SettingError("penalized", f"must be one of {', '.join(map(repr, PENALIZED))}; got {self.penalized!r}")
+        angles = tuple(self.angles)
+        if not all(isinstance(index, int) and 0 <= index < len(self.Q) for index in angles):
+            raise SettingError("angles", f"must be indices of {len(self.Q)} states; got {self.angles!r}")
+        object.__setattr__(self, "angles", angles)
 
     @property
     def largest_weight(self) -> float:
@@ -232,7 +304,7 @@ class Problem:
         cost: What is made small.
         inputs: Bounds of the inputs; none by default.
         input_rates: Bounds of u_i - u_{i-1} per step; none by default.
-        constraints: Of the states, ``Box`` or ``Halfspaces``; none by default.
+        constraints: Of the states, ``Box``, ``Halfspaces`` or ``Inequality``; none by default.
 
     Raises:
         SettingError: A part is of another kind or length than the cost asks for.
@@ -252,19 +324,19 @@ class Problem:
                 raise SettingError(key, f"must be Box(lower, upper); got {type(box).__name__}")
             if (box.probability, box.kappa, box.penalty, box.stages) != (None, None, "exact", None):
                 raise SettingError(key, "has bounds that are always kept: no probability, penalty or stages")
-            if not box.size:
-                box = Box(np.full(self.input_dim, -math.inf), np.full(self.input_dim, math.inf))
+            box = box if box.size else Box(np.full(self.input_dim, -math.inf))
+            if box.lower.ndim > 1:
+                raise SettingError(key, "must be one list for all stages")
             if box.size != self.input_dim:
                 raise SettingError(key, f"must bound {self.input_dim} inputs; got {box.size}")
             object.__setattr__(self, key, box)
         constraints = () if self.constraints is None else self.constraints
         given = [constraints] if isinstance(constraints, Constraint) else list(constraints)
         for constraint in given:
-            if not isinstance(constraint, Box | Halfspaces):
-                raise SettingError(
-                    "constraints", f"must be Box(...) or Halfspaces(...); got {type(constraint).__name__}"
-                )
-            if constraint.size != self.state_dim:
+            if not isinstance(constraint, Constraint):
+                kind = type(constraint).__name__
+                raise SettingError("constraints", f"must be Box(...), Halfspaces(...) or Inequality(...); got {kind}")
+            if constraint.size not in (None, self.state_dim):
                 raise SettingError("constraints", f"must bound {self.state_dim} states; got {constraint.size}")
         object.__setattr__(self, "constraints", tuple(given))
 

@@ -133,7 +133,7 @@ class Globalization:
         while length >= _SHORTEST_STEP:
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
             for trial in self._candidates(at, _between(plan, proposed, length), program.feedback):
-                rows = at.rows._replace(E=trial.rows.E)
+                rows = trial.rows if self._model.constraints.smooth else at.rows._replace(E=trial.rows.E)
                 if call_unchecked(_merit, terms, self._defect_prices, trial.stages.next, rows, trial.plan) <= bound:
                     return trial, None
             length /= 2.0

@@ -29,7 +29,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.linalg import dot
 from gpmpc.mpc.condense import StateRows
-from gpmpc.mpc.problem import Problem
+from gpmpc.mpc.problem import Inequality, Problem
 from gpmpc.propagation import Propagator, differentiate
 from gpmpc.propagation import linearize as linearize_belief
 from gpmpc.propagation.local_model import square_roots
@@ -201,6 +201,7 @@ class ConstraintRows:
         prices: Of the rows (r,), infinite where they are hard.
         signs: 1 where a row has upper bounds, -1 where it has lower ones (r,).
         applies: Whether a row has a bound at a stage (H, r).
+        smooth: Whether there is any ``Inequality``.
 
     Raises:
         SettingError: Sides or stages that the horizon does not have.
@@ -208,6 +209,7 @@ class ConstraintRows:
 
     def __init__(self, problem: Problem, horizon: int, covariance: Covariance):
         n, self._horizon, self._covariance = problem.state_dim, horizon, covariance
+        self._smooth: list[tuple[Inequality, slice]] = []
         F, kappa, prices, lower, upper = [np.empty((0, n))], [], [], [np.empty((horizon, 0))], [np.empty((horizon, 0))]
         for constraint in problem.constraints:
             rows, below, above = constraint.rows(horizon)
@@ -217,6 +219,10 @@ class ConstraintRows:
                 outside = [k for k in range(horizon) if k + 1 not in constraint.stages]
                 below[outside], above[outside] = -np.inf, np.inf
             sides = int(np.isfinite(below).sum() + np.isfinite(above).sum())
+            if isinstance(constraint, Inequality):
+                first = sum(map(len, F))
+                self._smooth.append((constraint, slice(first, first + len(rows))))
+                rows = np.zeros((len(rows), n))
             F, lower, upper = [*F, rows], [*lower, below], [*upper, above]
             kappa += [0.0 if covariance == "none" else constraint.standard_deviations(sides)] * len(rows)
             prices += [problem.price(constraint)] * len(rows)
@@ -229,26 +235,45 @@ class ConstraintRows:
         self._margins = np.tile(margins, (horizon, 1))
         mixed = bool((np.count_nonzero(self._F, axis=1) > 1).any())
         moves = mixed if covariance == "diagonal" else covariance == "full" and self.per_stage > 0
-        self._constant = None if moves else self._rows(np.zeros((1, n, n)))
-        fixed = not (moves or self._margins.any())
-        self._fixed = StateRows(self._rows(np.zeros((1, n, n))), self._lower, self._upper) if fixed else None
+        self.smooth, moves = bool(self._smooth), moves or bool(self._smooth)
+        self._constant = None if moves else self._rows(self._F[None], np.zeros((1, n, n)))
+        self._fixed = None
+        if self._constant is not None and not self._margins.any():
+            self._fixed = StateRows(self._constant, self._lower, self._upper)
 
-    def at(self, covariances: Array, stages: int, kappas: Array | None = None) -> StateRows:
-        """The rows, tightened, at covariances of the states.
+    def at(
+        self,
+        states: Array,
+        covariances: Array,
+        stages: int,
+        parameters: Array | None = None,
+        kappas: Array | None = None,
+    ) -> StateRows:
+        """The rows, tightened, at means and covariances of the states.
 
         Args:
+            states: Means x_0 .. x_H (H + 1, n), where smooth constraints are linearised.
             covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
             stages: H, or 1.
+            parameters: Of the smooth constraints (H, q).
             kappas: By stage (H,), in the place of those of the constraints that have some.
+
+        Raises:
+            ShapeError: A smooth constraint gives another shape.
+            DataError: It is not finite.
         """
         if self._fixed is not None:
             return self._fixed
-        lower, upper = self._lower.copy(), self._upper.copy()
+        lower, upper, F = self._lower.copy(), self._upper.copy(), self._F[None]
+        if self._smooth:
+            F = np.repeat(F, self._horizon, axis=0)
+            for constraint, where in self._smooth:
+                values, F[:, where] = constraint.linearize(states[1:], parameters)
+                upper[:, where] += np.einsum("kri,ki->kr", F[:, where], states[1:]) - values
         margins = self._margins if kappas is None else np.where(self._margins > 0, kappas[:, None], 0.0)
-        call_unchecked(_tighten, self._F, margins, covariances, lower, upper)
-        return StateRows(
-            self._rows(covariances[1 : stages + 1]) if self._constant is None else self._constant, lower, upper
-        )
+        call_unchecked(_tighten, F, margins, covariances, lower, upper)
+        E = self._rows(F, covariances[1 : stages + 1]) if self._constant is None else self._constant
+        return StateRows(np.ascontiguousarray(E), lower, upper)
 
     def softness(self, hard_rows: int) -> SoftRows | None:
         """The prices of all rows of a program's G, after ``hard_rows`` that have none; None where all are hard."""
@@ -256,32 +281,32 @@ class ConstraintRows:
             return None
         return SoftRows(linear=np.concatenate([np.full(hard_rows, np.inf), np.tile(self.prices, self._horizon)]))
 
-    def _rows(self, covariances: Array) -> Array:
-        """E (K, r, p) at covariances of the states (K, n, n)."""
-        F, (K, n, _), weight = self._F, covariances.shape, self.signs * self._kappa
+    def _rows(self, F: Array, covariances: Array) -> Array:
+        """E (K, r, p) of gradients F (K, r, n) at covariances of the states (K, n, n); one of either stands for all."""
+        K, n, weight = max(len(F), len(covariances)), F.shape[2], self.signs * self._kappa
         if self._covariance not in ("full", "diagonal"):
-            return np.tile(F, (K, 1, 1))
+            return F
+        F, covariances = (np.broadcast_to(part, (K, *part.shape[1:])) for part in (F, covariances))
         if self._covariance == "diagonal":
             moved = F * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).clip(0))[:, None]
             norms = np.linalg.norm(moved, axis=-1, keepdims=True)
-            slopes = np.divide(F * moved, norms, out=np.tile(np.abs(F), (K, 1, 1)), where=norms > 0)
-            return np.concatenate([np.tile(F, (K, 1, 1)), weight[:, None] * slopes], axis=2)
-        slopes = F[:, :, None] * _directions(F, covariances)[:, :, None, :]  # of |S g| by S (K, r, n, n)
-        return np.concatenate(
-            [np.tile(F, (K, 1, 1)), (weight[:, None, None] * slopes).reshape(K, len(F), n * n)], axis=2
-        )
+            slopes = np.divide(F * moved, norms, out=np.abs(F), where=norms > 0)
+            return np.concatenate([F, weight[:, None] * slopes], axis=2)
+        slopes = F[..., None] * _directions(F, covariances)[:, :, None, :]  # of |S g| by S (K, r, n, n)
+        return np.concatenate([F, (weight[:, None, None] * slopes).reshape(K, -1, n * n)], axis=2)
 
 
 @compiled
 def _tighten(F, kappa, covariances, lower, upper):
     """Moves the bounds of the rows (H, r) inwards by kappa (H, r) standard deviations."""
-    r, n = F.shape
+    held, r, n = F.shape
     for k in range(len(lower)):
+        at = min(k, held - 1)
         for e in range(r):
             variance = 0.0
             for i in range(n):
-                if F[e, i] != 0.0:
-                    variance += F[e, i] * dot(covariances[k + 1, i], F[e], n)
+                if F[at, e, i] != 0.0:
+                    variance += F[at, e, i] * dot(covariances[k + 1, i], F[at, e], n)
             margin = kappa[k, e] * math.sqrt(max(variance, 0.0))
             lower[k, e] += margin
             upper[k, e] -= margin
@@ -302,7 +327,7 @@ def price_violations(prices, rows, states, hard_price):
 
 
 def _directions(F: Array, covariances: Array) -> Array:
-    """S g / |S g| (K, r, n) for rows g of F (r, n) and the symmetric roots S of covariances (K, n, n)."""
+    """S g / |S g| (K, r, n) for rows g of F (K, r, n) and the symmetric roots S of covariances (K, n, n)."""
     eigenvalues, vectors = np.linalg.eigh(covariances)
     roots = (vectors * np.sqrt(np.clip(eigenvalues, 0, None))[:, None, :]) @ vectors.mT
     moved = F @ roots

@@ -67,6 +67,8 @@ class StateFormMPC:
         self.prediction = PredictionModel(model, propagator, problem, horizon, initial_input, prediction)
         self.initial_input, self.problem, self.horizon = self.prediction.initial_input, problem, horizon
         self.solver, self.options = solver, TIGHT.get(solver, {}) if options is None else options
+        if self.prediction.constraints.smooth:
+            raise SettingError("constraints", "StateFormMPC takes Box and Halfspaces; Inequality is for GPMPC")
         self._program = _Program(self.prediction, constraints)
 
     def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:

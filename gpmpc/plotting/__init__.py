@@ -4,6 +4,7 @@ Every function returns a ``Figure`` made without pyplot, so nothing global is to
 """
 
 from gpmpc.plotting.animation import animate, ffmpeg_exists
+from gpmpc.plotting.consistency import innovations_figure
 from gpmpc.plotting.image import png
 from gpmpc.plotting.logs import inspection_figure, judgement_figure
 from gpmpc.plotting.quality import quality
@@ -19,6 +20,7 @@ __all__ = [
     "calibration_figure",
     "error_over_size",
     "ffmpeg_exists",
+    "innovations_figure",
     "inputs_figure",
     "inspection_figure",
     "judgement_figure",

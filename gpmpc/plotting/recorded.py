@@ -159,7 +159,7 @@ def _duration(milliseconds: float) -> str:
 def title_of(run: "Run") -> str:
     """Returns what was run: the command, or the file."""
     command = run.metadata.get("run", {}).get("command", "")
-    return textwrap.shorten(command if command.startswith("gpmpc") else str(run.path), 90, placeholder=" ...")
+    return textwrap.fill(command if command.startswith("gpmpc") else str(run.path), 90, max_lines=2, placeholder=" ...")
 
 
 def _state_name(run: "Run", state: int) -> str:

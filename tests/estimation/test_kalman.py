@@ -16,6 +16,7 @@ from gpmpc.estimation import (
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import DelayedModel, DisturbedModel
+from gpmpc.plotting import innovations_figure
 from gpmpc.propagation import Linearization, MeanEquivalence, Unscented
 from gpmpc.testing import check_model
 
@@ -212,3 +213,16 @@ def test_errors_that_are_too_large_or_too_small_for_their_covariance_are_inconsi
 def test_misuse_is_refused(make, error, rule):
     with pytest.raises(error, match=rule):
         make(Measurement.of_states(2, [0], [0.1]))
+
+
+def test_the_figure_of_innovations_shows_those_that_were_measured_and_how_many_are_outside():
+    sensor = Measurement.of_states(2, [0, 1], [0.1, 0.3])
+    _, inputs, measured = simulated(LINEAR, 60, 0, sensor)
+    measured[:6, 1] = torch.nan
+    run = KalmanFilter.extended(LINEAR, sensor).run(PRIOR, inputs, measured)
+    axes = innovations_figure(run, 0.1, ["a", "b"]).axes
+    points = [axis.lines[0].get_ydata() for axis in axes]
+    assert [len(part) for part in points] == [61, 55]
+    white = run.innovations[:, 0] / run.innovation_covariances[:, 0, 0].sqrt()
+    assert np.allclose(points[0], white)
+    assert "10 % missing" in axes[1].lines[0].get_label()

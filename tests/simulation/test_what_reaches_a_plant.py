@@ -116,8 +116,9 @@ def test_a_loop_of_ones_own_is_stopped_where_the_policy_says_so(kind):
     state, reference = Gaussian.certain(START), Reference(REFERENCES.states[: H + 1])
     with pytest.raises(SolverFailure, match="step 7: its plan, SOLVED, is not finite or out of its bounds or shape"):
         command(Liar({0: kind}), state, reference, None, "raise", 7)
-    (failure,) = commands(Liar({0: kind}), [state], reference, [None], "hold", 7)
-    assert isinstance(failure, SolverFailure)  # there is nothing to hold
+    (first,) = commands(Liar({0: kind}), [state], reference, [None], "hold", 7)
+    assert first.failed
+    assert np.array_equal(first.input, Liar.initial_input)  # there is nothing else to hold
     good = command(Liar(), state, reference)
     held = command(Liar({0: kind}), state, reference, good, "hold")
     assert held.failed

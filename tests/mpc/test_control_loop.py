@@ -1,0 +1,83 @@
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpmpc.exceptions import SettingError, SolverFailure
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.policy import ControlLoop
+from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.propagation import Linearization
+from gpmpc.simulation import closed_loop
+from gpmpc.status import Status
+from gpmpc.systems import double_integrator
+from tests.mpc.small_models import double_integrator as model
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+BOX, RATES = Box([-1.0], [0.8]), Box([-0.3], [0.3])
+PROBLEM = Problem(Tracking([1.0, 0.1], [0.05]), BOX, RATES)
+GOAL = np.array([1.0, 0.0])
+
+
+def controller(problem=PROBLEM):
+    return GPMPC(model(), Linearization(), problem, 10, [0.0])
+
+
+def moved(x, u):
+    return np.array([x[0] + 0.5 * x[1] + 0.125 * u[0], x[1] + 0.5 * u[0]])
+
+
+def test_five_lines_steer_somebody_elses_plant_to_a_set_point():
+    loop, x = ControlLoop(controller()), np.zeros(2)
+    loop.warm_up(x, GOAL)
+    assert loop.last is None
+    for _ in range(60):
+        x = moved(x, loop.input(x, GOAL))
+    assert np.allclose(x, GOAL, atol=1e-3)
+    assert loop.failures == 0
+
+
+@pytest.mark.parametrize("on_failure", ["previous_plan", "hold"])
+def test_whatever_happens_an_input_is_finite_and_within_bounds_and_rates(on_failure, rng):
+    hard = Problem(PROBLEM.cost, BOX, RATES, [Box(None, [np.inf, 0.1], penalty=None)])
+    loop, x, last = ControlLoop(controller(hard), on_failure), np.zeros(2), np.zeros(1)
+    for k in range(60):
+        measured = x + 0.3 * rng.normal(size=2) if k % 3 else np.array([np.nan, 0.0])
+        u = loop.input(measured, GOAL)
+        assert np.isfinite(u).all()
+        assert BOX.lower[0] - 1e-9 <= u[0] <= BOX.upper[0] + 1e-9
+        assert abs(u[0] - last[0]) <= 0.3 + 1e-9
+        x, last = moved(x, u), u
+    assert 20 < loop.failures < 60
+    assert loop.last.status is not None
+
+
+def test_its_inputs_are_those_of_the_simulation():
+    plant = double_integrator()
+    steering = controller()
+    flown = closed_loop(plant, steering, np.tile(GOAL, (25, 1)), np.zeros(2), 12)
+    loop = ControlLoop(steering)
+    inputs = [loop.input(x, Reference(np.tile(GOAL, (11, 1)))) for x in flown.states[:12]]
+    assert np.array_equal(inputs, flown.inputs)
+
+
+def test_a_loop_that_may_not_go_on_says_so():
+    with pytest.raises(SettingError, match="on_failure"):
+        ControlLoop(controller(), "hope")
+    with pytest.raises(SolverFailure):
+        ControlLoop(controller(), "raise").input([np.nan, 0.0], GOAL)
+    assert ControlLoop(controller()).input([np.nan, 0.0], GOAL) == pytest.approx([0.0])
+    assert Status.INVALID_MEASUREMENT.advice
+
+
+@pytest.mark.parametrize("page", ["guide_constraints.md", "guide_loop.md"])
+def test_every_block_of_a_guide_runs(page):
+    blocks = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), flags=re.S)
+    names: dict = {}
+    for block in blocks:
+        exec(compile(block, page, "exec"), names)
+    assert len(blocks) >= 2
+    assert names["reached"] < 0.05
+    assert names.get("closest", 0.3) > 0.3 - 0.02
