@@ -15,6 +15,7 @@ import pytest
 import torch
 
 import gpmpc
+from gpmpc.cli.configuration import setting_names, settings
 from tests.cli.command import forked
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -58,10 +59,10 @@ def page(tmp_path, monkeypatch):
     loaded = set(sys.modules)
     names: dict = {"__name__": "page"}
 
-    def follow(path, given=""):
+    def follow(path, given="", section=""):
         exec(given, names)
         printed = []
-        for language, text in BLOCK.findall(read(path)):
+        for language, text in BLOCK.findall(read(path).partition(section)[2] if section else read(path)):
             if written := FILE.match(text):
                 (tmp_path / written[1]).parent.mkdir(exist_ok=True)
                 (tmp_path / written[1]).write_text(text)
@@ -133,11 +134,37 @@ def test_the_first_five_minutes_print_what_the_readme_shows_and_end_at_a_goal(pa
     assert np.abs(names["flight"].states[-1] - [1.0, 0.0]).max() < 0.02
 
 
+def test_the_recording_of_the_gallery_is_replayed(page):
+    names, printed = page("docs/gallery.md", section="## A recording, read and replayed")
+    assert len(printed) == 2
+    assert len(names["run"].times) == 100
+
+
+@pytest.mark.slow
+def test_the_whole_gallery_runs(page, tmp_path):
+    page("docs/gallery.md")
+    assert (tmp_path / "outputs/sweep/report/report.html").exists()
+
+
 @pytest.mark.parametrize("path", ["docs/gp.md", "docs/simulation.md", "docs/recording.md"])
 def test_the_python_of_a_page_runs_in_its_order(path, page):
     text = read(path)
     assert text.count("```python") > 0
     page(path, given=GIVEN)
+
+
+def test_every_page_with_python_is_followed_by_a_test():
+    tests = [path.read_text() for path in ROOT.glob("tests/**/*.py")]
+    followed = {path.name for path in PAGES if any(f'{path.name}"' in text for text in tests)}
+    assert {path.name for path in PAGES if "```python" in path.read_text()} <= followed
+
+
+def test_the_settings_that_pages_name_are_there():
+    with settings():
+        known = {*setting_names("run")}
+    named = {(path.name, name) for path in PAGES for name in re.findall(r"`(controller\.[\w.]+)=", path.read_text())}
+    assert named
+    assert not {entry for entry in named if entry[1] not in known}
 
 
 def anchors(path):
