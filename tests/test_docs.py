@@ -129,7 +129,7 @@ def test_the_first_five_minutes_print_what_the_readme_shows_and_end_at_a_goal(pa
     (shown,) = [text for _, text in BLOCK.findall(read("README.md")) if text.startswith(" flight ")]
     times = re.compile(r"(?<=, in )[\d.]+(?= s)|(?<=decision \[ms\]).*(?=written to)|compil.*(?=flight  )", re.DOTALL)
     assert times.sub("", shown).split() == times.sub("", flown).split()
-    assert "flight.gif" in drawn
+    assert "tracking.png" in drawn
     assert "/step" in info
     assert np.abs(names["flight"].states[-1] - [1.0, 0.0]).max() < 0.02
 
