@@ -1,0 +1,220 @@
+"""The documentation holds: its blocks run in an empty folder, its links lead somewhere, its pages are short.
+
+``tests/test_guides.py``, ``tests/models`` and ``tests/logs`` follow the guides.
+"""
+
+import importlib
+import pkgutil
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import gpmpc
+from gpmpc.cli.configuration import setting_names, settings
+from tests.cli.command import forked
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+FILE = re.compile(r"(?:# @package [\w.]+\n)?# ([\w/]+\.(?:py|yaml))\n")
+INSTALLATION = ("git ", "pip ", "gpmpc warmup")  # what a test has done already
+GIVEN = """
+import numpy as np
+import torch
+from gpmpc.gp import Trainer, Transitions, save_posterior
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.propagation import Linearization
+from gpmpc.systems import step, translational
+from gpmpc.trajectories import Elliptical, states_along
+
+plant, rng = translational(), np.random.default_rng(0)
+states, inputs = rng.normal(0, 1, (40, 6)), [7.26, 0, 0] + rng.normal(0, 0.3, (40, 3)) * [1, 0.3, 0.3]
+transitions = Transitions(states, inputs, [step(plant, *pair) for pair in zip(states, inputs, strict=True)])
+gp = Trainer(restarts=0, predicts="difference")(transitions).posterior
+for name in ("gp", "before"):
+    save_posterior(gp, f"{name}.safetensors")
+more, x, u = transitions, transitions.states[0], transitions.inputs[0]
+problem = Problem(Tracking(Q=[1] * 6, R=[1] * 3), inputs=Box([0, -0.7, -0.7]))
+controller = GPMPC(gp, Linearization(), problem, 10, [7.26, 0, 0])
+references = states_along(Elliptical(), np.arange(60.0))
+"""  # what the pages speak of: a plant, transitions, a model, a controller
+
+
+def read(path):
+    return (ROOT / path).read_text()
+
+
+@pytest.fixture
+def page(tmp_path, monkeypatch):
+    """Does what a page says in an empty folder, of one with given names its Python alone; gives names and outputs."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    torch.set_default_dtype(torch.float32)  # as a user has it
+    loaded = set(sys.modules)
+    names: dict = {"__name__": "page"}
+
+    def follow(path, given="", section=""):
+        exec(given, names)
+        printed = []
+        for language, text in BLOCK.findall(read(path).partition(section)[2] if section else read(path)):
+            if written := FILE.match(text):
+                (tmp_path / written[1]).parent.mkdir(exist_ok=True)
+                (tmp_path / written[1]).write_text(text)
+            elif language == "python":
+                code = compile(text, path, "exec")
+                if "..." not in text:  # else an excerpt
+                    exec(code, names)
+            elif not language and not given:
+                printed += run_block(text)
+        return names, printed
+
+    def run_block(text):
+        folder, printed = tmp_path, []
+        for line in text.splitlines():
+            program, *arguments = shlex.split(line, comments=True) or [""]
+            if program == "cd" and not text.startswith(INSTALLATION):
+                folder /= arguments[0]
+            elif program == "gpmpc" and not line.startswith(INSTALLATION):
+                paths = [sorted(folder.glob(argument)) if "/*/" in argument else [] for argument in arguments]
+                arguments = [str(*path) if path else argument for path, argument in zip(paths, arguments, strict=True)]
+                done = forked(*arguments, cwd=folder)
+                assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+                printed.append(done.stdout)
+        return printed
+
+    yield follow
+    for name in set(sys.modules) - loaded:
+        if str(tmp_path) in (getattr(sys.modules[name], "__file__", None) or ""):
+            del sys.modules[name]
+
+
+def test_ten_tasks_of_a_newcomer_are_done_from_an_empty_folder(page, tmp_path):
+    names, printed = page("docs/how_to.md")
+    assert read("docs/how_to.md").count("\n## ") == 10
+    assert "(docs/how_to.md)" in read("README.md")
+    weights, waypoints, own_path, _, own_system, _, _, bounded, swept, report, compared = printed
+    assert "20 steps of translational along elliptical with convex" in weights
+    assert "along waypoints" in waypoints
+    assert "along figure_eight" in own_path
+    assert "100 steps of arm" in own_system
+    assert "failed solves     none" in bounded
+    assert "12 runs: 12 flown" in swept
+    assert "12 finished in 2 cells, 0 failed, 0 missing" in report
+    assert "n = 6" in compared
+    from gpmpc.recording import read_run
+
+    (recording,) = tmp_path.glob("bounded/*/run.mcap")
+    run = read_run(recording)
+    assert run.references[:, 0].max() > 14
+    assert 10 < run.states[:, 0].max() < 12.5
+    (recording,) = tmp_path.glob("outputs/run/*figure_eight*/run.mcap")
+    assert np.abs(read_run(recording).states[10:, :3:2]).max() < 3.5  # of width 3, not 4
+    (recording,) = tmp_path.glob("arm/outputs/run/*/run.mcap")
+    assert abs(read_run(recording).states[-1, 0] - 1) < 0.1
+    assert float(names["errors"].abs().max()) < 0.2
+    assert names["table"].shape[0] == 60
+    assert np.allclose(names["decision"].x, names["run"].problems[17].x, atol=1e-6)
+    predictions = [names[key].predict(names["data"].states, names["data"].inputs).mean for key in ("gp", "model")]
+    assert torch.equal(*predictions)
+
+
+def test_the_first_five_minutes_print_what_the_readme_shows_and_end_at_a_goal(page):
+    names, (flown, drawn, info, _) = page("docs/start.md")
+    (shown,) = [text for _, text in BLOCK.findall(read("README.md")) if text.startswith(" flight ")]
+    times = re.compile(r"(?<=, in )[\d.]+(?= s)|(?<=decision \[ms\]).*(?=written to)|compil.*(?=flight  )", re.DOTALL)
+    assert times.sub("", shown).split() == times.sub("", flown).split()
+    assert "tracking.png" in drawn
+    assert "/step" in info
+    assert np.abs(names["flight"].states[-1] - [1.0, 0.0]).max() < 0.02
+
+
+def test_the_recording_of_the_gallery_is_replayed(page):
+    names, printed = page("docs/gallery.md", section="## A recording, read and replayed")
+    assert len(printed) == 2
+    assert len(names["run"].times) == 100
+
+
+@pytest.mark.slow
+def test_the_whole_gallery_runs(page, tmp_path):
+    page("docs/gallery.md")
+    assert (tmp_path / "outputs/sweep/report/report.html").exists()
+
+
+@pytest.mark.parametrize("path", ["docs/gp.md", "docs/simulation.md", "docs/recording.md"])
+def test_the_python_of_a_page_runs_in_its_order(path, page):
+    text = read(path)
+    assert text.count("```python") > 0
+    page(path, given=GIVEN)
+
+
+def test_every_page_with_python_is_followed_by_a_test():
+    tests = [path.read_text() for path in ROOT.glob("tests/**/*.py")]
+    followed = {path.name for path in PAGES if any(f'{path.name}"' in text for text in tests)}
+    assert {path.name for path in PAGES if "```python" in path.read_text()} <= followed
+
+
+def test_the_settings_that_pages_name_are_there():
+    with settings():
+        known = {*setting_names("run")}
+    named = {(path.name, name) for path in PAGES for name in re.findall(r"`(controller\.[\w.]+)=", path.read_text())}
+    assert named
+    assert not {entry for entry in named if entry[1] not in known}
+
+
+def anchors(path):
+    """The anchors of a page's headings, as GitHub and MyST make them."""
+    text = BLOCK.sub("", path.read_text())
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_every_link_leads_to_a_file_and_a_heading():
+    broken = []
+    for path in PAGES:
+        for file, anchor in re.findall(r"\]\(([^)#:\s]*)(?:#([^)\s]*))?\)", BLOCK.sub("", path.read_text())):
+            target = path.parent / file if file else path
+            if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
+                broken.append(f"{path.name}: {file}#{anchor}")
+    assert not broken
+
+
+def test_no_page_is_long_and_every_page_is_in_the_site():
+    counts = {path.name: len(re.findall(r"\S*[^\W_]\S*", BLOCK.sub("", path.read_text()))) for path in PAGES}
+    counts.pop("mathematics.md")
+    assert max(counts.values()) <= 1500, sorted(counts.items(), key=lambda item: -item[1])[:3]
+    assert len(read("README.md").split()) <= 900
+    listed = re.findall(r"^[\w]+$", read("docs/index.md"), re.MULTILINE)
+    assert sorted(listed) == sorted({path.stem for path in ROOT.glob("docs/*.md")} - {"index"})
+
+
+def public(module):
+    """The names that a module offers: those of ``__all__``, else the classes and functions that it defines."""
+    names = getattr(module, "__all__", None)
+    if names is None:
+        names = [key for key, value in vars(module).items() if getattr(value, "__module__", None) == module.__name__]
+    return {key: getattr(module, key) for key in names if not key.startswith("_")}
+
+
+def test_every_name_that_a_room_offers_or_that_settings_pages_and_examples_use_is_documented():
+    listed = [importlib.import_module(name) for name in re.findall(r"automodule:: (\S+)", read("docs/api.md"))]
+    documented = {id(value) for module in listed for value in public(module).values()}
+    found = [module.name for module in pkgutil.iter_modules(gpmpc.__path__, "gpmpc.") if module.ispkg]
+    offered = {(room, key) for room in found for key in getattr(importlib.import_module(room), "__all__", [])}
+    offered -= {entry for entry in offered if entry[0] == "gpmpc.kernels"}  # documented where they stand: NumPy's side
+    texts = [path.read_text() for path in (*PAGES, *ROOT.glob("examples/*.py"), *ROOT.glob("conf/**/*.yaml"))]
+    for text in texts:
+        for module, names in re.findall(r"^from (gpmpc[\w.]*) import (\([^)]*\)|.*)", text, re.MULTILINE):
+            offered |= {(module, name) for name in re.findall(r"\w+", names)}
+        offered |= set(re.findall(r"_target_: (gpmpc[\w.]*)\.(\w+)", text))
+    missing = [
+        f"{module}.{name}"
+        for module, name in sorted(offered)
+        if id(getattr(importlib.import_module(module), name)) not in documented
+    ]
+    assert not missing
