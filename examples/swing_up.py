@@ -4,11 +4,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from gpmpc.gp import Transitions, standardize, train
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import closed_loop
-from gpmpc.systems import System, step
+from gpmpc.systems import System, step_many
 
 
 class Pendulum:
@@ -24,15 +23,14 @@ class Pendulum:
 plant, rng = System(Pendulum(), time_step=0.05), np.random.default_rng(0)
 angles, torques = rng.uniform(-np.pi, np.pi, 400), rng.uniform(-2, 2, (400, 1))
 states = np.column_stack([np.cos(angles), np.sin(angles), rng.uniform(-8, 8, 400)])
-measured = [step(plant, x, u) for x, u in zip(states, torques, strict=True)] + rng.normal(0, 0.001, (400, 3))
+measured = step_many(plant, states, torques) + rng.normal(0, 0.001, (400, 3))
 gp = train(Transitions(states, torques, measured), predicts="difference", scaling=standardize).posterior
 
 problem = Problem(Tracking([1.0, 1.0, 0.01], [0.01], penalized="inputs"), inputs=Box([-2.0], [2.0]))
 controller = GPMPC(gp, Linearization(), problem, horizon=30, initial_input=[0.0])
-flight = closed_loop(plant, controller, np.tile([1.0, 0.0, 0.0], (131, 1)), [-1.0, 0.0, 0.0], steps=100)
+flight = closed_loop(plant, controller, [1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], steps=100)
 
 print("upright after", flight.times[np.abs(flight.states[:, 0] - 1) > 0.01][-1].round(2), "s")
-plt.plot(flight.times, flight.states, label=Pendulum.state_names)
-plt.step(flight.times[1:], flight.inputs, "k--", label="torque")
-plt.legend()
+plt.legend(plt.plot(flight.times, flight.states), Pendulum.state_names, title="dashed: torque")
+plt.step(flight.times[1:], flight.inputs, "k--")
 plt.savefig("swing_up.png")

@@ -10,11 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from gpmpc.gp import Transitions, standardize, train
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, closed_loop
-from gpmpc.systems import System, step
+from gpmpc.systems import System, step_many
 
 WALL, STEPS = 1.0, 400  # [m], [-]
 GUSTS = [0.005, 0.05]  # standard deviations a step [m, m/s]
@@ -32,7 +31,7 @@ class Cart:
 
 cart, rng = System(Cart(), time_step=0.1, units={"position": "m", "velocity": "m/s"}), np.random.default_rng(0)
 states, pushes = rng.uniform([-1.5, -2.0], [1.5, 2.0], (300, 2)), rng.uniform(-2, 2, (300, 1))
-after = [step(cart, x, u) for x, u in zip(states, pushes, strict=True)] + rng.normal(0, GUSTS, (300, 2))
+after = step_many(cart, states, pushes) + rng.normal(0, GUSTS, (300, 2))
 gp = train(Transitions(states, pushes, after), predicts="difference", scaling=standardize).posterior
 
 flights = {}
@@ -40,8 +39,7 @@ for name, probability in (("mean behind the wall", None), ("95 % of what may com
     behind = Box(upper=[WALL, np.inf], probability=probability)
     problem = Problem(Tracking([10.0, 0.1], [0.1]), inputs=Box([-2.0], [2.0]), constraints=[behind])
     controller = GPMPC(gp, Linearization(process_noise=True), problem, horizon=10, initial_input=[0.0])
-    goal = np.tile([WALL, 0.0], (STEPS + 11, 1))
-    flights[name] = closed_loop(cart, controller, goal, [-1.0, 0.0], STEPS, noise=Noise(process=GUSTS))
+    flights[name] = closed_loop(cart, controller, [WALL, 0.0], [-1.0, 0.0], STEPS, noise=Noise(process=GUSTS))
     beyond = (flights[name].states[1:, 0] > WALL).mean()
     print(f"{name:24} beyond the wall in {beyond:4.1%} of the steps")
 

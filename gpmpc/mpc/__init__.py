@@ -1,1 +1,22 @@
 """Controllers: from a state and a reference to an input."""
+
+from gpmpc.mpc.controller import Controller, Decision, Reference
+from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
+from gpmpc.mpc.policy import ControlLoop
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem, Tracking
+
+__all__ = [
+    "GPMPC",
+    "Box",
+    "ControlLoop",
+    "Controller",
+    "Decision",
+    "Halfspaces",
+    "Inequality",
+    "NonlinearGPMPC",
+    "PredictionSettings",
+    "Problem",
+    "Reference",
+    "Tracking",
+]

@@ -62,7 +62,7 @@ class Rollout:
 def closed_loop(
     system: Plant | ModelLoop,
     controller: Controller,
-    references: Reference | Array,
+    references: Reference | Array | Sequence[float],
     initial: Any,
     steps: int,
     *,
@@ -77,8 +77,8 @@ def closed_loop(
     Args:
         system: What is steered.
         controller: Its feedback law; it sees the next ``controller.horizon`` references.
-        references: Reference states r[0] .. (steps + horizon, n) or more, one a time step; as a ``Reference`` with the
-            inputs that belong to them.
+        references: Reference states r[0] .. (steps + horizon, n) or more, one a time step, or a set point (n,); as a
+            ``Reference`` with the inputs that belong to them.
         initial: The state (n,). A ``Gaussian`` is the belief that a model loop starts from, and what a plant's state is
             drawn from.
         steps: K.
@@ -294,14 +294,14 @@ def window(references: Reference, k: int, horizon: int) -> Reference:
     return Reference(references.states[k : k + horizon + 1], inputs)
 
 
-def check_references(references: Reference | Array, steps: int, horizon: int) -> Reference:
+def check_references(references: Reference | Array | Sequence[float], steps: int, horizon: int) -> Reference:
     """Returns references for all steps.
 
     Raises:
         ShapeError: Too few, or no table.
     """
     references = references if isinstance(references, Reference) else Reference(np.asarray(references, dtype=float))
-    needed = steps + horizon
+    references, needed = references.over(steps + horizon), steps + horizon
     if len(references.states) < needed:
         raise ShapeError(f"{steps} steps with horizon {horizon} need {needed} references; got {len(references.states)}")
     return references
