@@ -16,7 +16,7 @@ from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, closed_loop
 from gpmpc.systems import System, step
 
-WALL, STEPS, GUSTS = 1.0, 400, Noise(process=[0.005, 0.05])  # [m], [-], standard deviations a step [m, m/s]
+WALL, STEPS, GUSTS = 1.0, 400, [0.005, 0.05]  # [m], [-], standard deviations per step [m, m/s]
 
 
 class Cart:
@@ -31,7 +31,7 @@ class Cart:
 
 cart, rng = System(Cart(), time_step=0.1, units={"position": "m", "velocity": "m/s"}), np.random.default_rng(0)
 states, pushes = rng.uniform([-1.5, -2.0], [1.5, 2.0], (300, 2)), rng.uniform(-2, 2, (300, 1))
-after = [step(cart, x, u) for x, u in zip(states, pushes, strict=True)] + rng.normal(0, GUSTS.process, (300, 2))
+after = [step(cart, x, u) for x, u in zip(states, pushes, strict=True)] + rng.normal(0, GUSTS, (300, 2))
 gp = train(Transitions(states, pushes, after), predicts="difference", scaling=standardize).posterior
 
 flights = {}
@@ -40,7 +40,7 @@ for name, probability in (("mean behind the wall", None), ("95 % of what may com
     problem = Problem(Tracking([10.0, 0.1], [0.1]), inputs=Box([-2.0], [2.0]), constraints=[behind])
     controller = GPMPC(gp, Linearization(process_noise=True), problem, horizon=10, initial_input=[0.0])
     goal = np.tile([WALL, 0.0], (STEPS + 11, 1))
-    flights[name] = closed_loop(cart, controller, goal, [-1.0, 0.0], STEPS, noise=GUSTS)
+    flights[name] = closed_loop(cart, controller, goal, [-1.0, 0.0], STEPS, noise=Noise(process=GUSTS))
     beyond = (flights[name].states[1:, 0] > WALL).mean()
     print(f"{name:24} beyond the wall in {beyond:4.1%} of the steps")
 
