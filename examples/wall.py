@@ -16,7 +16,8 @@ from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, closed_loop
 from gpmpc.systems import System, step
 
-WALL, STEPS, GUSTS = 1.0, 400, [0.005, 0.05]  # [m], [-], standard deviations per step [m, m/s]
+WALL, STEPS = 1.0, 400  # [m], [-]
+GUSTS = [0.005, 0.05]  # standard deviations a step [m, m/s]
 
 
 class Cart:

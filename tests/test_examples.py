@@ -58,3 +58,12 @@ def test_the_example_of_a_log_learns_from_its_own_files_and_leaves_a_figure(tmp_
     assert "held value" in printed
     assert "motor torque" in printed
     assert (tmp_path / "own_log.png").stat().st_size > 10_000
+
+
+def test_the_example_of_a_wall_keeps_the_cart_behind_it_as_often_as_it_says(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["wall.py", str(tmp_path)])
+    names = runpy.run_path(str(EXAMPLES / "wall.py"), run_name="__main__")
+    beyond = [float((flight.states[1:, 0] > names["WALL"]).mean()) for flight in names["flights"].values()]
+    assert beyond[1] <= 0.05 < beyond[0]
+    assert "beyond the wall in 12.0% of the steps" in capsys.readouterr().out
+    assert (tmp_path / "wall.png").stat().st_size > 10_000

@@ -179,7 +179,7 @@ class AdaptiveTube:
         self._step += 1
         numbers = self.rate, 1.0 - self.probability, self.largest
         parts = self.kappas, self.alphas, self.counts, self.misses
-        call_unchecked(_observe, state, self.tube.rows, self._bounds, self._step, *numbers, self.tube.scores, *parts)
+        call_unchecked(_observe, state, self.tube.rows, self._bounds, self._step, numbers, self.tube.scores, parts)
         return self.kappas
 
     def remember(self, means: Array, covariances: Array) -> None:
@@ -205,9 +205,9 @@ def _check_probability(probability: float) -> None:
 
 
 @compiled(locked=True)
-def _observe(state, rows, bounds, step, rate, allowed, largest, scores, kappas, alphas, counts, misses):
+def _observe(state, rows, bounds, step, numbers, scores, parts):
     """Updates alpha and kappa of each stage (H,) by a state (n,); ``bounds`` (H, H, r) hold the last plans."""
-    N, H = scores.shape
+    (N, H), (rate, allowed, largest), (kappas, alphas, counts, misses) = scores.shape, numbers, parts
     for k in range(H):  # the plan of k + 1 steps ago said where the state would be at its stage k
         known, outside = True, False
         plan = (step - k - 1) % H

@@ -165,7 +165,7 @@ def test_help_and_tab_list_only_choices_that_the_command_has(tmp_path):
         ("gpmpc plot tree/m", ["tree/my run.mcap"]),
         ("gpmpc plot --format s", ["svg"]),
         ("gpmpc report tree --to t", ["tree/"]),
-        ("gpmpc log ", ["info", "recover", "export", "layout"]),
+        ("gpmpc log ", ["info", "recover", "export", "layout", "inspect"]),
         ("gpmpc log info tree/m", ["tree/my run.mcap"]),
         ("gpmpc run 'seed=range(", []),
         ("gpmpc run --nonsense x", []),
