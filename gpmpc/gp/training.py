@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from gpmpc.exceptions import DataError, SettingError, TrainingError, UnsupportedModel, check_number
@@ -33,6 +34,7 @@ from gpmpc.gp.transitions import Transitions, check_transitions
 from gpmpc.memory import GIB, available_memory
 
 _log = logging.getLogger(__name__)
+_ONE_THREAD = 1000  # points below which LAPACK's threads wait for each other longer than they work
 _MANY = 1000  # points: from here on the log has a line an output
 
 
@@ -185,7 +187,8 @@ class Trainer:
         for a in range(outputs):
             name = f"output {a + 1} of {outputs}"
             problem = SearchProblem(name, x, y[:, a], first[a], perturbations[a], rows, std, constant)
-            found.append(find_hyperparameters(problem, self))
+            with threadpool_limits(1 if size < _ONE_THREAD else None, user_api="blas"):
+                found.append(find_hyperparameters(problem, self))
             if size > _MANY:
                 _log.info("training: %s: %d evaluations, %.1f s", name, found[-1].evaluations, found[-1].seconds)
         failed = [a for a, one in enumerate(found) if one.objective >= FAILED]
