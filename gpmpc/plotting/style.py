@@ -48,6 +48,11 @@ def name_of(name: str, unit: str = "", z_down: bool = True) -> str:
     return f"{full} [{unit}]" if unit not in ("", "1", "?") else full
 
 
+def clipped(text: str, most: int) -> str:
+    """Returns a text of at most so many characters, the rest of a longer one as dots."""
+    return text if len(text) <= most else f"{text[: most - 4]} ..."
+
+
 def legend_below(figure: Figure, axes: Iterable[Axes]) -> None:
     """Puts one legend for all axes below them, each label once, in as many columns as the width holds."""
     found = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
@@ -58,5 +63,6 @@ def add_legend(figure: Figure, handles: Sequence[Any], labels: Sequence[str], **
     """Puts a legend below all axes, in as many columns as the figure's width holds."""
     if labels:
         characters = 11.0 * figure.get_figwidth()  # that fit into a line
+        labels = [clipped(label, int(characters) - 6) for label in labels]
         columns = max(1, min(len(labels), int(characters / (max(map(len, labels)) + 6))))
         figure.legend(handles, labels, loc="outside lower center", ncols=columns, **options)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-from gpmpc.plotting.style import COLOURS, add_legend, styled
+from gpmpc.plotting.style import COLOURS, add_legend, clipped, styled
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def over_variable(
     axis = figure.subplots()
     _draw(axis, lines, positions)
     axis.set_title(label, fontsize="medium")
-    axis.set_xlabel(title)
+    axis.set_xlabel(clipped(title, 50))
     if max(map(len, positions)) * len(positions) > 40:
         axis.tick_params(axis="x", labelrotation=30)
     values = [v for line in lines for group in line.values for v in group]
@@ -90,7 +90,7 @@ def _draw(axis: Axes, lines: Sequence[Series], positions: Sequence[str]) -> None
             axis.plot(place(x + np.array(aside)), group, ".", color=colour, alpha=0.45, markersize=5, mew=0)
     if wide:
         axis.set_xscale("log")
-    axis.set_xticks(place(at), list(positions))
+    axis.set_xticks(place(at), [clipped(position, 24) for position in positions])
     axis.xaxis.set_minor_locator(NullLocator())
     margin = 0.5 * gap if numbers is None else max(0.5 * gap, 0.06 * (at[-1] - at[0]))
     axis.set_xlim(*place(np.array([at[0] - margin, at[-1] + margin])))

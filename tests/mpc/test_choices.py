@@ -1,3 +1,4 @@
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ def names(group):
 def chosen(*overrides):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         settings = compose("run", overrides=list(overrides))
-    return instantiate(settings.controller, _convert_="all")
+    return partial(instantiate(settings.controller, _convert_="all"), initial_input=HOVER)  # the system's otherwise
 
 
 @pytest.mark.parametrize("controller", names("controller"))
