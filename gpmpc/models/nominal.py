@@ -1,4 +1,4 @@
-"""Nominal models x+ = f0(x, u): an affine one, and functions that are written in CasADi."""
+"""Known models x+ = f0(x, u): an affine one, functions that are written in CasADi, and any of them without a GP."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, batched_jacobian, tensors_for, to_array
+from gpmpc.dynamics import Array, Linearized, batched_jacobian, check_query, tensors_for, to_array
 from gpmpc.exceptions import ShapeError, UnsupportedModel
-from gpmpc.gaussian import check_tensors
+from gpmpc.gaussian import Gaussian, check_tensors
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,44 @@ class Affine:
     @cached_property
     def _arrays(self) -> tuple[Array, Array, Array]:
         return to_array(self.A), to_array(self.B), to_array(self.c)
+
+
+@dataclass(frozen=True)
+class KnownModel:
+    """A known function x+ = f0(x, u) as a model without uncertainty.
+
+    Attributes:
+        function: f0, from x (*batch, n) and u (*batch, m) to (*batch, n), such as ``CasadiFunction``.
+        state_dim: n.
+        input_dim: m.
+    """
+
+    function: Callable[[Tensor, Tensor], Tensor]
+    state_dim: int
+    input_dim: int
+
+    dtype, device = torch.float64, torch.device("cpu")
+
+    @property
+    def output_dim(self) -> int:
+        """Number of outputs, n: the next state."""
+        return self.state_dim
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """Zero (n, n)."""
+        return torch.zeros(self.state_dim, self.state_dim, dtype=self.dtype)
+
+    def predict(self, state: Tensor, input: Tensor) -> Gaussian:
+        """The next state (*batch, n), with zero covariance."""
+        check_query(self, state, input)
+        mean = self.function(state, input)
+        return Gaussian(mean, mean.new_zeros(*mean.shape, self.state_dim))
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises the function at K points (K, n), (K, m)."""
+        mean, A, B = linearize_function(self.function, self, states, inputs)
+        return Linearized(mean, A, B, np.zeros((*mean.shape, self.state_dim)) if covariance else None)
 
 
 class CasadiFunction:

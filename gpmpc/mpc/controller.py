@@ -177,6 +177,7 @@ class Request(NamedTuple):
         belief: Gaussian,
         reference: Reference,
         previous: Decision | None,
+        unwrap: bool = True,
     ) -> "Request":
         """Validates the arguments of ``Controller.control``.
 
@@ -187,6 +188,7 @@ class Request(NamedTuple):
             belief: Of the state.
             reference: Over the horizon.
             previous: The last decision. Of one that is not applicable only ``input`` counts: what was applied.
+            unwrap: Whether angles of the reference move by full turns towards the last plan.
 
         Raises:
             ShapeError: Belief or reference have other dimensions than the problem and the horizon.
@@ -222,7 +224,7 @@ class Request(NamedTuple):
         kappas = None if reference.kappas is None else _array(reference.kappas)
         if kappas is not None and not np.isfinite(kappas).all():
             raise DataError(f"reference kappas must be finite; got {kappas}")
-        if problem.cost.angles and not found & _BELIEF:
+        if unwrap and problem.cost.angles and not found & _BELIEF:
             states = _unwrapped(states, state, previous, problem.cost.angles)
         references = References(states[1:], inputs, last)
         return cls(state, covariance, references, guess, not found & _BELIEF, kappas=kappas)

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 
 from gpmpc.compiled import call_unchecked
-from gpmpc.dynamics import DynamicsModel
+from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.condense import CondensedProgram, Condenser
 from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_method
 from gpmpc.mpc.linear_quadratic import Stages, expand
-from gpmpc.mpc.prediction import Prediction, PredictionModel, PredictionSettings
+from gpmpc.mpc.prediction import Guess, Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc.problem import Problem
 from gpmpc.mpc.sqp import FAILURES, FullStep, Globalization
 from gpmpc.mpc.stages import Covariance, Plan, price_violations
@@ -96,7 +96,12 @@ class GPMPC:
             )
 
     def control(
-        self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
+        self,
+        belief: Gaussian,
+        reference: Reference,
+        previous: Decision | None = None,
+        parameters: Any = None,
+        guess: Guess | None = None,
     ) -> Decision:
         """Decides the input for one step; see ``Controller.control``.
 
@@ -109,16 +114,18 @@ class GPMPC:
             reference: Over the horizon, with inputs where the weights ask for them.
             previous: The last decision; one that is not applicable is ignored.
             parameters: Of the smooth constraints, (q,) or by stage (H, q), such as where an obstacle will be.
+            guess: States (H + 1, n) and inputs (H, m) to start from in the place of the last plan. Angles of the
+                reference are then taken as they are, turns included.
 
         Raises:
-            ShapeError: Belief, reference or parameters have other dimensions, or reference inputs are missing.
+            ShapeError: An argument has other dimensions, or reference inputs are missing.
             DataError: Reference or parameters are not finite.
         """
-        request, clock = self.prediction.read(belief, reference, previous, parameters), _Stopwatch()
+        request, clock = self.prediction.read(belief, reference, previous, parameters, guess), _Stopwatch()
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
-            plan = self.prediction.initial_guess(request, previous)
+            plan = self.prediction.initial_guess(request, previous, None if guess is None else guess[0])
             prediction = self.prediction.linearize(plan, request, previous)
             return self._improve(prediction, request, previous, clock)
         except FAILURES:
@@ -129,6 +136,7 @@ class GPMPC:
     ) -> Decision:
         """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
         guess, solution = prediction.plan, previous.solution if previous is not None and previous.applicable else None
+        best = None  # the last prediction that a program led to, with its feedback
         globalize = FullStep()
         if self.iterations > 1:
             globalize = Globalization(self.prediction, self._condenser.cost, request, self.tolerance)
@@ -142,9 +150,13 @@ class GPMPC:
             count, status = count + 1, solution.status
             if _is_usable(program, solution, prediction.plan):
                 proposed = self._proposed(prediction, program, solution, request.references.previous_input)
+                best = prediction, program.feedback
                 prediction, status = globalize(prediction, program, solution, proposed)
             if status is not None or count == self.iterations:
                 break
+        if best is not None and self.prediction.settings.rolled_out:
+            obeying = self.prediction.roll_out(prediction.plan, *best, request)
+            prediction = obeying if np.isfinite(obeying.plan.states).all() else prediction
         clock.model()
         status = Status.ITERATION_LIMIT if status is None else status
         program = QuadraticProgram.unchecked(*program[:5])
@@ -192,6 +204,14 @@ class GPMPC:
             except FAILURES:
                 decisions[t] = requests[t].failed_decision(Status.NUMERICAL_TROUBLE, timing=clock.timing)
         return decisions
+
+    def gains(self, decision: Decision) -> Array:
+        """K_0 .. K_{H-1} (H, m, n) of the feedback u = u_k - K_k (x - x_k) along a decision's plan.
+
+        They are those of the linear-quadratic regulator of the stages, linearised at the plan.
+        """
+        found = linearize(self.prediction.model, decision.means[:-1], decision.inputs, covariance=False)
+        return self.prediction.gains(found.A, found.B)
 
     @property
     def bytes_per_question(self) -> int | None:

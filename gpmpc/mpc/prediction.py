@@ -54,6 +54,7 @@ from gpmpc.propagation import Linearization, Propagator
 Array = np.ndarray
 
 Form = Literal["trajectory", "velocity"]
+Guess = tuple[Array, Array]  # states (H + 1, n) and inputs (H, m)
 FORMS = ("trajectory", "velocity")
 
 
@@ -84,6 +85,8 @@ class PredictionSettings:
             state constraints is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"``
             and ``"diagonal"`` are those without feedback.
         disturbance_gain: L in [0, 1], the observer gain of the constant-disturbance estimate; 0 disables it.
+        rolled_out: Ends a decision with a roll-out under the feedback, so that its plan obeys the model's dynamics
+            however few programs it took; for ``"trajectory"``.
 
     Raises:
         SettingError: An unknown form or covariance mode, a gain out of range, or one with ``"velocity"``.
@@ -93,14 +96,18 @@ class PredictionSettings:
     covariance: Covariance = "zero_order"
     feedback: bool = True
     disturbance_gain: float = 0.0
+    rolled_out: bool = False
 
     def __post_init__(self) -> None:
         for key, possible in (("form", FORMS), ("covariance", COVARIANCES)):
             if getattr(self, key) not in possible:
                 names = ", ".join(map(repr, possible))
                 raise SettingError(key, f"must be one of {names}; got {getattr(self, key)!r}")
-        if not isinstance(self.feedback, bool):
-            raise SettingError("feedback", f"must be true or false; got {self.feedback!r}")
+        for key in ("feedback", "rolled_out"):
+            if not isinstance(getattr(self, key), bool):
+                raise SettingError(key, f"must be true or false; got {getattr(self, key)!r}")
+        if self.rolled_out and self.form == "velocity":
+            raise SettingError("rolled_out", "is for plans of form 'trajectory'; got form 'velocity'")
         check_number("disturbance_gain", self.disturbance_gain, least=0)
         if self.disturbance_gain > (self.form != "velocity"):
             velocity = self.form == "velocity"
@@ -143,7 +150,12 @@ class PredictionModel:
         self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
 
     def read(
-        self, belief: Gaussian, reference: Reference, previous: Decision | None, parameters: Any = None
+        self,
+        belief: Gaussian,
+        reference: Reference,
+        previous: Decision | None,
+        parameters: Any = None,
+        guess: Guess | None = None,
     ) -> Request:
         """The checked arguments of a controller's ``control``, with the disturbance estimate.
 
@@ -151,7 +163,16 @@ class PredictionModel:
             ShapeError: Belief or reference have other dimensions, or reference inputs are missing.
         """
         problem, H = self.problem, self.horizon
-        request = Request.read(problem, H, self.initial_input, belief, reference, previous)
+        request = Request.read(problem, H, self.initial_input, belief, reference, previous, guess is None)
+        if guess is not None:
+            inputs = np.clip(guess[1], problem.inputs.lower, problem.inputs.upper)
+            shapes = np.shape(guess[0]), inputs.shape
+            if shapes != ((H + 1, problem.state_dim), (H, problem.input_dim)):
+                raise ShapeError(
+                    f"a guess must be states ({H + 1}, {problem.state_dim}) and inputs ({H}, {problem.input_dim}); "
+                    f"got {shapes[0]} and {shapes[1]}"
+                )
+            request = request._replace(initial_guess=inputs)
         if parameters is not None:
             request = request._replace(parameters=read_parameters(parameters, H))
         if reference.inputs is None and problem.cost.penalized == "deviations":
@@ -163,8 +184,10 @@ class PredictionModel:
             return request._replace(disturbance=self._disturbance(request, previous))
         return request
 
-    def initial_guess(self, request: Request, previous: Decision | None) -> Plan:
+    def initial_guess(self, request: Request, previous: Decision | None, states: Array | None = None) -> Plan:
         """The last plan, shifted by a stage; without one a line from the state to the last reference along the others.
+
+        Where states of a guess (H + 1, n) are given, these, with the inputs of the request.
 
         Its inputs are the previous one, or the reference's where R weighs deviations.
 
@@ -179,15 +202,17 @@ class PredictionModel:
             means[1:], covariances[1:] = request.state, covariances[0]
             return Plan(self.linearizer.state(means, covariances), request.constant_guess, covariances)
         inputs, last = request.initial_guess, None
-        if previous is not None and previous.applicable and len(previous.means) == H + 1:
+        if previous is not None and previous.applicable and len(previous.means) == H + 1 and states is None:
             last = previous
-        if last is not None:
+        if states is not None:
+            means[1:] = states[1:]
+        elif last is not None:
             means[1:H], means[H] = last.means[2:], last.means[H]
             if problem.cost.angles:  # a sensor may have taken a turn off
                 means[1:] += full_turns(request.state - last.means[1], problem.cost.angles)
         else:
-            states, shares = request.references.states, np.linspace(1.0, 0.0, H + 1)[1:, None]
-            means[1:] = states + shares * (request.state - states[0])
+            targets, shares = request.references.states, np.linspace(1.0, 0.0, H + 1)[1:, None]
+            means[1:] = targets + shares * (request.state - targets[0])
             if problem.cost.penalized == "deviations":
                 inputs = request.references.inputs.clip(problem.inputs.lower, problem.inputs.upper)
         if problem.input_rates.finite:
@@ -261,13 +286,12 @@ class PredictionModel:
 
         Args:
             towards: Whose states are followed.
-            prediction: Its first stage gives the feedback, where a program has none.
+            prediction: Its stages give the feedback, where a program has none.
             feedback: Of the program, F_k (H, m, p + m + 1), or nothing (0, m, p + m + 1).
             request: Of the step.
         """
         problem, n, parts = self.problem, self.problem.state_dim, []
-        gains = np.broadcast_to(-self.gain(prediction.stages), (self.horizon, problem.input_dim, n))
-        gains = feedback[:, :, :n] if len(feedback) else gains
+        gains = feedback[:, :, :n] if len(feedback) else -self.gains(*prediction.stages[:2])
         states, inputs, covariances = (part.copy() for part in towards)
         last, disturbance = request.references.previous_input, request.disturbance if len(request.disturbance) else None
         for k in range(self.horizon):
@@ -282,13 +306,17 @@ class PredictionModel:
         return self.predict(Plan(states, inputs, covariances), stages, request)
 
     def gain(self, stages: LinearizedStages) -> Array:
-        """K (m, n) of the feedback u = u_k - K (x - mu_k); zero without feedback."""
+        """K (m, n) of the feedback u = u_k - K (x - mu_k) at the first stage; zero without feedback."""
+        return self.gains(stages.A[:1], stages.B[:1])[0]
+
+    def gains(self, A: Array, B: Array) -> Array:
+        """K_0 .. K_{H-1} (H, m, n) of the feedback u = u_k - K_k (x - mu_k) along stages; zero without feedback."""
         problem, n = self.problem, self.problem.state_dim
         if not self.settings.feedback:
-            return np.zeros((problem.input_dim, n))
-        A, B = np.ascontiguousarray(stages.A[:1, :n, :n]), np.ascontiguousarray(stages.B[:1, :n])
+            return np.zeros((self.horizon, problem.input_dim, n))
+        A, B = np.ascontiguousarray(A[:, :n, :n]), np.ascontiguousarray(B[:, :n])
         cost = problem.cost
-        return call_unchecked(finite_horizon_lqr, A, B, cost.Q, cost.R, cost.terminal, self.horizon)[0][0]
+        return call_unchecked(finite_horizon_lqr, A, B, cost.Q, cost.R, cost.terminal, self.horizon)[0]
 
     def _first_covariances(self, means: Array, inputs: Array, request: Request) -> Array:
         """Sigma_1 .. Sigma_H (H, n, n) along a first guess, linearised at its points."""
