@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from gpmpc.compiled import compile_for, compiled, njit_inner, unchecked_entry_point
-from gpmpc.dynamics import DynamicsModel
+from gpmpc.dynamics import DynamicsModel, check_next_states
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.linear_quadratic import References
@@ -252,12 +252,7 @@ def check_dynamics(model: DynamicsModel) -> tuple[int, int]:
     Raises:
         SettingError: It is no model, or predicts something else.
     """
-    if not hasattr(model, "predict"):
-        raise SettingError("model", f"must be a DynamicsModel, such as GPPosterior; got {type(model).__name__}")
-    if model.output_dim != model.state_dim:
-        raise SettingError(
-            "model", f"must predict the next state; got {model.state_dim} states and {model.output_dim} outputs"
-        )
+    check_next_states(model)
     return model.state_dim, model.input_dim
 
 
