@@ -8,10 +8,15 @@ phi selects states, and takes angles as sine and cosine.
 import math
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gpmpc.compiled import compiled, njit_noalloc
 from gpmpc.kernels._packed import Array, GPArrays
 from gpmpc.kernels._simd import exp, load, total, use_widest_registers, zeros
 from gpmpc.kernels.linalg import aligned_rows, copy, dot
+
+Indices = NDArray[np.intp]
 
 PLAIN, SINE, COSINE = range(3)
 
@@ -37,9 +42,9 @@ class AffineGPs(NamedTuple):
     G: Array
     c: Array
     B: Array
-    states: Array
-    kinds: Array
-    inputs: Array
+    states: Indices
+    kinds: Indices
+    inputs: Indices
 
 
 class Feedback(NamedTuple):
