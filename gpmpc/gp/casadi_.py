@@ -18,6 +18,7 @@ import torch
 
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gp.posterior import AffineForm, GPPosterior
+from gpmpc.kernels.tape import CONST, INPUT, OPERATIONS, OUTPUT, Tape
 
 
 def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
@@ -40,13 +41,15 @@ def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
     """
     form = getattr(model, "affine_form", None)
     x, u = casadi.MX.sym("state", model.state_dim), casadi.MX.sym("input", model.input_dim)
-    mean, variance = _residual(model, x, u) if form is None else _affine(form, x, u)
+    mean, variance = _residual(model, x, u) if form is None or form.tape is not None else _affine(form, x, u)
     return casadi.Function(name, [x, u], [mean, variance], ["state", "input"], ["mean", "variance"])
 
 
 def _affine(form: AffineForm, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:
     """Mean and variance (k,) of a model with an affine form."""
-    seen = (x, u) if form.states is None else (_selected(x, form.states), _selected(u, form.inputs or []))
+    seen = (x, u)
+    if form.states is not None:
+        seen = _features(x, form.states, form.angles), _selected(u, form.inputs or [])
     mean, variance = _moments(form.f, *seen)
     if form.B is not None:
         B = _numbers(form.B)
@@ -58,7 +61,7 @@ def _affine(form: AffineForm, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, ca
 
 
 def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:
-    """Mean and variance (n,) of a residual model with angles, or with functions that are written in CasADi."""
+    """Mean and variance (n,) of a residual model with functions that are written in CasADi."""
     nominal: Any = getattr(model, "nominal", None)
     B: Any = getattr(model, "B", None)
     known: Any = getattr(nominal, "function", None)
@@ -69,10 +72,8 @@ def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi
         raise UnsupportedModel(
             f"CasADi can take a GPPosterior, or a ResidualModel of Affine, CasadiFunction and numbers; got {got}"
         )
-    entries = []
-    for i in model.states:
-        entries += [casadi.sin(x[i]), casadi.cos(x[i])] if i in model.angles else [x[i]]
-    mean, variance = _moments(model.residual, casadi.vertcat(*entries), _selected(u, model.inputs))
+    features = _features(x, model.states, model.angles)
+    mean, variance = _moments(model.residual, features, _selected(u, model.inputs))
     matrix = _numbers(B) if effect is None else effect(x)
     if affine:
         A, G, c = (_numbers(getattr(nominal, part)) for part in "ABc")
@@ -80,6 +81,14 @@ def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi
     else:
         moved = nominal.function(x, u)
     return moved + matrix @ mean, matrix**2 @ variance
+
+
+def _features(x: casadi.MX, states: Sequence[int], angles: Sequence[int]) -> casadi.MX:
+    """Some states, angles among them as sine and cosine."""
+    entries = []
+    for i in states:
+        entries += [casadi.sin(x[i]), casadi.cos(x[i])] if i in angles else [x[i]]
+    return casadi.vertcat(*entries) if entries else casadi.MX(0, 1)
 
 
 def _selected(vector: casadi.MX, entries: Sequence[int]) -> casadi.MX:
@@ -108,3 +117,37 @@ def _moments(gp: GPPosterior, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, ca
 
 def _numbers(tensor: torch.Tensor) -> casadi.DM:
     return casadi.DM(tensor.detach().double().cpu().numpy())
+
+
+def tape_of(function: casadi.Function) -> Tape | None:
+    """Reads the operations of a CasADi function of dense vectors; None where there are others than a tape has.
+
+    The value is taken column by column, the arguments one after the other.
+    """
+    try:
+        function = function if function.is_a("SXFunction") else function.expand()
+    except RuntimeError:  # it calls what is no expression
+        return None
+    if not all(function.sparsity_in(i).is_dense() for i in range(function.n_in())):
+        return None
+    sizes = [function.numel_in(i) for i in range(function.n_in())]
+    first, places = np.concatenate([[0], np.cumsum(sizes)]), function.sparsity_out(0).find()
+    code = np.zeros((function.n_instructions(), 4), dtype=np.int64)
+    constants = np.zeros(len(code))
+    for k, row in enumerate(code):
+        row[0], inputs, outputs = (
+            function.instruction_id(k),
+            function.instruction_input(k),
+            function.instruction_output(k),
+        )
+        if row[0] not in OPERATIONS:
+            return None
+        row[1] = places[outputs[1]] if row[0] == OUTPUT else outputs[0]
+        if row[0] == INPUT:
+            row[2] = first[inputs[0]] + inputs[1]
+        elif row[0] == CONST:
+            constants[k] = function.instruction_constant(k)
+        else:
+            row[2 : 2 + len(inputs)] = inputs
+            row[3] = inputs[-1]
+    return Tape(code, constants, function.sz_w(), function.numel_out(0))

@@ -31,17 +31,18 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from gpmpc.compiled import call_unchecked, compiled
-from gpmpc.dynamics import DynamicsModel, linearize
+from gpmpc.dynamics import DynamicsModel, check_next_states, linearize
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
+from gpmpc.kernels.gp_rollout import Feedback
 from gpmpc.kernels.linalg import copy_matrix, product
+from gpmpc.models.roll_out import RollOut
 from gpmpc.mpc.condense import StateRows
 from gpmpc.mpc.controller import (
     Decision,
     Reference,
     Request,
     check_controller,
-    check_dynamics,
     check_method,
     full_turns,
     read_parameters,
@@ -139,7 +140,7 @@ class PredictionModel:
         initial_input: Sequence[float] | Array,
         settings: PredictionSettings,
     ):
-        self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
+        self.initial_input = check_controller(problem, *check_next_states(model), horizon, initial_input)
         check_method("propagator", propagator, "propagate", "Linearization()")
         if not isinstance(settings, PredictionSettings):
             raise SettingError("prediction", f"must be PredictionSettings(...); got {type(settings).__name__}")
@@ -147,6 +148,7 @@ class PredictionModel:
         self.settings, self.points = settings, horizon if settings.form == "trajectory" else 1
         self.linearizer = StageLinearizer(model, propagator, settings.covariance)
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
+        self._roll_out = RollOut(model)
         self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
 
     def read(
@@ -281,7 +283,24 @@ class PredictionModel:
             c[n:] = stages.c[0, n:]
         return stages._replace(c=c[None])
 
-    def roll_out(self, towards: Plan, prediction: Prediction, feedback: Array, request: Request) -> Prediction:
+    @property
+    def evaluates(self) -> bool:
+        """Whether plans are compared without derivatives: where the means are all that is predicted."""
+        return self.linearizer.covariance == "none"
+
+    def evaluate(self, plan: Plan, at: Prediction, request: Request) -> Prediction:
+        """The prediction at a plan with the derivatives of another one, ``at``."""
+        disturbance = request.disturbance if len(request.disturbance) else None
+        return self._without(plan, self._roll_out.mean(plan.states[:-1], plan.inputs, disturbance), at, request)
+
+    def _without(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
+        known, n = (request.parameters, request.kappas), self.problem.state_dim
+        rows = self.constraints.at(plan.states[:, :n], plan.covariances, self.points, *known)
+        return Prediction(plan, at.stages._replace(next=after), plan.covariances, rows)
+
+    def roll_out(
+        self, towards: Plan, prediction: Prediction, feedback: Array, request: Request, derivatives: bool = True
+    ) -> Prediction:
         """The prediction at the plan that obeys the dynamics under a feedback towards another one, within its bounds.
 
         Args:
@@ -289,18 +308,31 @@ class PredictionModel:
             prediction: Its stages give the feedback, where a program has none.
             feedback: Of the program, F_k (H, m, p + m + 1), or nothing (0, m, p + m + 1).
             request: Of the step.
+            derivatives: Whether the stages are linearised where that is not needed to find the plan.
         """
-        problem, n, parts = self.problem, self.problem.state_dim, []
-        gains = feedback[:, :, :n] if len(feedback) else -self.gains(*prediction.stages[:2])
-        states, inputs, covariances = (part.copy() for part in towards)
+        problem, n, linearizer = self.problem, self.problem.state_dim, self.linearizer
+        gains = np.ascontiguousarray(feedback[:, :, :n]) if len(feedback) else -self.gains(*prediction.stages[:2])
         last, disturbance = request.references.previous_input, request.disturbance if len(request.disturbance) else None
-        for k in range(self.horizon):
+        bounds, rates = problem.inputs, problem.input_rates
+        if linearizer.at_points:
+            limits = bounds.lower, bounds.upper, rates.lower, rates.upper, last
+            law = Feedback(towards.states[None], towards.inputs[None], gains[None], *limits)
+            states, inputs = self._roll_out(towards.states[:1], law, disturbance)
+            plan = Plan(states[0], inputs[0], towards.covariances)
+            return (
+                self.linearize(plan, request)
+                if derivatives
+                else self._without(plan, plan.states[1:], prediction, request)
+            )
+        states, inputs, covariances = (part.copy() for part in towards)
+        parts = []
+        for k in range(self.horizon):  # of a belief, whose means depend on its covariances
             input = towards.inputs[k] + gains[k] @ (states[k, :n] - towards.states[k, :n])
-            input = np.clip(input, last + problem.input_rates.lower, last + problem.input_rates.upper)
-            last = inputs[k] = np.clip(input, problem.inputs.lower, problem.inputs.upper)
-            stage = self.linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance)
+            input = np.clip(input, last + rates.lower, last + rates.upper)
+            last = inputs[k] = np.clip(input, bounds.lower, bounds.upper)
+            stage = linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance)
             states[k + 1] = stage.next[0]
-            covariances[k + 1] = self.linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
+            covariances[k + 1] = linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
             parts.append(stage)
         stages = LinearizedStages(*map(np.concatenate, zip(*parts, strict=True)))
         return self.predict(Plan(states, inputs, covariances), stages, request)

@@ -61,7 +61,11 @@ class ManyStarts:
         for one in (self.controller, self.planner):
             if one.prediction.settings.form != "trajectory":
                 raise SettingError("controller", "must be of form 'trajectory', whose plans may start anywhere")
-        self.problem, self.horizon, self.initial_input = controller.problem, controller.horizon, controller.initial_input
+        self.problem, self.horizon, self.initial_input = (
+            controller.problem,
+            controller.horizon,
+            controller.initial_input,
+        )
         H, m, angles = self.horizon, self.problem.input_dim, self.problem.cost.angles
         if guesses is None:
             guesses = [None, *kicks(self.problem, H, self.initial_input)]
@@ -137,7 +141,9 @@ class ManyStarts:
         angles, moves = list(self.problem.cost.angles), []
         for angle, count in zip(angles, self.turns, strict=True):
             off = (state[angle] - reference.states[-1, angle]) / (2 * np.pi)
-            nearest = sorted(range(int(np.floor(off)) - count, int(np.ceil(off)) + count + 1), key=lambda k: abs(k - off))
+            nearest = sorted(
+                range(int(np.floor(off)) - count, int(np.ceil(off)) + count + 1), key=lambda k: abs(k - off)
+            )
             moves.append(nearest[:count])
         turns = np.zeros((len(list(product(*moves))), len(state)))
         turns[:, angles] = 2 * np.pi * np.array(list(product(*moves))).reshape(len(turns), len(angles))
@@ -156,7 +162,7 @@ class ManyStarts:
 
 
 def kicks(problem: Problem, horizon: int, initial_input: Array, share: float = 0.5) -> list[Array]:
-    """The initial input held (H, m), and for each bounded input a push and a pull, and a pull and a push, of H/6 stages.
+    """The initial input held (H, m); for each bounded input a push and a pull, and a pull and a push, of H/6 stages.
 
     Args:
         problem: With the bounds.
