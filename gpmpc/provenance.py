@@ -4,7 +4,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -23,6 +23,14 @@ def provenance() -> dict:
         "versions": versions(),
         "machine": {"system": platform.system(), "processor": processor(), "cores": os.cpu_count()},
     }
+
+
+def flattened(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Returns nested data as one dictionary, keys dotted."""
+    leaves: dict[str, Any] = {}
+    for key, value in data.items():
+        leaves |= flattened(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return leaves
 
 
 def environment() -> dict[str, str | None]:

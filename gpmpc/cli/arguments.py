@@ -10,15 +10,10 @@ from gpmpc.exceptions import GpmpcError, SettingError
 
 
 class Result(NamedTuple):
-    """What a command returns.
+    """What a command returns."""
 
-    Attributes:
-        data: Plain data, which ``--json`` prints.
-        code: The exit code.
-    """
-
-    data: Any = None
-    code: int = 0
+    data: Any = None  # plain data, which ``--json`` prints
+    code: int = 0  # the exit code
 
 
 class Parser(argparse.ArgumentParser):
@@ -39,20 +34,12 @@ class Parser(argparse.ArgumentParser):
         return super().add_argument(*names, **settings)
 
     def error(self, message: str) -> NoReturn:
-        """Raises instead of exiting.
-
-        Raises:
-            GpmpcError: Always.
-        """
+        """Raises instead of exiting."""
         raise GpmpcError(f"{message}; {self.prog} --help shows how")
 
 
 def folder_of(folder: Any) -> Path:
-    """Returns the folder that the setting ``folder`` names.
-
-    Raises:
-        SettingError: It is no text, or empty.
-    """
+    """Returns the folder that the setting ``folder`` names."""
     if not isinstance(folder, str) or not folder.strip():
         raise SettingError("folder", f"must be the path of a folder; got {folder!r}")
     return Path(folder)
@@ -60,11 +47,7 @@ def folder_of(folder: Any) -> Path:
 
 @contextmanager
 def writing(folder: Path, key: str = "folder") -> Iterator[None]:
-    """Turns errors of writing to ``folder`` into one of the setting ``key``, which named it.
-
-    Raises:
-        SettingError: The folder cannot be written.
-    """
+    """Turns errors of writing to ``folder`` into one of the setting ``key``, which named it."""
     try:
         yield
     except OSError as error:

@@ -23,19 +23,12 @@ from gpmpc.exceptions import GpmpcError
 
 
 class Command(NamedTuple):
-    """One command.
+    """One command."""
 
-    Attributes:
-        summary: For the list of all.
-        task: From the composed settings, or from the parsed arguments, to the result.
-        settings: Name of its file in ``conf/``; empty where it has arguments only.
-        add_arguments: To its parser.
-    """
-
-    summary: str
-    task: Callable[[Any], Result]
-    settings: str = ""
-    add_arguments: Callable[[Parser], None] = lambda parser: None
+    summary: str  # for the list of all
+    task: Callable[[Any], Result]  # from the composed settings, or from the parsed arguments, to the result
+    settings: str = ""  # name of its file in ``conf/``; empty where it has arguments only
+    add_arguments: Callable[[Parser], None] = lambda parser: None  # to its parser
 
     def parser(self, name: str) -> Parser:
         """Returns the parser of what follows the command's name."""

@@ -42,11 +42,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def completion(given: argparse.Namespace, commands: Mapping[str, Any]) -> Result:
-    """Prints a shell's script, or what may come next.
-
-    Raises:
-        GpmpcError: Neither was asked for.
-    """
+    """Prints a shell's script, or what may come next."""
     if given.line is not None:
         found = candidates(given.line, commands)
     elif given.shell:

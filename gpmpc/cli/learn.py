@@ -29,11 +29,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def learn(given: argparse.Namespace) -> Result:
-    """Learns from logs, judges on held-out runs, and writes model, report and card; goes on where it stopped.
-
-    Raises:
-        GpmpcError: A mistake in the arguments, a log that cannot be used, or a folder that cannot be written.
-    """
+    """Learns from logs, judges on held-out runs, and writes model, report and card; goes on where it stopped."""
     from rich.console import Console
 
     from gpmpc.files import write_whole

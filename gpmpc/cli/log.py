@@ -29,11 +29,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def log(given: argparse.Namespace) -> Result:
-    """Does what was asked for with a recording.
-
-    Raises:
-        GpmpcError: A mistake in the arguments, or a file that cannot be read or written.
-    """
+    """Does what was asked for with a recording."""
     if given.action == "info":
         if given.output:
             raise GpmpcError(f"log info: writes nothing; got {given.output}")

@@ -15,12 +15,7 @@ EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  #
 
 
 def explain(error: Exception, name: str) -> str | None:
-    """Returns a user's mistake in one line; None where the error is not the user's.
-
-    Args:
-        error: Any.
-        name: Of the command's file of settings; empty where it has none.
-    """
+    """Returns a user's mistake in one line; None where the error is not the user's."""
     if isinstance(error, GpmpcError | HydraException | OmegaConfBaseException):
         return _of_settings(error, name)
     if isinstance(error, OSError):

@@ -24,11 +24,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def new(given: argparse.Namespace) -> Result:
-    """Writes the project, and prints how it is run.
-
-    Raises:
-        SettingError: The name cannot be one of a module, or the folder is not empty or cannot be written.
-    """
+    """Writes the project, and prints how it is run."""
     name, folder = given.name, given.to or Path(given.name)
     if not name.isidentifier() or keyword.iskeyword(name) or not name.isascii() or name.startswith("_"):
         raise SettingError("NAME", f"must be letters, digits and _, a letter first; got {name!r}")

@@ -19,11 +19,7 @@ def add_report_arguments(parser: Parser) -> None:
 
 
 def report(given: argparse.Namespace) -> Result:
-    """Writes a tree of runs as one table with figures, and whether two groups of them differ.
-
-    Raises:
-        GpmpcError: No runs, groups that are none, or a folder that cannot be written.
-    """
+    """Writes a tree of runs as one table with figures, and whether two groups of them differ."""
     from rich.console import Console
 
     from gpmpc.files import write_whole
@@ -60,11 +56,7 @@ def add_plot_arguments(parser: Parser) -> None:
 
 
 def plot(given: argparse.Namespace) -> Result:
-    """Draws figures and an animation of a recorded flight.
-
-    Raises:
-        GpmpcError: No recording, or a folder that cannot be written.
-    """
+    """Draws figures and an animation of a recorded flight."""
     from rich.console import Console
 
     from gpmpc.plotting import animate, ffmpeg_exists, inputs_figure, timing_figure, tracking_figure

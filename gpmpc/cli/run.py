@@ -51,16 +51,7 @@ def run(config: DictConfig) -> Result:
 
 
 def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
-    """Flies one run; an error is kept in its folder and returned as ``error``.
-
-    Args:
-        config: The composed settings.
-        wait: For another process that works on the same run.
-
-    Raises:
-        Busy: Another process works on it, and ``wait`` is false.
-        SettingError: The folder cannot be written, or holds a finished run of other settings.
-    """
+    """Flies one run; an error is kept in its folder and returned as ``error``."""
     from gpmpc.studies.run_folder import RunFolder, folder_name, record
     from gpmpc.studies.study import one_thread
 
@@ -141,11 +132,7 @@ def _recorder(
 
 
 def experiment_of(config: DictConfig) -> "Experiment":
-    """Makes the objects that the settings describe.
-
-    Raises:
-        GpmpcError: A setting is wrong.
-    """
+    """Makes the objects that the settings describe."""
     from hydra.utils import instantiate
 
     from gpmpc.simulation import Noise
@@ -202,11 +189,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
 
 
 def system_of(settings: Any) -> "System":
-    """Makes the system that the settings ``system`` describe.
-
-    Raises:
-        GpmpcError: They make something else, or a setting is wrong.
-    """
+    """Makes the system that the settings ``system`` describe."""
     from hydra.utils import instantiate
 
     from gpmpc.systems import System
@@ -226,11 +209,7 @@ def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, A
 
 
 def plain_data(config: DictConfig) -> dict[str, Any]:
-    """Returns settings with everything resolved.
-
-    Raises:
-        OmegaConfBaseException: A setting without a default is missing.
-    """
+    """Returns settings with everything resolved."""
     found: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     return found
 

@@ -18,11 +18,7 @@ SHOWN_ERRORS = 10
 
 
 def run(config: DictConfig) -> Result:
-    """Runs what is missing of a study, writes its documents and prints its tables.
-
-    Raises:
-        GpmpcError: A setting is wrong, or data cannot be read.
-    """
+    """Runs what is missing of a study, writes its documents and prints its tables."""
     from gpmpc.files import write_whole
     from gpmpc.provenance import provenance
     from gpmpc.studies.document import json_text, terminal

@@ -64,16 +64,7 @@ class NoCallbacks:
 
 
 class Sweep:
-    """Runs of one tree: their settings, which are finished, and the launcher that flies the others.
-
-    Args:
-        name: Of the file of settings.
-        overrides: Of one run, which say where the tree is and what the launcher is.
-        console: For progress.
-
-    Raises:
-        GpmpcError: A mistake in the settings.
-    """
+    """Runs of one tree: their settings, which are finished, and the launcher that flies the others."""
 
     def __init__(self, name: str, overrides: Sequence[str], console: Any):
         for thread_count in THREADS:  # before the libraries load, here and in the processes started from here
@@ -96,11 +87,7 @@ class Sweep:
         return without_hydra(composed), composed.hydra.runtime.choices
 
     def check(self, jobs: Sequence[Job]) -> None:
-        """Makes the objects once for every value that occurs: a mistake is found before anything is launched.
-
-        Raises:
-            GpmpcError: A mistake in the settings, or a finished run of other ones.
-        """
+        """Makes the objects once for every value that occurs: a mistake is found before anything is launched."""
         finished = [job for job in jobs if job.folder.finished]
         with report_compilation():
             for job in jobs:
@@ -149,12 +136,7 @@ class Sweep:
 
     @contextmanager
     def progress(self, jobs: Sequence[Job], total: int) -> Iterator[Callable[[str], None]]:
-        """Shows one bar for many runs, drawn by a thread that looks at the folders; yields what names it.
-
-        Args:
-            jobs: May grow meanwhile.
-            total: Runs in the end.
-        """
+        """Shows one bar for many runs, drawn by a thread that looks at the folders; yields what names it."""
         with progress_bar(self.console) as bar:
             task, over, done = bar.add_task("flying", total=total), Event(), set()
 
@@ -178,15 +160,7 @@ class Sweep:
 
 
 def sweep(given: Namespace, name: str) -> Result:
-    """Runs every combination of the choices that is not finished; the result's code is 1 where runs failed.
-
-    Args:
-        given: As ``overrides`` the settings, some with several values.
-        name: Of the file of settings.
-
-    Raises:
-        GpmpcError: A mistake in the settings, before anything is launched, or a launcher that broke down.
-    """
+    """Runs every combination of the choices that is not finished; the result's code is 1 where runs failed."""
     from rich.console import Console
 
     console, combinations = Console(), _combinations(given.overrides)

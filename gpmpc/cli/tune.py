@@ -33,15 +33,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def tune(given: Namespace, name: str) -> Result:
-    """Searches, and writes the candidates, a figure of what mattered and the best settings.
-
-    Args:
-        given: The options, and as ``overrides`` the settings, some with several values or an interval.
-        name: Of the file of settings.
-
-    Raises:
-        GpmpcError: A mistake in the settings, nothing to search, or no flight that was not lost.
-    """
+    """Searches, and writes the candidates, a figure of what mattered and the best settings."""
     from rich.console import Console
 
     from gpmpc.files import write_whole

@@ -17,17 +17,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Panel:
-    """One panel of ``error_over_size``.
+    """One panel of ``error_over_size``."""
 
-    Attributes:
-        title: Above the panel.
-        draws: Errors of all draws by training size.
-        paper: The paper's figure by training size.
-    """
-
-    title: str
-    draws: dict[int, list[float]]
-    paper: dict[int, float]
+    title: str  # above the panel
+    draws: dict[int, list[float]]  # errors of all draws by training size
+    paper: dict[int, float]  # the paper's figure by training size
 
 
 @styled
@@ -117,23 +111,14 @@ def calibration_figure(calibration: "Calibration") -> Figure:
 
 @dataclass(frozen=True)
 class Curve:
-    """One line in each panel of a group.
+    """One line in each panel of a group."""
 
-    Attributes:
-        label: In the legend.
-        at: Where the values lie on the horizontal axis (K,).
-        values: A column a panel (K, p).
-        wanted: What they were to be (K or more, p); None where there is nothing.
-        bounds: Lower and upper, an entry a panel; None without.
-        interval: Lower and upper end of what is doubtful of the first column (K, 2).
-    """
-
-    label: str
-    at: np.ndarray
-    values: np.ndarray
-    wanted: np.ndarray | None = None
-    bounds: Sequence[Sequence[float]] | None = None
-    interval: np.ndarray | None = None
+    label: str  # in the legend
+    at: np.ndarray  # where the values lie on the horizontal axis (K,)
+    values: np.ndarray  # A column a panel (K, p)
+    wanted: np.ndarray | None = None  # what they were to be (K or more, p); None where there is nothing
+    bounds: Sequence[Sequence[float]] | None = None  # lower and upper, an entry a panel; None without
+    interval: np.ndarray | None = None  # lower and upper end of what is doubtful of the first column (K, 2)
 
 
 @styled

@@ -13,15 +13,10 @@ from gpmpc.plotting.style import COLOURS, add_legend, clipped, styled
 
 @dataclass(frozen=True)
 class Series:
-    """One line of a figure.
+    """One line of a figure."""
 
-    Attributes:
-        label: In the legend.
-        values: The runs' values by position on the axis; a position may have none.
-    """
-
-    label: str
-    values: Sequence[Sequence[float]]
+    label: str  # in the legend
+    values: Sequence[Sequence[float]]  # the runs' values by position on the axis; a position may have none
 
 
 @styled

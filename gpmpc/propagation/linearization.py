@@ -24,25 +24,15 @@ from gpmpc.propagation.sensitivity import Sensitivity
 
 
 class Expansion(NamedTuple):
-    """The model around a certain state and input.
+    """The model around a certain state and input."""
 
-    Attributes:
-        belief: The prediction there.
-        A: The mean's derivative by the state (*batch, k, n).
-        B: By the input (*batch, k, m).
-        variance_by_state: (*batch, k, n).
-        variance_by_input: (*batch, k, m).
-        mean_by_state2: Second derivatives (*batch, k, n, n).
-        mean_by_state_input: (*batch, k, n, m).
-    """
-
-    belief: Gaussian
-    A: Tensor
-    B: Tensor
-    variance_by_state: Tensor
-    variance_by_input: Tensor
-    mean_by_state2: Tensor
-    mean_by_state_input: Tensor
+    belief: Gaussian  #: the prediction there
+    A: Tensor  #: the mean's derivative by the state (*batch, k, n)
+    B: Tensor  #: by the input (*batch, k, m)
+    variance_by_state: Tensor  #: (*batch, k, n)
+    variance_by_input: Tensor  #: (*batch, k, m)
+    mean_by_state2: Tensor  #: second derivatives (*batch, k, n, n)
+    mean_by_state_input: Tensor  #: (*batch, k, n, m)
 
 
 def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:

@@ -28,12 +28,7 @@ _ORIGIN = fg.Pose(position=fg.Vector3(), orientation=fg.Quaternion(w=1.0))
 
 
 class Scene:
-    """Logs the pictures of steps; nothing for states that are neither positions nor attitudes.
-
-    Args:
-        context: Of the recording.
-        system: What is recorded.
-    """
+    """Logs the pictures of steps; nothing for states that are neither positions nor attitudes."""
 
     def __init__(self, context: Context, system: RecordedSystem):
         states = system.state_names
