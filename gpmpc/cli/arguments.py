@@ -1,7 +1,7 @@
 """Arguments of commands, what commands return, and the folders that they write to: a user's mistake is one line."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -17,14 +17,10 @@ class Result(NamedTuple):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that raises an error of this package instead of printing the usage and exiting.
-
-    Attributes:
-        values: What the arguments take, by option or name: a list of choices, empty for any; None for a flag.
-    """
+    """A parser that raises an error of this package instead of printing the usage and exiting."""
 
     def __init__(self, *arguments: Any, **settings: Any):
-        self.values: dict[str, list[str] | None] = {}
+        self.values: dict[str, list[str] | None] = {}  # by option or name: choices, empty for any; None for a flag
         super().__init__(*arguments, **settings)
 
     def add_argument(self, *names: Any, **settings: Any) -> Any:
@@ -52,3 +48,14 @@ def writing(folder: Path, key: str = "folder") -> Iterator[None]:
         yield
     except OSError as error:
         raise SettingError(key, f"cannot write to {folder}: {error.strerror or error}") from error
+
+
+def write_files(folder: Path, files: Mapping[str, str | bytes], key: str = "folder") -> str:
+    """Writes files, each in one piece, and makes the folder; returns the line that says so."""
+    from gpmpc.files import write_whole
+
+    with writing(folder, key):
+        for name, content in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            write_whole(folder / name, content)
+    return f"written to {folder}: {', '.join(sorted(files))}"

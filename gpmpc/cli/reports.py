@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from gpmpc.cli.arguments import Parser, Result, writing
+from gpmpc.cli.arguments import Parser, Result, write_files, writing
 from gpmpc.cli.log import CUT
 from gpmpc.exceptions import DataError
 
@@ -22,7 +22,6 @@ def report(given: argparse.Namespace) -> Result:
     """Writes a tree of runs as one table with figures, and whether two groups of them differ."""
     from rich.console import Console
 
-    from gpmpc.files import write_whole
     from gpmpc.studies.comparison import compare, sentences
     from gpmpc.studies.document import terminal
     from gpmpc.studies.report import read_report
@@ -33,17 +32,12 @@ def report(given: argparse.Namespace) -> Result:
         found = read_report(given.tree)
         lines = sentences(found, compare(found, *given.compare), *given.compare) if given.compare else []
         document = report_document(found, lines, folder)
-        written = document.files("report") | {"report.html": document.html()}
-        with writing(folder, "to"):
-            folder.mkdir(parents=True, exist_ok=True)
-            for name, content in written.items():
-                write_whole(folder / name, content)
+        where = write_files(folder, document.files("report") | {"report.html": document.html()}, "to")
     console.print(terminal([terminal_table(found)]))
     for kind, items in notes(found).items():
         lines += [f"{kind.lower()}: {item}" for item in items]
     lines += [f"to fill: {command}" for command in found.commands()]
-    for line in [*lines, f"written to {folder}: {', '.join(sorted(written))}"]:
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    console.out(*lines, where, sep="\n", highlight=False)
     return Result({"folder": str(folder), "cells": document.data.to_dict("records"), "lines": lines})
 
 

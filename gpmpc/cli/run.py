@@ -46,7 +46,7 @@ def run(config: DictConfig) -> Result:
         return Result(outcome, 2 if outcome["mistake"] else 1)
     console.print(terminal([summary(outcome["result"])]))
     state = "finished before" if outcome["skipped"] else "written to"
-    console.print(f"{state}: {outcome['folder']}", soft_wrap=True, highlight=False, markup=False)
+    console.out(f"{state}: {outcome['folder']}", highlight=False)
     return Result(outcome["result"] | {"folder": outcome["folder"]}, LOST if outcome["result"].get("lost") else 0)
 
 

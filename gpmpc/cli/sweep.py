@@ -53,14 +53,12 @@ class Job:
         return self.folder.finished or self.folder.failed_at not in (None, self.failed_before)
 
 
-class NoCallbacks:
+class _NoCallbacks:
     """Hydra calls these around every job; none are used here."""
 
-    def on_job_start(self, **_: Any) -> None:
-        """Does nothing."""
+    def on_job_start(self, **_: Any) -> None: ...
 
-    def on_job_end(self, **_: Any) -> None:
-        """Does nothing."""
+    on_job_end = on_job_start
 
 
 class Sweep:
@@ -72,7 +70,7 @@ class Sweep:
         self.config = hydra.compose(name, [*overrides], return_hydra_config=True)
         self.config.hydra.mode = RunMode.MULTIRUN
         self.tree, self.console = folder_of(self.config.folder), console
-        nothing: Any = NoCallbacks()
+        nothing: Any = _NoCallbacks()
         self._context = HydraContext(GlobalHydra.instance().config_loader(), nothing)
         self._checked: set[str] = set()
 
@@ -174,7 +172,7 @@ def sweep(given: Namespace, name: str) -> Result:
     failed = [outcome for outcome in outcomes if "error" in outcome]
     total = "1 run" if len(jobs) == 1 else f"{len(jobs)} runs"
     text = f"{total}: {len(outcomes) - len(failed)} flown, {finished} finished before, {len(failed)} failed"
-    console.print(f"{text}; in {runs.tree}", soft_wrap=True, highlight=False, markup=False)
+    console.out(f"{text}; in {runs.tree}", highlight=False)
     for outcome in failed:
         print_error(f"failed: {outcome['folder']}: {outcome['error']}")
     data = {"folder": str(runs.tree), "runs": [str(job.folder.path) for job in jobs], "failed": failed}

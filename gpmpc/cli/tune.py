@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from gpmpc.cli.arguments import Parser, Result, writing
+from gpmpc.cli.arguments import Parser, Result, write_files
 from gpmpc.cli.configuration import group_options, without_hydra
 from gpmpc.cli.run import ASIDE, experiment_of
 from gpmpc.cli.sweep import Job, Sweep
@@ -36,7 +36,6 @@ def tune(given: Namespace, name: str) -> Result:
     """Searches, and writes the candidates, a figure of what mattered and the best settings."""
     from rich.console import Console
 
-    from gpmpc.files import write_whole
     from gpmpc.studies.document import terminal
     from gpmpc.studies.tuning import Search
 
@@ -81,12 +80,9 @@ def tune(given: Namespace, name: str) -> Result:
         "tuning.html": document.html(),
         BEST: _config(best, name, str(runs.tree / "best")),
     }
-    with writing(runs.tree):
-        for file, content in written.items():
-            write_whole(runs.tree / file, content)
+    where = write_files(runs.tree, written)
     console.print(terminal(document.tables, document.lead))
-    for line in (f"to fly the best one: {command}", f"written to {runs.tree}: {', '.join(sorted(written))}"):
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    console.out(f"to fly the best one: {command}", where, sep="\n", highlight=False)
     data = {"folder": str(runs.tree), "best": search.candidates[search.best], "cost": search.costs[search.best]}
     return Result(data | {"unchanged": unchanged, "importances": search.importances(), "command": command})
 
