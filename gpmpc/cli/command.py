@@ -39,7 +39,7 @@ class Command(NamedTuple):
             for names in (("-h", "--help"), ("--resolve",)):
                 parser.add_argument(*names, action="store_true")
             parser.add_argument("--cfg", "-c", nargs="?", const="job")
-            parser.values["--cfg"] = [*SHOWN]
+            parser.values["--cfg"] = [*_SHOWN]
             for names in (("--config-name", "-cn"), ("--config-dir", "-cd")):
                 parser.add_argument(*names)
             parser.add_argument("overrides", nargs="*")
@@ -57,7 +57,7 @@ def version(given: argparse.Namespace) -> Result:
 
 def _show_usage(given: argparse.Namespace) -> Result:
     lines = "\n".join(f"  {name:12}{command.summary}" for name, command in COMMANDS.items())
-    print(USAGE.format(version=gpmpc.__version__, commands=lines), end="")
+    print(_USAGE.format(version=gpmpc.__version__, commands=lines), end="")
     return Result()
 
 
@@ -113,9 +113,9 @@ COMMANDS = {
     "version": Command("Prints the versions of what computes, and the processor", version),
     "help": Command("Explains a command", _show_usage),
 }
-SHOWN = ("job", "hydra", "all")  # parts of the settings
-FLAGS = ("--json", "--quiet", "--debug")
-USAGE = """gpmpc {version}: Gaussian process model predictive control
+_SHOWN = ("job", "hydra", "all")  # parts of the settings
+_FLAGS = ("--json", "--quiet", "--debug")
+_USAGE = """gpmpc {version}: Gaussian process model predictive control
 
 usage: gpmpc COMMAND [SETTING=VALUE ...] [OPTIONS]
 
@@ -133,7 +133,7 @@ eval "$(gpmpc completion bash)" completes at TAB; zsh likewise; fish: gpmpc comp
 
 def main() -> None:
     """Runs the command that the command line names."""
-    flags = {flag for flag in FLAGS if flag in sys.argv[1:]}
+    flags = {flag for flag in _FLAGS if flag in sys.argv[1:]}
     arguments = [argument for argument in sys.argv[1:] if argument not in flags]
     with redirected_output("error" if "--json" in flags else "nowhere" if "--quiet" in flags else "output"):
         result = _run(arguments, debug="--debug" in flags)
@@ -181,7 +181,7 @@ def _with_settings(name: str, command: Command, given: argparse.Namespace) -> Re
         if given.help:
             print(help_text(command.settings, []))
             return Result()
-        if given.cfg not in (None, *SHOWN):  # a setting behind --cfg
+        if given.cfg not in (None, *_SHOWN):  # a setting behind --cfg
             given.overrides, given.cfg = [given.cfg, *given.overrides], "job"
         if swept and given.cfg:
             raise GpmpcError("--cfg: shows the settings of one run; leave out -m, and give each setting one value")

@@ -7,7 +7,7 @@ from gpmpc.cli.arguments import Parser, Result, write_files, writing
 from gpmpc.cli.log import CUT
 from gpmpc.exceptions import DataError
 
-FORMATS = ("png", "pdf", "svg")
+_FORMATS = ("png", "pdf", "svg")
 
 
 def add_report_arguments(parser: Parser) -> None:
@@ -45,7 +45,7 @@ def add_plot_arguments(parser: Parser) -> None:
     """Adds the arguments of ``gpmpc plot``."""
     parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder, or a recording (.mcap)")
     parser.add_argument("--to", type=Path, metavar="DIR", help="where the figures go (RUN/figures)")
-    parser.add_argument("--format", choices=FORMATS, default="png", help="of the figures (png)")
+    parser.add_argument("--format", choices=_FORMATS, default="png", help="of the figures (png)")
     parser.add_argument("--no-animation", action="store_true", help="figures only: they take a second")
 
 

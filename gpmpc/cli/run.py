@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from gpmpc.systems import System
 
 ASIDE = ("launcher", "folder", "live")  # settings that a result does not depend on
-GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver")
-MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
-LOST = 3  # exit code of a run that is finished, and whose flight was lost
+_GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver")
+_MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
+_LOST = 3  # exit code of a run that is finished, and whose flight was lost
 
 
 def run(config: DictConfig) -> Result:
@@ -47,7 +47,7 @@ def run(config: DictConfig) -> Result:
     console.print(terminal([summary(outcome["result"])]))
     state = "finished before" if outcome["skipped"] else "written to"
     console.out(f"{state}: {outcome['folder']}", highlight=False)
-    return Result(outcome["result"] | {"folder": outcome["folder"]}, LOST if outcome["result"].get("lost") else 0)
+    return Result(outcome["result"] | {"folder": outcome["folder"]}, _LOST if outcome["result"].get("lost") else 0)
 
 
 def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
@@ -70,7 +70,7 @@ def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
             folder.finish(result)
         except Exception as error:
             folder.fail(error, about)
-            return outcome | {"error": one_line(error), "mistake": isinstance(error, MISTAKES)}
+            return outcome | {"error": one_line(error), "mistake": isinstance(error, _MISTAKES)}
     return outcome | {"result": result}
 
 
@@ -154,7 +154,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
             raise SettingError(group, "choose one")
     if len(config.trajectory) != 1:
         raise SettingError("trajectory", f"choose one; got {', '.join(config.trajectory)}")
-    system = system_of(config.system)
+    system = _system_of(config.system)
     for group, part in (("propagation", "propagator"), ("solver", "solver")):
         if config.get(group):
             if part not in config.controller:
@@ -179,7 +179,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
         trajectory=instantiate(trajectory, _convert_="all"),
         train=instantiate(config.model, _convert_="all"),
         system=system,
-        plant=system_of(OmegaConf.merge(config.system, other)) if other else None,
+        plant=_system_of(OmegaConf.merge(config.system, other)) if other else None,
         name=name,
         size=size,
         propagator=getattr(parts["controller"], "keywords", {}).get("propagator"),
@@ -188,7 +188,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
     )
 
 
-def system_of(settings: Any) -> "System":
+def _system_of(settings: Any) -> "System":
     """Makes the system that the settings ``system`` describe."""
     from hydra.utils import instantiate
 
@@ -204,7 +204,7 @@ def system_of(settings: Any) -> "System":
 def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, Any]:
     """Returns all that a result depends on, as plain data: the settings, and the chosen option by group."""
     settings = plain_data(config)
-    options = {group: chosen.get(group) for group in GROUPS}
+    options = {group: chosen.get(group) for group in _GROUPS}
     return {key: value for key, value in settings.items() if key not in ASIDE} | {"options": options}
 
 

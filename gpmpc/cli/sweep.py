@@ -36,7 +36,7 @@ from gpmpc.files import write_whole
 from gpmpc.parallel import THREADS, children_ignore_interrupts, end_with
 from gpmpc.studies.run_folder import PLAN, Busy, RunFolder, folder_name
 
-LOOK = 0.5  # between two looks at the folders [s]
+_LOOK = 0.5  # between two looks at the folders [s]
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,9 @@ class Sweep:
     def fly(self, jobs: Sequence[Job]) -> list[dict[str, Any]]:
         """Flies the runs that are not finished; returns the outcome of each of those."""
         waiting = [job for job in jobs if not job.folder.finished]
-        outcomes = self._launch(waiting, run_job)
+        outcomes = self._launch(waiting, _run_job)
         busy = [job for job, outcome in zip(waiting, outcomes, strict=True) if "busy" in outcome]
-        return [o for o in outcomes if "busy" not in o] + self._launch(busy, run_job_after_others)
+        return [o for o in outcomes if "busy" not in o] + self._launch(busy, _run_job_after_others)
 
     def _launch(self, jobs: Sequence[Job], task: Callable[[DictConfig], dict[str, Any]]) -> list[dict[str, Any]]:
         if not jobs:
@@ -143,7 +143,7 @@ class Sweep:
                 bar.update(task, completed=len(done))
 
             def watch() -> None:
-                while not over.wait(LOOK):
+                while not over.wait(_LOOK):
                     look()
 
             watcher = Thread(target=watch, daemon=True)
@@ -179,12 +179,12 @@ def sweep(given: Namespace, name: str) -> Result:
     return Result(data, 1 if failed else 0)
 
 
-def run_job(config: DictConfig) -> dict[str, Any]:
+def _run_job(config: DictConfig) -> dict[str, Any]:
     """Flies one run of a sweep, in whichever process a launcher started, unless another process works on it."""
     return _outcome(config, wait=False)
 
 
-def run_job_after_others(config: DictConfig) -> dict[str, Any]:
+def _run_job_after_others(config: DictConfig) -> dict[str, Any]:
     """Flies one run of a sweep, after the process that works on it."""
     return _outcome(config, wait=True)
 

@@ -23,7 +23,7 @@ from gpmpc.exceptions import GpmpcError, RecordingError, SettingError, check_num
 if TYPE_CHECKING:
     from gpmpc.studies.tuning import Interval
 
-BEST = "best.yaml"
+_BEST = "best.yaml"
 
 
 def add_arguments(parser: Parser) -> None:
@@ -74,11 +74,11 @@ def tune(given: Namespace, name: str) -> Result:
     if not math.isfinite(search.costs[search.best]):
         raise GpmpcError(f"tune: every flight was lost or failed; see {runs.tree}")
     best = [*fixed, *_overrides(search.candidates[search.best], base)]
-    command = shlex.join(["gpmpc", "run", "--config-dir", str(runs.tree), "--config-name", BEST.removesuffix(".yaml")])
+    command = shlex.join(["gpmpc", "run", "--config-dir", str(runs.tree), "--config-name", _BEST.removesuffix(".yaml")])
     document = search.document(unchanged if math.isfinite(unchanged) else None, command)
     written = document.files("tuning") | {
         "tuning.html": document.html(),
-        BEST: _config(best, name, str(runs.tree / "best")),
+        _BEST: _config(best, name, str(runs.tree / "best")),
     }
     where = write_files(runs.tree, written)
     console.print(terminal(document.tables, document.lead))

@@ -8,8 +8,8 @@ from gpmpc.cli.configuration import compose, settings
 from gpmpc.cli.run import experiment_of
 from gpmpc.cli.terminal import progress_bar
 
-FLOWN = ("controller=convex", "controller=paper", "controller=nonlinear", "controller=lqr")
-SHORT = ("data.samples=12", "model.restarts=0", "steps=2", "horizon=3")
+_FLOWN = ("controller=convex", "controller=paper", "controller=nonlinear", "controller=lqr")
+_SHORT = ("data.samples=12", "model.restarts=0", "steps=2", "horizon=3")
 
 
 def warmup(given: argparse.Namespace) -> Result:
@@ -21,10 +21,10 @@ def warmup(given: argparse.Namespace) -> Result:
 
     console, began = Console(), time.perf_counter()
     with progress_bar(console) as bar, report_compilation(), settings():
-        task = bar.add_task("", total=len(FLOWN))
-        for words in FLOWN:
+        task = bar.add_task("", total=len(_FLOWN))
+        for words in _FLOWN:
             bar.update(task, description=f"compiling what {words} needs")
-            run_trial(experiment_of(compose("run", [words, *SHORT])))
+            run_trial(experiment_of(compose("run", [words, *_SHORT])))
             bar.advance(task)
     seconds = round(time.perf_counter() - began, 3)
     console.print(f"ready after {seconds:.1f} s")

@@ -75,7 +75,7 @@ class Tracking:
     initial_input: Sequence[float]  #: first guess of the solver (m,)
 
     def __post_init__(self) -> None:
-        check_weights(self.plant, self.Q, self.R)
+        _check_weights(self.plant, self.Q, self.R)
 
     def fly(self, references: np.ndarray, horizon: int, steps: int) -> Rollout:
         """Unconstrained NMPC from rest along references (steps + horizon, n)."""
@@ -166,7 +166,7 @@ class PaperData:
         return data[: self.samples]
 
 
-def check_weights(plant: Plant, Q: Sequence[float], R: Sequence[float]) -> None:
+def _check_weights(plant: Plant, Q: Sequence[float], R: Sequence[float]) -> None:
     """Raises unless diagonal weights fit a plant.
 
     Raises:

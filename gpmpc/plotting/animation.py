@@ -23,8 +23,8 @@ from gpmpc.plotting.style import DASHED, GREEN, styled
 if TYPE_CHECKING:
     from gpmpc.recording import Run
 
-FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-VISIBLE = 0.06  # an ellipse's half axis, as a share of the view, from which on it is large enough
+_FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+_VISIBLE = 0.06  # an ellipse's half axis, as a share of the view, from which on it is large enough
 PLAN = GREEN
 
 
@@ -144,7 +144,7 @@ def _enlargement(run: "Run", x: int, y: int, half: float) -> int:
     largest = 2 * float(np.nanmedian(np.nanmax(stds, axis=(1, 2)))) if np.isfinite(stds).any() else 0.0
     if largest <= 0:
         return 1
-    return next((factor for factor in FACTORS if factor * largest >= VISIBLE * 2 * half), FACTORS[-1])
+    return next((factor for factor in _FACTORS if factor * largest >= _VISIBLE * 2 * half), _FACTORS[-1])
 
 
 def _tube(run: "Run", k: int, x: int, y: int, factor: int, axis) -> list:

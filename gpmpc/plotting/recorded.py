@@ -17,12 +17,12 @@ from gpmpc.plotting.style import BLUE, DASHED, GREY, ORANGE, SKY, VERMILION, leg
 if TYPE_CHECKING:
     from gpmpc.recording import Run
 
-FLOWN, REFERENCE, TUBE, BOUND, FAILED = BLUE, VERMILION, SKY, GREY, ORANGE
-STAGES = ("model", "build", "solve")
-STAGE_COLOURS = (BLUE, SKY, VERMILION)
+FLOWN, REFERENCE, TUBE, _BOUND, _FAILED = BLUE, VERMILION, SKY, GREY, ORANGE
+_STAGES = ("model", "build", "solve")
+_STAGE_COLOURS = (BLUE, SKY, VERMILION)
 
 
-def tracked_of(run: "Run") -> list[int]:
+def _tracked_of(run: "Run") -> list[int]:
     """Indices of the states that errors are reported of, as the recording says; of all where it does not."""
     tracked = run.metadata.get("run", {}).get("tracked", "").split()
     found = [run.state_names.index(name) for name in tracked if name in run.state_names]
@@ -54,10 +54,10 @@ def _noise(run: "Run") -> np.ndarray:
 @styled
 def tracking_figure(run: "Run") -> Figure:
     """Every axis over time against its reference, and below it the error with the tube."""
-    states = tracked_of(run)
+    states = _tracked_of(run)
     mean, std = expected(run, states)
     figure = Figure(figsize=(2.9 * max(len(states), 2), 4.8), layout="constrained")
-    figure.suptitle(title_of(run))
+    figure.suptitle(_title_of(run))
     axes = figure.subplots(2, len(states), squeeze=False, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
     for column, i in enumerate(states):
         above, below = axes[:, column]
@@ -90,7 +90,7 @@ def inputs_figure(run: "Run") -> Figure:
     """What acted, over time, with its bounds."""
     m, units = len(run.input_names), run.metadata.get("units", {})
     figure = Figure(figsize=(7.2, 1.6 * m + 1.0), layout="constrained")
-    figure.suptitle(title_of(run))
+    figure.suptitle(_title_of(run))
     axes = figure.subplots(m, 1, squeeze=False, sharex=True)[:, 0]
     for i, axis in enumerate(axes):
         held = np.append(run.inputs[:, i], run.inputs[-1:, i])  # the last one until its step ends
@@ -109,10 +109,10 @@ def timing_figure(run: "Run") -> Figure:
     """Where the time of every decision went, and how the totals are distributed."""
     milliseconds = 1e3 * run.timings
     figure = Figure(figsize=(8.4, 3.6), layout="constrained")
-    figure.suptitle(title_of(run))
+    figure.suptitle(_title_of(run))
     over_time, distribution = figure.subplots(1, 2, gridspec_kw={"width_ratios": [3, 2]})
     edges, bottom = _edges(run), np.zeros(len(run.times))
-    for j, (name, colour) in enumerate(zip(STAGES, STAGE_COLOURS, strict=True)):
+    for j, (name, colour) in enumerate(zip(_STAGES, _STAGE_COLOURS, strict=True)):
         top = bottom + milliseconds[:, j]
         over_time.stairs(top, edges, baseline=bottom, fill=True, color=colour, label=name)
         bottom = top
@@ -137,7 +137,7 @@ def timing_figure(run: "Run") -> Figure:
         distribution.xaxis.set_minor_formatter(NullFormatter())
     median, most = (float(np.quantile(total, share)) for share in (0.5, 0.99))
     for value in (median, most):
-        distribution.axvline(value, color=BOUND, linewidth=1, linestyle=DASHED)
+        distribution.axvline(value, color=_BOUND, linewidth=1, linestyle=DASHED)
     distribution.set_title(f"median {_duration(median)}, 99 % below {_duration(most)}", fontsize="small")
     distribution.set_ylim(0, 1.02)
     distribution.set_xlabel("time of a decision [ms]")
@@ -156,7 +156,7 @@ def _duration(milliseconds: float) -> str:
     return f"{milliseconds:.3g} ms" if milliseconds < 999.5 else f"{milliseconds / 1e3:.3g} s"
 
 
-def title_of(run: "Run") -> str:
+def _title_of(run: "Run") -> str:
     """Returns what was run: the command, or the file."""
     command = run.metadata.get("run", {}).get("command", "")
     return textwrap.fill(command if command.startswith("gpmpc") else str(run.path), 90, max_lines=2, placeholder=" ...")
@@ -182,13 +182,13 @@ def _bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
     limits = [limit for limit in bounds if np.isfinite(limit)]
     near = [limit for limit in limits if low - 2 * span <= limit <= high + 2 * span]
     for limit in near:
-        axis.axhline(limit, color=BOUND, linestyle=DASHED, linewidth=1, label="bound")
+        axis.axhline(limit, color=_BOUND, linestyle=DASHED, linewidth=1, label="bound")
     low, high = min([low, *near]), max([high, *near])
     axis.set_ylim(low - 0.12 * max(high - low, span), high + 0.25 * max(high - low, span))
     if len(near) < len(limits):
         text = "bounds " + " and ".join(f"{limit:g}" for limit in limits)
         axis.annotate(
-            text, (0.995, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize="small", color=BOUND
+            text, (0.995, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize="small", color=_BOUND
         )
 
 
@@ -197,4 +197,6 @@ def _failures(run: "Run", axes: tuple[Axes, ...]) -> None:
     times = run.times[run.failed]
     for axis in axes:
         for j, time in enumerate(times):
-            axis.axvline(time, color=FAILED, linewidth=1, alpha=0.6, label="failed solve" if j == 0 else None, zorder=0)
+            axis.axvline(
+                time, color=_FAILED, linewidth=1, alpha=0.6, label="failed solve" if j == 0 else None, zorder=0
+            )

@@ -12,12 +12,12 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-BLUE, VERMILION, GREEN, PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
+BLUE, VERMILION, GREEN, _PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
 ORANGE, SKY, BLACK, GREY = "#e69f00", "#56b4e9", "#000000", "0.45"
-COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK, GREY)
+COLOURS = (BLUE, VERMILION, GREEN, _PURPLE, ORANGE, SKY, BLACK, GREY)
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.6)), (0, (6, 2, 1.2, 2)), (0, (3, 3)), (0, (8, 2)))
 DASHED = (0, (4, 3))  # of references and bounds
-STYLE: Any = {
+_STYLE: Any = {
     "axes.axisbelow": True,
     "axes.grid": True,
     "axes.prop_cycle": cycler(color=COLOURS),
@@ -29,7 +29,7 @@ STYLE: Any = {
     "legend.frameon": False,
     "lines.linewidth": 1.4,
 }
-NAMES = {
+_NAMES = {
     "z": "z, downwards",
     "phi": "roll",
     "theta": "pitch",
@@ -39,12 +39,12 @@ NAMES = {
     "uy": "direction uy",
 }
 
-styled = mpl.rc_context(STYLE)  # a decorator of what makes a figure
+styled = mpl.rc_context(_STYLE)  # a decorator of what makes a figure
 
 
 def name_of(name: str, unit: str = "", z_down: bool = True) -> str:
     """Returns the full name of a state or input with its unit, such as ``z, downwards [m]``."""
-    full = name if name == "z" and not z_down else NAMES.get(name, name)
+    full = name if name == "z" and not z_down else _NAMES.get(name, name)
     return f"{full} [{unit}]" if unit not in ("", "1", "?") else full
 
 

@@ -23,7 +23,7 @@ from gpmpc.propagation.propagator import Propagation, Propagator, checked_input,
 from gpmpc.propagation.sensitivity import Sensitivity
 
 
-class Expansion(NamedTuple):
+class _Expansion(NamedTuple):
     """The model around a certain state and input."""
 
     belief: Gaussian  #: the prediction there
@@ -35,7 +35,7 @@ class Expansion(NamedTuple):
     mean_by_state_input: Tensor  #: (*batch, k, n, m)
 
 
-def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:
+def expand(model: Any, state: Tensor, input: Tensor) -> _Expansion | None:
     """The expansion of GPs alone, compiled or by torch; None for other models."""
     form = getattr(model, "affine_form", None)
     if form is None or form.B is not None:
@@ -53,7 +53,7 @@ def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:
     mean, A = parts[0] + gp.offset, parts[2]
     if form.A is not None:
         mean, A = mean + state, A + form.A
-    return Expansion(Gaussian(mean, torch.diag_embed(parts[1])), A, *parts[3:])
+    return _Expansion(Gaussian(mean, torch.diag_embed(parts[1])), A, *parts[3:])
 
 
 def _by_torch(model: GPPosterior, state: Tensor, input: Tensor) -> list[Tensor]:

@@ -127,7 +127,7 @@ def rehearse(system: Plant | ModelLoop, controller: Controller, references: Refe
         closed_loop(system, controller, references, initial, 2, on_failure="previous_plan")
 
 
-class Decided(Protocol):
+class _Decided(Protocol):
     """What one step applies."""
 
     @property
@@ -168,7 +168,7 @@ class Flight:
 
 def fly(
     flights: Sequence[Flight],
-    decide: Callable[[int, Sequence[Gaussian], Sequence[Any]], Sequence[Decided | SolverFailure]],
+    decide: Callable[[int, Sequence[Gaussian], Sequence[Any]], Sequence[_Decided | SolverFailure]],
     steps: int,
     time_step: float,
 ) -> None:
@@ -201,7 +201,7 @@ def fly(
                 flight.record(Moment(k, time, state, covariance, measured, input), decided)
 
 
-class StepSummary(NamedTuple):
+class _StepSummary(NamedTuple):
     """What a ``Rollout`` holds of a step: nothing of its quadratic program, and one row of its plan."""
 
     state: Array
@@ -225,7 +225,7 @@ class History:
     """
 
     def __init__(self, on_step: Callable[[Step], None] | None = None):
-        self.steps: list[StepSummary] = []
+        self.steps: list[_StepSummary] = []
         self._on_step = on_step
 
     def recording(self, references: Reference) -> Callable[[Moment, Command], None]:
@@ -259,7 +259,7 @@ class History:
                 )
             )
         at = (moment.state, moment.covariance, moment.measured, moment.input, reference)
-        self.steps.append(StepSummary(*at, expected, covariance, decided.status, decided.failed, iterations, timing))
+        self.steps.append(_StepSummary(*at, expected, covariance, decided.status, decided.failed, iterations, timing))
 
     def rollout(self, end: Simulator, references: Reference, time_step: float, states: slice = slice(None)) -> Rollout:
         """Makes the arrays of all steps.

@@ -25,7 +25,7 @@ _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticE
 Choices = dict[str, str]
 
 
-class Measure(NamedTuple):
+class _Measure(NamedTuple):
     """One number of a run."""
 
     label: str  #: with its unit; ``{unit}`` stands for that of the runs' positions or angles
@@ -39,11 +39,13 @@ def _outside(result: Mapping[str, Any]) -> float | None:
 
 
 MEASURES = {
-    "rmse": Measure("RMSE [{unit}]", lambda r: r["rmse"]["total"]),
-    "outside": Measure("steps outside bounds [%]", _outside, logarithmic=False),
-    "failed": Measure("failed solves [%]", lambda r: 100 * sum(r["failures"].values()) / r["steps"], logarithmic=False),
-    "decision": Measure("decision, median [ms]", lambda r: 1e3 * r["times"]["total"]["median"], wall_time=True),
-    "training": Measure("training [s]", lambda r: r["times"]["training"], wall_time=True),
+    "rmse": _Measure("RMSE [{unit}]", lambda r: r["rmse"]["total"]),
+    "outside": _Measure("steps outside bounds [%]", _outside, logarithmic=False),
+    "failed": _Measure(
+        "failed solves [%]", lambda r: 100 * sum(r["failures"].values()) / r["steps"], logarithmic=False
+    ),
+    "decision": _Measure("decision, median [ms]", lambda r: 1e3 * r["times"]["total"]["median"], wall_time=True),
+    "training": _Measure("training [s]", lambda r: r["times"]["training"], wall_time=True),
 }
 
 
