@@ -31,7 +31,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from gpmpc.compiled import call_unchecked, compiled
-from gpmpc.dynamics import DynamicsModel, linearize
+from gpmpc.dynamics import DynamicsModel, check_next_states, linearize
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.linalg import copy_matrix, product
@@ -41,7 +41,6 @@ from gpmpc.mpc.controller import (
     Reference,
     Request,
     check_controller,
-    check_dynamics,
     check_method,
     full_turns,
     read_parameters,
@@ -132,7 +131,7 @@ class PredictionModel:
         initial_input: Sequence[float] | Array,
         settings: PredictionSettings,
     ):
-        self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
+        self.initial_input = check_controller(problem, *check_next_states(model), horizon, initial_input)
         check_method("propagator", propagator, "propagate", "Linearization()")
         if not isinstance(settings, PredictionSettings):
             raise SettingError("prediction", f"must be PredictionSettings(...); got {type(settings).__name__}")
