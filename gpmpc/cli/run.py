@@ -115,6 +115,7 @@ def _recorder(
         time_step=flown.time_step,
         units=flown.units,
         input_bounds=[side[0] for side in controller.problem.inputs.by_stage(controller.horizon)],
+        pose=flown.pose,
         z_down=flown.z_down,
     )
     metadata = {

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.recording._messages import PLAN, STEP, TIMING
-from gpmpc.recording._scene import ATTITUDE, DISPLAY, POSITION, VEHICLE
+from gpmpc.recording._messages import ATTITUDE, PLAN, POSITION, STEP, TIMING
+from gpmpc.recording._scene import DISPLAY, VEHICLE
 from gpmpc.recording.reader import Run
 
 _STATE, _MEASURED, _REFERENCE, _BOUND = "#0072b2", "#e69f00", "#000000", "#d55e00"  # Okabe and Ito (2008)
@@ -29,8 +29,8 @@ def layout(run: Run) -> str:
     Plots in tabs (positions, attitude, other states, inputs with their bounds, uncertainty, solver) beside the vehicle
     in space, where the states tell where it is or how it is turned, and the log of failures.
     """
-    groups = {"Position": [n for n in POSITION if n in run.state_names]}
-    groups["Attitude"] = [n for n in ATTITUDE if n in run.state_names]
+    axes = (("Position", POSITION), ("Attitude", ATTITUDE))
+    groups = {title: [run.state_names[run.pose[axis]] for axis in those if axis in run.pose] for title, those in axes}
     tracked = [*groups["Position"], *groups["Attitude"]]
     groups["Rates" if tracked else "States"] = [name for name in run.state_names if name not in tracked]
     groups = {title: names for title, names in groups.items() if names}

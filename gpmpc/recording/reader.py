@@ -81,6 +81,12 @@ class Run:
     problems: dict[int, RecordedProblem]  # by k; see ``replay``
 
     @cached_property
+    def pose(self) -> dict[str, int]:
+        """Indices of the states that are x, y, z, roll, pitch and yaw in space, as far as there are any."""
+        named = self.metadata.get("pose", {}).items()
+        return {axis: self.state_names.index(name) for axis, name in named if name in self.state_names}
+
+    @cached_property
     def residuals(self) -> Array:
         """Primal and dual residual and duality gap of every recorded solution (K, 3); NaN without one."""
         nothing = (np.nan, np.nan, np.nan)

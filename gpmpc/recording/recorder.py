@@ -93,7 +93,12 @@ class McapRecorder:
             compression_level=1,
         )
         self._writer = foxglove.open_mcap(self._sink, context=context, writer_options=options)
-        for name, pairs in (("run", about), ("units", system.field_units), ("frames", frames)):
+        for name, pairs in (
+            ("run", about),
+            ("units", system.field_units),
+            ("frames", frames),
+            ("pose", dict(system.pose)),
+        ):
             self._writer.write_metadata(name, pairs)
         stamps = {"log_time": start_time_ns, "create_time": start_time_ns}
         self._writer.attach(name=CONFIG, media_type="application/yaml", data=config.encode(), **stamps)
