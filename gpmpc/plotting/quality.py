@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import NullLocator
 
-from gpmpc.plotting.style import BLACK, COLOURS, DASHED, styled
+from gpmpc.plotting.style import BLACK, COLOURS, DASHED, plain_numbers, styled
 
 _SIZE = (9.0, 6.2)  # [in]: at 100 dots an inch as wide as a README
 _CURVES = 5
@@ -75,9 +75,7 @@ def _scales(axis: Axes, rows: Sequence[Mapping]) -> None:
     axis.set_yscale("symlog", linthresh=_LINEAR, linscale=0.4)
     axis.set_xlabel("median time of a decision [ms], one thread")
     axis.set_ylabel("closed-loop cost above NMPC on the true model")
-    axis.xaxis.set_major_locator(LogLocator(10, (1, 2, 5)))
-    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.xaxis.set_minor_formatter(NullFormatter())
+    plain_numbers(axis.xaxis, few=True)
     values = [_excess(row) for row in rows] or [0.0]
     low, high = min(values), max(values)
     reach = [tick for tick in _TICKS if low * 1.5 - 1 <= tick <= high * 1.5 + 1]

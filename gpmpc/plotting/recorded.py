@@ -10,9 +10,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from gpmpc.plotting.style import BLUE, DASHED, GREY, ORANGE, SKY, VERMILION, legend_below, name_of, styled
+from gpmpc.plotting.style import (
+    BLUE,
+    DASHED,
+    GREY,
+    ORANGE,
+    SKY,
+    VERMILION,
+    legend_below,
+    name_of,
+    plain_numbers,
+    styled,
+)
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
@@ -64,7 +74,10 @@ def tracking_figure(run: "Run") -> Figure:
         reference = run.references[:, i]
         above.plot(run.times, run.states[:, i], color=FLOWN, linewidth=1.6, label="flown")
         above.plot(run.times, reference, color=REFERENCE, linewidth=1.2, linestyle=DASHED, label="reference")
-        above.set_title(_state_name(run, i))
+        name = run.state_names[i]
+        above.set_title(
+            name_of(name, _unit(run, f"state.{name}"), run.metadata.get("frames", {}).get("z axis") != "up")
+        )
         error, band = mean[:, column] - reference, 2 * std[:, column]
         below.axhline(0, color=REFERENCE, linewidth=1, linestyle=DASHED)
         below.fill_between(
@@ -79,7 +92,7 @@ def tracking_figure(run: "Run") -> Figure:
         below.plot(run.times, run.states[:, i] - reference, color=FLOWN, linewidth=1.2)
         _failures(run, (above, below))
         below.set_xlabel("time [s]")
-    axes[1, 0].set_ylabel(f"error{_unit(run, states[0])}")
+    axes[1, 0].set_ylabel(name_of("error", _unit(run, f"state.{run.state_names[states[0]]}")))
     legend_below(figure, axes.ravel())
     figure.align_ylabels(axes[:, 0])
     return figure
@@ -88,7 +101,7 @@ def tracking_figure(run: "Run") -> Figure:
 @styled
 def inputs_figure(run: "Run") -> Figure:
     """What acted, over time, with its bounds."""
-    m, units = len(run.input_names), run.metadata.get("units", {})
+    m = len(run.input_names)
     figure = Figure(figsize=(7.2, 1.6 * m + 1.0), layout="constrained")
     figure.suptitle(_title_of(run))
     axes = figure.subplots(m, 1, squeeze=False, sharex=True)[:, 0]
@@ -96,7 +109,7 @@ def inputs_figure(run: "Run") -> Figure:
         held = np.append(run.inputs[:, i], run.inputs[-1:, i])  # the last one until its step ends
         axis.step(_edges(run), held, where="post", color=FLOWN, linewidth=1.4, label="applied")
         _bounds(axis, run.inputs[:, i], run.input_bounds[:, i])
-        axis.set_ylabel(name_of(run.input_names[i], units.get(f"input.{run.input_names[i]}", "")))
+        axis.set_ylabel(name_of(run.input_names[i], _unit(run, f"input.{run.input_names[i]}")))
         _failures(run, (axis,))
     axes[-1].set_xlabel("time [s]")
     legend_below(figure, axes)
@@ -129,12 +142,7 @@ def timing_figure(run: "Run") -> Figure:
     distribution.step(total, np.arange(1, len(total) + 1) / len(total), where="post", color=FLOWN)
     if total[0] > 0 and total[-1] > 5 * total[0]:
         distribution.set_xscale("log")
-        if total[-1] < 300 * total[0]:  # few decades: their names alone say little
-            distribution.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        else:  # as many as fit beside each other
-            distribution.xaxis.set_major_locator(LogLocator(numticks=5))
-        distribution.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        distribution.xaxis.set_minor_formatter(NullFormatter())
+        plain_numbers(distribution.xaxis, few=total[-1] < 300 * total[0])
     median, most = (float(np.quantile(total, share)) for share in (0.5, 0.99))
     for value in (median, most):
         distribution.axvline(value, color=_BOUND, linewidth=1, linestyle=DASHED)
@@ -162,17 +170,8 @@ def _title_of(run: "Run") -> str:
     return textwrap.fill(command if command.startswith("gpmpc") else str(run.path), 90, max_lines=2, placeholder=" ...")
 
 
-def _state_name(run: "Run", state: int) -> str:
-    z_down = run.metadata.get("frames", {}).get("z axis") != "up"
-    return name_of(
-        run.state_names[state], run.metadata.get("units", {}).get(f"state.{run.state_names[state]}", ""), z_down
-    )
-
-
-def _unit(run: "Run", state: int) -> str:
-    """The unit of a state, in brackets."""
-    unit = run.metadata.get("units", {}).get(f"state.{run.state_names[state]}", "")
-    return f" [{unit}]" if unit else ""
+def _unit(run: "Run", field: str) -> str:
+    return run.metadata.get("units", {}).get(field, "")
 
 
 def _bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:

@@ -10,7 +10,9 @@ from typing import Any
 import matplotlib as mpl
 from cycler import cycler
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 BLUE, VERMILION, GREEN, _PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
 ORANGE, SKY, BLACK, GREY = "#e69f00", "#56b4e9", "#000000", "0.45"
@@ -51,6 +53,13 @@ def name_of(name: str, unit: str = "", z_down: bool = True) -> str:
 def clipped(text: str, most: int) -> str:
     """Returns a text of at most so many characters, the rest of a longer one as dots."""
     return text if len(text) <= most else f"{text[: most - 4]} ..."
+
+
+def plain_numbers(axis: Axis, few: bool) -> None:
+    """Labels a logarithmic axis by plain numbers; over few decades by 2 and 5 between them as well."""
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if few else LogLocator(numticks=5))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def legend_below(figure: Figure, axes: Iterable[Axes]) -> None:
