@@ -1,7 +1,7 @@
 """Arguments of commands, what commands return, and the folders that they write to: a user's mistake is one line."""
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -32,6 +32,33 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raises instead of exiting."""
         raise GpmpcError(f"{message}; {self.prog} --help shows how")
+
+
+SHOWN = ("job", "hydra", "all")  # parts of the settings
+
+
+class Command(NamedTuple):
+    """One command."""
+
+    summary: str  # for the list of all
+    task: Callable[[Any], Result]  # from the composed settings, or from the parsed arguments, to the result
+    settings: str = ""  # name of its file in ``conf/``; empty where it has arguments only
+    add_arguments: Callable[[Parser], None] = lambda parser: None  # to its parser
+
+    def parser(self, name: str) -> Parser:
+        """Returns the parser of what follows the command's name."""
+        description = f"gpmpc {name}: {self.summary[0].lower()}{self.summary[1:]}."
+        parser = Parser(prog=f"gpmpc {name}", description=description, add_help=not self.settings)
+        self.add_arguments(parser)
+        if self.settings:
+            for names in (("-h", "--help"), ("--resolve",)):
+                parser.add_argument(*names, action="store_true")
+            parser.add_argument("--cfg", "-c", nargs="?", const="job")
+            parser.values["--cfg"] = [*SHOWN]
+            for names in (("--config-name", "-cn"), ("--config-dir", "-cd")):
+                parser.add_argument(*names)
+            parser.add_argument("overrides", nargs="*")
+        return parser
 
 
 def folder_of(folder: Any) -> Path:

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from gpmpc.cli.arguments import Parser, Result, write_files, writing
+from gpmpc.cli.arguments import Command, Parser, Result, write_files, writing
 from gpmpc.cli.log import CUT
 from gpmpc.cli.terminal import print_error
 from gpmpc.exceptions import DataError, RecordingError
@@ -12,7 +12,7 @@ from gpmpc.exceptions import DataError, RecordingError
 _FORMATS = ("png", "pdf", "svg")
 
 
-def add_report_arguments(parser: Parser) -> None:
+def _add_report_arguments(parser: Parser) -> None:
     """Adds the arguments of ``gpmpc report``."""
     parser.add_argument("tree", type=Path, metavar="OUTPUTS", help="a folder with runs anywhere below it")
     parser.add_argument("--to", type=Path, metavar="DIR", help="where the documents go (OUTPUTS/report)")
@@ -20,7 +20,7 @@ def add_report_arguments(parser: Parser) -> None:
     parser.add_argument("--compare", nargs=2, metavar=("A", "B"), help=groups)
 
 
-def report(given: argparse.Namespace) -> Result:
+def _report(given: argparse.Namespace) -> Result:
     """Writes a tree of runs as one table with figures, and whether two groups of them differ."""
     from rich.console import Console
 
@@ -43,7 +43,7 @@ def report(given: argparse.Namespace) -> Result:
     return Result({"folder": str(folder), "cells": document.data.to_dict("records"), "lines": lines})
 
 
-def add_plot_arguments(parser: Parser) -> None:
+def _add_plot_arguments(parser: Parser) -> None:
     """Adds the arguments of ``gpmpc plot``."""
     parser.add_argument(
         "run", type=Path, metavar="RUN", help="a run's folder, one with runs below it, or a recording (.mcap)"
@@ -53,7 +53,7 @@ def add_plot_arguments(parser: Parser) -> None:
     parser.add_argument("--no-animation", action="store_true", help="figures only: they take a second")
 
 
-def plot(given: argparse.Namespace) -> Result:
+def _draw(given: argparse.Namespace) -> Result:
     """Draws figures and an animation of a recorded flight, or of every one below a folder."""
     from gpmpc.studies.run_folder import RECORDING
 
@@ -97,3 +97,9 @@ def _plot(given: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]
     note = "" if run.finished else f"; {len(run.times)} steps: the recording is {CUT}"
     print(f"written to {folder}: {', '.join(written)}{note}")
     return {"folder": str(folder), "written": written, "finished": run.finished}
+
+
+REPORT = Command(
+    "Puts a tree of runs into one table with figures; compares two groups", _report, add_arguments=_add_report_arguments
+)
+PLOT = Command("Draws recorded flights as figures and an animation", _draw, add_arguments=_add_plot_arguments)

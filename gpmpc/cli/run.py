@@ -14,7 +14,7 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc.cli.arguments import Result, folder_of, writing
+from gpmpc.cli.arguments import Command, Result, folder_of, writing
 from gpmpc.cli.terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, check_number
 
@@ -29,7 +29,7 @@ _MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaC
 _LOST = 3  # exit code of a run that is finished, and whose flight was lost
 
 
-def run(config: DictConfig) -> Result:
+def _run(config: DictConfig) -> Result:
     """Flies, prints the results and where they are kept; the task behind ``conf/run.yaml``."""
     from rich.console import Console
 
@@ -236,3 +236,11 @@ def one_line(error: BaseException) -> str:
     """Returns the reason of an error in one line."""
     ours = own_error(error)
     return " ".join((str(ours) if ours else f"{type(error).__name__}: {error}").split())
+
+
+COMMAND = Command(
+    "Trains a model, flies with it, records; with -m a sweep of many flights",
+    _run,
+    "run",
+    lambda parser: parser.add_argument("--multirun", "-m", action="store_true"),
+)

@@ -8,7 +8,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from gpmpc.cli.arguments import Result, folder_of, write_files, writing
+from gpmpc.cli.arguments import Command, Result, folder_of, write_files, writing
 from gpmpc.cli.run import experiment_of, plain_data, plain_settings
 from gpmpc.cli.terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
@@ -17,7 +17,7 @@ _ONE, _SEVERAL = ("data", "excited", "undithered", "model", "flying"), ("traject
 _SHOWN_ERRORS = 10
 
 
-def run(config: DictConfig) -> Result:
+def _run(config: DictConfig) -> Result:
     """Runs what is missing of a study, writes its documents and prints its tables."""
     from gpmpc.provenance import provenance
     from gpmpc.studies.document import json_text, terminal
@@ -66,3 +66,8 @@ def _study(config: DictConfig, settings: dict[str, Any]) -> Any:
     made = hydra.utils.instantiate(config, _convert_="all")
     module = import_module(f"gpmpc.experiments.{HydraConfig.get().job.name}")
     return module.from_settings({"trajectory": {}} | made, settings, flight)
+
+
+TABLES = Command("Computes Tables 1 and 2 of Cao, Lai and Alam (2017) beside the printed ones", _run, "tables")
+FIGURES = Command("Flies figures 2 to 4 and section 5.2, and the same with the plant in the loop", _run, "figures")
+QUALITY = Command("Measures closed-loop cost over the time of a decision, for every controller", _run, "quality")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from gpmpc.cli.arguments import Parser, Result, write_files
+from gpmpc.cli.arguments import Command, Parser, Result, write_files
 from gpmpc.cli.configuration import group_options, without_hydra
 from gpmpc.cli.run import ASIDE, experiment_of
 from gpmpc.cli.sweep import Job, Sweep
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _BEST = "best.yaml"
 
 
-def add_arguments(parser: Parser) -> None:
+def _add_arguments(parser: Parser) -> None:
     """Adds the options of the command; what they mean stands in ``conf/tune.yaml``."""
     for name, default in (("--trials", 40), ("--batch", 4), ("--seeds", 1)):
         parser.add_argument(name, type=int, default=default)
@@ -159,3 +159,6 @@ def _config(overrides: Sequence[str], name: str, folder: str) -> str:
             OmegaConf.update(own, key, override.value(), force_add=True)
     text = OmegaConf.to_yaml(OmegaConf.merge({"defaults": defaults}, own, {"folder": folder}))
     return f"# The best settings that gpmpc tune found.\n{text}"
+
+
+COMMAND = Command("Searches settings for the least closed-loop cost", lambda given: Result(), "tune", _add_arguments)

@@ -3,7 +3,7 @@
 import argparse
 import time
 
-from gpmpc.cli.arguments import Result
+from gpmpc.cli.arguments import Command, Result
 from gpmpc.cli.configuration import compose, settings
 from gpmpc.cli.run import experiment_of
 from gpmpc.cli.terminal import progress_bar
@@ -12,7 +12,7 @@ _FLOWN = ("controller=convex", "controller=paper", "controller=nonlinear", "cont
 _SHORT = ("data.samples=12", "model.restarts=0", "steps=2", "horizon=3")
 
 
-def warmup(given: argparse.Namespace) -> Result:
+def _warmup(given: argparse.Namespace) -> Result:
     """Flies two steps with every controller on a learned model, and prints how long that took."""
     from rich.console import Console
 
@@ -29,3 +29,6 @@ def warmup(given: argparse.Namespace) -> Result:
     seconds = round(time.perf_counter() - began, 3)
     console.print(f"ready after {seconds:.1f} s")
     return Result({"seconds": seconds})
+
+
+COMMAND = Command("Compiles the numerical kernels now, instead of at the first flight", _warmup)
