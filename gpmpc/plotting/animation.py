@@ -62,7 +62,7 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
     sign, axis_name = (-1, "-z") if run.metadata.get("frames", {}).get("z axis") != "up" else (1, "z")
     states, references, plans = run.states[:, plane], run.references[:, plane], run.plan_means[:, :, plane]
     covariances = run.plan_covariances[:, :, plane][..., plane]
-    whole = np.isfinite(plans).all(axis=2)  # a shorter plan ends in NaN
+    whole: np.ndarray = np.isfinite(plans).all(axis=2)  # a shorter plan ends in NaN
 
     figure = Figure(figsize=(10, 5.4), layout="constrained")
     FigureCanvasAgg(figure)
@@ -137,4 +137,4 @@ def _ellipses(means: np.ndarray, covariances: np.ndarray, factor: int, transform
     axes = 4 * factor * np.sqrt(values.clip(0))  # whole axes of the 2-sigma ellipse
     angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     look = {"facecolors": TUBE, "edgecolors": FLOWN, "alpha": 0.45, "linewidths": 0.6, "zorder": 1}
-    return EllipseCollection(*axes.T[::-1], angles, units="xy", offsets=means, transOffset=transform, **look)
+    return EllipseCollection(axes[:, 1], axes[:, 0], angles, units="xy", offsets=means, transOffset=transform, **look)

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator, PercentFormatter
 
@@ -47,7 +46,7 @@ def error_over_size(panels: Sequence[Panel], label: str, title: str = "") -> Fig
     return figure
 
 
-def _panels(count: int, width: float, height: float, title: str) -> tuple[Figure, Sequence[Axes]]:
+def _panels(count: int, width: float, height: float, title: str) -> tuple[Figure, Any]:
     """Makes a figure of panels in two columns."""
     columns = min(2, count)
     rows = -(-count // columns)

@@ -234,7 +234,7 @@ class History:
         expected: Any = (np.full(n, np.nan), np.full((n, n), np.nan))
         if decision is not None and not decided.failed:
             expected = np.array(decision.means[1]), np.array(decision.covariances[1])
-        spent = (0, Timing(0.0, 0.0, 0.0)) if decision is None else (decision.iterations, decision.timing)
+        spent: Any = (0, Timing(0.0, 0.0, 0.0)) if decision is None else (decision.iterations, decision.timing)
         self.rows.append(_Row(replace(step, decision=None), *expected, *spent))
 
     def rollout(self, end: Simulator, references: Reference, time_step: float, states: slice = slice(None)) -> Rollout:

@@ -88,7 +88,7 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         if len(pairs[0]) >= 2:
             seeds = sorted((n for n in left_out if n.startswith(f"{SEED}=")), key=lambda name: in_order(name[5:]))
             names = (*(n for n in left_out if n not in seeds), *seeds)
-            comparisons.append(_test(measure, *pairs, names))
+            comparisons.append(_test(measure, pairs[0], pairs[1], names))
     if not comparisons:
         raise DataError(f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common")
     return comparisons
