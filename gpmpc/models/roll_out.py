@@ -90,6 +90,6 @@ def _compiled_form(form: AffineForm, n: int, m: int) -> AffineGPs:
 def _known_form(model: Any) -> AffineGPs:
     """The arrays of a tape alone, without a GP."""
     n, m, none = model.state_dim, model.input_dim, np.empty((0, 0))
-    nothing, places = GPArrays(none, none, np.empty(0), none, 0), [np.empty(0, dtype=np.intp) for _ in range(3)]
+    nothing, empty = GPArrays(none, none, np.empty(0), none, 0), np.empty(0, dtype=np.intp)
     affine = np.zeros((n, n)), np.zeros((n, m)), np.zeros(n), np.empty((n, 0))
-    return AffineGPs(nothing, np.empty(0), *affine, *places, model.tape)
+    return AffineGPs(nothing, np.empty(0), *affine, empty, empty, empty, model.tape)

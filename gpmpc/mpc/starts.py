@@ -69,8 +69,9 @@ class ManyStarts:
         H, m, angles = self.horizon, self.problem.input_dim, self.problem.cost.angles
         if guesses is None:
             guesses = [None, *kicks(self.problem, H, self.initial_input)]
-        if any(guess is not None and np.shape(guess) != (H, m) for guess in guesses):
-            raise ShapeError(f"guesses must be None or inputs ({H}, {m}); got {[np.shape(guess) for guess in guesses]}")
+        shapes = [np.shape(guess) for guess in guesses if guess is not None]
+        if any(shape != (H, m) for shape in shapes):
+            raise ShapeError(f"guesses must be None or inputs ({H}, {m}); got {shapes}")
         self.guesses = guesses
         self.turns = [turns] * len(angles) if isinstance(turns, int) else list(turns)
         if len(self.turns) != len(angles) or min(self.turns, default=1) < 1:
