@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
+from hashlib import sha256
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
     from gpmpc.studies.run_folder import RunFolder
     from gpmpc.systems import System
 
-ASIDE = ("launcher", "folder", "live")  # settings that a result does not depend on
+ASIDE = ("launcher", "folder", "live", "tracker")  # settings that a result does not depend on
 _GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver")
 _MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
 _LOST = 3  # exit code of a run that is finished, and whose flight was lost
@@ -71,7 +73,19 @@ def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
         except Exception as error:
             folder.fail(error, about)
             return outcome | {"error": one_line(error), "mistake": isinstance(error, _MISTAKES)}
+        if config.tracker == "mlflow":
+            _track(folder, result)
     return outcome | {"result": result}
+
+
+def _track(folder: "RunFolder", result: Mapping[str, Any]) -> None:
+    """Writes a finished run to MLflow; the run stays finished where that fails."""
+    from gpmpc.studies.tracking import log_to_mlflow
+
+    try:
+        log_to_mlflow(folder.path, result)
+    except Exception as error:
+        print_error(f"{folder.path} is not in MLflow: {one_line(error)}")
 
 
 def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
@@ -136,8 +150,10 @@ def experiment_of(config: DictConfig) -> "Experiment":
     """Makes the objects that the settings describe."""
     from hydra.utils import instantiate
 
+    from gpmpc.logs.flying import SavedModel
     from gpmpc.simulation import Noise
     from gpmpc.studies.flight import Experiment
+    from gpmpc.studies.tracking import check_tracker
 
     config = DictConfig(plain_data(config))
     folder_of(config.folder)
@@ -146,6 +162,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
         raise SettingError("disturbances", f"must be a list; got {config.disturbances!r}")
     if config.recorder not in ("mcap", "none", None):
         raise SettingError("recorder", f"must be 'mcap' or 'none'; got {config.recorder!r}")
+    check_tracker(config.tracker)
     if config.live not in (True, False):
         raise SettingError("live", f"must be true or false; got {config.live!r}")
     if config.live and config.recorder != "mcap":
@@ -175,10 +192,15 @@ def experiment_of(config: DictConfig) -> "Experiment":
     ((name, trajectory),) = config.trajectory.items()
     parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "controller", "disturbances")}
     other = {key: value for key, value in (config.plant or {}).items() if value != config.system.get(key)}
+    trained = instantiate(config.model, _convert_="all")
+    saved = isinstance(trained, SavedModel)
+    if saved:
+        trained.check(system)
     return Experiment(
         **parts,
         trajectory=instantiate(trajectory, _convert_="all"),
-        train=instantiate(config.model, _convert_="all"),
+        train=trained,
+        model=trained.model if saved else None,
         system=system,
         plant=_system_of(OmegaConf.merge(config.system, other)) if other else None,
         name=name,
@@ -205,6 +227,8 @@ def _system_of(settings: Any) -> "System":
 def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, Any]:
     """Returns all that a result depends on, as plain data: the settings, and the chosen option by group."""
     settings = plain_data(config)
+    if path := settings["model"].get("path"):
+        settings["model"]["sha256"] = sha256(Path(path).read_bytes()).hexdigest()
     options = {group: chosen.get(group) for group in _GROUPS}
     return {key: value for key, value in settings.items() if key not in ASIDE} | {"options": options}
 
