@@ -30,10 +30,6 @@ def settings(own: str | None = None) -> Iterator[None]:
     """Lets Hydra find the package's settings, and those in a folder ``own`` behind them.
 
     What stands in the working folder can be named by ``_target_`` inside, behind everything that is installed.
-
-    Raises:
-        GpmpcError: There is no working folder any more.
-        SettingError: There is no folder ``own``.
     """
     try:
         here = os.getcwd()

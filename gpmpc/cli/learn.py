@@ -7,7 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpmpc.cli.arguments import Parser, Result, writing
+from gpmpc.cli.arguments import Command, Parser, Result, writing
 
 if TYPE_CHECKING:
     from gpmpc.logs import Judgement, Learned, Log
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 MODEL, PROGRESS = "model.safetensors", "progress.json"
 
 
-def add_arguments(parser: Parser) -> None:
+def _add_arguments(parser: Parser) -> None:
     """Adds the arguments of the command."""
     parser.add_argument("mapping", type=Path, help="a YAML file that says what the columns mean")
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="logs: CSV, Parquet, npz, MCAP, ULog")
@@ -28,12 +28,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--partial", action="store_true", help="take what is whole of unfinished files")
 
 
-def learn(given: argparse.Namespace) -> Result:
-    """Learns from logs, judges on held-out runs, and writes model, report and card; goes on where it stopped.
-
-    Raises:
-        GpmpcError: A mistake in the arguments, a log that cannot be used, or a folder that cannot be written.
-    """
+def _learn(given: argparse.Namespace) -> Result:
+    """Learns from logs, judges on held-out runs, and writes model, report and card; goes on where it stopped."""
     from rich.console import Console
 
     from gpmpc.files import write_whole
@@ -220,3 +216,10 @@ def card(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Lo
         pd.DataFrame(),
         lists={"Outputs": learns, "What must not be trusted": doubts, "Left out of the data": left_out or ["nothing"]},
     )
+
+
+COMMAND = Command(
+    "Learns a model from logs, judges it on held-out runs, and writes it with a report and a card",
+    _learn,
+    add_arguments=_add_arguments,
+)

@@ -14,7 +14,7 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc.cli.arguments import Result, folder_of, writing
+from gpmpc.cli.arguments import Command, Result, folder_of, writing
 from gpmpc.cli.terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, check_number
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from gpmpc.systems import System
 
 ASIDE = ("launcher", "folder", "live")  # settings that a result does not depend on
-GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver")
-MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
-LOST = 3  # exit code of a run that is finished, and whose flight was lost
+_GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver")
+_MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
+_LOST = 3  # exit code of a run that is finished, and whose flight was lost
 
 
-def run(config: DictConfig) -> Result:
+def _run(config: DictConfig) -> Result:
     """Flies, prints the results and where they are kept; the task behind ``conf/run.yaml``."""
     from rich.console import Console
 
@@ -46,21 +46,12 @@ def run(config: DictConfig) -> Result:
         return Result(outcome, 2 if outcome["mistake"] else 1)
     console.print(terminal([summary(outcome["result"])]))
     state = "finished before" if outcome["skipped"] else "written to"
-    console.print(f"{state}: {outcome['folder']}", soft_wrap=True, highlight=False, markup=False)
-    return Result(outcome["result"] | {"folder": outcome["folder"]}, LOST if outcome["result"].get("lost") else 0)
+    console.out(f"{state}: {outcome['folder']}", highlight=False)
+    return Result(outcome["result"] | {"folder": outcome["folder"]}, _LOST if outcome["result"].get("lost") else 0)
 
 
 def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
-    """Flies one run; an error is kept in its folder and returned as ``error``.
-
-    Args:
-        config: The composed settings.
-        wait: For another process that works on the same run.
-
-    Raises:
-        Busy: Another process works on it, and ``wait`` is false.
-        SettingError: The folder cannot be written, or holds a finished run of other settings.
-    """
+    """Flies one run; an error is kept in its folder and returned as ``error``."""
     from gpmpc.studies.run_folder import RunFolder, folder_name, record
     from gpmpc.studies.study import one_thread
 
@@ -79,7 +70,7 @@ def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
             folder.finish(result)
         except Exception as error:
             folder.fail(error, about)
-            return outcome | {"error": one_line(error), "mistake": isinstance(error, MISTAKES)}
+            return outcome | {"error": one_line(error), "mistake": isinstance(error, _MISTAKES)}
     return outcome | {"result": result}
 
 
@@ -124,6 +115,7 @@ def _recorder(
         time_step=flown.time_step,
         units=flown.units,
         input_bounds=[side[0] for side in controller.problem.inputs.by_stage(controller.horizon)],
+        pose=flown.pose,
         z_down=flown.z_down,
     )
     metadata = {
@@ -141,11 +133,7 @@ def _recorder(
 
 
 def experiment_of(config: DictConfig) -> "Experiment":
-    """Makes the objects that the settings describe.
-
-    Raises:
-        GpmpcError: A setting is wrong.
-    """
+    """Makes the objects that the settings describe."""
     from hydra.utils import instantiate
 
     from gpmpc.simulation import Noise
@@ -167,7 +155,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
             raise SettingError(group, "choose one")
     if len(config.trajectory) != 1:
         raise SettingError("trajectory", f"choose one; got {', '.join(config.trajectory)}")
-    system = system_of(config.system)
+    system = _system_of(config.system)
     for group, part in (("propagation", "propagator"), ("solver", "solver")):
         if config.get(group):
             if part not in config.controller:
@@ -194,7 +182,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
         trajectory=instantiate(trajectory, _convert_="all"),
         train=instantiate(config.model, _convert_="all"),
         system=system,
-        plant=system_of(OmegaConf.merge(config.system, other)) if other else None,
+        plant=_system_of(OmegaConf.merge(config.system, other)) if other else None,
         name=name,
         size=size,
         propagator=getattr(parts["controller"], "keywords", {}).get("propagator"),
@@ -203,12 +191,8 @@ def experiment_of(config: DictConfig) -> "Experiment":
     )
 
 
-def system_of(settings: Any) -> "System":
-    """Makes the system that the settings ``system`` describe.
-
-    Raises:
-        GpmpcError: They make something else, or a setting is wrong.
-    """
+def _system_of(settings: Any) -> "System":
+    """Makes the system that the settings ``system`` describe."""
     from hydra.utils import instantiate
 
     from gpmpc.systems import System
@@ -223,16 +207,12 @@ def system_of(settings: Any) -> "System":
 def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, Any]:
     """Returns all that a result depends on, as plain data: the settings, and the chosen option by group."""
     settings = plain_data(config)
-    options = {group: chosen.get(group) for group in GROUPS}
+    options = {group: chosen.get(group) for group in _GROUPS}
     return {key: value for key, value in settings.items() if key not in ASIDE} | {"options": options}
 
 
 def plain_data(config: DictConfig) -> dict[str, Any]:
-    """Returns settings with everything resolved.
-
-    Raises:
-        OmegaConfBaseException: A setting without a default is missing.
-    """
+    """Returns settings with everything resolved."""
     found: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     return found
 
@@ -258,3 +238,11 @@ def one_line(error: BaseException) -> str:
     """Returns the reason of an error in one line."""
     ours = own_error(error)
     return " ".join((str(ours) if ours else f"{type(error).__name__}: {error}").split())
+
+
+COMMAND = Command(
+    "Trains a model, flies with it, records; with -m a sweep of many flights",
+    _run,
+    "run",
+    lambda parser: parser.add_argument("--multirun", "-m", action="store_true"),
+)

@@ -38,45 +38,32 @@ _STAGES = ("model", "build", "solve", "total")  # of a decision's time
 class Experiment:
     """One flight of one system, with everything that it depends on.
 
-    Attributes:
-        data: Where transitions come from.
-        trajectory: What is followed, from its beginning; None holds the system's goal.
-        system: Whose transitions are learned; names, units and references are its own.
-        train: From transitions and a ``seed`` to a ``Training``, such as a ``Trainer``; one that learns differences
-            sees the system's angles as sine and cosine.
-        controller: From a model, or from a ``plant`` where its first argument is called so, to a ``Controller``.
-        plant: What flies, and the true model of a controller that takes one; the system by default.
-        name: Of the trajectory, which data from files are filed under.
-        size: Rows drawn for the training; None takes all.
-        steps: Of the flight.
-        seed: Of all random numbers.
-        loop: What stands at the other end: the plant, or the learned model rolled on itself.
-        propagator: The controller's own, if it has one. A model loop carries its belief on with it, or by moment
-            matching (unscented where the system has angles).
-        noise: On the plant.
-        disturbances: Of the plant.
-        on_failure: What is applied where a solve fails.
-
     Raises:
         SettingError: A number out of range, an unknown policy or loop, a disturbance that does not fit the plant.
         ShapeError: Noise that does not fit the plant.
     """
 
-    data: DataSource
-    trajectory: Trajectory | None
-    system: System
+    data: DataSource  #: where transitions come from
+    trajectory: Trajectory | None  #: what is followed, from its beginning; None holds the system's goal
+    system: System  #: whose transitions are learned; names, units and references are its own
+    #: from transitions and a ``seed`` to a ``Training``, such as a ``Trainer``; one that learns differences sees the
+    #: system's angles as sine and cosine
     train: Callable[..., Training]
+    #: from a model, or from a ``plant`` where its first argument is called so, to a ``Controller``
     controller: Callable[..., Any]
-    plant: System | None = None
-    name: str = "elliptical"
-    size: int | None = None
-    steps: int = 100
-    seed: int = 0
+    plant: System | None = None  #: what flies, and the true model of a controller that takes one; the system by default
+    name: str = "elliptical"  #: of the trajectory, which data from files are filed under
+    size: int | None = None  #: rows drawn for the training; None takes all
+    steps: int = 100  #: of the flight
+    seed: int = 0  #: of all random numbers
+    #: what stands at the other end: the plant, or the learned model rolled on itself
     loop: Literal["plant", "model"] = "plant"
+    #: the controller's own, if it has one. A model loop carries its belief on with it, or by moment matching (unscented
+    #: where the system has angles)
     propagator: Propagator | None = None
-    noise: Noise | None = None
-    disturbances: Sequence[Disturbance] = ()
-    on_failure: OnFailure = "previous_plan"
+    noise: Noise | None = None  #: on the plant
+    disturbances: Sequence[Disturbance] = ()  #: of the plant
+    on_failure: OnFailure = "previous_plan"  #: what is applied where a solve fails
 
     def __post_init__(self) -> None:
         if self.size is not None:
@@ -161,18 +148,12 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Flown:
-    """An experiment that was flown.
+    """An experiment that was flown."""
 
-    Attributes:
-        rollout: Every step, as arrays.
-        controller: The ``Controller`` that steered, with its ``problem``.
-        training: What was learned; None where the controller knows the plant.
-        diverged: Where and why the system left the finite numbers, and the rollout ends; None where it did not.
-    """
-
-    rollout: Rollout
-    controller: Any
-    training: Training | None
+    rollout: Rollout  #: every step, as arrays
+    controller: Any  #: the ``Controller`` that steered, with its ``problem``
+    training: Training | None  #: what was learned; None where the controller knows the plant
+    #: where and why the system left the finite numbers, and the rollout ends; None where it did not
     diverged: Diverged | None = None
 
 
