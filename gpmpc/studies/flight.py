@@ -24,7 +24,7 @@ from gpmpc.models import DynamicsModel, train_with_angles
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.policy import OnFailure, check_policy
 from gpmpc.mpc.problem import Box
-from gpmpc.propagation import MomentMatching, Propagator, Unscented
+from gpmpc.propagation import Propagator, best_propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
 from gpmpc.studies.document import Table
 from gpmpc.studies.study import random_rows
@@ -58,8 +58,7 @@ class Experiment:
     seed: int = 0  #: of all random numbers
     #: what stands at the other end: the plant, or the learned model rolled on itself
     loop: Literal["plant", "model"] = "plant"
-    #: the controller's own, if it has one. A model loop carries its belief on with it, or by moment matching (unscented
-    #: where the system has angles)
+    #: the controller's own, if it has one. A model loop carries its belief on with it, or as ``best_propagator`` does
     propagator: Propagator | None = None
     noise: Noise | None = None  #: on the plant
     disturbances: Sequence[Disturbance] = ()  #: of the plant
@@ -184,8 +183,7 @@ def run_trial(
     controller = experiment.controller(model if experiment.learns else plant)
     system: System | ModelLoop = plant
     if experiment.loop == "model" and model is not None:
-        propagator = experiment.propagator or (Unscented() if plant.angles else MomentMatching())
-        system = ModelLoop(model, propagator, time_step=plant.time_step)
+        system = ModelLoop(model, experiment.propagator or best_propagator(model), time_step=plant.time_step)
     states = experiment.references(experiment.steps + controller.horizon + 1)
     resting = np.asarray(controller.initial_input)  # falls back on it where the very first solve fails
     reference = Reference(states, np.tile(resting, (len(states) - 1, 1)))
