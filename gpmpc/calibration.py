@@ -111,7 +111,7 @@ def calibrate(
     Args:
         model: What was learned, from other recordings.
         recordings: Measured states and applied inputs. A start counts for the steps that its recording still holds.
-        propagator: How the belief moves; by default exact moment matching, unscented for a model that has no such moments.
+        propagator: How the belief moves; as ``best_propagator`` of ``gpmpc.propagation`` does by default.
         horizon: H, the longest prediction in steps.
         levels: Of the central intervals.
         start_covariance: How uncertain the measured start is (n, n); certain by default.
