@@ -18,10 +18,10 @@ import torch
 from scipy.linalg import block_diag, solve_triangular
 from scipy.optimize import minimize
 
-from gpmpc.dynamics import DynamicsModel, tensors_for, to_array
+from gpmpc.dynamics import DynamicsModel, check_next_states, tensors_for, to_array
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Decision, Reference, Request, Timing, check_controller, check_dynamics
+from gpmpc.mpc.controller import Decision, Reference, Request, Timing, check_controller
 from gpmpc.mpc.problem import Box, Problem
 from gpmpc.propagation import Propagator, differentiate
 from gpmpc.status import Status
@@ -83,7 +83,7 @@ class SLSQP:
         tolerance: float = 1e-5,
         iterations: int = 300,
     ):
-        self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
+        self.initial_input = check_controller(problem, *check_next_states(model), horizon, initial_input)
         H, m, cost = horizon, problem.input_dim, problem.cost
         boxes = [box for box in problem.constraints if isinstance(box, Box) and box.penalty is None and not box.joint]
         if len(boxes) < len(problem.constraints) or any(box.lower.ndim > 1 or box.stages for box in boxes):

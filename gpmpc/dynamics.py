@@ -208,6 +208,21 @@ def _constant_arrays(*tensors: Tensor) -> list[Array] | None:
     return None if followed else arrays
 
 
+def check_next_states(model: Any) -> tuple[int, int]:
+    """Returns the numbers of states and inputs of a model that predicts next states.
+
+    Raises:
+        SettingError: It is no model, or predicts something else.
+    """
+    if not hasattr(model, "predict"):
+        raise SettingError("model", f"must be a DynamicsModel, such as GPPosterior; got {type(model).__name__}")
+    if model.output_dim != model.state_dim:
+        raise SettingError(
+            "model", f"must predict the next state; got {model.state_dim} states and {model.output_dim} outputs"
+        )
+    return model.state_dim, model.input_dim
+
+
 def check_query(model: Any, state: Tensor, input: Tensor) -> None:
     """Raises unless a state (*batch, n) and an input (*batch, m) fit a model in shape, type and device.
 

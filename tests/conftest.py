@@ -6,11 +6,15 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"): 
     os.environ.setdefault(variable, "1")
 
 import signal
+import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+
+from tests.pages import follow, forget_modules_of
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # started in the background: commands would not end at Ctrl-C
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -36,3 +40,14 @@ def paper_data() -> Path:
     if not folder:
         pytest.skip("GPMPC_PAPER_DATA names no folder with the authors' data")
     return Path(folder)
+
+
+@pytest.fixture
+def page(tmp_path, monkeypatch):
+    """Does what a page of the documentation says in an empty folder, as a user has it; see ``tests.pages.follow``."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    torch.set_default_dtype(torch.float32)
+    loaded = set(sys.modules)
+    yield partial(follow, folder=tmp_path)
+    forget_modules_of(tmp_path, loaded)

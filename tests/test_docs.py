@@ -1,14 +1,11 @@
 """The documentation holds: its blocks run in an empty folder, its links lead somewhere, its pages are short.
 
-``tests/test_guides.py``, ``tests/models`` and ``tests/logs`` follow the guides.
+``tests/test_guides.py`` and ``tests/logs`` follow the guides.
 """
 
 import importlib
 import pkgutil
 import re
-import shlex
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,13 +13,9 @@ import torch
 
 import gpmpc
 from gpmpc.cli.configuration import setting_names, settings
-from tests.cli.command import forked
+from tests.pages import BLOCK, ROOT, read
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
-BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-FILE = re.compile(r"(?:# @package [\w.]+\n)?# ([\w/]+\.(?:py|yaml))\n")
-INSTALLATION = ("git ", "pip ", "gpmpc warmup")  # what a test has done already
 GIVEN = """
 import numpy as np
 import torch
@@ -44,54 +37,6 @@ problem = Problem(Tracking(Q=[1] * 6, R=[1] * 3), inputs=Box([0, -0.7, -0.7]))
 controller = GPMPC(gp, Linearization(), problem, 10, [7.26, 0, 0])
 references = states_along(Elliptical(), np.arange(60.0))
 """  # what the pages speak of: a plant, transitions, a model, a controller
-
-
-def read(path):
-    return (ROOT / path).read_text()
-
-
-@pytest.fixture
-def page(tmp_path, monkeypatch):
-    """Does what a page says in an empty folder, of one with given names its Python alone; gives names and outputs."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    torch.set_default_dtype(torch.float32)  # as a user has it
-    loaded = set(sys.modules)
-    names: dict = {"__name__": "page"}
-
-    def follow(path, given="", section=""):
-        exec(given, names)
-        printed = []
-        for language, text in BLOCK.findall(read(path).partition(section)[2] if section else read(path)):
-            if written := FILE.match(text):
-                (tmp_path / written[1]).parent.mkdir(exist_ok=True)
-                (tmp_path / written[1]).write_text(text)
-            elif language == "python":
-                code = compile(text, path, "exec")
-                if "..." not in text:  # else an excerpt
-                    exec(code, names)
-            elif not language and not given:
-                printed += run_block(text)
-        return names, printed
-
-    def run_block(text):
-        folder, printed = tmp_path, []
-        for line in text.splitlines():
-            program, *arguments = shlex.split(line, comments=True) or [""]
-            if program == "cd" and not text.startswith(INSTALLATION):
-                folder /= arguments[0]
-            elif program == "gpmpc" and not line.startswith(INSTALLATION):
-                paths = [sorted(folder.glob(argument)) if "/*/" in argument else [] for argument in arguments]
-                arguments = [str(*path) if path else argument for path, argument in zip(paths, arguments, strict=True)]
-                done = forked(*arguments, cwd=folder)
-                assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
-                printed.append(done.stdout)
-        return printed
-
-    yield follow
-    for name in set(sys.modules) - loaded:
-        if str(tmp_path) in (getattr(sys.modules[name], "__file__", None) or ""):
-            del sys.modules[name]
 
 
 def test_ten_tasks_of_a_newcomer_are_done_from_an_empty_folder(page, tmp_path):

@@ -1,51 +1,15 @@
 """What the guides show runs as it stands: files are written, Python runs in order, commands succeed."""
 
-import re
 import shlex
-import sys
-from pathlib import Path
 
 import pytest
 
 from tests.cli.command import forked
-
-DOCS = Path(__file__).resolve().parents[1] / "docs"
-BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+from tests.pages import BLOCK, read
 
 
-def follow(page, folder, monkeypatch):
-    """Does what a page says in a folder; returns the names that its Python leaves and the commands' outputs."""
-    monkeypatch.chdir(folder)
-    monkeypatch.syspath_prepend(str(folder))
-    names, printed = {}, []
-    for language, text in BLOCK.findall((DOCS / page).read_text()):
-        path = re.match(r"(?:# @package _global_\n)?(?:#|<!--) ([\w/]+\.(?:py|yaml|xml))(?: -->)?\n", text)
-        if path:
-            (folder / path[1]).parent.mkdir(exist_ok=True)
-            (folder / path[1]).write_text(text)
-        elif language == "python":
-            exec(compile(text, page, "exec"), names)
-        else:
-            for line in text.splitlines():
-                command, *arguments = shlex.split(line)
-                assert command == "gpmpc"
-                done = forked(*arguments, cwd=folder)
-                assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
-                printed.append(done.stdout)
-    return names, printed
-
-
-@pytest.fixture(autouse=True)
-def _forget_modules():
-    before = set(sys.modules)
-    yield
-    for name in set(sys.modules) - before:
-        if name in ("arm", "fly"):
-            del sys.modules[name]
-
-
-def test_a_system_of_ones_own_is_flown_learned_swept_reported_recorded_and_calibrated(tmp_path, monkeypatch):
-    names, (flown, *_, heavier, swept, report) = follow("guide_system.md", tmp_path, monkeypatch)
+def test_a_system_of_ones_own_is_flown_learned_swept_reported_recorded_and_calibrated(page, tmp_path):
+    names, (flown, *_, heavier, swept, report) = page("docs/guide_system.md")
     assert abs(names["flown"].rollout.states[-20:] - [1.0, 0.0]).max() < 0.05
     assert "100 steps of arm with convex" in flown
     assert "200 rows of random data" in flown
@@ -58,14 +22,28 @@ def test_a_system_of_ones_own_is_flown_learned_swept_reported_recorded_and_calib
     assert "state.angle" in (tmp_path / "outputs/run/system=arm/run.layout.json").read_text()
 
 
-def test_simulators_are_systems(tmp_path, monkeypatch):
+def test_simulators_are_systems(page):
     pytest.importorskip("gymnasium")
     pytest.importorskip("mujoco")
-    names, (flown,) = follow("guide_simulator.md", tmp_path, monkeypatch)
+    names, (flown,) = page("docs/guide_simulator.md")
     assert abs(names["flown"].rollout.states[-20:] - [1.0, 0.0, 0.0]).max() < 0.05
     assert "5 steps of gymnasium with convex" in flown
     assert names["cart"].state_names == ("slider", "hinge", "slider_rate", "hinge_rate", "push_activation")
     assert names["seen"].state_names == ("position", "angle")
+
+
+@pytest.mark.parametrize("path", ["docs/guide_models.md", "docs/guide_estimation.md"])
+def test_the_blocks_of_a_guide_run(path, page, monkeypatch):
+    monkeypatch.setattr("matplotlib.pyplot.show", lambda: None)
+    assert len(BLOCK.findall(read(path))) >= 4
+    page(path)
+
+
+@pytest.mark.parametrize("path", ["docs/guide_constraints.md", "docs/guide_loop.md"])
+def test_the_loops_of_the_guides_reach_their_goals(path, page):
+    names, _ = page(path)
+    assert names["reached"] < 0.05
+    assert names.get("closest", 0.3) > 0.3 - 0.02
 
 
 def test_a_new_project_runs_at_once(tmp_path, monkeypatch):

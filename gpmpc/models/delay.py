@@ -20,13 +20,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, DynamicsModel, Linearized, check_query, linearize
-from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.dynamics import Array, DynamicsModel, Linearized, check_next_states, check_query, linearize
+from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gaussian import Gaussian
+from gpmpc.models.wrapper import Wrapper, padded
 
 
 @dataclass(frozen=True)
-class DelayedModel:
+class DelayedModel(Wrapper):
     """A model whose input acts late.
 
     Attributes:
@@ -53,26 +54,6 @@ class DelayedModel:
     def state_dim(self) -> int:
         """Number of states, n + D m."""
         return self.model.state_dim + self.pending * self.model.input_dim
-
-    @property
-    def input_dim(self) -> int:
-        """Number of inputs, m."""
-        return self.model.input_dim
-
-    @property
-    def output_dim(self) -> int:
-        """Number of outputs: the next state."""
-        return self.state_dim
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Of the undelayed model."""
-        return self.model.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Of the undelayed model."""
-        return self.model.device
 
     @property
     def noise_covariance(self) -> Tensor:
@@ -164,21 +145,6 @@ class DelayedModel:
                 f"first; got {tuple(queue.shape)}"
             )
         return queue
-
-
-def check_next_states(model: Any) -> None:
-    """Raises ``SettingError`` unless a model predicts next states."""
-    if not hasattr(model, "predict"):
-        raise SettingError("model", f"must be a DynamicsModel, such as GPPosterior; got {type(model).__name__}")
-    if model.output_dim != model.state_dim:
-        sizes = f"{model.state_dim} states and {model.output_dim} outputs"
-        raise SettingError("model", f"must predict the next state; got {sizes}")
-
-
-def padded(covariance: Tensor, size: int) -> Tensor:
-    """A covariance (*batch, n, n) with zeros for further, certain variables (*batch, size, size)."""
-    more = size - covariance.shape[-1]
-    return torch.nn.functional.pad(covariance, (0, more, 0, more))
 
 
 def _padded_array(covariance: Array, size: int) -> Array:

@@ -17,14 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, DynamicsModel, Linearized, check_query, linearize, to_array
+from gpmpc.dynamics import Array, DynamicsModel, Linearized, check_next_states, check_query, linearize, to_array
 from gpmpc.exceptions import SettingError, ShapeError, check_numbers
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.models.delay import check_next_states, padded
+from gpmpc.models.wrapper import Wrapper, padded
 
 
 @dataclass(frozen=True)
-class DisturbedModel:
+class DisturbedModel(Wrapper):
     """A model with disturbances as further states, (x, d).
 
     Attributes:
@@ -69,26 +69,6 @@ class DisturbedModel:
     def state_dim(self) -> int:
         """Number of states, n + q."""
         return self.model.state_dim + self.disturbances
-
-    @property
-    def input_dim(self) -> int:
-        """Number of inputs, m."""
-        return self.model.input_dim
-
-    @property
-    def output_dim(self) -> int:
-        """Number of outputs: the next state."""
-        return self.state_dim
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Of the model without disturbances."""
-        return self.model.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Of the model without disturbances."""
-        return self.model.device
 
     @property
     def noise_covariance(self) -> Tensor:

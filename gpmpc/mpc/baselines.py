@@ -18,11 +18,11 @@ from time import perf_counter
 import casadi
 import numpy as np
 
-from gpmpc.dynamics import DynamicsModel, linearize
+from gpmpc.dynamics import DynamicsModel, check_next_states, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.interrupts import interrupts_after
-from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_controller, check_dynamics
+from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_controller
 from gpmpc.mpc.linear_quadratic import Stages, optimal_feedback
 from gpmpc.mpc.problem import Problem
 from gpmpc.mpc.stages import ConstraintRows, Plan, StageCosts, StageLinearizer
@@ -126,7 +126,7 @@ class LQR:
     """
 
     def __init__(self, model: DynamicsModel, problem: Problem, horizon: int, initial_input: Sequence[float]):
-        self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
+        self.initial_input = check_controller(problem, *check_next_states(model), horizon, initial_input)
         problem.check_plain("LQR")
         if problem.constraints:
             raise SettingError("constraints", "LQR knows the bounds of inputs only; leave those of states out")

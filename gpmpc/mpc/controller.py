@@ -11,7 +11,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from gpmpc.compiled import compile_for, compiled, njit_inner, unchecked_entry_point
-from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.linear_quadratic import References
@@ -252,21 +251,6 @@ class Request(NamedTuple):
             iterations=iterations,
             timing=timing or Timing(0.0, 0.0, 0.0),
         )
-
-
-def check_dynamics(model: DynamicsModel) -> tuple[int, int]:
-    """Returns the numbers of states and inputs of a model that predicts the next state.
-
-    Raises:
-        SettingError: It is no model, or predicts something else.
-    """
-    if not hasattr(model, "predict"):
-        raise SettingError("model", f"must be a DynamicsModel, such as GPPosterior; got {type(model).__name__}")
-    if model.output_dim != model.state_dim:
-        raise SettingError(
-            "model", f"must predict the next state; got {model.state_dim} states and {model.output_dim} outputs"
-        )
-    return model.state_dim, model.input_dim
 
 
 def check_method(key: str, value: object, method: str, example: str) -> None:

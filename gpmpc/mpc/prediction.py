@@ -31,16 +31,17 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from gpmpc.compiled import call_unchecked, compiled
-from gpmpc.dynamics import DynamicsModel, linearize
+from gpmpc.dynamics import DynamicsModel, check_next_states, linearize
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
+from gpmpc.kernels.gp_rollout import Feedback
 from gpmpc.kernels.linalg import copy_matrix, product
+from gpmpc.models.roll_out import RollOut
 from gpmpc.mpc.controller import (
     Decision,
     Reference,
     Request,
     check_controller,
-    check_dynamics,
     check_method,
     full_turns,
     read_parameters,
@@ -141,7 +142,7 @@ class PredictionModel:
         initial_input: Sequence[float] | Array,
         settings: PredictionSettings,
     ):
-        self.initial_input = check_controller(problem, *check_dynamics(model), horizon, initial_input)
+        self.initial_input = check_controller(problem, *check_next_states(model), horizon, initial_input)
         check_method("propagator", propagator, "propagate", "Linearization()")
         if not isinstance(settings, PredictionSettings):
             raise SettingError("prediction", f"must be PredictionSettings(...); got {type(settings).__name__}")
@@ -150,6 +151,7 @@ class PredictionModel:
         self.linearizer = StageLinearizer(model, propagator, settings.covariance)
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         self.costs = StageCosts(problem, horizon, self.linearizer)
+        self._roll_out = RollOut(model)
         self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
 
     def read(
@@ -182,11 +184,12 @@ class PredictionModel:
 
     def _states(self, request: Request) -> Array | None:
         """The means (H + 1, n) that the first guess of the inputs leads to; None where they are not finite."""
-        states = [request.state]
-        for input in request.initial_guess:
-            after = linearize(self.model, states[-1][None], input[None], covariance=False).mean[0]
-            states.append(after + request.disturbance if len(request.disturbance) else after)
-        return np.array(states) if np.isfinite(states).all() else None
+        (H, m), n = request.initial_guess.shape, len(request.state)
+        nothing, free = (np.zeros((1, H, n)), np.zeros((1, H, m, n))), np.full(m, np.inf)
+        law = Feedback(nothing[0], request.initial_guess[None], nothing[1], -free, free, -free, free, np.zeros(m))
+        disturbance = request.disturbance if len(request.disturbance) else None
+        states = self._roll_out(request.state[None], law, disturbance)[0][0]
+        return states if np.isfinite(states).all() else None
 
     def initial_guess(self, request: Request) -> Plan:
         """The plan handed over, or the last plan, shifted by a stage.
@@ -283,19 +286,25 @@ class PredictionModel:
             feedback: Of the program, F_k (H, m, p + m + 1), or nothing (0, m, p + m + 1).
             request: Of the step.
         """
-        problem, n, parts = self.problem, self.problem.state_dim, []
+        problem, n, linearizer = self.problem, self.problem.state_dim, self.linearizer
         gains = np.broadcast_to(-self.gain(prediction.stages, prediction.cost), (self.horizon, problem.input_dim, n))
-        gains = feedback[:, :, :n] if len(feedback) else gains
-        states, inputs, covariances = (part.copy() for part in towards)
+        gains = np.ascontiguousarray(feedback[:, :, :n] if len(feedback) else gains)
         last, disturbance = request.references.previous_input, request.disturbance if len(request.disturbance) else None
+        limits = problem.inputs.lower, problem.inputs.upper, problem.input_rates.lower, problem.input_rates.upper
+        if linearizer.at_points and all(limit.ndim == 1 for limit in limits):
+            law = Feedback(towards.states[None], towards.inputs[None], gains[None], *limits, last)
+            states, inputs = self._roll_out(towards.states[:1], law, disturbance)
+            return self.linearize(Plan(states[0], inputs[0], towards.covariances), request)
+        states, inputs, covariances = (part.copy() for part in towards)
         (low, high), (down, up) = (box.by_stage(self.horizon) for box in (problem.inputs, problem.input_rates))
-        for k in range(self.horizon):
+        parts = []
+        for k in range(self.horizon):  # of a belief, whose means depend on its covariances
             input = towards.inputs[k] + gains[k] @ (states[k, :n] - towards.states[k, :n])
             input = np.clip(input, last + down[k], last + up[k])
             last = inputs[k] = np.clip(input, low[k], high[k])
-            stage = self.linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance)
+            stage = linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance)
             states[k + 1] = stage.next[0]
-            covariances[k + 1] = self.linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
+            covariances[k + 1] = linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
             parts.append(stage)
         stages = LinearizedStages(*map(np.concatenate, zip(*parts, strict=True)))
         return self.predict(Plan(states, inputs, covariances), stages, request)

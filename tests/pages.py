@@ -1,0 +1,63 @@
+"""Follows a page of the documentation as a reader would: writes its files, runs its Python and commands in order."""
+
+import re
+import shlex
+import sys
+from pathlib import Path
+
+from tests.cli.command import forked
+
+ROOT = Path(__file__).resolve().parents[1]
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+FILE = re.compile(r"(?:# @package [\w.]+\n)?(?:#|<!--) ([\w/]+\.(?:py|yaml|xml))(?: -->)?\n")
+INSTALLATION = ("git ", "pip ", "gpmpc warmup")  # what a test has done already
+
+
+def read(path):
+    return (ROOT / path).read_text()
+
+
+def follow(path, folder, given="", section=""):
+    """Does what a page, or what follows a heading of it, says in a folder.
+
+    Where Python is given that its blocks build upon, its commands are not run; a block with ", ...)" is an excerpt.
+
+    Returns:
+        The names that its Python leaves, and what each command printed.
+    """
+    names: dict = {"__name__": "page"}
+    exec(given, names)
+    printed = []
+    for language, text in BLOCK.findall(read(path).partition(section)[2] if section else read(path)):
+        if written := FILE.match(text):
+            (folder / written[1]).parent.mkdir(exist_ok=True)
+            (folder / written[1]).write_text(text)
+        elif language == "python":
+            code = compile(text, path, "exec")
+            if ", ...)" not in text:
+                exec(code, names)
+        elif not language and not given:
+            printed += _run(text, folder)
+    return names, printed
+
+
+def _run(text, folder):
+    printed = []
+    for line in text.splitlines():
+        program, *arguments = shlex.split(line, comments=True) or [""]
+        if program == "cd" and not text.startswith(INSTALLATION):
+            folder /= arguments[0]
+        elif program == "gpmpc" and not line.startswith(INSTALLATION):
+            paths = [sorted(folder.glob(argument)) if "/*/" in argument else [] for argument in arguments]
+            arguments = [str(*path) if path else argument for path, argument in zip(paths, arguments, strict=True)]
+            done = forked(*arguments, cwd=folder)
+            assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+            printed.append(done.stdout)
+    return printed
+
+
+def forget_modules_of(folder, loaded):
+    """Unloads modules that were imported from a folder since."""
+    for name in set(sys.modules) - loaded:
+        if str(folder) in (getattr(sys.modules[name], "__file__", None) or ""):
+            del sys.modules[name]
