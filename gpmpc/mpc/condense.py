@@ -5,8 +5,8 @@
     subject to  bounds on u_k, on u_k - u_{k-1} and on E_k s_{k+1} + D_k u_k
 
 where v is the input, its deviation from a reference or its increment, and Z are the squares of linearised outputs in
-z_k = [x_{k+1}; u_k; 1], x the mean in s. Weights of s are block diagonal, (p / n, n, n):
-Q alone for the mean, and one Q a row of S for s = [mu; vec S], where diag(Q, I_n kron Q) is never written out.
+z_k = [x_{k+1}; u_k; 1], x the mean in s. Weights of s are block diagonal, (p / n, n, n): Q alone for the mean, and one
+Q a row of S for s = [mu; vec S]. D comes with H stages of E.
 
 Input coordinates. With Gamma_{k,i} = ds_k / du_i the program is min 1/2 U'P U + q'U, P = 2 (Gamma' W Gamma + R~): (38)-
 (39) of Cao, Lai and Alam (2017), whose P lacks the 2 and whose unknowns are the increments. Bounds of inputs are a box.
@@ -21,8 +21,6 @@ stable. The bounds of inputs are rows, for which stable plants would pay two to 
 coordinates are used where the diagonal of P exceeds that of the last stage, which no A enters, by ``_LARGEST_GROWTH``.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import types
 
@@ -32,6 +30,7 @@ from gpmpc.kernels.linalg import aligned_rows, combine_rows, copy, copy_matrix, 
 from gpmpc.mpc.linear_quadratic import (
     DEVIATIONS,
     INCREMENTS,
+    CondensedProgram,
     InputBounds,
     QuadraticCost,
     References,
@@ -47,21 +46,6 @@ from gpmpc.mpc.problem import Problem
 Array = np.ndarray
 
 _LARGEST_GROWTH = 1e10
-
-
-class CondensedProgram(NamedTuple):
-    """min 1/2 v'P v + q'v under lower <= [v; G v] <= upper.
-
-    The last of the stacked constraints are the bounds of inputs, of increments (where there are such) and of E s, stage
-    by stage: all of them in input coordinates, all after H m unbounded v in feedback coordinates.
-    """
-
-    P: Array  # (H m, H m)
-    q: Array  # (H m,)
-    G: Array  # (rows, H m)
-    lower: Array  # (H m + rows,)
-    upper: Array  # (H m + rows,)
-    feedback: Array  # F_k of u_k = F_k [s_k; u_{k-1}; 1] + v_k (H, m, p + m + 1); (0, m, p + m + 1) where u = v
 
 
 class Condenser:
@@ -146,17 +130,21 @@ def write_hessian_and_rows(cost, bounds, stages, rows, program):
     if len(stages.A) == len(rows.E) == len(cost.state) == 1 and len(cost.squares) == 0:
         _add_constant_stages(cost, stages, rows.E[0], H, P, G[first:])
     else:
-        _add_varying_stages(cost, stages, rows.E, H, P, G[first:])
-    for k in range(len(rows.D)):
-        for e in range(rows.D.shape[1]):
-            for j in range(m):
-                G[first + k * rows.D.shape[1] + e, k * m + j] += rows.D[k, e, j]
+        _add_varying_stages(cost, stages, rows, H, P, G[first:])
 
 
 @njit_inner
-def _add_varying_stages(cost, stages, E, H, P, G):
+def _add_varying_stages(cost, stages, rows, H, P, G):
     """Adds 2 Gamma' W Gamma to P, and writes E Gamma to G; whole registers at a time, in padded copies."""
-    (p, m), n, r, last, Z = stages.B.shape[1:], cost.terminal.shape[1], E.shape[1], len(stages.A) - 1, cost.squares
+    (p, m), n, last, E, D, Z = (
+        stages.B.shape[1:],
+        cost.terminal.shape[1],
+        len(stages.A) - 1,
+        rows.E,
+        rows.D,
+        cost.squares,
+    )
+    r = E.shape[1]
     M, MA, MB = _zeros(p, p), _zeros(p, p), _zeros(p, m)
     A, transposed, B = _zeros(p, p), np.empty((p, p)), _zeros(p, m)
     BM = np.empty((H, m, p))  # 2 B_k' M_{k+1}
@@ -194,6 +182,8 @@ def _add_varying_stages(cost, stages, E, H, P, G):
         for e in range(r):
             combine_rows(gamma, p, E[min(k, len(E) - 1), e], 0, width, row)
             copy(row, G[k * r + e, :width])
+            for j in range(m if len(D) > 0 else 0):
+                G[k * r + e, k * m + j] += D[k, e, j]
     _mirror(P)
 
 
@@ -277,17 +267,15 @@ def write_gradient_and_bounds(cost, bounds, stages, start, references, rows, pro
         copy(free[k + 1], error)
         for i in range(n):
             error[i] -= targets[k, i]
-        constant = len(cost.state) == 1 and k < H - 1
-        _weigh(W if constant else _padded(weight_of_stage(cost, k, H)), error, gradient)
+        _weigh(W if len(cost.state) == 1 and k < H - 1 else _padded(weight_of_stage(cost, k, H)), error, gradient)
         for i in range(p):
             gradient[i] = 2.0 * gradient[i] + pulled[i]
-        if len(Z) > 0:
-            for i in range(n + m):
-                slope = 2.0 * (dot(Z[k, i], free[k + 1], n) + Z[k, i, n + m])
-                if i < n:
-                    gradient[i] += slope
-                else:
-                    q[k, i - n] += slope
+        for i in range(n + m if len(Z) > 0 else 0):
+            slope = 2.0 * (dot(Z[k, i], free[k + 1], n) + Z[k, i, n + m])
+            if i < n:
+                gradient[i] += slope
+            else:
+                q[k, i - n] += slope
         pulled[:] = 0.0
         for i in range(p):
             weight, row, reach = gradient[i], A[min(k, last), i], B[min(k, last), i]

@@ -24,9 +24,9 @@ from gpmpc.compiled import call_unchecked
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.condense import CondensedProgram, Condenser
+from gpmpc.mpc.condense import Condenser
 from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_method
-from gpmpc.mpc.linear_quadratic import Stages, expand
+from gpmpc.mpc.linear_quadratic import CondensedProgram, Stages, expand
 from gpmpc.mpc.prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc.problem import Problem
 from gpmpc.mpc.sqp import FAILURES, FullStep, Globalization

@@ -71,6 +71,21 @@ class StageRows(NamedTuple):
     upper: Array  # (H, r)
 
 
+class CondensedProgram(NamedTuple):
+    """min 1/2 v'P v + q'v under lower <= [v; G v] <= upper.
+
+    The last of the stacked constraints are the bounds of inputs, of increments (where there are such) and of E s, stage
+    by stage: all of them in input coordinates, all after H m unbounded v in feedback coordinates.
+    """
+
+    P: Array  # (H m, H m)
+    q: Array  # (H m,)
+    G: Array  # (rows, H m)
+    lower: Array  # (H m + rows,)
+    upper: Array  # (H m + rows,)
+    feedback: Array  # F_k of u_k = F_k [s_k; u_{k-1}; 1] + v_k (H, m, p + m + 1); (0, m, p + m + 1) where u = v
+
+
 @compiled
 def expand(stages, start, feedback, previous_input, unknowns):
     """Inputs (H, m) and states s_0 .. s_H (H + 1, p) of the unknowns v (H m,)."""

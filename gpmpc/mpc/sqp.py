@@ -25,9 +25,8 @@ import torch
 from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.exceptions import DataError, ProblemError
 from gpmpc.kernels.linalg import dot
-from gpmpc.mpc.condense import CondensedProgram
 from gpmpc.mpc.controller import Request
-from gpmpc.mpc.linear_quadratic import References, evaluate_cost, weight_of_stage
+from gpmpc.mpc.linear_quadratic import CondensedProgram, References, evaluate_cost, weight_of_stage
 from gpmpc.mpc.prediction import Prediction, PredictionModel
 from gpmpc.mpc.stages import Plan, price_violations
 from gpmpc.qp import QPSolution

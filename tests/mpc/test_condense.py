@@ -210,7 +210,7 @@ def test_weights_by_stage_outputs_and_rows_of_inputs_make_the_stacked_problem_in
     problem = Problem(Tracking(Q, R, terminal=spd(rng, n), penalized=penalized), inputs=Box([-0.4] * m, [0.5] * m))
     condenser = Condensing(problem, H, blocks, outputs.mT @ outputs)
     stages, start, references = random_stages(rng, p, m, H, held), rng.normal(size=p), random_references(rng, H, n, m)
-    E, D = rng.normal(size=(len(stages.A), r, p)), rng.normal(size=(H, r, m))
+    E, D = rng.normal(size=(H, r, p)), rng.normal(size=(H, r, m))
     rows = StageRows(E, D, np.full((H, r), -3.0), np.full((H, r), 1.0))
     W, _ = problem.cost.by_stage(H)
 

@@ -18,7 +18,7 @@ from gpmpc.mpc.stages import COVARIANCES
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
-from tests.mpc.double_pendulum import DoublePendulum
+from tests.mpc.double_pendulum import ACROBOT, DoublePendulum
 from tests.mpc.systems import LinearPlant, linear_gaussian
 
 H = 7
@@ -90,7 +90,7 @@ def casadi_tip():
 @pytest.mark.parametrize("y", [tip, casadi_tip()], ids=["torch", "CasADi"])
 def test_an_iterated_plan_is_where_the_cost_of_its_outputs_has_no_slope(y):
     """The gradient of the true cost in the inputs, by differences of a roll-out, vanishes: KKT without bounds."""
-    model, steps, R = DoublePendulum(), 12, 1e-2
+    model, steps, R = DoublePendulum(ACROBOT), 12, 1e-2
     place, start = np.array([0.5, 1.6]), np.array([0.2, 0.1, 0.0, 0.0])
     problem = Problem(
         Tracking([0.0, 0.0, 0.02, 0.02], [R], penalized="inputs"), outputs=[LeastSquares(y, [5.0, 5.0, 1.0])]
@@ -113,7 +113,7 @@ def test_an_iterated_plan_is_where_the_cost_of_its_outputs_has_no_slope(y):
     slopes = np.array([(cost(plan.inputs + d) - cost(plan.inputs - d)) / 2e-5 for d in step])
     at_rest = np.array([(cost(d) - cost(-d)) / 2e-5 for d in step])
     assert np.abs(slopes).max() < 1e-4 * np.abs(at_rest).max()
-    assert cost(plan.inputs) < 0.9 * cost(0.0 * plan.inputs)
+    assert cost(plan.inputs) < 0.97 * cost(0.0 * plan.inputs)
 
 
 def test_a_constraint_of_states_and_inputs_is_kept_and_touched():
@@ -132,7 +132,7 @@ def test_a_constraint_of_states_and_inputs_is_kept_and_touched():
 
 
 def test_a_plan_that_is_handed_over_is_where_the_iteration_starts():
-    model, goal = DoublePendulum(), Reference(np.zeros(4))
+    model, goal = DoublePendulum(ACROBOT), Reference(np.zeros(4))
     cost = Tracking([1.0] * 4, [1e-3], penalized="inputs")
     settings = {"prediction": PredictionSettings(covariance="none"), "tolerance": 1e-9}
     args = model, Linearization(), Problem(cost, Box([-6.0], [6.0])), 15, [0.0]
