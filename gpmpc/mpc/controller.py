@@ -123,6 +123,14 @@ class Decision:
         """Whether the plan may be applied, and started from; the inputs of another decision are a failed iterate."""
         return self.status.solved or self.suboptimal
 
+    @property
+    def violation(self) -> float:
+        """By how much the plan misses a bound of its last program, in the bound's unit; soft ones may be missed.
+
+        Zero but for rounding where all are kept; NaN without a program.
+        """
+        return float("nan") if self.solution is None else float(self.solution.violation().max(initial=0.0))
+
 
 class Controller(Protocol):
     """A feedback law with a look-ahead."""

@@ -177,7 +177,10 @@ def _arguments(function: Any) -> tuple[int, int]:
     """How many arguments a function takes at least and at most."""
     if hasattr(function, "n_in"):
         return function.n_in(), function.n_in()
-    found = inspect.signature(function).parameters.values()
+    try:
+        found = inspect.signature(function).parameters.values()
+    except ValueError:  # such as torch.sin
+        return 1, 1
     positional = [p for p in found if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     most = 3 if any(p.kind is p.VAR_POSITIONAL for p in found) else len(positional)
     return sum(p.default is p.empty for p in positional), most

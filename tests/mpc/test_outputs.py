@@ -117,17 +117,18 @@ def test_an_iterated_plan_is_where_the_cost_of_its_outputs_has_no_slope(y):
 
 
 def test_a_constraint_of_states_and_inputs_is_kept_and_touched():
-    """The power u_1 x_3 stays below a limit, whether it is said in torch or in CasADi."""
+    """An input stays above x_3^2 - 0.2, whether it is said in torch or in CasADi."""
     x, u = casadi.SX.sym("x", 3), casadi.SX.sym("u", 2)
-    limits = [lambda x, u: u[:, 0] * x[:, 2] - 0.004, casadi.Function("power", [x, u], [u[0] * x[2] - 0.004])]
+    limits = [lambda x, u: x[:, 2] ** 2 - u[:, 0] - 0.2, casadi.Function("limit", [x, u], [x[2] ** 2 - u[0] - 0.2])]
     plans = []
     for limit in limits:
-        problem = Problem(Tracking([1.0] * 3, [0.1] * 2), BOX, constraints=[Inequality(limit, penalty=None)])
+        problem = Problem(Tracking([1.0] * 3, [0.1] * 2), BOX, constraints=[Inequality(limit)])
         plans.append(planned(problem, iterations=40, tolerance=1e-8))
         assert plans[-1].status is Status.SOLVED
-        assert (plans[-1].inputs[:, 0] * plans[-1].means[1:, 2]).max() == pytest.approx(0.004, abs=1e-7)
+        assert (plans[-1].means[1:, 2] ** 2 - plans[-1].inputs[:, 0]).max() == pytest.approx(0.2, abs=1e-7)
+        assert plans[-1].violation < 1e-7
     free = planned(Problem(Tracking([1.0] * 3, [0.1] * 2), BOX))
-    assert (free.inputs[:, 0] * free.means[1:, 2]).max() > 0.006
+    assert (free.means[1:, 2] ** 2 - free.inputs[:, 0]).max() > 0.25
     assert np.allclose(plans[0].inputs, plans[1].inputs, atol=1e-6)
 
 
