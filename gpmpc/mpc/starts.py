@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from gpmpc.compiled import call_unchecked
 from gpmpc.dynamics import linearize
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Array, Decision, Reference, full_turns
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.linear_quadratic import References, TrackingCost, tracking_cost
 from gpmpc.mpc.problem import Problem
 
 Criterion = Callable[[Decision, Reference], float]
@@ -122,7 +120,7 @@ class ManyStarts:
         inputs: Array,
     ) -> tuple[Decision, float]:
         """A decision from a guess, and its criterion: infinite where it is not applicable."""
-        decision = controller.control(belief, goal, previous, parameters, (states, inputs))
+        decision = controller.control(belief, goal, previous, parameters, (inputs, states))
         value = self.criterion(decision, goal) if decision.applicable else inf
         return decision, value if np.isfinite(value) else inf
 
@@ -183,13 +181,16 @@ def kicks(problem: Problem, horizon: int, initial_input: Array, share: float = 0
 
 
 def plan_cost(problem: Problem) -> Criterion:
-    """The criterion that is the cost of a problem."""
-    cost = TrackingCost.of(problem, problem.cost.Q[None], problem.cost.terminal[None])
+    """The criterion that is the tracking cost of a problem."""
 
     def value(decision: Decision, reference: Reference) -> float:
-        wanted = decision.inputs * 0.0 if reference.inputs is None else reference.inputs
-        references = References(reference.states[1:].copy(), np.ascontiguousarray(wanted), decision.inputs[0])
-        return call_unchecked(tracking_cost, cost, decision.means, decision.inputs, references)
+        Q, R = problem.cost.by_stage(len(decision.inputs))
+        off, inputs = decision.means[1:] - reference.states[1:], decision.inputs
+        if problem.cost.penalized == "deviations" and reference.inputs is not None:
+            inputs = inputs - reference.inputs
+        elif problem.cost.penalized == "increments":
+            inputs = np.diff(inputs, axis=0, prepend=inputs[:1])
+        return float(np.einsum("ki,kij,kj", off, Q, off) + np.einsum("ki,kij,kj", inputs, R, inputs))
 
     return value
 

@@ -206,7 +206,7 @@ class DoublePendulum:
 
 
 def acrobot(
-    masses: tuple[float, float] = (1.0, 1.0), first_length: float = 1.0, time_step: float = 0.05, torque: float = 20.0
+    masses: tuple[float, float] = (1.0, 1.0), first_length: float = 1.0, time_step: float = 0.05, torque: float = 10.0
 ) -> System:
     """Makes an acrobot that hangs at first (Spong, 1995, and its table).
 
@@ -217,7 +217,7 @@ def acrobot(
         torque: Its largest [N m].
     """
     links = DoublePendulum((masses[0], masses[1]), first_length, (0.5, 1.0), (0.083, 0.33))
-    return _two_links("acrobot", links, time_step, 10, torque, (6.0, 8.0))
+    return _two_links("acrobot", links, time_step, 10, torque, (4.0, 6.0))
 
 
 def double_pendulum(
@@ -260,7 +260,7 @@ def _two_links(
         input_lower=[-torque],
         input_upper=[torque],
         start=[pi, 0.0, 0.0, 0.0],
-        region=[[-2.0, -rates[0], -pi, -rates[1]], [2 * pi + 2, rates[0], pi, rates[1]]],
+        region=[[0.0, -rates[0], -pi, -rates[1]], [2 * pi, rates[0], pi, rates[1]]],
         angles=["shoulder", "elbow"],
         rates={"shoulder_rate": "shoulder", "elbow_rate": "elbow"},
     )

@@ -111,8 +111,8 @@ def test_a_measurement_that_is_not_finite_is_said_so_and_misuse_is_refused():
     with pytest.raises(SettingError, match="turns"):
         pendulums(turns=(2, 2))
     one = controller(pendulum(), [1.0, 0.01], [0.01], 30)
-    with pytest.raises(ShapeError, match="a guess must be states"):
-        one.control(Gaussian.certain(np.zeros(2)), Reference(np.zeros(2)), guess=(np.zeros((3, 2)), np.zeros((2, 1))))
+    with pytest.raises(ShapeError, match="a plan must be inputs"):
+        one.control(Gaussian.certain(np.zeros(2)), Reference(np.zeros(2)), plan=(np.zeros((2, 1)), np.zeros((3, 2))))
 
 
 def test_kicks_push_every_input_to_both_sides_within_its_bounds():
@@ -136,7 +136,7 @@ def test_no_solve_of_a_double_pendulum_from_a_wild_start_breaks_down(starts):
             for goal, guess in list(many._candidates(state, Reference(np.zeros(4)).over(60)))[
                 :: 1 if starts > 3 else 5
             ]:
-                found = one.control(Gaussian.certain(state), goal, guess=guess)
+                found = one.control(Gaussian.certain(state), goal, plan=guess[::-1])
                 count += 1
                 assert found.status in (Status.SOLVED, Status.ITERATION_LIMIT) or found.suboptimal, found.status
                 assert np.isfinite(found.inputs).all()
