@@ -17,8 +17,9 @@ from typing import Any, Literal
 import numpy as np
 
 from gpmpc.datasets import DataSource
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
-from gpmpc.gp import GPPosterior, Training, Transitions
+from gpmpc.gp import Training, Transitions
 from gpmpc.metrics import find_loss, time_quantiles, tracking_error, violation_rate
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.policy import OnFailure, check_policy
@@ -37,44 +38,30 @@ _STAGES = ("model", "build", "solve", "total")  # of a decision's time
 class Experiment:
     """One flight of one system, with everything that it depends on.
 
-    Attributes:
-        data: Where transitions come from.
-        trajectory: What is followed, from its beginning; None holds the system's goal.
-        system: Whose transitions are learned; names, units and references are its own.
-        train: From transitions and a ``seed`` to a ``Training``.
-        controller: From a model, or from a ``plant`` where its first argument is called so, to a ``Controller``.
-        plant: What flies, and the true model of a controller that takes one; the system by default.
-        name: Of the trajectory, which data from files are filed under.
-        size: Rows drawn for the training; None takes all.
-        steps: Of the flight.
-        seed: Of all random numbers.
-        loop: What stands at the other end: the plant, or the learned model rolled on itself.
-        propagator: The controller's own, if it has one. A model loop carries its belief on with it, or by moment
-            matching.
-        noise: On the plant.
-        disturbances: Of the plant.
-        on_failure: What is applied where a solve fails.
-
     Raises:
         SettingError: A number out of range, an unknown policy or loop, a disturbance that does not fit the plant.
         ShapeError: Noise that does not fit the plant.
     """
 
-    data: DataSource
-    trajectory: Trajectory | None
-    system: System
-    train: Callable[..., Training]
+    data: DataSource  #: where transitions come from
+    trajectory: Trajectory | None  #: what is followed, from its beginning; None holds the system's goal
+    system: System  #: whose transitions are learned; names, units and references are its own
+    train: Callable[..., Training]  #: from transitions and a ``seed`` to a ``Training``
+    #: from a model, or from a ``plant`` where its first argument is called so, to a ``Controller``
     controller: Callable[..., Any]
-    plant: System | None = None
-    name: str = "elliptical"
-    size: int | None = None
-    steps: int = 100
-    seed: int = 0
+    plant: System | None = None  #: what flies, and the true model of a controller that takes one; the system by default
+    name: str = "elliptical"  #: of the trajectory, which data from files are filed under
+    size: int | None = None  #: rows drawn for the training; None takes all
+    steps: int = 100  #: of the flight
+    seed: int = 0  #: of all random numbers
+    #: what stands at the other end: the plant, or the learned model rolled on itself
     loop: Literal["plant", "model"] = "plant"
+    #: the controller's own, if it has one. A model loop carries its belief on with it, or by moment matching
     propagator: Propagator | None = None
-    noise: Noise | None = None
-    disturbances: Sequence[Disturbance] = ()
-    on_failure: OnFailure = "previous_plan"
+    noise: Noise | None = None  #: on the plant
+    disturbances: Sequence[Disturbance] = ()  #: of the plant
+    on_failure: OnFailure = "previous_plan"  #: what is applied where a solve fails
+    model: DynamicsModel | None = None  #: trained before; None trains one where the controller needs it
 
     def __post_init__(self) -> None:
         if self.size is not None:
@@ -102,7 +89,7 @@ class Experiment:
         if problem is not None and (problem.state_dim, problem.input_dim) != shape:
             weighed = f"weighs {problem.state_dim} states and {problem.input_dim} inputs"
             raise SettingError("controller.problem", f"{weighed}; {system.name} has {shape[0]} and {shape[1]}")
-        if self.learns and hasattr(self.data, "check"):
+        if self.learns and self.model is None and hasattr(self.data, "check"):
             self.data.check(system, self.trajectory)
 
     @property
@@ -144,33 +131,27 @@ class Experiment:
         n = len(self.system.state_names)
         if getattr(self.propagator, "process_noise", False) or self.loop == "model":
             return np.zeros(n)
-        if training is not None:
-            return training.posterior.noise_covariance.diagonal().sqrt().numpy()
+        model = self.model if training is None else training.posterior
+        if model is not None and self.learns:
+            return model.noise_covariance.diagonal().sqrt().numpy()
         noise = self.noise and self.noise.process
         return np.zeros(n) if noise is None else np.array(noise, dtype=float)
 
 
 @dataclass(frozen=True)
 class Flown:
-    """An experiment that was flown.
+    """An experiment that was flown."""
 
-    Attributes:
-        rollout: Every step, as arrays.
-        controller: The ``Controller`` that steered, with its ``problem``.
-        training: What was learned; None where the controller knows the plant.
-        diverged: Where and why the system left the finite numbers, and the rollout ends; None where it did not.
-    """
-
-    rollout: Rollout
-    controller: Any
-    training: Training | None
+    rollout: Rollout  #: every step, as arrays
+    controller: Any  #: the ``Controller`` that steered, with its ``problem``
+    training: Training | None  #: what was learned; None where the controller knows the plant
+    #: where and why the system left the finite numbers, and the rollout ends; None where it did not
     diverged: Diverged | None = None
 
 
 def run_trial(
     experiment: Experiment,
     prepare: Callable[[Any, Training | None], Callable[[Step], None]] | None = None,
-    model: GPPosterior | None = None,
 ) -> Flown:
     """Trains and flies.
 
@@ -178,7 +159,6 @@ def run_trial(
         experiment: All of it.
         prepare: Called before the first step with the controller and the training; what it returns is called with
             every step.
-        model: Trained before; None trains one where the controller needs it.
 
     Raises:
         SettingError: More rows are asked for than there are, or settings that do not fit each other.
@@ -187,7 +167,7 @@ def run_trial(
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
         Diverged: The system left the finite numbers in its first step.
     """
-    plant, training = experiment.flown, None
+    plant, training, model = experiment.flown, None, experiment.model
     if experiment.learns and model is None:
         training = experiment.train(experiment.training_rows(), seed=experiment.seed)
         model = training.posterior
@@ -284,6 +264,8 @@ def summary(result: Mapping[str, Any]) -> Table:
     other = _differences(result["settings"])
     if other:
         lines.append(("flown with", ", ".join(f"{key} {now} (learned: {then})" for key, then, now in other)))
+    if path := result["settings"]["model"].get("path"):
+        lines.append(("model", path))
     if training:
         from_what = f"{training['size']} rows of {options['data']} data"
         lines.append(("learned from", f"{from_what}, in {times['training']:.2f} s"))
