@@ -37,15 +37,7 @@ from gpmpc.mpc.problem import Box, Constraint, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import ModelLoop, Noise, Rollout, closed_loop, rehearse
 from gpmpc.studies.document import Document, Table
-from gpmpc.studies.study import (
-    Trial,
-    check_workers,
-    derived_seed,
-    fingerprint,
-    load_model,
-    random_rows,
-    trained_model,
-)
+from gpmpc.studies.study import Trial, check_workers, derived_seed, fingerprint, load_model, random_rows, trained_model
 from gpmpc.systems.attitudes import GRAVITY
 from gpmpc.trajectories import Trajectory
 

@@ -110,11 +110,7 @@ class _Loss:
 
 
 def find_loss(
-    states: np.ndarray,
-    references: np.ndarray,
-    axes: Sequence[int],
-    least: float = 0.0,
-    angles: Sequence[int] = (),
+    states: np.ndarray, references: np.ndarray, axes: Sequence[int], least: float = 0.0, angles: Sequence[int] = ()
 ) -> _Loss | None:
     """Finds where a flight is farther from its reference than the reference ever goes from where the flight began.
 

@@ -21,11 +21,7 @@ class Series:
 
 @styled
 def over_variable(
-    title: str,
-    positions: Sequence[str],
-    label: str,
-    lines: Sequence[Series],
-    logarithmic: bool = False,
+    title: str, positions: Sequence[str], label: str, lines: Sequence[Series], logarithmic: bool = False
 ) -> Figure:
     """Median and quartiles of a measure over the values of a variable, every run a dot.
 
