@@ -182,8 +182,9 @@ def test_a_folder_of_runs_is_drawn_run_by_run_and_one_that_cannot_be_read_is_nam
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "run.mcap").touch()
     done = forked("plot", str(tmp_path), "--no-animation", cwd=tmp_path)
-    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
-    assert "c/run.mcap: is empty" in done.stderr
+    assert done.returncode == 2
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("gpmpc: ")]
+    assert "c/run.mcap: is empty" in line
     for name in ("a", "b"):
         assert (tmp_path / name / "figures" / "tracking.png").exists()
     (tmp_path / "d").mkdir()
