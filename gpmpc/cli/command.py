@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 import gpmpc
 from gpmpc.cli import completion, learn, log, new, reports, run, study, tune, warmup
 from gpmpc.cli.arguments import SHOWN, Command, Result
-from gpmpc.cli.configuration import compose, help_text, settings
+from gpmpc.cli.configuration import compose, help_text, model_file, settings
 from gpmpc.cli.mistakes import explain, nearest
 from gpmpc.cli.sweep import sweep
 from gpmpc.cli.terminal import print_error, redirected_output
@@ -118,6 +118,7 @@ def _run(arguments: list[str], debug: bool) -> Result:
 def _with_settings(name: str, command: Command, given: argparse.Namespace) -> Result:
     """Composes the settings, and shows them or runs the command with them."""
     config_name, swept = given.config_name or command.settings, name == "tune" or getattr(given, "multirun", False)
+    given.overrides = [choice for word in given.overrides for choice in model_file(word)]
     with settings(given.config_dir):
         if given.help:
             print(help_text(command.settings, []))

@@ -25,6 +25,8 @@ def _add_arguments(parser: Parser) -> None:
     parser.add_argument("--points", type=int, default=300, help="rows of a GP (300)")
     parser.add_argument("--steps", type=int, default=50, help="length of the rollouts (50)")
     parser.add_argument("--seed", type=int, default=0, help="of every random number (0)")
+    text = "only what a controller can plan with: no feedback of the controller that flew, no late inputs"
+    parser.add_argument("--for-control", action="store_true", help=text)
     parser.add_argument("--partial", action="store_true", help="take what is whole of unfinished files")
 
 
@@ -51,7 +53,7 @@ def _learn(given: argparse.Namespace) -> Result:
                 status.update(stage)
                 console.print(f"  {stage}", soft_wrap=True, highlight=False, markup=False)
 
-            learned = learn(train, given.points, given.steps, given.seed, show, memory)
+            learned = learn(train, given.points, given.steps, given.seed, show, memory, given.for_control)
             status.update("judging on held-out runs")
             steps = sorted({step for step in (1, 10, 50) if step <= given.steps} | {given.steps})
             judgement = judge(learned, held_out, train, steps)
@@ -79,7 +81,7 @@ def _split(log: "Log", held_out: list[str]) -> tuple["Log", "Log"]:
 
 
 def _fingerprint(log: "Log", given: argparse.Namespace) -> str:
-    digest = sha256(repr((log.mapping, given.points, given.steps, given.seed)).encode())
+    digest = sha256(repr((log.mapping, given.points, given.steps, given.seed, given.for_control)).encode())
     for run in log:
         for array in (run.states, run.inputs, run.context):
             digest.update(array.tobytes())
@@ -177,8 +179,8 @@ def card(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Lo
 
     names = [*train.space.names, *train.input_names]
     ranges = [[n, number(low), number(high)] for n, low, high in zip(names, *learned.ranges, strict=True)]
-    parameters = [[name, number(value), number(error)] for name, value, error in learned.fit.to_rows()]
-    many = len(parameters) > 60  # an affine map's
+    # An affine map has many parameters, and no standard errors.
+    parameters = [[name, number(v), number(error)] for name, v, error in learned.fit.to_rows() if error == error]
     (chosen,) = [candidate for candidate in learned.candidates if candidate.chosen]
     left_out = [f"{f.run}: {f.kind}: {f.text}" for f in train.findings if f.run in learned.runs]
     with_gp = {
@@ -210,7 +212,7 @@ def card(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Lo
         "Model card",
         [
             Table(["", ""], [[key, str(value)] for key, value in facts.items()], "What it is"),
-            Table(["parameter", "value", "standard error"], parameters[:0] if many else parameters, "Parameters"),
+            Table(["parameter", "value", "standard error"], parameters, "Parameters"),
             Table(["channel", "lowest", "highest"], ranges, "Ranges of the data"),
         ],
         pd.DataFrame(),

@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
+from hashlib import sha256
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -136,6 +138,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
     """Makes the objects that the settings describe."""
     from hydra.utils import instantiate
 
+    from gpmpc.logs.flying import SavedModel
     from gpmpc.simulation import Noise
     from gpmpc.studies.flight import Experiment
 
@@ -175,10 +178,15 @@ def experiment_of(config: DictConfig) -> "Experiment":
     ((name, trajectory),) = config.trajectory.items()
     parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "controller", "disturbances")}
     other = {key: value for key, value in (config.plant or {}).items() if value != config.system.get(key)}
+    trained = instantiate(config.model, _convert_="all")
+    saved = isinstance(trained, SavedModel)
+    if saved:
+        trained.check(system)
     return Experiment(
         **parts,
         trajectory=instantiate(trajectory, _convert_="all"),
-        train=instantiate(config.model, _convert_="all"),
+        train=trained,
+        model=trained.model if saved else None,
         system=system,
         plant=_system_of(OmegaConf.merge(config.system, other)) if other else None,
         name=name,
@@ -205,6 +213,8 @@ def _system_of(settings: Any) -> "System":
 def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, Any]:
     """Returns all that a result depends on, as plain data: the settings, and the chosen option by group."""
     settings = plain_data(config)
+    if path := settings["model"].get("path"):
+        settings["model"]["sha256"] = sha256(Path(path).read_bytes()).hexdigest()
     options = {group: chosen.get(group) for group in _GROUPS}
     return {key: value for key, value in settings.items() if key not in ASIDE} | {"options": options}
 

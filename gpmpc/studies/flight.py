@@ -17,8 +17,9 @@ from typing import Any, Literal
 import numpy as np
 
 from gpmpc.datasets import DataSource
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
-from gpmpc.gp import GPPosterior, Training, Transitions
+from gpmpc.gp import Training, Transitions
 from gpmpc.metrics import find_loss, time_quantiles, tracking_error, violation_rate
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.policy import OnFailure, check_policy
@@ -60,6 +61,7 @@ class Experiment:
     noise: Noise | None = None  #: on the plant
     disturbances: Sequence[Disturbance] = ()  #: of the plant
     on_failure: OnFailure = "previous_plan"  #: what is applied where a solve fails
+    model: DynamicsModel | None = None  #: trained before; None trains one where the controller needs it
 
     def __post_init__(self) -> None:
         if self.size is not None:
@@ -87,7 +89,7 @@ class Experiment:
         if problem is not None and (problem.state_dim, problem.input_dim) != shape:
             weighed = f"weighs {problem.state_dim} states and {problem.input_dim} inputs"
             raise SettingError("controller.problem", f"{weighed}; {system.name} has {shape[0]} and {shape[1]}")
-        if self.learns and hasattr(self.data, "check"):
+        if self.learns and self.model is None and hasattr(self.data, "check"):
             self.data.check(system, self.trajectory)
 
     @property
@@ -129,8 +131,9 @@ class Experiment:
         n = len(self.system.state_names)
         if getattr(self.propagator, "process_noise", False) or self.loop == "model":
             return np.zeros(n)
-        if training is not None:
-            return training.posterior.noise_covariance.diagonal().sqrt().numpy()
+        model = self.model if training is None else training.posterior
+        if model is not None and self.learns:
+            return model.noise_covariance.diagonal().sqrt().numpy()
         noise = self.noise and self.noise.process
         return np.zeros(n) if noise is None else np.array(noise, dtype=float)
 
@@ -149,7 +152,6 @@ class Flown:
 def run_trial(
     experiment: Experiment,
     prepare: Callable[[Any, Training | None], Callable[[Step], None]] | None = None,
-    model: GPPosterior | None = None,
 ) -> Flown:
     """Trains and flies.
 
@@ -157,7 +159,6 @@ def run_trial(
         experiment: All of it.
         prepare: Called before the first step with the controller and the training; what it returns is called with
             every step.
-        model: Trained before; None trains one where the controller needs it.
 
     Raises:
         SettingError: More rows are asked for than there are, or settings that do not fit each other.
@@ -166,7 +167,7 @@ def run_trial(
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
         Diverged: The system left the finite numbers in its first step.
     """
-    plant, training = experiment.flown, None
+    plant, training, model = experiment.flown, None, experiment.model
     if experiment.learns and model is None:
         training = experiment.train(experiment.training_rows(), seed=experiment.seed)
         model = training.posterior
@@ -264,6 +265,8 @@ def summary(result: Mapping[str, Any]) -> Table:
     other = [f"{k} {v} (learned: {system.get(k)})" for k, v in plant.items() if v != system.get(k)]
     if other:
         lines.append(("flown with", ", ".join(other)))
+    if path := result["settings"]["model"].get("path"):
+        lines.append(("model", path))
     if training:
         from_what = f"{training['size']} rows of {options['data']} data"
         lines.append(("learned from", f"{from_what}, in {times['training']:.2f} s"))
