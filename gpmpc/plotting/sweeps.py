@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from gpmpc.plotting.style import COLOURS, add_legend, clipped, plain_numbers, styled
+from gpmpc.plotting._style import COLOURS, add_legend, clipped, plain_numbers, styled
 
 
 @dataclass(frozen=True)

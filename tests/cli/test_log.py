@@ -13,8 +13,8 @@ from mcap.writer import Writer
 sys.path.append(str(Path(__file__).resolve().parents[1] / "recording"))
 import runs
 
-from gpmpc.cli.command import COMMANDS
-from gpmpc.cli.log import log
+from gpmpc.cli._command import COMMANDS
+from gpmpc.cli._log import log
 from gpmpc.exceptions import GpmpcError
 from gpmpc.recording import layout, read_run
 from tests.cli.command import forked

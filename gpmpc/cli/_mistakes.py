@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from gpmpc.cli.configuration import setting_names, settings
-from gpmpc.cli.run import one_line, own_error
+from gpmpc.cli._configuration import setting_names, settings
+from gpmpc.cli._run import one_line, own_error
 from gpmpc.exceptions import GpmpcError
 
 _EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher

@@ -27,10 +27,10 @@ from hydra.core.plugins import Plugins
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig
 
-from gpmpc.cli.arguments import Result, folder_of, write_files
-from gpmpc.cli.configuration import without_hydra
-from gpmpc.cli.run import choices, experiment_of, plain_settings, run_one
-from gpmpc.cli.terminal import print_error, progress_bar
+from gpmpc.cli._arguments import Result, folder_of, write_files
+from gpmpc.cli._configuration import without_hydra
+from gpmpc.cli._run import choices, experiment_of, plain_settings, run_one
+from gpmpc.cli._terminal import print_error, progress_bar
 from gpmpc.compiling import report_compilation
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.parallel import THREADS, children_ignore_interrupts, end_with

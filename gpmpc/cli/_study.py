@@ -8,9 +8,9 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from gpmpc.cli.arguments import Command, Result, folder_of, write_files, writing
-from gpmpc.cli.run import experiment_of, plain_data, plain_settings
-from gpmpc.cli.terminal import logging_console, progress_bar
+from gpmpc.cli._arguments import Command, Result, folder_of, write_files, writing
+from gpmpc.cli._run import experiment_of, plain_data, plain_settings
+from gpmpc.cli._terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
 
 if TYPE_CHECKING:
