@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from gpmpc.studies.run_folder import RunFolder
     from gpmpc.systems import System
 
-ASIDE = ("launcher", "folder", "live")  # settings that a result does not depend on
+ASIDE = ("launcher", "folder", "live", "tracker")  # settings that a result does not depend on
 _GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver")
 _MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
 _LOST = 3  # exit code of a run that is finished, and whose flight was lost
@@ -73,7 +73,19 @@ def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
         except Exception as error:
             folder.fail(error, about)
             return outcome | {"error": one_line(error), "mistake": isinstance(error, _MISTAKES)}
+        if config.tracker == "mlflow":
+            _track(folder, result)
     return outcome | {"result": result}
+
+
+def _track(folder: "RunFolder", result: Mapping[str, Any]) -> None:
+    """Writes a finished run to MLflow; the run stays finished where that fails."""
+    from gpmpc.studies.tracking import log_to_mlflow
+
+    try:
+        log_to_mlflow(folder.path, result)
+    except Exception as error:
+        print_error(f"{folder.path} is not in MLflow: {one_line(error)}")
 
 
 def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
@@ -141,6 +153,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
     from gpmpc.logs.flying import SavedModel
     from gpmpc.simulation import Noise
     from gpmpc.studies.flight import Experiment
+    from gpmpc.studies.tracking import check_tracker
 
     config = DictConfig(plain_data(config))
     folder_of(config.folder)
@@ -149,6 +162,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
         raise SettingError("disturbances", f"must be a list; got {config.disturbances!r}")
     if config.recorder not in ("mcap", "none", None):
         raise SettingError("recorder", f"must be 'mcap' or 'none'; got {config.recorder!r}")
+    check_tracker(config.tracker)
     if config.live not in (True, False):
         raise SettingError("live", f"must be true or false; got {config.live!r}")
     if config.live and config.recorder != "mcap":
