@@ -22,7 +22,7 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.transitions import Transitions
 from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
-from gpmpc.propagation import MomentMatching, Propagator
+from gpmpc.propagation import Propagator, best_propagator
 
 if TYPE_CHECKING:
     import pandas
@@ -111,7 +111,7 @@ def calibrate(
     Args:
         model: What was learned, from other recordings.
         recordings: Measured states and applied inputs. A start counts for the steps that its recording still holds.
-        propagator: How the belief moves; exact moment matching by default.
+        propagator: How the belief moves; as ``best_propagator`` of ``gpmpc.propagation`` does by default.
         horizon: H, the longest prediction in steps.
         levels: Of the central intervals.
         start_covariance: How uncertain the measured start is (n, n); certain by default.
@@ -124,7 +124,7 @@ def calibrate(
         SettingError: A level is not between 0 and 1, or no recording is as long as the horizon.
     """
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    propagator = MomentMatching() if propagator is None else propagator
+    propagator = best_propagator(model) if propagator is None else propagator
     names = tuple(names) or tuple(f"x{i + 1}" for i in range(model.state_dim))
     check_number("horizon", horizon, least=1, whole=True)
     _check(model, recordings, horizon, levels, names)

@@ -185,6 +185,8 @@ def experiment_of(config: DictConfig) -> "Experiment":
         problem = config.controller.problem
         if problem.cost.get("Q") is None or problem.cost.get("R") is None:
             raise SettingError("controller.problem.cost", f"has no weights Q and R; {system.name} is to bring them")
+        if problem.cost.get("angles") is None:
+            problem.cost.angles = list(system.angle_indices)
         box = problem.inputs
         for side in ("lower", "upper"):
             if box.get(side) is None:
