@@ -273,11 +273,11 @@ def summary(result: Mapping[str, Any]) -> Table:
     options, training, times = result["settings"]["options"], result["training"], result["times"]
     along = "" if options["trajectory"] == "goal" else f" along {options['trajectory']}"
     lines = [("flight", f"{result['steps']} steps of {options['system']}{along} with {options['controller']}")]
-    system, plant = (result["settings"].get(key, {}) for key in ("system", "plant"))
+    system, plant, model = (result["settings"].get(key) or {} for key in ("system", "plant", "model"))
     other = [f"{k} {v} (learned: {system.get(k)})" for k, v in plant.items() if v != system.get(k)]
     if other:
         lines.append(("flown with", ", ".join(other)))
-    if path := result["settings"]["model"].get("path"):
+    if path := model.get("path"):
         lines.append(("model", path))
     if training:
         from_what = f"{training['size']} rows of {options['data']} data"
