@@ -56,14 +56,12 @@ class RollOut:
             states[:, k + 1] = _mean(self._model, np.ascontiguousarray(states[:, k]), last) + added
         return states, inputs
 
-    def mean(self, states: Array, inputs: Array, disturbance: Array | None = None) -> Array:
-        """Returns the next states (K, n) at K points (K, n), (K, m), without derivatives."""
-        n, m = states.shape[1], inputs.shape[1]
-        none, low, high = np.zeros((1, 1, m, n)), np.full(m, -np.inf), np.full(m, np.inf)
-        feedback = Feedback(
-            states[:, None], np.ascontiguousarray(inputs)[:, None], none, low, high, low, high, np.zeros(m)
-        )
-        return self(states, feedback, disturbance)[0][:, 1]
+    def open_loop(self, start: Array, inputs: Array, disturbance: Array | None = None) -> Array:
+        """Returns the states (T, H + 1, n) that inputs (T, H, m) lead to from x_0 (T, n), without bounds."""
+        (T, H, m), n = inputs.shape, start.shape[1]
+        gains, free = np.zeros((1, H, m, n)), np.full(m, np.inf)
+        law = Feedback(np.zeros((T, H, n)), np.ascontiguousarray(inputs), gains, -free, free, -free, free, np.zeros(m))
+        return self(start, law, disturbance)[0]
 
 
 def _mean(model: Any, states: Array, inputs: Array) -> Array:

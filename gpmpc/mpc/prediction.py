@@ -190,11 +190,8 @@ class PredictionModel:
 
     def _states(self, request: Request) -> Array | None:
         """The means (H + 1, n) that the first guess of the inputs leads to; None where they are not finite."""
-        (H, m), n = request.initial_guess.shape, len(request.state)
-        nothing, free = (np.zeros((1, H, n)), np.zeros((1, H, m, n))), np.full(m, np.inf)
-        law = Feedback(nothing[0], request.initial_guess[None], nothing[1], -free, free, -free, free, np.zeros(m))
         disturbance = request.disturbance if len(request.disturbance) else None
-        states = self._roll_out(request.state[None], law, disturbance)[0][0]
+        states = self._roll_out.open_loop(request.state[None], request.initial_guess[None], disturbance)[0]
         return states if np.isfinite(states).all() else None
 
     def initial_guess(self, request: Request) -> Plan:
@@ -291,12 +288,15 @@ class PredictionModel:
     def evaluate(self, plan: Plan, at: Prediction, request: Request) -> Prediction:
         """The prediction at a plan with the derivatives of another one, ``at``."""
         disturbance = request.disturbance if len(request.disturbance) else None
-        return self._without(plan, self._roll_out.mean(plan.states[:-1], plan.inputs, disturbance), at, request)
+        return self._without(
+            plan, self._roll_out.open_loop(plan.states[:-1], plan.inputs[:, None], disturbance)[:, 1], at, request
+        )
 
     def _without(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
         rows = self.constraints.at(plan, plan.covariances, self.points, request.parameters, request.kappas)
-        cost = self.costs.at(plan, request.parameters)
-        return Prediction(plan, at.stages._replace(next=after), plan.covariances, rows, cost)
+        return Prediction(
+            plan, at.stages._replace(next=after), plan.covariances, rows, self.costs.at(plan, request.parameters)
+        )
 
     def roll_out(
         self, towards: Plan, prediction: Prediction, feedback: Array, request: Request, derivatives: bool = True
@@ -322,11 +322,9 @@ class PredictionModel:
             law = Feedback(towards.states[None], towards.inputs[None], gains[None], *limits, last)
             states, inputs = self._roll_out(towards.states[:1], law, disturbance)
             plan = Plan(states[0], inputs[0], towards.covariances)
-            return (
-                self.linearize(plan, request)
-                if derivatives
-                else self._without(plan, plan.states[1:], prediction, request)
-            )
+            if not derivatives:
+                return self._without(plan, plan.states[1:], prediction, request)
+            return self.linearize(plan, request)
         states, inputs, covariances = (part.copy() for part in towards)
         (low, high), (down, up) = (box.by_stage(self.horizon) for box in (problem.inputs, problem.input_rates))
         parts = []
@@ -346,10 +344,7 @@ class PredictionModel:
         return self.gains(stages.A[:1], stages.B[:1], cost)[0]
 
     def gains(self, A: Array, B: Array, cost: QuadraticCost) -> Array:
-        """K_0 .. K_{H-1} (H, m, n) of the feedback u = u_k - K_k (x - mu_k); zero without feedback.
-
-        Weights of states and inputs are those of the first stage.
-        """
+        """K_0 .. K_{H-1} (H, m, n) of the feedback u = u_k - K_k (x - mu_k), weighed as at the first stage; or zero."""
         (m, n), Z = (self.problem.input_dim, self.problem.state_dim), cost.squares
         if not self.settings.feedback:
             return np.zeros((self.horizon, m, n))

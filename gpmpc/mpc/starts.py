@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from gpmpc.dynamics import linearize
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
+from gpmpc.models.roll_out import RollOut
 from gpmpc.mpc.controller import Array, Decision, Reference, full_turns
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Problem
@@ -78,6 +78,7 @@ class ManyStarts:
             check_number("budget", budget, above=0, unit="[s]")
         self.criterion = plan_cost(self.problem) if criterion is None else criterion
         self.limit, self.budget = limit, budget
+        self._rolled_out = RollOut(self.planner.prediction.model)
 
     def control(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
@@ -150,14 +151,9 @@ class ManyStarts:
         return (_moved(reference, turns[i]) for i in np.argsort(distances, kind="stable"))
 
     def _roll_out(self, state: Array, inputs: Array) -> Array:
-        states = np.tile(state, (self.horizon + 1, 1))
-        for k in range(self.horizon):
-            after = linearize(self.planner.prediction.model, states[k : k + 1], inputs[k : k + 1], False).mean[0]
-            if not np.isfinite(after).all():
-                states[k + 1 :] = states[k]
-                break
-            states[k + 1] = after
-        return states
+        states = self._rolled_out.open_loop(state[None], np.asarray(inputs, dtype=float)[None])[0]
+        finite = np.isfinite(states).all(axis=1)
+        return states if finite.all() else np.tile(state, (self.horizon + 1, 1))
 
 
 def kicks(problem: Problem, horizon: int, initial_input: Array, share: float = 0.5) -> list[Array]:
