@@ -288,15 +288,13 @@ class PredictionModel:
     def evaluate(self, plan: Plan, at: Prediction, request: Request) -> Prediction:
         """The prediction at a plan with the derivatives of another one, ``at``."""
         disturbance = request.disturbance if len(request.disturbance) else None
-        return self._without(
-            plan, self._roll_out.open_loop(plan.states[:-1], plan.inputs[:, None], disturbance)[:, 1], at, request
-        )
+        after = self._roll_out.open_loop(plan.states[:-1], plan.inputs[:, None], disturbance)[:, 1]
+        return self._without(plan, after, at, request)
 
     def _without(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
         rows = self.constraints.at(plan, plan.covariances, self.points, request.parameters, request.kappas)
-        return Prediction(
-            plan, at.stages._replace(next=after), plan.covariances, rows, self.costs.at(plan, request.parameters)
-        )
+        stages, cost = at.stages._replace(next=after), self.costs.at(plan, request.parameters)
+        return Prediction(plan, stages, plan.covariances, rows, cost)
 
     def roll_out(
         self, towards: Plan, prediction: Prediction, feedback: Array, request: Request, derivatives: bool = True
@@ -311,11 +309,8 @@ class PredictionModel:
             derivatives: Whether the stages are linearised where that is not needed to find the plan.
         """
         problem, n, linearizer = self.problem, self.problem.state_dim, self.linearizer
-        gains = (
-            np.ascontiguousarray(feedback[:, :, :n])
-            if len(feedback)
-            else -self.gains(*prediction.stages[:2], prediction.cost)
-        )
+        own = -self.gains(*prediction.stages[:2], prediction.cost) if not len(feedback) else feedback
+        gains = np.ascontiguousarray(own[:, :, :n])
         last, disturbance = request.references.previous_input, request.disturbance if len(request.disturbance) else None
         limits = problem.inputs.lower, problem.inputs.upper, problem.input_rates.lower, problem.input_rates.upper
         if linearizer.at_points and all(limit.ndim == 1 for limit in limits):
