@@ -25,7 +25,7 @@ from gpmpc.gp import GPPosterior, Trainer, Transitions, standardize
 from gpmpc.gp.sparse_training import informative_points
 from gpmpc.models import Affine, CasadiFunction, Features, KnownModel, ResidualModel
 from gpmpc.mpc import GPMPC, Box, ControlLoop, Decision, ManyStarts, PredictionSettings, Problem, Reference, Tracking
-from gpmpc.mpc.linear_quadratic import finite_horizon_lqr
+from gpmpc.mpc.linear_quadratic import dlqr
 from gpmpc.propagation import Linearization
 from gpmpc.systems import System, double_pendulum, step
 
@@ -162,7 +162,7 @@ def pilot(model: Any, robot: str, horizon: int = 40, programs: int = 10, wild: b
 
 
 def _cost_to_go(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    K = finite_horizon_lqr(A[None], B[None], Q, R, Q, 1000)[0][0]
+    K = dlqr(A, B, Q, R)
     closed, P, total = A - B @ K, Q + K.T @ R @ K, np.zeros_like(A)
     for _ in range(5000):
         total, P = total + P, closed.T @ P @ closed
