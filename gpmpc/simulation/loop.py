@@ -243,6 +243,7 @@ class History:
                 expected, covariance = np.array(decision.means[1]), np.array(decision.covariances[1])
         if self._on_step is not None:
             before = self.steps[-1].expected if self.steps else np.nan
+            learned = None if decision is None else decision.learned
             self._on_step(
                 Step(
                     time=moment.time,
@@ -254,6 +255,8 @@ class History:
                     decision=decision,
                     innovation=moment.measured - before,
                     belief_covariance=moment.covariance,
+                    gp_size=0 if learned is None else learned.size,
+                    gp_version=0 if learned is None else learned.version,
                     failed=decided.failed,
                     status=decided.status,
                 )
