@@ -46,7 +46,9 @@ def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
 
 def _affine(form: AffineForm, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:
     """Mean and variance (k,) of a model with an affine form."""
-    seen = (x, u) if form.states is None else (_selected(x, form.states), _selected(u, form.inputs or []))
+    seen = (x, u)
+    if form.states is not None:
+        seen = _features(x, form.states, form.angles), _selected(u, form.inputs or [])
     mean, variance = _moments(form.f, *seen)
     if form.B is not None:
         B = _numbers(form.B)
@@ -58,7 +60,7 @@ def _affine(form: AffineForm, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, ca
 
 
 def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:
-    """Mean and variance (n,) of a residual model with angles, or with functions that are written in CasADi."""
+    """Mean and variance (n,) of a residual model with functions that are written in CasADi."""
     nominal: Any = getattr(model, "nominal", None)
     B: Any = getattr(model, "B", None)
     known: Any = getattr(nominal, "function", None)
@@ -69,10 +71,8 @@ def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi
         raise UnsupportedModel(
             f"CasADi can take a GPPosterior, or a ResidualModel of Affine, CasadiFunction and numbers; got {got}"
         )
-    entries = []
-    for i in model.states:
-        entries += [casadi.sin(x[i]), casadi.cos(x[i])] if i in model.angles else [x[i]]
-    mean, variance = _moments(model.residual, casadi.vertcat(*entries), _selected(u, model.inputs))
+    features = _features(x, model.states, model.angles)
+    mean, variance = _moments(model.residual, features, _selected(u, model.inputs))
     matrix = _numbers(B) if effect is None else effect(x)
     if affine:
         A, G, c = (_numbers(getattr(nominal, part)) for part in "ABc")
@@ -80,6 +80,14 @@ def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi
     else:
         moved = nominal.function(x, u)
     return moved + matrix @ mean, matrix**2 @ variance
+
+
+def _features(x: casadi.MX, states: Sequence[int], angles: Sequence[int]) -> casadi.MX:
+    """Some states, angles among them as sine and cosine."""
+    entries = []
+    for i in states:
+        entries += [casadi.sin(x[i]), casadi.cos(x[i])] if i in angles else [x[i]]
+    return casadi.vertcat(*entries) if entries else casadi.MX(0, 1)
 
 
 def _selected(vector: casadi.MX, entries: Sequence[int]) -> casadi.MX:

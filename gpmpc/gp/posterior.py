@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class AffineForm(NamedTuple):
-    """A model of the form x+ = A x + G u + c + B f(x_s, u_s), through which moments go exactly.
+    """A model of the form x+ = A x + G u + c + B f(x_s, u_s), through which moments go exactly without angles.
 
     None stands for A = 0, G = 0, c = 0, B = I, or a selection of everything.
 
@@ -39,6 +39,7 @@ class AffineForm(NamedTuple):
         B: (n, k).
         states: The states that f depends on.
         inputs: The inputs that f depends on.
+        angles: Those of ``states`` that f sees as (sine, cosine), at their place.
     """
 
     f: "GPPosterior"
@@ -48,6 +49,7 @@ class AffineForm(NamedTuple):
     B: Tensor | None = None
     states: list[int] | None = None
     inputs: list[int] | None = None
+    angles: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -131,7 +131,9 @@ def learn(
         trial_name = f"{name}, {words}" if words else name
         progress(f"{trial_name}: fitted on rollouts of {steps} steps")
         if trial_name not in memory:
-            memory[trial_name] = [_fit(trial, train, steps).model.theta.tolist() for train, _ in folds.parts]
+            starts = models or [structure] * len(folds.parts)
+            pairs = zip(starts, folds.parts, strict=True)
+            memory[trial_name] = [_fit(trial, m, train, steps).model.theta.tolist() for m, (train, _) in pairs]
         fitted = [_with_parameters(trial, theta) for theta in memory[trial_name]]
         candidates.append(folds.judge(trial_name, fitted))
         if not models or is_better(candidates[-1], candidates[best]):
@@ -156,7 +158,7 @@ def learn(
     errors = folds.errors(models)
     noise = fit_noise(models, folds.windows, errors)
     progress("the chosen structure, fitted to all runs")
-    fit = _fit(structure, log, steps)
+    fit = _fit(structure, models[0], log, steps)
     groups = kinematics.output_groups
     gps = tuple(_train(fit.model, log, groups[group], average, points, seed) for group, average in choice.items())
     candidates[best] = replace(candidates[best], chosen=True)
@@ -224,9 +226,12 @@ def _split(log: Log, count: int) -> list[tuple[Log, Log]]:
     return [log.split(group) for group in groups]
 
 
-def _fit(structure: LogModel, log: Log, steps: int) -> NominalFit:
+def _fit(structure: LogModel, simpler: LogModel, log: Log, steps: int) -> NominalFit:
+    """Fits a structure's nominal part, from the parameters that a simpler model has in common with it."""
     if not isinstance(structure.nominal, AffineNominal):
-        return fit_nominal(structure, None, log, steps)
+        known = dict(zip(simpler.nominal.parameter_names, simpler.theta, strict=False))
+        pairs = zip(structure.nominal.parameter_names, structure.nominal.start, strict=True)
+        return fit_nominal(structure, np.array([known.get(name, start) for name, start in pairs]), log, steps)
     affine = fit_least_squares(structure.kinematics, log)  # linear in its many parameters
     unknown = np.full(len(affine.theta), np.nan)
     return NominalFit(replace(affine, history=structure.history), unknown, np.nan, np.nan, 1)

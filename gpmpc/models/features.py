@@ -61,11 +61,15 @@ class Features:
         return np.array([i for i in self.states for _ in range(1 + (i in self.angles))], dtype=np.intp)
 
     @cached_property
-    def _places(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-        """The selected inputs (m_s,), and where the sines and cosines stand among the features (a,)."""
-        sines = [k for k, i in enumerate(self.columns) if i in self.angles and (k == 0 or self.columns[k - 1] != i)]
-        sines = np.array(sines, dtype=np.intp)
-        return np.array(self.inputs, dtype=np.intp), sines, sines + 1
+    def sines(self) -> NDArray[np.intp]:
+        """Where the sines stand among the features, each before its cosine (a,)."""
+        places = [k for k, i in enumerate(self.columns) if i in self.angles and (k == 0 or self.columns[k - 1] != i)]
+        return np.array(places, dtype=np.intp)
+
+    @cached_property
+    def _selected(self) -> NDArray[np.intp]:
+        """The selected inputs (m_s,)."""
+        return np.array(self.inputs, dtype=np.intp)
 
     @cached_property
     def _by_column(self) -> Array:
@@ -105,14 +109,13 @@ class Features:
             states: (K, n).
             inputs: (K, m).
         """
-        selected, sines, cosines = self._places
-        z, v = states[:, self.columns], inputs[:, selected]
+        z, v, sines = states[:, self.columns], inputs[:, self._selected], self.sines
         if not self.angles:
             return z, v, None
         angle = z[:, sines]
         sine, cosine, slope = np.sin(angle), np.cos(angle), np.ones_like(z)
-        z[:, sines], z[:, cosines] = sine, cosine
-        slope[:, sines], slope[:, cosines] = cosine, -sine
+        z[:, sines], z[:, sines + 1] = sine, cosine
+        slope[:, sines], slope[:, sines + 1] = cosine, -sine
         return z, v, slope
 
     def chain(self, by_features: Array, by_inputs: Array, slope: Array | None) -> tuple[Array, Array]:
@@ -120,7 +123,7 @@ class Features:
         if slope is not None:
             by_features = by_features * slope[:, None, :]
         by_input = np.zeros((*by_inputs.shape[:-1], self.input_dim))
-        by_input[..., self._places[0]] = by_inputs
+        by_input[..., self._selected] = by_inputs
         return by_features @ self._by_column, by_input
 
 

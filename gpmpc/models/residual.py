@@ -22,6 +22,7 @@ from gpmpc.dynamics import (
     check_destination,
     check_query,
     predict_by_autograd,
+    tensors_for,
     to_array,
 )
 from gpmpc.exceptions import SettingError, ShapeError
@@ -206,6 +207,15 @@ class ResidualModel:
         mean = _nominal(self.nominal, state, input) + (B @ d.mean[..., None])[..., 0]
         return Gaussian(mean, B @ d.covariance @ B.mT)
 
+    def predict_mean(self, states: Array, inputs: Array) -> Array:
+        """The mean of the next states (K, n) at K points (K, n), (K, m), without derivatives."""
+        x, u = tensors_for(self, states, inputs)
+        with torch.no_grad():
+            known, B = to_array(_nominal(self.nominal, x, u)), to_array(_effect(self.B, x))
+        features, selected, _ = self.features.linearize(states, inputs)
+        d = self.residual.linearize(features, selected, False).mean
+        return known + (B @ d[..., None])[..., 0]
+
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
         """Linearises the model at K points (K, n), (K, m), by the chain rule around the GP's own ``linearize``.
 
@@ -254,11 +264,12 @@ class ResidualModel:
 
     @property
     def affine_form(self) -> AffineForm | None:
-        """The model as moments are composed of it; None unless ``Affine`` with a constant B and without angles."""
+        """The parts of the model; None unless the nominal model is ``Affine`` and B constant."""
         nominal = self.nominal
-        if not isinstance(nominal, Affine) or callable(self.B) or self.angles:
+        if not isinstance(nominal, Affine) or callable(self.B):
             return None
-        return AffineForm(self.residual, nominal.A, nominal.B, nominal.c, self.B, list(self.states), list(self.inputs))
+        selected = list(self.states), list(self.inputs), tuple(self.angles)
+        return AffineForm(self.residual, nominal.A, nominal.B, nominal.c, self.B, *selected)
 
     def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "ResidualModel":
         """Copies the model to another device or type; functions (nominal model, effect) are taken as they are."""

@@ -35,7 +35,9 @@ from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.dynamics import DynamicsModel, check_next_states, linearize
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
+from gpmpc.kernels.gp_rollout import Feedback
 from gpmpc.kernels.linalg import copy_matrix, product
+from gpmpc.models.roll_out import RollOut
 from gpmpc.mpc.condense import StateRows
 from gpmpc.mpc.controller import (
     Decision,
@@ -140,6 +142,7 @@ class PredictionModel:
         self.settings, self.points = settings, horizon if settings.form == "trajectory" else 1
         self.linearizer = StageLinearizer(model, propagator, settings.covariance)
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
+        self._roll_out = RollOut(model)
         self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
 
     def with_model(self, model: DynamicsModel) -> "PredictionModel":
@@ -272,18 +275,25 @@ class PredictionModel:
             feedback: Of the program, F_k (H, m, p + m + 1), or nothing (0, m, p + m + 1).
             request: Of the step.
         """
-        problem, n, parts = self.problem, self.problem.state_dim, []
+        problem, n, linearizer = self.problem, self.problem.state_dim, self.linearizer
         gains = np.broadcast_to(-self.gain(prediction.stages), (self.horizon, problem.input_dim, n))
-        gains = feedback[:, :, :n] if len(feedback) else gains
-        states, inputs, covariances = (part.copy() for part in towards)
+        gains = np.ascontiguousarray(feedback[:, :, :n] if len(feedback) else gains)
         last, disturbance = request.references.previous_input, request.disturbance if len(request.disturbance) else None
-        for k in range(self.horizon):
+        bounds, rates = problem.inputs, problem.input_rates
+        if linearizer.at_points:
+            limits = bounds.lower, bounds.upper, rates.lower, rates.upper, last
+            law = Feedback(towards.states[None], towards.inputs[None], gains[None], *limits)
+            states, inputs = self._roll_out(towards.states[:1], law, disturbance)
+            return self.linearize(Plan(states[0], inputs[0], towards.covariances), request)
+        states, inputs, covariances = (part.copy() for part in towards)
+        parts = []
+        for k in range(self.horizon):  # of a belief, whose means depend on its covariances
             input = towards.inputs[k] + gains[k] @ (states[k, :n] - towards.states[k, :n])
-            input = np.clip(input, last + problem.input_rates.lower, last + problem.input_rates.upper)
-            last = inputs[k] = np.clip(input, problem.inputs.lower, problem.inputs.upper)
-            stage = self.linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance)
+            input = np.clip(input, last + rates.lower, last + rates.upper)
+            last = inputs[k] = np.clip(input, bounds.lower, bounds.upper)
+            stage = linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance)
             states[k + 1] = stage.next[0]
-            covariances[k + 1] = self.linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
+            covariances[k + 1] = linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
             parts.append(stage)
         stages = LinearizedStages(*map(np.concatenate, zip(*parts, strict=True)))
         return self.predict(Plan(states, inputs, covariances), stages, request)

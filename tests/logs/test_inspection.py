@@ -83,7 +83,7 @@ def test_learn_writes_a_model_a_report_and_a_card_and_names_mistakes(tmp_path):
     import yaml
 
     example = runpy.run_path(str(ROOT / "examples" / "own_log.py"))
-    for number, flight in enumerate(example["simulate_flights"](2, 600)):
+    for number, flight in enumerate(example["simulate_flights"](2, 300)):
         flight.to_csv(tmp_path / f"{number}.csv", index=False)
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(example["MAPPING"], sort_keys=False))
     arguments = ["map.yaml", "0.csv", "1.csv", "--points", "20", "--steps", "10", "--held-out", "1"]

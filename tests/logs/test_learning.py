@@ -80,7 +80,7 @@ def test_parameters_come_back_from_rollouts_within_their_standard_errors_also_wi
 def test_learning_chooses_the_motors_finds_the_noise_and_beats_what_costs_nothing(flights):
     log = as_log(flights, gaps=(500,))
     train, held_out = log.split(["flight 2"])
-    learned = learn(train, points=40, steps=20)
+    learned = learn(train, points=20, steps=20)
     (chosen,) = [candidate for candidate in learned.candidates if candidate.chosen]
     assert "motor torque" in chosen.name
     judgement = judge(learned, held_out, train, steps=(1, 10, 20))

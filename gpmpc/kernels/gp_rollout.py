@@ -1,0 +1,125 @@
+"""Roll-outs of the mean of GPs with an affine part, under a feedback towards plans.
+
+    u_k = clip(u'_k + K_k (x_k - x'_k)),   x_{k+1} = A x_k + G u_k + c + B f(phi(x_k), u_k)
+
+phi selects states, and takes angles as sine and cosine.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpmpc.compiled import compiled, njit_noalloc
+from gpmpc.kernels._packed import Array, GPArrays
+from gpmpc.kernels._simd import exp, load, total, use_widest_registers, zeros
+from gpmpc.kernels.linalg import aligned_rows, copy, dot
+
+Indices = NDArray[np.intp]
+
+PLAIN, SINE, COSINE = range(3)
+
+
+class AffineGPs(NamedTuple):
+    """GPs f inside an affine model, for compiled code.
+
+    Attributes:
+        f: The GPs.
+        offset: Their prior means (k,).
+        A: (n, n).
+        G: (n, m).
+        c: (n,).
+        B: (n, k).
+        states: The state that each feature of f is a function of (d,).
+        kinds: Which function: ``PLAIN``, ``SINE`` or ``COSINE`` (d,).
+        inputs: The inputs that f depends on (m_s,).
+    """
+
+    f: GPArrays
+    offset: Array
+    A: Array
+    G: Array
+    c: Array
+    B: Array
+    states: Indices
+    kinds: Indices
+    inputs: Indices
+
+
+class Feedback(NamedTuple):
+    """A feedback u_k = u'_k + K_k (x_k - x'_k) towards T plans of H stages, within bounds.
+
+    Attributes:
+        states: x'_0 .. x'_{H-1}, and more that are not read (T, H or more, n).
+        inputs: u' (T, H, m).
+        gains: K of each plan, or of all (T or 1, H, m, n).
+        lower: Bounds of the inputs (m,).
+        upper: (m,).
+        rate_lower: Bounds of their changes in a step (m,).
+        rate_upper: (m,).
+        previous_input: The input before the first (m,).
+    """
+
+    states: Array
+    inputs: Array
+    gains: Array
+    lower: Array
+    upper: Array
+    rate_lower: Array
+    rate_upper: Array
+    previous_input: Array
+
+
+@njit_noalloc
+def _mean(points, log_signal, D, weights, at):
+    """The latent mean sum_j beta_j sf2 exp(-1/2 sum_d D_d (x~_j - x~)_d^2) of one GP."""
+    use_widest_registers()
+    sums = zeros()
+    for j in range(0, len(weights), 8):
+        exponent = zeros() + log_signal
+        for d in range(len(points)):
+            difference = load(points[d], j) - at[d]
+            exponent = exponent - (0.5 * D[d]) * (difference * difference)
+        sums = sums + exp(exponent) * load(weights, j)
+    return total(sums)
+
+
+@compiled
+def roll_out_gps(model, feedback, start, disturbance, states, inputs):
+    """Writes the states (T, H + 1, n) and the inputs (T, H, m) of T roll-outs.
+
+    Args:
+        model: ``AffineGPs``.
+        feedback: ``Feedback``.
+        start: x_0 (T, n).
+        disturbance: Added to every next state (n,).
+        states: To write to.
+        inputs: To write to.
+    """
+    use_widest_registers()
+    f, offset, A, G, c, B, columns, kinds, chosen = model
+    (T, H, m), n, d, k_dim = inputs.shape, start.shape[1], len(columns), len(offset)
+    work = aligned_rows(2, 8 + d + len(chosen) + k_dim)
+    at, value = work[0], work[1]
+    for t in range(T):
+        gains = feedback.gains[min(t, len(feedback.gains) - 1)]
+        copy(start[t], states[t, 0])
+        for k in range(H):
+            x, u, after, planned = states[t, k], inputs[t, k], states[t, k + 1], feedback.states[t, k]
+            for i in range(m):
+                wanted = feedback.inputs[t, k, i]
+                for j in range(n):
+                    wanted += gains[k, i, j] * (x[j] - planned[j])
+                last = inputs[t, k - 1, i] if k > 0 else feedback.previous_input[i]
+                wanted = min(max(wanted, last + feedback.rate_lower[i]), last + feedback.rate_upper[i])
+                u[i] = min(max(wanted, feedback.lower[i]), feedback.upper[i])
+            for i in range(d):
+                z = x[columns[i]]
+                at[i] = math.sin(z) if kinds[i] == SINE else math.cos(z) if kinds[i] == COSINE else z
+            for i in range(len(chosen)):
+                at[d + i] = u[chosen[i]]
+            for a in range(k_dim):
+                value[a] = offset[a] + _mean(f.points, f.log_signal[a], f.inverse_squares[a], f.weights[a], at)
+            for i in range(n):
+                after[i] = c[i] + disturbance[i] + dot(A[i], x, n) + dot(G[i], u, m) + dot(B[i], value, k_dim)
