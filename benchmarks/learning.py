@@ -7,8 +7,8 @@ step a second. At 20 s it becomes 20 % heavier, or a wind begins, which turns at
 model as learned, without and with the controller's own disturbance estimate (gain 0.5), online learning, and a model
 that was trained on the plant that flies after the change (on the plant without wind where the wind changes), which
 flies that plant all along. RMSE of the position [m] from 5 s after a change on, pooled over the seeds; ``ratio`` is to
-the last of these, ``lost`` counts flights farther than 5 m away then. Also by how much a decision takes longer. Each cell is kept in ``outputs/benchmarks/learning.json`` and not
-flown again; remove the file to fly anew.
+the last of these, ``lost`` counts flights farther than 5 m away then. Also by how much a decision takes longer. Each
+cell is kept in ``outputs/benchmarks/learning.json`` and not flown again; remove the file to fly anew.
 """
 
 import argparse
@@ -106,7 +106,7 @@ def main() -> None:
             for change in CHANGES:
                 cell: dict[str, dict] = {}
                 for way in WAYS:
-                    key = {"trajectory": trajectory, "noise": noise, "change": change, "way": way}
+                    key: dict[str, Any] = {"trajectory": trajectory, "noise": noise, "change": change, "way": way}
                     key["seeds"] = arguments.seeds
                     found = next((row for row in rows if key.items() <= row.items()), None)
                     if found is None:
@@ -119,11 +119,11 @@ def main() -> None:
                     f"{one['rmse']:10.4f} x{one['rmse'] / best:7.3f} lost {one['lost']:2}" for one in cell.values()
                 )
                 print(f"{trajectory:12}{noise:16}{change:18}{text}", flush=True)
-    fastest = [[row[key] for row in rows if row["change"] == "none" and row["way"] == way] for way in WAYS[::2]
-               for key in ("fastest_ms", "decision_ms")]  # fmt: skip
-    (plain, plain_median), (online, online_median) = np.min(fastest, axis=1).reshape(2, 2)
-    print(f"a step with online learning takes {online - plain:.2f} ms more (fastest), {online_median - plain_median:.2f}"
-          " (median), while the change is not used")  # fmt: skip
+    keys = "fastest_ms", "decision_ms"
+    unchanged = [row for row in rows if row["change"] == "none"]
+    plain, online = ([min(row[key] for row in unchanged if row["way"] == way) for key in keys] for way in WAYS[::2])
+    more = [after - before for before, after in zip(plain, online, strict=True)]
+    print(f"a decision with online learning takes {more[0]:.2f} ms more (fastest), {more[1]:.2f} ms (median)")
     arguments.figure.parent.mkdir(parents=True, exist_ok=True)
     write_whole(arguments.figure, png(figure()))
     print(f"written to {arguments.figure}")

@@ -84,7 +84,7 @@ class OnlineLearning:
     share: float = 0.3
     memory: float = 200.0  # [steps]
     window: int = 20
-    margin: float = 3.0
+    margin: float = 20.0
     surprise: float = 30.0
 
     def __post_init__(self) -> None:
