@@ -12,8 +12,8 @@ tables: $(ENV)  ## The paper's Tables 1 and 2 beside ours; settings: make tables
 figures: $(ENV)  ## Figures 2 to 4 and section 5.2; settings: make figures SET="trials=10 data=paper data.folder=DIR"
 	.venv/bin/gpmpc figures $(SET)
 
-test: $(ENV)  ## The whole test suite; options: make test ARGS="-k gaussian"
-	.venv/bin/python -m pytest $(ARGS)
+test: $(ENV)  ## The whole test suite, on all cores; options: make test ARGS="-k gaussian"
+	.venv/bin/python -m pytest --numprocesses auto --dist loadfile $(ARGS)
 
 lint: $(ENV)  ## Format check, linter, import contracts and types
 	.venv/bin/ruff format --check .

@@ -177,7 +177,7 @@ class Quality:
             GpmpcError: The vehicle has left its path.
         """
         experiment, model = trial.condition
-        flown = run_trial(experiment, model=None if model is None else load_model(model))
+        flown = run_trial(replace(experiment, model=None if model is None else load_model(model)))
         rollout, controller = flown.rollout, flown.controller
         distance = np.linalg.norm((rollout.states - rollout.references)[:, experiment.system.tracked_indices], axis=1)
         if not distance.max() <= LOST:

@@ -34,17 +34,13 @@ CHUNK = 64  # starts propagated at once: bounds the memory of moment matching at
 class Recording:
     """One uninterrupted run at equal time steps.
 
-    Attributes:
-        states: x[0] to x[K] (K + 1, n).
-        inputs: u[0] to u[K - 1] (K, m).
-
     Raises:
         ShapeError: There is not one state more than inputs, or no input.
         DataError: An entry is not finite.
     """
 
-    states: Tensor
-    inputs: Tensor
+    states: Tensor  #: x[0] to x[K] (K + 1, n)
+    inputs: Tensor  #: u[0] to u[K - 1] (K, m)
 
     def __post_init__(self) -> None:
         for name in ("states", "inputs"):

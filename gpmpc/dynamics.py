@@ -20,18 +20,12 @@ _log = logging.getLogger(__name__)
 
 
 class Linearized(NamedTuple):
-    """A model's first-order expansions at K points, as C-contiguous float64 arrays.
+    """A model's first-order expansions at K points, as C-contiguous float64 arrays."""
 
-    Attributes:
-        mean: Next states f(x, u) (K, n).
-        A: Derivatives of the means by the state (K, n, n).
-        B: Derivatives of the means by the input (K, n, m).
-        covariance: Of the latent next states at the points, without observation noise (K, n, n); None where not wanted.
-    """
-
-    mean: Array
-    A: Array
-    B: Array
+    mean: Array  #: next states f(x, u) (K, n)
+    A: Array  #: derivatives of the means by the state (K, n, n)
+    B: Array  #: derivatives of the means by the input (K, n, m)
+    #: of the latent next states at the points, without observation noise (K, n, n); None where not wanted
     covariance: Array | None
 
 

@@ -25,17 +25,13 @@ def check_tensors(**given: Any) -> None:
 class Gaussian:
     """N(mean, covariance), batched over leading dimensions.
 
-    Attributes:
-        mean: (*batch, n).
-        covariance: (*batch, n, n), symmetric.
-
     Raises:
         ShapeError: The shapes do not belong together.
         SettingError: One of the two is no tensor.
     """
 
-    mean: Tensor
-    covariance: Tensor
+    mean: Tensor  #: (*batch, n)
+    covariance: Tensor  #: (*batch, n, n), symmetric
 
     def __post_init__(self) -> None:
         check_tensors(mean=self.mean, covariance=self.covariance)

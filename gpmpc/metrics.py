@@ -57,7 +57,7 @@ def _check_alike(**given: Tensor) -> None:
 
 
 @dataclass(frozen=True)
-class TrackingError:
+class _TrackingError:
     """Root mean squared distance from the references."""
 
     axes: np.ndarray  # (j,) of every state looked at, in its unit
@@ -66,7 +66,7 @@ class TrackingError:
 
 def tracking_error(
     states: np.ndarray, references: np.ndarray, axes: Sequence[int], angles: Sequence[int] = ()
-) -> TrackingError:
+) -> _TrackingError:
     """Computes how far a flight was from its references, the initial state left out: nobody steered there.
 
     Args:
@@ -80,7 +80,7 @@ def tracking_error(
     """
     with np.errstate(over="ignore", invalid="ignore"):
         squares = np.square(_errors(states, references, axes, angles))[1:].mean(axis=0)
-        return TrackingError(np.sqrt(squares), float(np.sqrt(squares.sum())))
+        return _TrackingError(np.sqrt(squares), float(np.sqrt(squares.sum())))
 
 
 def _errors(states: np.ndarray, references: np.ndarray, axes: Sequence[int], angles: Sequence[int]) -> np.ndarray:
@@ -101,7 +101,7 @@ def _errors(states: np.ndarray, references: np.ndarray, axes: Sequence[int], ang
 
 
 @dataclass(frozen=True)
-class Loss:
+class _Loss:
     """Where a flight was lost."""
 
     step: int  # the first step k whose state is too far off
@@ -115,7 +115,7 @@ def find_loss(
     axes: Sequence[int],
     least: float = 0.0,
     angles: Sequence[int] = (),
-) -> Loss | None:
+) -> _Loss | None:
     """Finds where a flight is farther from its reference than the reference ever goes from where the flight began.
 
     There the system would have been nearer had it never moved: it no longer follows. That holds for any system and any
@@ -140,11 +140,11 @@ def find_loss(
         limit = max(least, float(np.linalg.norm(_errors(still, references, axes, angles), axis=1).max()))
     beyond = ~(distances <= limit)  # what is no number is nowhere near
     k = int(np.argmax(beyond))
-    return Loss(k, float(distances[k]), limit) if beyond[k] else None
+    return _Loss(k, float(distances[k]), limit) if beyond[k] else None
 
 
 @dataclass(frozen=True)
-class ViolationRate:
+class _ViolationRate:
     """How often bounds were broken."""
 
     violations: int  # steps at which any entry was outside
@@ -161,7 +161,7 @@ class ViolationRate:
 
 def violation_rate(
     values: np.ndarray, lower: np.ndarray, upper: np.ndarray, level: float = 0.95, tolerance: float = 1e-9
-) -> ViolationRate:
+) -> _ViolationRate:
     """Counts how often states or inputs were outside their bounds, with the interval of Clopper and Pearson (1934).
 
     The interval takes steps for independent. Those of one flight are not: pool several seeds, and read it as a lower
@@ -190,7 +190,7 @@ def violation_rate(
     inside = (values >= lower - tolerance) & (values <= upper + tolerance)
     violations = int((~inside.all(axis=1)).sum())
     outside = np.fmax.reduce(np.maximum(lower - values, values - upper), axis=None, initial=0.0)
-    return ViolationRate(violations, len(values), float(outside), *binomial_interval(violations, len(values), level))
+    return _ViolationRate(violations, len(values), float(outside), *binomial_interval(violations, len(values), level))
 
 
 def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
@@ -210,7 +210,7 @@ def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple
 
 
 @dataclass(frozen=True)
-class TimeQuantiles:
+class _TimeQuantiles:
     """Of wall times [s]."""
 
     median: float  # [s]
@@ -219,7 +219,7 @@ class TimeQuantiles:
     largest: float  # [s]
 
 
-def time_quantiles(seconds: np.ndarray) -> TimeQuantiles:
+def time_quantiles(seconds: np.ndarray) -> _TimeQuantiles:
     """Computes median, 95 % and 99 % quantile, and the largest of wall times (K,) [s].
 
     Raises:
@@ -227,7 +227,7 @@ def time_quantiles(seconds: np.ndarray) -> TimeQuantiles:
     """
     if np.ndim(seconds) != 1 or not len(seconds):
         raise ShapeError(f"seconds must be (K,), K of 1 or more; got {np.shape(seconds)}")
-    return TimeQuantiles(*(float(q) for q in np.quantile(seconds, [0.5, 0.95, 0.99, 1.0])))
+    return _TimeQuantiles(*(float(q) for q in np.quantile(seconds, [0.5, 0.95, 0.99, 1.0])))
 
 
 def tracking_cost(

@@ -19,7 +19,7 @@ J = TypeVar("J")
 R = TypeVar("R")
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-LOOK = 0.5  # between two looks at whether the parent lives [s]
+_LOOK = 0.5  # between two looks at whether the parent lives [s]
 
 
 def in_processes(
@@ -68,7 +68,7 @@ def end_with(parent: int) -> None:
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(LOOK)
+            time.sleep(_LOOK)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

@@ -4,13 +4,13 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("gpmpc", "torch", "gpytorch", "numpy", "scipy", "casadi", "hydra-core")
+_PACKAGES = ("gpmpc", "torch", "gpytorch", "numpy", "scipy", "casadi", "hydra-core")
 
 
 def provenance() -> dict:
@@ -18,11 +18,19 @@ def provenance() -> dict:
     return {
         "created": now(),
         "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-        "git": git_commit(),
+        "git": _git_commit(),
         "python": platform.python_version(),
         "versions": versions(),
         "machine": {"system": platform.system(), "processor": processor(), "cores": os.cpu_count()},
     }
+
+
+def flattened(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Returns nested data as one dictionary, keys dotted."""
+    leaves: dict[str, Any] = {}
+    for key, value in data.items():
+        leaves |= flattened(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return leaves
 
 
 def environment() -> dict[str, str | None]:
@@ -56,12 +64,12 @@ def now() -> str:
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
-def versions(packages: Sequence[str] = PACKAGES) -> dict[str, str | None]:
+def versions(packages: Sequence[str] = _PACKAGES) -> dict[str, str | None]:
     """The installed versions by name; None where a package is not installed."""
     return {name: _version(name) for name in packages}
 
 
-def git_commit() -> dict | None:
+def _git_commit() -> dict | None:
     """Commit of the source checkout, and whether it has uncommitted changes; None for an installed package."""
     root = Path(__file__).resolve().parents[1]
     if not (root / "pyproject.toml").exists():

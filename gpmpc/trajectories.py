@@ -32,21 +32,13 @@ class Trajectory(Protocol):
 
 @dataclass(frozen=True)
 class Elliptical:
-    """The paper's helix: x = a sin(w t), y = b cos(w t), z = z0 + c t.
+    """The paper's helix: x = a sin(w t), y = b cos(w t), z = z0 + c t."""
 
-    Attributes:
-        radius_x: Semi-axis a [m].
-        radius_y: Semi-axis b [m].
-        rate: Angular rate w [rad/s].
-        start_z: z0 [m].
-        climb_rate: c [m/s], negative upwards because z points down.
-    """
-
-    radius_x: float = 15.0  # [m]
-    radius_y: float = 15.0  # [m]
-    rate: float = 0.1  # [rad/s]
-    start_z: float = -5.0  # [m]
-    climb_rate: float = -0.25  # [m/s]
+    radius_x: float = 15.0  #: semi-axis a [m]
+    radius_y: float = 15.0  #: semi-axis b [m]
+    rate: float = 0.1  #: angular rate w [rad/s]
+    start_z: float = -5.0  #: z0 [m]
+    climb_rate: float = -0.25  #: c [m/s], negative upwards because z points down
 
     def __post_init__(self) -> None:
         for key in ("radius_x", "radius_y", "rate", "start_z", "climb_rate"):
@@ -75,28 +67,17 @@ class Lorenz:
     The authors sampled an adaptive Dormand-Prince 5(4) integration at its natural output points, four a step, so
     equal steps of flight time are unequal steps of Lorenz time. Between samples the flight follows the integrator's
     dense output, Lorenz time running linearly from one sample to the next.
-
-    Attributes:
-        sigma: Prandtl number of the Lorenz system.
-        rho: Rayleigh number of the Lorenz system.
-        beta: Geometric factor of the Lorenz system.
-        start: (X, Y, Z) at time zero.
-        scale: Factors from (X, Y, Z) to metres [m].
-        relative_tolerance: Of the adaptive integration; it sets the sampling.
-        samples_per_step: Output points of one accepted integration step.
-        sampling_time: Flight time from one output point to the next [s].
-        duration: Flight time that the trajectory is defined for [s].
     """
 
-    sigma: float = 10.0
-    rho: float = 28.0
-    beta: float = 8 / 3
-    start: tuple[float, float, float] = (-1.79, -3.13, 12.74)
-    scale: tuple[float, float, float] = (0.7, -0.7, 1.0)  # [m]
-    relative_tolerance: float = 1e-3
-    samples_per_step: int = 4
-    sampling_time: float = 1.0  # [s]
-    duration: float = 400.0  # [s]
+    sigma: float = 10.0  #: Prandtl number of the Lorenz system
+    rho: float = 28.0  #: Rayleigh number of the Lorenz system
+    beta: float = 8 / 3  #: geometric factor of the Lorenz system
+    start: tuple[float, float, float] = (-1.79, -3.13, 12.74)  #: (X, Y, Z) at time zero
+    scale: tuple[float, float, float] = (0.7, -0.7, 1.0)  #: factors from (X, Y, Z) to metres [m]
+    relative_tolerance: float = 1e-3  #: of the adaptive integration; it sets the sampling
+    samples_per_step: int = 4  #: output points of one accepted integration step
+    sampling_time: float = 1.0  #: flight time from one output point to the next [s]
+    duration: float = 400.0  #: flight time that the trajectory is defined for [s]
 
     def __post_init__(self) -> None:
         for key in ("sigma", "rho", "beta"):
@@ -159,17 +140,11 @@ class Lorenz:
 
 @dataclass(frozen=True)
 class Step:
-    """A jump from one position to another.
+    """A jump from one position to another."""
 
-    Attributes:
-        before: Position until the jump (d,).
-        after: Position from the jump on (d,).
-        at: Time of the jump [s].
-    """
-
-    before: Sequence[float] = (0.0, 0.0, 0.0)
-    after: Sequence[float] = (1.0, 1.0, -1.0)
-    at: float = 0.0  # [s]
+    before: Sequence[float] = (0.0, 0.0, 0.0)  #: position until the jump (d,)
+    after: Sequence[float] = (1.0, 1.0, -1.0)  #: position from the jump on (d,)
+    at: float = 0.0  #: time of the jump [s]
 
     def __post_init__(self) -> None:
         check_number("at", self.at)
@@ -187,13 +162,9 @@ class Step:
 
 @dataclass(frozen=True)
 class Hover:
-    """One position, held.
+    """One position, held."""
 
-    Attributes:
-        position: Where (d,).
-    """
-
-    position: Sequence[float] = (0.0, 0.0, 0.0)
+    position: Sequence[float] = (0.0, 0.0, 0.0)  #: where (d,)
 
     def __post_init__(self) -> None:
         _check_positions("position", [self.position])
@@ -212,14 +183,10 @@ class Waypoints:
     """A smooth path through given positions at given times; the first and the last one are held outside.
 
     A monotone cubic (Fritsch and Carlson, 1980) per coordinate: it passes every waypoint and overshoots none.
-
-    Attributes:
-        times: Strictly increasing times of the waypoints [s].
-        positions: One position (d,) per time.
     """
 
-    times: Sequence[float]  # [s]
-    positions: Sequence[Sequence[float]]
+    times: Sequence[float]  #: strictly increasing times of the waypoints [s]
+    positions: Sequence[Sequence[float]]  #: one position (d,) per time
 
     def __post_init__(self) -> None:
         _check_positions("positions", self.positions)

@@ -5,55 +5,22 @@ Heavy libraries are imported inside the tasks, so help and completion stay quick
 
 import argparse
 import sys
-from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 import gpmpc
-from gpmpc.cli import completion, learn, log, new, reports, study, tune, warmup
-from gpmpc.cli.arguments import Parser, Result
-from gpmpc.cli.configuration import compose, help_text, settings
+from gpmpc.cli import completion, learn, log, new, reports, run, study, tune, warmup
+from gpmpc.cli.arguments import SHOWN, Command, Result
+from gpmpc.cli.configuration import compose, help_text, model_file, settings
 from gpmpc.cli.mistakes import explain, nearest
-from gpmpc.cli.run import run
 from gpmpc.cli.sweep import sweep
 from gpmpc.cli.terminal import print_error, redirected_output
 from gpmpc.exceptions import GpmpcError
 
 
-class Command(NamedTuple):
-    """One command.
-
-    Attributes:
-        summary: For the list of all.
-        task: From the composed settings, or from the parsed arguments, to the result.
-        settings: Name of its file in ``conf/``; empty where it has arguments only.
-        add_arguments: To its parser.
-    """
-
-    summary: str
-    task: Callable[[Any], Result]
-    settings: str = ""
-    add_arguments: Callable[[Parser], None] = lambda parser: None
-
-    def parser(self, name: str) -> Parser:
-        """Returns the parser of what follows the command's name."""
-        description = f"gpmpc {name}: {self.summary[0].lower()}{self.summary[1:]}."
-        parser = Parser(prog=f"gpmpc {name}", description=description, add_help=not self.settings)
-        self.add_arguments(parser)
-        if self.settings:
-            for names in (("-h", "--help"), ("--resolve",)):
-                parser.add_argument(*names, action="store_true")
-            parser.add_argument("--cfg", "-c", nargs="?", const="job")
-            parser.values["--cfg"] = [*SHOWN]
-            for names in (("--config-name", "-cn"), ("--config-dir", "-cd")):
-                parser.add_argument(*names)
-            parser.add_argument("overrides", nargs="*")
-        return parser
-
-
-def version(given: argparse.Namespace) -> Result:
+def _version(given: argparse.Namespace) -> Result:
     """Prints what a report of a bug needs: versions, the BLAS library, the processor."""
     from gpmpc.provenance import environment
 
@@ -64,65 +31,32 @@ def version(given: argparse.Namespace) -> Result:
 
 def _show_usage(given: argparse.Namespace) -> Result:
     lines = "\n".join(f"  {name:12}{command.summary}" for name, command in COMMANDS.items())
-    print(USAGE.format(version=gpmpc.__version__, commands=lines), end="")
+    print(_USAGE.format(version=gpmpc.__version__, commands=lines), end="")
     return Result()
 
 
-def _add_multirun(parser: Parser) -> None:
-    parser.add_argument("--multirun", "-m", action="store_true")
-
-
 COMMANDS = {
-    "run": Command(
-        "Trains a model, flies with it, records; with -m a sweep of many flights", run, "run", _add_multirun
-    ),
-    "tune": Command(
-        "Searches settings for the least closed-loop cost", lambda given: Result(), "tune", tune.add_arguments
-    ),
-    "tables": Command(
-        "Computes Tables 1 and 2 of Cao, Lai and Alam (2017) beside the printed ones", study.run, "tables"
-    ),
-    "figures": Command(
-        "Flies figures 2 to 4 and section 5.2, and the same with the plant in the loop", study.run, "figures"
-    ),
-    "quality": Command(
-        "Measures closed-loop cost over the time of a decision, for every controller", study.run, "quality"
-    ),
-    "new": Command(
-        "Writes a project of your own: a system, its settings, a script and a test",
-        new.new,
-        add_arguments=new.add_arguments,
-    ),
-    "report": Command(
-        "Puts a tree of runs into one table with figures; compares two groups",
-        reports.report,
-        add_arguments=reports.add_report_arguments,
-    ),
-    "plot": Command(
-        "Draws a recorded flight as figures and an animation", reports.plot, add_arguments=reports.add_plot_arguments
-    ),
-    "learn": Command(
-        "Learns a model from logs, judges it on held-out runs, and writes it with a report and a card",
-        learn.learn,
-        add_arguments=learn.add_arguments,
-    ),
-    "log": Command(
-        "Shows, rescues or exports a recording, or writes a Foxglove layout for it",
-        log.log,
-        add_arguments=log.add_arguments,
-    ),
-    "warmup": Command("Compiles the numerical kernels now, instead of at the first flight", warmup.warmup),
+    "run": run.COMMAND,
+    "tune": tune.COMMAND,
+    "tables": study.TABLES,
+    "figures": study.FIGURES,
+    "quality": study.QUALITY,
+    "new": new.COMMAND,
+    "report": reports.REPORT,
+    "plot": reports.PLOT,
+    "learn": learn.COMMAND,
+    "log": log.COMMAND,
+    "warmup": warmup.COMMAND,
     "completion": Command(
         "Prints a script that completes commands, settings and files at TAB",
         lambda given: completion.completion(given, COMMANDS),
         add_arguments=completion.add_arguments,
     ),
-    "version": Command("Prints the versions of what computes, and the processor", version),
+    "version": Command("Prints the versions of what computes, and the processor", _version),
     "help": Command("Explains a command", _show_usage),
 }
-SHOWN = ("job", "hydra", "all")  # parts of the settings
-FLAGS = ("--json", "--quiet", "--debug")
-USAGE = """gpmpc {version}: Gaussian process model predictive control
+_FLAGS = ("--json", "--quiet", "--debug")
+_USAGE = """gpmpc {version}: Gaussian process model predictive control
 
 usage: gpmpc COMMAND [SETTING=VALUE ...] [OPTIONS]
 
@@ -140,7 +74,7 @@ eval "$(gpmpc completion bash)" completes at TAB; zsh likewise; fish: gpmpc comp
 
 def main() -> None:
     """Runs the command that the command line names."""
-    flags = {flag for flag in FLAGS if flag in sys.argv[1:]}
+    flags = {flag for flag in _FLAGS if flag in sys.argv[1:]}
     arguments = [argument for argument in sys.argv[1:] if argument not in flags]
     with redirected_output("error" if "--json" in flags else "nowhere" if "--quiet" in flags else "output"):
         result = _run(arguments, debug="--debug" in flags)
@@ -184,6 +118,7 @@ def _run(arguments: list[str], debug: bool) -> Result:
 def _with_settings(name: str, command: Command, given: argparse.Namespace) -> Result:
     """Composes the settings, and shows them or runs the command with them."""
     config_name, swept = given.config_name or command.settings, name == "tune" or getattr(given, "multirun", False)
+    given.overrides = [choice for word in given.overrides for choice in model_file(word)]
     with settings(given.config_dir):
         if given.help:
             print(help_text(command.settings, []))

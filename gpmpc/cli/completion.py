@@ -12,7 +12,7 @@ from gpmpc.cli.arguments import Parser, Result
 from gpmpc.cli.configuration import group_options, setting_names, settings
 from gpmpc.exceptions import GpmpcError
 
-SCRIPTS = {
+_SCRIPTS = {
     "bash": r"""_gpmpc() {
     local IFS=$'\n' word=${COMP_LINE:0:COMP_POINT} before
     COMPREPLY=($(gpmpc completion --line "$word" 2>/dev/null))
@@ -37,22 +37,20 @@ compdef _gpmpc gpmpc
 
 def add_arguments(parser: Parser) -> None:
     """Adds the arguments of the command."""
-    parser.add_argument("shell", nargs="?", choices=[*SCRIPTS], help='for its profile: eval "$(gpmpc completion bash)"')
+    parser.add_argument(
+        "shell", nargs="?", choices=[*_SCRIPTS], help='for its profile: eval "$(gpmpc completion bash)"'
+    )
     parser.add_argument("--line", metavar="LINE", help="print what may come next after this beginning of a line")
 
 
 def completion(given: argparse.Namespace, commands: Mapping[str, Any]) -> Result:
-    """Prints a shell's script, or what may come next.
-
-    Raises:
-        GpmpcError: Neither was asked for.
-    """
+    """Prints a shell's script, or what may come next."""
     if given.line is not None:
         found = candidates(given.line, commands)
     elif given.shell:
-        found = [SCRIPTS[given.shell].rstrip()]
+        found = [_SCRIPTS[given.shell].rstrip()]
     else:
-        raise GpmpcError(f"completion: name a shell: {', '.join(SCRIPTS)}")
+        raise GpmpcError(f"completion: name a shell: {', '.join(_SCRIPTS)}")
     print("\n".join(found))
     return Result(found)
 

@@ -17,6 +17,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 import gpmpc
 from gpmpc.exceptions import GpmpcError, SettingError
 
+ENDINGS = (".safetensors", ".safetensors'", '.safetensors"')  # of files of models, quoted or not
+
 
 def config_folder() -> Path:
     """Returns the settings' folder: beside the package's modules in a wheel, beside the package in a checkout."""
@@ -30,10 +32,6 @@ def settings(own: str | None = None) -> Iterator[None]:
     """Lets Hydra find the package's settings, and those in a folder ``own`` behind them.
 
     What stands in the working folder can be named by ``_target_`` inside, behind everything that is installed.
-
-    Raises:
-        GpmpcError: There is no working folder any more.
-        SettingError: There is no folder ``own``.
     """
     try:
         here = os.getcwd()
@@ -63,6 +61,12 @@ def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
     config = hydra.compose(name, [*overrides], return_hydra_config=True)
     HydraConfig.instance().set_config(config)
     return without_hydra(config)
+
+
+def model_file(override: str) -> list[str]:
+    """Returns an override; in the place of ``model=FILE``, of a file or several, the option that reads it."""
+    key, _, value = override.partition("=")
+    return ["model=saved", f"model.path={value}"] if key == "model" and value.endswith(ENDINGS) else [override]
 
 
 def without_hydra(config: DictConfig) -> DictConfig:

@@ -7,7 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpmpc.cli.arguments import Parser, Result, writing
+from gpmpc.cli.arguments import Command, Parser, Result, writing
 
 if TYPE_CHECKING:
     from gpmpc.logs import Judgement, Learned, Log
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 MODEL, PROGRESS = "model.safetensors", "progress.json"
 
 
-def add_arguments(parser: Parser) -> None:
+def _add_arguments(parser: Parser) -> None:
     """Adds the arguments of the command."""
     parser.add_argument("mapping", type=Path, help="a YAML file that says what the columns mean")
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="logs: CSV, Parquet, npz, MCAP, ULog")
@@ -25,15 +25,13 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--points", type=int, default=300, help="rows of a GP (300)")
     parser.add_argument("--steps", type=int, default=50, help="length of the rollouts (50)")
     parser.add_argument("--seed", type=int, default=0, help="of every random number (0)")
+    text = "only what a controller can plan with: no feedback of the controller that flew, no late inputs"
+    parser.add_argument("--for-control", action="store_true", help=text)
     parser.add_argument("--partial", action="store_true", help="take what is whole of unfinished files")
 
 
-def learn(given: argparse.Namespace) -> Result:
-    """Learns from logs, judges on held-out runs, and writes model, report and card; goes on where it stopped.
-
-    Raises:
-        GpmpcError: A mistake in the arguments, a log that cannot be used, or a folder that cannot be written.
-    """
+def _learn(given: argparse.Namespace) -> Result:
+    """Learns from logs, judges on held-out runs, and writes model, report and card; goes on where it stopped."""
     from rich.console import Console
 
     from gpmpc.files import write_whole
@@ -55,7 +53,7 @@ def learn(given: argparse.Namespace) -> Result:
                 status.update(stage)
                 console.print(f"  {stage}", soft_wrap=True, highlight=False, markup=False)
 
-            learned = learn(train, given.points, given.steps, given.seed, show, memory)
+            learned = learn(train, given.points, given.steps, given.seed, show, memory, given.for_control)
             status.update("judging on held-out runs")
             steps = sorted({step for step in (1, 10, 50) if step <= given.steps} | {given.steps})
             judgement = judge(learned, held_out, train, steps)
@@ -83,7 +81,7 @@ def _split(log: "Log", held_out: list[str]) -> tuple["Log", "Log"]:
 
 
 def _fingerprint(log: "Log", given: argparse.Namespace) -> str:
-    digest = sha256(repr((log.mapping, given.points, given.steps, given.seed)).encode())
+    digest = sha256(repr((log.mapping, given.points, given.steps, given.seed, given.for_control)).encode())
     for run in log:
         for array in (run.states, run.inputs, run.context):
             digest.update(array.tobytes())
@@ -181,8 +179,8 @@ def card(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Lo
 
     names = [*train.space.names, *train.input_names]
     ranges = [[n, number(low), number(high)] for n, low, high in zip(names, *learned.ranges, strict=True)]
-    parameters = [[name, number(value), number(error)] for name, value, error in learned.fit.to_rows()]
-    many = len(parameters) > 60  # an affine map's
+    # An affine map has many parameters, and no standard errors.
+    parameters = [[name, number(v), number(error)] for name, v, error in learned.fit.to_rows() if error == error]
     (chosen,) = [candidate for candidate in learned.candidates if candidate.chosen]
     left_out = [f"{f.run}: {f.kind}: {f.text}" for f in train.findings if f.run in learned.runs]
     with_gp = {
@@ -214,9 +212,16 @@ def card(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Lo
         "Model card",
         [
             Table(["", ""], [[key, str(value)] for key, value in facts.items()], "What it is"),
-            Table(["parameter", "value", "standard error"], parameters[:0] if many else parameters, "Parameters"),
+            Table(["parameter", "value", "standard error"], parameters, "Parameters"),
             Table(["channel", "lowest", "highest"], ranges, "Ranges of the data"),
         ],
         pd.DataFrame(),
         lists={"Outputs": learns, "What must not be trusted": doubts, "Left out of the data": left_out or ["nothing"]},
     )
+
+
+COMMAND = Command(
+    "Learns a model from logs, judges it on held-out runs, and writes it with a report and a card",
+    _learn,
+    add_arguments=_add_arguments,
+)

@@ -5,7 +5,7 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpmpc.cli.arguments import Parser, Result, writing
+from gpmpc.cli.arguments import Command, Parser, Result, writing
 from gpmpc.exceptions import GpmpcError, SettingError
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ SUFFIXES = {"recover": ".recovered.mcap", "export": ".csv", "layout": ".layout.j
 CUT = "unfinished or damaged; this is what could be read"
 
 
-def add_arguments(parser: Parser) -> None:
+def _add_arguments(parser: Parser) -> None:
     """Adds the arguments of the command."""
     what = "info: channels, times, how the solves ended; recover: what is whole in an unfinished file, as a new one; "
     what += "export: the steps as a table, a row each; layout: for Foxglove or Lichtblick, fitting the recording; "
@@ -29,11 +29,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def log(given: argparse.Namespace) -> Result:
-    """Does what was asked for with a recording.
-
-    Raises:
-        GpmpcError: A mistake in the arguments, or a file that cannot be read or written.
-    """
+    """Does what was asked for with a recording."""
     if given.action == "info":
         if given.output:
             raise GpmpcError(f"log info: writes nothing; got {given.output}")
@@ -187,3 +183,8 @@ def _write(output: Path, content: str | bytes) -> None:
 
     with writing(output, "output"):
         write_whole(output, content)
+
+
+COMMAND = Command(
+    "Shows, rescues or exports a recording, or writes a Foxglove layout for it", log, add_arguments=_add_arguments
+)

@@ -11,16 +11,11 @@ from gpmpc.cli.configuration import setting_names, settings
 from gpmpc.cli.run import one_line, own_error
 from gpmpc.exceptions import GpmpcError
 
-EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher
+_EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher
 
 
 def explain(error: Exception, name: str) -> str | None:
-    """Returns a user's mistake in one line; None where the error is not the user's.
-
-    Args:
-        error: Any.
-        name: Of the command's file of settings; empty where it has none.
-    """
+    """Returns a user's mistake in one line; None where the error is not the user's."""
     if isinstance(error, GpmpcError | HydraException | OmegaConfBaseException):
         return _of_settings(error, name)
     if isinstance(error, OSError):
@@ -53,7 +48,7 @@ def _of_settings(error: Exception, name: str) -> str:
     if unknown := re.match(r"Could not override '([^']+)'", text):
         return f"unknown setting {unknown[1]!r}{nearest(unknown[1], _names(name))}"
     option = re.search(r"Could not find '([^'/]+)/([^']+)'\s+Available options in '[^']+':\n((?:\t.*\n)+)", text)
-    if option and (extra := EXTRAS.get(option[2].removeprefix("launcher/"))):
+    if option and (extra := _EXTRAS.get(option[2].removeprefix("launcher/"))):
         return f"launcher: this one is not installed: pip install 'gpmpc[{extra}]'"
     if option:
         known = option[3].split()

@@ -2,14 +2,14 @@
 
 import argparse
 import keyword
+import re
 from pathlib import Path
 
-from gpmpc.cli.arguments import Parser, Result, writing
+from gpmpc.cli.arguments import Command, Parser, Result, write_files
 from gpmpc.exceptions import SettingError
-from gpmpc.files import write_whole
 
-TEMPLATES = Path(__file__).with_name("project")  # its files, named and written for a system called NAME
-FILES = {
+_TEMPLATES = Path(__file__).with_name("project")  # its files, named and written for a system called NAME
+_FILES = {
     "NAME.py": "system.txt",
     "system/NAME.yaml": "settings.txt",
     "fly.py": "script.txt",
@@ -17,31 +17,30 @@ FILES = {
 }
 
 
-def add_arguments(parser: Parser) -> None:
+def _add_arguments(parser: Parser) -> None:
     """Adds the arguments of ``gpmpc new``."""
     parser.add_argument("name", metavar="NAME", help="of the system: letters, digits and _, a letter first")
     parser.add_argument("--to", type=Path, metavar="DIR", help="an empty folder, or one to be made (NAME)")
 
 
-def new(given: argparse.Namespace) -> Result:
-    """Writes the project, and prints how it is run.
-
-    Raises:
-        SettingError: The name cannot be one of a module, or the folder is not empty or cannot be written.
-    """
+def _new(given: argparse.Namespace) -> Result:
+    """Writes the project, and prints how it is run."""
     name, folder = given.name, given.to or Path(given.name)
     if not name.isidentifier() or keyword.iskeyword(name) or not name.isascii() or name.startswith("_"):
         raise SettingError("NAME", f"must be letters, digits and _, a letter first; got {name!r}")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise SettingError("to", f"{folder} is not an empty folder; nothing was written")
-    with writing(folder, "to"):
-        for path, template in FILES.items():
-            target = folder / path.replace("NAME", name)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            text = (TEMPLATES / template).read_text(encoding="utf-8")
-            write_whole(target, text.replace("NAME", name).replace("CLASS", name.title().replace("_", "")))
-    written = [path.replace("NAME", name) for path in FILES]
-    run = f"gpmpc run --config-dir . system={name}"
-    print(f"written to {folder}: {', '.join(written)}\n")
+    named = {"NAME": name, "CLASS": name.title().replace("_", "")}
+    files = {}
+    for path, template in _FILES.items():
+        text = (_TEMPLATES / template).read_text(encoding="utf-8")
+        files[path.replace("NAME", name)] = re.sub("NAME|CLASS", lambda found: named[found[0]], text)
+    written, run = [*files], f"gpmpc run --config-dir . system={name}"
+    print(write_files(folder, files, "to") + "\n")
     print(f"cd {folder}\n{run}\n{run} -m 'seed=range(5)' data.size=50,100,200\npython fly.py\npytest")
     return Result({"folder": str(folder), "files": written, "command": run})
+
+
+COMMAND = Command(
+    "Writes a project of your own: a system, its settings, a script and a test", _new, add_arguments=_add_arguments
+)

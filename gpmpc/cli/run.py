@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
+from hashlib import sha256
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -14,24 +16,22 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc.cli.arguments import Result, folder_of, writing
+from gpmpc.cli.arguments import Command, Result, folder_of, writing
 from gpmpc.cli.terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, check_number
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from gpmpc.studies.flight import Experiment
     from gpmpc.studies.run_folder import RunFolder
     from gpmpc.systems import System
 
-ASIDE = ("launcher", "folder", "live")  # settings that a result does not depend on
-GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver", "learning")
-MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
-LOST = 3  # exit code of a run that is finished, and whose flight was lost
+ASIDE = ("launcher", "folder", "live", "tracker")  # settings that a result does not depend on
+_GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver", "learning")
+_MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
+_LOST = 3  # exit code of a run that is finished, and whose flight was lost
 
 
-def run(config: DictConfig) -> Result:
+def _run(config: DictConfig) -> Result:
     """Flies, prints the results and where they are kept; the task behind ``conf/run.yaml``."""
     from rich.console import Console
 
@@ -48,21 +48,12 @@ def run(config: DictConfig) -> Result:
         return Result(outcome, 2 if outcome["mistake"] else 1)
     console.print(terminal([summary(outcome["result"])]))
     state = "finished before" if outcome["skipped"] else "written to"
-    console.print(f"{state}: {outcome['folder']}", soft_wrap=True, highlight=False, markup=False)
-    return Result(outcome["result"] | {"folder": outcome["folder"]}, LOST if outcome["result"].get("lost") else 0)
+    console.out(f"{state}: {outcome['folder']}", highlight=False)
+    return Result(outcome["result"] | {"folder": outcome["folder"]}, _LOST if outcome["result"].get("lost") else 0)
 
 
 def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
-    """Flies one run; an error is kept in its folder and returned as ``error``.
-
-    Args:
-        config: The composed settings.
-        wait: For another process that works on the same run.
-
-    Raises:
-        Busy: Another process works on it, and ``wait`` is false.
-        SettingError: The folder cannot be written, or holds a finished run of other settings.
-    """
+    """Flies one run; an error is kept in its folder and returned as ``error``."""
     from gpmpc.studies.run_folder import RunFolder, folder_name, record
     from gpmpc.studies.study import one_thread
 
@@ -81,8 +72,20 @@ def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
             folder.finish(result)
         except Exception as error:
             folder.fail(error, about)
-            return outcome | {"error": one_line(error), "mistake": isinstance(error, MISTAKES)}
+            return outcome | {"error": one_line(error), "mistake": isinstance(error, _MISTAKES)}
+        if config.tracker == "mlflow":
+            _track(folder, result)
     return outcome | {"result": result}
+
+
+def _track(folder: "RunFolder", result: Mapping[str, Any]) -> None:
+    """Writes a finished run to MLflow; the run stays finished where that fails."""
+    from gpmpc.studies.tracking import log_to_mlflow
+
+    try:
+        log_to_mlflow(folder.path, result)
+    except Exception as error:
+        print_error(f"{folder.path} is not in MLflow: {one_line(error)}")
 
 
 def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
@@ -128,6 +131,7 @@ def _recorder(
         time_step=flown.time_step,
         units=flown.units,
         input_bounds=[side[0] for side in controller.problem.inputs.by_stage(controller.horizon)],
+        pose=flown.pose,
         z_down=flown.z_down,
     )
     metadata = {
@@ -145,15 +149,13 @@ def _recorder(
 
 
 def experiment_of(config: DictConfig) -> "Experiment":
-    """Makes the objects that the settings describe.
-
-    Raises:
-        GpmpcError: A setting is wrong.
-    """
+    """Makes the objects that the settings describe."""
     from hydra.utils import instantiate
 
+    from gpmpc.logs.flying import SavedModel
     from gpmpc.simulation import Noise
     from gpmpc.studies.flight import Experiment
+    from gpmpc.studies.tracking import check_tracker
 
     config = DictConfig(plain_data(config))
     folder_of(config.folder)
@@ -162,6 +164,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
         raise SettingError("disturbances", f"must be a list; got {config.disturbances!r}")
     if config.recorder not in ("mcap", "none", None):
         raise SettingError("recorder", f"must be 'mcap' or 'none'; got {config.recorder!r}")
+    check_tracker(config.tracker)
     if config.live not in (True, False):
         raise SettingError("live", f"must be true or false; got {config.live!r}")
     if config.live and config.recorder != "mcap":
@@ -171,7 +174,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
             raise SettingError(group, "choose one")
     if len(config.trajectory) != 1:
         raise SettingError("trajectory", f"choose one; got {', '.join(config.trajectory)}")
-    system = system_of(config.system)
+    system = _system_of(config.system)
     for group, part in (("propagation", "propagator"), ("solver", "solver")):
         if config.get(group):
             if part not in config.controller:
@@ -184,6 +187,8 @@ def experiment_of(config: DictConfig) -> "Experiment":
         problem = config.controller.problem
         if problem.cost.get("Q") is None or problem.cost.get("R") is None:
             raise SettingError("controller.problem.cost", f"has no weights Q and R; {system.name} is to bring them")
+        if problem.cost.get("angles") is None:
+            problem.cost.angles = list(system.angle_indices)
         box = problem.inputs
         for side in ("lower", "upper"):
             if box.get(side) is None:
@@ -191,12 +196,17 @@ def experiment_of(config: DictConfig) -> "Experiment":
     ((name, trajectory),) = config.trajectory.items()
     parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "controller", "disturbances")}
     other = {key: value for key, value in (config.plant or {}).items() if value != config.system.get(key)}
+    trained = instantiate(config.model, _convert_="all")
+    saved = isinstance(trained, SavedModel)
+    if saved:
+        trained.check(system)
     return Experiment(
         **parts,
         trajectory=instantiate(trajectory, _convert_="all"),
-        train=instantiate(config.model, _convert_="all"),
+        train=trained,
+        model=trained.model if saved else None,
         system=system,
-        plant=system_of(OmegaConf.merge(config.system, other)) if other else None,
+        plant=_system_of(OmegaConf.merge(config.system, other)) if other else None,
         name=name,
         size=size,
         propagator=getattr(parts["controller"], "keywords", {}).get("propagator"),
@@ -206,12 +216,8 @@ def experiment_of(config: DictConfig) -> "Experiment":
     )
 
 
-def system_of(settings: Any) -> "System":
-    """Makes the system that the settings ``system`` describe.
-
-    Raises:
-        GpmpcError: They make something else, or a setting is wrong.
-    """
+def _system_of(settings: Any) -> "System":
+    """Makes the system that the settings ``system`` describe."""
     from hydra.utils import instantiate
 
     from gpmpc.systems import System
@@ -226,16 +232,14 @@ def system_of(settings: Any) -> "System":
 def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, Any]:
     """Returns all that a result depends on, as plain data: the settings, and the chosen option by group."""
     settings = plain_data(config)
-    options = {group: chosen.get(group) for group in GROUPS}
+    if path := settings["model"].get("path"):
+        settings["model"]["sha256"] = sha256(Path(path).read_bytes()).hexdigest()
+    options = {group: chosen.get(group) for group in _GROUPS}
     return {key: value for key, value in settings.items() if key not in ASIDE} | {"options": options}
 
 
 def plain_data(config: DictConfig) -> dict[str, Any]:
-    """Returns settings with everything resolved.
-
-    Raises:
-        OmegaConfBaseException: A setting without a default is missing.
-    """
+    """Returns settings with everything resolved."""
     found: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     return found
 
@@ -261,3 +265,11 @@ def one_line(error: BaseException) -> str:
     """Returns the reason of an error in one line."""
     ours = own_error(error)
     return " ".join((str(ours) if ours else f"{type(error).__name__}: {error}").split())
+
+
+COMMAND = Command(
+    "Trains a model, flies with it, records; with -m a sweep of many flights",
+    _run,
+    "run",
+    lambda parser: parser.add_argument("--multirun", "-m", action="store_true"),
+)

@@ -8,22 +8,17 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from gpmpc.cli.arguments import Result, folder_of, writing
+from gpmpc.cli.arguments import Command, Result, folder_of, write_files, writing
 from gpmpc.cli.run import experiment_of, plain_data, plain_settings
 from gpmpc.cli.terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
 
-ONE, SEVERAL = ("data", "excited", "undithered", "model", "flying"), ("trajectory", "subsystem")
-SHOWN_ERRORS = 10
+_ONE, _SEVERAL = ("data", "excited", "undithered", "model", "flying"), ("trajectory", "subsystem")
+_SHOWN_ERRORS = 10
 
 
-def run(config: DictConfig) -> Result:
-    """Runs what is missing of a study, writes its documents and prints its tables.
-
-    Raises:
-        GpmpcError: A setting is wrong, or data cannot be read.
-    """
-    from gpmpc.files import write_whole
+def _run(config: DictConfig) -> Result:
+    """Runs what is missing of a study, writes its documents and prints its tables."""
     from gpmpc.provenance import provenance
     from gpmpc.studies.document import json_text, terminal
     from gpmpc.studies.study import TrialStore, run_study
@@ -45,27 +40,24 @@ def run(config: DictConfig) -> Result:
     data = {"meta": meta, study.trial_name: plain}
     written = found.files(study.name) | {f"{study.name}.json": json_text(data)}
     written["config.yaml"] = OmegaConf.to_yaml(config, resolve=True)
-    with writing(folder):
-        for name, content in written.items():
-            write_whole(folder / name, content)
+    where = write_files(folder, written)
     shown, notes = study.summary(records)
     console.print(terminal(shown, *notes))
     failed = [(trial, record) for trial, record in zip(trials, records, strict=True) if "error" in record]
-    lines = [f"\nwritten to {folder}: {', '.join(sorted(written))}"]
-    for trial, record in failed[:SHOWN_ERRORS]:
+    lines = [f"\n{where}"]
+    for trial, record in failed[:_SHOWN_ERRORS]:
         which = ", ".join(f"{key} {value}" for key, value in trial.labels.items())
         lines.append(f"{'lost' if study.lost_is_result else 'failed'}: {which}: {record['error']}")
-    for line in lines:
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    console.out(*lines, sep="\n", highlight=False)
     wrong = len(failed) == len(records) or not study.lost_is_result
     return Result(data | {"folder": str(folder)}, 1 if failed and wrong else 0)
 
 
 def _study(config: DictConfig, settings: dict[str, Any]) -> Any:
     """Makes the study that the settings describe; what a user can get wrong is found here."""
-    for key in (*ONE, *SEVERAL):
+    for key in (*_ONE, *_SEVERAL):
         if key in config and not config[key]:
-            raise SettingError(key, "choose at least one" if key in SEVERAL else "choose one")
+            raise SettingError(key, "choose at least one" if key in _SEVERAL else "choose one")
 
     def flight(words: str) -> tuple[Any, dict[str, Any]]:
         composed = hydra.compose("run", words.split())
@@ -74,3 +66,8 @@ def _study(config: DictConfig, settings: dict[str, Any]) -> Any:
     made = hydra.utils.instantiate(config, _convert_="all")
     module = import_module(f"gpmpc.experiments.{HydraConfig.get().job.name}")
     return module.from_settings({"trajectory": {}} | made, settings, flight)
+
+
+TABLES = Command("Computes Tables 1 and 2 of Cao, Lai and Alam (2017) beside the printed ones", _run, "tables")
+FIGURES = Command("Flies figures 2 to 4 and section 5.2, and the same with the plant in the loop", _run, "figures")
+QUALITY = Command("Measures closed-loop cost over the time of a decision, for every controller", _run, "quality")

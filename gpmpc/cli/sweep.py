@@ -36,7 +36,7 @@ from gpmpc.files import write_whole
 from gpmpc.parallel import THREADS, children_ignore_interrupts, end_with
 from gpmpc.studies.run_folder import PLAN, Busy, RunFolder, folder_name
 
-LOOK = 0.5  # between two looks at the folders [s]
+_LOOK = 0.5  # between two looks at the folders [s]
 
 
 @dataclass(frozen=True)
@@ -53,27 +53,16 @@ class Job:
         return self.folder.finished or self.folder.failed_at not in (None, self.failed_before)
 
 
-class NoCallbacks:
+class _NoCallbacks:
     """Hydra calls these around every job; none are used here."""
 
-    def on_job_start(self, **_: Any) -> None:
-        """Does nothing."""
+    def on_job_start(self, **_: Any) -> None: ...
 
-    def on_job_end(self, **_: Any) -> None:
-        """Does nothing."""
+    on_job_end = on_job_start
 
 
 class Sweep:
-    """Runs of one tree: their settings, which are finished, and the launcher that flies the others.
-
-    Args:
-        name: Of the file of settings.
-        overrides: Of one run, which say where the tree is and what the launcher is.
-        console: For progress.
-
-    Raises:
-        GpmpcError: A mistake in the settings.
-    """
+    """Runs of one tree: their settings, which are finished, and the launcher that flies the others."""
 
     def __init__(self, name: str, overrides: Sequence[str], console: Any):
         for thread_count in THREADS:  # before the libraries load, here and in the processes started from here
@@ -81,7 +70,7 @@ class Sweep:
         self.config = hydra.compose(name, [*overrides], return_hydra_config=True)
         self.config.hydra.mode = RunMode.MULTIRUN
         self.tree, self.console = folder_of(self.config.folder), console
-        nothing: Any = NoCallbacks()
+        nothing: Any = _NoCallbacks()
         self._context = HydraContext(GlobalHydra.instance().config_loader(), nothing)
         self._checked: set[str] = set()
 
@@ -96,11 +85,7 @@ class Sweep:
         return without_hydra(composed), composed.hydra.runtime.choices
 
     def check(self, jobs: Sequence[Job]) -> None:
-        """Makes the objects once for every value that occurs: a mistake is found before anything is launched.
-
-        Raises:
-            GpmpcError: A mistake in the settings, or a finished run of other ones.
-        """
+        """Makes the objects once for every value that occurs: a mistake is found before anything is launched."""
         finished = [job for job in jobs if job.folder.finished]
         with report_compilation():
             for job in jobs:
@@ -121,9 +106,9 @@ class Sweep:
     def fly(self, jobs: Sequence[Job]) -> list[dict[str, Any]]:
         """Flies the runs that are not finished; returns the outcome of each of those."""
         waiting = [job for job in jobs if not job.folder.finished]
-        outcomes = self._launch(waiting, run_job)
+        outcomes = self._launch(waiting, _run_job)
         busy = [job for job, outcome in zip(waiting, outcomes, strict=True) if "busy" in outcome]
-        return [o for o in outcomes if "busy" not in o] + self._launch(busy, run_job_after_others)
+        return [o for o in outcomes if "busy" not in o] + self._launch(busy, _run_job_after_others)
 
     def _launch(self, jobs: Sequence[Job], task: Callable[[DictConfig], dict[str, Any]]) -> list[dict[str, Any]]:
         if not jobs:
@@ -149,12 +134,7 @@ class Sweep:
 
     @contextmanager
     def progress(self, jobs: Sequence[Job], total: int) -> Iterator[Callable[[str], None]]:
-        """Shows one bar for many runs, drawn by a thread that looks at the folders; yields what names it.
-
-        Args:
-            jobs: May grow meanwhile.
-            total: Runs in the end.
-        """
+        """Shows one bar for many runs, drawn by a thread that looks at the folders; yields what names it."""
         with progress_bar(self.console) as bar:
             task, over, done = bar.add_task("flying", total=total), Event(), set()
 
@@ -163,7 +143,7 @@ class Sweep:
                 bar.update(task, completed=len(done))
 
             def watch() -> None:
-                while not over.wait(LOOK):
+                while not over.wait(_LOOK):
                     look()
 
             watcher = Thread(target=watch, daemon=True)
@@ -178,15 +158,7 @@ class Sweep:
 
 
 def sweep(given: Namespace, name: str) -> Result:
-    """Runs every combination of the choices that is not finished; the result's code is 1 where runs failed.
-
-    Args:
-        given: As ``overrides`` the settings, some with several values.
-        name: Of the file of settings.
-
-    Raises:
-        GpmpcError: A mistake in the settings, before anything is launched, or a launcher that broke down.
-    """
+    """Runs every combination of the choices that is not finished; the result's code is 1 where runs failed."""
     from rich.console import Console
 
     console, combinations = Console(), _combinations(given.overrides)
@@ -200,19 +172,19 @@ def sweep(given: Namespace, name: str) -> Result:
     failed = [outcome for outcome in outcomes if "error" in outcome]
     total = "1 run" if len(jobs) == 1 else f"{len(jobs)} runs"
     text = f"{total}: {len(outcomes) - len(failed)} flown, {finished} finished before, {len(failed)} failed"
-    console.print(f"{text}; in {runs.tree}", soft_wrap=True, highlight=False, markup=False)
+    console.out(f"{text}; in {runs.tree}", highlight=False)
     for outcome in failed:
         print_error(f"failed: {outcome['folder']}: {outcome['error']}")
     data = {"folder": str(runs.tree), "runs": [str(job.folder.path) for job in jobs], "failed": failed}
     return Result(data, 1 if failed else 0)
 
 
-def run_job(config: DictConfig) -> dict[str, Any]:
+def _run_job(config: DictConfig) -> dict[str, Any]:
     """Flies one run of a sweep, in whichever process a launcher started, unless another process works on it."""
     return _outcome(config, wait=False)
 
 
-def run_job_after_others(config: DictConfig) -> dict[str, Any]:
+def _run_job_after_others(config: DictConfig) -> dict[str, Any]:
     """Flies one run of a sweep, after the process that works on it."""
     return _outcome(config, wait=True)
 

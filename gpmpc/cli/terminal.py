@@ -15,11 +15,7 @@ _SEARCH = "gpmpc.gp._search"  # logs single evaluations, where a bar says how fa
 
 
 class Output:
-    """A stream that ends the command where nothing can be written to it any more.
-
-    Args:
-        stream: What is written to.
-    """
+    """A stream that ends the command where nothing can be written to it any more."""
 
     def __init__(self, stream: TextIO):
         self._stream = stream

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from gpmpc.cli.arguments import Parser, Result, writing
+from gpmpc.cli.arguments import Command, Parser, Result, write_files
 from gpmpc.cli.configuration import group_options, without_hydra
 from gpmpc.cli.run import ASIDE, experiment_of
 from gpmpc.cli.sweep import Job, Sweep
@@ -23,28 +23,19 @@ from gpmpc.exceptions import GpmpcError, RecordingError, SettingError, check_num
 if TYPE_CHECKING:
     from gpmpc.studies.tuning import Interval
 
-BEST = "best.yaml"
+_BEST = "best.yaml"
 
 
-def add_arguments(parser: Parser) -> None:
+def _add_arguments(parser: Parser) -> None:
     """Adds the options of the command; what they mean stands in ``conf/tune.yaml``."""
     for name, default in (("--trials", 40), ("--batch", 4), ("--seeds", 1)):
         parser.add_argument(name, type=int, default=default)
 
 
 def tune(given: Namespace, name: str) -> Result:
-    """Searches, and writes the candidates, a figure of what mattered and the best settings.
-
-    Args:
-        given: The options, and as ``overrides`` the settings, some with several values or an interval.
-        name: Of the file of settings.
-
-    Raises:
-        GpmpcError: A mistake in the settings, nothing to search, or no flight that was not lost.
-    """
+    """Searches, and writes the candidates, a figure of what mattered and the best settings."""
     from rich.console import Console
 
-    from gpmpc.files import write_whole
     from gpmpc.studies.document import terminal
     from gpmpc.studies.tuning import Search
 
@@ -83,18 +74,15 @@ def tune(given: Namespace, name: str) -> Result:
     if not math.isfinite(search.costs[search.best]):
         raise GpmpcError(f"tune: every flight was lost or failed; see {runs.tree}")
     best = [*fixed, *_overrides(search.candidates[search.best], base)]
-    command = shlex.join(["gpmpc", "run", "--config-dir", str(runs.tree), "--config-name", BEST.removesuffix(".yaml")])
+    command = shlex.join(["gpmpc", "run", "--config-dir", str(runs.tree), "--config-name", _BEST.removesuffix(".yaml")])
     document = search.document(unchanged if math.isfinite(unchanged) else None, command)
     written = document.files("tuning") | {
         "tuning.html": document.html(),
-        BEST: _config(best, name, str(runs.tree / "best")),
+        _BEST: _config(best, name, str(runs.tree / "best")),
     }
-    with writing(runs.tree):
-        for file, content in written.items():
-            write_whole(runs.tree / file, content)
+    where = write_files(runs.tree, written)
     console.print(terminal(document.tables, document.lead))
-    for line in (f"to fly the best one: {command}", f"written to {runs.tree}: {', '.join(sorted(written))}"):
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    console.out(f"to fly the best one: {command}", where, sep="\n", highlight=False)
     data = {"folder": str(runs.tree), "best": search.candidates[search.best], "cost": search.costs[search.best]}
     return Result(data | {"unchanged": unchanged, "importances": search.importances(), "command": command})
 
@@ -171,3 +159,6 @@ def _config(overrides: Sequence[str], name: str, folder: str) -> str:
             OmegaConf.update(own, key, override.value(), force_add=True)
     text = OmegaConf.to_yaml(OmegaConf.merge({"defaults": defaults}, own, {"folder": folder}))
     return f"# The best settings that gpmpc tune found.\n{text}"
+
+
+COMMAND = Command("Searches settings for the least closed-loop cost", lambda given: Result(), "tune", _add_arguments)

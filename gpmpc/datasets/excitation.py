@@ -35,24 +35,16 @@ from gpmpc.trajectories import Trajectory
 class Excitation:
     """How one subsystem is flown for data: NMPC on the true system, which is shaken meanwhile.
 
-    Attributes:
-        Q: State weights, the diagonal (n,).
-        R: Weights of the inputs' increments, the diagonal (m,).
-        initial_input: First guess of the solver, and the input before the first (m,).
-        dither: Standard deviation of what is added to the inputs (m,), in their units.
-        noise: Standard deviation of what is added to every next state (n,), in their units.
-        horizon: Of the NMPC.
-
     Raises:
         SettingError: A list has another length than the quadrotor's six states or three inputs.
     """
 
-    Q: Sequence[float]
-    R: Sequence[float]
-    initial_input: Sequence[float]
-    dither: Sequence[float]
-    noise: Sequence[float]
-    horizon: int = 1
+    Q: Sequence[float]  #: state weights, the diagonal (n,)
+    R: Sequence[float]  #: weights of the inputs' increments, the diagonal (m,)
+    initial_input: Sequence[float]  #: first guess of the solver, and the input before the first (m,)
+    dither: Sequence[float]  #: standard deviation of what is added to the inputs (m,), in their units
+    noise: Sequence[float]  #: standard deviation of what is added to every next state (n,), in their units
+    horizon: int = 1  #: of the NMPC
 
     def __post_init__(self) -> None:
         for key, length in (("Q", 6), ("noise", 6), ("R", 3), ("initial_input", 3), ("dither", 3)):
@@ -76,24 +68,15 @@ class ExcitedData:
     The translational subsystem follows the trajectory from its beginning. The rotational one is asked for attitudes of
     that flight in random order, each held for a while and approached at first order, as a ``Cascade`` asks for them: so
     a few seconds at its own rate cover the whole flight's attitudes.
-
-    Attributes:
-        translational: How the outer subsystem is flown.
-        rotational: How the inner subsystem is flown.
-        samples: Transitions of either.
-        hold: Inner steps that an attitude is asked for.
-        response_time: Of the approach to it [s].
-        attitude: How thrust direction becomes attitude: ``"exact"`` or ``"paper"``.
-        seed: Of dither, noise and the order of the attitudes.
     """
 
-    translational: Excitation
-    rotational: Excitation
-    samples: int = 189
-    hold: int = 10
-    response_time: float = 0.1  # [s]
-    attitude: str = "exact"
-    seed: int = 0
+    translational: Excitation  #: how the outer subsystem is flown
+    rotational: Excitation  #: how the inner subsystem is flown
+    samples: int = 189  #: transitions of either
+    hold: int = 10  #: inner steps that an attitude is asked for
+    response_time: float = 0.1  #: of the approach to it [s]
+    attitude: str = "exact"  #: how thrust direction becomes attitude: ``"exact"`` or ``"paper"``
+    seed: int = 0  #: of dither, noise and the order of the attitudes
 
     note = (
         "Data: our own dithered and noisy flights of integrated plants. They are made for control; the paper's figures "

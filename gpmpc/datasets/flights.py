@@ -65,23 +65,17 @@ class DataSource(Protocol):
 class Tracking:
     """How one subsystem is flown.
 
-    Attributes:
-        plant: The true system.
-        Q: State weights, the diagonal (n,).
-        R: Input weights, the diagonal (m,).
-        initial_input: First guess of the solver (m,).
-
     Raises:
         SettingError: A weight has another length than the plant's states or inputs.
     """
 
-    plant: Plant
-    Q: Sequence[float]
-    R: Sequence[float]
-    initial_input: Sequence[float]
+    plant: Plant  #: the true system
+    Q: Sequence[float]  #: state weights, the diagonal (n,)
+    R: Sequence[float]  #: input weights, the diagonal (m,)
+    initial_input: Sequence[float]  #: first guess of the solver (m,)
 
     def __post_init__(self) -> None:
-        check_weights(self.plant, self.Q, self.R)
+        _check_weights(self.plant, self.Q, self.R)
 
     def fly(self, references: np.ndarray, horizon: int, steps: int) -> Rollout:
         """Unconstrained NMPC from rest along references (steps + horizon, n)."""
@@ -93,21 +87,13 @@ class Tracking:
 
 @dataclass(frozen=True)
 class NMPCData:
-    """Transitions of unconstrained NMPC on the true plant.
+    """Transitions of unconstrained NMPC on the true plant."""
 
-    Attributes:
-        translational: How the outer subsystem is flown.
-        rotational: How the inner subsystem is flown.
-        samples: Transitions of either subsystem.
-        horizon: Of the controller: predicted states in its cost.
-        attitude: How thrust direction becomes attitude: ``"paper"`` or ``"exact"``; see
-            ``attitude_for_thrust_direction``.
-    """
-
-    translational: Tracking
-    rotational: Tracking
-    samples: int = 189
-    horizon: int = 2
+    translational: Tracking  #: how the outer subsystem is flown
+    rotational: Tracking  #: how the inner subsystem is flown
+    samples: int = 189  #: transitions of either subsystem
+    horizon: int = 2  #: of the controller: predicted states in its cost
+    #: how thrust direction becomes attitude: ``"paper"`` or ``"exact"``; see ``attitude_for_thrust_direction``
     attitude: str = "paper"
 
     note = (
@@ -150,15 +136,10 @@ class NMPCData:
 
 @dataclass(frozen=True)
 class PaperData:
-    """The authors' published files, ``ds_nmpc_<Trajectory>_<trans|rotate>.txt``.
+    """The authors' published files, ``ds_nmpc_<Trajectory>_<trans|rotate>.txt``."""
 
-    Attributes:
-        folder: Where the files lie.
-        samples: Rows to use from the top of each file.
-    """
-
-    folder: str | Path
-    samples: int = 189
+    folder: str | Path  #: where the files lie
+    samples: int = 189  #: rows to use from the top of each file
 
     note = "Data: the authors' own."
 
@@ -185,7 +166,7 @@ class PaperData:
         return data[: self.samples]
 
 
-def check_weights(plant: Plant, Q: Sequence[float], R: Sequence[float]) -> None:
+def _check_weights(plant: Plant, Q: Sequence[float], R: Sequence[float]) -> None:
     """Raises unless diagonal weights fit a plant.
 
     Raises:

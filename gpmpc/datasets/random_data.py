@@ -15,29 +15,21 @@ from gpmpc.trajectories import Trajectory
 class RandomData:
     """Transitions under inputs drawn uniformly within the system's limits.
 
-    Attributes:
-        samples: How many.
-        episode: Steps from one start; the next episode starts anew.
-        hold: Steps for which an input is held.
-        starts: Where episodes start: ``"region"``, uniformly in the system's region, or ``"start"``, where its flights
-            start.
-        amplitude: Part of the width of the input limits that is used.
-        around: What the inputs are drawn about: the ``"middle"`` of their limits or the system's ``"initial_input"``.
-        noise: Standard deviations of what is added to every next state (n,); None for none.
-        seed: Of starts, inputs and noise.
-
     Raises:
         SettingError: A number out of range, or an unknown word.
     """
 
-    samples: int = 200
-    episode: int = 10
-    hold: int = 1
+    samples: int = 200  #: how many
+    episode: int = 10  #: steps from one start; the next episode starts anew
+    hold: int = 1  #: steps for which an input is held
+    #: where episodes start: ``"region"``, uniformly in the system's region, or ``"start"``, where its flights start
     starts: str = "region"
-    amplitude: float = 1.0
+    amplitude: float = 1.0  #: part of the width of the input limits that is used
+    #: what the inputs are drawn about: the ``"middle"`` of their limits or the system's ``"initial_input"``
     around: str = "middle"
+    #: standard deviations of what is added to every next state (n,); None for none
     noise: Sequence[float] | None = None
-    seed: int = 0
+    seed: int = 0  #: of starts, inputs and noise
 
     note = "Data: our own, under random inputs."
 

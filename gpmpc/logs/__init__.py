@@ -1,6 +1,7 @@
 """Logs of real systems: reading, checking, learning from them, and judging what was learned."""
 
 from gpmpc.logs.fitting import NominalFit, fit_nominal
+from gpmpc.logs.flying import LearnedDynamics, SavedModel, load_flyable
 from gpmpc.logs.inspection import Inspection, inspect_log
 from gpmpc.logs.judging import Judgement, judge
 from gpmpc.logs.kinematics import Increments, Kinematics, RigidBody
@@ -23,6 +24,7 @@ __all__ = [
     "Judgement",
     "Kinematics",
     "Learned",
+    "LearnedDynamics",
     "Log",
     "LogMapping",
     "LogModel",
@@ -32,6 +34,7 @@ __all__ = [
     "NominalFit",
     "OutputNoise",
     "RigidBody",
+    "SavedModel",
     "Signal",
     "StateGroup",
     "StateSpace",
@@ -40,6 +43,7 @@ __all__ = [
     "inspect_log",
     "judge",
     "learn",
+    "load_flyable",
     "load_learned",
     "read_log",
     "read_streams",

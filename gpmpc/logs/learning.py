@@ -26,6 +26,7 @@ from gpmpc.logs.state_space import Array
 
 AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
 LATE = 3  # rows by which motors may act late
+FEEDBACK, LATE_INPUTS = "feedback", f"inputs {LATE} rows late"  # structures
 JUDGED = (10, 50)  # steps whose errors decide
 GAIN = 0.01  # least relative improvement for which a model may grow
 LOSS = 0.05  # most relative loss in any group at any step
@@ -56,6 +57,10 @@ class Learned:
         ranges: Smallest and largest value (2, n + m) of the states and inputs in the log.
         rows: Of the log.
         runs: Names of the runs.
+        state_names: As the file's columns are called (n,).
+        input_names: Likewise (m,).
+        context_names: Likewise.
+        time_step: [s]
     """
 
     model: LogModel
@@ -65,6 +70,10 @@ class Learned:
     ranges: Array
     rows: int
     runs: tuple[str, ...]
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    context_names: tuple[str, ...]
+    time_step: float
 
 
 @dataclass
@@ -101,6 +110,7 @@ def learn(
     seed: int = 0,
     progress: Progress = lambda text: None,
     memory: Memory | None = None,
+    for_control: bool = False,
 ) -> Learned:
     """Learns a model of the outputs behind a log.
 
@@ -111,6 +121,8 @@ def learn(
         seed: Of every random number.
         progress: Called with a line at each stage.
         memory: Holds the outcome of stages that an earlier call with equal arguments went through.
+        for_control: Leaves out what predicts such runs and no controller can plan with: the feedback of the controller
+            that flew, and inputs that act late.
 
     Raises:
         DataError: The log is too short for rollouts of that many steps.
@@ -122,6 +134,8 @@ def learn(
     folds = _Folds(_split(log, 2), steps)
     memory = {} if memory is None else memory
     name, structure, options = _structures(kinematics, log)
+    if for_control:
+        options = {words: grow for words, grow in options.items() if words not in (FEEDBACK, LATE_INPUTS)}
     candidates: list[Candidate] = []
     best, models = 0, []
     for words, grow in [("", lambda model: model), *options.items()]:
@@ -171,6 +185,10 @@ def learn(
         np.stack([values.min(axis=0), values.max(axis=0)]),
         len(log),
         tuple(run.name for run in log),
+        log.mapping.column_names("states"),
+        log.mapping.column_names("inputs"),
+        log.mapping.column_names("context"),
+        log.time_step,
     )
 
 
@@ -207,8 +225,8 @@ def _structures(kinematics: Kinematics, log: Log) -> tuple[str, LogModel, dict[s
         {
             "force disturbance": lambda model: replace(model, history=(PAST,) * 3 + (0,) * 3),
             "motor torque": lambda model: replace(model, nominal=replace(model.nominal, torque=True)),
-            "feedback": lambda model: replace(model, nominal=replace(model.nominal, feedback=True)),
-            f"inputs {LATE} rows late": lambda model: replace(model, lag=LATE) if model.nominal.torque else None,
+            FEEDBACK: lambda model: replace(model, nominal=replace(model.nominal, feedback=True)),
+            LATE_INPUTS: lambda model: replace(model, lag=LATE) if model.nominal.torque else None,
             "torque disturbance": lambda model: (
                 replace(model, history=(*model.history[:3], PAST, PAST, PAST)) if model.nominal.torque else None
             ),

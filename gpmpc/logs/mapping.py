@@ -166,6 +166,23 @@ class LogMapping:
         """The signals of one role."""
         return tuple(signal for signal in self.signals if signal.role == role)
 
+    def column_names(self, role: Role) -> tuple[str, ...]:
+        """The columns of one role in the order that they come out in, with what was done to their values."""
+        found = []
+        for signal in self.of(role):
+            names, turned = signal.columns, signal.kind == "euler"
+            if signal.kind == "quaternion" and signal.order == "wxyz":
+                names = (*names[1:], names[0])
+            elif turned:
+                names = signal.group.entries
+            factor = signal.scale * UNITS.get(signal.unit, ("", 1.0))[1]
+            other = self.model == "rigid_body" and signal.frame == {"m/s": "body", "rad/s": "world"}.get(
+                signal.group.unit
+            )
+            done = f" times {factor:.6g}" * (factor != 1 and not turned) + " in other axes" * other
+            found += [f"{name}{done}" for name in names]
+        return tuple(found)
+
     @property
     def space(self) -> StateSpace:
         """The space of the states."""

@@ -21,7 +21,7 @@ from gpmpc.logs.nominal import AffineNominal, MultirotorNominal, Nominal, Still
 from gpmpc.logs.rollouts import LogModel, OutputGP
 from gpmpc.logs.state_space import StateGroup, StateSpace
 
-FORMAT, VERSION = "gpmpc model of a log", 1
+FORMAT, VERSION = "gpmpc model of a log", 2
 _KERNEL = ("lengthscales", "signal_variance", "noise_variance")
 
 
@@ -50,6 +50,8 @@ def save_learned(learned: Learned, path: str | Path) -> None:
         "candidates": [[c.name, c.chosen, c.errors.tolist()] for c in learned.candidates],
         "rows": learned.rows,
         "runs": learned.runs,
+        "names": [learned.state_names, learned.input_names, learned.context_names],
+        "time_step": learned.time_step,
     }
     arrays = {"theta": model.theta, "standard_errors": learned.fit.standard_errors, "ranges": learned.ranges}
     arrays |= {f"noise/{key}": getattr(learned.noise, key) for key in ("outputs", "measurement", "level")}
@@ -61,6 +63,15 @@ def save_learned(learned: Learned, path: str | Path) -> None:
         write_whole(path, content)
     except OSError as error:
         raise SettingError("path", f"cannot write to {path}: {error.strerror}") from error
+
+
+def holds_learned(path: str | Path) -> bool:
+    """Whether a file is one of ``save_learned``, of whatever version."""
+    try:
+        with safe_open(str(path), "numpy") as file:
+            return json.loads((file.metadata() or {}).get("gpmpc", "{}")).get("format") == FORMAT
+    except (SafetensorError, OSError, ValueError):
+        return False
 
 
 def load_learned(path: str | Path) -> Learned:
@@ -100,6 +111,7 @@ def _learned(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Learned:
             own["features"], own["targets"], lengthscales, signal, noise, 0, "value", own["offset"]
         )
         gps.append(OutputGP(tuple(outputs), posterior))
+    states, inputs, context = (tuple(names) for names in header["names"])
     model = LogModel(kinematics, nominal, arrays["theta"], tuple(header["history"]), header["lag"], tuple(gps))
     return Learned(
         model,
@@ -111,4 +123,8 @@ def _learned(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Learned:
         arrays["ranges"],
         header["rows"],
         tuple(header["runs"]),
+        states,
+        inputs,
+        context,
+        header["time_step"],
     )

@@ -13,13 +13,7 @@ if TYPE_CHECKING:
 
 @styled
 def innovations_figure(run: "FilterRun", time_step: float = 1.0, names: list[str] | None = None) -> Figure:
-    """Draws each measured value's innovations over their standard deviation, and the share outside of 95 %.
-
-    Args:
-        run: A log, filtered.
-        time_step: [s].
-        names: Of the measured values.
-    """
+    """Draws each measured value's innovations over their standard deviation, and the share outside of 95 %."""
     deviations = run.innovation_covariances.diagonal(dim1=-2, dim2=-1).sqrt()
     white = (run.innovations / deviations).cpu().numpy()
     p, times = white.shape[1], time_step * np.arange(len(white))

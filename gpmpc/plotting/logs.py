@@ -10,11 +10,11 @@ if TYPE_CHECKING:
     from gpmpc.logs.inspection import Channel, Inspection
     from gpmpc.logs.judging import Judgement
 
-MODEL = "#08306b"
-OTHERS = ("#999999", "#e8871e", "#2e8b57", "#d070b0", "#8c6d31")  # told apart without colour by their markers
-MARKERS = ("s", "^", "v", "D", "P")
-MOST_POINTS = 3000  # of a line
-PER_PAGE = 24  # channels drawn
+_MODEL = "#08306b"
+_OTHERS = ("#999999", "#e8871e", "#2e8b57", "#d070b0", "#8c6d31")  # told apart without colour by their markers
+_MARKERS = ("s", "^", "v", "D", "P")
+_MOST_POINTS = 3000  # of a line
+_PER_PAGE = 24  # channels drawn
 
 
 def judgement_figure(judgement: "Judgement") -> Figure:
@@ -24,18 +24,20 @@ def judgement_figure(judgement: "Judgement") -> Figure:
     axes = figure.subplots(2, groups, squeeze=False, gridspec_kw={"height_ratios": [3, 1.6]})
     for g, (axis, below) in enumerate(axes.T):
         others = [name for name in judgement.mean if name != "model"]
-        for name, colour, marker in zip(others, OTHERS, MARKERS, strict=False):
+        for name, colour, marker in zip(others, _OTHERS, _MARKERS, strict=False):
             errors = np.where(np.isfinite(judgement.mean[name][:, g]), judgement.mean[name][:, g], np.nan)
             axis.loglog(judgement.steps, errors, color=colour, marker=marker, markersize=4, linewidth=1, label=name)
-        axis.loglog(judgement.steps, judgement.mean["model"][:, g], color=MODEL, marker="o", linewidth=2, label="model")
+        axis.loglog(
+            judgement.steps, judgement.mean["model"][:, g], color=_MODEL, marker="o", linewidth=2, label="model"
+        )
         axis.set_title(judgement.groups[g])
         axis.set_ylabel(f"mean error [{judgement.units[g]}]")
         low, high = np.moveaxis(judgement.coverage_interval[:, g], -1, 0)
         bars = [judgement.coverage[:, g] - low, high - judgement.coverage[:, g]]
         below.errorbar(
-            judgement.steps, judgement.coverage[:, g], np.maximum(bars, 0), color=MODEL, marker="o", capsize=3
+            judgement.steps, judgement.coverage[:, g], np.maximum(bars, 0), color=_MODEL, marker="o", capsize=3
         )
-        below.plot(judgement.steps, judgement.width[:, g], color=OTHERS[1], marker="s", linestyle="--")
+        below.plot(judgement.steps, judgement.width[:, g], color=_OTHERS[1], marker="s", linestyle="--")
         below.axhline(judgement.level, color="0.6", linewidth=0.8)
         below.set_xscale("log")
         below.set_ylim(0.5, 1.5)
@@ -52,7 +54,7 @@ def judgement_figure(judgement: "Judgement") -> Figure:
 
 def inspection_figure(inspection: "Inspection") -> Figure:
     """Draws each channel over the time, with its gaps, on one page."""
-    channels = inspection.channels[:PER_PAGE]
+    channels = inspection.channels[:_PER_PAGE]
     columns = 2 if len(channels) > 6 else 1
     rows = -(-len(channels) // columns)
     figure = Figure(figsize=(10, 1.1 * rows + 1), layout="constrained")
@@ -68,9 +70,9 @@ def inspection_figure(inspection: "Inspection") -> Figure:
 
 
 def _draw(axis, channel: "Channel", gaps: Sequence[tuple[float, float]]) -> None:
-    axis.plot(channel.time, channel.values, color=MODEL, linewidth=0.7)
+    axis.plot(channel.time, channel.values, color=_MODEL, linewidth=0.7)
     for begin, end in gaps[:200]:
-        axis.axvspan(begin, end, color=OTHERS[1], alpha=0.4, linewidth=0)
+        axis.axvspan(begin, end, color=_OTHERS[1], alpha=0.4, linewidth=0)
     axis.set_ylabel(channel.name, rotation=0, ha="right", va="center", fontsize=7)
     axis.tick_params(labelsize=7)
     axis.spines[["top", "right"]].set_visible(False)

@@ -5,17 +5,17 @@ from collections.abc import Mapping, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import NullLocator
 
-from gpmpc.plotting.style import BLACK, COLOURS, DASHED, styled
+from gpmpc.plotting.style import BLACK, COLOURS, DASHED, plain_numbers, styled
 
-SIZE = (9.0, 6.2)  # [in]: at 100 dots an inch as wide as a README
-CURVES = 5
-MARKERS = ("o", "^", "s", "D", "v", "P", "X")
-OTHERS = "0.75"
-FRONT = "0.35"
-TICKS = (-1, 0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # [%]
-LINEAR = 1.0  # [%] of cost up to which the axis is linear
+_SIZE = (9.0, 6.2)  # [in]: at 100 dots an inch as wide as a README
+_CURVES = 5
+_MARKERS = ("o", "^", "s", "D", "v", "P", "X")
+_OTHERS = "0.75"
+_FRONT = "0.35"
+_TICKS = (-1, 0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # [%]
+_LINEAR = 1.0  # [%] of cost up to which the axis is linear
 
 
 @styled
@@ -30,13 +30,13 @@ def quality(rows: Sequence[Mapping]) -> Figure:
         rows: Of the quality study; lost ones are counted in the corner.
     """
     flown, horizons = [row for row in rows if row["lost"] is None], sorted({row["H"] for row in rows})
-    markers = {horizon: MARKERS[i % len(MARKERS)] for i, horizon in enumerate(horizons)}
-    figure = Figure(figsize=SIZE, layout="constrained")
+    markers = {horizon: _MARKERS[i % len(_MARKERS)] for i, horizon in enumerate(horizons)}
+    figure = Figure(figsize=_SIZE, layout="constrained")
     axis = figure.subplots()
     axis.set_title(f"gpmpc quality: {len({row['what'] for row in rows})} choices of settings over the horizon")
     axis.axhline(0, color=BLACK, linewidth=0.8, linestyle=DASHED, zorder=1)
     for row in flown:
-        axis.plot(row["median"], _excess(row), markers[row["H"]], color=OTHERS, markersize=4, zorder=2)
+        axis.plot(row["median"], _excess(row), markers[row["H"]], color=_OTHERS, markersize=4, zorder=2)
     curves = _curves(flown)
     for (_, line), colour in zip(curves.items(), COLOURS, strict=False):
         at = [(row["median"], _excess(row)) for row in line]
@@ -62,7 +62,7 @@ def _curves(rows: Sequence[Mapping]) -> dict[str, list[Mapping]]:
     best: dict[str, str] = {}
     for what in sorted(lines, key=merit):
         best.setdefault(what.split()[0], what)
-    return {what: lines[what] for what in list(best.values())[:CURVES]}
+    return {what: lines[what] for what in list(best.values())[:_CURVES]}
 
 
 def _excess(row: Mapping) -> float:
@@ -72,18 +72,16 @@ def _excess(row: Mapping) -> float:
 
 def _scales(axis: Axes, rows: Sequence[Mapping]) -> None:
     axis.set_xscale("log")
-    axis.set_yscale("symlog", linthresh=LINEAR, linscale=0.4)
+    axis.set_yscale("symlog", linthresh=_LINEAR, linscale=0.4)
     axis.set_xlabel("median time of a decision [ms], one thread")
     axis.set_ylabel("closed-loop cost above NMPC on the true model")
-    axis.xaxis.set_major_locator(LogLocator(10, (1, 2, 5)))
-    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.xaxis.set_minor_formatter(NullFormatter())
+    plain_numbers(axis.xaxis, few=True)
     values = [_excess(row) for row in rows] or [0.0]
     low, high = min(values), max(values)
-    reach = [tick for tick in TICKS if low * 1.5 - 1 <= tick <= high * 1.5 + 1]
+    reach = [tick for tick in _TICKS if low * 1.5 - 1 <= tick <= high * 1.5 + 1]
     axis.set_yticks(reach, [f"{tick:+d} %" if tick else "0" for tick in reach])
     axis.yaxis.set_minor_locator(NullLocator())
-    axis.set_ylim(min(1.5 * low, 0) - 0.4, 1.7 * max(high, LINEAR))
+    axis.set_ylim(min(1.5 * low, 0) - 0.4, 1.7 * max(high, _LINEAR))
     times = [row["median"] for row in rows] or [1.0]
     axis.set_xlim(min(times) / 1.7, max(times) * 1.6)
 
@@ -98,11 +96,11 @@ def _front(axis: Axes, members: Sequence[Mapping]) -> None:
     stair = [(at[0][0], top)]
     for x, y in at:
         stair += [(x, stair[-1][1]), (x, y)]
-    axis.plot(*zip(*stair, (right, at[-1][1]), strict=True), color=FRONT, linewidth=1.4, zorder=1.5)
+    axis.plot(*zip(*stair, (right, at[-1][1]), strict=True), color=_FRONT, linewidth=1.4, zorder=1.5)
     axis.set_xlim(right=right)
     axis.set_ylim(top=top)
     for number, (x, y) in enumerate(at, 1):
-        axis.plot(x, y, "o", markersize=11, markerfacecolor="none", markeredgecolor=FRONT, markeredgewidth=1.2)
+        axis.plot(x, y, "o", markersize=11, markerfacecolor="none", markeredgecolor=_FRONT, markeredgewidth=1.2)
         # Below and left of a member of the front there is nobody.
         axis.annotate(
             str(number),
@@ -126,9 +124,9 @@ def _legends(axis: Axes, colours: Mapping[str, str], markers: Mapping[int, str],
     """Curves by colour above, horizons by marker beside them."""
     plain = {"linestyle": "none", "markersize": 5.5}
     lines = [Line2D([], [], color=colour, marker="o", markersize=5.5, label=name) for name, colour in colours.items()]
-    lines.append(Line2D([], [], color=OTHERS, marker="o", **plain, label="other settings"))
-    lines.append(Line2D([], [], color=FRONT, linewidth=1.4, label="front: none is better and faster"))
+    lines.append(Line2D([], [], color=_OTHERS, marker="o", **plain, label="other settings"))
+    lines.append(Line2D([], [], color=_FRONT, linewidth=1.4, label="front: none is better and faster"))
     lines += [Line2D([], [], color="0.4", marker=kind, **plain, label=f"H = {H}") for H, kind in markers.items()]
     axis.figure.legend(handles=lines, loc="outside upper center", ncols=3, fontsize=8.5)
     if lost:
-        axis.text(0.99, 0.98, f"lost: {lost}", transform=axis.transAxes, ha="right", va="top", color=FRONT)
+        axis.text(0.99, 0.98, f"lost: {lost}", transform=axis.transAxes, ha="right", va="top", color=_FRONT)

@@ -10,19 +10,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from gpmpc.plotting.style import BLUE, DASHED, GREY, ORANGE, SKY, VERMILION, legend_below, name_of, styled
+from gpmpc.plotting.style import (
+    BLUE,
+    DASHED,
+    GREY,
+    ORANGE,
+    SKY,
+    VERMILION,
+    legend_below,
+    name_of,
+    plain_numbers,
+    styled,
+)
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
 
-FLOWN, REFERENCE, TUBE, BOUND, FAILED = BLUE, VERMILION, SKY, GREY, ORANGE
-STAGES = ("model", "build", "solve")
-STAGE_COLOURS = (BLUE, SKY, VERMILION)
+FLOWN, REFERENCE, TUBE, _BOUND, _FAILED = BLUE, VERMILION, SKY, GREY, ORANGE
+_STAGES = ("model", "build", "solve")
+_STAGE_COLOURS = (BLUE, SKY, VERMILION)
 
 
-def tracked_of(run: "Run") -> list[int]:
+def _tracked_of(run: "Run") -> list[int]:
     """Indices of the states that errors are reported of, as the recording says; of all where it does not."""
     tracked = run.metadata.get("run", {}).get("tracked", "").split()
     found = [run.state_names.index(name) for name in tracked if name in run.state_names]
@@ -54,17 +64,20 @@ def _noise(run: "Run") -> np.ndarray:
 @styled
 def tracking_figure(run: "Run") -> Figure:
     """Every axis over time against its reference, and below it the error with the tube."""
-    states = tracked_of(run)
+    states = _tracked_of(run)
     mean, std = expected(run, states)
     figure = Figure(figsize=(2.9 * max(len(states), 2), 4.8), layout="constrained")
-    figure.suptitle(title_of(run))
+    figure.suptitle(_title_of(run))
     axes = figure.subplots(2, len(states), squeeze=False, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
     for column, i in enumerate(states):
         above, below = axes[:, column]
         reference = run.references[:, i]
         above.plot(run.times, run.states[:, i], color=FLOWN, linewidth=1.6, label="flown")
         above.plot(run.times, reference, color=REFERENCE, linewidth=1.2, linestyle=DASHED, label="reference")
-        above.set_title(_state_name(run, i))
+        name = run.state_names[i]
+        above.set_title(
+            name_of(name, _unit(run, f"state.{name}"), run.metadata.get("frames", {}).get("z axis") != "up")
+        )
         error, band = mean[:, column] - reference, 2 * std[:, column]
         below.axhline(0, color=REFERENCE, linewidth=1, linestyle=DASHED)
         below.fill_between(
@@ -79,7 +92,7 @@ def tracking_figure(run: "Run") -> Figure:
         below.plot(run.times, run.states[:, i] - reference, color=FLOWN, linewidth=1.2)
         _failures(run, (above, below))
         below.set_xlabel("time [s]")
-    axes[1, 0].set_ylabel(f"error{_unit(run, states[0])}")
+    axes[1, 0].set_ylabel(name_of("error", _unit(run, f"state.{run.state_names[states[0]]}")))
     legend_below(figure, axes.ravel())
     figure.align_ylabels(axes[:, 0])
     return figure
@@ -88,15 +101,15 @@ def tracking_figure(run: "Run") -> Figure:
 @styled
 def inputs_figure(run: "Run") -> Figure:
     """What acted, over time, with its bounds."""
-    m, units = len(run.input_names), run.metadata.get("units", {})
+    m = len(run.input_names)
     figure = Figure(figsize=(7.2, 1.6 * m + 1.0), layout="constrained")
-    figure.suptitle(title_of(run))
+    figure.suptitle(_title_of(run))
     axes = figure.subplots(m, 1, squeeze=False, sharex=True)[:, 0]
     for i, axis in enumerate(axes):
         held = np.append(run.inputs[:, i], run.inputs[-1:, i])  # the last one until its step ends
         axis.step(_edges(run), held, where="post", color=FLOWN, linewidth=1.4, label="applied")
         _bounds(axis, run.inputs[:, i], run.input_bounds[:, i])
-        axis.set_ylabel(name_of(run.input_names[i], units.get(f"input.{run.input_names[i]}", "")))
+        axis.set_ylabel(name_of(run.input_names[i], _unit(run, f"input.{run.input_names[i]}")))
         _failures(run, (axis,))
     axes[-1].set_xlabel("time [s]")
     legend_below(figure, axes)
@@ -109,10 +122,10 @@ def timing_figure(run: "Run") -> Figure:
     """Where the time of every decision went, and how the totals are distributed."""
     milliseconds = 1e3 * run.timings
     figure = Figure(figsize=(8.4, 3.6), layout="constrained")
-    figure.suptitle(title_of(run))
+    figure.suptitle(_title_of(run))
     over_time, distribution = figure.subplots(1, 2, gridspec_kw={"width_ratios": [3, 2]})
     edges, bottom = _edges(run), np.zeros(len(run.times))
-    for j, (name, colour) in enumerate(zip(STAGES, STAGE_COLOURS, strict=True)):
+    for j, (name, colour) in enumerate(zip(_STAGES, _STAGE_COLOURS, strict=True)):
         top = bottom + milliseconds[:, j]
         over_time.stairs(top, edges, baseline=bottom, fill=True, color=colour, label=name)
         bottom = top
@@ -129,15 +142,10 @@ def timing_figure(run: "Run") -> Figure:
     distribution.step(total, np.arange(1, len(total) + 1) / len(total), where="post", color=FLOWN)
     if total[0] > 0 and total[-1] > 5 * total[0]:
         distribution.set_xscale("log")
-        if total[-1] < 300 * total[0]:  # few decades: their names alone say little
-            distribution.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        else:  # as many as fit beside each other
-            distribution.xaxis.set_major_locator(LogLocator(numticks=5))
-        distribution.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        distribution.xaxis.set_minor_formatter(NullFormatter())
+        plain_numbers(distribution.xaxis, few=total[-1] < 300 * total[0])
     median, most = (float(np.quantile(total, share)) for share in (0.5, 0.99))
     for value in (median, most):
-        distribution.axvline(value, color=BOUND, linewidth=1, linestyle=DASHED)
+        distribution.axvline(value, color=_BOUND, linewidth=1, linestyle=DASHED)
     distribution.set_title(f"median {_duration(median)}, 99 % below {_duration(most)}", fontsize="small")
     distribution.set_ylim(0, 1.02)
     distribution.set_xlabel("time of a decision [ms]")
@@ -156,23 +164,14 @@ def _duration(milliseconds: float) -> str:
     return f"{milliseconds:.3g} ms" if milliseconds < 999.5 else f"{milliseconds / 1e3:.3g} s"
 
 
-def title_of(run: "Run") -> str:
+def _title_of(run: "Run") -> str:
     """Returns what was run: the command, or the file."""
     command = run.metadata.get("run", {}).get("command", "")
     return textwrap.fill(command if command.startswith("gpmpc") else str(run.path), 90, max_lines=2, placeholder=" ...")
 
 
-def _state_name(run: "Run", state: int) -> str:
-    z_down = run.metadata.get("frames", {}).get("z axis") != "up"
-    return name_of(
-        run.state_names[state], run.metadata.get("units", {}).get(f"state.{run.state_names[state]}", ""), z_down
-    )
-
-
-def _unit(run: "Run", state: int) -> str:
-    """The unit of a state, in brackets."""
-    unit = run.metadata.get("units", {}).get(f"state.{run.state_names[state]}", "")
-    return f" [{unit}]" if unit else ""
+def _unit(run: "Run", field: str) -> str:
+    return run.metadata.get("units", {}).get(field, "")
 
 
 def _bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
@@ -182,13 +181,13 @@ def _bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
     limits = [limit for limit in bounds if np.isfinite(limit)]
     near = [limit for limit in limits if low - 2 * span <= limit <= high + 2 * span]
     for limit in near:
-        axis.axhline(limit, color=BOUND, linestyle=DASHED, linewidth=1, label="bound")
+        axis.axhline(limit, color=_BOUND, linestyle=DASHED, linewidth=1, label="bound")
     low, high = min([low, *near]), max([high, *near])
     axis.set_ylim(low - 0.12 * max(high - low, span), high + 0.25 * max(high - low, span))
     if len(near) < len(limits):
         text = "bounds " + " and ".join(f"{limit:g}" for limit in limits)
         axis.annotate(
-            text, (0.995, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize="small", color=BOUND
+            text, (0.995, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize="small", color=_BOUND
         )
 
 
@@ -197,4 +196,6 @@ def _failures(run: "Run", axes: tuple[Axes, ...]) -> None:
     times = run.times[run.failed]
     for axis in axes:
         for j, time in enumerate(times):
-            axis.axvline(time, color=FAILED, linewidth=1, alpha=0.6, label="failed solve" if j == 0 else None, zorder=0)
+            axis.axvline(
+                time, color=_FAILED, linewidth=1, alpha=0.6, label="failed solve" if j == 0 else None, zorder=0
+            )

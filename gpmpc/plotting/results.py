@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, NullFormatter, NullLocator, PercentFormatter
+from matplotlib.ticker import MaxNLocator, NullLocator, PercentFormatter
 
-from gpmpc.plotting.style import BLUE, COLOURS, DASHED, DASHES, SKY, VERMILION, add_legend, legend_below, styled
+from gpmpc.plotting.style import COLOURS, DASHED, DASHES, VERMILION, add_legend, legend_below, styled
+from gpmpc.plotting.sweeps import Series, draw_quartiles
 
 if TYPE_CHECKING:
     from gpmpc.calibration import Calibration
@@ -17,63 +18,44 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Panel:
-    """One panel of ``error_over_size``.
+    """One panel of ``error_over_size``."""
 
-    Attributes:
-        title: Above the panel.
-        draws: Errors of all draws by training size.
-        paper: The paper's figure by training size.
-    """
-
-    title: str
-    draws: dict[int, list[float]]
-    paper: dict[int, float]
+    title: str  # above the panel
+    draws: dict[int, list[float]]  # errors of all draws by training size
+    paper: dict[int, float]  # the paper's figure by training size
 
 
 @styled
 def error_over_size(panels: Sequence[Panel], label: str, title: str = "") -> Figure:
-    """Boxes and draws of an error over the training size, with the paper's points on them; logarithmic."""
-    columns = min(2, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
-    figure.suptitle(title)
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    """Draws of an error over the training size with their quartiles, and the paper's points; logarithmic."""
+    figure, axes = _panels(len(panels), 4.6, 3.4, title)
     for axis, panel in zip(axes, panels, strict=False):
         sizes = sorted(panel.draws)
-        axis.set_title(panel.title)
-        axis.set_xlabel("training points N")
+        axis.set(title=panel.title, xlabel="training points N")
         if not sizes:  # every fit failed
             axis.set_axis_off()
             continue
-        positions = range(len(sizes))
-        axis.boxplot(
-            [list(panel.draws[size]) for size in sizes],
-            positions=positions,
-            whis=(0, 100),
-            widths=0.5,
-            patch_artist=True,
-            boxprops={"facecolor": SKY, "edgecolor": BLUE},
-            whiskerprops={"color": BLUE},
-            capprops={"color": BLUE},
-            medianprops={"color": BLUE, "linewidth": 1.8},
-        )
-        for position, size in enumerate(sizes):  # the draws themselves: a box hides that there are two modes
-            draws = list(panel.draws[size])
-            aside = [0.18 * ((7 * i) % 11 / 5 - 1) for i in range(len(draws))]
-            named = {} if position else {"label": "our draws, in boxes of their quartiles"}
-            axis.plot([position + a for a in aside], draws, ".", color=BLUE, alpha=0.55, markersize=4, **named)
-        known = [(position, panel.paper[size]) for position, size in enumerate(sizes) if size in panel.paper]
-        if known:
-            axis.plot(*zip(*known, strict=True), "o", color=VERMILION, markersize=6, zorder=3, label="paper")
+        draws = Series("our draws, with their quartiles", [panel.draws[size] for size in sizes])
+        draw_quartiles(axis, [draws], [str(size) for size in sizes])
+        if known := {size: panel.paper[size] for size in sizes if size in panel.paper}:
+            axis.plot([*known], [*known.values()], "o", color=VERMILION, markersize=6, zorder=3, label="paper")
         axis.set_yscale("log")
         axis.yaxis.set_minor_locator(NullLocator())
-        axis.yaxis.set_minor_formatter(NullFormatter())
-        axis.set_xticks(list(positions), [str(size) for size in sizes])
-    for axis in axes[len(panels) :]:
-        axis.set_visible(False)
     legend_below(figure, axes)
     figure.supylabel(label)
     return figure
+
+
+def _panels(count: int, width: float, height: float, title: str) -> tuple[Figure, Any]:
+    """Makes a figure of panels in two columns."""
+    columns = min(2, count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(width * columns, height * rows + 0.8 * (rows > 1)), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis in axes[count:]:
+        axis.set_visible(False)
+    return figure, axes
 
 
 @styled
@@ -117,23 +99,14 @@ def calibration_figure(calibration: "Calibration") -> Figure:
 
 @dataclass(frozen=True)
 class Curve:
-    """One line in each panel of a group.
+    """One line in each panel of a group."""
 
-    Attributes:
-        label: In the legend.
-        at: Where the values lie on the horizontal axis (K,).
-        values: A column a panel (K, p).
-        wanted: What they were to be (K or more, p); None where there is nothing.
-        bounds: Lower and upper, an entry a panel; None without.
-        interval: Lower and upper end of what is doubtful of the first column (K, 2).
-    """
-
-    label: str
-    at: np.ndarray
-    values: np.ndarray
-    wanted: np.ndarray | None = None
-    bounds: Sequence[Sequence[float]] | None = None
-    interval: np.ndarray | None = None
+    label: str  # in the legend
+    at: np.ndarray  # where the values lie on the horizontal axis (K,)
+    values: np.ndarray  # A column a panel (K, p)
+    wanted: np.ndarray | None = None  # what they were to be (K or more, p); None where there is nothing
+    bounds: Sequence[Sequence[float]] | None = None  # lower and upper, an entry a panel; None without
+    interval: np.ndarray | None = None  # lower and upper end of what is doubtful of the first column (K, 2)
 
 
 @styled
@@ -177,11 +150,7 @@ def over_settings(
     title: str = "",
 ) -> Figure:
     """One measure over a setting, a panel a title, with intervals; logarithmic, or with the diagonal drawn in."""
-    columns = min(2, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(4.8 * columns, 3.3 * rows + 0.8), layout="constrained")
-    figure.suptitle(title)
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    figure, axes = _panels(len(panels), 4.8, 3.5, title)
     handles: dict[str, Any] = {}
     for axis, (heading, curves) in zip(axes, panels.items(), strict=False):
         axis.set_title(heading)
@@ -212,7 +181,5 @@ def over_settings(
             (line,) = axis.plot([0, end], [0, end], color="0.4", linestyle=DASHED, linewidth=1)
             handles.setdefault("what is allowed", line)
             axis.set_ylim(bottom=0)
-    for axis in axes[len(panels) :]:
-        axis.set_visible(False)
     add_legend(figure, list(handles.values()), list(handles))
     return figure

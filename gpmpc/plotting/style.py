@@ -10,14 +10,16 @@ from typing import Any
 import matplotlib as mpl
 from cycler import cycler
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-BLUE, VERMILION, GREEN, PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
+BLUE, VERMILION, GREEN, _PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
 ORANGE, SKY, BLACK, GREY = "#e69f00", "#56b4e9", "#000000", "0.45"
-COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK, GREY)
+COLOURS = (BLUE, VERMILION, GREEN, _PURPLE, ORANGE, SKY, BLACK, GREY)
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.6)), (0, (6, 2, 1.2, 2)), (0, (3, 3)), (0, (8, 2)))
 DASHED = (0, (4, 3))  # of references and bounds
-STYLE: Any = {
+_STYLE: Any = {
     "axes.axisbelow": True,
     "axes.grid": True,
     "axes.prop_cycle": cycler(color=COLOURS),
@@ -29,7 +31,7 @@ STYLE: Any = {
     "legend.frameon": False,
     "lines.linewidth": 1.4,
 }
-NAMES = {
+_NAMES = {
     "z": "z, downwards",
     "phi": "roll",
     "theta": "pitch",
@@ -39,18 +41,25 @@ NAMES = {
     "uy": "direction uy",
 }
 
-styled = mpl.rc_context(STYLE)  # a decorator of what makes a figure
+styled = mpl.rc_context(_STYLE)  # a decorator of what makes a figure
 
 
 def name_of(name: str, unit: str = "", z_down: bool = True) -> str:
     """Returns the full name of a state or input with its unit, such as ``z, downwards [m]``."""
-    full = name if name == "z" and not z_down else NAMES.get(name, name)
+    full = name if name == "z" and not z_down else _NAMES.get(name, name)
     return f"{full} [{unit}]" if unit not in ("", "1", "?") else full
 
 
 def clipped(text: str, most: int) -> str:
     """Returns a text of at most so many characters, the rest of a longer one as dots."""
     return text if len(text) <= most else f"{text[: most - 4]} ..."
+
+
+def plain_numbers(axis: Axis, few: bool) -> None:
+    """Labels a logarithmic axis by plain numbers; over few decades by 2 and 5 between them as well."""
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if few else LogLocator(numticks=5))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def legend_below(figure: Figure, axes: Iterable[Axes]) -> None:

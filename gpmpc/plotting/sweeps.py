@@ -6,22 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
-from gpmpc.plotting.style import COLOURS, add_legend, clipped, styled
+from gpmpc.plotting.style import COLOURS, add_legend, clipped, plain_numbers, styled
 
 
 @dataclass(frozen=True)
 class Series:
-    """One line of a figure.
+    """One line of a figure."""
 
-    Attributes:
-        label: In the legend.
-        values: The runs' values by position on the axis; a position may have none.
-    """
-
-    label: str
-    values: Sequence[Sequence[float]]
+    label: str  # in the legend
+    values: Sequence[Sequence[float]]  # the runs' values by position on the axis; a position may have none
 
 
 @styled
@@ -45,7 +40,7 @@ def over_variable(
     drawn = [line for line in lines if any(line.values)]
     figure = Figure(figsize=(4.8, 3.4 + 0.11 * len(drawn)), layout="constrained")
     axis = figure.subplots()
-    _draw(axis, lines, positions)
+    draw_quartiles(axis, lines, positions)
     axis.set_title(label, fontsize="medium")
     axis.set_xlabel(clipped(title, 50))
     if max(map(len, positions)) * len(positions) > 40:
@@ -53,10 +48,7 @@ def over_variable(
     values = [v for line in lines for group in line.values for v in group]
     if logarithmic and values and min(values) > 0 and max(values) > 3 * min(values):
         axis.set_yscale("log")
-        if max(values) < 30 * min(values):  # hardly a decade: its name alone says little
-            axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.yaxis.set_minor_formatter(NullFormatter())
+        plain_numbers(axis.yaxis, few=max(values) < 30 * min(values))
     elif not values or max(values) <= 0:
         axis.set_ylim(0, 1)
     elif min(values) >= 0:
@@ -66,7 +58,8 @@ def over_variable(
     return figure
 
 
-def _draw(axis: Axes, lines: Sequence[Series], positions: Sequence[str]) -> None:
+def draw_quartiles(axis: Axes, lines: Sequence[Series], positions: Sequence[str]) -> None:
+    """Draws median, quartiles and every value of each line at each position."""
     numbers = _numbers(positions)
     wide = numbers is not None and numbers[0] > 0 and numbers[-1] >= 10 * numbers[0]
     at = np.arange(float(len(positions))) if numbers is None else np.log10(numbers) if wide else numbers

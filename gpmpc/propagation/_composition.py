@@ -23,31 +23,18 @@ _NOT_WANTED: Any = None
 
 
 class Latent(NamedTuple):
-    """Moments of f at x_s ~ N(mu_s, S_s), with derivatives by mu_s, S_s and u_s where they are wanted.
+    """Moments of f at x_s ~ N(mu_s, S_s), with derivatives by mu_s, S_s and u_s where they are wanted."""
 
-    Attributes:
-        M: E[f] (*batch, k).
-        V: Cov[f] (*batch, k, k).
-        J: E[df/dx_s] (*batch, k, n_s).
-        dM_dS: (*batch, k, n_s, n_s); half of dJ/dmu (Price, 1958).
-        dM_du: (*batch, k, m_s).
-        dV_dmu: (*batch, k, k, n_s).
-        dV_dS: (*batch, k, k, n_s, n_s).
-        dV_du: (*batch, k, k, m_s).
-        dJ_dS: (*batch, k, n_s, n_s, n_s); needed where A is not zero.
-        dJ_du: (*batch, k, n_s, m_s); needed where A is not zero.
-    """
-
-    M: Tensor
-    V: Tensor
-    J: Tensor
-    dM_dS: Tensor = _NOT_WANTED
-    dM_du: Tensor = _NOT_WANTED
-    dV_dmu: Tensor = _NOT_WANTED
-    dV_dS: Tensor = _NOT_WANTED
-    dV_du: Tensor = _NOT_WANTED
-    dJ_dS: Tensor = _NOT_WANTED
-    dJ_du: Tensor = _NOT_WANTED
+    M: Tensor  # E[f] (*batch, k)
+    V: Tensor  # Cov[f] (*batch, k, k)
+    J: Tensor  # E[df/dx_s] (*batch, k, n_s)
+    dM_dS: Tensor = _NOT_WANTED  # (*batch, k, n_s, n_s); half of dJ/dmu (Price, 1958)
+    dM_du: Tensor = _NOT_WANTED  # (*batch, k, m_s)
+    dV_dmu: Tensor = _NOT_WANTED  # (*batch, k, k, n_s)
+    dV_dS: Tensor = _NOT_WANTED  # (*batch, k, k, n_s, n_s)
+    dV_du: Tensor = _NOT_WANTED  # (*batch, k, k, m_s)
+    dJ_dS: Tensor = _NOT_WANTED  # (*batch, k, n_s, n_s, n_s); needed where A is not zero
+    dJ_du: Tensor = _NOT_WANTED  # (*batch, k, n_s, m_s); needed where A is not zero
 
 
 class Composition:

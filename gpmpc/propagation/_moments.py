@@ -42,21 +42,13 @@ _LARGEST = {torch.float64: 300.0, torch.float32: 80.0}  # delta
 
 
 class _OutputTerms(NamedTuple):
-    """What each output needs at a belief of its own; the letters are those of the module's text.
+    """What each output needs at a belief of its own; the letters are those of the module's text."""
 
-    Attributes:
-        z: (*batch, k, N, n).
-        q: (*batch, k, N).
-        half_logdet: 1/2 log|I + S D_a| (*batch, k).
-        G: (*batch, k, n, n).
-        T: (*batch, k, n, n).
-    """
-
-    z: Tensor
-    q: Tensor
-    half_logdet: Tensor
-    G: Tensor
-    T: Tensor
+    z: Tensor  # (*batch, k, N, n)
+    q: Tensor  # (*batch, k, N)
+    half_logdet: Tensor  # 1/2 log|I + S D_a| (*batch, k)
+    G: Tensor  # (*batch, k, n, n)
+    T: Tensor  # (*batch, k, n, n)
 
 
 def moments(

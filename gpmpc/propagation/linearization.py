@@ -23,29 +23,19 @@ from gpmpc.propagation.propagator import Propagation, Propagator, checked_input,
 from gpmpc.propagation.sensitivity import Sensitivity
 
 
-class Expansion(NamedTuple):
-    """The model around a certain state and input.
+class _Expansion(NamedTuple):
+    """The model around a certain state and input."""
 
-    Attributes:
-        belief: The prediction there.
-        A: The mean's derivative by the state (*batch, k, n).
-        B: By the input (*batch, k, m).
-        variance_by_state: (*batch, k, n).
-        variance_by_input: (*batch, k, m).
-        mean_by_state2: Second derivatives (*batch, k, n, n).
-        mean_by_state_input: (*batch, k, n, m).
-    """
-
-    belief: Gaussian
-    A: Tensor
-    B: Tensor
-    variance_by_state: Tensor
-    variance_by_input: Tensor
-    mean_by_state2: Tensor
-    mean_by_state_input: Tensor
+    belief: Gaussian  #: the prediction there
+    A: Tensor  #: the mean's derivative by the state (*batch, k, n)
+    B: Tensor  #: by the input (*batch, k, m)
+    variance_by_state: Tensor  #: (*batch, k, n)
+    variance_by_input: Tensor  #: (*batch, k, m)
+    mean_by_state2: Tensor  #: second derivatives (*batch, k, n, n)
+    mean_by_state_input: Tensor  #: (*batch, k, n, m)
 
 
-def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:
+def expand(model: Any, state: Tensor, input: Tensor) -> _Expansion | None:
     """The expansion of GPs alone, compiled or by torch; None for other models."""
     form = getattr(model, "affine_form", None)
     if form is None or form.B is not None:
@@ -63,7 +53,7 @@ def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:
     mean, A = parts[0] + gp.offset, parts[2]
     if form.A is not None:
         mean, A = mean + state, A + form.A
-    return Expansion(Gaussian(mean, torch.diag_embed(parts[1])), A, *parts[3:])
+    return _Expansion(Gaussian(mean, torch.diag_embed(parts[1])), A, *parts[3:])
 
 
 def _by_torch(model: GPPosterior, state: Tensor, input: Tensor) -> list[Tensor]:

@@ -27,21 +27,13 @@ from gpmpc.propagation.sensitivity import differentiate
 
 @dataclass(frozen=True)
 class LocalModel:
-    """s+ = A s + B u + c near a belief and an input; batched over leading dimensions.
+    """s+ = A s + B u + c near a belief and an input; batched over leading dimensions."""
 
-    Attributes:
-        A: (*batch, p, p), p = n + n^2.
-        B: (*batch, p, m).
-        c: (*batch, p).
-        next: The next belief itself.
-        next_state: It as an extended state, F(s, u) (*batch, p).
-    """
-
-    A: Tensor
-    B: Tensor
-    c: Tensor
-    next: Gaussian
-    next_state: Tensor
+    A: Tensor  #: (*batch, p, p), p = n + n^2
+    B: Tensor  #: (*batch, p, m)
+    c: Tensor  #: (*batch, p)
+    next: Gaussian  #: the next belief itself
+    next_state: Tensor  #: it as an extended state, F(s, u) (*batch, p)
 
     def __call__(self, s: Tensor, input: Tensor) -> Tensor:
         """The next extended state (*batch, p)."""

@@ -14,17 +14,12 @@ from gpmpc.gaussian import Gaussian, check_tensors, nearest_positive_semidefinit
 
 @dataclass(frozen=True)
 class Propagation:
-    """A belief moved one step on.
+    """A belief moved one step on."""
 
-    Attributes:
-        belief: N(mean, covariance) of the next state; the covariance is symmetric positive semidefinite.
-        cross_covariance: Cov[x, x+] (*batch, n, k).
-        deficit: How far below zero the covariance's smallest eigenvalue was before the projection (*batch,). More
-            than round-off of the largest entry: the model is too nearly noise-free for double precision.
-    """
-
-    belief: Gaussian
-    cross_covariance: Tensor
+    belief: Gaussian  #: N(mean, covariance) of the next state; the covariance is symmetric positive semidefinite
+    cross_covariance: Tensor  #: Cov[x, x+] (*batch, n, k)
+    #: how far below zero the covariance's smallest eigenvalue was before the projection (*batch,). More than round-off
+    #: of the largest entry: the model is too nearly noise-free for double precision
     deficit: Tensor
 
 

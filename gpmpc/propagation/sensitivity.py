@@ -21,22 +21,14 @@ class Sensitivity:
 
     Those by Sigma are symmetric in their last two indices: d mu+_a = sum_cd mean_by_covariance[a, c, d] dSigma[c, d]
     for symmetric dSigma.
-
-    Attributes:
-        mean_by_mean: (*batch, k, n).
-        mean_by_covariance: (*batch, k, n, n).
-        mean_by_input: (*batch, k, m).
-        covariance_by_mean: (*batch, k, k, n).
-        covariance_by_covariance: (*batch, k, k, n, n).
-        covariance_by_input: (*batch, k, k, m).
     """
 
-    mean_by_mean: Tensor
-    mean_by_covariance: Tensor
-    mean_by_input: Tensor
-    covariance_by_mean: Tensor
-    covariance_by_covariance: Tensor
-    covariance_by_input: Tensor
+    mean_by_mean: Tensor  #: (*batch, k, n)
+    mean_by_covariance: Tensor  #: (*batch, k, n, n)
+    mean_by_input: Tensor  #: (*batch, k, m)
+    covariance_by_mean: Tensor  #: (*batch, k, k, n)
+    covariance_by_covariance: Tensor  #: (*batch, k, k, n, n)
+    covariance_by_input: Tensor  #: (*batch, k, k, m)
 
     def of_variances(self) -> "Sensitivity":
         """The derivatives where only the diagonal of the next covariance is kept."""

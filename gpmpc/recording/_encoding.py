@@ -31,11 +31,7 @@ class PackedStep(NamedTuple):
 
 
 def pack(step: Step, gp_size: int | None, n: int, m: int, record_problems: bool) -> PackedStep:
-    """Copies a step.
-
-    Raises:
-        ShapeError: An array of the step does not fit n states and m inputs.
-    """
+    """Copies a step."""
     decision = step.decision
     problem: tuple[Any, ...] = ()
     arrays: list[Any] = [step.reference, step.state, step.measured, step.innovation, step.input, step.belief_covariance]

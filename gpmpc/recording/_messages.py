@@ -24,6 +24,7 @@ from gpmpc.status import Status
 STEP, PLAN, QP = "/step", "/plan", "/qp"
 TOPICS = {STEP: "Step", PLAN: "Plan", QP: "QuadraticProgram"}
 TIMING = ("model", "build", "solve", "total")
+POSITION, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "yaw")
 QP_ARRAYS = ("P", "q", "G", "lower", "upper", "softness", "x", "multipliers")
 
 _FIELDS = {
@@ -59,29 +60,17 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 @dataclass(frozen=True)
 class RecordedSystem:
-    """Describes the system whose steps are recorded.
+    """Describes the system whose steps are recorded."""
 
-    Attributes:
-        state_names: Names of the n states; they become field names. x, y, z and phi, theta, psi are drawn in space.
-        input_names: Names of the m inputs.
-        time_step: Of the plant [s]; it dates the stages of a plan.
-        units: By name of state or input, such as ``{"x": "m"}``.
-        input_bounds: Lower and upper bounds of the input (2, m), repeated in every step for plots.
-        frame: Name of the frame that positions are in.
-        z_down: Whether that frame's z axis points downwards, as the quadrotor's does.
-
-    Raises:
-        SettingError: Names that cannot be fields, units of unknown names, a time step that is not positive.
-        ShapeError: Bounds that are not (2, m).
-    """
-
-    state_names: Sequence[str]
-    input_names: Sequence[str]
-    time_step: float  # [s]
-    units: Mapping[str, str] = field(default_factory=dict)
-    input_bounds: Any = None
-    frame: str = "world"
-    z_down: bool = True
+    state_names: Sequence[str]  # names of the n states; they become field names
+    input_names: Sequence[str]  # names of the m inputs
+    time_step: float  # of the plant [s]; it dates the stages of a plan
+    units: Mapping[str, str] = field(default_factory=dict)  # by name of state or input, such as ``{"x": "m"}``
+    input_bounds: Any = None  # lower and upper bounds of the input (2, m), repeated in every step for plots
+    # states of position and attitude (Rz(yaw) Ry(pitch) Rx(roll)) in space, by x, y, z, roll, pitch, yaw
+    pose: Mapping[str, str] = field(default_factory=dict)
+    frame: str = "world"  # name of the frame that positions are in
+    z_down: bool = True  # whether that frame's z axis points downwards, as the quadrotor's does
 
     def __post_init__(self) -> None:
         for key in ("state_names", "input_names"):
@@ -89,9 +78,14 @@ class RecordedSystem:
         check_number("time_step", self.time_step, above=0, unit="[s]")
         if self.input_bounds is not None and np.shape(self.input_bounds) != (2, len(self.input_names)):
             raise ShapeError(f"input bounds must be (2, {len(self.input_names)}); got {np.shape(self.input_bounds)}")
-        if unknown := sorted({*self.units} - {*self.state_names, *self.input_names}):
-            names = ", ".join([*self.state_names, *self.input_names])
-            raise SettingError("units", f"must be of {names}; got {', '.join(unknown)}")
+        states, inputs = self.state_names, self.input_names
+        for key, given, names in (
+            ("units", self.units, (*states, *inputs)),
+            ("pose", self.pose, POSITION + ATTITUDE),
+            ("pose", self.pose.values(), states),
+        ):
+            if unknown := sorted({*given} - {*names}):
+                raise SettingError(key, f"must be of {', '.join(names)}; got {', '.join(unknown)}")
 
     @property
     def field_units(self) -> dict[str, str]:
@@ -105,11 +99,7 @@ class RecordedSystem:
 
 
 def check_names(kind: str, names: Sequence[str]) -> tuple[str, ...]:
-    """Returns the names, if each can be a field of a message and none comes twice.
-
-    Raises:
-        SettingError: They cannot.
-    """
+    """Returns the names, if each can be a field of a message and none comes twice."""
     names = tuple(names)
     if not 1 <= len(names) <= _LARGEST:
         raise SettingError(kind, f"must be 1 to {_LARGEST} names; got {len(names)}")
@@ -150,11 +140,7 @@ def descriptor(states: Sequence[str], inputs: Sequence[str], packed: str = "repe
 
 
 def message_classes(file: FileDescriptorProto) -> dict[str, Any]:
-    """Builds the message classes by their short name.
-
-    Raises:
-        SettingError: Two names are one to protobuf, such as x_1 and x1.
-    """
+    """Builds the message classes by their short name."""
     pool = DescriptorPool()
     try:
         pool.Add(file)

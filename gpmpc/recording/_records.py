@@ -42,11 +42,7 @@ def room(path: Path) -> int:
 
 
 def whole_records(path: Path) -> Iterator[McapRecord]:
-    """Yields schemas, channels, messages, metadata, attachments up to the first broken record; a footer if none is.
-
-    Raises:
-        RecordingError: There is no such file, it is no MCAP file, or its chunks unfold to more than there is ``room``.
-    """
+    """Yields schemas, channels, messages, metadata, attachments up to the first broken record; a footer if none is."""
     try:
         if path.exists() and not path.is_file():
             raise RecordingError(f"{path}: is not a file")
@@ -132,11 +128,7 @@ class _Bounded(BytesIO):
 
 
 def _parsed(data: bytes) -> Iterator[McapRecord]:
-    """Parses records that follow each other; those of an unknown kind are left out.
-
-    Raises:
-        EndOfFile: The last one is cut off; and whatever else MCAP's library raises.
-    """
+    """Parses records that follow each other; those of an unknown kind are left out."""
     stream = _Bounded(data)
     try:
         yield from StreamReader(stream, skip_magic=True, emit_chunks=True).records

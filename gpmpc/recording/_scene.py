@@ -1,11 +1,11 @@
 """Draws steps in space: where the vehicle is, where it should be, where it plans to go and how sure it is.
 
-Position and attitude are recognised by the states' names: x, y, z (one that is missing is 0) and the angles phi, theta,
-psi (roll, pitch, yaw [rad], applied as Rz(psi) Ry(theta) Rx(phi)). The tube of a plan is one ellipsoid per stage, the
-2-sigma surface of the predicted position. A viewer draws some thirty pictures a second, so no more are written.
+``RecordedSystem.pose`` names the states of position and attitude; what has none is 0. The tube of a plan is one
+ellipsoid per stage, the 2-sigma surface of the predicted position. A viewer draws some thirty pictures a second, so no
+more are written.
 
-The plants of this package have their z axis pointing downwards, viewers upwards: the frame ``display`` is the parent of
-the world frame, half a turn about x away, and is the one to look from.
+Viewers have their z axis pointing upwards: the frame ``display`` is the parent of the world frame, half a turn about x
+away where that one's points downwards, and is the one to look from.
 """
 
 from typing import Any
@@ -15,12 +15,11 @@ from foxglove import Context, channels
 from foxglove import messages as fg
 
 from gpmpc.recording._encoding import StepCopy
-from gpmpc.recording._messages import RecordedSystem
+from gpmpc.recording._messages import ATTITUDE, POSITION, RecordedSystem
 
 Array = np.ndarray
 
 DISPLAY, VEHICLE = "display", "vehicle"
-POSITION, ATTITUDE = ("x", "y", "z"), ("phi", "theta", "psi")
 _INTERVAL = 1 / 30  # [s]
 _SIGMAS = 2.0  # radius of the tube in standard deviations
 _TUBE, _LINE = fg.Color(r=0.0, g=0.45, b=0.7, a=0.18), fg.Color(r=0.0, g=0.45, b=0.7, a=0.9)
@@ -28,21 +27,14 @@ _ORIGIN = fg.Pose(position=fg.Vector3(), orientation=fg.Quaternion(w=1.0))
 
 
 class Scene:
-    """Logs the pictures of steps; nothing for states that are neither positions nor attitudes.
-
-    Args:
-        context: Of the recording.
-        system: What is recorded.
-    """
+    """Logs the pictures of steps; nothing for states that are neither positions nor attitudes."""
 
     def __init__(self, context: Context, system: RecordedSystem):
-        states = system.state_names
+        at = {axis: system.state_names.index(name) for axis, name in system.pose.items()}
         self._frame = system.frame
         self._display_turn = fg.Quaternion(x=1.0) if system.z_down else fg.Quaternion(w=1.0)
-        self._axes = [axis for axis, name in enumerate(POSITION) if name in states]
-        self._position = [states.index(POSITION[axis]) for axis in self._axes]
-        self._attitude = [states.index(name) for name in ATTITUDE] if set(ATTITUDE) <= set(states) else []
-        self._next = -np.inf if self._axes or self._attitude else np.inf  # time of the next picture [s]
+        self._position, self._attitude = ([at.get(axis, -1) for axis in axes] for axes in (POSITION, ATTITUDE))
+        self._next = -np.inf if at else np.inf  # time of the next picture [s]
         self._frames = [channels.FrameTransformChannel(topic, context=context) for topic in ("/tf/display", "/tf")]
         self._poses = [channels.PoseInFrameChannel(topic, context=context) for topic in ("/pose", "/reference")]
         self._path = channels.PosesInFrameChannel("/plan/path", context=context)
@@ -72,31 +64,21 @@ class Scene:
                 pose=_ORIGIN,
                 thickness=2.0,
                 scale_invariant=True,
-                points=[fg.Point3(x=x, y=y, z=z) for x, y, z in self._positions(means).tolist()],
+                points=[fg.Point3(x=x, y=y, z=z) for x, y, z in _selected(means, self._position).tolist()],
                 color=_LINE,
             )
             tube = self._ellipsoids(places[2:], copy.plan[2])
             entity = fg.SceneEntity(id="plan", spheres=tube, lines=[line], **at)
             self._tube.log(fg.SceneUpdate(entities=[entity]), log_time=nanoseconds)
 
-    def _positions(self, states: Array) -> Array:
-        """Positions (K, 3) of states (K, n)."""
-        found = np.zeros((len(states), 3))
-        found[:, self._axes] = states[:, self._position]
-        return found
-
     def _places(self, states: Array) -> tuple[list[fg.Vector3], list[fg.Quaternion]]:
         """Where states (K, n) are and how they are turned."""
-        turns = [fg.Quaternion(w=1.0)] * len(states)
-        if self._attitude:
-            turns = _quaternions(_from_angles(states[:, self._attitude]))
-        return [fg.Vector3(x=x, y=y, z=z) for x, y, z in self._positions(states).tolist()], turns
+        places = [fg.Vector3(x=x, y=y, z=z) for x, y, z in _selected(states, self._position).tolist()]
+        return places, _quaternions(_from_angles(_selected(states, self._attitude)))
 
     def _ellipsoids(self, places: list[fg.Vector3], covariances: Array) -> list[fg.SpherePrimitive]:
         """The 2-sigma ellipsoids of covariances (K, n, n), but those without extent."""
-        spatial = np.zeros((len(covariances), 3, 3))
-        axes, position = np.array(self._axes, int), np.array(self._position, int)
-        spatial[:, axes[:, None], axes] = covariances[:, position[:, None], position]
+        spatial = _selected(_selected(covariances, self._position).mT, self._position)
         variances, directions = np.linalg.eigh(np.nan_to_num(spatial, posinf=0.0, neginf=0.0))
         directions[np.linalg.det(directions) < 0, :, 0] *= -1  # reflections are no rotations
         diameters = 2 * _SIGMAS * np.sqrt(np.maximum(variances, 0))
@@ -109,6 +91,11 @@ class Scene:
             )
             if a or b or c
         ]
+
+
+def _selected(values: Array, entries: list[int]) -> Array:
+    """Selects entries of the last axis; -1 stands for one that is 0."""
+    return np.where(np.array(entries) < 0, 0.0, values[..., entries])
 
 
 def _quaternions(numbers: Array) -> list[fg.Quaternion]:

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.recording._messages import PLAN, STEP, TIMING
-from gpmpc.recording._scene import ATTITUDE, DISPLAY, POSITION, VEHICLE
+from gpmpc.recording._messages import ATTITUDE, PLAN, POSITION, STEP, TIMING
+from gpmpc.recording._scene import DISPLAY, VEHICLE
 from gpmpc.recording.reader import Run
 
-STATE, MEASURED, REFERENCE, BOUND = "#0072b2", "#e69f00", "#000000", "#d55e00"  # Okabe and Ito (2008)
-PALETTE = (STATE, BOUND, "#009e73", "#cc79a7", MEASURED, "#56b4e9")
-Panels = dict[str, dict[str, Any]]
+_STATE, _MEASURED, _REFERENCE, _BOUND = "#0072b2", "#e69f00", "#000000", "#d55e00"  # Okabe and Ito (2008)
+_PALETTE = (_STATE, _BOUND, "#009e73", "#cc79a7", _MEASURED, "#56b4e9")
+_Panels = dict[str, dict[str, Any]]
 
 
 def layout(run: Run) -> str:
@@ -29,8 +29,8 @@ def layout(run: Run) -> str:
     Plots in tabs (positions, attitude, other states, inputs with their bounds, uncertainty, solver) beside the vehicle
     in space, where the states tell where it is or how it is turned, and the log of failures.
     """
-    groups = {"Position": [n for n in POSITION if n in run.state_names]}
-    groups["Attitude"] = [n for n in ATTITUDE if n in run.state_names]
+    axes = (("Position", POSITION), ("Attitude", ATTITUDE))
+    groups = {title: [run.state_names[run.pose[axis]] for axis in those if axis in run.pose] for title, those in axes}
     tracked = [*groups["Position"], *groups["Attitude"]]
     groups["Rates" if tracked else "States"] = [name for name in run.state_names if name not in tracked]
     groups = {title: names for title, names in groups.items() if names}
@@ -49,7 +49,7 @@ def layout(run: Run) -> str:
     return json.dumps(whole | {"layout": _split("row", left, "Tab!plots", share)}, indent=1) + "\n"
 
 
-def _tabs(run: Run, groups: Mapping[str, Sequence[str]]) -> dict[str, Panels]:
+def _tabs(run: Run, groups: Mapping[str, Sequence[str]]) -> dict[str, _Panels]:
     """Makes the panels with plots, from top to bottom, by the title of their tab."""
     units = run.metadata.get("units", {})
 
@@ -58,22 +58,22 @@ def _tabs(run: Run, groups: Mapping[str, Sequence[str]]) -> dict[str, Panels]:
         return f" [{found.pop()}]" if len(found) == 1 and not found & {"1", "?"} else ""
 
     def several(title: str, fields: Mapping[str, str]) -> dict[str, Any]:
-        lines = [_line(path, label, PALETTE[i % len(PALETTE)]) for i, (path, label) in enumerate(fields.items())]
+        lines = [_line(path, label, _PALETTE[i % len(_PALETTE)]) for i, (path, label) in enumerate(fields.items())]
         return _plot(title, lines)
 
-    tabs: dict[str, Panels] = {title: {} for title in (*groups, "Inputs", "Uncertainty", "Solver")}
+    tabs: dict[str, _Panels] = {title: {} for title in (*groups, "Inputs", "Uncertainty", "Solver")}
     for title, names in groups.items():
         for name in names:
             lines = [
-                _line(f"{STEP}.measured.{name}", "measured", MEASURED),
-                _line(f"{STEP}.state.{name}", "state", STATE),
-                _line(f"{STEP}.reference.{name}", "reference", REFERENCE, lineStyle="dashed"),
+                _line(f"{STEP}.measured.{name}", "measured", _MEASURED),
+                _line(f"{STEP}.state.{name}", "state", _STATE),
+                _line(f"{STEP}.reference.{name}", "reference", _REFERENCE, lineStyle="dashed"),
             ]
             tabs[title][f"Plot!state-{name}"] = _plot(name + unit(f"state.{name}"), lines)
     for name, bounds in zip(run.input_names, run.input_bounds.T, strict=True):
-        lines = [_line(f"{STEP}.input.{name}", "applied", STATE, lineInterpolation="step")]
+        lines = [_line(f"{STEP}.input.{name}", "applied", _STATE, lineInterpolation="step")]
         for side in ("lower", "upper") if np.isfinite(bounds).any() else ():
-            lines.append(_line(f"{STEP}.input_{side}.{name}", f"{side} bound", BOUND, lineStyle="dashed"))
+            lines.append(_line(f"{STEP}.input_{side}.{name}", f"{side} bound", _BOUND, lineStyle="dashed"))
         tabs["Inputs"][f"Plot!input-{name}"] = _plot(name + unit(f"input.{name}"), lines)
     for title, names in list(groups.items())[:2]:
         for id, path, what in (

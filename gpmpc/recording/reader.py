@@ -81,6 +81,12 @@ class Run:
     problems: dict[int, RecordedProblem]  # by k; see ``replay``
 
     @cached_property
+    def pose(self) -> dict[str, int]:
+        """Indices of the states that are x, y, z, roll, pitch and yaw in space, as far as there are any."""
+        named = self.metadata.get("pose", {}).items()
+        return {axis: self.state_names.index(name) for axis, name in named if name in self.state_names}
+
+    @cached_property
     def residuals(self) -> Array:
         """Primal and dual residual and duality gap of every recorded solution (K, 3); NaN without one."""
         nothing = (np.nan, np.nan, np.nan)
@@ -200,11 +206,7 @@ class _Described(NamedTuple):
 
 
 def _describe(path: Path, metadata: dict[str, dict[str, str]]) -> _Described:
-    """Finds the names of states and inputs, and builds the classes of the messages.
-
-    Raises:
-        RecordingError: The metadata do not tell of a run.
-    """
+    """Finds the names of states and inputs, and builds the classes of the messages."""
     about = metadata.get("run", {})
     if not {"state_names", "input_names"} <= about.keys():
         raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
@@ -217,11 +219,7 @@ def _describe(path: Path, metadata: dict[str, dict[str, str]]) -> _Described:
 
 
 def _decode(path: Path, topic: str, described: _Described, record: Message) -> Any:
-    """Parses a message; of a quadratic program it returns its step's number k and itself.
-
-    Raises:
-        RecordingError: It does not parse, or its arrays do not belong together.
-    """
+    """Parses a message; of a quadratic program it returns its step's number k and itself."""
     n = len(described.states)
     try:
         message = described.classes[TOPICS[topic]].FromString(record.data)
@@ -239,11 +237,7 @@ def _decode(path: Path, topic: str, described: _Described, record: Message) -> A
 
 
 def _numbers(message: Any, field: str, *shape: int) -> Array:
-    """Reads a packed array.
-
-    Raises:
-        ValueError: It has more or fewer numbers.
-    """
+    """Reads a packed array."""
     data = getattr(message, field)
     if min(shape) < 0 or len(data) != 8 * math.prod(shape):
         raise ValueError(f"{field} must be {shape}; got {len(data)} bytes")

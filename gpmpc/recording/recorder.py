@@ -23,7 +23,7 @@ from foxglove.mcap import MCAPWriteOptions
 from foxglove.messages import Log, LogLevel, Timestamp
 
 from gpmpc.exceptions import RecordingError, check_number
-from gpmpc.provenance import provenance
+from gpmpc.provenance import flattened, provenance
 from gpmpc.recording._encoding import Encoder, PackedStep, StepCopy, pack
 from gpmpc.recording._messages import RecordedSystem
 from gpmpc.recording._records import CONFIG, LARGEST
@@ -68,7 +68,8 @@ class McapRecorder:
     ):
         check_number("start_time_ns", start_time_ns, least=0, whole=True, unit="[ns]")
         check_number("chunk_size", chunk_size, least=1, whole=True, unit="[bytes]")
-        about = _flat(provenance() | {"host": platform.node()} | dict(metadata or {}))
+        about = flattened(provenance() | {"host": platform.node()} | dict(metadata or {}))
+        about = {key: str(value) for key, value in about.items()}
         about |= {"state_names": " ".join(system.state_names), "input_names": " ".join(system.input_names)}
         frames = {"positions": system.frame, "z axis": "down" if system.z_down else "up", "display": "z axis up"}
         config = config if isinstance(config, str) else json.dumps(config, indent=2, default=str)
@@ -92,7 +93,12 @@ class McapRecorder:
             compression_level=1,
         )
         self._writer = foxglove.open_mcap(self._sink, context=context, writer_options=options)
-        for name, pairs in (("run", about), ("units", system.field_units), ("frames", frames)):
+        for name, pairs in (
+            ("run", about),
+            ("units", system.field_units),
+            ("frames", frames),
+            ("pose", dict(system.pose)),
+        ):
             self._writer.write_metadata(name, pairs)
         stamps = {"log_time": start_time_ns, "create_time": start_time_ns}
         self._writer.attach(name=CONFIG, media_type="application/yaml", data=config.encode(), **stamps)
@@ -174,11 +180,7 @@ class McapRecorder:
         self._waiting.clear()
 
     def _save(self, sync: bool = False) -> None:
-        """Saves what was written: it is safe from now on if this process dies, with ``sync`` if the machine does.
-
-        Raises:
-            RecordingError: It could not be written.
-        """
+        """Saves what was written: it is safe from now on if this process dies, with ``sync`` if the machine does."""
         try:
             self._sink.save(sync)
         except OSError as error:
@@ -205,9 +207,6 @@ class _Sink:
     """Collects what the library writes until it is saved in one piece.
 
     (A writer that is not closed adds a footer when it is collected: what is never saved does no harm.)
-
-    Raises:
-        RecordingError: The file cannot be written, or another process is writing it.
     """
 
     def __init__(self, path: Path):
@@ -238,11 +237,7 @@ class _Sink:
         """Does nothing: see ``save``."""
 
     def save(self, sync: bool) -> None:
-        """Writes what was collected, and puts it on the disk if asked to; where that fails, nothing of it stays.
-
-        Raises:
-            OSError: It failed.
-        """
+        """Writes what was collected, and puts it on the disk if asked to; where that fails, nothing of it stays."""
         left, self._data = memoryview(self._data), bytearray()
         size = len(left)
         try:
@@ -270,11 +265,3 @@ def _failure(copy: StepCopy, nanoseconds: int) -> Log:
         name="gpmpc",
         message=f"step {copy.step.k}: {status.name}: {status.advice}{policy}",
     )
-
-
-def _flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Flattens nested data to the text pairs that a metadata record holds, keys dotted."""
-    pairs: dict[str, str] = {}
-    for key, value in data.items():
-        pairs |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": str(value)}
-    return pairs

@@ -35,19 +35,15 @@ class Gust(Disturbance):
 
     (Where the dynamics give the next state, it is added to that.)
 
-    Attributes:
-        rates: What is added to the derivative of a state, by its name: ``{"vx": 2.0}`` is an acceleration of
-            2 m/s^2, the force over the mass.
-        start: When it begins [s].
-        stop: When it ends [s].
-
     Raises:
         SettingError: A rate is no number, or the window is empty.
     """
 
-    rates: Mapping[str, float]  # [unit of the state / s]
-    start: float = 0.0  # [s]
-    stop: float = math.inf  # [s]
+    #: what is added to the derivative of a state, by its name: ``{"vx": 2.0}`` is an acceleration of 2 m/s^2, the force
+    #: over the mass [unit of the state / s]
+    rates: Mapping[str, float]
+    start: float = 0.0  #: when it begins [s]
+    stop: float = math.inf  #: when it ends [s]
 
     def __post_init__(self) -> None:
         _check_window(self.start, self.stop)
@@ -76,18 +72,13 @@ class Gust(Disturbance):
 class Replaced(Disturbance):
     """Another plant over a time window: another mass, a broken arm.
 
-    Attributes:
-        plant: What acts then.
-        start: When it begins [s].
-        stop: When it ends [s].
-
     Raises:
         SettingError: The window is empty.
     """
 
-    plant: Plant
-    start: float = 0.0  # [s]
-    stop: float = math.inf  # [s]
+    plant: Plant  #: what acts then
+    start: float = 0.0  #: when it begins [s]
+    stop: float = math.inf  #: when it ends [s]
 
     def __post_init__(self) -> None:
         _check_window(self.start, self.stop)
@@ -110,17 +101,13 @@ class Replaced(Disturbance):
 class Dropout(Disturbance):
     """Nothing is measured over a time window: entries of the state are NaN.
 
-    Attributes:
-        start: When it begins [s].
-        stop: When it ends [s].
-        entries: Which ones, from 0; all by default. Without position, for one: 0 to 5 of a ``Coupled`` plant.
-
     Raises:
         SettingError: The window is empty, or an entry is no whole number, 0 or more.
     """
 
-    start: float  # [s]
-    stop: float  # [s]
+    start: float  #: when it begins [s]
+    stop: float  #: when it ends [s]
+    #: which ones, from 0; all by default. Without position, for one: 0 to 5 of a ``Coupled`` plant
     entries: Sequence[int] | None = None
 
     def __post_init__(self) -> None:

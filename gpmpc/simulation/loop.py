@@ -7,8 +7,8 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -111,7 +111,7 @@ def closed_loop(
 
     flight = Flight(simulator, history.recording(references))
     fly([flight], decide, steps, system.time_step)
-    if isinstance(flight.error, Diverged) and history.steps:
+    if isinstance(flight.error, Diverged) and history.rows:
         flight.error.flown = history.rollout(simulator, references, system.time_step)
     if flight.error is not None:
         raise flight.error
@@ -125,15 +125,6 @@ def rehearse(system: Plant | ModelLoop, controller: Controller, references: Refe
     """
     with suppress(GpmpcError):
         closed_loop(system, controller, references, initial, 2, on_failure="previous_plan")
-
-
-class Decided(Protocol):
-    """What one step applies."""
-
-    @property
-    def input(self) -> Array:
-        """(m,)."""
-        ...
 
 
 class Moment(NamedTuple):
@@ -168,7 +159,7 @@ class Flight:
 
 def fly(
     flights: Sequence[Flight],
-    decide: Callable[[int, Sequence[Gaussian], Sequence[Any]], Sequence[Decided | SolverFailure]],
+    decide: Callable[[int, Sequence[Gaussian], Sequence[Any]], Sequence[Any]],
     steps: int,
     time_step: float,
 ) -> None:
@@ -177,7 +168,7 @@ def fly(
     Args:
         flights: Of one plant.
         decide: From the number of the step, what is known of the states, and what was decided one step ago (None at the
-            first), to what is to be applied.
+            first), to what is to be applied, its ``input`` (m,), or to a ``SolverFailure``.
         steps: K.
         time_step: [s].
     """
@@ -201,31 +192,21 @@ def fly(
                 flight.record(Moment(k, time, state, covariance, measured, input), decided)
 
 
-class StepSummary(NamedTuple):
+class _Row(NamedTuple):
     """What a ``Rollout`` holds of a step: nothing of its quadratic program, and one row of its plan."""
 
-    state: Array
-    covariance: Array
-    measured: Array
-    input: Array
-    reference: Array
+    step: Step  # without its decision
     expected: Array  # mean of the next state; NaN where no plan was applied
     expected_covariance: Array
-    status: Status
-    failed: bool
     iterations: int
     timing: Timing
 
 
 class History:
-    """Collects the steps of one loop for its ``Rollout``.
-
-    Args:
-        on_step: Called with every step.
-    """
+    """Collects the steps of one loop for its ``Rollout``."""
 
     def __init__(self, on_step: Callable[[Step], None] | None = None):
-        self.steps: list[StepSummary] = []
+        self.rows: list[_Row] = []
         self._on_step = on_step
 
     def recording(self, references: Reference) -> Callable[[Moment, Command], None]:
@@ -235,34 +216,29 @@ class History:
     def add(self, moment: Moment, reference: Array, decided: Command) -> None:
         """Adds a step that was to be at a reference state (n,)."""
         decision, n = decided.decision, len(moment.state)
-        expected, covariance = np.full(n, np.nan), np.full((n, n), np.nan)
-        iterations, timing = 0, Timing(0.0, 0.0, 0.0)
-        if decision is not None:
-            iterations, timing = decision.iterations, decision.timing
-            if not decided.failed:
-                expected, covariance = np.array(decision.means[1]), np.array(decision.covariances[1])
+        learned = None if decision is None else decision.learned
+        step = Step(
+            time=moment.time,
+            k=moment.k,
+            reference=np.asarray(reference, dtype=float),
+            state=moment.state,
+            measured=moment.measured,
+            input=np.asarray(moment.input, dtype=float),
+            decision=decision,
+            innovation=moment.measured - (self.rows[-1].expected if self.rows else np.nan),
+            belief_covariance=moment.covariance,
+            gp_size=0 if learned is None else learned.size,
+            gp_version=0 if learned is None else learned.version,
+            failed=decided.failed,
+            status=decided.status,
+        )
         if self._on_step is not None:
-            before = self.steps[-1].expected if self.steps else np.nan
-            learned = None if decision is None else decision.learned
-            self._on_step(
-                Step(
-                    time=moment.time,
-                    k=moment.k,
-                    reference=np.asarray(reference, dtype=float),
-                    state=moment.state,
-                    measured=moment.measured,
-                    input=np.asarray(moment.input, dtype=float),
-                    decision=decision,
-                    innovation=moment.measured - before,
-                    belief_covariance=moment.covariance,
-                    gp_size=0 if learned is None else learned.size,
-                    gp_version=0 if learned is None else learned.version,
-                    failed=decided.failed,
-                    status=decided.status,
-                )
-            )
-        at = (moment.state, moment.covariance, moment.measured, moment.input, reference)
-        self.steps.append(StepSummary(*at, expected, covariance, decided.status, decided.failed, iterations, timing))
+            self._on_step(step)
+        expected: Any = (np.full(n, np.nan), np.full((n, n), np.nan))
+        if decision is not None and not decided.failed:
+            expected = np.array(decision.means[1]), np.array(decision.covariances[1])
+        spent: Any = (0, Timing(0.0, 0.0, 0.0)) if decision is None else (decision.iterations, decision.timing)
+        self.rows.append(_Row(replace(step, decision=None), *expected, *spent))
 
     def rollout(self, end: Simulator, references: Reference, time_step: float, states: slice = slice(None)) -> Rollout:
         """Makes the arrays of all steps.
@@ -273,21 +249,21 @@ class History:
             time_step: [s].
             states: Which of the simulator's states these are.
         """
-        steps = self.steps
-        last = references.states[min(len(steps), len(references.states) - 1)]
+        rows, steps = self.rows, [row.step for row in self.rows]
+        last = references.states[min(len(rows), len(references.states) - 1)]
         return Rollout(
             states=np.array([*(step.state for step in steps), end.mean[states]]),
-            covariances=np.array([*(step.covariance for step in steps), end.covariance[states, states]]),
+            covariances=np.array([*(step.belief_covariance for step in steps), end.covariance[states, states]]),
             measured=np.array([step.measured for step in steps]),
             inputs=np.array([step.input for step in steps]),
             references=np.array([*(step.reference for step in steps), last], dtype=float),
-            predicted_means=np.array([step.expected for step in steps]),
-            predicted_covariances=np.array([step.expected_covariance for step in steps]),
-            statuses=tuple(step.status for step in steps),
-            iterations=np.array([step.iterations for step in steps]),
-            timings=tuple(step.timing for step in steps),
+            predicted_means=np.array([row.expected for row in rows]),
+            predicted_covariances=np.array([row.expected_covariance for row in rows]),
+            statuses=tuple(step.status for step in steps if step.status is not None),
+            iterations=np.array([row.iterations for row in rows]),
+            timings=tuple(row.timing for row in rows),
             time_step=time_step,
-            suboptimal=tuple(k for k, step in enumerate(steps) if not (step.failed or step.status.solved)),
+            suboptimal=tuple(s.k for s in steps if not (s.failed or s.status is None or s.status.solved)),
         )
 
 

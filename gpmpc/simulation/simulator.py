@@ -26,19 +26,14 @@ Array = np.ndarray
 class ModelLoop:
     """A learned model rolled on itself.
 
-    Attributes:
-        model: It predicts the next state.
-        propagator: How the belief is carried on.
-        time_step: Time that one step stands for [s].
-        initial_std: Standard deviation of every state at the start where only its mean is given; the paper's 0.1.
-
     Raises:
         SettingError: A time step that is not positive, or a negative deviation.
     """
 
-    model: DynamicsModel
-    propagator: Propagator
-    time_step: float = 1.0  # [s]
+    model: DynamicsModel  #: it predicts the next state
+    propagator: Propagator  #: how the belief is carried on
+    time_step: float = 1.0  #: time that one step stands for [s]
+    #: standard deviation of every state at the start where only its mean is given; the paper's 0.1
     initial_std: float = 0.1
 
     def __post_init__(self) -> None:
@@ -50,17 +45,13 @@ class ModelLoop:
 class Noise:
     """White Gaussian noise, as standard deviations; every source draws from a stream of its own.
 
-    Attributes:
-        process: Added to every next state (n,).
-        measurement: Added to what is measured (n,).
-        input: Added to every input that is applied (m,): an actuator's, or the dither that makes data informative.
-
     Raises:
         SettingError: An entry is negative or no number.
     """
 
-    process: Sequence[float] | None = None
-    measurement: Sequence[float] | None = None
+    process: Sequence[float] | None = None  #: added to every next state (n,)
+    measurement: Sequence[float] | None = None  #: added to what is measured (n,)
+    #: added to every input that is applied (m,): an actuator's, or the dither that makes data informative
     input: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
@@ -281,12 +272,7 @@ def step_together(simulators: Sequence[Any], time: float, inputs: Sequence[Array
 
 
 def _check_state(value: Any, n: int) -> Array:
-    """Returns a finite state (n,) as an array of its own.
-
-    Raises:
-        ShapeError: Another shape.
-        SettingError: An entry is not finite.
-    """
+    """Returns a finite state (n,) as an array of its own."""
     state = np.array(value.cpu().numpy() if isinstance(value, torch.Tensor) else value, dtype=float)
     if state.shape != (n,):
         raise ShapeError(f"the initial state must have shape ({n},); got {state.shape}")

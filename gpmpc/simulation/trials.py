@@ -123,11 +123,7 @@ def chunk_size(controller: Controller, trials: int, memory: int = _MEMORY, chunk
 
 
 def _check_seeds(seeds: int | Sequence[int]) -> list[int]:
-    """Returns the seeds one by one.
-
-    Raises:
-        SettingError: There are none, or one is there twice or is no whole number from 0 on.
-    """
+    """Returns the seeds one by one."""
     if isinstance(seeds, int | np.integer):
         check_number("seeds", int(seeds), least=1, whole=True)
         seeds = range(int(seeds))

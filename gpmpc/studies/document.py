@@ -49,48 +49,28 @@ pre { padding: .6rem; } li { overflow-wrap: anywhere; }
 
 
 class Table(NamedTuple):
-    """A table of texts.
+    """A table of texts."""
 
-    Attributes:
-        header: Names of the columns.
-        rows: Cells; a cell may have several lines, of which those below the first are details.
-        title: Stands above the table.
-        sections: Whether rows of one first cell form a section.
-    """
-
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    title: str = ""
-    sections: bool = False
+    header: Sequence[str]  # names of the columns
+    rows: Sequence[Sequence[str]]  # cells; a cell may have several lines, of which those below the first are details
+    title: str = ""  # stands above the table
+    sections: bool = False  # whether rows of one first cell form a section
 
 
 @dataclass(frozen=True)
 class Document:
-    """Everything that is said about one result.
+    """Everything that is said about one result."""
 
-    Attributes:
-        title: Heading.
-        tables: In their order.
-        data: One row a row of the tables, as numbers, for CSV.
-        lead: Paragraph above the tables.
-        notes: Paragraphs below the tables.
-        lists: Items by their heading.
-        code: Lines that are typed or data, by their heading.
-        images: PNG files by name.
-        links: Addresses by their text, for HTML, folded.
-        latex: Tables for LaTeX; by default the same.
-    """
-
-    title: str
-    tables: Sequence[Table]
-    data: pd.DataFrame
-    lead: str = ""
-    notes: Sequence[str] = ()
-    lists: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    code: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    images: Mapping[str, bytes] = field(default_factory=dict)
-    links: Mapping[str, str] = field(default_factory=dict)
-    latex: Sequence[Table] | None = None
+    title: str  # heading
+    tables: Sequence[Table]  # in their order
+    data: pd.DataFrame  # one row a row of the tables, as numbers, for CSV
+    lead: str = ""  # paragraph above the tables
+    notes: Sequence[str] = ()  # paragraphs below the tables
+    lists: Mapping[str, Sequence[str]] = field(default_factory=dict)  # items by their heading
+    code: Mapping[str, Sequence[str]] = field(default_factory=dict)  # lines that are typed or data, by their heading
+    images: Mapping[str, bytes] = field(default_factory=dict)  # PNG files by name
+    links: Mapping[str, str] = field(default_factory=dict)  # addresses by their text, for HTML, folded
+    latex: Sequence[Table] | None = None  # tables for LaTeX; by default the same
 
     def files(self, name: str) -> dict[str, str | bytes]:
         """Returns the document as Markdown, CSV and LaTeX, and its images, by file name."""
@@ -194,11 +174,7 @@ def with_range(low: float, middle: float, high: float) -> str:
 
 
 def plain_text(text: object) -> str:
-    """Returns a text on one line in which unprintable characters stand as their escapes.
-
-    Raises:
-        TypeError: It is not a text.
-    """
+    """Returns a text on one line in which unprintable characters stand as their escapes."""
     if not isinstance(text, str):
         raise TypeError(f"must be a text; got {text!r:.80}")
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -17,14 +17,16 @@ from typing import Any, Literal
 import numpy as np
 
 from gpmpc.datasets import DataSource
+from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
-from gpmpc.gp import GPPosterior, Training, Transitions
+from gpmpc.gp import Training, Transitions
 from gpmpc.learning import EpisodicLearning, LearningController, OnlineLearning
 from gpmpc.metrics import find_loss, time_quantiles, tracking_error, violation_rate
+from gpmpc.models import train_with_angles
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.policy import OnFailure, check_policy
 from gpmpc.mpc.problem import Box
-from gpmpc.propagation import MomentMatching, Propagator
+from gpmpc.propagation import Propagator, best_propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
 from gpmpc.studies.document import Table
 from gpmpc.studies.study import random_rows
@@ -38,46 +40,33 @@ _STAGES = ("model", "build", "solve", "total")  # of a decision's time
 class Experiment:
     """One flight of one system, with everything that it depends on.
 
-    Attributes:
-        data: Where transitions come from.
-        trajectory: What is followed, from its beginning; None holds the system's goal.
-        system: Whose transitions are learned; names, units and references are its own.
-        train: From transitions and a ``seed`` to a ``Training``.
-        controller: From a model, or from a ``plant`` where its first argument is called so, to a ``Controller``.
-        plant: What flies, and the true model of a controller that takes one; the system by default.
-        name: Of the trajectory, which data from files are filed under.
-        size: Rows drawn for the training; None takes all.
-        steps: Of the flight.
-        seed: Of all random numbers.
-        loop: What stands at the other end: the plant, or the learned model rolled on itself.
-        propagator: The controller's own, if it has one. A model loop carries its belief on with it, or by moment
-            matching.
-        noise: On the plant.
-        disturbances: Of the plant.
-        on_failure: What is applied where a solve fails.
-        learning: While flying, an ``OnlineLearning`` or ``EpisodicLearning``; None for none.
-
     Raises:
         SettingError: A number out of range, an unknown policy or loop, a disturbance that does not fit the plant.
         ShapeError: Noise that does not fit the plant.
     """
 
-    data: DataSource
-    trajectory: Trajectory | None
-    system: System
+    data: DataSource  #: where transitions come from
+    trajectory: Trajectory | None  #: what is followed, from its beginning; None holds the system's goal
+    system: System  #: whose transitions are learned; names, units and references are its own
+    #: from transitions and a ``seed`` to a ``Training``, such as a ``Trainer``; one that learns differences sees the
+    #: system's angles as sine and cosine
     train: Callable[..., Training]
+    #: from a model, or from a ``plant`` where its first argument is called so, to a ``Controller``
     controller: Callable[..., Any]
-    plant: System | None = None
-    name: str = "elliptical"
-    size: int | None = None
-    steps: int = 100
-    seed: int = 0
+    plant: System | None = None  #: what flies, and the true model of a controller that takes one; the system by default
+    name: str = "elliptical"  #: of the trajectory, which data from files are filed under
+    size: int | None = None  #: rows drawn for the training; None takes all
+    steps: int = 100  #: of the flight
+    seed: int = 0  #: of all random numbers
+    #: what stands at the other end: the plant, or the learned model rolled on itself
     loop: Literal["plant", "model"] = "plant"
+    #: the controller's own, if it has one. A model loop carries its belief on with it, or as ``best_propagator`` does
     propagator: Propagator | None = None
-    noise: Noise | None = None
-    disturbances: Sequence[Disturbance] = ()
-    on_failure: OnFailure = "previous_plan"
-    learning: OnlineLearning | EpisodicLearning | None = None
+    noise: Noise | None = None  #: on the plant
+    disturbances: Sequence[Disturbance] = ()  #: of the plant
+    on_failure: OnFailure = "previous_plan"  #: what is applied where a solve fails
+    learning: OnlineLearning | EpisodicLearning | None = None  #: from the flight, while it flies or after it
+    model: DynamicsModel | None = None  #: trained before; None trains one where the controller needs it
 
     def __post_init__(self) -> None:
         if self.size is not None:
@@ -107,7 +96,7 @@ class Experiment:
         if problem is not None and (problem.state_dim, problem.input_dim) != shape:
             weighed = f"weighs {problem.state_dim} states and {problem.input_dim} inputs"
             raise SettingError("controller.problem", f"{weighed}; {system.name} has {shape[0]} and {shape[1]}")
-        if self.learns and hasattr(self.data, "check"):
+        if self.learns and self.model is None and hasattr(self.data, "check"):
             self.data.check(system, self.trajectory)
 
     @property
@@ -137,6 +126,13 @@ class Experiment:
             raise SettingError("data.size", f"must be at most {len(data)}, the rows of the data; got {size}")
         return data[random_rows(len(data), size, self.seed)]
 
+    def learn(self, transitions: Transitions, seed: int) -> Training:
+        """Trains on transitions; see ``train``."""
+        angles = self.system.angle_indices
+        if angles and getattr(self.train, "predicts", None) == "difference":
+            return train_with_angles(self.train, angles, transitions, seed)
+        return self.train(transitions, seed=seed)
+
     def references(self, count: int) -> np.ndarray:
         """Returns the states to follow (count, n), one per time step."""
         return self.system.reference_states(self.trajectory, count)
@@ -149,35 +145,28 @@ class Experiment:
         n = len(self.system.state_names)
         if getattr(self.propagator, "process_noise", False) or self.loop == "model":
             return np.zeros(n)
-        if training is not None:
-            return training.posterior.noise_covariance.diagonal().sqrt().numpy()
+        model = self.model if training is None else training.posterior
+        if model is not None and self.learns:
+            return model.noise_covariance.diagonal().sqrt().numpy()
         noise = self.noise and self.noise.process
         return np.zeros(n) if noise is None else np.array(noise, dtype=float)
 
 
 @dataclass(frozen=True)
 class Flown:
-    """An experiment that was flown.
+    """An experiment that was flown."""
 
-    Attributes:
-        rollout: Every step, as arrays.
-        controller: The ``Controller`` that steered, with its ``problem``.
-        training: What was learned; None where the controller knows the plant.
-        diverged: Where and why the system left the finite numbers, and the rollout ends; None where it did not.
-        before: The flights that were learned from before.
-    """
-
-    rollout: Rollout
-    controller: Any
-    training: Training | None
+    rollout: Rollout  #: every step, as arrays
+    controller: Any  #: the ``Controller`` that steered, with its ``problem``
+    training: Training | None  #: what was learned; None where the controller knows the plant
+    #: where and why the system left the finite numbers, and the rollout ends; None where it did not
     diverged: Diverged | None = None
-    before: tuple["Flown", ...] = ()
+    before: tuple["Flown", ...] = ()  #: the episodes
 
 
 def run_trial(
     experiment: Experiment,
     prepare: Callable[[Any, Training | None], Callable[[Step], None]] | None = None,
-    model: GPPosterior | None = None,
 ) -> Flown:
     """Trains and flies.
 
@@ -185,7 +174,6 @@ def run_trial(
         experiment: All of it.
         prepare: Called before the first step with the controller and the training; what it returns is called with
             every step.
-        model: Trained before; None trains one where the controller needs it.
 
     Raises:
         SettingError: More rows are asked for than there are, or settings that do not fit each other.
@@ -194,17 +182,17 @@ def run_trial(
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
         Diverged: The system left the finite numbers in its first step.
     """
-    training, before = None, []
+    training, model, before = None, experiment.model, []
     if experiment.learns and model is None:
         data = experiment.training_rows()
-        training = experiment.train(data, seed=experiment.seed)
+        training = experiment.learn(data, experiment.seed)
         if isinstance(experiment.learning, EpisodicLearning):
             for k in range(experiment.learning.episodes):
                 seed = int(np.random.SeedSequence([experiment.seed, k]).generate_state(1)[0])
                 before.append(_fly(replace(experiment, seed=seed), prepare, training.posterior, training))
                 data = experiment.learning.with_flight(data, before[-1].rollout)
                 if k + 1 < experiment.learning.episodes:
-                    training = experiment.train(data, seed=experiment.seed)
+                    training = experiment.learn(data, experiment.seed)
             best = min(before, key=lambda flown: _error(experiment, flown))
             training = best.training or training
         model = training.posterior
@@ -221,7 +209,7 @@ def _error(experiment: Experiment, flown: Flown) -> float:
 def _fly(
     experiment: Experiment,
     prepare: Callable[[Any, Training | None], Callable[[Step], None]] | None,
-    model: GPPosterior | None,
+    model: DynamicsModel | None,
     training: Training | None,
 ) -> Flown:
     """Flies with a model, or on the plant's own where it is None."""
@@ -231,7 +219,7 @@ def _fly(
         controller = LearningController(controller, experiment.learning)
     system: System | ModelLoop = plant
     if experiment.loop == "model" and model is not None:
-        system = ModelLoop(model, experiment.propagator or MomentMatching(), time_step=plant.time_step)
+        system = ModelLoop(model, experiment.propagator or best_propagator(model), time_step=plant.time_step)
     states = experiment.references(experiment.steps + controller.horizon + 1)
     resting = np.asarray(controller.initial_input)  # falls back on it where the very first solve fails
     reference = Reference(states, np.tile(resting, (len(states) - 1, 1)))
@@ -268,6 +256,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     rollout, problem, training = flown.rollout, flown.controller.problem, flown.training
     system = experiment.system
     error = tracking_error(rollout.states, rollout.references, system.tracked_indices, system.angle_indices)
+    at_end = (rollout.states[-2:], rollout.references[-2:], system.tracked_indices, system.angle_indices)
     episodes = [one if np.isfinite(one := _error(experiment, each)) else None for each in flown.before]
     rmse = {name: float(value) for name, value in zip(system.tracked, error.axes, strict=True)}
     rmse["total"] = error.total
@@ -287,6 +276,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         "steps": len(rollout.inputs),
         "unit": system.unit,
         "rmse": rmse,
+        "error_at_end": None if rmse["total"] is None else float(tracking_error(*at_end).total),
         "lost": _lost(experiment, flown),
         "violations": {name: asdict(rate) | {"rate": rate.rate} for name, rate in violations.items()},
         "failures": dict(Counter(status.name for _, status in rollout.failures)),
@@ -323,6 +313,8 @@ def summary(result: Mapping[str, Any]) -> Table:
     other = _differences(result["settings"])
     if other:
         lines.append(("flown with", ", ".join(f"{key} {now} (learned: {then})" for key, then, now in other)))
+    if path := result["settings"]["model"].get("path"):
+        lines.append(("model", path))
     if training:
         from_what = f"{training['size']} rows of {options['data']} data"
         lines.append(("learned from", f"{from_what}, in {times['training']:.2f} s"))
@@ -331,6 +323,8 @@ def summary(result: Mapping[str, Any]) -> Table:
     axes = ", ".join(f"{k} {v:.3g}" for k, v in result["rmse"].items() if v is not None and k != "total")
     total = result["rmse"]["total"]
     lines.append((f"RMSE [{result['unit']}]", "none: it diverged" if total is None else f"{total:.3g}  ({axes})"))
+    if (error := result.get("error_at_end")) is not None:
+        lines.append((f"at the end [{result['unit']}]", f"{error:.3g}"))
     if episodes := result.get("episodes"):
         lines.append(("episodes before", ", ".join("diverged" if e is None else f"{e:.3g}" for e in episodes)))
     for name, rate in result["violations"].items():

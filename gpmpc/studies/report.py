@@ -11,11 +11,11 @@ import math
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from gpmpc.exceptions import DataError
+from gpmpc.provenance import flattened
 from gpmpc.studies.document import plain_text
 from gpmpc.studies.run_folder import ERROR, METRICS, PLAN, folder_name
 
@@ -25,82 +25,54 @@ _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticE
 Choices = dict[str, str]
 
 
-class Measure(NamedTuple):
-    """One number of a run.
+class _Measure(NamedTuple):
+    """One number of a run."""
 
-    Attributes:
-        label: With its unit; ``{unit}`` stands for that of the runs' positions or angles.
-        of: From a run's result to the number; None where the run has none.
-        logarithmic: How it is drawn.
-        wall_time: Whether it depends on what else the machine did meanwhile.
-    """
-
-    label: str
-    of: Callable[[Mapping[str, Any]], float | None]
-    logarithmic: bool = True
-    wall_time: bool = False
+    label: str  #: with its unit; ``{unit}`` stands for that of the runs' positions or angles
+    of: Callable[[Mapping[str, Any]], float | None]  #: from a run's result to the number; None where the run has none
+    logarithmic: bool = True  #: how it is drawn
+    wall_time: bool = False  #: whether it depends on what else the machine did meanwhile
 
 
 def _outside(result: Mapping[str, Any]) -> float | None:
     return max((100 * rate["rate"] for rate in result["violations"].values()), default=None)
 
 
-def _decision(result: Mapping[str, Any]) -> float | None:
-    median = result["times"]["total"]["median"]
-    return None if median is None else 1e3 * median
-
-
 MEASURES = {
-    "rmse": Measure("RMSE [{unit}]", lambda r: r["rmse"]["total"]),
-    "outside": Measure("steps outside bounds [%]", _outside, logarithmic=False),
-    "failed": Measure("failed solves [%]", lambda r: 100 * sum(r["failures"].values()) / r["steps"], logarithmic=False),
-    "decision": Measure("decision, median [ms]", _decision, wall_time=True),
-    "training": Measure("training [s]", lambda r: r["times"]["training"], wall_time=True),
+    "rmse": _Measure("RMSE [{unit}]", lambda r: r["rmse"]["total"]),
+    "outside": _Measure("steps outside bounds [%]", _outside, logarithmic=False),
+    "failed": _Measure(
+        "failed solves [%]", lambda r: 100 * sum(r["failures"].values()) / r["steps"], logarithmic=False
+    ),
+    "decision": _Measure("decision, median [ms]", lambda r: 1e3 * r["times"]["total"]["median"], wall_time=True),
+    "training": _Measure("training [s]", lambda r: r["times"]["training"], wall_time=True),
 }
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run of a tree.
+    """One run of a tree."""
 
-    Attributes:
-        folder: Where it is.
-        choices: What was asked for, by key.
-        settings: All of them.
-        numbers: By measure; empty where the run failed.
-        unit: Of its errors.
-        lost: Since when and why the flight was lost; None where it was not.
-        error: Why the run failed; None where it did not.
-        origin: What made it: "date", "commit" and "machine", where it says so.
-    """
-
-    folder: Path
-    choices: Choices
-    settings: Mapping[str, Any]
-    numbers: Mapping[str, float | None] = field(default_factory=dict)
-    unit: str = ""
-    lost: str | None = None
-    error: str | None = None
+    folder: Path  #: where it is
+    choices: Choices  #: what was asked for, by key
+    settings: Mapping[str, Any]  #: all of them, by dotted key
+    numbers: Mapping[str, float | None] = field(default_factory=dict)  #: by measure; empty where the run failed
+    unit: str = ""  #: of its errors
+    lost: str | None = None  #: since when and why the flight was lost; None where it was not
+    error: str | None = None  #: why the run failed; None where it did not
+    #: what made it: "date", "commit" and "machine", where it says so
     origin: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass
 class Cell:
-    """All runs of one combination.
+    """All runs of one combination."""
 
-    Attributes:
-        values: Of the varied settings, in the order of ``Report.variables``.
-        runs: Those that finished, by seed.
-        failed: Those that failed, by seed.
-        missing: Seeds asked for of which there is nothing.
-        skipped: Seeds asked for of which there is something that cannot be read.
-    """
-
-    values: tuple[str, ...]
-    runs: dict[str, Run] = field(default_factory=dict)
-    failed: dict[str, Run] = field(default_factory=dict)
-    missing: tuple[str, ...] = ()
-    skipped: tuple[str, ...] = ()
+    values: tuple[str, ...]  #: of the varied settings, in the order of ``Report.variables``
+    runs: dict[str, Run] = field(default_factory=dict)  #: those that finished, by seed
+    failed: dict[str, Run] = field(default_factory=dict)  #: those that failed, by seed
+    missing: tuple[str, ...] = ()  #: seeds asked for of which there is nothing
+    skipped: tuple[str, ...] = ()  #: seeds asked for of which there is something that cannot be read
 
     def numbers(self, measure: str) -> list[float]:
         """Returns one measure of all runs that have it, by seed."""
@@ -114,21 +86,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Report:
-    """A tree of runs.
+    """A tree of runs."""
 
-    Attributes:
-        tree: Where it is.
-        variables: Settings that were varied, without the seed.
-        constants: What was asked for of all runs alike.
-        cells: In the order of their values.
-        skipped: What could not be read of it, with the reason, one line each.
-    """
-
-    tree: Path
-    variables: tuple[str, ...]
-    constants: Choices
-    cells: tuple[Cell, ...]
-    skipped: tuple[str, ...] = ()
+    tree: Path  #: where it is
+    variables: tuple[str, ...]  #: settings that were varied, without the seed
+    constants: Choices  #: what was asked for of all runs alike
+    cells: tuple[Cell, ...]  #: in the order of their values
+    skipped: tuple[str, ...] = ()  #: what could not be read of it, with the reason, one line each
 
     @property
     def runs(self) -> list[Run]:
@@ -146,10 +110,9 @@ class Report:
 
     def base_settings(self) -> list[str]:
         """Returns the settings that all runs share, one ``key: value`` each."""
-        return [
-            plain_text(f"{k}: {json.dumps(v)}")
-            for k, v in _leaves(reduce(_shared, (run.settings for run in self.runs)))
-        ]
+        first, *others = self.runs
+        shared = (item for item in first.settings.items() if all(item in run.settings.items() for run in others))
+        return [plain_text(f"{key}: {json.dumps(value)}") for key, value in shared]
 
     def commands(self) -> list[str]:
         """Returns the commands that fill the cells in which runs are missing or failed, one a cell.
@@ -232,10 +195,10 @@ def _read(tree: Path) -> tuple[list[Run], list[Choices], set[str], list[str]]:
 
 
 def _run(path: Path, content: Mapping[str, Any]) -> Run:
-    choices, settings = _parsed(content["choices"]), content["settings"]
+    choices, settings, origin = _parsed(content["choices"]), content["settings"], _origin(content)
     if not isinstance(settings, Mapping) or not isinstance(settings.get("options", {}), Mapping):
         raise TypeError("settings and their options are not by name")
-    origin = _origin(content)
+    settings = flattened(settings)
     if path.name == ERROR:
         return Run(path.parent, choices, settings, error=plain_text(content["error"]), origin=origin)
     numbers, lost = {name: _number(name, content) for name in MEASURES}, content.get("lost")
@@ -287,31 +250,8 @@ def _as_others(choices: Choices, keys: Iterable[str], runs: Sequence[Run]) -> Ch
 
 def _setting(settings: Mapping[str, Any], key: str) -> str:
     """Returns the value that a run had which did not choose; "default" where the settings do not tell."""
-    value = settings.get("options", {}).get(key)
-    if value is None:
-        value = settings
-        for part in key.split("."):
-            if not isinstance(value, Mapping) or part not in value:
-                return "default"
-            value = value[part]
+    value = settings.get(f"options.{key}")
+    value = settings.get(key, "default") if value is None else value
     if isinstance(value, bool) or value is None:
-        return {True: "true", False: "false", None: "null"}[value]
+        return json.dumps(value)
     return plain_text(str(value)) if isinstance(value, int | float | str) else "default"
-
-
-def _shared(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns what is equal in two settings."""
-    both = {key: (a[key], b[key]) for key in a if key in b}
-    return {
-        key: _shared(x, y) if isinstance(x, Mapping) and isinstance(y, Mapping) else x
-        for key, (x, y) in both.items()
-        if x == y or (isinstance(x, Mapping) and isinstance(y, Mapping))
-    }
-
-
-def _leaves(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    return [
-        leaf
-        for key, value in settings.items()
-        for leaf in (_leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [(f"{prefix}{key}", value)])
-    ]

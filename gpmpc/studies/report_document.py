@@ -43,7 +43,7 @@ def report_document(
         plain_text(report.tree.resolve().name),
         [_table(report, report.measures())],
         _numbers(report),
-        lead=f"{counts(report)}." + (f" All of them: {constants}." if constants else ""),
+        lead=f"{_counts(report)}." + (f" All of them: {constants}." if constants else ""),
         notes=[_LEGEND],
         lists={heading: items for heading, items in lists.items() if items},
         code={heading: lines for heading, lines in code.items() if lines},
@@ -66,7 +66,7 @@ def _made(report: Report) -> list[str]:
     return [f"{key}: {plain_text(value)}" for key, value in shown.items() if value]
 
 
-def counts(report: Report) -> str:
+def _counts(report: Report) -> str:
     """Returns how many runs there are, by how they ended."""
     finished, lost, failed, missing = (
         sum(len(getattr(cell, kind)) for cell in report.cells) for kind in ("runs", "lost", "failed", "missing")
@@ -82,7 +82,7 @@ def terminal_table(report: Report) -> Table:
     _, rows, _, _ = _table(report, shown)
     header = [name.replace(".", ".\n") for name in report.variables or ("runs",)]
     header += ["seeds", *(f"{_SHORT[name]}\n[{_unit(report, name)}]" for name in shown)]
-    return Table(header, rows, counts(report))
+    return Table(header, rows, _counts(report))
 
 
 def notes(report: Report) -> dict[str, list[str]]:

@@ -23,7 +23,7 @@ from typing import Any
 
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.files import remove_partial, write_whole
-from gpmpc.provenance import provenance
+from gpmpc.provenance import flattened, provenance
 
 METRICS, ERROR, CONFIG, RECORDING = "metrics.json", "error.json", "config.yaml", "run.mcap"
 PLAN = "sweep-"  # begins the names of the files that say which runs a sweep asked for
@@ -36,13 +36,9 @@ class Busy(GpmpcError):
 
 @dataclass(frozen=True)
 class RunFolder:
-    """One run's folder.
+    """One run's folder."""
 
-    Attributes:
-        path: Where it is.
-    """
-
-    path: Path
+    path: Path  # where it is
 
     @property
     def finished(self) -> bool:
@@ -59,14 +55,7 @@ class RunFolder:
 
     @contextmanager
     def locked(self, wait: bool = True) -> Iterator[None]:
-        """Makes the folder, clears it of half-written files and keeps other processes from working on it meanwhile.
-
-        Args:
-            wait: Until another process is done with it.
-
-        Raises:
-            Busy: Another process works on it, and ``wait`` is false.
-        """
+        """Makes the folder, clears it of half-written files and keeps other processes from working on it meanwhile."""
         self.path.mkdir(parents=True, exist_ok=True)
         folder = os.open(self.path, os.O_RDONLY)
         try:
@@ -98,15 +87,7 @@ class RunFolder:
         write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")
 
     def result(self, settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """Reads the result of the finished run.
-
-        Args:
-            settings: Those that are asked for now; None takes any.
-
-        Raises:
-            DataError: The file is not what a run writes.
-            SettingError: The run was flown with other settings: those of a file have changed meanwhile.
-        """
+        """Reads the result of the finished run."""
         path = self.path / METRICS
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
@@ -120,13 +101,7 @@ class RunFolder:
 
 
 def record(choices: Sequence[str], settings: Mapping[str, Any], command: str) -> dict[str, Any]:
-    """Returns the beginning of metrics.json and error.json: what was asked for and what made it.
-
-    Args:
-        choices: What the user chose, ``key=value`` each.
-        settings: The resolved configuration, with the chosen options by group under ``options``.
-        command: What makes this run again.
-    """
+    """Returns the beginning of metrics.json and error.json: what was asked for and what made it."""
     about = {"schema": 1, "choices": list(choices), "settings": dict(settings), "seed": settings.get("seed")}
     return about | {"provenance": provenance() | {"command": command}}
 
@@ -144,13 +119,7 @@ def folder_name(choices: Sequence[str]) -> str:
 
 def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Returns in words where two settings differ, the first three of their leaves; empty where they are equal."""
-    differing = _differing(then, now)
-    first = ", ".join(f"{key}: {a!r} then, {b!r} now" for key, a, b in differing[:3])
+    a, b = flattened(then), flattened(now)
+    differing = [key for key in dict.fromkeys([*a, *b]) if a.get(key) != b.get(key)]
+    first = ", ".join(f"{key}: {a.get(key)!r} then, {b.get(key)!r} now" for key in differing[:3])
     return first + (f", and {len(differing) - 3} more" if len(differing) > 3 else "")
-
-
-def _differing(then: Any, now: Any, key: str = "") -> list[tuple[str, Any, Any]]:
-    if isinstance(then, Mapping) and isinstance(now, Mapping):
-        keys = dict.fromkeys([*then, *now])
-        return [d for k in keys for d in _differing(then.get(k), now.get(k), f"{key}.{k}" if key else k)]
-    return [] if then == now else [(key, then, now)]

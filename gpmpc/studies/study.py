@@ -30,24 +30,17 @@ from gpmpc.studies.document import Document, Table
 
 @dataclass(frozen=True)
 class Trial:
-    """One condition with one seed.
+    """One condition with one seed."""
 
-    Attributes:
-        labels: First entries of its record, plain data: what the condition is called, which trial it is.
-        condition: What ``run_trial`` needs of it; it can be pickled.
-        seed: Of all random numbers.
-        fingerprint: Names everything that the numbers of the record depend on.
-        work: Trials of more work are started earlier, so that the last ones to run are short.
-    """
-
+    #: first entries of its record, plain data: what the condition is called, which trial it is
     labels: Mapping[str, Any]
-    condition: Any
-    seed: int
-    fingerprint: str
-    work: float = 0.0
+    condition: Any  #: what ``run_trial`` needs of it; it can be pickled
+    seed: int  #: of all random numbers
+    fingerprint: str  #: names everything that the numbers of the record depend on
+    work: float = 0.0  #: trials of more work are started earlier, so that the last ones to run are short
 
 
-class Study(Protocol):
+class _Study(Protocol):
     """A published result: which trials it needs, and how its tables follow from their records."""
 
     name: str  # of its documents

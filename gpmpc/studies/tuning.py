@@ -18,9 +18,9 @@ from gpmpc.plotting import png, search_figure
 from gpmpc.studies.document import MISSING, Document, Table, figure_label, number, plain_text
 from gpmpc.studies.study import derived_seed
 
-FEWEST = 8  # candidates of which an importance is told
-SHOWN = 10  # best candidates in the table
-LEGEND = (
+_FEWEST = 8  # candidates of which an importance is told
+_SHOWN = 10  # best candidates in the table
+_LEGEND = (
     "cost: of states and increments of the inputs along the true flight, per step, mean over the seeds, with the "
     "weights that the settings have which are not searched. Importance: share of the variance of being among the best "
     "tenth (PED-ANOVA; Watanabe, Bansal and Hutter, 2023)."
@@ -97,7 +97,7 @@ class Search:
     def importances(self) -> dict[str, float]:
         """Returns by setting how much it matters, the most first; nothing where too few candidates say so."""
         finite = [cost for cost in self.costs if math.isfinite(cost)]
-        if len(finite) < FEWEST or len(self._space) < 2 or min(finite) == max(finite):
+        if len(finite) < _FEWEST or len(self._space) < 2 or min(finite) == max(finite):
             return {}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", self._optuna.exceptions.ExperimentalWarning)
@@ -113,7 +113,7 @@ class Search:
         """
         order = sorted(range(len(self.costs)), key=lambda i: (self.costs[i], i))
         keys, matter = [*self._space], self.importances()
-        rows = [[str(i), _shown(self.costs[i]), *(_text(self.candidates[i][k]) for k in keys)] for i in order[:SHOWN]]
+        rows = [[str(i), _shown(self.costs[i]), *(_text(self.candidates[i][k]) for k in keys)] for i in order[:_SHOWN]]
         tables = [Table(["candidate", "cost", *keys], rows, "Best candidates")]
         if matter:
             share = [[key, f"{100 * value:.0f} %"] for key, value in matter.items()]
@@ -126,7 +126,7 @@ class Search:
             pd.DataFrame(data, dtype=object),
             lead=f"{len(self.costs)} candidates; cost of the best {_shown(self.costs[self.best])}, "
             f"of the settings as they are {MISSING if base is None else number(base)}.",
-            notes=[LEGEND],
+            notes=[_LEGEND],
             code={"To fly the best one": [command]},
             images={"tuning.png": png(search_figure(self.costs, labels, base))},
         )

@@ -18,7 +18,7 @@ import numpy as np
 
 from gpmpc.exceptions import check_number
 from gpmpc.systems.attitudes import GRAVITY, attitude_for_thrust_direction
-from gpmpc.systems.quadrotor import ANGLE_UNITS, POSITION_UNITS, Rotational, Translational
+from gpmpc.systems.quadrotor import ANGLE_UNITS, ATTITUDE, POSITION, POSITION_UNITS, Rotational, Translational
 from gpmpc.systems.system import System, cos, sin
 
 
@@ -81,6 +81,7 @@ def coupled(
         rates={"vx": "x", "vy": "y", "vz": "z"},
         region=((-2.0, -1.0) * 3 + (-0.3, -0.5) * 3, (2.0, 1.0) * 3 + (0.3, 0.5) * 3),
         lost=10.0,
+        pose=POSITION | ATTITUDE,
         z_down=True,
     )
 

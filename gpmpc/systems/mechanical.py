@@ -279,6 +279,7 @@ def planar_quadrotor(mass: float = 0.74, arm: float = 0.21, inertia: float = 0.0
         region=[[-2.0, -2.0, -2.0, -2.0, -0.8, -3.0], [2.0, 2.0, 2.0, 2.0, 0.8, 3.0]],
         angles=["tilt"],
         rates={"vx": "x", "vy": "y"},
+        pose={"x": "x", "z": "y"},
         lost=10.0,
     )
 

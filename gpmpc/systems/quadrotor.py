@@ -15,6 +15,8 @@ from gpmpc.exceptions import check_number, check_numbers
 from gpmpc.systems.attitudes import GRAVITY, rotational_states_along
 from gpmpc.systems.system import System
 
+POSITION = {"x": "x", "y": "y", "z": "z"}
+ATTITUDE = {"roll": "phi", "pitch": "theta", "yaw": "psi"}
 POSITION_UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s")
 ANGLE_UNITS = dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys("pqr", "rad/s")
 
@@ -151,6 +153,7 @@ def translational(
         rates={"vx": "x", "vy": "y", "vz": "z"},
         region=((-20.0, -2.0) * 3, (20.0, 2.0) * 3),
         lost=10.0,  # a hundred times what a controlled one is off; twice where a fifth more mass than learned holds it
+        pose=POSITION,
         z_down=True,
     )
 
@@ -184,5 +187,6 @@ def rotational(
         region=((-0.5, -1.0) * 3, (0.5, 1.0) * 3),
         lost=pi / 2,  # a vehicle on its side carries itself no more
         references=rotational_states_along,
+        pose=ATTITUDE,
         z_down=True,
     )

@@ -83,7 +83,9 @@ class System:
             infinity only one that leaves the finite numbers is.
         references: From a trajectory, a count K and the time step to reference states (K, n), where a trajectory
             prescribes something other than tracked states.
-        z_down: Whether positions x, y, z have their z axis pointing downwards.
+        pose: States that say where it is in space and how it is turned, by x, y, z, roll, pitch, yaw; pictures show it
+            there.
+        z_down: Whether the z axis of that space points downwards.
 
     Raises:
         SettingError: A number out of range, an unknown name, tracked states of several units, or dynamics without a
@@ -107,6 +109,7 @@ class System:
     rates: Mapping[str, str] = field(default_factory=dict)
     lost: float = inf
     references: Callable[[Trajectory, int, float], Array] | None = None
+    pose: Mapping[str, str] = field(default_factory=dict)
     z_down: bool = False
 
     def __post_init__(self) -> None:
@@ -120,8 +123,13 @@ class System:
         self._set("units", {name: self.units.get(name, UNKNOWN) for name in (*states, *inputs)})
         if not self.tracked:
             self._set("tracked", [name for name in states if self.units[name] == self.units[states[0]]])
-        for key in ("angles", "tracked", "rates"):
-            for name in getattr(self, key):
+        for key, names in {
+            "angles": self.angles,
+            "tracked": self.tracked,
+            "rates": self.rates,
+            "pose": self.pose.values(),
+        }.items():
+            for name in names:
                 if name not in states:
                     raise SettingError(key, f"must name states, {', '.join(states)}; got {name!r}")
         for name in self.rates.values():

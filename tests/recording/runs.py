@@ -9,6 +9,7 @@ from gpmpc.status import Status
 
 STATES, INPUTS = ("x", "vx", "y", "vy", "z", "vz"), ("U1", "ux", "uy")
 UNITS = {"x": "m", "vx": "m/s", "y": "m", "vy": "m/s", "z": "m", "vz": "m/s", "U1": "N", "ux": "1", "uy": "1"}
+POSE = {axis: axis for axis in "xyz"}
 BOUNDS = [[0.0, -0.5, -0.5], [10.0, 0.5, 0.5]]
 TIME_STEP = 0.1  # [s]
 
@@ -56,9 +57,15 @@ def make_step(k, rng, horizon=5, status=Status.SOLVED, failed=False, qp=True, so
 
 def recorder(path, **settings):
     """A recorder of small chunks, so that a short run has several."""
-    given = {"chunk_size": 20_000, "time_step": TIME_STEP, "units": UNITS, "input_bounds": BOUNDS} | settings
+    given = {
+        "chunk_size": 20_000,
+        "time_step": TIME_STEP,
+        "units": UNITS,
+        "input_bounds": BOUNDS,
+        "pose": POSE,
+    } | settings
     of_system = {
-        key: given.pop(key) for key in ("time_step", "units", "input_bounds", "frame", "z_down") if key in given
+        key: given.pop(key) for key in ("time_step", "units", "input_bounds", "pose", "frame", "z_down") if key in given
     }
     system = RecordedSystem(STATES, INPUTS, **of_system)
     return McapRecorder(path, system, **({"config": {"seed": 7}, "metadata": {"seed": 7}} | given))

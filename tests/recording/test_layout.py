@@ -12,15 +12,15 @@ from mcap_protobuf.decoder import DecoderFactory
 from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.recording import McapRecorder, RecordedSystem, Step, layout, read_run
 from gpmpc.status import Status
-from gpmpc.systems import Coupled, Rotational
+from gpmpc.systems import coupled, pendulum, rotational, translational
 from tests.recording import runs
 
 SHIPPED = Path(__file__).resolve().parents[2] / "docs" / "foxglove-layout.json"
 FLOWN = {
-    "translational": (runs.STATES, runs.INPUTS),
-    "rotational": (Rotational.state_names, Rotational.input_names),
-    "whole": (Coupled.state_names, Coupled.input_names),
-    "pendulum": (("angle", "rate"), ("torque",)),
+    "translational": translational(),
+    "rotational": rotational(),
+    "whole": coupled(),
+    "pendulum": pendulum(),
 }
 
 
@@ -42,9 +42,10 @@ def record(path, states, inputs, steps=3, **settings):
 @pytest.fixture(scope="module", params=FLOWN)
 def shown(request, tmp_path_factory):
     """What was flown, its recording and its layout."""
-    states, inputs = FLOWN[request.param]
+    system = FLOWN[request.param]
+    states, inputs = system.state_names, system.input_names
     bounds = np.array([-np.ones(len(inputs)), np.ones(len(inputs))])
-    path = record(tmp_path_factory.mktemp("run") / "run.mcap", states, inputs, input_bounds=bounds)
+    path = record(tmp_path_factory.mktemp("run") / "run.mcap", states, inputs, input_bounds=bounds, pose=system.pose)
     return request.param, path, json.loads(layout(read_run(path)))
 
 
@@ -73,7 +74,7 @@ def test_every_path_is_a_number_of_the_recording(shown):
 
 def test_every_state_and_every_input_with_its_bounds_is_plotted(shown):
     flown, _, made = shown
-    states, inputs = FLOWN[flown]
+    states, inputs = FLOWN[flown].state_names, FLOWN[flown].input_names
     groups = [(group, states) for group in ("reference", "state", "measured")]
     groups += [(group, inputs) for group in ("input", "input_lower", "input_upper")]
     assert {f"/step.{group}.{name}" for group, names in groups for name in names} <= set(paths_of(made))

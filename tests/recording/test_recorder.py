@@ -148,7 +148,7 @@ def test_the_file_says_where_it_comes_from_before_the_first_message(recorded):
         reader = make_reader(file)
         first_chunk = min(index.chunk_start_offset for index in reader.get_summary().chunk_indexes)
         early = [index for index in reader.get_summary().metadata_indexes if index.offset < first_chunk]
-        assert [index.name for index in early] == ["run", "units", "frames"]
+        assert [index.name for index in early] == ["run", "units", "frames", "pose"]
         assert all(index.offset < first_chunk for index in reader.get_summary().attachment_indexes)
 
 

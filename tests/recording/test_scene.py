@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.recording import McapRecorder, RecordedSystem, Step
 from gpmpc.status import Status
-from gpmpc.systems import Coupled
+from gpmpc.systems import Coupled, coupled
 
 H = 3
 
@@ -56,7 +56,7 @@ def turn(quaternion):
 def flown(tmp_path_factory):
     path, rng = tmp_path_factory.mktemp("run") / "run.mcap", np.random.default_rng(4)
     outcomes = [(Status.SOLVED, False)] * 5 + [(Status.INFEASIBLE, True), (Status.ITERATION_LIMIT, False)]
-    return path, record(path, Coupled.state_names, outcomes, rng)
+    return path, record(path, Coupled.state_names, outcomes, rng, pose=coupled().pose)
 
 
 def of(state):
@@ -122,9 +122,17 @@ def test_every_solve_that_failed_is_logged_the_louder_the_more_it_mattered(flown
     assert failed.message == f"step 5: INFEASIBLE: {Status.INFEASIBLE.advice}; the policy for failures chose the input"
 
 
-def test_an_axis_that_no_state_names_is_zero_and_an_attitude_that_is_not_whole_is_none(tmp_path, rng):
+def test_an_axis_that_no_state_is_is_zero(tmp_path, rng):
     path = tmp_path / "run.mcap"
-    steps = record(path, ("z", "x", "phi"), [(Status.SOLVED, False)] * 3, rng, z_down=False, frame="hall")
+    steps = record(
+        path,
+        ("z", "x", "phi"),
+        [(Status.SOLVED, False)] * 3,
+        rng,
+        z_down=False,
+        frame="hall",
+        pose={"x": "x", "z": "z"},
+    )
     for message, step in zip(decoded(path, "/pose"), steps, strict=True):
         assert message.frame_id == "hall"
         assert place(message.pose.position) == [step.state[1], 0, step.state[0]]

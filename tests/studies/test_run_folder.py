@@ -24,8 +24,8 @@ def test_other_choices_have_another_folder_even_where_capitals_count_for_nothing
     [
         ({"a": {"b": 1}}, {"a": {"b": 1}}, ""),
         ({"a": {"b": 1, "c": 2}}, {"a": {"b": 1, "c": 3}}, "a.c: 2 then, 3 now"),
-        ({"a": {"b": 1}}, {"a": None}, "a: {'b': 1} then, None now"),
-        ({"a": 1}, {"a": {"b": 1}}, "a: 1 then, {'b': 1} now"),
+        ({"a": {"b": 1}}, {"a": None}, "a.b: 1 then, None now"),
+        ({"a": 1}, {"a": {"b": 1}}, "a: 1 then, None now, a.b: None then, 1 now"),
         ({"a": 1}, {"b": 2}, "a: 1 then, None now, b: None then, 2 now"),
         ({"a": 0, "b": 0, "c": 0}, {"a": 1, "b": 1, "c": 1}, "a: 0 then, 1 now, b: 0 then, 1 now, c: 0 then, 1 now"),
         (
