@@ -78,7 +78,7 @@ def kkt_residual(model: DynamicsModel, problem: Problem, instance: Instance, inp
         return np.inf
     states, A, B = _rollout(model, instance.state, np.asarray(inputs, dtype=float))
     errors = states[1:] - instance.targets
-    weights = np.array([problem.cost.Q] * (H - 1) + [problem.cost.terminal])
+    weights, _ = problem.cost.by_stage(H)
     cost, gradient, curvature = _of_the_inputs(problem, instance.last, inputs)
     cost += np.einsum("ia,iab,ib->", errors, weights, errors)
     adjoint = np.zeros(problem.state_dim)

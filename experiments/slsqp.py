@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 from scipy.optimize import minimize
 
 from gpmpc.dynamics import DynamicsModel, check_next_states, tensors_for, to_array
@@ -88,11 +88,13 @@ class SLSQP:
         boxes = [box for box in problem.constraints if isinstance(box, Box) and box.penalty is None and not box.joint]
         if len(boxes) < len(problem.constraints) or any(box.lower.ndim > 1 or box.stages for box in boxes):
             raise SettingError("problem", "must have hard boxes (penalty=None) at all stages, or no constraints")
+        problem.check_plain("SLSQP")
         self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
         self.tolerance, self.iterations = tolerance, iterations
         self._differences = np.kron(np.eye(H) - np.eye(H, k=-1), np.eye(m))  # U -> u_i - u_{i-1}, without u_{-1}
         self._penalized = self._differences if cost.penalized == "increments" else np.eye(H * m)
-        self._R, self._weights = np.kron(np.eye(H), cost.R), np.array([cost.Q] * (H - 1) + [cost.terminal])
+        self._weights, R = cost.by_stage(H)
+        self._R = block_diag(*R)
         sides = [(side, sign, box) for box in boxes for side, sign in ((box.lower, -1.0), (box.upper, 1.0))]
         entries = [
             (j, sign, bound[j], box.standard_deviations())
@@ -153,7 +155,7 @@ class SLSQP:
 
     def _minimize(self, request: Request) -> tuple[Evaluation, Status, int]:
         """Rounds of SLSQP, each in inputs scaled by the Gauss-Newton Hessian, from the better of two plans."""
-        lower, upper = (np.tile(side, self.horizon) for side in (self.problem.inputs.lower, self.problem.inputs.upper))
+        lower, upper = (side.ravel() for side in self.problem.inputs.by_stage(self.horizon))
         starts = [plan.ravel().clip(lower, upper) for plan in (request.constant_guess, request.initial_guess)]
         found, used = min((self.evaluate(plan, request) for plan in starts), key=_rank), 0
         for _ in range(ROUNDS):

@@ -23,9 +23,10 @@ from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.interrupts import interrupts_after
 from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_controller
-from gpmpc.mpc.linear_quadratic import Stages, TrackingCost, optimal_feedback
+from gpmpc.mpc.linear_quadratic import Stages, optimal_feedback
 from gpmpc.mpc.problem import Problem
-from gpmpc.mpc.stages import ConstraintRows
+from gpmpc.mpc.stages import ConstraintRows, Plan, StageCosts, StageLinearizer
+from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from gpmpc.systems import Plant
 
@@ -126,10 +127,11 @@ class LQR:
 
     def __init__(self, model: DynamicsModel, problem: Problem, horizon: int, initial_input: Sequence[float]):
         self.initial_input = check_controller(problem, *check_next_states(model), horizon, initial_input)
+        problem.check_plain("LQR")
         if problem.constraints:
             raise SettingError("constraints", "LQR knows the bounds of inputs only; leave those of states out")
         self.model, self.problem, self.horizon = model, problem, horizon
-        self._cost = TrackingCost.of(problem, problem.cost.Q[None], problem.cost.terminal[None])
+        self._cost = StageCosts(problem, horizon, StageLinearizer(model, Linearization(), "none")).quadratic
 
     def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
         """The clipped linear-quadratic plan; see ``Controller.control``. Covariances are not predicted.
@@ -154,10 +156,11 @@ class LQR:
         if not np.isfinite(feedback).all():
             return request.failed_decision(Status.NUMERICAL_TROUBLE)
         states, inputs, box, rates = [x], [], self.problem.inputs, self.problem.input_rates
-        for A, B, offset, F in zip(*stages, feedback, strict=True):
+        (low, high), (down, up) = (bounds.by_stage(self.horizon) for bounds in (box, rates))
+        for k, (A, B, offset, F) in enumerate(zip(*stages, feedback, strict=True)):
             u = F @ np.concatenate([x, last, [1.0]])
             # The box last: where it and the rates contradict each other, the input must at least exist.
-            u = u.clip(last + rates.lower, last + rates.upper).clip(box.lower, box.upper)
+            u = u.clip(last + down[k], last + up[k]).clip(low[k], high[k])
             x, last = A @ x + B @ u + offset, u
             states.append(x)
             inputs.append(u)
@@ -177,14 +180,15 @@ def _build(
     plant: Plant, problem: Problem, horizon: int, tolerance: float
 ) -> tuple[casadi.Function, list[dict[str, np.ndarray]]]:
     """IPOPT on the unknowns (x_1 .. x_H, u_0 .. u_{H-1}, slacks), and the bounds of unknowns and constraints."""
+    problem.check_plain("NMPC")
     n, m, H, goal = problem.state_dim, problem.input_dim, horizon, problem.cost
     x0, last = casadi.SX.sym("x0", n), casadi.SX.sym("last", m)
     x, u, r, wanted = (casadi.SX.sym(name, size, H) for name, size in (("x", n), ("u", m), ("r", n), ("wanted", m)))
     rates = u - casadi.horzcat(last, u[:, :-1])
     penalized = {"inputs": u, "deviations": u - wanted, "increments": rates}[goal.penalized]
-    Q, R, T = casadi.DM(goal.Q), casadi.DM(goal.R), casadi.DM(goal.terminal)
-    cost = sum(casadi.bilin(R, v, v) for v in casadi.horzsplit(penalized))
-    cost += sum(casadi.bilin(T if k == H - 1 else Q, e, e) for k, e in enumerate(casadi.horzsplit(x - r)))
+    Q, R = goal.by_stage(H)
+    cost = sum(casadi.bilin(casadi.DM(R[k]), v, v) for k, v in enumerate(casadi.horzsplit(penalized)))
+    cost += sum(casadi.bilin(casadi.DM(Q[k]), e, e) for k, e in enumerate(casadi.horzsplit(x - r)))
     before = casadi.horzsplit(casadi.horzcat(x0, x[:, :-1]))
     after = [casadi.vertcat(*plant.successor(s, v)) for s, v in zip(before, casadi.horzsplit(u), strict=True)]
     constraints, g = [casadi.vec(x - casadi.horzcat(*after))], [np.zeros((2, H * n))]
@@ -194,10 +198,8 @@ def _build(
     unknowns, states = [casadi.vec(x), casadi.vec(u)], np.stack([np.full((H, n), -np.inf), np.full((H, n), np.inf)])
     box = [np.empty((2, 0)), np.array(problem.inputs.by_stage(H)).reshape(2, -1)]
     rows = ConstraintRows(problem, H, "none")
-    if rows.smooth:
-        raise SettingError("constraints", "NMPC takes Box and Halfspaces; Inequality is for GPMPC")
     soft = np.isfinite(rows.prices)
-    E, lower, upper = rows.at(np.empty((0, n)), np.empty(0), H)
+    E, _, lower, upper = rows.at(Plan(np.empty((0, n)), np.empty((0, m)), np.empty(0)), np.empty(0), H)
     single = (np.count_nonzero(E[0], axis=1) == 1) & (E[0].max(axis=1) == 1.0)
     for e in np.flatnonzero(single & ~soft):
         j = int(np.argmax(E[0, e]))

@@ -1,11 +1,12 @@
 """Condenses a linear-quadratic tracking problem over affine stages into a quadratic program without states.
 
     s_{k+1} = A_k s_k + B_k u_k + c_k,   k = 0 .. H-1,   s_0 given
-    minimise    sum_{k=1..H} |s_k - r_k|^2_W + sum_{k=0..H-1} |v_k|^2_R
-    subject to  bounds on u_k, on u_k - u_{k-1} and on E_k s_{k+1}
+    minimise    sum_{k=0..H-1} |s_{k+1} - r_{k+1}|^2_W + |v_k|^2_R + z_k' Z_k z_k
+    subject to  bounds on u_k, on u_k - u_{k-1} and on E_k s_{k+1} + D_k u_k
 
-where v is the input, its deviation from a reference or its increment. Weights of s are block diagonal, (p / n, n, n):
-Q alone for the mean, and one Q a row of S for s = [mu; vec S], where diag(Q, I_n kron Q) is never written out.
+where v is the input, its deviation from a reference or its increment, and Z are the squares of linearised outputs in
+z_k = [x_{k+1}; u_k; 1], x the mean in s. Weights of s are block diagonal, (p / n, n, n): Q alone for the mean, and one
+Q a row of S for s = [mu; vec S]. D comes with H stages of E.
 
 Input coordinates. With Gamma_{k,i} = ds_k / du_i the program is min 1/2 U'P U + q'U, P = 2 (Gamma' W Gamma + R~): (38)-
 (39) of Cao, Lai and Alam (2017), whose P lacks the 2 and whose unknowns are the increments. Bounds of inputs are a box.
@@ -18,12 +19,7 @@ eigenvalue, of the size of R, is lost. There the unknowns are what is added to t
 u_k = F_k [s_k; u_{k-1}; 1] + v_k, by the Riccati recursion: P is block diagonal, q is zero, and the response to v is
 stable. The bounds of inputs are rows, for which stable plants would pay two to three times the time. So these
 coordinates are used where the diagonal of P exceeds that of the last stage, which no A enters, by ``_LARGEST_GROWTH``.
-
-A stage-structured (Riccati) factorisation costs O(H), and two of its recursions for every working constraint: with none
-condensing takes 1.1 of its time at H = 50 (n = 6, m = 3), and less where constraints work.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 from numba import types
@@ -34,12 +30,16 @@ from gpmpc.kernels.linalg import aligned_rows, combine_rows, copy, copy_matrix, 
 from gpmpc.mpc.linear_quadratic import (
     DEVIATIONS,
     INCREMENTS,
+    CondensedProgram,
+    InputBounds,
+    QuadraticCost,
     References,
+    StageRows,
     Stages,
-    TrackingCost,
     add_blocks,
     expand,
     optimal_feedback,
+    weight_of_stage,
 )
 from gpmpc.mpc.problem import Problem
 
@@ -48,84 +48,60 @@ Array = np.ndarray
 _LARGEST_GROWTH = 1e10
 
 
-class InputBounds(NamedTuple):
-    """Bounds of u_k and of u_k - u_{k-1}."""
-
-    lower: Array  # (H, m)
-    upper: Array  # (H, m)
-    rate_lower: Array  # (H, m), or (0, m) where rates have no bounds
-    rate_upper: Array  # (H, m) or (0, m)
-
-
-class StateRows(NamedTuple):
-    """Bounds lower_k <= E_k s_{k+1} <= upper_k."""
-
-    E: Array  # (H or 1, r, p)
-    lower: Array  # (H, r)
-    upper: Array  # (H, r)
-
-
-class CondensedProgram(NamedTuple):
-    """min 1/2 v'P v + q'v under lower <= [v; G v] <= upper.
-
-    The last of the stacked constraints are the bounds of inputs, of increments (where there are such) and of E s, stage
-    by stage: all of them in input coordinates, all after H m unbounded v in feedback coordinates.
-    """
-
-    P: Array  # (H m, H m)
-    q: Array  # (H m,)
-    G: Array  # (rows, H m)
-    lower: Array  # (H m + rows,)
-    upper: Array  # (H m + rows,)
-    feedback: Array  # F_k of u_k = F_k [s_k; u_{k-1}; 1] + v_k (H, m, p + m + 1); (0, m, p + m + 1) where u = v
-
-
 class Condenser:
-    """Condenses the stages of one tracking problem.
+    """Condenses the stages of one problem.
 
     Args:
-        problem: Weights and bounds of the inputs.
+        problem: Bounds of the inputs.
         horizon: H.
-        weight: W of the extended state (p / n, n, n).
-        terminal: W_H (p / n, n, n).
+        blocks: p / n.
     """
 
-    def __init__(self, problem: Problem, horizon: int, weight: Array, terminal: Array):
+    def __init__(self, problem: Problem, horizon: int, blocks: int):
         rated = horizon if problem.input_rates.finite else 0
-        self.cost = TrackingCost.of(problem, weight, terminal)
         self.bounds = InputBounds(
             *problem.inputs.by_stage(horizon), *[side[:rated] for side in problem.input_rates.by_stage(horizon)]
         )
         compile_for(_condense, _SIGNATURE)  # pyright: ignore[reportArgumentType]
         self._condense = unchecked_entry_point(_condense)
         n, m = problem.state_dim, problem.input_dim
-        self._size, self._rates, self._plain = horizon * m, rated * m, np.empty((0, m, len(weight) * n + m + 1))
+        self._size, self._rates, self._plain = horizon * m, rated * m, np.empty((0, m, blocks * n + m + 1))
 
-    def condense(self, stages: Stages, start: Array, references: References, rows: StateRows) -> CondensedProgram:
+    def condense(
+        self, cost: QuadraticCost, stages: Stages, start: Array, references: References, rows: StageRows
+    ) -> CondensedProgram:
         """Makes the program in the coordinates that suit it; ``expand`` gives inputs and states of its solution.
 
         Args:
+            cost: Of the extended state.
             stages: With constant A, B and E, or H of one of them.
             start: s_0 (p,).
             references: What is tracked.
-            rows: Bounds of the states.
+            rows: Bounds of states and inputs.
         """
-        for array in (*stages, start, rows.E, references.states):  # the kernel does not look at their strides
+        for array in (
+            *stages,
+            start,
+            rows.E,
+            rows.D,
+            references.states,
+            cost.squares,
+        ):  # the kernel does not look at their strides
             if not array.flags.c_contiguous:
                 raise ShapeError("stages, rows and references must be contiguous arrays")
         size, count = self._size, self._rates + rows.lower.size
         lower, upper = np.empty((2, size + count))
         P, q, G = np.empty((size, size)), np.empty(size), np.empty((count, size))
         program = CondensedProgram(P, q, G, lower, upper, self._plain)
-        if self._condense(self.cost, self.bounds, stages, start, references, rows, program) <= _LARGEST_GROWTH:
+        if self._condense(cost, self.bounds, stages, start, references, rows, program) <= _LARGEST_GROWTH:
             return program
-        return condense_with_feedback(self.cost, self.bounds, stages, start, references, rows)
+        return condense_with_feedback(cost, self.bounds, stages, start, references, rows)
 
 
 @compiled
 def _condense(cost, bounds, stages, start, references, rows, program):
     """Writes the program in input coordinates, and returns the growth of A: P_ii over the last stage's, summed."""
-    growth, m = 0.0, len(cost.input)
+    growth, m = 0.0, bounds.lower.shape[1]
     write_hessian_and_rows(cost, bounds, stages, rows, program)
     for i in range(len(program.P)):
         growth += program.P[i, i] / program.P[len(program.P) - m + i % m, len(program.P) - m + i % m]
@@ -139,32 +115,43 @@ def write_hessian_and_rows(cost, bounds, stages, rows, program):
     (H, m), first, P, G = bounds.lower.shape, bounds.rate_lower.size, program.P, program.G
     P[:], G[:] = 0.0, 0.0
     for k in range(H):
+        R, following = cost.input[min(k, len(cost.input) - 1)], cost.input[min(k + 1, len(cost.input) - 1)]
         for i in range(m):
             for j in range(m):
-                R = 2.0 * cost.input[i, j]
-                P[k * m + i, k * m + j] = 2.0 * R if cost.penalized == INCREMENTS and k < H - 1 else R
+                P[k * m + i, k * m + j] = 2.0 * R[i, j]
+                if cost.penalized == INCREMENTS and k < H - 1:
+                    P[k * m + i, k * m + j] += 2.0 * following[i, j]
                 if cost.penalized == INCREMENTS and k > 0:
-                    P[k * m + i, (k - 1) * m + j] = -R
+                    P[k * m + i, (k - 1) * m + j] = -2.0 * R[i, j]
     for i in range(first):
         G[i, i] = 1.0
         if i >= m:
             G[i, i - m] = -1.0
-    if len(stages.A) == 1 and len(rows.E) == 1:
+    if len(stages.A) == len(rows.E) == len(cost.state) == 1 and len(cost.squares) == 0:
         _add_constant_stages(cost, stages, rows.E[0], H, P, G[first:])
     else:
-        _add_varying_stages(cost, stages, rows.E, H, P, G[first:])
+        _add_varying_stages(cost, stages, rows, H, P, G[first:])
 
 
 @njit_inner
-def _add_varying_stages(cost, stages, E, H, P, G):
+def _add_varying_stages(cost, stages, rows, H, P, G):
     """Adds 2 Gamma' W Gamma to P, and writes E Gamma to G; whole registers at a time, in padded copies."""
-    (p, m), r, last = stages.B.shape[1:], E.shape[1], len(stages.A) - 1
+    (p, m), n, last, E, D, Z = (
+        stages.B.shape[1:],
+        cost.terminal.shape[1],
+        len(stages.A) - 1,
+        rows.E,
+        rows.D,
+        cost.squares,
+    )
+    r = E.shape[1]
     M, MA, MB = _zeros(p, p), _zeros(p, p), _zeros(p, m)
     A, transposed, B = _zeros(p, p), np.empty((p, p)), _zeros(p, m)
     BM = np.empty((H, m, p))  # 2 B_k' M_{k+1}
     for k in range(H - 1, -1, -1):  # backward: M_{k+1} = W_{k+1} + A' M A, the second part is there already
         at = min(k, last)
-        add_blocks(cost.terminal if k == H - 1 else cost.state, M)
+        add_blocks(weight_of_stage(cost, k, H), M)
+        add_blocks(Z[k : k + 1, :n, :n], M)
         for i in range(p):
             for j in range(p):
                 A[i, j] = transposed[j, i] = stages.A[at, i, j]
@@ -177,6 +164,8 @@ def _add_varying_stages(cost, stages, E, H, P, G):
                 BM[k, j, i] = 2.0 * MB[i, j]
         for i in range(p):
             combine_rows(MA, p, transposed[i], 0, p, M[i])
+        if len(Z) > 0:
+            _add_inputs_of_square(Z[k], stages.B[at], BM[k], P[k * m :, k * m :])
     gamma, following, row = _zeros(p, H * m), _zeros(p, H * m), _zeros(1, H * m)[0]
     for k in range(H):  # forward: Gamma_{k+1}
         at, width = min(k, last), (k + 1) * m
@@ -193,7 +182,22 @@ def _add_varying_stages(cost, stages, E, H, P, G):
         for e in range(r):
             combine_rows(gamma, p, E[min(k, len(E) - 1), e], 0, width, row)
             copy(row, G[k * r + e, :width])
+            for j in range(m if len(D) > 0 else 0):
+                G[k * r + e, k * m + j] += D[k, e, j]
     _mirror(P)
+
+
+@njit_inner
+def _add_inputs_of_square(Z, B, BM, P):
+    """Adds what weighs u_k in z'Zz: alone and with s_{k+1} to its block of P, with what came before to 2 B'M."""
+    m, n = len(BM), len(Z) - len(BM) - 1
+    for a in range(m):
+        for b in range(m):
+            P[a, b] += 2.0 * Z[n + a, n + b]
+            for i in range(n):
+                P[a, b] += 2.0 * B[i, a] * Z[i, n + b]
+        for i in range(n):
+            BM[a, i] += 2.0 * Z[n + a, i]
 
 
 @njit_inner
@@ -201,7 +205,7 @@ def _add_constant_stages(cost, stages, E, H, P, G):
     """``_add_varying_stages`` for one A, B and E."""
     (p, m), r, size = stages.B.shape[1:], len(E), len(P)
     X, transposed = _zeros(size, p), _zeros(p, p)  # row l m + a of X: column a of A^l B
-    W, T, same = _padded(cost.state), _padded(cost.terminal), np.array_equal(cost.state, cost.terminal)
+    W, T, same = _padded(cost.state[0]), _padded(cost.terminal), np.array_equal(cost.state[0], cost.terminal)
     for i in range(p):
         for j in range(p):
             transposed[j, i] = stages.A[0, i, j]
@@ -241,7 +245,7 @@ def _add_constant_stages(cost, stages, E, H, P, G):
 @njit_inner
 def write_gradient_and_bounds(cost, bounds, stages, start, references, rows, program):
     """Writes q by the adjoint recursion, and the bounds of the stacked constraints, in input coordinates."""
-    A, B, R, targets, last = stages.A, stages.B, cost.input, references.states, len(stages.A) - 1
+    A, B, Z, targets, last = stages.A, stages.B, cost.squares, references.states, len(stages.A) - 1
     (H, m), n, p = references.inputs.shape, targets.shape[1], len(start)
     q, previous, free = program.q.reshape(H, m), references.previous_input, np.empty((H + 1, p))
     copy(start, free[0])
@@ -249,9 +253,10 @@ def write_gradient_and_bounds(cost, bounds, stages, start, references, rows, pro
         for i in range(p):
             free[k + 1, i] = stages.c[min(k, last), i] + dot(A[min(k, last), i], free[k], p)
     q[:] = 0.0
-    W, T = _padded(cost.state), _padded(cost.terminal)
+    W = _padded(cost.state[0])
     error, gradient, pulled = np.empty(p), np.zeros(p + 8), np.zeros(p)
     for k in range(H - 1, -1, -1):
+        R = cost.input[min(k, len(cost.input) - 1)]
         for j in range(m):
             if cost.penalized == DEVIATIONS:
                 centre = references.inputs[k, j]
@@ -262,9 +267,15 @@ def write_gradient_and_bounds(cost, bounds, stages, start, references, rows, pro
         copy(free[k + 1], error)
         for i in range(n):
             error[i] -= targets[k, i]
-        _weigh(T if k == H - 1 else W, error, gradient)
+        _weigh(W if len(cost.state) == 1 and k < H - 1 else _padded(weight_of_stage(cost, k, H)), error, gradient)
         for i in range(p):
             gradient[i] = 2.0 * gradient[i] + pulled[i]
+        for i in range(n + m if len(Z) > 0 else 0):
+            slope = 2.0 * (dot(Z[k, i], free[k + 1], n) + Z[k, i, n + m])
+            if i < n:
+                gradient[i] += slope
+            else:
+                q[k, i - n] += slope
         pulled[:] = 0.0
         for i in range(p):
             weight, row, reach = gradient[i], A[min(k, last), i], B[min(k, last), i]
@@ -278,7 +289,7 @@ def write_gradient_and_bounds(cost, bounds, stages, start, references, rows, pro
 @compiled
 def condense_with_feedback(cost, bounds, stages, start, references, rows):
     """``condense`` in feedback coordinates."""
-    (p, m), r, E = stages.B.shape[1:], rows.E.shape[1], rows.E
+    (p, m), r, E, D = stages.B.shape[1:], rows.E.shape[1], rows.E, rows.D
     H, limited = len(references.inputs), bounds.rate_lower.size
     size, count = H * m, H * m + limited + H * r
     feedback, hessians = optimal_feedback(cost, stages, references)
@@ -305,7 +316,10 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
             combine_rows(reach, p + m, factors, 0, width, following[i])
         copy_matrix(following, reach[:p])
         for e in range(r):
-            combine_rows(reach, p, E[min(k, len(E) - 1), e], 0, width, inputs[0])
+            factors[:p], factors[p:] = E[min(k, len(E) - 1), e], 0.0
+            if len(D) > 0:
+                factors[p:] = D[k, e]
+            combine_rows(reach, p + m, factors, 0, width, inputs[0])
             copy(inputs[0], G[size + limited + k * r + e, :width])
             inputs[0, here:width] = 0.0
     previous, lower, upper = references.previous_input, np.full(size + count, -np.inf), np.full(size + count, np.inf)
@@ -318,7 +332,8 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
 @njit_inner
 def _write_bounds(bounds, rows, inputs, states, previous_input, unbounded, program):
     """Writes bounds of the stacked constraints after the unbounded ones, given what inputs and states are at v = 0."""
-    (H, m), limited, E, lower, upper = inputs.shape, bounds.rate_lower.size, rows.E, program.lower, program.upper
+    (H, m), limited, E, D = inputs.shape, bounds.rate_lower.size, rows.E, rows.D
+    lower, upper = program.lower, program.upper
     first, r = unbounded + H * m, E.shape[1]
     for k in range(H):
         for i in range(m):
@@ -330,6 +345,7 @@ def _write_bounds(bounds, rows, inputs, states, previous_input, unbounded, progr
                 lower[at], upper[at] = bounds.rate_lower[k, i] - rate, bounds.rate_upper[k, i] - rate
         for e in range(r):
             at, value = first + limited + k * r + e, dot(E[min(k, len(E) - 1), e], states[k + 1], E.shape[2])
+            value += dot(D[k, e], inputs[k], m) if len(D) > 0 else 0.0
             lower[at], upper[at] = rows.lower[k, e] - value, rows.upper[k, e] - value
 
 
@@ -375,5 +391,5 @@ def _record(kind, *fields):
 
 
 _PROGRAM, _VECTOR = _record(CondensedProgram, 2, 1, 2, 1, 1, 3), types.Array(types.float64, 1, "C")
-_GIVEN = _record(TrackingCost, 3, 3, 2, 0), _record(InputBounds, 2, 2, 2, 2), _record(Stages, 3, 3, 2)
-_SIGNATURE = types.float64(*_GIVEN, _VECTOR, _record(References, 2, 2, 1), _record(StateRows, 3, 2, 2), _PROGRAM)
+_GIVEN = _record(QuadraticCost, 4, 3, 3, 0, 3), _record(InputBounds, 2, 2, 2, 2), _record(Stages, 3, 3, 2)
+_SIGNATURE = types.float64(*_GIVEN, _VECTOR, _record(References, 2, 2, 1), _record(StageRows, 3, 3, 2, 2), _PROGRAM)

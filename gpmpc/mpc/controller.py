@@ -22,7 +22,7 @@ Array = np.ndarray
 
 FEASIBLE = 1e-3  # by how much a suboptimal plan may miss hard bounds, in their units: a next step mends it
 _NO_PLAN, _NO_DISTURBANCE = np.empty((0, 0)), np.empty(0)
-_SIGNATURE = "i8(f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])"
+_SIGNATURE = f"i8(f8[::1], {3 * 'f8[:, ::1], '}f8[::1], {4 * 'f8[:, ::1], '})".replace(", )", ")")
 _BELIEF, _STATES, _INPUTS, _PREVIOUS = 1, 2, 4, 8  # what may not be finite
 
 
@@ -126,6 +126,14 @@ class Decision:
         """Whether the plan may be applied, and started from; the inputs of another decision are a failed iterate."""
         return self.status.solved or self.suboptimal
 
+    @property
+    def violation(self) -> float:
+        """By how much the plan misses a bound of its last program, in the bound's unit; soft ones may be missed.
+
+        Zero but for rounding where all are kept; NaN without a program.
+        """
+        return float("nan") if self.solution is None else float(self.solution.violation().max(initial=0.0))
+
 
 class Controller(Protocol):
     """A feedback law with a look-ahead."""
@@ -153,12 +161,14 @@ class Request(NamedTuple):
         state: Mean of the belief (n,).
         covariance: Of the belief (n, n).
         references: r_1 .. r_H, reference inputs (zero where there are none), and the input before this step.
-        initial_guess: The last plan, one step on, its last input repeated (H, m); the previous input repeated where no
-            plan may be applied. Within the input bounds.
+        initial_guess: Inputs (H, m) within their bounds: those handed over; else the last plan's, one step on, the last
+            one repeated; else the previous input repeated.
         finite: Whether the belief is. A belief that is not is a bad measurement, not misuse.
         disturbance: Added to the model's mean at every stage (n,), or nothing (0,).
         parameters: Of the smooth constraints, by stage (H, q); None where there are none.
         kappas: Of the reference (H,), where it has some.
+        previous: The last decision, where its plan may be started from and has this horizon.
+        states: A first guess of x_0 .. x_H (H + 1, n), where one was handed over.
     """
 
     state: Array
@@ -169,6 +179,8 @@ class Request(NamedTuple):
     disturbance: Array = _NO_DISTURBANCE
     parameters: Array | None = None
     kappas: Array | None = None
+    previous: Decision | None = None
+    states: Array | None = None
 
     @classmethod
     def read(
@@ -179,6 +191,7 @@ class Request(NamedTuple):
         belief: Gaussian,
         reference: Reference,
         previous: Decision | None,
+        plan: Any = None,
     ) -> "Request":
         """Validates the arguments of ``Controller.control``.
 
@@ -189,10 +202,11 @@ class Request(NamedTuple):
             belief: Of the state.
             reference: Over the horizon.
             previous: The last decision. Of one that is not applicable only ``input`` counts: what was applied.
+            plan: To start from in the place of the last one: inputs (H, m), or these and states (H + 1, n).
 
         Raises:
-            ShapeError: Belief or reference have other dimensions than the problem and the horizon.
-            DataError: The reference is not finite.
+            ShapeError: Belief, reference or plan have other dimensions than the problem and the horizon.
+            DataError: Reference or plan are not finite.
         """
         if not (isinstance(belief, Gaussian) and isinstance(reference, Reference)):
             raise ShapeError(
@@ -209,15 +223,16 @@ class Request(NamedTuple):
         inputs = np.zeros((horizon, m)) if reference.inputs is None else _array(reference.inputs)
         if inputs.shape != (horizon, m):
             raise ShapeError(f"reference inputs must have shape ({horizon}, {m}); got {inputs.shape}")
-        last, plan = initial_input if previous is None else _array(previous.input), _NO_PLAN
-        if previous is not None and previous.applicable and np.shape(previous.inputs) == (horizon, m):
-            plan = _array(previous.inputs)
-        last, guess = _array(last), np.empty((horizon, m))
-        bounds = problem.inputs.lower, problem.inputs.upper
-        found = _run(state, covariance, states, inputs, last, plan, *bounds, guess)
+        last, guess = _array(initial_input if previous is None else previous.input), np.empty((horizon, m))
+        usable = previous is not None and previous.applicable and np.shape(previous.inputs) == guess.shape
+        made, previous = previous if usable else None, None
+        first, guessed = (_NO_PLAN if made is None else _array(made.inputs)), None
+        if plan is not None:
+            first, guessed = _read_plan(plan, horizon, n, m)
+        found = _run(state, covariance, states, inputs, last, first, *problem.inputs.sides, guess)
         if found & _PREVIOUS:
             last = _array(initial_input)
-            found = _run(state, covariance, states, inputs, last, plan, *bounds, guess)
+            found = _run(state, covariance, states, inputs, last, first, *problem.inputs.sides, guess)
         for part, name, values in ((_STATES, "states", states), (_INPUTS, "inputs", inputs)):
             if found & part:
                 raise DataError(f"reference {name} must be finite; got {values[~np.isfinite(values)][0]}")
@@ -225,9 +240,10 @@ class Request(NamedTuple):
         if kappas is not None and not np.isfinite(kappas).all():
             raise DataError(f"reference kappas must be finite; got {kappas}")
         if problem.cost.angles and not found & _BELIEF:
-            states = _unwrapped(states, state, previous, problem.cost.angles)
+            states = _unwrapped(states, state, guessed, made, problem.cost.angles)
         references = References(states[1:], inputs, last)
-        return cls(state, covariance, references, guess, not found & _BELIEF, kappas=kappas)
+        known = {"kappas": kappas, "previous": made, "states": guessed}
+        return cls(state, covariance, references, guess, not found & _BELIEF, **known)
 
     @property
     def constant_guess(self) -> Array:
@@ -311,10 +327,26 @@ def full_turns(difference: Array, angles: Sequence[int]) -> Array:
     return turns
 
 
-def _unwrapped(states: Array, state: Array, previous: Decision | None, angles: Sequence[int]) -> Array:
-    """References (H + 1, n) whose angles are moved by full turns towards the last plan, or the state where none is."""
+def _read_plan(plan: Any, horizon: int, n: int, m: int) -> tuple[Array, Array | None]:
+    """The inputs of a plan, after one more row, and its states where it has some."""
+    inputs, states = plan if isinstance(plan, tuple) else (plan, None)
+    inputs, states = _array(inputs), None if states is None else _array(states)
+    if inputs.shape != (horizon, m) or (states is not None and states.shape != (horizon + 1, n)):
+        shapes = f"inputs ({horizon}, {m}), or these and states ({horizon + 1}, {n})"
+        raise ShapeError(f"a plan must be {shapes}; got {inputs.shape}{'' if states is None else f', {states.shape}'}")
+    if not (np.isfinite(inputs).all() and (states is None or np.isfinite(states).all())):
+        raise DataError("a plan to start from must be finite")
+    return np.vstack([inputs[:1], inputs]), states
+
+
+def _unwrapped(
+    states: Array, state: Array, guess: Array | None, previous: Decision | None, angles: Sequence[int]
+) -> Array:
+    """References (H + 1, n) whose angles are moved by full turns towards the plan, or the state where none is."""
     plan = np.tile(state, (len(states), 1))
-    if previous is not None and previous.applicable and np.shape(previous.means) == states.shape:
+    if guess is not None:
+        plan[:] = guess
+    elif previous is not None:
         plan[1:] = np.concatenate([previous.means[2:], previous.means[-1:]])
         plan[1:] += full_turns(state - previous.means[1], angles)
     moved, index = states.copy(), list(angles)
@@ -328,8 +360,8 @@ def _check(state, covariance, states, inputs, last, plan, lower, upper, guess):
     H, m = guess.shape
     for k in range(H):
         for j in range(m):
-            u = plan[min(k + 1, H - 1), j] if len(plan) > 0 else last[j]
-            guess[k, j] = min(max(u, lower[j]), upper[j])
+            u, at = plan[min(k + 1, len(plan) - 1), j] if len(plan) > 0 else last[j], min(k, len(lower) - 1)
+            guess[k, j] = min(max(u, lower[at, j]), upper[at, j])
     found = 0 if _is_finite(state) and _is_finite(covariance.ravel()) else _BELIEF
     found += 0 if _is_finite(states.ravel()) else _STATES
     found += 0 if _is_finite(inputs.ravel()) else _INPUTS

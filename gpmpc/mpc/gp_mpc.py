@@ -25,9 +25,9 @@ from gpmpc.compiled import call_unchecked
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.condense import CondensedProgram, Condenser
+from gpmpc.mpc.condense import Condenser
 from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_method
-from gpmpc.mpc.linear_quadratic import Stages, expand
+from gpmpc.mpc.linear_quadratic import CondensedProgram, Stages, expand
 from gpmpc.mpc.prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc.problem import Problem
 from gpmpc.mpc.sqp import FAILURES, FullStep, Globalization
@@ -86,8 +86,7 @@ class GPMPC:
         self.iterations, self.tolerance = iterations, tolerance
         self.solver = DualActiveSet() if solver is None else solver
         check_method("solver", self.solver, "solve", "DualActiveSet()")
-        weight = self.prediction.linearizer.weight
-        self._condenser = Condenser(problem, horizon, weight(problem.cost.Q), weight(problem.cost.terminal))
+        self._condenser = Condenser(problem, horizon, len(self.prediction.costs.quadratic.terminal))
         self._rates = self._condenser.bounds.rate_lower.size
         self.soft = self.prediction.constraints.softness(self._rates)
         if self.soft is not None and not isinstance(self.solver, DualActiveSet):
@@ -97,7 +96,12 @@ class GPMPC:
             )
 
     def control(
-        self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
+        self,
+        belief: Gaussian,
+        reference: Reference,
+        previous: Decision | None = None,
+        parameters: Any = None,
+        plan: Any = None,
     ) -> Decision:
         """Decides the input for one step; see ``Controller.control``.
 
@@ -109,30 +113,27 @@ class GPMPC:
             belief: What is known of the state.
             reference: Over the horizon, with inputs where the weights ask for them.
             previous: The last decision; one that is not applicable is ignored.
-            parameters: Of the smooth constraints, (q,) or by stage (H, q), such as where an obstacle will be.
+            parameters: Of outputs and smooth constraints, (q,) or by stage (H, q), such as where an obstacle will be.
+            plan: To start from in the place of the last one: inputs (H, m), or these and states (H + 1, n), which need
+                not obey the dynamics.
 
         Raises:
-            ShapeError: Belief, reference or parameters have other dimensions, or reference inputs are missing.
-            DataError: Reference or parameters are not finite.
+            ShapeError: Belief, reference, parameters or plan have other dimensions, or reference inputs are missing.
+            DataError: Reference, parameters or plan are not finite.
         """
-        request, clock = self.prediction.read(belief, reference, previous, parameters), _Stopwatch()
+        request, clock = self.prediction.read(belief, reference, previous, parameters, plan), _Stopwatch()
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
-            plan = self.prediction.initial_guess(request, previous)
-            prediction = self.prediction.linearize(plan, request, previous)
-            return self._improve(prediction, request, previous, clock)
+            prediction = self.prediction.linearize(self.prediction.initial_guess(request), request)
+            return self._improve(prediction, request, clock)
         except FAILURES:
             return request.failed_decision(Status.NUMERICAL_TROUBLE, timing=clock.timing)
 
-    def _improve(
-        self, prediction: Prediction, request: Request, previous: Decision | None, clock: "_Stopwatch"
-    ) -> Decision:
+    def _improve(self, prediction: Prediction, request: Request, clock: "_Stopwatch") -> Decision:
         """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
-        guess, solution = prediction.plan, previous.solution if previous is not None and previous.applicable else None
-        globalize = FullStep()
-        if self.iterations > 1:
-            globalize = Globalization(self.prediction, self._condenser.cost, request, self.tolerance)
+        guess, solution = prediction.plan, None if request.previous is None else request.previous.solution
+        globalize = FullStep() if self.iterations == 1 else Globalization(self.prediction, request, self.tolerance)
         status, count = None, 0
         while True:
             clock.model()
@@ -189,13 +190,13 @@ class GPMPC:
         known, clock = [t for t, request in enumerate(requests) if request.finite], _Stopwatch()
         decisions = [request.failed_decision(Status.INVALID_MEASUREMENT) for request in requests]
         try:
-            made = self.prediction.linearize_many([requests[t] for t in known], [previous[t] for t in known])
+            made = self.prediction.linearize_many([requests[t] for t in known])
         except FAILURES:  # one of them spoils the batch: which one, they say alone
             return [self.control(*question) for question in asked]
         clock.model(len(known))
         for t, prediction in zip(known, made, strict=True):
             try:
-                decisions[t] = self._improve(prediction, requests[t], previous[t], clock.copy())
+                decisions[t] = self._improve(prediction, requests[t], clock.copy())
             except FAILURES:
                 decisions[t] = requests[t].failed_decision(Status.NUMERICAL_TROUBLE, timing=clock.timing)
         return decisions
@@ -212,7 +213,7 @@ class GPMPC:
         if features is None or getattr(linearizer.propagator, "hessian", False):
             return None
         (N, d), n, size = features.shape, model.state_dim, self.horizon * self.problem.input_dim
-        p = len(linearizer.weight(self.problem.cost.Q)) * n
+        p = len(self.prediction.costs.quadratic.terminal) * n
         each = 8 * n * N * (d + 1) + 4 * p * (p + d)
         if not linearizer.at_points:
             each += 8 * N * N + 12 * n * n * (N * (n + 1) + n * n + d)
@@ -238,13 +239,13 @@ class GPMPC:
             ProblemError: The program is malformed, numerically.
         """
         request = self.prediction.read(belief, reference, previous, parameters)
-        plan = self.prediction.initial_guess(request, previous)
-        prediction = self.prediction.linearize(plan, request, previous)
+        prediction = self.prediction.linearize(self.prediction.initial_guess(request), request)
         return QuadraticProgram.from_stacked(*self._condense(prediction, request)[:5])
 
     def _condense(self, prediction: Prediction, request: Request) -> CondensedProgram:
         stages, references = Stages(*prediction.stages[:3]), request.references
-        return self._condenser.condense(stages, prediction.plan.states[0], references, prediction.rows)
+        start = prediction.plan.states[0]
+        return self._condenser.condense(prediction.cost, stages, start, references, prediction.rows)
 
     def _solve(self, program: CondensedProgram, warm: QPSolution | None) -> QPSolution:
         if isinstance(self.solver, DualActiveSet):
@@ -265,7 +266,7 @@ class GPMPC:
     def _missed(self, prediction: Prediction) -> float:
         """Violations of hard constraints by a plan, summed."""
         prices = np.where(np.isinf(self.prediction.constraints.prices), np.inf, 0.0)
-        return price_violations(prices, prediction.rows, prediction.plan.states, 1.0)
+        return price_violations(prices, prediction.rows, prediction.plan, 1.0)
 
 
 class NonlinearGPMPC(GPMPC):

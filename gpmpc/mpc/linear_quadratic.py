@@ -1,6 +1,7 @@
 """Computes gains of the linear-quadratic regulator, u = -K x, by the Riccati recursion.
 
-For x_{k+1} = A_k x_k + B_k u_k and the cost sum_{k=0..H-1} |x_k|^2_Q + |u_k|^2_R + |x_H|^2_T, backward from P_H = T
+For x_{k+1} = A_k x_k + B_k u_k and the cost sum_{k=0..H-1} |x_k|^2_Q + |u_k|^2_R + |x_H|^2_T (Q and R may be other
+matrices at each stage), backward from P_H = T
 (Anderson and Moore, 1990, section 2.4; the second line keeps P positive semidefinite whatever is rounded):
 
     D_k = R + B_k' P_{k+1} B_k,   K_k = D_k^-1 B_k' P_{k+1} A_k
@@ -13,10 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpmpc.compiled import compiled, njit_noalloc
+from gpmpc.compiled import compiled, njit_inner, njit_noalloc
 from gpmpc.exceptions import SettingError
 from gpmpc.kernels.linalg import add_transposed_product, copy, copy_matrix, dot, product, solve_positive
-from gpmpc.mpc.problem import PENALIZED, Problem
 
 Array = np.ndarray
 
@@ -35,19 +35,14 @@ class Stages(NamedTuple):
     c: Array  # (H or 1, p)
 
 
-class TrackingCost(NamedTuple):
-    """Weights of the cost."""
+class QuadraticCost(NamedTuple):
+    """Weights of a cost, the sum of |s_{k+1} - r_{k+1}|^2_W + |v_k|^2_R + z'Z z, z = [x_{k+1}; u_k; 1], x the mean."""
 
-    state: Array  # W of s_1 .. s_{H-1} (p / n, n, n)
+    state: Array  # W of s_1 .. s_{H-1} (H or 1, p / n, n, n)
     terminal: Array  # W of s_H (p / n, n, n)
-    input: Array  # R (m, m)
+    input: Array  # R (H or 1, m, m)
     penalized: int  # what R weighs: INPUTS, DEVIATIONS or INCREMENTS
-
-    @classmethod
-    def of(cls, problem: Problem, weight: Array, terminal: Array) -> "TrackingCost":
-        """The cost of a problem whose Q and terminal weight are W of s (p / n, n, n)."""
-        W, T, R = (np.ascontiguousarray(part) for part in (weight, terminal, problem.cost.R))
-        return cls(W, T, R, PENALIZED.index(problem.cost.penalized))
+    squares: Array  # Z of linearised outputs (H, n + m + 1, n + m + 1), or (0, n + m + 1, n + m + 1)
 
 
 class References(NamedTuple):
@@ -56,6 +51,39 @@ class References(NamedTuple):
     states: Array  # r_1 .. r_H of the mean (H, n); the rest of s is to be zero
     inputs: Array  # (H, m), used where R weighs deviations
     previous_input: Array  # u_{-1} (m,)
+
+
+class InputBounds(NamedTuple):
+    """Bounds of u_k and of u_k - u_{k-1}."""
+
+    lower: Array  # (H, m)
+    upper: Array  # (H, m)
+    rate_lower: Array  # (H, m), or (0, m) where rates have no bounds
+    rate_upper: Array  # (H, m) or (0, m)
+
+
+class StageRows(NamedTuple):
+    """Bounds lower_k <= E_k s_{k+1} + D_k u_k <= upper_k."""
+
+    E: Array  # (H or 1, r, p)
+    D: Array  # (H, r, m), or (0, r, m)
+    lower: Array  # (H, r)
+    upper: Array  # (H, r)
+
+
+class CondensedProgram(NamedTuple):
+    """min 1/2 v'P v + q'v under lower <= [v; G v] <= upper.
+
+    The last of the stacked constraints are the bounds of inputs, of increments (where there are such) and of E s, stage
+    by stage: all of them in input coordinates, all after H m unbounded v in feedback coordinates.
+    """
+
+    P: Array  # (H m, H m)
+    q: Array  # (H m,)
+    G: Array  # (rows, H m)
+    lower: Array  # (H m + rows,)
+    upper: Array  # (H m + rows,)
+    feedback: Array  # F_k of u_k = F_k [s_k; u_{k-1}; 1] + v_k (H, m, p + m + 1); (0, m, p + m + 1) where u = v
 
 
 @compiled
@@ -78,30 +106,41 @@ def expand(stages, start, feedback, previous_input, unknowns):
 
 
 @compiled
-def tracking_cost(cost, states, inputs, references):
-    """The cost itself, constants included, of states s_0 .. s_H (H + 1, p) and inputs (H, m)."""
-    W, R, targets = cost.state, cost.input, references.states
-    (H, n), m = targets.shape, len(R)
-    total, error, v = 0.0, np.empty(states.shape[1]), np.empty(m)
+def evaluate_cost(cost, states, inputs, references, constant):
+    """The cost of states s_0 .. s_H (H + 1, p) and inputs (H, m), with ``constant`` in the place of the 1 of z."""
+    targets, penalized = references.states, cost.penalized
+    (H, n), m = targets.shape, inputs.shape[1]
+    total, error, v, z = 0.0, np.empty(states.shape[1]), np.empty(m), np.full(n + m + 1, constant)
     for k in range(H):
         copy(states[k + 1], error)
         for i in range(n):
             error[i] -= targets[k, i]
-        weight = cost.terminal if k == H - 1 else W
-        for b in range(len(W)):
+        weight, R = weight_of_stage(cost, k, H), cost.input[min(k, len(cost.input) - 1)]
+        for b in range(len(weight)):
             for i in range(n):
                 for j in range(n):
                     total += error[b * n + i] * weight[b, i, j] * error[b * n + j]
         for i in range(m):
             v[i] = inputs[k, i]
-            if cost.penalized == DEVIATIONS:
+            if penalized == DEVIATIONS:
                 v[i] -= references.inputs[k, i]
-            elif cost.penalized == INCREMENTS:
+            elif penalized == INCREMENTS:
                 v[i] -= inputs[k - 1, i] if k > 0 else references.previous_input[i]
         for i in range(m):
             for j in range(m):
                 total += v[i] * R[i, j] * v[j]
+        if len(cost.squares) > 0:
+            copy(states[k + 1, :n], z[:n])
+            copy(inputs[k], z[n : n + m])
+            for i in range(n + m + 1):
+                total += z[i] * dot(cost.squares[k, i], z, n + m + 1)
     return total
+
+
+@njit_inner
+def weight_of_stage(cost, k, H):
+    """W of s_{k+1} (p / n, n, n)."""
+    return cost.terminal if k == H - 1 else cost.state[min(k, len(cost.state) - 1)]
 
 
 @compiled
@@ -111,19 +150,20 @@ def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
     Args:
         A: (H, n, n), or (1, n, n) where it is constant: then the recursion ends where P settles.
         B: (H, n, m) or (1, n, m).
-        Q: (n, n), positive semidefinite.
-        R: (m, m), positive definite.
+        Q: Of x_0 .. x_{H-1} (H, n, n), or (1, n, n), positive semidefinite.
+        R: (H, m, m) or (1, m, m), positive definite.
         terminal: T (n, n), positive semidefinite.
         horizon: H.
     """
-    n, m = B.shape[1:]
+    (n, m), constant = B.shape[1:], len(A) == len(Q) == len(R) == 1
     gains, hessians = np.zeros((horizon, m, n)), np.empty((horizon, m, m))
     P, following, PB, PC = terminal.copy(), np.empty((n, n)), np.empty((n, m)), np.empty((n, n))
     closed, factor, RK = np.empty((n, n)), np.empty((m, m)), np.empty((m, n))
     for k in range(horizon - 1, -1, -1):
         A_k, B_k, K, D = A[min(k, len(A) - 1)], B[min(k, len(B) - 1)], gains[k], hessians[k]
+        R_k = R[min(k, len(R) - 1)]
         product(P, B_k, PB)
-        copy_matrix(R, D)
+        copy_matrix(R_k, D)
         add_transposed_product(B_k, PB, D)
         add_transposed_product(PB, A_k, K)
         copy_matrix(D, factor)
@@ -133,8 +173,8 @@ def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
             for j in range(n):
                 closed[i, j] = A_k[i, j] - closed[i, j]
         product(P, closed, PC)
-        product(R, K, RK)
-        copy_matrix(Q, following)
+        product(R_k, K, RK)
+        copy_matrix(Q[min(k, len(Q) - 1)], following)
         add_transposed_product(closed, PC, following)
         add_transposed_product(K, RK, following)
         change, size = 0.0, 0.0
@@ -143,7 +183,7 @@ def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
                 value = 0.5 * (following[i, j] + following[j, i])
                 change, size = max(change, abs(value - P[i, j])), max(size, abs(value))
                 P[i, j] = P[j, i] = value
-        if len(A) == 1 and change <= _SETTLED * size:
+        if constant and change <= _SETTLED * size:
             for j in range(k):
                 copy_matrix(K, gains[j])
                 copy_matrix(D, hessians[j])
@@ -155,15 +195,20 @@ def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
 def optimal_feedback(cost, stages, references):
     """The feedback F (H, m, p + m + 1) that minimises the cost without bounds, u_k = F_k [s_k; u_{k-1}; 1].
 
-    It is that of the regulator of [s_k - r_k; u_{k-1}; 1], without u_{k-1} but for increments, whose input is the
+    It is that of the regulator of [s_k - r_k; u_{k-1}; 1], without u_{k-1} where nothing weighs it, whose input is the
     penalized v. The second result is half the Hessian of the cost in what is added to each u_k (H, m, m).
     """
-    (p, m), targets, R = stages.B.shape[1:], references.states, cost.input
-    (H, n), e = targets.shape, p + (m if cost.penalized == INCREMENTS else 0)
+    (p, m), targets, squares = stages.B.shape[1:], references.states, cost.squares
+    incremental = cost.penalized == INCREMENTS
+    (H, n), e = targets.shape, p + (m if incremental or len(squares) > 0 else 0)
     A, B = np.zeros((H, e + 1, e + 1)), np.zeros((H, e + 1, m))
-    weight, terminal = np.zeros((e + 1, e + 1)), np.zeros((e + 1, e + 1))
-    add_blocks(cost.state, weight)
+    weights = np.zeros((H if len(squares) > 0 else len(cost.state), e + 1, e + 1))  # of stages 1 .. H - 1
+    terminal = np.zeros((e + 1, e + 1))
     add_blocks(cost.terminal, terminal)
+    for k in range(len(weights)):
+        add_blocks(cost.state[min(k, len(cost.state) - 1)], weights[k])
+    for k in range(len(squares)):
+        _add_square(squares[k], targets[k], terminal if k == H - 1 else weights[k], p)
     for k in range(H):
         at = min(k, len(stages.A) - 1)
         A[k, e, e] = 1.0
@@ -180,22 +225,40 @@ def optimal_feedback(cost, stages, references):
         for i in range(n):
             A[k, i, e] -= targets[k, i]
         for i in range(e - p):
-            A[k, p + i, p + i] = B[k, p + i, i] = 1.0
-            for j in range(p):
-                A[k, j, p + i] = stages.B[at, j, i]
-    gains, hessians = finite_horizon_lqr(A, B, weight, R, terminal, H)
+            B[k, p + i, i] = 1.0
+            if incremental:
+                A[k, p + i, p + i] = 1.0
+                for j in range(p):
+                    A[k, j, p + i] = stages.B[at, j, i]
+            elif cost.penalized == DEVIATIONS:
+                A[k, p + i, e] = references.inputs[k, i]
+    before = np.concatenate((weights[:1], weights))[: H if len(weights) > 1 else 1]  # of stages 0 .. H - 1
+    gains, hessians = finite_horizon_lqr(A, B, before, cost.input, terminal, H)
     feedback = np.zeros((H, m, p + m + 1))
     for k in range(H):
         for i in range(m):
             F, K = feedback[k, i], gains[k, i]
             for j in range(e):
                 F[j] = -K[j]
-            if cost.penalized == INCREMENTS:
+            if incremental:
                 F[p + i] += 1.0
             F[p + m] = -K[e] + (references.inputs[k, i] if cost.penalized == DEVIATIONS else 0.0)
             if k > 0:
                 F[p + m] += dot(K, targets[k - 1], n)
     return feedback, hessians
+
+
+@njit_noalloc
+def _add_square(Z, target, W, p):
+    """Adds z'Zz, z = [x; u; 1], to a weight W of [s - r; u; 1]."""
+    n, e = len(target), len(W) - 1
+    m = e - p
+    for i in range(n + m):
+        row, constant = i if i < n else p + i - n, Z[i, n + m] + dot(Z[i], target, n)
+        for j in range(n + m):
+            W[row, j if j < n else p + j - n] += Z[i, j]
+        W[row, e] += constant
+        W[e, row] += constant
 
 
 @njit_noalloc
@@ -221,7 +284,7 @@ def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
         SettingError: The inputs do not reach a mode that grows.
     """
     A, B, Q, R = (np.ascontiguousarray(matrix, dtype=float) for matrix in (A, B, Q, R))
-    K = finite_horizon_lqr(A[None], B[None], Q, R, Q, _LONGEST)[0][0]
+    K = finite_horizon_lqr(A[None], B[None], Q[None], R[None], Q, _LONGEST)[0][0]
     if not np.isfinite(K).all() or np.abs(np.linalg.eigvals(A - B @ K)).max() > 1 + _STABLE:
         raise SettingError("A, B, Q", "there is no stationary gain: the inputs do not reach a growing mode")
     return K

@@ -57,6 +57,7 @@ def command(
     on_failure: OnFailure = "raise",
     step: int = 0,
     parameters: Any = None,
+    plan: Any = None,
 ) -> Command:
     """Decides one step's input by a controller, or by the policy where it has none.
 
@@ -69,16 +70,17 @@ def command(
             ``"raise"`` stops. Before the first such plan, the first two take the reference's own input if there is
             one, else the controller's initial input, within its input and rate bounds.
         step: Number of the step, for the message.
-        parameters: Of the controller's smooth constraints, where it has any.
+        parameters: Of the controller's outputs and smooth constraints, where it has any.
+        plan: For the controller to start from in the place of the last one; see ``GPMPC.control``.
 
     Raises:
         SettingError: No such policy.
         SolverFailure: The policy is ``"raise"``, or there is nothing to fall back on.
     """
     check_policy(on_failure)
-    plan, reference = None if last is None else last.plan, reference.over(controller.horizon)
-    known = {} if parameters is None else {"parameters": parameters}
-    decision = controller.control(belief, reference, plan, **known) if _is_finite(belief) else None
+    previous, reference = None if last is None else last.plan, reference.over(controller.horizon)
+    known = {key: value for key, value in (("parameters", parameters), ("plan", plan)) if value is not None}
+    decision = controller.control(belief, reference, previous, **known) if _is_finite(belief) else None
     return _conclude(controller, decision, reference, last, on_failure, step)
 
 
@@ -138,21 +140,23 @@ class ControlLoop:
         self.last: Command | None = None
         self.failures, self._steps = 0, 0
 
-    def input(self, state: Any, reference: Any, parameters: Any = None) -> np.ndarray:
+    def input(self, state: Any, reference: Any, parameters: Any = None, plan: Any = None) -> np.ndarray:
         """Returns the input to apply now (m,).
 
         Args:
             state: Measured (n,), or a ``Gaussian``.
             reference: A set point (n,), states (H + 1, n), or a ``Reference``.
-            parameters: Of the controller's smooth constraints, where it has any.
+            parameters: Of the controller's outputs and smooth constraints, where it has any.
+            plan: To start from in the place of the last one: inputs (H, m), or these and states (H + 1, n).
 
         Raises:
-            ShapeError: State, reference or parameters have other dimensions than the controller.
+            ShapeError: State, reference, parameters or plan have other dimensions than the controller.
             SolverFailure: The policy is ``"raise"``.
         """
         belief = state if isinstance(state, Gaussian) else Gaussian.certain(np.asarray(state, dtype=float))
         wanted = reference if isinstance(reference, Reference) else Reference(np.asarray(reference, dtype=float))
-        self.last = command(self.controller, belief, wanted, self.last, self.on_failure, self._steps, parameters)
+        known = self.last, self.on_failure, self._steps, parameters, plan
+        self.last = command(self.controller, belief, wanted, *known)
         self.failures, self._steps = self.failures + self.last.failed, self._steps + 1
         return self.last.input.copy()
 
@@ -238,8 +242,10 @@ def _within_bounds(controller: Controller, input: np.ndarray, last: Command | No
         return input
     before = getattr(controller, "initial_input", None) if last is None else last.input
     if before is not None:
-        input = np.minimum(np.maximum(input, before + problem.input_rates.lower), before + problem.input_rates.upper)
-    return np.minimum(np.maximum(input, problem.inputs.lower), problem.inputs.upper)
+        down, up = problem.input_rates.first
+        input = np.minimum(np.maximum(input, before + down), before + up)
+    low, high = problem.inputs.first
+    return np.minimum(np.maximum(input, low), high)
 
 
 def _with_first_input(plan: Decision, inputs: np.ndarray, first: np.ndarray) -> Decision:

@@ -38,7 +38,6 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.gp_rollout import Feedback
 from gpmpc.kernels.linalg import copy_matrix, product
 from gpmpc.models.roll_out import RollOut
-from gpmpc.mpc.condense import StateRows
 from gpmpc.mpc.controller import (
     Decision,
     Reference,
@@ -48,9 +47,17 @@ from gpmpc.mpc.controller import (
     full_turns,
     read_parameters,
 )
-from gpmpc.mpc.linear_quadratic import finite_horizon_lqr
+from gpmpc.mpc.linear_quadratic import QuadraticCost, StageRows, finite_horizon_lqr
 from gpmpc.mpc.problem import Problem
-from gpmpc.mpc.stages import COVARIANCES, ConstraintRows, Covariance, LinearizedStages, Plan, StageLinearizer
+from gpmpc.mpc.stages import (
+    COVARIANCES,
+    ConstraintRows,
+    Covariance,
+    LinearizedStages,
+    Plan,
+    StageCosts,
+    StageLinearizer,
+)
 from gpmpc.propagation import Linearization, Propagator
 
 Array = np.ndarray
@@ -66,13 +73,15 @@ class Prediction(NamedTuple):
         plan: Where the stages were linearised; with ``velocity`` its first stage only.
         stages: Of it.
         covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
-        rows: Of the bounded states.
+        rows: Of the constraints.
+        cost: With outputs linearised at the plan.
     """
 
     plan: Plan
     stages: LinearizedStages
     covariances: Array
-    rows: StateRows
+    rows: StageRows
+    cost: QuadraticCost
 
 
 @dataclass(frozen=True)
@@ -142,6 +151,7 @@ class PredictionModel:
         self.settings, self.points = settings, horizon if settings.form == "trajectory" else 1
         self.linearizer = StageLinearizer(model, propagator, settings.covariance)
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
+        self.costs = StageCosts(problem, horizon, self.linearizer)
         self._roll_out = RollOut(model)
         self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
 
@@ -153,15 +163,20 @@ class PredictionModel:
         return other
 
     def read(
-        self, belief: Gaussian, reference: Reference, previous: Decision | None, parameters: Any = None
+        self,
+        belief: Gaussian,
+        reference: Reference,
+        previous: Decision | None,
+        parameters: Any = None,
+        plan: Any = None,
     ) -> Request:
         """The checked arguments of a controller's ``control``, with the disturbance estimate.
 
         Raises:
-            ShapeError: Belief or reference have other dimensions, or reference inputs are missing.
+            ShapeError: Belief, reference or plan have other dimensions, or reference inputs are missing.
         """
         problem, H = self.problem, self.horizon
-        request = Request.read(problem, H, self.initial_input, belief, reference, previous)
+        request = Request.read(problem, H, self.initial_input, belief, reference, previous, plan)
         if parameters is not None:
             request = request._replace(parameters=read_parameters(parameters, H))
         if reference.inputs is None and problem.cost.penalized == "deviations":
@@ -170,13 +185,25 @@ class PredictionModel:
             mode = self.linearizer.covariance
             raise SettingError("kappas", f"are for covariances of 'zero_order'; this controller has {mode!r}")
         if self.settings.disturbance_gain and request.finite:
-            return request._replace(disturbance=self._disturbance(request, previous))
+            request = request._replace(disturbance=self._disturbance(request))
+        if plan is not None and request.states is None and request.finite:
+            return request._replace(states=self._states(request))
         return request
 
-    def initial_guess(self, request: Request, previous: Decision | None) -> Plan:
-        """The last plan, shifted by a stage; without one a line from the state to the last reference along the others.
+    def _states(self, request: Request) -> Array | None:
+        """The means (H + 1, n) that the first guess of the inputs leads to; None where they are not finite."""
+        (H, m), n = request.initial_guess.shape, len(request.state)
+        nothing, free = (np.zeros((1, H, n)), np.zeros((1, H, m, n))), np.full(m, np.inf)
+        law = Feedback(nothing[0], request.initial_guess[None], nothing[1], -free, free, -free, free, np.zeros(m))
+        disturbance = request.disturbance if len(request.disturbance) else None
+        states = self._roll_out(request.state[None], law, disturbance)[0][0]
+        return states if np.isfinite(states).all() else None
 
-        Its inputs are the previous one, or the reference's where R weighs deviations.
+    def initial_guess(self, request: Request) -> Plan:
+        """The plan handed over, or the last plan, shifted by a stage.
+
+        Without one it is a line from the state to the last reference along the others, and its inputs are the previous
+        one, or the reference's where R weighs deviations. Inputs handed over without states lead to those of the model.
 
         Covariances are those of the last plan, unshifted: they depend on the time since the last measurement.
         """
@@ -188,10 +215,10 @@ class PredictionModel:
         if self.settings.form == "velocity":
             means[1:], covariances[1:] = request.state, covariances[0]
             return Plan(self.linearizer.state(means, covariances), request.constant_guess, covariances)
-        inputs, last = request.initial_guess, None
-        if previous is not None and previous.applicable and len(previous.means) == H + 1:
-            last = previous
-        if last is not None:
+        inputs, last = request.initial_guess, request.previous
+        if request.states is not None:
+            means[1:] = request.states[1:]
+        elif last is not None:
             means[1:H], means[H] = last.means[2:], last.means[H]
             if problem.cost.angles:  # a sensor may have taken a turn off
                 means[1:] += full_turns(request.state - last.means[1], problem.cost.angles)
@@ -202,58 +229,50 @@ class PredictionModel:
                 inputs = request.references.inputs.clip(problem.inputs.lower, problem.inputs.upper)
         if problem.input_rates.finite:
             inputs = inputs.copy()
-            _keep_rates(inputs, request.references.previous_input, problem.input_rates.lower, problem.input_rates.upper)
+            _keep_rates(inputs, request.references.previous_input, *problem.input_rates.sides)
         if not self.linearizer.at_points:
             covariances[1:] = self._first_covariances(means, inputs, request) if last is None else last.covariances[1:]
         return Plan(self.linearizer.state(means, covariances), inputs, covariances)
 
-    def linearize(self, plan: Plan, request: Request, previous: Decision | None = None) -> Prediction:
-        """The stages of a plan, linearised in one call, with covariances and rows.
-
-        Args:
-            plan: Where.
-            request: Of the step.
-            previous: The last decision, from which ``velocity`` counts its increments.
-        """
+    def linearize(self, plan: Plan, request: Request) -> Prediction:
+        """The stages of a plan, linearised in one call, with covariances, rows and cost."""
         K = self.points
         disturbance = request.disturbance if len(request.disturbance) else None
         stages = self.linearizer(plan.states[:K], plan.inputs[:K], plan.covariances[:K], disturbance)
-        return self.predict(plan, stages, request, previous)
+        return self.predict(plan, stages, request)
 
-    def linearize_many(self, requests: Sequence[Request], previous: Sequence[Decision | None]) -> list[Prediction]:
+    def linearize_many(self, requests: Sequence[Request]) -> list[Prediction]:
         """``linearize`` at the first guesses of many requests, all stages of all of them in one call."""
         if not requests:
             return []
         K, T = self.points, len(requests)
-        plans = [self.initial_guess(*question) for question in zip(requests, previous, strict=True)]
+        plans = list(map(self.initial_guess, requests))
         states, inputs, covariances = (np.concatenate([s[:K] for s in parts]) for parts in zip(*plans, strict=True))
         disturbances = [np.broadcast_to(r.disturbance, (K, len(r.state))) for r in requests if len(r.disturbance)]
         disturbance = np.concatenate(disturbances) if disturbances else None
         stages = self.linearizer(states, inputs, covariances, disturbance)
         parts = zip(*(part.reshape(T, K, *part.shape[1:]) for part in stages), strict=True)
-        asked = zip(plans, map(LinearizedStages._make, parts), requests, previous, strict=True)
-        return [self.predict(*question) for question in asked]
+        return list(map(self.predict, plans, map(LinearizedStages._make, parts), requests))
 
     def canonical(self, plan: Plan) -> Plan:
         """A plan whose s are those of its beliefs: with roots that are positive semidefinite."""
         means, covariances = self.linearizer.moments(plan.states, plan.covariances)
         return Plan(self.linearizer.state(means, covariances), plan.inputs, covariances)
 
-    def predict(
-        self, plan: Plan, stages: LinearizedStages, request: Request, previous: Decision | None = None
-    ) -> Prediction:
-        """Covariances and rows for stages that were linearised at a plan; see ``linearize``."""
+    def predict(self, plan: Plan, stages: LinearizedStages, request: Request) -> Prediction:
+        """Covariances, rows and cost for stages that were linearised at a plan; see ``linearize``."""
         covariances, mode = plan.covariances, self.linearizer.covariance
+        cost = self.costs.at(plan, request.parameters)
         if mode == "zero_order":
-            covariances, K = np.empty_like(covariances), self.gain(stages)
+            covariances, K = np.empty_like(covariances), self.gain(stages, cost)
             call_unchecked(_predict_covariances, *stages[:2], stages.V, request.covariance, K, covariances)
         elif self.settings.form == "velocity" and mode != "none":
             covariances = np.repeat(self.linearizer.moments(stages.next, covariances)[1], self.horizon + 1, axis=0)
             covariances[0] = request.covariance
-        if self.settings.form == "velocity" and previous is not None and previous.applicable:
-            stages = self._increments(plan, stages, request, previous)
-        means, known = plan.states[:, : self.problem.state_dim], (request.parameters, request.kappas)
-        return Prediction(plan, stages, covariances, self.constraints.at(means, covariances, self.points, *known))
+        if self.settings.form == "velocity" and request.previous is not None:
+            stages = self._increments(plan, stages, request, request.previous)
+        rows = self.constraints.at(plan, covariances, self.points, request.parameters, request.kappas)
+        return Prediction(plan, stages, covariances, rows, cost)
 
     def _increments(
         self, plan: Plan, stages: LinearizedStages, request: Request, previous: Decision
@@ -276,21 +295,21 @@ class PredictionModel:
             request: Of the step.
         """
         problem, n, linearizer = self.problem, self.problem.state_dim, self.linearizer
-        gains = np.broadcast_to(-self.gain(prediction.stages), (self.horizon, problem.input_dim, n))
+        gains = np.broadcast_to(-self.gain(prediction.stages, prediction.cost), (self.horizon, problem.input_dim, n))
         gains = np.ascontiguousarray(feedback[:, :, :n] if len(feedback) else gains)
         last, disturbance = request.references.previous_input, request.disturbance if len(request.disturbance) else None
-        bounds, rates = problem.inputs, problem.input_rates
-        if linearizer.at_points:
-            limits = bounds.lower, bounds.upper, rates.lower, rates.upper, last
-            law = Feedback(towards.states[None], towards.inputs[None], gains[None], *limits)
+        limits = problem.inputs.lower, problem.inputs.upper, problem.input_rates.lower, problem.input_rates.upper
+        if linearizer.at_points and all(limit.ndim == 1 for limit in limits):
+            law = Feedback(towards.states[None], towards.inputs[None], gains[None], *limits, last)
             states, inputs = self._roll_out(towards.states[:1], law, disturbance)
             return self.linearize(Plan(states[0], inputs[0], towards.covariances), request)
         states, inputs, covariances = (part.copy() for part in towards)
+        (low, high), (down, up) = (box.by_stage(self.horizon) for box in (problem.inputs, problem.input_rates))
         parts = []
         for k in range(self.horizon):  # of a belief, whose means depend on its covariances
             input = towards.inputs[k] + gains[k] @ (states[k, :n] - towards.states[k, :n])
-            input = np.clip(input, last + rates.lower, last + rates.upper)
-            last = inputs[k] = np.clip(input, bounds.lower, bounds.upper)
+            input = np.clip(input, last + down[k], last + up[k])
+            last = inputs[k] = np.clip(input, low[k], high[k])
             stage = linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance)
             states[k + 1] = stage.next[0]
             covariances[k + 1] = linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
@@ -298,26 +317,29 @@ class PredictionModel:
         stages = LinearizedStages(*map(np.concatenate, zip(*parts, strict=True)))
         return self.predict(Plan(states, inputs, covariances), stages, request)
 
-    def gain(self, stages: LinearizedStages) -> Array:
-        """K (m, n) of the feedback u = u_k - K (x - mu_k); zero without feedback."""
-        problem, n = self.problem, self.problem.state_dim
+    def gain(self, stages: LinearizedStages, cost: QuadraticCost) -> Array:
+        """K (m, n) of the feedback u = u_k - K (x - mu_k), of states' and inputs' weights; zero without feedback."""
+        (m, n), Z = (self.problem.input_dim, self.problem.state_dim), cost.squares
         if not self.settings.feedback:
-            return np.zeros((problem.input_dim, n))
+            return np.zeros((m, n))
         A, B = np.ascontiguousarray(stages.A[:1, :n, :n]), np.ascontiguousarray(stages.B[:1, :n])
-        cost = problem.cost
-        return call_unchecked(finite_horizon_lqr, A, B, cost.Q, cost.R, cost.terminal, self.horizon)[0][0]
+        Q, R, terminal = np.ascontiguousarray(cost.state[:1, 0]), cost.input[:1], cost.terminal[0]
+        if len(Z):
+            Q, R, terminal = Q + Z[:1, :n, :n], R + Z[:1, n:-1, n:-1], terminal + Z[-1, :n, :n]
+        return call_unchecked(finite_horizon_lqr, A, B, Q, R, terminal, self.horizon)[0][0]
 
     def _first_covariances(self, means: Array, inputs: Array, request: Request) -> Array:
         """Sigma_1 .. Sigma_H (H, n, n) along a first guess, linearised at its points."""
         stages = self._at_points(means[:-1], inputs, np.zeros((self.horizon, *request.covariance.shape)))
         covariances = np.empty((self.horizon + 1, *request.covariance.shape))
-        gain = self.gain(stages)
+        gain = self.gain(stages, self.costs.quadratic)
         _predict_covariances(stages.A, stages.B, stages.V, request.covariance, gain, covariances)
         return covariances[1:]
 
-    def _disturbance(self, request: Request, previous: Decision | None) -> Array:
+    def _disturbance(self, request: Request) -> Array:
         """d_k (n,), from the estimate of the last decision and the state that its input led to; at first zero."""
-        if previous is None or not previous.applicable:
+        previous = request.previous
+        if previous is None:
             return np.zeros(self.problem.state_dim)
         before = np.zeros_like(request.state) if previous.disturbance is None else previous.disturbance
         applied = request.references.previous_input[None]
@@ -353,4 +375,5 @@ def _keep_rates(inputs, last, lower, upper):
     for k in range(len(inputs)):
         for j in range(len(last)):
             before = inputs[k - 1, j] if k > 0 else last[j]
-            inputs[k, j] = min(max(inputs[k, j], before + lower[j]), before + upper[j])
+            at = min(k, len(lower) - 1)
+            inputs[k, j] = min(max(inputs[k, j], before + lower[at, j]), before + upper[at, j])

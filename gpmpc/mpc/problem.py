@@ -1,13 +1,10 @@
 """Declares what a controller makes small and what it keeps: one problem for all controllers.
 
-    minimise    sum_{i=1..H} E|x_i - r_i|^2_Q + sum_{i=0..H-1} |v_i|^2_R       (the last state's weight may be another)
+    minimise    the costs of ``gpmpc.mpc.cost``
     subject to  bounds on u_i and on u_i - u_{i-1}, and the constraints of the states x_1 .. x_H
 
-where v is the input itself, its deviation from the reference input, or its increment (Cao, Lai and Alam, 2017,
-sections 3.2-3.3). For a Gaussian x_i, E|x - r|^2_Q = |mu - r|^2_Q + tr(Q Sigma).
-
 A constraint g'x <= f of a Gaussian state holds with probability eta where g'mu + kappa sqrt(g'Sigma g) <= f,
-kappa = Phi^-1(eta); smooth ones, h(x, p) <= 0, are linearised along the plan. By default a constraint is soft: a
+kappa = Phi^-1(eta); smooth ones, h(x, u, p) <= 0, are linearised along the plan. By default a constraint is soft: a
 violation pays a price, so that a program always has a solution. The penalty is exact (Fletcher, 1987, section 14.3): as
 long as the price exceeds what the cost can gain by a violation, no plan that can keep the constraint pays it.
 """
@@ -15,21 +12,17 @@ long as the price exceeds what the cost can gain by a violation, no plan that ca
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from statistics import NormalDist
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
-from gpmpc.dynamics import batched_jacobian, to_array
-from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
+from gpmpc.exceptions import SettingError, check_number
+from gpmpc.mpc.cost import Expansion, LeastSquares, Tracking, by_stage, expand_function
 from gpmpc.qp.problem import ABSENT
 
 Array = np.ndarray
-
-Penalized = Literal["inputs", "deviations", "increments"]
-PENALIZED = ("inputs", "deviations", "increments")
 
 _EXACT = 1e6  # the exact price, in the cost's largest weight: more than any multiplier that a bound is worth
 
@@ -134,6 +127,16 @@ class Box(Constraint):
         """Whether there is any bound."""
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
+    @cached_property
+    def sides(self) -> tuple[Array, Array]:
+        """Lower and upper bounds (K, d), of every stage or of one that stands for all."""
+        return self.lower.reshape(-1, self.size), self.upper.reshape(-1, self.size)
+
+    @property
+    def first(self) -> tuple[Array, Array]:
+        """Lower and upper bounds (d,) of the first stage."""
+        return self.sides[0][0], self.sides[1][0]
+
     def by_stage(self, horizon: int) -> tuple[Array, Array]:
         """Returns lower and upper bounds of every stage (H, d)."""
         return by_stage("lower", self.lower, horizon, 1), by_stage("upper", self.upper, horizon, 1)
@@ -185,16 +188,15 @@ class Halfspaces(Constraint):
 
 @dataclass(frozen=True)
 class Inequality(Constraint):
-    """Smooth constraints h(x, p) <= 0 of the states, such as obstacles, linearised along the plan.
+    """Smooth constraints h(x_i, u_{i-1}, p_i) <= 0, such as obstacles, linearised along the plan.
 
     Its standard deviation is the one along the gradient, sqrt(dh Sigma dh'). A gradient that vanishes says nothing of
     where to go: prefer ``radius - distance`` to ``radius**2 - distance**2``.
 
     Attributes:
-        h: A function of tensors, states (H, n) and, where ``parameters`` are handed to the controller, these (H, q),
-            that gives (H, count), each row of its own state; or a CasADi function of one state and one vector of
-            parameters.
-        count: Number of values of h at a state.
+        h: A function of tensors or in CasADi, like y of ``LeastSquares``: states, inputs and parameters of all stages
+            to (H, count), or the first of these arguments.
+        count: Number of values of h at a stage.
 
     Raises:
         SettingError: h is no function, or as for ``Constraint``.
@@ -214,86 +216,9 @@ class Inequality(Constraint):
         upper = np.zeros((horizon, self.count))
         return np.zeros((self.count, 0)), np.full_like(upper, -math.inf), upper
 
-    def linearize(self, states: Array, parameters: Array | None) -> tuple[Array, Array]:
-        """Returns h (H, count) and its gradients (H, count, n) at states (H, n).
-
-        Raises:
-            ShapeError: h gives another shape.
-            DataError: h or a gradient is not finite.
-        """
-        arguments = [states] if parameters is None else [states, parameters]
-        if hasattr(self.h, "n_in"):
-            values, gradients = _linearize_casadi(self.h, arguments)
-        else:
-            x, *rest = (torch.as_tensor(argument) for argument in arguments)
-
-            def h(x: torch.Tensor) -> tuple[torch.Tensor]:
-                value = self.h(x, *rest)
-                return (value.unsqueeze(-1) if value.dim() == 1 else value,)
-
-            (value,), (gradient,) = batched_jacobian(h, (x,))
-            values, gradients = to_array(value), to_array(gradient)
-        if values.shape != (len(states), self.count):
-            raise ShapeError(f"h must give ({len(states)}, {self.count}); got {values.shape}")
-        if not (np.isfinite(values).all() and np.isfinite(gradients).all()):
-            raise DataError("h or its gradient is not finite along the plan")
-        return values, gradients
-
-
-@lru_cache(maxsize=64)
-def _casadi_expansion(function: Any, points: int) -> Any:
-    x, y = function.name_in(0), function.name_out(0)
-    return function.factory("expansion", function.name_in(), [y, f"jac:{y}:{x}"]).map(points)
-
-
-def _linearize_casadi(function: Any, arguments: Sequence[Array]) -> tuple[Array, Array]:
-    (K, n), expansion = arguments[0].shape, _casadi_expansion(function, len(arguments[0]))
-    value, jacobian = expansion(*[argument.T for argument in arguments])
-    return value.full().T.copy(), jacobian.full().reshape(-1, K, n).transpose(1, 0, 2).copy()
-
-
-@dataclass(frozen=True)
-class Tracking:
-    """Costs of the distance to a reference and of the inputs.
-
-    Attributes:
-        Q: State weights, the diagonal (n,) or the matrix (n, n).
-        R: Input weights, the diagonal (m,) or the matrix (m, m).
-        terminal: Weight of the last predicted state, like Q; Q itself by default.
-        penalized: What R weighs: ``"inputs"``, ``"deviations"`` from the reference inputs, or ``"increments"``.
-        angles: Indices of states whose error is modulo 2 pi: their references move by full turns towards the plan.
-
-    Raises:
-        SettingError: A weight is not symmetric positive semidefinite, R is zero in a direction, or a length is wrong.
-    """
-
-    Q: Any
-    R: Any
-    terminal: Any = None
-    penalized: Penalized = "increments"
-    angles: Sequence[int] = ()
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "Q", _weight("Q", self.Q))
-        object.__setattr__(self, "R", _weight("R", self.R))
-        lowest = np.linalg.eigvalsh(self.R)[0]
-        if lowest <= 0:
-            raise SettingError("R", f"must be positive definite; its smallest eigenvalue is {lowest:.3g}")
-        terminal = self.Q if self.terminal is None else _weight("terminal", self.terminal)
-        object.__setattr__(self, "terminal", terminal)
-        if terminal.shape != self.Q.shape:
-            raise SettingError("terminal", f"must be a weight of {len(self.Q)} states; got {len(terminal)}")
-        if self.penalized not in PENALIZED:
-            raise SettingError("penalized", f"must be one of {', '.join(map(repr, PENALIZED))}; got {self.penalized!r}")
-        angles = tuple(self.angles)
-        if not all(isinstance(index, int) and 0 <= index < len(self.Q) for index in angles):
-            raise SettingError("angles", f"must be indices of {len(self.Q)} states; got {self.angles!r}")
-        object.__setattr__(self, "angles", angles)
-
-    @property
-    def largest_weight(self) -> float:
-        """Returns the largest eigenvalue of all weights."""
-        return float(max(np.linalg.eigvalsh(weight)[-1] for weight in (self.Q, self.terminal, self.R)))
+    def expand(self, states: Array, inputs: Array, parameters: Array | None) -> Expansion:
+        """Returns h and its gradients along a plan (H, n), (H, m); see ``gpmpc.mpc.cost.expand_function``."""
+        return expand_function("h", self.h, self.count, states, inputs, parameters)
 
 
 @dataclass(frozen=True)
@@ -301,10 +226,11 @@ class Problem:
     """A cost, bounds of the inputs, and constraints of the states; see the module's text.
 
     Attributes:
-        cost: What is made small.
+        cost: Of states and inputs; its Q may be zero.
         inputs: Bounds of the inputs; none by default.
         input_rates: Bounds of u_i - u_{i-1} per step; none by default.
         constraints: Of the states, ``Box``, ``Halfspaces`` or ``Inequality``; none by default.
+        outputs: Costs of outputs, ``LeastSquares``, beside ``cost``; none by default.
 
     Raises:
         SettingError: A part is of another kind or length than the cost asks for.
@@ -314,6 +240,7 @@ class Problem:
     inputs: Box = field(default_factory=Box)
     input_rates: Box = field(default_factory=Box)
     constraints: Sequence[Constraint] = ()
+    outputs: Sequence[LeastSquares] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.cost, Tracking):
@@ -325,49 +252,43 @@ class Problem:
             if (box.probability, box.kappa, box.penalty, box.stages) != (None, None, "exact", None):
                 raise SettingError(key, "has bounds that are always kept: no probability, penalty or stages")
             box = box if box.size else Box(np.full(self.input_dim, -math.inf))
-            if box.lower.ndim > 1:
-                raise SettingError(key, "must be one list for all stages")
             if box.size != self.input_dim:
                 raise SettingError(key, f"must bound {self.input_dim} inputs; got {box.size}")
             object.__setattr__(self, key, box)
-        constraints = () if self.constraints is None else self.constraints
-        given = [constraints] if isinstance(constraints, Constraint) else list(constraints)
-        for constraint in given:
-            if not isinstance(constraint, Constraint):
-                kind = type(constraint).__name__
-                raise SettingError("constraints", f"must be Box(...), Halfspaces(...) or Inequality(...); got {kind}")
-            if constraint.size not in (None, self.state_dim):
-                raise SettingError("constraints", f"must bound {self.state_dim} states; got {constraint.size}")
-        object.__setattr__(self, "constraints", tuple(given))
+        for key, kind, examples in (
+            ("constraints", Constraint, "Box(...), Halfspaces(...) or Inequality(...)"),
+            ("outputs", LeastSquares, "LeastSquares(...)"),
+        ):
+            value = () if getattr(self, key) is None else getattr(self, key)
+            parts = (value,) if isinstance(value, kind) else tuple(value)
+            for part in parts:
+                if not isinstance(part, kind):
+                    raise SettingError(key, f"must be {examples}; got {type(part).__name__}")
+                size = getattr(part, "size", None)
+                if size not in (None, self.state_dim):
+                    raise SettingError(key, f"must bound {self.state_dim} states; got {size}")
+            object.__setattr__(self, key, parts)
 
     @property
     def state_dim(self) -> int:
         """Number of states, n."""
-        return len(self.cost.Q)
+        return self.cost.Q.shape[-1]
 
     @property
     def input_dim(self) -> int:
         """Number of inputs, m."""
-        return len(self.cost.R)
+        return self.cost.R.shape[-1]
+
+    def check_plain(self, name: str) -> None:
+        """Raises ``SettingError`` where there are functions to linearise, which a controller of this name does not."""
+        if self.outputs or any(isinstance(constraint, Inequality) for constraint in self.constraints):
+            raise SettingError("problem", f"{name} takes Box and Halfspaces; Inequality and LeastSquares are for GPMPC")
 
     def price(self, constraint: Constraint) -> float:
         """Returns the price of violating a constraint, infinite for a hard one."""
         if constraint.penalty == "exact":
-            return _EXACT * self.cost.largest_weight
+            return _EXACT * max(part.largest_weight for part in (self.cost, *self.outputs))
         return math.inf if constraint.penalty is None else float(constraint.penalty)
-
-
-def by_stage(key: str, values: Array, horizon: int, dims: int) -> Array:
-    """Returns values of every stage, given of every stage or of one (whose array has ``dims`` axes).
-
-    Raises:
-        SettingError: Of another number of stages.
-    """
-    if values.ndim == dims:
-        return np.ascontiguousarray(np.broadcast_to(values, (horizon, *values.shape)))
-    if len(values) != horizon:
-        raise SettingError(key, f"must be given for one stage or all {horizon}; got {len(values)}")
-    return np.ascontiguousarray(values)
 
 
 def _numbers(key: str, value: Any) -> Array:
@@ -379,22 +300,3 @@ def _numbers(key: str, value: Any) -> Array:
     if array.ndim == 0 or not array.size or np.isnan(array).any():
         raise SettingError(key, f"must be a list of numbers, infinite where unbounded; got {value!r}")
     return array
-
-
-def _weight(key: str, value: Any) -> Array:
-    """A weight from its diagonal or its matrix."""
-    try:
-        weight = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        weight = np.empty(0)
-    weight = np.diag(weight) if weight.ndim == 1 else weight
-    if weight.ndim != 2 or len(weight) != len(weight.T) or not weight.size:
-        raise SettingError(key, f"must be the diagonal of a weight or a square matrix; got {value!r}")
-    if not np.isfinite(weight).all():
-        raise SettingError(key, f"must be finite; got {value!r}")
-    if not np.allclose(weight, weight.T, rtol=1e-12, atol=0):
-        raise SettingError(key, "must be symmetric")
-    lowest = np.linalg.eigvalsh(weight)[0]
-    if lowest < -1e-12 * max(1.0, np.abs(weight).max()):
-        raise SettingError(key, f"must be positive semidefinite; its smallest eigenvalue is {lowest:.3g}")
-    return weight

@@ -25,9 +25,8 @@ import torch
 from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.exceptions import DataError, ProblemError
 from gpmpc.kernels.linalg import dot
-from gpmpc.mpc.condense import CondensedProgram
 from gpmpc.mpc.controller import Request
-from gpmpc.mpc.linear_quadratic import References, TrackingCost, tracking_cost
+from gpmpc.mpc.linear_quadratic import CondensedProgram, References, evaluate_cost, weight_of_stage
 from gpmpc.mpc.prediction import Prediction, PredictionModel
 from gpmpc.mpc.stages import Plan, price_violations
 from gpmpc.qp import QPSolution
@@ -66,18 +65,16 @@ class Globalization:
 
     Args:
         model: What predicts.
-        cost: Weights of the extended state and the inputs.
         request: Of the step.
         tolerance: Of relative offset and defects.
     """
 
-    def __init__(self, model: PredictionModel, cost: TrackingCost, request: Request, tolerance: float):
-        self._model, self._cost_terms, self._request, self._tolerance = model, cost, request, tolerance
+    def __init__(self, model: PredictionModel, request: Request, tolerance: float):
+        self._model, self._request, self._tolerance = model, request, tolerance
         self._references = request.references
-        problem = model.problem
-        weights = problem.cost.R, problem.inputs.lower, problem.inputs.upper
-        self._smallest = call_unchecked(_smallest_cost, *weights, self._references.previous_input)
-        self._defect_prices, self._row_price = np.zeros(len(cost.state) * problem.state_dim), 0.0
+        R, bounds = model.costs.quadratic.input[0], model.problem.inputs.first
+        self._smallest = call_unchecked(_smallest_cost, R, *bounds, self._references.previous_input)
+        self._defect_prices, self._row_price = np.zeros(model.costs.quadratic.terminal[:, 0].size), 0.0
         self._size, self._rate, self._creeps = math.inf, 1.0, False
         self._updates: deque[tuple[Array, Array]] = deque(maxlen=_MEMORY)  # steps and changes of the gradient
         self._gradient = np.empty(0)  # of the cost at the plan of the last program
@@ -118,8 +115,8 @@ class Globalization:
             self._last = plan.inputs.ravel(), gradient, z
         z = z[len(z) - at.rows.lower.size :].reshape(at.rows.lower.shape)
         self._row_price = max(self._row_price, 2.0 * float(np.abs(z).max())) if z.size else self._row_price
-        terms, stages = (self._cost_terms, self._references, prices, self._row_price), (at.stages.A, at.stages.next)
-        found = call_unchecked(_assess, terms, self._defect_prices, stages, at.rows, plan, proposed, z)
+        terms, stages = (self._references, prices, self._row_price), (at.stages.A, at.stages.next)
+        found = call_unchecked(_assess, at.cost, terms, self._defect_prices, stages, at.rows, plan, proposed, z)
         cost, curvature, promised, largest, merit, self._defect_prices = found
         size = max(math.sqrt(curvature / (cost + self._smallest)), largest)
         self._size, self._rate = size, size / self._size if math.isfinite(self._size) else 1.0
@@ -134,7 +131,8 @@ class Globalization:
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
             for trial in self._candidates(at, _between(plan, proposed, length), program.feedback):
                 rows = trial.rows if self._model.constraints.smooth else at.rows._replace(E=trial.rows.E)
-                if call_unchecked(_merit, terms, self._defect_prices, trial.stages.next, rows, trial.plan) <= bound:
+                points = trial.stages.next, rows, trial.plan
+                if call_unchecked(_merit, trial.cost, terms, self._defect_prices, *points) <= bound:
                     return trial, None
             length /= 2.0
         if size**2 <= _ROUND_OFF:  # size^2 of the cost is what could still be gained
@@ -171,14 +169,14 @@ def _smallest_cost(R, lower, upper, last):
 
 
 @compiled
-def _assess(terms, defect_prices, stages, rows, plan, proposed, z):
+def _assess(cost, terms, defect_prices, stages, rows, plan, proposed, z):
     """What a step from a plan to a proposed one promises.
 
     Returns:
         Cost with price of violated rows at the plan, curvature of the step in the cost, cost with price promised, the
         largest defect relative to the states, merit of the plan under new prices of defects, and these prices (p,).
     """
-    (cost, references, prices, row_price), (A, after) = terms, stages
+    (references, prices, row_price), (A, after) = terms, stages
     zero = References(0.0 * references.states, 0.0 * references.inputs, 0.0 * references.previous_input)
     (H, p), reach, largest, defects, new = after.shape, 1.0, 0.0, np.zeros(after.shape[1]), defect_prices.copy()
     for k in range(H):
@@ -186,12 +184,12 @@ def _assess(terms, defect_prices, stages, rows, plan, proposed, z):
             reach = max(reach, abs(plan.states[k + 1, i]))
             defects[i] += abs(after[k, i] - plan.states[k + 1, i])
             largest = max(largest, abs(after[k, i] - plan.states[k + 1, i]))
-    here = tracking_cost(cost, plan.states, plan.inputs, references)
-    here += price_violations(prices, rows, plan.states, row_price)
-    curvature = tracking_cost(cost, proposed.states - plan.states, proposed.inputs - plan.inputs, zero)
-    promised = tracking_cost(cost, proposed.states, proposed.inputs, references)
-    promised += price_violations(prices, rows, proposed.states, row_price)
-    costates = _costates(cost, A, proposed.states, references.states, rows.E, z)
+    here = evaluate_cost(cost, plan.states, plan.inputs, references, 1.0)
+    here += price_violations(prices, rows, plan, row_price)
+    curvature = evaluate_cost(cost, proposed.states - plan.states, proposed.inputs - plan.inputs, zero, 0.0)
+    promised = evaluate_cost(cost, proposed.states, proposed.inputs, references, 1.0)
+    promised += price_violations(prices, rows, proposed, row_price)
+    costates = _costates(cost, A, proposed, references.states, rows.E, z)
     for k in range(H):
         for i in range(p):
             new[i] = max(new[i], 1.5 * abs(costates[k, i]))
@@ -199,11 +197,11 @@ def _assess(terms, defect_prices, stages, rows, plan, proposed, z):
 
 
 @compiled
-def _merit(terms, defect_prices, after, rows, plan):
+def _merit(cost, terms, defect_prices, after, rows, plan):
     """The exact penalty function at a plan, within the bounds of ``rows``."""
-    cost, references, prices, row_price = terms
-    merit = tracking_cost(cost, plan.states, plan.inputs, references)
-    merit += price_violations(prices, rows, plan.states, row_price)
+    references, prices, row_price = terms
+    merit = evaluate_cost(cost, plan.states, plan.inputs, references, 1.0)
+    merit += price_violations(prices, rows, plan, row_price)
     for k in range(len(after)):
         for i in range(after.shape[1]):
             merit += defect_prices[i] * abs(after[k, i] - plan.states[k + 1, i])
@@ -211,12 +209,15 @@ def _merit(terms, defect_prices, after, rows, plan):
 
 
 @compiled
-def _costates(cost, A, states, targets, E, z):
+def _costates(cost, A, plan, targets, E, z):
     """Multipliers of the dynamics (H, p): the derivatives of cost and rows by s_1 .. s_H, through all that follows."""
-    (H, n), p = targets.shape, states.shape[1]
+    states, inputs, (H, n), Z = plan.states, plan.inputs, targets.shape, cost.squares
+    p, m = states.shape[1], inputs.shape[1]
     costates = np.zeros((H, p))
     for k in range(H - 1, -1, -1):
-        weight, out, rows = cost.terminal if k == H - 1 else cost.state, costates[k], E[min(k, len(E) - 1)]
+        weight, out, rows = weight_of_stage(cost, k, H), costates[k], E[min(k, len(E) - 1)]
+        for i in range(n if len(Z) > 0 else 0):
+            out[i] += 2.0 * (dot(Z[k, i], states[k + 1], n) + dot(Z[k, i, n:], inputs[k], m) + Z[k, i, n + m])
         for i in range(p):
             for j in range(n):
                 error = states[k + 1, i // n * n + j] - (targets[k, j] if i < n else 0.0)

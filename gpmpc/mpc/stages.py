@@ -1,4 +1,4 @@
-"""Affine stage models of the belief's dynamics, s_{k+1} = A_k s_k + B_k u_k + c_k, and linear rows of its constraints.
+"""Affine stage models of the belief's dynamics, s_{k+1} = A_k s_k + B_k u_k + c_k, quadratic costs, and linear rows.
 
 The *covariance* mode says what s holds of the belief N(mu, Sigma):
 
@@ -28,7 +28,8 @@ from gpmpc.dynamics import DynamicsModel, linearize, tensors_for, to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.linalg import dot
-from gpmpc.mpc.condense import StateRows
+from gpmpc.mpc.cost import PENALIZED, by_stage
+from gpmpc.mpc.linear_quadratic import QuadraticCost, StageRows
 from gpmpc.mpc.problem import Inequality, Problem
 from gpmpc.propagation import Propagator, differentiate
 from gpmpc.propagation import linearize as linearize_belief
@@ -92,10 +93,10 @@ class StageLinearizer:
         self._linearize = self._points if self.at_points else moments[covariance]
 
     def weight(self, Q: Array) -> Array:
-        """The weight of s that belongs to a weight of x (n, n): the blocks on its diagonal (p / n, n, n)."""
+        """The weights of s that belong to weights of x (K, n, n): the blocks on their diagonals (K, p / n, n, n)."""
         if self.covariance == "full":  # tr(Q Sigma) = |vec S|^2 in I_n kron Q
-            return np.tile(Q, (self._n + 1, 1, 1))
-        return np.stack([Q, np.diag(np.diag(Q))]) if self.covariance == "diagonal" else Q[None]
+            return np.repeat(Q[:, None], self._n + 1, axis=1)
+        return np.stack([Q, Q * np.eye(self._n)], axis=1) if self.covariance == "diagonal" else Q[:, None]
 
     def state(self, means: Array, covariances: Array) -> Array:
         """The vectors s (K, p) of beliefs (K, n), (K, n, n)."""
@@ -187,6 +188,49 @@ def _constants(A, B, after, states, inputs):
     return c
 
 
+class StageCosts:
+    """The cost of a problem's stages: weights, and the squares of its outputs, linearised along a plan.
+
+    Args:
+        problem: With the costs.
+        horizon: H.
+        linearizer: Says what s holds of the belief.
+
+    Attributes:
+        quadratic: The weights alone.
+
+    Raises:
+        SettingError: Weights or references of another number of stages.
+    """
+
+    def __init__(self, problem: Problem, horizon: int, linearizer: StageLinearizer):
+        n, m, cost, self._linearizer = problem.state_dim, problem.input_dim, problem.cost, linearizer
+        self.outputs, (Q, R) = problem.outputs, cost.by_stage(horizon)
+        for output in self.outputs:
+            by_stage("weight", output.weight, horizon, 2)
+            by_stage("reference", output.reference, horizon, 1)
+        self._Q, own = Q, linearizer.weight(Q[-1:])[0]
+        Q, R = Q if cost.Q.ndim > 2 else cost.Q[None], R if cost.R.ndim > 2 else cost.R[None]
+        weights = [np.ascontiguousarray(part) for part in (linearizer.weight(Q), own, R)]
+        self.quadratic = QuadraticCost(*weights, PENALIZED.index(cost.penalized), np.empty((0, n + m + 1, n + m + 1)))
+
+    def at(self, plan: Plan, parameters: Array | None = None) -> QuadraticCost:
+        """The cost with its outputs linearised along a plan.
+
+        Raises:
+            ShapeError: An output has another shape.
+            DataError: It is not finite.
+        """
+        if not self.outputs:
+            return self.quadratic
+        n = self._Q.shape[1]
+        means = np.ascontiguousarray(plan.states[1:, :n])
+        squares = np.sum([output.squares(means, plan.inputs, parameters) for output in self.outputs], axis=0)
+        weights = self._linearizer.weight(self._Q + squares[:, :n, :n])
+        weights[:, 0] = self._Q  # of the mean, which the squares weigh themselves
+        return self.quadratic._replace(state=weights, terminal=weights[-1], squares=squares)
+
+
 class ConstraintRows:
     """The rows of a problem's constraints: of a box one for each entry with a bound, upper ones first.
 
@@ -210,6 +254,7 @@ class ConstraintRows:
     def __init__(self, problem: Problem, horizon: int, covariance: Covariance):
         n, self._horizon, self._covariance = problem.state_dim, horizon, covariance
         self._smooth: list[tuple[Inequality, slice]] = []
+        self._plain = np.zeros((0, 0, problem.input_dim))  # no row holds inputs
         F, kappa, prices, lower, upper = [np.empty((0, n))], [], [], [np.empty((horizon, 0))], [np.empty((horizon, 0))]
         for constraint in problem.constraints:
             rows, below, above = constraint.rows(horizon)
@@ -239,20 +284,20 @@ class ConstraintRows:
         self._constant = None if moves else self._rows(self._F[None], np.zeros((1, n, n)))
         self._fixed = None
         if self._constant is not None and not self._margins.any():
-            self._fixed = StateRows(self._constant, self._lower, self._upper)
+            self._fixed = StageRows(self._constant, self._plain, self._lower, self._upper)
 
     def at(
         self,
-        states: Array,
+        plan: Plan,
         covariances: Array,
         stages: int,
         parameters: Array | None = None,
         kappas: Array | None = None,
-    ) -> StateRows:
-        """The rows, tightened, at means and covariances of the states.
+    ) -> StageRows:
+        """The rows, tightened, at a plan and the covariances of its states.
 
         Args:
-            states: Means x_0 .. x_H (H + 1, n), where smooth constraints are linearised.
+            plan: Where smooth constraints are linearised.
             covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
             stages: H, or 1.
             parameters: Of the smooth constraints (H, q).
@@ -264,16 +309,18 @@ class ConstraintRows:
         """
         if self._fixed is not None:
             return self._fixed
-        lower, upper, F = self._lower.copy(), self._upper.copy(), self._F[None]
+        lower, upper, F, D = self._lower.copy(), self._upper.copy(), self._F[None], self._plain
         if self._smooth:
-            F = np.repeat(F, self._horizon, axis=0)
+            means = np.ascontiguousarray(plan.states[1:, : F.shape[2]])
+            F, D = np.repeat(F, self._horizon, axis=0), np.zeros((self._horizon, self.per_stage, D.shape[2]))
             for constraint, where in self._smooth:
-                values, F[:, where] = constraint.linearize(states[1:], parameters)
-                upper[:, where] += np.einsum("kri,ki->kr", F[:, where], states[1:]) - values
+                values, F[:, where], D[:, where] = constraint.expand(means, plan.inputs, parameters)
+                upper[:, where] += np.einsum("kri,ki->kr", F[:, where], means) - values
+                upper[:, where] += np.einsum("kri,ki->kr", D[:, where], plan.inputs)
         margins = self._margins if kappas is None else np.where(self._margins > 0, kappas[:, None], 0.0)
         call_unchecked(_tighten, F, margins, covariances, lower, upper)
         E = self._rows(F, covariances[1 : stages + 1]) if self._constant is None else self._constant
-        return StateRows(np.ascontiguousarray(E), lower, upper)
+        return StageRows(np.ascontiguousarray(E), D, lower, upper)
 
     def softness(self, hard_rows: int) -> SoftRows | None:
         """The prices of all rows of a program's G, after ``hard_rows`` that have none; None where all are hard."""
@@ -313,14 +360,14 @@ def _tighten(F, kappa, covariances, lower, upper):
 
 
 @compiled
-def price_violations(prices, rows, states, hard_price):
-    """What violations along states s_0 .. s_H cost: their declared price, or ``hard_price`` per unit without one."""
-    E, lower, upper = rows
+def price_violations(prices, rows, plan, hard_price):
+    """What violations along a plan cost: their declared price, or ``hard_price`` per unit without one."""
+    E, D, lower, upper = rows
     total = 0.0
     for k in range(len(lower)):
-        at, s = min(k, len(E) - 1), states[k + 1]
+        at, s, u = min(k, len(E) - 1), plan.states[k + 1], plan.inputs[k]
         for e in range(len(prices)):
-            value = dot(E[at, e], s, len(s))
+            value = dot(E[at, e], s, len(s)) + (dot(D[k, e], u, len(u)) if len(D) > 0 else 0.0)
             outside = max(0.0, value - upper[k, e], lower[k, e] - value)
             total += (hard_price if prices[e] == np.inf else prices[e]) * outside
     return total

@@ -67,8 +67,7 @@ class StateFormMPC:
         self.prediction = PredictionModel(model, propagator, problem, horizon, initial_input, prediction)
         self.initial_input, self.problem, self.horizon = self.prediction.initial_input, problem, horizon
         self.solver, self.options = solver, TIGHT.get(solver, {}) if options is None else options
-        if self.prediction.constraints.smooth:
-            raise SettingError("constraints", "StateFormMPC takes Box and Halfspaces; Inequality is for GPMPC")
+        problem.check_plain("StateFormMPC")
         self._program = _Program(self.prediction, constraints)
 
     def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
@@ -79,8 +78,8 @@ class StateFormMPC:
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
-            plan = self.prediction.initial_guess(request, previous)
-            prediction = self.prediction.linearize(plan, request, previous)
+            plan = self.prediction.initial_guess(request)
+            prediction = self.prediction.linearize(plan, request)
             if not all(np.isfinite(part).all() for part in prediction.stages):
                 raise DataError("the stages are not finite")
         except FAILURES:
@@ -114,18 +113,17 @@ class _Program:
         import cvxpy
 
         problem, H, m, rows = model.problem, model.horizon, model.problem.input_dim, model.constraints
-        weight, terminal = (_factor(model.linearizer.weight(W)) for W in (problem.cost.Q, problem.cost.terminal))
-        p, K, r = len(weight), model.points, rows.per_stage
+        Q, R = problem.cost.by_stage(H)
+        weights = [_factor(blocks) for blocks in model.linearizer.weight(Q)]
+        p, K, r = len(weights[0]), model.points, rows.per_stage
         self.states, self.inputs = s, u = cvxpy.Variable((H + 1, p)), cvxpy.Variable((H, m))
         self._stages = [[cvxpy.Parameter(shape) for shape in ((p, p), (p, m), (p,))] for _ in range(K)]
         self._start, self._targets = cvxpy.Parameter(p), cvxpy.Parameter((H, p), value=np.zeros((H, p)))
         self._wanted, self._last = cvxpy.Parameter((H, m)), cvxpy.Parameter(m)
         rates = u - cvxpy.vstack([cvxpy.reshape(self._last, (1, m), order="C"), *([u[:-1]] if H > 1 else [])])
         penalized = {"inputs": u, "deviations": u - self._wanted, "increments": rates}[problem.cost.penalized]
-        cost = cvxpy.sum_squares(penalized @ _factor(problem.cost.R[None]))
-        cost += cvxpy.sum_squares((s[H] - self._targets[H - 1]) @ terminal)
-        if H > 1:
-            cost += cvxpy.sum_squares((s[1:H] - self._targets[:-1]) @ weight)
+        cost = sum(cvxpy.sum_squares(penalized[k] @ _factor(R[k : k + 1])) for k in range(H))
+        cost += sum(cvxpy.sum_squares((s[k + 1] - self._targets[k]) @ weights[k]) for k in range(H))
         rules = [s[0] == self._start, *_within(u, *problem.inputs.by_stage(H))]
         rules += _within(rates, *problem.input_rates.by_stage(H))
         for k in range(H):
@@ -164,7 +162,7 @@ class _Program:
         targets[:, : request.references.states.shape[1]] = request.references.states
         self._targets.value = targets
         if self._rows:
-            E, lower, upper = prediction.rows
+            E, _, lower, upper = prediction.rows
             sign = self._signs
             for parameter, value in zip(self._rows, np.broadcast_to(E, (len(self._rows), *E.shape[1:])), strict=True):
                 parameter.value = sign[:, None] * value

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import ShapeError
-from gpmpc.mpc.condense import Condenser, StateRows, condense_with_feedback
-from gpmpc.mpc.linear_quadratic import References, Stages, expand, tracking_cost
+from gpmpc.mpc.condense import Condenser, condense_with_feedback
+from gpmpc.mpc.cost import PENALIZED
+from gpmpc.mpc.linear_quadratic import QuadraticCost, References, StageRows, Stages, evaluate_cost, expand
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
 from gpmpc.status import Status
 from tests.mpc.double_pendulum import ACROBOT, PENDUBOT, UPRIGHT, DoublePendulum
-
-PENALIZED = ("inputs", "deviations", "increments")
 
 
 def spd(rng, n):
@@ -30,12 +29,27 @@ def random_references(rng, H, n, m):
     return References(rng.normal(size=(H, n)), rng.normal(size=(H, m)), 0.1 * rng.normal(size=m))
 
 
-def weights(blocks, *matrices):
-    return [np.tile(matrix, (blocks, 1, 1)) for matrix in matrices]
+class Condensing(Condenser):
+    """A condenser with the cost of an extended state of so many blocks, and of squares of outputs."""
+
+    def __init__(self, problem, H, blocks=1, squares=None):
+        super().__init__(problem, H, blocks)
+        (Q, R), cost, z = problem.cost.by_stage(H), problem.cost, problem.state_dim + problem.input_dim + 1
+        W = np.repeat(Q[:, None], blocks, axis=1)
+        squares = np.empty((0, z, z)) if squares is None else squares
+        weights = W if cost.Q.ndim > 2 else np.tile(cost.Q, (1, blocks, 1, 1)), W[-1], R if cost.R.ndim > 2 else R[:1]
+        self.cost = QuadraticCost(*weights, PENALIZED.index(cost.penalized), squares)
+
+    def condense(self, *arguments):
+        return super().condense(self.cost, *arguments)
 
 
 def no_rows(p, H):
-    return StateRows(np.zeros((1, 0, p)), np.empty((H, 0)), np.empty((H, 0)))
+    return state_rows(np.zeros((1, 0, p)), np.empty((H, 0)), np.empty((H, 0)))
+
+
+def state_rows(E, lower, upper):
+    return StageRows(E, np.empty((0, 0, 1)), lower, upper)
 
 
 def at(array, k):
@@ -59,10 +73,10 @@ def test_constant_stages_are_stages_that_vary_and_do_not(terminal, rng):
     n, m, r, blocks, H = 3, 2, 2, 4, 9
     Q, R = spd(rng, n), spd(rng, m)
     T = spd(rng, n) if terminal == "own" else Q
-    condenser = Condenser(Problem(Tracking(Q, R, terminal=T, penalized="inputs")), H, *weights(blocks, Q, T))
+    condenser = Condensing(Problem(Tracking(Q, R, terminal=T, penalized="inputs")), H, blocks)
     stages, start = random_stages(rng, n * blocks, m, H, held=True), rng.normal(size=n * blocks)
     references = random_references(rng, H, n, m)
-    rows = StateRows(rng.normal(size=(1, r, n * blocks)), -np.ones((H, r)), np.ones((H, r)))
+    rows = state_rows(rng.normal(size=(1, r, n * blocks)), -np.ones((H, r)), np.ones((H, r)))
     repeated = Stages(*(np.repeat(part, H, axis=0) for part in stages))
     held = condenser.condense(stages, start, references, rows)
     varying = condenser.condense(repeated, start, references, rows._replace(E=np.repeat(rows.E, H, axis=0)))
@@ -78,9 +92,9 @@ def test_the_condensed_problem_is_the_stacked_one(H, blocks, held, penalized, rn
     n, m, r, p = 3, 2, 4, 3 * blocks
     Q, T, R = spd(rng, n), spd(rng, n), spd(rng, m)
     problem = Problem(Tracking(Q, R, terminal=T, penalized=penalized), input_rates=Box([-1.0, -2.0], [1.0, np.inf]))
-    condenser = Condenser(problem, H, *weights(blocks, Q, T))
+    condenser = Condensing(problem, H, blocks)
     stages, start, references = random_stages(rng, p, m, H, held), rng.normal(size=p), random_references(rng, H, n, m)
-    rows = StateRows(rng.normal(size=(len(stages.A), r, p)), np.zeros((H, r)), np.ones((H, r)))
+    rows = state_rows(rng.normal(size=(len(stages.A), r, p)), np.zeros((H, r)), np.ones((H, r)))
     targets, wanted, last = references
     P, q, G, lower, upper, feedback = condenser.condense(stages, start, references, rows)
 
@@ -118,8 +132,8 @@ def test_the_condensed_problem_is_the_stacked_one(H, blocks, held, penalized, rn
     assert np.array_equal(inputs.ravel(), unknowns)
     assert np.allclose(states[1:].ravel(), gamma @ unknowns + free.ravel(), atol=1e-12)
     rest, at_rest = expand(stages, start, feedback, last, np.zeros(H * m))
-    difference = tracking_cost(condenser.cost, states, inputs, references)
-    difference -= tracking_cost(condenser.cost, at_rest, rest, references)
+    difference = evaluate_cost(condenser.cost, states, inputs, references, 1.0)
+    difference -= evaluate_cost(condenser.cost, at_rest, rest, references, 1.0)
     assert difference == pytest.approx(unknowns @ P @ unknowns / 2 + q @ unknowns, rel=1e-10, abs=1e-9)
 
 
@@ -132,7 +146,7 @@ def test_in_increments_it_is_the_papers_problem(rng):
     A[0, :, n:] = 0.0  # as at a measured state
     s0, before, last = rng.normal(size=p), rng.normal(size=p), rng.normal(size=m)
     targets = rng.normal(size=(H, n))
-    condenser = Condenser(Problem(Tracking(Q, R, penalized="inputs")), H, *weights(n + 1, Q, Q))
+    condenser = Condensing(Problem(Tracking(Q, R, penalized="inputs")), H, n + 1)
     c = s0 - A[0] @ before - B[0] @ last
     references = References(targets, np.zeros((H, m)), last)
     P, q, *_ = condenser.condense(Stages(A, B, c[None]), s0, references, no_rows(p, H))
@@ -164,9 +178,9 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
     Q, T, R = spd(rng, n), spd(rng, n), spd(rng, m)
     rates = {"input_rates": Box([-0.4, -0.3], [0.4, np.inf])} if rated else {}
     problem = Problem(Tracking(Q, R, terminal=T, penalized=penalized), inputs=Box([-0.5, -0.3], [np.inf, 0.4]), **rates)
-    condenser = Condenser(problem, H, *weights(blocks, Q, T))
+    condenser = Condensing(problem, H, blocks)
     stages, start, references = random_stages(rng, p, m, H, held), rng.normal(size=p), random_references(rng, H, n, m)
-    rows = StateRows(rng.normal(size=(len(stages.A), r, p)), np.full((H, r), -3.0), np.full((H, r), 4.0))
+    rows = state_rows(rng.normal(size=(len(stages.A), r, p)), np.full((H, r), -3.0), np.full((H, r), 4.0))
     price = np.full(H * r, 2.0)
     found, plain = [], condenser.condense(stages, start, references, rows)
     assert len(plain.feedback) == 0
@@ -186,10 +200,59 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
     assert not other.q.any()
 
 
+@pytest.mark.parametrize("held", [True, False], ids=["held", "varying"])
+@pytest.mark.parametrize("penalized", PENALIZED)
+def test_weights_by_stage_outputs_and_rows_of_inputs_make_the_stacked_problem_in_both_coordinates(penalized, held, rng):
+    n, m, r, blocks, H = 3, 2, 2, 2, 6
+    p, z = n * blocks, n + m + 1
+    Q, R = np.array([spd(rng, n) for _ in range(H)]), np.array([spd(rng, m) for _ in range(H)])
+    outputs = rng.normal(size=(H, 2, z))
+    problem = Problem(Tracking(Q, R, terminal=spd(rng, n), penalized=penalized), inputs=Box([-0.4] * m, [0.5] * m))
+    condenser = Condensing(problem, H, blocks, outputs.mT @ outputs)
+    stages, start, references = random_stages(rng, p, m, H, held), rng.normal(size=p), random_references(rng, H, n, m)
+    E, D = rng.normal(size=(H, r, p)), rng.normal(size=(H, r, m))
+    rows = StageRows(E, D, np.full((H, r), -3.0), np.full((H, r), 1.0))
+    W, _ = problem.cost.by_stage(H)
+
+    def cost_and_rows(inputs):
+        s, total, values = start, 0.0, []
+        for k, u in enumerate(inputs):
+            s = at(stages.A, k) @ s + at(stages.B, k) @ u + at(stages.c, k)
+            error, before = s.reshape(blocks, n).copy(), inputs[k - 1] if k else references.previous_input
+            error[0] -= references.states[k]
+            v = {"inputs": u, "deviations": u - references.inputs[k], "increments": u - before}[penalized]
+            y = outputs[k] @ np.concatenate([s[:n], u, [1.0]])
+            total += np.einsum("bi,ij,bj->", error, W[k], error) + v @ R[k] @ v + y @ y
+            values.append(at(E, k) @ s + D[k] @ u)
+        return total, np.array(values)
+
+    rest, plans = cost_and_rows(np.zeros((H, m))), []
+    with_feedback = condense_with_feedback(condenser.cost, condenser.bounds, stages, start, references, rows)
+    plain = condenser.condense(stages, start, references, rows)
+    for program in (plain, with_feedback):
+        x = rng.normal(size=H * m)
+        inputs, states = expand(stages, start, program.feedback, references.previous_input, x)
+        origin, _ = expand(stages, start, program.feedback, references.previous_input, 0.0 * x)
+        total, values = cost_and_rows(inputs)
+        assert evaluate_cost(condenser.cost, states, inputs, references, 1.0) == pytest.approx(total, rel=1e-11)
+        gained = x @ program.P @ x / 2 + program.q @ x
+        assert gained == pytest.approx(total - cost_and_rows(origin)[0], rel=1e-9)
+        left = program.upper[-H * r :] - program.G[-H * r :] @ x
+        assert np.allclose(left.reshape(H, r), 1.0 - values, atol=1e-10)
+        solution = DualActiveSet().solve(QuadraticProgram.unchecked(*program[:5]), soft=priced(program, H * r))
+        plans.append(expand(stages, start, program.feedback, references.previous_input, solution.x)[0])
+        assert cost_and_rows(plans[-1])[0] < rest[0]
+    assert np.allclose(*plans, atol=1e-8)
+
+
+def priced(program, rows):
+    return SoftRows(np.concatenate([np.full(len(program.G) - rows, np.inf), np.full(rows, 2.0)]))
+
+
 def test_an_unstable_plant_is_condensed_in_feedback_coordinates_and_the_plan_is_found(rng):
     """x+ = 2 x + u over 50 stages: 2^100 stands beside R in P, and nothing of R is left."""
     H, problem = 50, Problem(Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-3.0], [3.0]))
-    condenser = Condenser(problem, H, *weights(1, problem.cost.Q, problem.cost.terminal))
+    condenser = Condensing(problem, H, 1)
     stages = Stages(np.array([[[2.0]]]), np.array([[[1.0]]]), np.zeros((1, 1)))
     references = References(np.zeros((H, 1)), np.zeros((H, 1)), np.zeros(1))
     program = condenser.condense(stages, np.array([2.5]), references, no_rows(1, H))
@@ -203,9 +266,7 @@ def test_an_unstable_plant_is_condensed_in_feedback_coordinates_and_the_plan_is_
 
 
 def test_arrays_that_are_not_contiguous_are_refused(rng):
-    condenser = Condenser(
-        Problem(Tracking([1.0, 1.0], [1.0], penalized="inputs")), 3, *weights(1, np.eye(2), np.eye(2))
-    )
+    condenser = Condensing(Problem(Tracking([1.0, 1.0], [1.0], penalized="inputs")), 3, 1)
     stages = random_stages(rng, 2, 1, 3, held=False)
     with pytest.raises(ShapeError, match="contiguous"):
         condenser.condense(
@@ -240,7 +301,7 @@ def programs_of_the_double_pendulum(starts, seed):
             Problem(Tracking([100.0, 100.0, 1.0, 1.0], [1e-3], penalized=penalized), **bounds),
             DoublePendulum(joint),
         )
-        condenser = Condenser(problem, H, *weights(1, problem.cost.Q, problem.cost.terminal))
+        condenser = Condensing(problem, H, 1)
         start = np.concatenate([rng.uniform(-np.pi, np.pi, 2), rng.uniform(-15, 15, 2)])
         for turns in product((0, 1), (-1, 0, 1)):
             goal = UPRIGHT + 2 * np.pi * np.array([*turns, 0, 0])

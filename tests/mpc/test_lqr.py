@@ -173,10 +173,10 @@ def test_a_state_that_is_part_of_a_graph_is_answered_like_any_other():
 
 def test_the_gain_over_a_long_horizon_is_stationary_and_exists_for_any_system(rng):
     A, B, Q, R = rng.normal(size=(1, 4, 4)), rng.normal(size=(1, 4, 2)), np.eye(4), np.eye(2)
-    gains, hessians = finite_horizon_lqr(A, B, Q, R, Q, 500)
-    varying, same = finite_horizon_lqr(np.repeat(A, 500, axis=0), np.repeat(B, 500, axis=0), Q, R, Q, 500)
+    gains, hessians = finite_horizon_lqr(A, B, Q[None], R[None], Q, 500)
+    varying, same = finite_horizon_lqr(np.repeat(A, 500, axis=0), np.repeat(B, 500, axis=0), Q[None], R[None], Q, 500)
     assert np.allclose(gains[0], dlqr(A[0], B[0], Q, R), atol=1e-7)
     assert np.allclose(gains, varying, atol=1e-7)
     assert np.allclose(hessians, same, atol=1e-6)
-    unreachable, _ = finite_horizon_lqr(2 * np.eye(4)[None], np.zeros((1, 4, 2)), Q, R, Q, 20)
+    unreachable, _ = finite_horizon_lqr(2 * np.eye(4)[None], np.zeros((1, 4, 2)), Q[None], R[None], Q, 20)
     assert np.array_equal(unreachable, np.zeros((20, 2, 4)))

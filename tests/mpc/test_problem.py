@@ -37,7 +37,7 @@ def test_a_cost_that_makes_no_sense_is_refused(arguments, message):
     [
         ({"cost": (1, 2)}, r"cost: must be Tracking\(...\); got tuple"),
         ({"inputs": Box([1.0, 2.0])}, "inputs: must bound 1 inputs; got 2"),
-        ({"inputs": Box([[1.0], [2.0]])}, "inputs: must be one list for all stages"),
+        ({"outputs": [Box([1.0])]}, r"outputs: must be LeastSquares\(...\); got Box"),
         ({"inputs": [-1, 1]}, r"inputs: must be Box\(lower, upper\); got list"),
         ({"inputs": Box([-1.0], probability=0.9)}, "inputs: has bounds that are always kept"),
         ({"input_rates": Box([-1.0], penalty=None)}, "input_rates: has bounds that are always kept"),

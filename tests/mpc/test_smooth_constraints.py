@@ -26,14 +26,14 @@ def integrator(noise=0.0):
     return type(model)(A=eye, B=eye, c=torch.zeros(2, dtype=torch.float64), V=noise * eye)
 
 
-def disc(x, p):
+def disc(x, u, p):
     """Distance into a disc at p."""
     return RADIUS - torch.linalg.vector_norm(x - p, dim=-1)
 
 
 def casadi_disc():
-    x, p = casadi.SX.sym("x", 2), casadi.SX.sym("p", 2)
-    return casadi.Function("disc", [x, p], [RADIUS - casadi.norm_2(x - p)])
+    x, u, p = (casadi.SX.sym(name, 2) for name in "xup")
+    return casadi.Function("disc", [x, u, p], [RADIUS - casadi.norm_2(x - p)])
 
 
 def controller(constraint, **settings):
