@@ -4,6 +4,7 @@ import runpy
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 from gpmpc.gp import Transitions, load_posterior
@@ -60,6 +61,14 @@ def test_the_example_of_a_log_learns_from_its_own_files_and_leaves_a_figure(tmp_
     assert (tmp_path / "own_log.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
+def test_a_quadrotor_in_mujoco_flies_better_with_what_its_logs_teach_than_with_its_data_sheet(tmp_path):
+    pytest.importorskip("mujoco")
+    found = runpy.run_path(str(EXAMPLES / "mujoco_flight.py"))["main"](tmp_path)
+    assert found["learned, disturbance_gain 0"] < 0.3 * found["data sheet, disturbance_gain 0"]
+    assert found["learned, disturbance_gain 0"] < 0.7 * found["data sheet, disturbance_gain 0.3"]
+
+
 def test_the_example_of_a_wall_keeps_the_cart_behind_it_as_often_as_it_says(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["wall.py", str(tmp_path)])
     names = runpy.run_path(str(EXAMPLES / "wall.py"), run_name="__main__")
@@ -67,3 +76,12 @@ def test_the_example_of_a_wall_keeps_the_cart_behind_it_as_often_as_it_says(tmp_
     assert beyond[1] <= 0.05 < beyond[0]
     assert "beyond the wall in 12.0% of the steps" in capsys.readouterr().out
     assert (tmp_path / "wall.png").stat().st_size > 10_000
+
+
+def test_the_example_of_learning_while_flying_finds_the_heavier_vehicle(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["learning.py", str(tmp_path)])
+    names = runpy.run_path(str(EXAMPLES / "learning.py"), run_name="__main__")
+    away = {name: abs(f.states - f.references)[26:, [0, 2, 4]].max() for name, f in names["flights"].items()}
+    assert away["online learning"] < 0.2 < 2.0 < away["as learned"]
+    assert "online learning" in capsys.readouterr().out
+    assert (tmp_path / "learning.png").stat().st_size > 10_000
