@@ -57,6 +57,7 @@ from gpmpc.mpc.stages import (
     Plan,
     StageCosts,
     StageLinearizer,
+    keep_rates,
 )
 from gpmpc.propagation import Linearization, Propagator
 
@@ -232,7 +233,7 @@ class PredictionModel:
                 inputs = request.references.inputs.clip(problem.inputs.lower, problem.inputs.upper)
         if problem.input_rates.finite:
             inputs = inputs.copy()
-            _keep_rates(inputs, request.references.previous_input, *problem.input_rates.sides)
+            keep_rates(inputs, request.references.previous_input, *problem.input_rates.sides)
         if not self.linearizer.at_points:
             covariances[1:] = self._first_covariances(means, inputs, request) if last is None else last.covariances[1:]
         return Plan(self.linearizer.state(means, covariances), inputs, covariances)
@@ -396,13 +397,3 @@ def _predict_covariances(A, B, V, start, K, covariances):
                 for c in range(n):
                     total += moved[i, c] * closed[j, c]
                 after[i, j] = after[j, i] = total
-
-
-@compiled
-def _keep_rates(inputs, last, lower, upper):
-    """Moves inputs (H, m), one after the other, to within their rates from the one before."""
-    for k in range(len(inputs)):
-        for j in range(len(last)):
-            before = inputs[k - 1, j] if k > 0 else last[j]
-            at = min(k, len(lower) - 1)
-            inputs[k, j] = min(max(inputs[k, j], before + lower[at, j]), before + upper[at, j])
