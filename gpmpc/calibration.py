@@ -10,9 +10,9 @@ than the count, the more so the larger k.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -153,16 +153,18 @@ def calibrate(
                 observed = torch.stack([recordings[r].states[t + k + 1] for r, t in alive])
                 found[k].append((belief.mean.double().cpu(), (belief.variance + noise).double().cpu(), observed))
     steps = [tuple(torch.cat(parts) for parts in zip(*step, strict=True)) for step in found]
-    columns = [[tuple(part[:, i : i + 1] for part in step) for i in range(n)] for step in steps]
+    columns = [[[part[:, i : i + 1] for part in step] for i in range(n)] for step in steps]
+
+    def table(measure: Callable[[Tensor, Tensor, Tensor], Any]) -> Tensor:
+        return torch.tensor([[measure(*column) for column in step] for step in columns], dtype=torch.float64)
+
     return Calibration(
         names,
         tuple(levels),
         torch.tensor([len(mean) for mean, _, _ in steps]),
-        torch.tensor([[math.sqrt(mean_squared_error(m, y)) for m, _, y in step] for step in columns]).double(),
-        torch.tensor([[negative_log_predictive_density(m, v, y) for m, v, y in step] for step in columns]).double(),
-        torch.tensor(
-            [[[interval_coverage(m, v, y, level) for level in levels] for m, v, y in step] for step in columns]
-        ).double(),
+        table(lambda m, v, y: math.sqrt(mean_squared_error(m, y))),
+        table(negative_log_predictive_density),
+        table(lambda m, v, y: [interval_coverage(m, v, y, level) for level in levels]),
     )
 
 

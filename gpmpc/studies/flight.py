@@ -273,10 +273,11 @@ def summary(result: Mapping[str, Any]) -> Table:
     options, training, times = result["settings"]["options"], result["training"], result["times"]
     along = "" if options["trajectory"] == "goal" else f" along {options['trajectory']}"
     lines = [("flight", f"{result['steps']} steps of {options['system']}{along} with {options['controller']}")]
-    other = _differences(result["settings"])
+    system, plant, model = (result["settings"].get(key) or {} for key in ("system", "plant", "model"))
+    other = [f"{k} {v} (learned: {system.get(k)})" for k, v in plant.items() if v != system.get(k)]
     if other:
-        lines.append(("flown with", ", ".join(f"{key} {now} (learned: {then})" for key, then, now in other)))
-    if path := result["settings"]["model"].get("path"):
+        lines.append(("flown with", ", ".join(other)))
+    if path := model.get("path"):
         lines.append(("model", path))
     if training:
         from_what = f"{training['size']} rows of {options['data']} data"
@@ -299,14 +300,6 @@ def summary(result: Mapping[str, Any]) -> Table:
     median, most = (f"{1e3 * times['total'][key]:.3g}" for key in ("median", "p99"))
     lines.append(("decision [ms]", f"median {median}  ({stages}), 99 % below {most}"))
     return Table(("", ""), lines)
-
-
-def _differences(settings: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Returns what distinguishes the plant from the system: setting, the system's value, the plant's."""
-    system = settings.get("system", {})
-    return [
-        (key, system.get(key), value) for key, value in settings.get("plant", {}).items() if value != system.get(key)
-    ]
 
 
 def _counted(statuses: Mapping[str, int]) -> str:

@@ -41,7 +41,7 @@ class Trial:
     work: float = 0.0  #: trials of more work are started earlier, so that the last ones to run are short
 
 
-class _Study(Protocol):
+class Study(Protocol):
     """A published result: which trials it needs, and how its tables follow from their records."""
 
     name: str  # of its documents

@@ -16,8 +16,8 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc.cli.arguments import Command, Result, folder_of, writing
-from gpmpc.cli.terminal import print_error
+from gpmpc.cli._arguments import Command, Result, folder_of, writing
+from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, check_number
 
 if TYPE_CHECKING:
