@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from gpmpc.plotting.style import BLUE, COLOURS, GREY, ORANGE, legend_below, styled
+from gpmpc.plotting._style import BLUE, COLOURS, GREY, ORANGE, legend_below, styled
 
 if TYPE_CHECKING:
     from gpmpc.logs.inspection import Channel, Inspection
