@@ -90,8 +90,8 @@ HOUSE = House(ROOT)
 @pytest.mark.parametrize(
     ("what", "count", "most"),
     [
-        ("lines of gpmpc/", HOUSE.lines, 30_040),
-        ("public functions and classes", len(HOUSE.public_names), 580),
+        ("lines of gpmpc/", HOUSE.lines, 30_590),
+        ("public functions and classes", len(HOUSE.public_names), 540),
         ("functions with more than 10 arguments", len(HOUSE.functions_above(10)), 0),
         ("files of mpc/", HOUSE.mpc_files, 14),
         ("circles of rooms", len(HOUSE.room_circles), 0),

@@ -101,6 +101,8 @@ class Decision:
             is estimated.
         suboptimal: The solve stopped short of its tolerance, at a limit say, with a plan that keeps its bounds and that
             steps towards the optimum led to (Scokaert, Mayne and Rawlings, 1999).
+        learned: What the flight has taught a controller that learns (``gpmpc.learning``), for its next decision; with
+            ``size``, the points of the model that decided, and ``version``, how often it has changed.
     """
 
     input: Array
@@ -114,6 +116,7 @@ class Decision:
     solution: QPSolution | None = None
     disturbance: Array | None = None
     suboptimal: bool = False
+    learned: Any = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "input", np.array(self.input, dtype=float))  # no view of the plan

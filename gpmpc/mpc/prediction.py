@@ -25,6 +25,7 @@ finite-horizon LQR at the first stage. It is part of the covariances only: the b
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -153,6 +154,13 @@ class PredictionModel:
         self.costs = StageCosts(problem, horizon, self.linearizer)
         self._roll_out = RollOut(model)
         self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
+
+    def with_model(self, model: DynamicsModel) -> "PredictionModel":
+        """Returns the predictions by another model of as many states and inputs."""
+        other = copy(self)
+        other.model, other.linearizer = model, StageLinearizer(model, self.propagator, self.settings.covariance)
+        other._at_points = StageLinearizer(model, Linearization(), "zero_order")
+        return other
 
     def read(
         self,
