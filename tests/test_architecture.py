@@ -91,7 +91,7 @@ HOUSE = House(ROOT)
     ("what", "count", "most"),
     [
         ("lines of gpmpc/", HOUSE.lines, 30_590),
-        ("public functions and classes", len(HOUSE.public_names), 580),
+        ("public functions and classes", len(HOUSE.public_names), 540),
         ("functions with more than 10 arguments", len(HOUSE.functions_above(10)), 0),
         ("files of mpc/", HOUSE.mpc_files, 14),
         ("circles of rooms", len(HOUSE.room_circles), 0),
