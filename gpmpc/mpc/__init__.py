@@ -5,6 +5,7 @@ from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.policy import ControlLoop
 from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem, Tracking
+from gpmpc.mpc.starts import ManyStarts, kicks
 
 __all__ = [
     "GPMPC",
@@ -14,9 +15,11 @@ __all__ = [
     "Decision",
     "Halfspaces",
     "Inequality",
+    "ManyStarts",
     "NonlinearGPMPC",
     "PredictionSettings",
     "Problem",
     "Reference",
     "Tracking",
+    "kicks",
 ]
