@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas
-from matplotlib.figure import Figure
 
 from gpmpc.logs import judge, learn, read_log
 from gpmpc.logs.state_space import quaternion_inverse, quaternion_product, rotate, rotation_quaternion
+from gpmpc.plotting import judgement_figure
 
 STEP, THRUST, DRAG = 0.01, 20.0, 0.3  # [s], [m/s2] of all motors at full signal, [1/s]
 MIXER = np.array([[1, 1, -1], [1, -1, 1], [-1, -1, -1], [-1, 1, 1]]) / 4  # motors' u^2 by roll, pitch, yaw
@@ -90,17 +90,7 @@ def main(folder: Path) -> None:
         print(f"  {name} {value:.3f} +- {error:.3f}")
     print(judgement.to_pandas().query("predictor == 'model'").round(4).to_string(index=False))
 
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
-    axes = figure.subplots(1, len(judgement.groups))
-    for g, (axis, group, unit) in enumerate(zip(axes, judgement.groups, judgement.units, strict=True)):
-        for name, errors in judgement.mean.items():
-            style = {"color": "#08306b", "linewidth": 2.5} if name == "model" else {"linewidth": 1, "alpha": 0.8}
-            axis.loglog(judgement.steps, errors[:, g], marker="o", markersize=3, label=name, **style)
-        axis.set_title(group)
-        axis.set_xlabel("steps ahead")
-        axis.set_ylabel(f"mean error [{unit}]")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
+    figure = judgement_figure(judgement)
     figure.savefig(folder / "own_log.png", dpi=150)
 
 

@@ -42,8 +42,8 @@ from gpmpc.studies.study import (
     check_workers,
     derived_seed,
     fingerprint,
-    load_model,
     random_rows,
+    read_model,
     trained_model,
 )
 from gpmpc.systems.attitudes import GRAVITY
@@ -172,7 +172,7 @@ class Condition:
             return NMPC(PLANT, problem, row.horizon, at_first, **settings)
         propagator = PROPAGATIONS[row.propagation](process_noise=row.process_noise)
         make = CONTROLLERS[row.controller]
-        return make(load_model(self.model), propagator, problem, row.horizon, at_first, **settings)
+        return make(read_model(self.model), propagator, problem, row.horizon, at_first, **settings)
 
 
 @dataclass(frozen=True)
@@ -330,7 +330,7 @@ class Figures:
         condition = trial.condition
         controller, reference = condition.controller(), condition.reference
         if condition.row.loop == "model":
-            system, noise = ModelLoop(load_model(condition.model), MomentMatching()), None
+            system, noise = ModelLoop(read_model(condition.model), MomentMatching()), None
         else:
             system, noise = PLANT, Noise(process=[condition.noise] * 6)
         rehearse(system, controller, reference, reference.states[0])

@@ -16,10 +16,7 @@ from gpmpc.studies.document import MISSING, Document, Table, number
 ERRORS = ("x - reference [m]", "y - reference [m]", "z - reference [m], downwards")
 POSITIONS, ANGLES = ("x [m]", "y [m]", "z, downwards [m]"), ("roll [rad]", "pitch [rad]", "yaw [rad]")
 INPUTS = ("thrust U1 [N]", "direction ux", "direction uy")
-LOOPS = {
-    "model": "The paper's reading: the GP rolled on itself",
-    "plant": "The plant in the loop",
-}
+LOOPS = {"model": "The paper's reading: the GP rolled on itself", "plant": "The plant in the loop"}
 LEGEND = (
     "RMSE: of the positions [m] (attitude: roll, pitch, yaw [rad]) over all steps and trials; total: root of summed "
     "squares. outside: the farthest that an input left its bounds. failed: steps without a solve, bridged by the last "

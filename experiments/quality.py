@@ -29,7 +29,7 @@ from gpmpc.mpc.controller import Controller, Decision, Reference
 from gpmpc.plotting import png, quality
 from gpmpc.studies.document import MISSING, Document, Table, number
 from gpmpc.studies.flight import Experiment, run_trial
-from gpmpc.studies.study import Trial, check_workers, fingerprint, load_model, trained_model
+from gpmpc.studies.study import Trial, check_workers, fingerprint, read_model, trained_model
 from gpmpc.trajectories import Trajectory
 
 ROOMS = ("gp", "models", "propagation", "kernels", "qp", "mpc", "simulation", "datasets", "systems")
@@ -154,7 +154,7 @@ class Quality:
             learning = next((e for e in self.experiments.values() if e.learns), None)
             if learning is not None:
                 learning = replace(learning, trajectory=trajectory, name=name, seed=0)
-                models[name] = trained_model(learning.train, self.settings, learning.training_rows(), 0, folder)
+                models[name] = trained_model(learning.learn, self.settings, learning.training_rows(), 0, folder)
         trials = []
         for seed, (name, trajectory), (family, horizon) in product(
             range(self.seeds), self.trajectories.items(), self.cases
@@ -177,7 +177,7 @@ class Quality:
             GpmpcError: The vehicle has left its path.
         """
         experiment, model = trial.condition
-        flown = run_trial(replace(experiment, model=None if model is None else load_model(model)))
+        flown = run_trial(replace(experiment, model=None if model is None else read_model(model)))
         rollout, controller = flown.rollout, flown.controller
         distance = np.linalg.norm((rollout.states - rollout.references)[:, experiment.system.tracked_indices], axis=1)
         if not distance.max() <= LOST:

@@ -10,9 +10,9 @@ than the count, the more so the larger k.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.transitions import Transitions
 from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
-from gpmpc.propagation import MomentMatching, Propagator
+from gpmpc.propagation import Propagator, best_propagator
 
 if TYPE_CHECKING:
     import pandas
@@ -111,7 +111,7 @@ def calibrate(
     Args:
         model: What was learned, from other recordings.
         recordings: Measured states and applied inputs. A start counts for the steps that its recording still holds.
-        propagator: How the belief moves; exact moment matching by default.
+        propagator: How the belief moves; as ``best_propagator`` of ``gpmpc.propagation`` does by default.
         horizon: H, the longest prediction in steps.
         levels: Of the central intervals.
         start_covariance: How uncertain the measured start is (n, n); certain by default.
@@ -124,7 +124,7 @@ def calibrate(
         SettingError: A level is not between 0 and 1, or no recording is as long as the horizon.
     """
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    propagator = MomentMatching() if propagator is None else propagator
+    propagator = best_propagator(model) if propagator is None else propagator
     names = tuple(names) or tuple(f"x{i + 1}" for i in range(model.state_dim))
     check_number("horizon", horizon, least=1, whole=True)
     _check(model, recordings, horizon, levels, names)
@@ -153,16 +153,18 @@ def calibrate(
                 observed = torch.stack([recordings[r].states[t + k + 1] for r, t in alive])
                 found[k].append((belief.mean.double().cpu(), (belief.variance + noise).double().cpu(), observed))
     steps = [tuple(torch.cat(parts) for parts in zip(*step, strict=True)) for step in found]
-    columns = [[tuple(part[:, i : i + 1] for part in step) for i in range(n)] for step in steps]
+    columns = [[[part[:, i : i + 1] for part in step] for i in range(n)] for step in steps]
+
+    def table(measure: Callable[[Tensor, Tensor, Tensor], Any]) -> Tensor:
+        return torch.tensor([[measure(*column) for column in step] for step in columns], dtype=torch.float64)
+
     return Calibration(
         names,
         tuple(levels),
         torch.tensor([len(mean) for mean, _, _ in steps]),
-        torch.tensor([[math.sqrt(mean_squared_error(m, y)) for m, _, y in step] for step in columns]).double(),
-        torch.tensor([[negative_log_predictive_density(m, v, y) for m, v, y in step] for step in columns]).double(),
-        torch.tensor(
-            [[[interval_coverage(m, v, y, level) for level in levels] for m, v, y in step] for step in columns]
-        ).double(),
+        table(lambda m, v, y: math.sqrt(mean_squared_error(m, y))),
+        table(negative_log_predictive_density),
+        table(lambda m, v, y: [interval_coverage(m, v, y, level) for level in levels]),
     )
 
 

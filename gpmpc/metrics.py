@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.special import betaincinv
+from scipy import stats
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError
@@ -14,11 +14,7 @@ from gpmpc.gaussian import check_tensors
 
 
 def mean_squared_error(predicted: Tensor, observed: Tensor) -> float:
-    """Computes the squared error summed over the outputs, averaged over the samples; both (N, n).
-
-    Raises:
-        ShapeError: The shapes differ.
-    """
+    """Computes the squared error summed over the outputs, averaged over the samples; both (N, n)."""
     _check_alike(predicted=predicted, observed=observed)
     return float((predicted - observed).square().sum(dim=-1).mean())
 
@@ -27,26 +23,22 @@ def negative_log_predictive_density(mean: Tensor, variance: Tensor, observed: Te
     """Computes -log N(observed; mean, variance), averaged over samples and outputs; all (N, n). Lower is better.
 
     Quinonero-Candela et al. (2006), "Evaluating predictive uncertainty challenge".
-
-    Raises:
-        ShapeError: The shapes differ.
     """
     _check_alike(mean=mean, variance=variance, observed=observed)
     return float(((2 * math.pi * variance).log() + (observed - mean).square() / variance).mean() / 2)
 
 
 def interval_coverage(mean: Tensor, variance: Tensor, observed: Tensor, level: float = 0.95) -> float:
-    """Computes the part of observations inside the central interval of the given level; all (N, n). Ideal: the level.
-
-    Raises:
-        ShapeError: The shapes differ.
-        SettingError: A level outside (0, 1).
-    """
+    """Computes the part of observations inside the central interval of a level; all (N, n). Ideal: the level."""
     _check_alike(mean=mean, variance=variance, observed=observed)
-    if not 0 < level < 1:
-        raise SettingError("level", f"must lie between 0 and 1; got {level}")
+    _check_level(level)
     half_width = torch.special.ndtri(torch.tensor((1 + level) / 2, dtype=variance.dtype)) * variance.sqrt()
     return float(((observed - mean).abs() <= half_width).double().mean())
+
+
+def _check_level(level: float) -> None:
+    if not 0 < level < 1:
+        raise SettingError("level", f"must lie between 0 and 1; got {level}")
 
 
 def _check_alike(**given: Tensor) -> None:
@@ -74,9 +66,6 @@ def tracking_error(
         references: r[0] .. r[K] (K + 1, n).
         axes: Which states to look at, all in one unit.
         angles: Those of them whose errors are taken within half a turn [rad].
-
-    Raises:
-        ShapeError: The two do not belong together, or have no such axes.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         squares = np.square(_errors(states, references, axes, angles))[1:].mean(axis=0)
@@ -110,11 +99,7 @@ class _Loss:
 
 
 def find_loss(
-    states: np.ndarray,
-    references: np.ndarray,
-    axes: Sequence[int],
-    least: float = 0.0,
-    angles: Sequence[int] = (),
+    states: np.ndarray, references: np.ndarray, axes: Sequence[int], least: float = 0.0, angles: Sequence[int] = ()
 ) -> _Loss | None:
     """Finds where a flight is farther from its reference than the reference ever goes from where the flight began.
 
@@ -130,9 +115,6 @@ def find_loss(
 
     Returns:
         The first such step; None where there is none.
-
-    Raises:
-        ShapeError: The two do not belong together, or have no such axes.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         distances = np.linalg.norm(_errors(states, references, axes, angles), axis=1)
@@ -173,10 +155,6 @@ def violation_rate(
         upper: (d,); inf where there is none.
         level: Of the interval, two-sided.
         tolerance: What a solver's round-off may be outside.
-
-    Raises:
-        ShapeError: Bounds do not fit the values, or there is no row.
-        SettingError: A level outside (0, 1), or crossed bounds.
     """
     values, lower, upper = (np.asarray(a, dtype=float) for a in (values, lower, upper))
     if values.ndim != 2 or not len(values) or lower.shape != values.shape[1:] or upper.shape != values.shape[1:]:
@@ -194,18 +172,11 @@ def violation_rate(
 
 
 def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """Computes the exact interval for a probability from ``successes`` of ``trials`` (Clopper and Pearson, 1934).
-
-    Raises:
-        SettingError: More successes than trials, no trials, or a level outside (0, 1).
-    """
-    if not 0 < level < 1:
-        raise SettingError("level", f"must lie between 0 and 1; got {level}")
+    """Computes the exact interval for a probability from ``successes`` of ``trials`` (Clopper and Pearson, 1934)."""
+    _check_level(level)
     if not 0 <= successes <= trials or trials < 1:
         raise SettingError("successes", f"must lie between 0 and trials, 1 or more; got {successes} of {trials}")
-    tail = (1 - level) / 2
-    low = betaincinv(successes, trials - successes + 1, tail) if successes else 0.0
-    high = betaincinv(successes + 1, trials - successes, 1 - tail) if successes < trials else 1.0
+    low, high = stats.binomtest(successes, trials).proportion_ci(level, "exact")
     return float(low), float(high)
 
 
@@ -220,14 +191,10 @@ class _TimeQuantiles:
 
 
 def time_quantiles(seconds: np.ndarray) -> _TimeQuantiles:
-    """Computes median, 95 % and 99 % quantile, and the largest of wall times (K,) [s].
-
-    Raises:
-        ShapeError: There is none.
-    """
+    """Computes median, 95 % and 99 % quantile, and the largest of wall times (K,) [s]."""
     if np.ndim(seconds) != 1 or not len(seconds):
         raise ShapeError(f"seconds must be (K,), K of 1 or more; got {np.shape(seconds)}")
-    return _TimeQuantiles(*(float(q) for q in np.quantile(seconds, [0.5, 0.95, 0.99, 1.0])))
+    return _TimeQuantiles(*np.quantile(seconds, [0.5, 0.95, 0.99, 1.0]).tolist())
 
 
 def tracking_cost(

@@ -4,6 +4,7 @@ import runpy
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 from gpmpc.gp import Transitions, load_posterior
@@ -58,6 +59,14 @@ def test_the_example_of_a_log_learns_from_its_own_files_and_leaves_a_figure(tmp_
     assert "held value" in printed
     assert "motor torque" in printed
     assert (tmp_path / "own_log.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_a_quadrotor_in_mujoco_flies_better_with_what_its_logs_teach_than_with_its_data_sheet(tmp_path):
+    pytest.importorskip("mujoco")
+    found = runpy.run_path(str(EXAMPLES / "mujoco_flight.py"))["main"](tmp_path)
+    assert found["learned, disturbance_gain 0"] < 0.3 * found["data sheet, disturbance_gain 0"]
+    assert found["learned, disturbance_gain 0"] < 0.7 * found["data sheet, disturbance_gain 0.3"]
 
 
 def test_the_example_of_a_wall_keeps_the_cart_behind_it_as_often_as_it_says(tmp_path, monkeypatch, capsys):

@@ -30,10 +30,10 @@ def main() -> None:
         signal.signal(signal.SIGALRM, interrupt)
     sys.unraisablehook = interrupt_again
     try:
-        from gpmpc.cli.terminal import usable_streams
+        from gpmpc.cli._terminal import usable_streams
 
         with usable_streams():
-            from gpmpc.cli.command import main as command
+            from gpmpc.cli._command import main as command
 
             command()
     except BaseException as error:  # whatever a library made of the interrupt

@@ -4,13 +4,4 @@ from gpmpc.datasets.excitation import Excitation, ExcitedData
 from gpmpc.datasets.flights import SUBSYSTEMS, DataSource, NMPCData, PaperData, Tracking
 from gpmpc.datasets.random_data import RandomData
 
-__all__ = [
-    "SUBSYSTEMS",
-    "DataSource",
-    "Excitation",
-    "ExcitedData",
-    "NMPCData",
-    "PaperData",
-    "RandomData",
-    "Tracking",
-]
+__all__ = ["SUBSYSTEMS", "DataSource", "Excitation", "ExcitedData", "NMPCData", "PaperData", "RandomData", "Tracking"]

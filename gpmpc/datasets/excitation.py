@@ -109,12 +109,8 @@ class ExcitedData:
             return transitions_of(flight, self.samples)
         streams = np.random.SeedSequence([self.seed, SUBSYSTEMS.index("rotational")])
         angles = attitude_for_thrust_direction(flight.inputs[:, 1], flight.inputs[:, 2], self.attitude)
-        references = self._attitudes(angles, np.random.default_rng(streams), system.time_step)
+        count = self.samples + self.rotational.horizon
+        chosen = angles[np.random.default_rng(streams).integers(len(angles), size=-(-count // self.hold))]
+        references = approached(chosen, count, self.hold, system.time_step, self.response_time)
         seed = int(streams.generate_state(1)[0])
         return transitions_of(self.rotational.fly(system, references, self.samples, seed), self.samples)
-
-    def _attitudes(self, angles: np.ndarray, generator: np.random.Generator, time_step: float) -> np.ndarray:
-        """Rotational states (samples + horizon, 6) that approach rows of ``angles`` (K, 2) [rad] one after another."""
-        count = self.samples + self.rotational.horizon
-        chosen = angles[generator.integers(len(angles), size=-(-count // self.hold))]
-        return approached(chosen, count, self.hold, time_step, self.response_time)

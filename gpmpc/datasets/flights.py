@@ -75,7 +75,8 @@ class Tracking:
     initial_input: Sequence[float]  #: first guess of the solver (m,)
 
     def __post_init__(self) -> None:
-        _check_weights(self.plant, self.Q, self.R)
+        check_numbers("Q", self.Q, len(self.plant.dynamics.state_names), least=0)
+        check_numbers("R", self.R, len(self.plant.dynamics.input_names), least=0)
 
     def fly(self, references: np.ndarray, horizon: int, steps: int) -> Rollout:
         """Unconstrained NMPC from rest along references (steps + horizon, n)."""
@@ -118,20 +119,17 @@ class NMPCData:
             SolverFailure: The controller's solver failed.
         """
         self.check(system, trajectory)
-        ahead = self.horizon  # the attitude's references reach this far beyond its last step
-        outer = self._fly_translational(trajectory, self.samples + ahead)
+        steps = self.samples + self.horizon  # the attitude's references reach this far beyond its last step
+        references = np.zeros((steps + self.horizon, 6))  # the velocities are asked to be zero, with little weight
+        along: Any = trajectory
+        references[:, ::2] = along(self.translational.plant.time_step * np.arange(len(references)))  # x, y, z
+        outer = self.translational.fly(references, self.horizon, steps)
         if system.name == "translational":
             return transitions_of(outer, self.samples)
         angles = attitude_for_thrust_direction(outer.inputs[:, 1], outer.inputs[:, 2], self.attitude)
         references = np.zeros((len(angles), 6))
         references[:, [0, 2]] = angles  # phi, theta; psi and the rates are to be zero
         return transitions_of(self.rotational.fly(references, self.horizon, self.samples), self.samples)
-
-    def _fly_translational(self, trajectory: Any, steps: int) -> Rollout:
-        times = self.translational.plant.time_step * np.arange(steps + self.horizon)
-        references = np.zeros((len(times), 6))
-        references[:, ::2] = trajectory(times)  # x, y, z; the velocities are asked to be zero, with little weight
-        return self.translational.fly(references, self.horizon, steps)
 
 
 @dataclass(frozen=True)
@@ -164,16 +162,6 @@ class PaperData:
         if len(data) < self.samples:
             raise DataError(f"{path}: the file holds {len(data)} rows; data.samples asks for {self.samples}")
         return data[: self.samples]
-
-
-def _check_weights(plant: Plant, Q: Sequence[float], R: Sequence[float]) -> None:
-    """Raises unless diagonal weights fit a plant.
-
-    Raises:
-        SettingError: They do not.
-    """
-    check_numbers("Q", Q, len(plant.dynamics.state_names), least=0)
-    check_numbers("R", R, len(plant.dynamics.input_names), least=0)
 
 
 def transitions_of(flight: Rollout, samples: int) -> Transitions:

@@ -1,7 +1,7 @@
 """Logs of real systems: reading, checking, learning from them, and judging what was learned."""
 
 from gpmpc.logs.fitting import NominalFit, fit_nominal
-from gpmpc.logs.flying import LearnedDynamics, SavedModel, load_flyable
+from gpmpc.logs.flying import LogDynamics, SavedModel, load_flyable
 from gpmpc.logs.inspection import Inspection, inspect_log
 from gpmpc.logs.judging import Judgement, judge
 from gpmpc.logs.kinematics import Increments, Kinematics, RigidBody
@@ -24,8 +24,8 @@ __all__ = [
     "Judgement",
     "Kinematics",
     "Learned",
-    "LearnedDynamics",
     "Log",
+    "LogDynamics",
     "LogMapping",
     "LogModel",
     "LogRun",

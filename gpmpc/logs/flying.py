@@ -17,7 +17,8 @@ from gpmpc.dynamics import DynamicsModel, Linearized, check_query, to_array
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.storage import load_metadata
-from gpmpc.logs.learning import Learned
+from gpmpc.logs.noise import OutputNoise
+from gpmpc.logs.rollouts import LogModel
 from gpmpc.logs.state_space import Array, wrap
 from gpmpc.logs.storage import holds_learned, load_learned
 from gpmpc.models import load_model
@@ -27,27 +28,31 @@ DIFFERENCE = 1e-5  # of central differences, relative to entries above one
 
 
 @dataclass(frozen=True)
-class LearnedDynamics:
-    """A model of the next state, of what was learned from a log.
+class LogDynamics:
+    """A model of a log as one of the next state.
 
     Attributes:
-        learned: Without context and without late inputs.
+        model: Without context and without late inputs.
+        input_dim: Number of inputs, m.
+        time_step: [s]
+        noise: Of its outputs; none by default.
 
     Raises:
-        SettingError: It has a context, inputs that act late, or a term of the controller that flew.
+        SettingError: Its inputs act late, or it has a term of the controller that flew.
     """
 
-    learned: Learned
+    model: LogModel
+    input_dim: int
+    time_step: float
+    noise: OutputNoise | None = None
 
     dtype = torch.float64
     device = torch.device("cpu")
 
     def __post_init__(self) -> None:
-        model = self.learned.model
         for wrong, what in (
-            (self.learned.context_names, f"needs a context ({', '.join(self.learned.context_names)})"),
-            (model.lag, f"has inputs that act {model.lag} rows late"),
-            (getattr(model.nominal, "feedback", False), "holds the feedback of the controller that flew"),
+            (self.model.lag, f"has inputs that act {self.model.lag} rows late"),
+            (getattr(self.model.nominal, "feedback", False), "holds the feedback of the controller that flew"),
         ):
             if wrong:
                 raise SettingError("model", f"{what}, which no controller can plan with: gpmpc learn --for-control")
@@ -55,29 +60,27 @@ class LearnedDynamics:
     @property
     def state_dim(self) -> int:
         """Number of states, n; four of an attitude."""
-        return self.learned.model.kinematics.space.dim
+        return self.model.kinematics.space.dim
 
     output_dim = state_dim
 
     @property
-    def input_dim(self) -> int:
-        """Number of inputs, m."""
-        return len(self.learned.input_names)
-
-    @property
     def noise_covariance(self) -> Tensor:
-        """Of the next state, around the middle of the log (n, n): of the outputs and of the measurement."""
+        """Of the next state, where all states are zero and nothing is turned (n, n)."""
         return self._noise
 
     @cached_property
     def _noise(self) -> Tensor:
-        space, noise = self.learned.model.kinematics.space, self.learned.noise
-        x = self.learned.ranges.mean(axis=0)[None, : self.state_dim]
+        space, noise, n = self.model.kinematics.space, self.noise, self.state_dim
+        if noise is None:
+            return torch.zeros(n, n, dtype=torch.float64)
+        x = np.zeros((1, n))
         for group, at in zip(space.groups, space.columns, strict=True):
-            x[:, at] = [0.0, 0.0, 0.0, 1.0] if group.kind == "quaternion" else x[:, at]
+            x[0, at.stop - 1] = group.kind == "quaternion"
+        h = DIFFERENCE * np.eye(space.error_dim)
         B = self._by_outputs(x, np.zeros((1, noise.outputs.shape[1])))[0]
-        D = np.stack([space.displace(x, h) - space.displace(x, -h) for h in 1e-6 * np.eye(space.error_dim)], -1)[0]
-        N = B * noise.outputs.sum(axis=0) @ B.T + D / 2e-6 * noise.measurement @ D.T / 2e-6
+        D = (space.displace(x, h) - space.displace(x, -h)).T / (2 * DIFFERENCE)
+        N = B * noise.outputs.sum(axis=0) @ B.T + D * noise.measurement @ D.T
         return torch.from_numpy((N + N.T) / 2)
 
     def predict(self, state: Tensor, input: Tensor) -> Gaussian:
@@ -99,15 +102,15 @@ class LearnedDynamics:
         return Linearized(self._mean(states, inputs), A, B, self._covariance(states, inputs) if covariance else None)
 
     def _mean(self, x: Array, u: Array) -> Array:
-        model = self.learned.model
-        after = model.kinematics.step(x, model.outputs(x, u, np.empty((len(x), 0))), self.learned.time_step)
+        model = self.model
+        after = model.kinematics.step(x, model.outputs(x, u, np.empty((len(x), 0))), self.time_step)
         for group, at in zip(model.kinematics.space.groups, model.kinematics.space.columns, strict=True):
             if group.kind == "angle":  # a plan counts turns
                 after[:, at] = x[:, at] + wrap(after[:, at] - x[:, at])
         return after
 
     def _covariance(self, x: Array, u: Array) -> Array:
-        model, nothing = self.learned.model, np.empty((len(x), 0))
+        model, nothing = self.model, np.empty((len(x), 0))
         o = len(model.kinematics.output_names)
         V = np.zeros((len(x), o, o))
         if not model.gps:
@@ -121,7 +124,7 @@ class LearnedDynamics:
 
     def _by_outputs(self, x: Array, y: Array) -> Array:
         """Derivatives of the next states by the outputs (K, n, o)."""
-        step, dt = self.learned.model.kinematics.step, self.learned.time_step
+        step, dt = self.model.kinematics.step, self.time_step
         columns = [step(x, y + h, dt) - step(x, y - h, dt) for h in DIFFERENCE * np.eye(y.shape[1])]
         return np.stack(columns, axis=-1) / (2 * DIFFERENCE)
 
@@ -173,7 +176,10 @@ def load_flyable(path: str | Path) -> SavedModel:
     """
     if holds_learned(path):
         learned = load_learned(path)
-        flown = LearnedDynamics(learned)
+        if learned.context_names:
+            context = ", ".join(learned.context_names)
+            raise SettingError("model", f"{path} needs a context ({context}), which is not known in flight")
+        flown = LogDynamics(learned.model, len(learned.input_names), learned.time_step, learned.noise)
         return SavedModel(str(path), flown, learned.state_names, learned.input_names, learned.time_step)
     try:
         said = load_metadata(path).get("metadata") or {}

@@ -15,7 +15,7 @@ from scipy.special import ndtri
 from gpmpc.logs.baselines import Ridge, fit_least_squares, predict_still
 from gpmpc.logs.learning import Learned
 from gpmpc.logs.log import Log, Windows
-from gpmpc.logs.noise import error_variances
+from gpmpc.logs.noise import error_variances, follow_errors
 from gpmpc.logs.rollouts import PAST, choose_stride, rollout_errors
 from gpmpc.logs.state_space import Array
 from gpmpc.metrics import binomial_interval
@@ -126,6 +126,7 @@ def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = ST
         distances = {name: space.distances(e) for name, e in errors.items()}
     parts = [cut[i : i + CHUNK] for i in range(0, len(cut), CHUNK)]
     variances = np.concatenate([error_variances(model, part, learned.noise, steps) for part in parts])
+    variances = follow_errors(cut, errors["model"], variances, steps)
     coverage, interval, width = _coverage(cut, errors["model"], variances, steps, stride, level)
     return Judgement(
         tuple(group.name for group in space.groups),

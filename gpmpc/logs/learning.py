@@ -218,7 +218,8 @@ def _structures(kinematics: Kinematics, log: Log) -> tuple[str, LogModel, dict[s
         )
     volts = bool(log.context_names) and log.mapping.of("context")[0].unit in ("V", "mV")
     voltage = float(np.median(np.concatenate([run.context[:, 0] for run in log]))) if volts else 0.0
-    plain = MultirotorNominal(len(log.input_names), voltage=voltage)
+    thrusts = all(signal.unit == "N" for signal in log.mapping.of("inputs"))
+    plain = MultirotorNominal(len(log.input_names), voltage=voltage, thrusts=thrusts)
     return (
         "rigid body",
         LogModel(kinematics, plain, nothing, none),

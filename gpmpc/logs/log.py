@@ -76,6 +76,7 @@ class Windows:
         inputs: (W, past + ahead + 1, m).
         context: At the start, held through a prediction (W, past + 1, c).
         runs: Number of the run that each is from (W,).
+        times: Of the starts (W,) [s].
     """
 
     space: StateSpace
@@ -85,12 +86,13 @@ class Windows:
     inputs: Array
     context: Array
     runs: np.ndarray
+    times: Array
 
     def __len__(self) -> int:
         return len(self.states)
 
     def __getitem__(self, rows: Any) -> "Windows":
-        parts = {name: getattr(self, name)[rows] for name in ("states", "inputs", "context", "runs")}
+        parts = {name: getattr(self, name)[rows] for name in ("states", "inputs", "context", "runs", "times")}
         return replace(self, **parts)
 
     @property
@@ -209,16 +211,19 @@ class Log:
         """
         for key, value, least in (("ahead", ahead, 0), ("past", past, 0), ("stride", stride, 1)):
             check_number(key, value, least=least, whole=True)
-        offsets, parts, numbers = np.arange(-past, ahead + 1), [], []
+        offsets, parts = np.arange(-past, ahead + 1), []
         for number, run in enumerate(self.runs):
-            rows = windows_of(run.pieces, past, ahead, stride)[:, None] + offsets
-            parts.append((run.states[rows], run.inputs[rows], run.context[rows[:, : past + 1]]))
-            numbers.append(np.full(len(rows), number))
-        states, inputs, context = (np.concatenate(one) for one in zip(*parts, strict=True))
+            starts = windows_of(run.pieces, past, ahead, stride)
+            rows = starts[:, None] + offsets
+            numbers = np.full(len(rows), number)
+            parts.append(
+                (run.states[rows], run.inputs[rows], run.context[rows[:, : past + 1]], numbers, run.time[starts])
+            )
+        states, *others = (np.concatenate(one) for one in zip(*parts, strict=True))
         if not len(states):
             longest = max(b - a for run in self.runs for a, b in run.pieces)
             raise DataError(f"windows of {past + ahead + 1} rows need a piece as long; the longest has {longest}")
-        return Windows(self.space, self.time_step, past, states, inputs, context, np.concatenate(numbers))
+        return Windows(self.space, self.time_step, past, states, *others)
 
     def __iter__(self) -> Iterator[LogRun]:
         return iter(self.runs)

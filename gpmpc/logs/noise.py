@@ -21,6 +21,7 @@ from gpmpc.logs.state_space import Array
 TIME_CONSTANTS = (0.0, 0.05, 0.25, 1.0)  # [s]; zero is white
 FITTED = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps
 DIFFERENCE = 1e-6
+FOLLOWED, PRIOR = 6.0, 1.0  # times of the longest prediction: after which an error is forgotten, that a one weighs
 ALIKE = 0.05  # weight of differences within a group of outputs
 
 
@@ -49,6 +50,35 @@ def error_variances(model: LogModel, windows: Windows, noise: OutputNoise, steps
     weights = np.concatenate([noise.outputs.ravel(), noise.measurement])
     level = np.exp(_regressors(model, windows) @ noise.level)
     return level[:, None, None] * (_responses(model, windows, steps, noise.time_constants) @ weights)
+
+
+def follow_errors(windows: Windows, errors: Array, variances: Array, steps: Sequence[int]) -> Array:
+    """Scales claimed variances by how predictions of the same run ended that were over before each one began.
+
+    A run may be calmer or rougher than those that the noise was fitted to. For each group of states and each step the
+    scale is the mean of squared errors over claimed variances, weighted by exp(-age / (6 T)), with a one of the weight
+    T added, and T the time of the longest prediction (adaptive conformal inference by variances instead of
+    quantiles; Gibbs and Candes, 2021).
+
+    Args:
+        windows: W of them.
+        errors: Of predictions of them (W, len(steps), e).
+        variances: Claimed by ``error_variances`` (W, len(steps), e).
+        steps: k.
+    """
+    longest, scaled = max(steps) * windows.time_step, variances.copy()
+    for run in np.unique(windows.runs):
+        at = np.flatnonzero(windows.runs == run)
+        times = windows.times[at]
+        spacing = float(times[-1] - times[0]) / max(len(at) - 1, 1)
+        for k, step in enumerate(steps):
+            age = times[:, None] - times - (step - 0.5) * windows.time_step
+            weights = np.where(age > 0, spacing * np.exp(-np.maximum(age, 0) / (FOLLOWED * longest)), 0.0)
+            for columns in windows.space.error_columns:
+                ratio = (errors[at, k, columns] ** 2 / np.maximum(variances[at, k, columns], 1e-300)).mean(axis=1)
+                scale = (PRIOR * longest + weights @ ratio) / (PRIOR * longest + weights.sum(axis=1))
+                scaled[at, k, columns] *= scale[:, None]
+    return scaled
 
 
 def _regressors(model: LogModel, windows: Windows) -> Array:

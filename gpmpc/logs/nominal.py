@@ -53,7 +53,8 @@ class Still:
 class MultirotorNominal:
     """A multirotor: thrust and torque from squared motor signals, drag, and what a closed loop adds.
 
-    With u2 = the squared motor signals, times the battery's voltage over ``voltage`` where it is in the context:
+    With u2 = the squared motor signals (or the signals themselves, where they are thrusts), times the battery's voltage
+    over ``voltage`` where it is in the context:
 
         fx, fy = -drag_xy v,  fz = thrust mean(u2) - drag_z v          (v in body axes)
         alpha = torque u2 - damping w + feedback tilt                  (tilt: the world's z axis in body axes)
@@ -65,6 +66,7 @@ class MultirotorNominal:
         motors: Number of inputs, all of them motor signals.
         torque: Whether the motors' torques are parameters.
         feedback: Whether the tilt's effect is.
+        thrusts: Whether the inputs are thrusts instead of speeds.
         voltage: At which ``thrust`` and ``torque`` are stated [V]; zero leaves the voltage out.
     """
 
@@ -72,6 +74,7 @@ class MultirotorNominal:
     torque: bool = False
     feedback: bool = False
     voltage: float = 0.0
+    thrusts: bool = False
 
     def __post_init__(self) -> None:
         if self.motors < 1:
@@ -99,7 +102,7 @@ class MultirotorNominal:
         thrust, drag_xy, drag_z, *rest = theta
         to_body = quaternion_inverse(states[..., 3:7])
         v, w = rotate(to_body, states[..., 7:10]), states[..., 10:13]
-        u2 = inputs**2 * (context[..., :1] / self.voltage if self.voltage else 1.0)
+        u2 = (inputs if self.thrusts else inputs**2) * (context[..., :1] / self.voltage if self.voltage else 1.0)
         force = [-drag_xy * v[..., 0], -drag_xy * v[..., 1], thrust * u2.mean(axis=-1) - drag_z * v[..., 2]]
         alpha = [-rest[i] * w[..., i] for i in range(3)]
         if self.feedback:

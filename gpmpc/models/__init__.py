@@ -5,7 +5,7 @@ from gpmpc.models.delay import DelayedModel
 from gpmpc.models.disturbance import DisturbedModel
 from gpmpc.models.features import Features, Lags
 from gpmpc.models.nominal import Affine, CasadiFunction
-from gpmpc.models.residual import ResidualModel
+from gpmpc.models.residual import ResidualModel, train_with_angles
 from gpmpc.models.storage import load_model, save_model
 
 __all__ = [
@@ -22,4 +22,5 @@ __all__ = [
     "linearize_by_autograd",
     "load_model",
     "save_model",
+    "train_with_angles",
 ]

@@ -29,7 +29,7 @@ from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp.online import SlidingWindow, append_points
 from gpmpc.gp.posterior import AffineForm, GPPosterior
-from gpmpc.gp.training import Trainer
+from gpmpc.gp.training import Trainer, Training
 from gpmpc.gp.transitions import Transitions, check_transitions
 from gpmpc.models.features import Features
 from gpmpc.models.nominal import Affine, CasadiFunction, linearize_function
@@ -122,33 +122,30 @@ class ResidualModel:
             B: Where d acts (n, k), or a function of the state; on every state by default.
             states: The states that d depends on; all by default.
             inputs: The inputs that d depends on; all by default.
-            trainer: A ``Trainer`` or ``SparseTrainer`` that does not learn differences.
+            trainer: A ``Trainer`` or ``SparseTrainer``; its ``predicts`` is not read.
             seed: Of the random starts.
             angles: The states that d sees as sine and cosine.
 
         Raises:
             ShapeError: ``nominal`` or B do not fit the transitions.
-            SettingError: An index is out of range, the columns of B depend on each other, or the trainer learns
-                differences.
+            SettingError: An index is out of range, the columns of B depend on each other, or there is no trainer.
             TrainingError: An output could not be trained.
         """
         check_transitions(transitions)
-        trainer = Trainer() if trainer is None else trainer
-        if getattr(trainer, "predicts", "difference") == "difference":
-            rule = "must be a Trainer or SparseTrainer with predicts='value' (or the default), which a residual is"
-            raise SettingError("trainer", f"{rule}; got {trainer!r}")
         n, m = transitions.state_dim, transitions.input_dim
         states = list(range(n)) if states is None else list(states)
         inputs = list(range(m)) if inputs is None else list(inputs)
         B = torch.eye(n, dtype=torch.float64) if B is None else B
         features = Features(states, inputs, list(angles), n, m)
-        observed = _residuals(nominal, B, features, transitions)
-        posterior = trainer.fit(*observed, len(inputs), "value", seed).posterior
+        training = _fit(nominal, B, features, transitions, Trainer() if trainer is None else trainer, seed)
         noise = None
         if callable(B):  # one covariance for all states: its mean over those that were observed
             effect = _effect(B, transitions.states)
-            noise = (effect @ posterior.noise_covariance @ effect.mT).mean(0)
-        return cls(nominal, posterior, B, states, inputs, m, list(angles), noise)
+            noise = (effect @ training.posterior.noise_covariance @ effect.mT).mean(0)
+        return cls(nominal, training.posterior, B, states, inputs, m, list(angles), noise)
+
+    def __len__(self) -> int:
+        return len(self.residual)
 
     def append(self, transitions: Transitions, window: SlidingWindow | None = None) -> "ResidualModel":
         """Appends transitions to the data of the residual GP, held to a number of points where a window is given.
@@ -308,6 +305,35 @@ def _effect(B: Effect, state: Tensor) -> Tensor:
     if value.shape[:-1] != state.shape:
         raise ShapeError(f"B must give (*batch, {n}, k) at {tuple(state.shape)}; got {tuple(value.shape)}")
     return value
+
+
+def train_with_angles(trainer: Any, angles: Sequence[int], transitions: Transitions, seed: int = 0) -> Training:
+    """Trains a model of differences of states that sees angles as sine and cosine.
+
+    Args:
+        trainer: A ``Trainer`` or ``SparseTrainer``.
+        angles: Indices of states.
+        transitions: What was observed.
+        seed: Of the random starts.
+
+    Raises:
+        SettingError: An index is out of range, or there is no trainer.
+        TrainingError: An output could not be trained.
+    """
+    n, m = transitions.state_dim, transitions.input_dim
+    nominal, B, every = Affine.identity(n, m), torch.eye(n, dtype=torch.float64), (list(range(n)), list(range(m)))
+    training = _fit(nominal, B, Features(*every, angles, n, m), transitions, trainer, seed)
+    return replace(training, posterior=ResidualModel(nominal, training.posterior, B, *every, m, angles))
+
+
+def _fit(
+    nominal: Nominal, B: Effect, features: Features, transitions: Transitions, trainer: Any, seed: int
+) -> Training:
+    """The training of the residual GP."""
+    if not hasattr(trainer, "fit"):
+        raise SettingError("trainer", f"must be a Trainer or SparseTrainer; got {trainer!r}")
+    observed = _residuals(nominal, B, features, transitions)
+    return trainer.fit(*observed, len(features.inputs), "value", seed)
 
 
 def _residuals(

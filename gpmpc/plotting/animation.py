@@ -8,7 +8,7 @@ is written into the picture.
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.animation import FFMpegWriter, FuncAnimation, PillowWriter
@@ -17,8 +17,8 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from gpmpc.exceptions import UnsupportedModel
+from gpmpc.plotting._style import DASHED, GREEN, styled
 from gpmpc.plotting.recorded import FLOWN, REFERENCE, TUBE
-from gpmpc.plotting.style import DASHED, GREEN, styled
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
@@ -62,7 +62,7 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
     sign, axis_name = (-1, "-z") if run.metadata.get("frames", {}).get("z axis") != "up" else (1, "z")
     states, references, plans = run.states[:, plane], run.references[:, plane], run.plan_means[:, :, plane]
     covariances = run.plan_covariances[:, :, plane][..., plane]
-    whole: np.ndarray = np.isfinite(plans).all(axis=2)  # a shorter plan ends in NaN
+    whole: Any = np.isfinite(plans).all(axis=2)  # a shorter plan ends in NaN
 
     figure = Figure(figsize=(10, 5.4), layout="constrained")
     FigureCanvasAgg(figure)

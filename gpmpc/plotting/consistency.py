@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from gpmpc.plotting.style import BLUE, VERMILION, styled
+from gpmpc.plotting._style import BLUE, VERMILION, styled
 
 if TYPE_CHECKING:
     from gpmpc.estimation import FilterRun

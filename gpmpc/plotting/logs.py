@@ -6,17 +6,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
+from gpmpc.plotting._style import BLUE, COLOURS, GREY, ORANGE, legend_below, styled
+
 if TYPE_CHECKING:
     from gpmpc.logs.inspection import Channel, Inspection
     from gpmpc.logs.judging import Judgement
 
-_MODEL = "#08306b"
-_OTHERS = ("#999999", "#e8871e", "#2e8b57", "#d070b0", "#8c6d31")  # told apart without colour by their markers
+_MODEL, _GAP = BLUE, ORANGE
+_OTHERS = (GREY, *COLOURS[1:5])  # told apart without colour by their markers
 _MARKERS = ("s", "^", "v", "D", "P")
-_MOST_POINTS = 3000  # of a line
 _PER_PAGE = 24  # channels drawn
 
 
+@styled
 def judgement_figure(judgement: "Judgement") -> Figure:
     """Draws the errors over the steps for every predictor, with coverage and width of the model's intervals below."""
     groups = len(judgement.groups)
@@ -45,13 +47,12 @@ def judgement_figure(judgement: "Judgement") -> Figure:
         for each in (axis, below):
             each.set_xticks(judgement.steps, [str(step) for step in judgement.steps])
             each.minorticks_off()
-            each.spines[["top", "right"]].set_visible(False)
     axes[1][0].set_ylabel("coverage (solid)\nwidth (dashed)")
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8)
+    legend_below(figure, axes[0])
     return figure
 
 
+@styled
 def inspection_figure(inspection: "Inspection") -> Figure:
     """Draws each channel over the time, with its gaps, on one page."""
     channels = inspection.channels[:_PER_PAGE]
@@ -72,7 +73,6 @@ def inspection_figure(inspection: "Inspection") -> Figure:
 def _draw(axis, channel: "Channel", gaps: Sequence[tuple[float, float]]) -> None:
     axis.plot(channel.time, channel.values, color=_MODEL, linewidth=0.7)
     for begin, end in gaps[:200]:
-        axis.axvspan(begin, end, color=_OTHERS[1], alpha=0.4, linewidth=0)
+        axis.axvspan(begin, end, color=_GAP, alpha=0.4, linewidth=0)
     axis.set_ylabel(channel.name, rotation=0, ha="right", va="center", fontsize=7)
     axis.tick_params(labelsize=7)
-    axis.spines[["top", "right"]].set_visible(False)

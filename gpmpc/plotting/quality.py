@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
 
-from gpmpc.plotting.style import BLACK, COLOURS, DASHED, plain_numbers, styled
+from gpmpc.plotting._style import BLACK, COLOURS, DASHED, plain_numbers, styled
 
 _SIZE = (9.0, 6.2)  # [in]: at 100 dots an inch as wide as a README
 _CURVES = 5

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gpmpc.plotting.style import (
+from gpmpc.plotting._style import (
     BLUE,
     DASHED,
     GREY,

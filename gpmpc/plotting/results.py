@@ -9,7 +9,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator, PercentFormatter
 
-from gpmpc.plotting.style import COLOURS, DASHED, DASHES, VERMILION, add_legend, legend_below, styled
+from gpmpc.plotting._style import COLOURS, DASHED, DASHES, VERMILION, add_legend, legend_below, styled
 from gpmpc.plotting.sweeps import Series, draw_quartiles
 
 if TYPE_CHECKING:

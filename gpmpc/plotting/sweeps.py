@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from gpmpc.plotting.style import COLOURS, add_legend, clipped, plain_numbers, styled
+from gpmpc.plotting._style import COLOURS, add_legend, clipped, plain_numbers, styled
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,7 @@ class Series:
 
 @styled
 def over_variable(
-    title: str,
-    positions: Sequence[str],
-    label: str,
-    lines: Sequence[Series],
-    logarithmic: bool = False,
+    title: str, positions: Sequence[str], label: str, lines: Sequence[Series], logarithmic: bool = False
 ) -> Figure:
     """Median and quartiles of a measure over the values of a variable, every run a dot.
 

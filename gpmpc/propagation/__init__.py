@@ -2,7 +2,7 @@
 
 from gpmpc.propagation.linearization import Linearization, MeanEquivalence
 from gpmpc.propagation.local_model import LocalModel, linearize, rollout
-from gpmpc.propagation.moment_matching import MomentMatching
+from gpmpc.propagation.moment_matching import MomentMatching, best_propagator
 from gpmpc.propagation.monte_carlo import MonteCarlo
 from gpmpc.propagation.propagator import Propagation, Propagator
 from gpmpc.propagation.sensitivity import Sensitivity, differentiate
@@ -18,6 +18,7 @@ __all__ = [
     "Propagator",
     "Sensitivity",
     "Unscented",
+    "best_propagator",
     "differentiate",
     "linearize",
     "rollout",

@@ -14,6 +14,7 @@ from gpmpc.propagation._composition import Composition, Latent
 from gpmpc.propagation._moments import moments, moments_with_jacobian
 from gpmpc.propagation.propagator import Propagation, Propagator, checked_input, projected
 from gpmpc.propagation.sensitivity import Sensitivity
+from gpmpc.propagation.unscented import Unscented
 
 
 class MomentMatching(Propagator):
@@ -92,3 +93,8 @@ class MomentMatching(Propagator):
         parts: list[Any] = [p if p is None else torch.from_numpy(p.reshape(*batch, *p.shape[1:])) for p in found]
         parts[0] += f.offset
         return Latent(*parts)
+
+
+def best_propagator(model: Any) -> Propagator:
+    """Makes ``MomentMatching()`` where a model has exact moments, else ``Unscented()``."""
+    return Unscented() if Composition.of(model) is None else MomentMatching()

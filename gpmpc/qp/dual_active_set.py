@@ -23,14 +23,14 @@ from gpmpc.qp.dual_kernels import SIGNATURE, solve
 from gpmpc.qp.dual_rescue import rescue
 from gpmpc.qp.problem import QuadraticProgram, SoftRows, stack_softness
 from gpmpc.qp.solution import QPSolution, WarmStart, proves_infeasibility
-from gpmpc.qp.workspace import new_memory, prepare_memory
+from gpmpc.qp.workspace import most_working, new_memory, prepare_memory
 
 Array = NDArray[np.float64]
 _Arrays = tuple[Array, Array, Array, Array, Array]  # P, q, G, lower, upper
 
-_NO_RECORD = layout.NO_RECORD
+_NO_RECORD, _MISUSE = layout.NO_RECORD, layout.MISUSE  # local names save look-ups
 _FLOAT = np.dtype(np.float64)
-_empty = np.empty  # a local name saves a look-up
+_empty = np.empty
 _new = tuple.__new__  # half the time of a named tuple's own constructor
 
 _run = solve  # until it is compiled
@@ -90,7 +90,7 @@ class DualActiveSet:
             problem = QuadraticProgram.from_stacked(*problem)
             plan = self._plan(problem.G.shape, soft)
         (P, q, G, lower, upper), (softness, memory, size, where) = problem, plan
-        record, status = _empty(size), layout.MISUSE
+        record, status = _empty(size), _MISUSE
         try:
             guess = _NO_RECORD if warm_start is None else warm_start.record  # pyright: ignore[reportAttributeAccessIssue]
             if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
@@ -121,7 +121,8 @@ class DualActiveSet:
         if self.time_limit is not None:
             limit = min(limit, _ITERATIONS_PER_LOOK)
         memory = new_memory(softness, n, limit, self.tolerance, soft is not None, prepared)
-        plan = softness, memory, layout.record_size(n, M), slice(layout.HEADER, layout.HEADER + n)
+        size = layout.record_size(n, M, most_working(n, M, soft is not None) if prepared else 0)
+        plan = softness, memory, size, slice(layout.HEADER, layout.HEADER + n)
         if soft is None and not prepared:
             self._plans[m, n] = plan
         return plan
@@ -163,7 +164,7 @@ class Prepared:
         """
         began = perf_counter()  # line by line as in ``DualActiveSet.solve``: a call costs a tenth of a small solve
         P, G = self._P, self._G
-        record, status = _empty(self._size), layout.MISUSE
+        record, status = _empty(self._size), _MISUSE
         try:
             guess = _NO_RECORD if warm_start is None else warm_start.record  # pyright: ignore[reportAttributeAccessIssue]
             if q.dtype is lower.dtype is upper.dtype is _FLOAT:
@@ -217,6 +218,7 @@ def _solve_again(problem: _Arrays, warm_start, plan, solver, status, record, beg
     if stopped or _is_certain(record, G, lower, upper):
         return solution(record)
     guess, record = record, np.empty_like(record)
+    guess[layout.TAG] = 0.0  # the factor is computed anew
     if solve(P, q, G, lower, upper, guess, memory, record) == layout.MISUSE:
         record = guess
     record[layout.ITERATIONS] += done

@@ -12,12 +12,13 @@ The functions take a ``Workspace``, a ``WorkingSet`` and the number k of its con
 import numpy as np
 
 from gpmpc.compiled import inline_njit
-from gpmpc.kernels.linalg import dot, four_dots
+from gpmpc.kernels.linalg import combine_rows, dot
 from gpmpc.qp.record import INFEASIBLE, ITERATION_LIMIT, SOLVED
 from gpmpc.qp.triangular import (
     append_row,
     delete_row,
     multiply_rows,
+    multiply_to_ends,
     solve_lower,
     solve_transposed,
     subtract_rows,
@@ -31,7 +32,6 @@ from gpmpc.qp.violations import (
     most_violated,
     restore_limits,
 )
-from gpmpc.qp.workspace import UNCHANGED
 
 NEGLIGIBLE = 1e-26  # share of the length of q below which x, and a violation of a bound of zero, is none
 _GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
@@ -62,10 +62,8 @@ def iterate(work, active, k, count, margin, iterations, batches):
             chosen = choose_bad(work, _BAD * work.excess[p], count, work.capacity - k)
             k = add_constraints(work, active, k, chosen)
             iterations += k - before
-        several = k > before
-        if several:
-            k = drop_wrong_multipliers(work, active, k)
-        else:
+        several = unsettled = k > before
+        if not several:
             mu_p, scale = work.mu[p], work.scale[p]
             satisfied, k, changes = _satisfy_constraint(work, active, k, p)
             iterations += changes
@@ -76,22 +74,27 @@ def iterate(work, active, k, count, margin, iterations, batches):
                     return INFEASIBLE, k, iterations, batches, passed
                 work.mu[p], passed = mu_p, True  # what it gained on the way belongs to no working set
                 ignore_violations(work, p)
-                if not work.soft:  # else refinement has to do
-                    k = drop_wrong_multipliers(work, active, k)
+                unsettled = not work.soft  # else refinement has to do
             if work.soft:
                 batches = _BATCHES  # caps may have changed x_u
-        complete = several or work.soft or count == 1 or iterations >= work.limit
+        if unsettled:
+            k = drop_wrong_multipliers(work, active, k)
+        complete = several or work.soft or work.prepared or count == 1 or iterations >= work.limit
         if not complete:  # first satisfy those that were seen to be violated, then look at all
-            if not work.prepared:
-                minimise(work, active, k)
-            count = keep_violated(work, active, k, margin, count)
+            minimise(work, active, k)
+            count = keep_violated(work, margin, count)
             complete = count == 0
-        if complete:
+        if work.prepared:
+            follow_multipliers(work)
+        elif complete:
             evaluate(work, active, k)
+        if complete:
             count = list_violated(work, margin)
     for i in range(k):  # rounding can take multipliers out of their ranges
         p = abs(active.name[i]) - 1
         work.mu[p] = min(max(work.mu[p], active.least[i]), active.most[i])
+    if work.prepared:
+        multiply_constraints(work)  # which x has, but for rounding
     return SOLVED, k, iterations, batches, passed
 
 
@@ -108,8 +111,7 @@ def _satisfy_constraint(work, active, k, p):
     violation = (work.y[p] - (work.upper[p] if above else work.lower[p])) * sense
     place = _make_row(work, active, k, p)
     row, size = work.rows[place], int(work.end[p])
-    free_value = dot(row, work.v, len(work.x))
-    K_pp = dot(row, row, size) + work.softness[p]
+    free_value, K_pp = _measure_row(work, p, row, size)
     _multiply_working_rows(work, active, k, p, row)
     solve_lower(active.factor, k, solved)
     while True:
@@ -205,24 +207,34 @@ def add_constraints(work, active, k, count):
         p = abs(work.candidates[i]) - 1
         place = _make_row(work, active, first + i, p)
         row, size = work.rows[place], int(work.end[p])
-        if k < work.settings[UNCHANGED] and abs(active.name[k]) == p + 1:  # its row of the factor is there
-            _write_slot(work, active, k, p, work.candidates[i] > 0)
-            active.free_value[k] = dot(row, work.v, len(work.x))
-            k += 1
-            continue
-        work.settings[UNCHANGED] = min(work.settings[UNCHANGED], k)
         _multiply_working_rows(work, active, k, p, row)
         solve_lower(active.factor, k, solved)
-        K_pp = dot(row, row, size) + work.softness[p]
+        free_value, K_pp = _measure_row(work, p, row, size)
         pivot = K_pp - dot(solved, solved, k)
         if pivot > _GUESSED_PIVOT * K_pp:
             active.place[first + i] = active.place[k]
             _write_slot(work, active, k, p, work.candidates[i] > 0)
-            active.place[k], active.free_value[k], active.diagonal[k] = place, dot(row, work.v, len(work.x)), K_pp
+            active.place[k], active.free_value[k], active.diagonal[k] = place, free_value, K_pp
             append_row(active.factor, k, solved, pivot)
             k += 1
         else:
             restore_limits(work, p)
+    return k
+
+
+@inline_njit
+def restore_constraints(work, active, names, factor):
+    """Makes the named constraints of a prepared problem the working set, whose factor is known; returns its size."""
+    k, at = len(names), 0
+    for i in range(k):
+        p, row = int(abs(names[i])) - 1, active.factor[i]
+        active.place[i] = p
+        active.free_value[i], active.diagonal[i] = _measure_row(work, p, work.rows[p], 0)
+        _write_slot(work, active, i, p, names[i] > 0.0)
+        ignore_violations(work, p)
+        for j in range(i + 1):
+            row[j] = factor[at + j]
+        at += i + 1
     return k
 
 
@@ -243,6 +255,15 @@ def _make_row(work, active, slot, p):
         row[p] = 1.0
     solve_transposed(work.L, int(work.end[p]), row)
     return place
+
+
+@inline_njit
+def _measure_row(work, p, row, size):
+    """Returns c_p'x at the unconstrained minimiser, and K_pp with softness; ``row`` is w_p."""
+    n = len(work.x)
+    if work.prepared:
+        return dot(work.gram[p], work.v, n), work.gram[p, p] + work.softness[p]
+    return dot(row, work.v, n), dot(row, row, size) + work.softness[p]
 
 
 @inline_njit
@@ -269,7 +290,6 @@ def _write_slot(work, active, k, p, above):
 def _drop_constraint(work, active, k, slot):
     """Drops the constraint in a slot from the working set of k, and from ``work.solved``; its place becomes free."""
     delete_row(active.factor, k, slot, work.solved, work.cosines, work.sines)
-    work.settings[UNCHANGED] = min(work.settings[UNCHANGED], slot)
     place = active.place[slot]
     for i in range(slot, k - 1):
         active.name[i], active.place[i], active.bound[i] = active.name[i + 1], active.place[i + 1], active.bound[i + 1]
@@ -313,6 +333,12 @@ def drop_wrong_multipliers(work, active, k):
 def minimise(work, active, k):
     """Writes the minimiser of the Lagrangian, ``P x = -(q + C'mu)``, to the first n entries of y."""
     n, y = len(work.x), work.y
+    if work.prepared:
+        add_multipliers(work, active, k)
+        combine_rows(work.gram, n, work.slope, 0, n, y)
+        for i in range(n):
+            y[i] = -y[i]
+        return
     if work.soft:  # constraints at their caps have multipliers, too
         add_multipliers(work, active, k)
         for i in range(n):
@@ -332,20 +358,28 @@ def evaluate(work, active, k):
     """Writes ``y = C x`` for the minimiser x of the Lagrangian."""
     minimise(work, active, k)
     multiply_constraints(work)
+    if work.prepared:
+        for p in range(len(work.mu)):
+            work.seen[p] = work.mu[p]
+
+
+@inline_njit
+def follow_multipliers(work):
+    """Moves y of a prepared program by the rows of K whose multipliers have changed."""
+    mu, seen, amounts, count, M = work.mu, work.seen, work.excess, 0, len(work.mu)
+    for p in range(M):
+        work.candidates[count] = p
+        amounts[count] = mu[p] - seen[p]
+        count += amounts[count] != 0.0
+        seen[p] = mu[p]
+    subtract_rows(work.y, work.gram, work.candidates, amounts, count, M)
 
 
 @inline_njit
 def multiply_constraints(work):
-    """Writes ``y[n:] = G y[:n]``, four rows at a time, as far as they may not be zero."""
-    n, y, G = len(work.x), work.y, work.G
-    product, end, p = y[n:], work.end[n:], 0
-    while p + 4 <= len(G):
-        size = int(max(max(end[p], end[p + 1]), max(end[p + 2], end[p + 3])))
-        four_dots((G[p], G[p + 1], G[p + 2], G[p + 3]), y, size, product[p:])
-        p += 4
-    while p < len(G):
-        product[p] = dot(G[p], y, n)
-        p += 1
+    """Writes ``y[n:] = G y[:n]``."""
+    n = len(work.x)
+    multiply_to_ends(work.G, work.end[n:], work.y, work.y[n:])
 
 
 @inline_njit

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from gpmpc.compiled import compiled, inline_njit
-from gpmpc.kernels._simd import any_nonzero, load, load_some, total, zeros
+from gpmpc.kernels._simd import any_nonzero, larger, largest, load, load_some, store, total, zeros
 from gpmpc.kernels.linalg import dot, multiply
 from gpmpc.qp.dual_iteration import (
     NEGLIGIBLE,
@@ -22,8 +22,10 @@ from gpmpc.qp.dual_iteration import (
     evaluate,
     iterate,
     multiply_constraints,
+    restore_constraints,
 )
 from gpmpc.qp.record import (
+    AGE,
     CONSTRAINTS,
     HEADER,
     ITERATION_LIMIT,
@@ -32,12 +34,13 @@ from gpmpc.qp.record import (
     NUMERICAL_TROUBLE,
     SOLVED,
     STATUS,
+    TAG,
     VARIABLES,
     WORKING,
 )
 from gpmpc.qp.triangular import factorise, multiply_rows, solve_lower, solve_transposed, subtract_rows
-from gpmpc.qp.violations import choose_guess, list_violated, restore_limits
-from gpmpc.qp.workspace import UNCHANGED, all_finite, is_dense, is_dense_matrix, open_workspace, round_end
+from gpmpc.qp.violations import are_present, choose_guess, list_violated, restore_limits
+from gpmpc.qp.workspace import SHARE, all_finite, is_dense, is_dense_matrix, open_workspace, round_end
 
 SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 
@@ -49,6 +52,7 @@ _REFINEMENTS = 3
 _FINE, _FINEST = 2e-10, 1e-15  # residuals at which refinement stops
 _DOUBT = 3e-7  # times the shares that cancellation left of the pivots: the largest residual of a solution
 _ILL = 5e-4  # such a share: what else x violates is seen of the best x only
+_OLD = 1000  # changes after which a factor is computed anew
 _BATCHES = 4  # see ``iterate``
 _TINY = 1e-300
 _UNDEFINED = 1e300  # a residual that overflowed; less than infinity, so that refinement is tried
@@ -65,10 +69,10 @@ def solve(P, q, G, lower, upper, guess, memory, out):
     work, active = open_workspace(P, q, G, memory, out)
     if not work.prepared and not (factorise(P, work.L) and _measure_rows(work)):
         return MISUSE
-    least = 0.0  # length of x that is none
-    for i in range(n):
-        least = max(least, abs(q[i]) * work.scale[i])
-    least *= NEGLIGIBLE
+    longest = zeros()
+    for i in range(0, n, 8):
+        longest = larger(longest, load_some(q, i) * load(work.scale, i))
+    least = NEGLIGIBLE * largest(longest)  # length of x that is none
     if not _read_bounds(work, lower, upper, least):
         return MISUSE
     return _solve_opened(work, active, guess, least)
@@ -81,11 +85,7 @@ def _solve_opened(work, active, guess, least):
     known = len(guess) > HEADER and guess[VARIABLES] == n and guess[CONSTRAINTS] == M and 0 <= guess[WORKING] <= M
     k = start(work, active, guess if known else guess[:0])
     evaluate(work, active, k)
-    pivots = 1.0  # what cancellation left of the pivots of P, as a share of P_ii
-    for i in range(n):
-        pivots = max(pivots, work.L[i, i] * work.L[i, i] * work.P[i, i])
-    pivots = 1.0 / pivots
-    margin, fine = _LATER / NEGLIGIBLE * least, _FINE
+    pivots, margin, fine = work.settings[SHARE], _LATER / NEGLIGIBLE * least, _FINE
     iterations, rounds = np.int64(0), 0  # for a literal numba compiles callees anew
     status, passed, moved = NUMERICAL_TROUBLE, False, False
     interrupted = known and guess[STATUS] == ITERATION_LIMIT
@@ -125,10 +125,18 @@ def _solve_opened(work, active, guess, least):
         status = NUMERICAL_TROUBLE
     out = work.record
     out[STATUS], out[ITERATIONS], out[WORKING], out[VARIABLES], out[CONSTRAINTS] = status, iterations, k, n, M
+    out[TAG], out[AGE] = work.tag if status == SOLVED else 0.0, out[AGE] + iterations
     for i in range(n):
         work.x[i] = work.y[i]
     for i in range(k):
         out[HEADER + n + M + i] = active.name[i]
+    if work.prepared:
+        at = HEADER + n + 2 * M
+        for i in range(k):
+            row = active.factor[i]
+            for j in range(i + 1):
+                out[at + j] = row[j]
+            at += i + 1
     return status
 
 
@@ -136,6 +144,7 @@ def _solve_opened(work, active, guess, least):
 def start(work, active, guess):
     """Starts from a guess: x_u, soft rows that stay violated, and the working set; returns its size."""
     n, M = len(work.x), len(work.mu)
+    work.record[AGE] = 0.0
     if not work.prepared:
         for i in range(work.capacity + 2):
             active.place[i] = i
@@ -148,15 +157,17 @@ def start(work, active, guess):
     add_multipliers(work, active, np.int64(0))
     for i in range(n):
         work.v[i] = -work.slope[i]
-    solve_transposed(work.L, n, work.v)
+    if not work.prepared:
+        solve_transposed(work.L, n, work.v)
     if len(guess) == 0:
         return np.int64(0)
     first = HEADER + n + M
-    count = choose_guess(work, guess[first : first + int(guess[WORKING])])
-    if not work.prepared:
-        work.settings[UNCHANGED] = 0.0
-    k = add_constraints(work, active, np.int64(0), count)
-    work.settings[UNCHANGED] = k
+    names, known = guess[first : first + int(guess[WORKING])], work.prepared and guess[TAG] == work.tag
+    if known and len(guess) == len(work.record) and guess[AGE] < _OLD and are_present(work, names):
+        work.record[AGE] = guess[AGE]
+        k = restore_constraints(work, active, names, guess[first + M :])
+    else:
+        k = add_constraints(work, active, np.int64(0), choose_guess(work, names))
     return drop_wrong_multipliers(work, active, k)
 
 
@@ -176,21 +187,27 @@ def _read_bounds(work, lower, upper, least):
 @inline_njit
 def _measure_rows(work):
     """Writes lengths in the metric of P's diagonal, and the ends of the rows of G; returns False if not finite."""
-    n, G, units, scale = len(work.x), work.G, work.scratch, work.scale
+    n, G, units, scale, cancelled = len(work.x), work.G, work.scratch, work.scale, 1.0
     for i in range(n):
         scale[i] = units[i] = 1.0 / math.sqrt(work.P[i, i])
+        cancelled = max(cancelled, work.L[i, i] * work.L[i, i] * work.P[i, i])
+    work.settings[SHARE] = 1.0 / cancelled
     for i in range(n, n + 8):
         units[i] = 0.0
     undefined, end = 0.0, 0
     for p in range(len(G)):
         row, near, far = G[p], zeros(), zeros()
         head, tail, rest = row[:end], row[end:], units[end:]
-        for j in range(0, end, 8):
-            values = load_some(head, j) * load(units, j)
+        for j in range(0, end - 7, 8):
+            values = load(head, j) * load(units, j)
             near = near + values * values
-        for j in range(0, n - end, 8):
-            values = load_some(tail, j) * load(rest, j)
+        values = load_some(head, end // 8 * 8) * load(units, end // 8 * 8)
+        near = near + values * values
+        for j in range(0, n - end - 7, 8):
+            values = load(tail, j) * load(rest, j)
             far = far + values * values
+        values = load_some(tail, (n - end) // 8 * 8) * load(rest, (n - end) // 8 * 8)
+        far = far + values * values
         if any_nonzero(far):  # longer than the row before
             end = n
             while end > 0 and row[end - 1] == 0.0:
@@ -235,13 +252,15 @@ def _measure_residuals(work, active, k, least):
     P, y, slope, gradient, n = work.P, work.y, work.slope, work.gradient, len(work.x)
     multiply(P, n, y, n, gradient)
     size = math.sqrt(max(dot(gradient, y, n), least * least, _TINY))
-    length, shift, entry, undefined = 0.0, 0.0, _TINY, 0.0
-    for i in range(n):
-        gradient[i] += slope[i]
-        part = abs(gradient[i]) * work.scale[i]
-        length, shift, entry = max(length, part), max(shift, part * work.scale[i]), max(entry, abs(y[i]))
-        undefined += 0.0 * part
-    worst = max(length / size, 0.01 * shift / entry)
+    lengths = shifts = entries = nothing = zeros()
+    for i in range(0, n, 8):
+        rest = load_some(gradient[:n], i) + load_some(slope[:n], i)
+        store(gradient, i, rest)
+        length = rest * load(work.scale, i)
+        lengths, shifts = larger(lengths, length), larger(shifts, length * load(work.scale, i))
+        entries, nothing = larger(entries, load_some(y[:n], i)), nothing + 0.0 * length
+    worst, undefined = largest(lengths) / size, total(nothing)
+    worst = max(worst, 0.01 * largest(shifts) / max(largest(entries), _TINY))
     for i in range(k):
         p, b = abs(active.name[i]) - 1, active.bound[i]
         work.rest[i] = y[p] - work.softness[p] * work.mu[p] - b

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 _new = tuple.__new__
 ABSENT = 1e20  # a bound of this size or more is none
 _SYMMETRY = 1e-10  # largest |P - P'| accepted, as a share of the largest diagonal entry
+_LARGE = 300  # variables from which an error tells no eigenvalue: a thousand take seconds
 
 
 def _as_float_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
@@ -63,6 +64,8 @@ def _check_hessian(P: Array) -> None:
     except np.linalg.LinAlgError:
         definite = False
     if not definite:
+        if len(P) > _LARGE:
+            raise ProblemError(f"P ({len(P)} x {len(P)}) must be positive definite; it has no Cholesky factor")
         eigenvalues = np.linalg.eigvalsh(P)
         raise ProblemError(
             f"P must be positive definite; its smallest eigenvalue (number 0 of {len(P)}, in ascending order) is "

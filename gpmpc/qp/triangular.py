@@ -17,6 +17,19 @@ _SKEW = 1e-10  # largest |P - P'| accepted, as a share of the largest diagonal e
 
 
 @njit_noalloc
+def multiply_to_ends(A, ends, vector, product):
+    """Writes ``product = A vector`` for rows of which ``ends`` leading entries may not be zero."""
+    i = 0
+    while i + 4 <= len(A):
+        size = int(max(max(ends[i], ends[i + 1]), max(ends[i + 2], ends[i + 3])))
+        four_dots((A[i], A[i + 1], A[i + 2], A[i + 3]), vector, size, product[i:])
+        i += 4
+    while i < len(A):
+        product[i] = dot(A[i], vector, int(ends[i]))
+        i += 1
+
+
+@njit_noalloc
 def multiply_rows(A, places, count, vector, size, product):
     """Writes ``product[i] = A[places[i]] . vector``."""
     i = 0
@@ -51,13 +64,23 @@ def solve_lower(L, k, a):
     """Writes ``a <- L^-1 a``."""
     i = 0
     while i + 4 <= k:
-        r1, r2, r3 = L[i + 1], L[i + 2], L[i + 3]
-        a0, a1, a2, a3 = a[i], a[i + 1], a[i + 2], a[i + 3]
-        four_dots((L[i], r1, r2, r3), a, i, a[i:])
-        a0 = (a0 - a[i]) * L[i, i]
-        a1 = (a1 - a[i + 1] - r1[i] * a0) * r1[i + 1]
-        a2 = (a2 - a[i + 2] - r2[i] * a0 - r2[i + 1] * a1) * r2[i + 2]
-        a3 = (a3 - a[i + 3] - r3[i] * a0 - r3[i + 1] * a1 - r3[i + 2] * a2) * r3[i + 3]
+        r0, r1, r2, r3 = L[i], L[i + 1], L[i + 2], L[i + 3]
+        s0 = s1 = s2 = s3 = zeros()
+        whole = i // _LANES * _LANES
+        for j in range(0, whole, _LANES):
+            x = load(a, j)
+            s0, s1, s2, s3 = s0 + load(r0, j) * x, s1 + load(r1, j) * x, s2 + load(r2, j) * x, s3 + load(r3, j) * x
+        a0, a1, a2, a3 = a[i] - total(s0), a[i + 1] - total(s1), a[i + 2] - total(s2), a[i + 3] - total(s3)
+        if whole < i:
+            x0, x1, x2, x3 = a[whole], a[whole + 1], a[whole + 2], a[whole + 3]
+            a0 -= r0[whole] * x0 + r0[whole + 1] * x1 + r0[whole + 2] * x2 + r0[whole + 3] * x3
+            a1 -= r1[whole] * x0 + r1[whole + 1] * x1 + r1[whole + 2] * x2 + r1[whole + 3] * x3
+            a2 -= r2[whole] * x0 + r2[whole + 1] * x1 + r2[whole + 2] * x2 + r2[whole + 3] * x3
+            a3 -= r3[whole] * x0 + r3[whole + 1] * x1 + r3[whole + 2] * x2 + r3[whole + 3] * x3
+        a0 = a0 * r0[i]
+        a1 = (a1 - r1[i] * a0) * r1[i + 1]
+        a2 = (a2 - r2[i] * a0 - r2[i + 1] * a1) * r2[i + 2]
+        a3 = (a3 - r3[i] * a0 - r3[i + 1] * a1 - r3[i + 2] * a2) * r3[i + 3]
         a[i], a[i + 1], a[i + 2], a[i + 3] = a0, a1, a2, a3
         i += 4
     while i < k:
@@ -104,19 +127,41 @@ def delete_row(L, k, gone, solved, cosines, sines):
     and ``sines`` (k,) are scratch.
     """
     left = solved[gone]
-    for i in range(gone + 1, k):
-        row, above, rest = L[i], L[i - 1], L[i, gone]
-        for j in range(gone):
-            above[j] = row[j]
-        for j in range(gone + 1, i):
-            entry = row[j]
-            above[j - 1], rest = cosines[j] * rest + sines[j] * entry, cosines[j] * entry - sines[j] * rest
-        diagonal = 1.0 / row[i]
-        reciprocal = 1.0 / math.sqrt(rest * rest + diagonal * diagonal)
-        cosines[i], sines[i] = rest * reciprocal, diagonal * reciprocal
-        above[i - 1] = reciprocal
-        below = solved[i]
-        solved[i - 1], left = cosines[i] * left + sines[i] * below, cosines[i] * below - sines[i] * left
+    for top in range(gone + 1, k, _BLOCK):
+        rests = (L[top, gone], 0.0, 0.0, 0.0)
+        if top + _BLOCK <= k:
+            rests = L[top, gone], L[top + 1, gone], L[top + 2, gone], L[top + 3, gone]
+            rests = _rotate_four(L, top, gone, rests, cosines, sines)
+        for i in range(top, min(top + _BLOCK, k)):
+            row, above, rest = L[i], L[i - 1], rests[i - top]
+            first = top
+            if top + _BLOCK > k:
+                first, rest = gone + 1, row[gone]
+            for j in range(gone):
+                above[j] = row[j]
+            for j in range(first, i):
+                entry = row[j]
+                above[j - 1], rest = cosines[j] * rest + sines[j] * entry, cosines[j] * entry - sines[j] * rest
+            diagonal = 1.0 / row[i]
+            reciprocal = 1.0 / math.sqrt(rest * rest + diagonal * diagonal)
+            cosines[i], sines[i] = rest * reciprocal, diagonal * reciprocal
+            above[i - 1] = reciprocal
+            below = solved[i]
+            solved[i - 1], left = cosines[i] * left + sines[i] * below, cosines[i] * below - sines[i] * left
+
+
+@inline_njit
+def _rotate_four(L, top, gone, rests, cosines, sines):
+    """Applies the rotations before ``top`` to four rows, whose chains hide each other's latency; returns the rests."""
+    a, b, c, d = rests
+    row0, row1, row2, row3, above = L[top], L[top + 1], L[top + 2], L[top + 3], L[top - 1]
+    for j in range(gone + 1, top):
+        cosine, sine, e0, e1, e2, e3 = cosines[j], sines[j], row0[j], row1[j], row2[j], row3[j]
+        above[j - 1], row0[j - 1] = cosine * a + sine * e0, cosine * b + sine * e1
+        row1[j - 1], row2[j - 1] = cosine * c + sine * e2, cosine * d + sine * e3
+        a, b = cosine * e0 - sine * a, cosine * e1 - sine * b
+        c, d = cosine * e2 - sine * c, cosine * e3 - sine * d
+    return a, b, c, d
 
 
 @njit_noalloc

@@ -47,16 +47,12 @@ def list_violated(work, margin):
 
 
 @inline_njit
-def keep_violated(work, active, k, margin, count):
-    """Computes the listed constraints anew, from x = y[:n] or K; keeps the violated ones, and returns how many."""
+def keep_violated(work, margin, count):
+    """Computes the listed constraints anew, from x = y[:n]; keeps the violated ones, and returns how many."""
     kept, n, y = 0, len(work.x), work.y
     for i in range(count):
         p = work.violated[i]
-        if work.prepared:
-            y[p] = dot(work.rows[p], work.v, n)
-            for j in range(k):
-                y[p] -= work.gram[p, active.place[j]] * work.mu[active.place[j]]
-        elif p >= n:
+        if p >= n:
             y[p] = dot(work.G[p - n], y, int(work.end[p]))
         work.excess[p] = max(y[p] - work.allowed_high[p], work.allowed_low[p] - y[p]) / work.scale[p] - margin
         if work.excess[p] > 0.0:
@@ -110,3 +106,15 @@ def choose_guess(work, names):
                 chosen += 1
                 ignore_violations(work, p)
     return chosen
+
+
+@inline_njit
+def are_present(work, names):
+    """Returns whether every one of the named bounds is there (it may have become absent), its multiplier at no cap."""
+    for name in names:
+        if not 1.0 <= abs(name) <= len(work.mu):
+            return False
+        p = int(abs(name)) - 1
+        if work.mu[p] != 0.0 or abs(work.upper[p] if name > 0.0 else work.lower[p]) == np.inf:
+            return False
+    return True

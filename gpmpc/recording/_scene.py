@@ -46,7 +46,9 @@ class Scene:
             return
         self._next = copy.step.time + _INTERVAL * (1 - 1e-6)  # a step of just the interval is drawn every time
         means = copy.plan[1] if copy.plan else np.zeros((0, len(copy.state)))
-        places, turns = self._places(np.vstack([copy.state, copy.reference, means]))
+        states = np.vstack([copy.state, copy.reference, means])
+        places = [fg.Vector3(x=x, y=y, z=z) for x, y, z in _selected(states, self._position).tolist()]
+        turns = _quaternions(_from_angles(_selected(states, self._attitude)))
         poses = [fg.Pose(position=place, orientation=turn) for place, turn in zip(places, turns, strict=True)]
         at: Any = {"timestamp": fg.Timestamp(sec=nanoseconds // 10**9, nsec=nanoseconds % 10**9)}
         frames = ((DISPLAY, self._frame, fg.Vector3(), self._display_turn),)
@@ -70,11 +72,6 @@ class Scene:
             tube = self._ellipsoids(places[2:], copy.plan[2])
             entity = fg.SceneEntity(id="plan", spheres=tube, lines=[line], **at)
             self._tube.log(fg.SceneUpdate(entities=[entity]), log_time=nanoseconds)
-
-    def _places(self, states: Array) -> tuple[list[fg.Vector3], list[fg.Quaternion]]:
-        """Where states (K, n) are and how they are turned."""
-        places = [fg.Vector3(x=x, y=y, z=z) for x, y, z in _selected(states, self._position).tolist()]
-        return places, _quaternions(_from_angles(_selected(states, self._attitude)))
 
     def _ellipsoids(self, places: list[fg.Vector3], covariances: Array) -> list[fg.SpherePrimitive]:
         """The 2-sigma ellipsoids of covariances (K, n, n), but those without extent."""

@@ -21,10 +21,11 @@ from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
 from gpmpc.gp import Training, Transitions
 from gpmpc.metrics import find_loss, time_quantiles, tracking_error, violation_rate
+from gpmpc.models import train_with_angles
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.policy import OnFailure, check_policy
 from gpmpc.mpc.problem import Box
-from gpmpc.propagation import MomentMatching, Propagator
+from gpmpc.propagation import Propagator, best_propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
 from gpmpc.studies.document import Table
 from gpmpc.studies.study import random_rows
@@ -46,7 +47,9 @@ class Experiment:
     data: DataSource  #: where transitions come from
     trajectory: Trajectory | None  #: what is followed, from its beginning; None holds the system's goal
     system: System  #: whose transitions are learned; names, units and references are its own
-    train: Callable[..., Training]  #: from transitions and a ``seed`` to a ``Training``
+    #: from transitions and a ``seed`` to a ``Training``, such as a ``Trainer``; one that learns differences sees the
+    #: system's angles as sine and cosine
+    train: Callable[..., Training]
     #: from a model, or from a ``plant`` where its first argument is called so, to a ``Controller``
     controller: Callable[..., Any]
     plant: System | None = None  #: what flies, and the true model of a controller that takes one; the system by default
@@ -56,7 +59,7 @@ class Experiment:
     seed: int = 0  #: of all random numbers
     #: what stands at the other end: the plant, or the learned model rolled on itself
     loop: Literal["plant", "model"] = "plant"
-    #: the controller's own, if it has one. A model loop carries its belief on with it, or by moment matching
+    #: the controller's own, if it has one. A model loop carries its belief on with it, or as ``best_propagator`` does
     propagator: Propagator | None = None
     noise: Noise | None = None  #: on the plant
     disturbances: Sequence[Disturbance] = ()  #: of the plant
@@ -119,6 +122,13 @@ class Experiment:
             raise SettingError("data.size", f"must be at most {len(data)}, the rows of the data; got {size}")
         return data[random_rows(len(data), size, self.seed)]
 
+    def learn(self, transitions: Transitions, seed: int) -> Training:
+        """Trains on transitions; see ``train``."""
+        angles = self.system.angle_indices
+        if angles and getattr(self.train, "predicts", None) == "difference":
+            return train_with_angles(self.train, angles, transitions, seed)
+        return self.train(transitions, seed=seed)
+
     def references(self, count: int) -> np.ndarray:
         """Returns the states to follow (count, n), one per time step."""
         return self.system.reference_states(self.trajectory, count)
@@ -169,12 +179,12 @@ def run_trial(
     """
     plant, training, model = experiment.flown, None, experiment.model
     if experiment.learns and model is None:
-        training = experiment.train(experiment.training_rows(), seed=experiment.seed)
+        training = experiment.learn(experiment.training_rows(), experiment.seed)
         model = training.posterior
     controller = experiment.controller(model if experiment.learns else plant)
     system: System | ModelLoop = plant
     if experiment.loop == "model" and model is not None:
-        system = ModelLoop(model, experiment.propagator or MomentMatching(), time_step=plant.time_step)
+        system = ModelLoop(model, experiment.propagator or best_propagator(model), time_step=plant.time_step)
     states = experiment.references(experiment.steps + controller.horizon + 1)
     resting = np.asarray(controller.initial_input)  # falls back on it where the very first solve fails
     reference = Reference(states, np.tile(resting, (len(states) - 1, 1)))
@@ -211,6 +221,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     rollout, problem, training = flown.rollout, flown.controller.problem, flown.training
     system = experiment.system
     error = tracking_error(rollout.states, rollout.references, system.tracked_indices, system.angle_indices)
+    at_end = (rollout.states[-2:], rollout.references[-2:], system.tracked_indices, system.angle_indices)
     rmse = {name: float(value) for name, value in zip(system.tracked, error.axes, strict=True)}
     rmse["total"] = error.total
     if flown.diverged is not None or not np.isfinite(error.total):
@@ -229,6 +240,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         "steps": len(rollout.inputs),
         "unit": system.unit,
         "rmse": rmse,
+        "error_at_end": None if rmse["total"] is None else float(tracking_error(*at_end).total),
         "lost": _lost(experiment, flown),
         "violations": {name: asdict(rate) | {"rate": rate.rate} for name, rate in violations.items()},
         "failures": dict(Counter(status.name for _, status in rollout.failures)),
@@ -261,10 +273,11 @@ def summary(result: Mapping[str, Any]) -> Table:
     options, training, times = result["settings"]["options"], result["training"], result["times"]
     along = "" if options["trajectory"] == "goal" else f" along {options['trajectory']}"
     lines = [("flight", f"{result['steps']} steps of {options['system']}{along} with {options['controller']}")]
-    other = _differences(result["settings"])
+    system, plant, model = (result["settings"].get(key) or {} for key in ("system", "plant", "model"))
+    other = [f"{k} {v} (learned: {system.get(k)})" for k, v in plant.items() if v != system.get(k)]
     if other:
-        lines.append(("flown with", ", ".join(f"{key} {now} (learned: {then})" for key, then, now in other)))
-    if path := result["settings"]["model"].get("path"):
+        lines.append(("flown with", ", ".join(other)))
+    if path := model.get("path"):
         lines.append(("model", path))
     if training:
         from_what = f"{training['size']} rows of {options['data']} data"
@@ -274,6 +287,8 @@ def summary(result: Mapping[str, Any]) -> Table:
     axes = ", ".join(f"{k} {v:.3g}" for k, v in result["rmse"].items() if v is not None and k != "total")
     total = result["rmse"]["total"]
     lines.append((f"RMSE [{result['unit']}]", "none: it diverged" if total is None else f"{total:.3g}  ({axes})"))
+    if (error := result.get("error_at_end")) is not None:
+        lines.append((f"at the end [{result['unit']}]", f"{error:.3g}"))
     for name, rate in result["violations"].items():
         outside = f"{rate['violations']} of {rate['steps']} steps outside"
         lines.append((f"bounds of {name}", f"{outside} (95 %: {100 * rate['low']:.2g} to {100 * rate['high']:.2g} %)"))
@@ -285,14 +300,6 @@ def summary(result: Mapping[str, Any]) -> Table:
     median, most = (f"{1e3 * times['total'][key]:.3g}" for key in ("median", "p99"))
     lines.append(("decision [ms]", f"median {median}  ({stages}), 99 % below {most}"))
     return Table(("", ""), lines)
-
-
-def _differences(settings: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Returns what distinguishes the plant from the system: setting, the system's value, the plant's."""
-    system = settings.get("system", {})
-    return [
-        (key, system.get(key), value) for key, value in settings.get("plant", {}).items() if value != system.get(key)
-    ]
 
 
 def _counted(statuses: Mapping[str, int]) -> str:

@@ -11,7 +11,7 @@ import pandas as pd
 from gpmpc.plotting import Series, over_variable, png
 from gpmpc.provenance import now
 from gpmpc.studies.document import MISSING, Document, Table, figure_label, plain_text, with_range
-from gpmpc.studies.report import MEASURES, Cell, Report, Run, in_order
+from gpmpc.studies.report import MEASURES, Cell, Report, in_order
 from gpmpc.studies.run_folder import LONGEST_NAME
 
 _DRAWN = ("rmse", "failed", "decision")  # a figure each
@@ -48,13 +48,12 @@ def report_document(
         lists={heading: items for heading, items in lists.items() if items},
         code={heading: lines for heading, lines in code.items() if lines},
         images=_figures(report) if images is None else images,
-        links={_name(report, run): os.path.relpath(run.folder.resolve(), start) for run in report.runs},
+        links={
+            plain_text(str(run.folder.relative_to(report.tree))): os.path.relpath(run.folder.resolve(), start)
+            for run in report.runs
+        },
         latex=[_table(report, _telling(report))],
     )
-
-
-def _name(report: Report, run: Run) -> str:
-    return plain_text(str(run.folder.relative_to(report.tree)))
 
 
 def _made(report: Report) -> list[str]:

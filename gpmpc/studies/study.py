@@ -23,7 +23,8 @@ from threadpoolctl import threadpool_limits
 import gpmpc
 from gpmpc.compiling import report_compilation
 from gpmpc.exceptions import DataError, GpmpcError, check_number
-from gpmpc.gp import GPPosterior, Training, Transitions, load_posterior, save_posterior
+from gpmpc.gp import Training, Transitions
+from gpmpc.models import DynamicsModel, load_model, save_model
 from gpmpc.parallel import in_processes
 from gpmpc.studies.document import Document, Table
 
@@ -40,7 +41,7 @@ class Trial:
     work: float = 0.0  #: trials of more work are started earlier, so that the last ones to run are short
 
 
-class _Study(Protocol):
+class Study(Protocol):
     """A published result: which trials it needs, and how its tables follow from their records."""
 
     name: str  # of its documents
@@ -193,7 +194,7 @@ def trained_model(train: Callable[..., Training], settings: Any, data: Transitio
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         with one_thread():
-            save_posterior(train(data, seed=seed).posterior, path)
+            save_model(train(data, seed=seed).posterior, path)
     return path
 
 
@@ -210,6 +211,6 @@ def one_thread() -> Iterator[None]:
 
 
 @lru_cache(maxsize=8)
-def load_model(path: Path) -> GPPosterior:
-    """Reads trained GPs, once a process."""
-    return load_posterior(path)
+def read_model(path: Path) -> DynamicsModel:
+    """Reads a trained model, once a process."""
+    return load_model(path)

@@ -201,7 +201,7 @@ class Acrobot:
 
 
 def acrobot(
-    masses: tuple[float, float] = (1.0, 1.0), first_length: float = 1.0, time_step: float = 0.05, torque: float = 20.0
+    masses: tuple[float, float] = (1.0, 1.0), first_length: float = 1.0, time_step: float = 0.05, torque: float = 10.0
 ) -> System:
     """Makes an acrobot that hangs at first.
 
@@ -222,7 +222,7 @@ def acrobot(
         input_lower=[-torque],
         input_upper=[torque],
         start=[pi, 0.0, 0.0, 0.0],
-        region=[[-2.0, -6.0, -pi, -8.0], [2 * pi + 2, 6.0, pi, 8.0]],
+        region=[[0.0, -4.0, -pi, -6.0], [2 * pi, 4.0, pi, 6.0]],
         angles=["shoulder", "elbow"],
         rates={"shoulder_rate": "shoulder", "elbow_rate": "elbow"},
     )

@@ -13,10 +13,10 @@ IMPORTED = [
     "gpytorch",
     "cvxpy",
     "matplotlib.pyplot",
-    "gpmpc.cli.command",
+    "gpmpc.cli._command",
     "gpmpc.recording",
 ]
-IMPORTED += ["gpmpc.cli.sweep", "gpmpc.experiments.figures", "gpmpc.experiments.tables"]
+IMPORTED += ["gpmpc.cli._sweep", "gpmpc.experiments.figures", "gpmpc.experiments.tables"]
 IMPORTED += ["gpmpc.studies.report_document", "gpmpc.studies.flight", "gpmpc.plotting.recorded"]
 SECONDS = 300  # a command may take
 

@@ -13,8 +13,8 @@ from mcap.writer import Writer
 sys.path.append(str(Path(__file__).resolve().parents[1] / "recording"))
 import runs
 
-from gpmpc.cli.command import COMMANDS
-from gpmpc.cli.log import log
+from gpmpc.cli._command import COMMANDS
+from gpmpc.cli._log import log
 from gpmpc.exceptions import GpmpcError
 from gpmpc.recording import layout, read_run
 from tests.cli.command import forked
@@ -174,3 +174,19 @@ def test_a_mistake_is_one_clear_line(folder, arguments, message):
     assert result.stderr.startswith("gpmpc: ")
     assert message in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+def test_a_folder_of_runs_is_drawn_run_by_run_and_one_that_cannot_be_read_is_named(tmp_path):
+    for name in ("a", "b"):
+        runs.record_run(tmp_path / name / "run.mcap", steps=3)
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "run.mcap").touch()
+    done = forked("plot", str(tmp_path), "--no-animation", cwd=tmp_path)
+    assert done.returncode == 2
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("gpmpc: ")]
+    assert "c/run.mcap: is empty" in line
+    for name in ("a", "b"):
+        assert (tmp_path / name / "figures" / "tracking.png").exists()
+    (tmp_path / "d").mkdir()
+    done = forked("plot", "d", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (2, "gpmpc: d: holds no run.mcap, nor does a folder below it\n")

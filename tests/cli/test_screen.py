@@ -2,7 +2,7 @@
 
 import logging
 
-from gpmpc.cli.terminal import logging_console
+from gpmpc.cli._terminal import logging_console
 
 
 def test_what_the_package_logs_is_told_once_and_a_searchs_evaluations_not_at_all(capsys):

@@ -15,9 +15,9 @@ import time
 
 import pytest
 
-from gpmpc.cli.command import COMMANDS
-from gpmpc.cli.completion import candidates
-from gpmpc.cli.terminal import Output
+from gpmpc.cli._command import COMMANDS
+from gpmpc.cli._completion import candidates
+from gpmpc.cli._terminal import Output
 from tests.cli.command import PATH, SECONDS, forked
 
 TINY = ["data.samples=25", "model.restarts=0", "steps=2", "horizon=1", "recorder=none"]

@@ -11,8 +11,7 @@ import torch
 
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
-from gpmpc.logs import Increments, Learned, LearnedDynamics, LogModel, MultirotorNominal, OutputNoise, RigidBody
-from gpmpc.logs.fitting import NominalFit
+from gpmpc.logs import Increments, LogDynamics, LogModel, MultirotorNominal, OutputNoise, RigidBody
 from gpmpc.logs.nominal import Still
 from gpmpc.logs.rollouts import OutputGP
 from gpmpc.logs.state_space import StateGroup, StateSpace, rotation_quaternion
@@ -26,37 +25,33 @@ VECTORS = [StateGroup(name, tuple(f"{name}{axis}" for axis in "xyz")) for name i
 BODY = StateSpace((VECTORS[0], StateGroup("q", ("qx", "qy", "qz", "qw"), "", "quaternion"), *VECTORS[1:]))
 
 
-def learned(kinematics, nominal, theta, inputs, dim, **model):
-    """What ``learn`` would return, with a GP on the last output."""
+def dynamics(kinematics, nominal, theta, inputs, dim, **model):
+    """What ``load_flyable`` would return, with a GP on the last output."""
     rng, o = np.random.default_rng(0), len(kinematics.output_names)
     z, y = torch.from_numpy(rng.normal(size=(20, dim))), torch.from_numpy(rng.normal(size=(20, 1)))
     one = torch.ones(1, dtype=torch.float64)
     gp = GPPosterior.from_hyperparameters(z, y, 2 * torch.ones(1, dim, dtype=torch.float64), one, 0.1 * one, 0, "value")
     whole = LogModel(kinematics, nominal, theta, (0,) * o, gps=(OutputGP((o - 1,), gp),), **model)
     noise = OutputNoise(np.ones((4, o)), np.ones(kinematics.space.error_dim), np.zeros(3))
-    n = kinematics.space.dim
-    fit = NominalFit(whole, 0 * theta, 0.0, 0.0, 0)
-    names = tuple(f"u{i}" for i in range(inputs))
-    return Learned(whole, noise, fit, (), np.zeros((2, n + inputs)), 9, ("a",), kinematics.space.names, names, (), 0.02)
+    return LogDynamics(whole, inputs, 0.02, noise)
 
 
 def test_what_was_learned_obeys_the_protocol_of_models():
     rng = np.random.default_rng(1)
     nominal = MultirotorNominal(4, torque=True)
-    body = learned(RigidBody(BODY), nominal, rng.normal(size=18), 4, 12)
+    body = dynamics(RigidBody(BODY), nominal, rng.normal(size=18), 4, 12)
     x = np.hstack([rng.normal(size=(5, 3)), rotation_quaternion(rng.normal(size=(5, 3))), rng.normal(size=(5, 6))])
-    check_model(LearnedDynamics(body), torch.from_numpy(x), torch.from_numpy(rng.uniform(0.2, 0.8, (5, 4))))
+    check_model(body, torch.from_numpy(x), torch.from_numpy(rng.uniform(0.2, 0.8, (5, 4))))
     space = StateSpace((StateGroup("a", ("a",), "rad", "angle"), StateGroup("b", ("b",))))
-    turning = LearnedDynamics(learned(Increments(space), Still(2), np.empty(0), 1, 4))
+    turning = dynamics(Increments(space), Still(2), np.empty(0), 1, 4)
     states = torch.tensor([[3.1415, 60.0], [-7.0, 1.0]], dtype=torch.float64)  # a turn is counted, not taken back
     check_model(turning, states, torch.ones(2, 1, dtype=torch.float64))
     assert abs(turning.predict(states, states[:, :1]).mean - states).max() < 0.1
 
 
 def test_what_no_controller_can_plan_with_is_named():
-    late = learned(RigidBody(BODY), MultirotorNominal(4), np.zeros(6), 4, 12, lag=3)
     with pytest.raises(SettingError, match="inputs that act 3 rows late, which no controller"):
-        LearnedDynamics(late)
+        dynamics(RigidBody(BODY), MultirotorNominal(4), np.zeros(6), 4, 12, lag=3)
 
 
 def test_the_guide_flies_learns_and_flies_what_was_learned(tmp_path):

@@ -138,14 +138,17 @@ def test_a_residual_model_can_be_moved_to_single_precision():
     assert torch.allclose(single.predict(x.float(), u.float()).mean.double(), model().predict(x, u).mean, atol=1e-4)
 
 
-def test_a_trainer_of_differences_is_no_trainer_of_residuals():
-    for trainer in (Trainer(predicts="difference"), SparseTrainer(predicts="difference"), 3):
-        with pytest.raises(SettingError, match="trainer: must be a Trainer or SparseTrainer with predicts='value'"):
-            ResidualModel.train(AFFINE, transitions(15), trainer=trainer)
+def test_any_trainer_learns_residuals_and_nothing_else_does():
+    found = [
+        ResidualModel.train(AFFINE, transitions(15), trainer=Trainer(predicts=predicts, restarts=0)).residual
+        for predicts in ("value", "difference")
+    ]
+    assert found[1].predicts == "value"
+    assert torch.equal(found[0].weights, found[1].weights)
+    with pytest.raises(SettingError, match="trainer: must be a Trainer or SparseTrainer; got 3"):
+        ResidualModel.train(AFFINE, transitions(15), trainer=3)
     with pytest.raises(SettingError, match=r"transitions: must be Transitions\(...\); got str"):
         ResidualModel.train(AFFINE, "data.npz")
-    known = ResidualModel.train(AFFINE, transitions(15), trainer=Trainer(predicts="value", restarts=0))
-    assert known.residual.predicts == "value"
 
 
 @pytest.mark.parametrize(

@@ -108,7 +108,7 @@ def test_a_solution_is_a_copy_that_later_solves_leave_alone(solve, rng):
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (6, 9), (20, 40)])
 def test_a_prepared_program_that_has_solved_others_gives_the_bits_of_a_new_one(n, m, rng):
-    """It keeps the factor of the last working set, and must notice where the guess is another one."""
+    """The factor of the working set comes with the guess, not from the memory of the solver."""
     problem = feasible_problem(rng, n, m)
     used, last, changes = DualActiveSet().prepare(problem.P, problem.G), None, 0
     for k in range(60):

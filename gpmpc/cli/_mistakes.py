@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from gpmpc.cli.configuration import setting_names, settings
-from gpmpc.cli.run import one_line, own_error
+from gpmpc.cli._configuration import setting_names, settings
+from gpmpc.cli._run import one_line, own_error
 from gpmpc.exceptions import GpmpcError
 
 _EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher
@@ -46,7 +46,9 @@ def _of_settings(error: Exception, name: str) -> str:
         return one_line(error)
     text = str(error)
     if unknown := re.match(r"Could not override '([^']+)'", text):
-        return f"unknown setting {unknown[1]!r}{nearest(unknown[1], _names(name))}"
+        with settings():
+            known = setting_names(name)
+        return f"unknown setting {unknown[1]!r}{nearest(unknown[1], known)}"
     option = re.search(r"Could not find '([^'/]+)/([^']+)'\s+Available options in '[^']+':\n((?:\t.*\n)+)", text)
     if option and (extra := _EXTRAS.get(option[2].removeprefix("launcher/"))):
         return f"launcher: this one is not installed: pip install 'gpmpc[{extra}]'"
@@ -68,8 +70,3 @@ def _of_settings(error: Exception, name: str) -> str:
         return f"{listed}; a sweep takes -m" if name == "run" else listed
     lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc" not in line]
     return "; ".join(line.rstrip(".:;") for line in lines) or type(error).__name__
-
-
-def _names(name: str) -> list[str]:
-    with settings():
-        return setting_names(name)

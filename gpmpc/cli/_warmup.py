@@ -3,10 +3,10 @@
 import argparse
 import time
 
-from gpmpc.cli.arguments import Command, Result
-from gpmpc.cli.configuration import compose, settings
-from gpmpc.cli.run import experiment_of
-from gpmpc.cli.terminal import progress_bar
+from gpmpc.cli._arguments import Command, Result
+from gpmpc.cli._configuration import compose, settings
+from gpmpc.cli._run import experiment_of
+from gpmpc.cli._terminal import progress_bar
 
 _FLOWN = ("controller=convex", "controller=paper", "controller=nonlinear", "controller=lqr")
 _SHORT = ("data.samples=12", "model.restarts=0", "steps=2", "horizon=3")

@@ -16,6 +16,7 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from threading import Event, Thread
 from typing import Any
 
@@ -26,13 +27,12 @@ from hydra.core.plugins import Plugins
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig
 
-from gpmpc.cli.arguments import Result, folder_of, writing
-from gpmpc.cli.configuration import without_hydra
-from gpmpc.cli.run import choices, experiment_of, plain_settings, run_one
-from gpmpc.cli.terminal import print_error, progress_bar
+from gpmpc.cli._arguments import Result, folder_of, write_files
+from gpmpc.cli._configuration import without_hydra
+from gpmpc.cli._run import choices, experiment_of, plain_settings, run_one
+from gpmpc.cli._terminal import print_error, progress_bar
 from gpmpc.compiling import report_compilation
 from gpmpc.exceptions import GpmpcError, SettingError
-from gpmpc.files import write_whole
 from gpmpc.parallel import THREADS, children_ignore_interrupts, end_with
 from gpmpc.studies.run_folder import PLAN, Busy, RunFolder, folder_name
 
@@ -99,16 +99,14 @@ class Sweep:
     def keep_plan(self, jobs: Sequence[Job]) -> None:
         """Writes what was asked for, so that a report knows what is missing; equal sweeps write the same file."""
         text = json.dumps({"runs": [choices(job.overrides) for job in jobs]}, indent=1) + "\n"
-        with writing(self.tree):
-            self.tree.mkdir(parents=True, exist_ok=True)
-            write_whole(self.tree / f"{PLAN}{hashlib.sha256(text.encode()).hexdigest()[:10]}.json", text)
+        write_files(self.tree, {f"{PLAN}{hashlib.sha256(text.encode()).hexdigest()[:10]}.json": text})
 
     def fly(self, jobs: Sequence[Job]) -> list[dict[str, Any]]:
         """Flies the runs that are not finished; returns the outcome of each of those."""
         waiting = [job for job in jobs if not job.folder.finished]
-        outcomes = self._launch(waiting, _run_job)
+        outcomes = self._launch(waiting, partial(_fly_job, wait=False))
         busy = [job for job, outcome in zip(waiting, outcomes, strict=True) if "busy" in outcome]
-        return [o for o in outcomes if "busy" not in o] + self._launch(busy, _run_job_after_others)
+        return [o for o in outcomes if "busy" not in o] + self._launch(busy, partial(_fly_job, wait=True))
 
     def _launch(self, jobs: Sequence[Job], task: Callable[[DictConfig], dict[str, Any]]) -> list[dict[str, Any]]:
         if not jobs:
@@ -179,18 +177,9 @@ def sweep(given: Namespace, name: str) -> Result:
     return Result(data, 1 if failed else 0)
 
 
-def _run_job(config: DictConfig) -> dict[str, Any]:
-    """Flies one run of a sweep, in whichever process a launcher started, unless another process works on it."""
-    return _outcome(config, wait=False)
-
-
-def _run_job_after_others(config: DictConfig) -> dict[str, Any]:
-    """Flies one run of a sweep, after the process that works on it."""
-    return _outcome(config, wait=True)
-
-
 @report_compilation()
-def _outcome(config: DictConfig, wait: bool) -> dict[str, Any]:
+def _fly_job(config: DictConfig, wait: bool) -> dict[str, Any]:
+    """Flies one run of a sweep, in whichever process a launcher started; with ``wait`` after others that work on it."""
     try:
         outcome = run_one(config, wait)
     except Busy:

@@ -16,8 +16,8 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc.cli.arguments import Command, Result, folder_of, writing
-from gpmpc.cli.terminal import print_error
+from gpmpc.cli._arguments import Command, Result, folder_of, writing
+from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, check_number
 
 if TYPE_CHECKING:
@@ -185,6 +185,8 @@ def experiment_of(config: DictConfig) -> "Experiment":
         problem = config.controller.problem
         if problem.cost.get("Q") is None or problem.cost.get("R") is None:
             raise SettingError("controller.problem.cost", f"has no weights Q and R; {system.name} is to bring them")
+        if problem.cost.get("angles") is None:
+            problem.cost.angles = list(system.angle_indices)
         box = problem.inputs
         for side in ("lower", "upper"):
             if box.get(side) is None:

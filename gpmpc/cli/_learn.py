@@ -7,7 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpmpc.cli.arguments import Command, Parser, Result, writing
+from gpmpc.cli._arguments import Command, Parser, Result, writing
 
 if TYPE_CHECKING:
     from gpmpc.logs import Judgement, Learned, Log

@@ -2,16 +2,19 @@
 
 from dataclasses import replace
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from gpmpc.cli.arguments import Command, Result, folder_of, write_files, writing
-from gpmpc.cli.run import experiment_of, plain_data, plain_settings
-from gpmpc.cli.terminal import logging_console, progress_bar
+from gpmpc.cli._arguments import Command, Result, folder_of, write_files, writing
+from gpmpc.cli._run import experiment_of, plain_data, plain_settings
+from gpmpc.cli._terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
+
+if TYPE_CHECKING:
+    from gpmpc.studies.study import Study
 
 _ONE, _SEVERAL = ("data", "excited", "undithered", "model", "flying"), ("trajectory", "subsystem")
 _SHOWN_ERRORS = 10
@@ -53,7 +56,7 @@ def _run(config: DictConfig) -> Result:
     return Result(data | {"folder": str(folder)}, 1 if failed and wrong else 0)
 
 
-def _study(config: DictConfig, settings: dict[str, Any]) -> Any:
+def _study(config: DictConfig, settings: dict[str, Any]) -> "Study":
     """Makes the study that the settings describe; what a user can get wrong is found here."""
     for key in (*_ONE, *_SEVERAL):
         if key in config and not config[key]:

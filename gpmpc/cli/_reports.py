@@ -4,9 +4,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from gpmpc.cli.arguments import Command, Parser, Result, write_files, writing
-from gpmpc.cli.log import CUT
-from gpmpc.cli.terminal import print_error
+from gpmpc.cli._arguments import Command, Parser, Result, write_files, writing
+from gpmpc.cli._log import CUT
+from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, RecordingError
 
 _FORMATS = ("png", "pdf", "svg")

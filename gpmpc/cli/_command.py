@@ -11,12 +11,20 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 import gpmpc
-from gpmpc.cli import completion, learn, log, new, reports, run, study, tune, warmup
-from gpmpc.cli.arguments import SHOWN, Command, Result
-from gpmpc.cli.configuration import compose, help_text, model_file, settings
-from gpmpc.cli.mistakes import explain, nearest
-from gpmpc.cli.sweep import sweep
-from gpmpc.cli.terminal import print_error, redirected_output
+from gpmpc.cli import _completion as completion
+from gpmpc.cli import _learn as learn
+from gpmpc.cli import _log as log
+from gpmpc.cli import _new as new
+from gpmpc.cli import _reports as reports
+from gpmpc.cli import _run as run
+from gpmpc.cli import _study as study
+from gpmpc.cli import _tune as tune
+from gpmpc.cli import _warmup as warmup
+from gpmpc.cli._arguments import SHOWN, Command, Result
+from gpmpc.cli._configuration import compose, help_text, model_file, settings
+from gpmpc.cli._mistakes import explain, nearest
+from gpmpc.cli._sweep import sweep
+from gpmpc.cli._terminal import print_error, redirected_output
 from gpmpc.exceptions import GpmpcError
 
 
