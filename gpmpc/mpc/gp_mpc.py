@@ -154,7 +154,7 @@ class GPMPC:
             return replace(request.failed_decision(status, count, clock.timing), problem=program, solution=solution)
         plan, disturbance = prediction.plan, request.disturbance if self.prediction.settings.disturbance_gain else None
         inputs, beliefs = plan.inputs.copy(), self.prediction.linearizer.moments(plan.states, prediction.covariances)
-        found = program, solution, disturbance, suboptimal
+        found = program, solution, disturbance, suboptimal, self.prediction.novelty(prediction.stages)
         return Decision(inputs[0], inputs, *beliefs, status, count, clock.timing, *found)
 
     def control_many(

@@ -92,6 +92,15 @@ class StageLinearizer:
         moments = {"full": self._full, "diagonal": self._diagonal, "zero_order": self._zero_order}
         self._linearize = self._points if self.at_points else moments[covariance]
 
+    def prior_variances(self) -> Array:
+        """What V is far from all data (n,), for GPs in an affine form; empty where V is zero or that is not known."""
+        form = getattr(self.model, "affine_form", None)
+        if form is None or not self.at_points or self.covariance == "none":
+            return np.empty(0)
+        latent = to_array(form.f.signal_variance)
+        found = latent if form.B is None else to_array(form.B) ** 2 @ latent
+        return np.ascontiguousarray(found if self._noise is None else found + np.diagonal(self._noise))
+
     def weight(self, Q: Array) -> Array:
         """The weights of s that belong to weights of x (K, n, n): the blocks on their diagonals (K, p / n, n, n)."""
         if self.covariance == "full":  # tr(Q Sigma) = |vec S|^2 in I_n kron Q
