@@ -86,7 +86,7 @@ def loop(steps: list[Step], count: int, apart: float, recorder: McapRecorder | N
 def measure(horizon: int, seconds: float, apart: float, record_problems: bool, turns: int) -> dict:
     """Measures one line of the table."""
     steps, count = make_steps(horizon, 16), round(seconds / 1e-3 / turns)
-    system = RecordedSystem(STATES, INPUTS, time_step=apart)
+    system = RecordedSystem(STATES, INPUTS, time_step=apart, pose={axis: axis for axis in "xyz"})
     records, with_recorder, without = [], [], []
     with tempfile.TemporaryDirectory() as folder:
         for turn in range(turns):

@@ -22,7 +22,7 @@ from gpmpc.files import write_whole
 from gpmpc.metrics import tracking_error
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.prediction import PredictionSettings
-from gpmpc.plotting.image import png
+from gpmpc.plotting import png
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Replaced, Rollout, closed_loop
 from gpmpc.systems import System, Translational

@@ -5,6 +5,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -66,7 +67,11 @@ def now() -> str:
 
 def versions(packages: Sequence[str] = _PACKAGES) -> dict[str, str | None]:
     """The installed versions by name; None where a package is not installed."""
-    return {name: _version(name) for name in packages}
+    found: dict[str, str | None] = dict.fromkeys(packages)
+    for name in packages:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 def _git_commit() -> dict | None:
@@ -85,10 +90,3 @@ def _git(root: Path, *arguments: str) -> str:
     # Without the lock that refreshes the index: a run that is killed would leave it, and git would refuse to commit.
     command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None

@@ -41,8 +41,8 @@ class Elliptical:
     climb_rate: float = -0.25  #: c [m/s], negative upwards because z points down
 
     def __post_init__(self) -> None:
-        for key in ("radius_x", "radius_y", "rate", "start_z", "climb_rate"):
-            check_number(key, getattr(self, key))
+        for key, value in vars(self).items():
+            check_number(key, value)
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., 3) [m] at times (...) [s]."""

@@ -94,3 +94,12 @@ def test_the_example_of_moving_obstacles_reaches_its_goal_and_touches_none(tmp_p
     assert names["nearest"] > 0.0
     assert names["loop"].failures == 0
     assert (tmp_path / "obstacles.png").stat().st_size > 10_000
+
+
+def test_the_example_of_learning_while_flying_finds_the_heavier_vehicle(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["learning.py", str(tmp_path)])
+    names = runpy.run_path(str(EXAMPLES / "learning.py"), run_name="__main__")
+    away = {name: abs(f.states - f.references)[26:, [0, 2, 4]].max() for name, f in names["flights"].items()}
+    assert away["online learning"] < 0.2 < 2.0 < away["as learned"]
+    assert "online learning" in capsys.readouterr().out
+    assert (tmp_path / "learning.png").stat().st_size > 10_000

@@ -24,13 +24,11 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*arguments, **settings)
 
     def add_argument(self, *names: Any, **settings: Any) -> Any:
-        """Adds an argument as ``argparse`` does."""
         flag = settings.get("action") in ("store_true", "help")
         self.values |= dict.fromkeys(names, None if flag else [*settings.get("choices", ())])
         return super().add_argument(*names, **settings)
 
     def error(self, message: str) -> NoReturn:
-        """Raises instead of exiting."""
         raise GpmpcError(f"{message}; {self.prog} --help shows how")
 
 

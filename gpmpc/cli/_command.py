@@ -81,7 +81,6 @@ eval "$(gpmpc completion bash)" completes at TAB; zsh likewise; fish: gpmpc comp
 
 
 def main() -> None:
-    """Runs the command that the command line names."""
     flags = {flag for flag in _FLAGS if flag in sys.argv[1:]}
     arguments = [argument for argument in sys.argv[1:] if argument not in flags]
     with redirected_output("error" if "--json" in flags else "nowhere" if "--quiet" in flags else "output"):

@@ -36,7 +36,6 @@ compdef _gpmpc gpmpc
 
 
 def add_arguments(parser: Parser) -> None:
-    """Adds the arguments of the command."""
     parser.add_argument(
         "shell", nargs="?", choices=[*_SCRIPTS], help='for its profile: eval "$(gpmpc completion bash)"'
     )

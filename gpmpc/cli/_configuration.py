@@ -70,7 +70,6 @@ def model_file(override: str) -> list[str]:
 
 
 def without_hydra(config: DictConfig) -> DictConfig:
-    """Returns settings without Hydra's own."""
     config = config.copy()
     with open_dict(config):
         del config["hydra"]

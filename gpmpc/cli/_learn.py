@@ -17,7 +17,6 @@ MODEL, PROGRESS = "model.safetensors", "progress.json"
 
 
 def _add_arguments(parser: Parser) -> None:
-    """Adds the arguments of the command."""
     parser.add_argument("mapping", type=Path, help="a YAML file that says what the columns mean")
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="logs: CSV, Parquet, npz, MCAP, ULog")
     parser.add_argument("--held-out", nargs="+", metavar="RUN", default=[], help="runs to judge on (a fifth of them)")

@@ -17,7 +17,6 @@ CUT = "unfinished or damaged; this is what could be read"
 
 
 def _add_arguments(parser: Parser) -> None:
-    """Adds the arguments of the command."""
     what = "info: channels, times, how the solves ended; recover: what is whole in an unfinished file, as a new one; "
     what += "export: the steps as a table, a row each; layout: for Foxglove or Lichtblick, fitting the recording; "
     what += "inspect: rates, gaps, repeated values, noise, delays and excitation of any log, on one page"

@@ -18,7 +18,6 @@ _FILES = {
 
 
 def _add_arguments(parser: Parser) -> None:
-    """Adds the arguments of ``gpmpc new``."""
     parser.add_argument("name", metavar="NAME", help="of the system: letters, digits and _, a letter first")
     parser.add_argument("--to", type=Path, metavar="DIR", help="an empty folder, or one to be made (NAME)")
 

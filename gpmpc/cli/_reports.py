@@ -13,7 +13,6 @@ _FORMATS = ("png", "pdf", "svg")
 
 
 def _add_report_arguments(parser: Parser) -> None:
-    """Adds the arguments of ``gpmpc report``."""
     parser.add_argument("tree", type=Path, metavar="OUTPUTS", help="a folder with runs anywhere below it")
     parser.add_argument("--to", type=Path, metavar="DIR", help="where the documents go (OUTPUTS/report)")
     groups = "choices that make two groups, such as controller=lqr controller=convex: a paired test over the seeds"
@@ -44,7 +43,6 @@ def _report(given: argparse.Namespace) -> Result:
 
 
 def _add_plot_arguments(parser: Parser) -> None:
-    """Adds the arguments of ``gpmpc plot``."""
     parser.add_argument(
         "run", type=Path, metavar="RUN", help="a run's folder, one with runs below it, or a recording (.mcap)"
     )

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from gpmpc.systems import System
 
 ASIDE = ("launcher", "folder", "live", "tracker")  # settings that a result does not depend on
-_GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver")
+_GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver", "learning")
 _MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
 _LOST = 3  # exit code of a run that is finished, and whose flight was lost
 
@@ -91,13 +91,16 @@ def _track(folder: "RunFolder", result: Mapping[str, Any]) -> None:
 def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
     """Trains, flies and records; returns the metrics."""
     from gpmpc.studies.flight import metrics, run_trial
+    from gpmpc.studies.run_folder import RECORDING
 
     if config.recorder != "mcap":
         return metrics(experiment, run_trial(experiment))
+    episodes = range(1, 1 + getattr(experiment.learning, "episodes", 0))
+    paths = iter([folder.path / name for name in [*(f"episode_{k}.mcap" for k in episodes), RECORDING]])
     with ExitStack() as stack:
 
         def prepare(controller: Any, training: Any) -> Callable:
-            recorder = stack.enter_context(_recorder(experiment, folder, config, about, controller, training))
+            recorder = stack.enter_context(_recorder(experiment, next(paths), config, about, controller, training))
             callback = partial(recorder.record, gp_size=0 if training is None else len(training.posterior))
             return _in_real_time(callback, experiment.system.time_step) if config.live else callback
 
@@ -117,10 +120,9 @@ def _in_real_time(callback: Callable, time_step: float) -> Callable:
 
 
 def _recorder(
-    experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict, controller: Any, training: Any
+    experiment: "Experiment", path: "Path", config: DictConfig, about: dict, controller: Any, training: Any
 ) -> Any:
     from gpmpc.recording import McapRecorder, RecordedSystem
-    from gpmpc.studies.run_folder import RECORDING
 
     flown = experiment.system
     system = RecordedSystem(
@@ -139,7 +141,7 @@ def _recorder(
         "system": flown.name,
         "tracked": " ".join(flown.tracked),
     }
-    path, text = folder.path / RECORDING, OmegaConf.to_yaml(config, resolve=True)
+    text = OmegaConf.to_yaml(config, resolve=True)
     recorder = McapRecorder(path, system, config=text, metadata=metadata, live=config.live)
     if recorder.address:
         print(f"live view: open {recorder.address} in Foxglove or Lichtblick", file=sys.stderr, flush=True)
@@ -209,6 +211,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
         size=size,
         propagator=getattr(parts["controller"], "keywords", {}).get("propagator"),
         noise=Noise(**config.noise) if any(config.noise.values()) else None,
+        learning=instantiate(config.learning, _convert_="all") if config.get("learning") else None,
         **{key: config[key] for key in ("steps", "seed", "loop", "on_failure")},
     )
 

@@ -25,11 +25,9 @@ class Output:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Writes as any stream does."""
         return self._try(self._stream.write, text)
 
     def flush(self) -> None:
-        """Flushes as any stream does."""
         self._try(self._stream.flush)
 
     def _try(self, act: Callable, *arguments: str) -> Any:

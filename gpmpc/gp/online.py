@@ -36,6 +36,7 @@ from gpmpc.compiled import compiled
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel, check_number
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._kernel import kernel_matrix
+from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.transitions import Transitions, check_transitions
 
@@ -180,6 +181,9 @@ class SlidingWindow:
 
     def append(self, posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
         """The posterior with points x~ (p, n + m) and their targets (p, k), held to ``points`` points."""
+        oldest = self.remove == "oldest" and len(posterior) == self.points and len(features) == 1
+        if oldest and self.points > 1 and host_arrays(posterior.weights) is not None:
+            return _slide(posterior, *_checked_points(posterior, features, targets))
         larger = append_points(posterior, features, targets)
         excess, removable = len(larger) - self.points, len(posterior)
         if excess <= 0:
@@ -234,6 +238,66 @@ def _noise_variances(posterior: GPPosterior) -> Tensor:
         return nominal
     diagonal = posterior.cholesky.square().sum(-1) - posterior.signal_variance[:, None]
     return diagonal.clamp_min(torch.finfo(posterior.dtype).eps)
+
+
+def _slide(posterior: GPPosterior, feature: Tensor, target: Tensor) -> GPPosterior:
+    """``append_points`` and ``remove_points`` of the first point, in one pass over the factor and its memory."""
+    features, targets = torch.cat([posterior.features[1:], feature]), torch.cat([posterior.targets[1:], target])
+    upper = np.empty(posterior.cholesky.shape)
+    hyperparameters = posterior.lengthscales, posterior.signal_variance, posterior.noise_variance
+    scales, sf2, sn2 = (part.numpy() for part in hyperparameters)
+    weights = np.ascontiguousarray((targets - posterior.offset).mT.numpy())
+    before = np.ascontiguousarray(posterior.cholesky.numpy().transpose(0, 2, 1))  # no copy after the first time
+    if not _slide_factors(before, upper, features.numpy(), scales, sf2, sn2, weights):
+        rule = f"with the new point the kernel matrix is not positive definite in {posterior.dtype}: raise the noise"
+        raise SettingError("noise_variance", f"{rule}; got {sn2.tolist()}")
+    factor = torch.from_numpy(upper.transpose(0, 2, 1))
+    return replace(posterior, features=features, targets=targets, cholesky=factor, weights=torch.from_numpy(weights))
+
+
+@compiled
+def _slide_factors(before, upper, features, scales, sf2, sn2, right):
+    """Writes the transposed factors (k, N, N) without the first and with a new last point; ``right`` becomes weights.
+
+    Column by column of the factor, which is row by row here, so that every loop runs over contiguous memory.
+    """
+    outputs, N, d = len(before), before.shape[1], features.shape[1]
+    v, new = np.empty(N), np.empty(N)
+    for a in range(outputs):
+        U, b = upper[a], right[a]
+        for i in range(N - 1):
+            square = 0.0
+            for c in range(d):
+                square += ((features[i, c] - features[N - 1, c]) / scales[a, c]) ** 2
+            new[i], v[i] = sf2[a] * np.exp(-0.5 * square), before[a, 0, i + 1]
+        rest = sf2[a] + sn2[a]
+        for j in range(N - 1):
+            old, row = before[a, j + 1], U[j]
+            radius = np.hypot(old[j + 1], v[j])
+            c, s = old[j + 1] / radius, v[j] / radius
+            row[:j], row[j] = 0.0, radius
+            w, b[j] = new[j] / radius, b[j] / radius
+            row[N - 1] = w
+            rest -= w * w
+            y = b[j]
+            for i in range(j + 1, N - 1):
+                entry = old[i + 1]
+                mixed = c * entry + s * v[i]
+                v[i] = c * v[i] - s * entry
+                row[i] = mixed
+                new[i] -= w * mixed
+                b[i] -= y * mixed
+            b[N - 1] -= y * w
+        if not rest > 0.0:
+            return False
+        U[N - 1, : N - 1], U[N - 1, N - 1] = 0.0, np.sqrt(rest)
+        b[N - 1] /= U[N - 1, N - 1]
+        for j in range(N - 1, -1, -1):
+            total = b[j]
+            for i in range(j + 1, N):
+                total -= U[j, i] * b[i]
+            b[j] = total / U[j, j]
+    return True
 
 
 @compiled

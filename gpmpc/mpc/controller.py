@@ -105,6 +105,8 @@ class Decision:
             steps towards the optimum led to (Scokaert, Mayne and Rawlings, 1999).
         novelty: The largest standard deviation that a stage of the plan adds, over the one that the model has far from
             all data: near 0 among data, near 1 where the model knows nothing; NaN where that is not known.
+        learned: What the flight has taught a controller that learns (``gpmpc.learning``), for its next decision; with
+            ``size``, the points of the model that decided, and ``version``, how often it has changed.
     """
 
     input: Array
@@ -119,6 +121,7 @@ class Decision:
     disturbance: Array | None = None
     suboptimal: bool = False
     novelty: float = math.nan
+    learned: Any = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "input", np.array(self.input, dtype=float))  # no view of the plan

@@ -14,6 +14,7 @@ nonlinear problem itself. Where the iteration ends, in the covariance modes of `
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -156,6 +157,12 @@ class GPMPC:
         inputs, beliefs = plan.inputs.copy(), self.prediction.linearizer.moments(plan.states, prediction.covariances)
         found = program, solution, disturbance, suboptimal, self.prediction.novelty(prediction.stages)
         return Decision(inputs[0], inputs, *beliefs, status, count, clock.timing, *found)
+
+    def with_model(self, model: DynamicsModel) -> "GPMPC":
+        """Returns the controller for another model of as many states and inputs, in microseconds."""
+        other = copy(self)
+        other.prediction = self.prediction.with_model(model)
+        return other
 
     def control_many(
         self,

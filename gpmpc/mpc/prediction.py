@@ -26,6 +26,7 @@ finite-horizon LQR at the first stage. It is part of the covariances only: the b
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -155,6 +156,13 @@ class PredictionModel:
         self._roll_out = RollOut(model)
         self._prior = self.linearizer.prior_variances()
         self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
+
+    def with_model(self, model: DynamicsModel) -> "PredictionModel":
+        """Returns the predictions by another model of as many states and inputs."""
+        other = copy(self)
+        other.model, other.linearizer = model, StageLinearizer(model, self.propagator, self.settings.covariance)
+        other._at_points = StageLinearizer(model, Linearization(), "zero_order")
+        return other
 
     def read(
         self,

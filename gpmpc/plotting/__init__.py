@@ -3,13 +3,20 @@
 Every function returns a ``Figure`` made without pyplot, so nothing global is touched and no window opens.
 """
 
+from gpmpc.plotting._style import png
 from gpmpc.plotting.animation import animate, ffmpeg_exists
-from gpmpc.plotting.consistency import innovations_figure
-from gpmpc.plotting.image import png
 from gpmpc.plotting.logs import inspection_figure, judgement_figure
 from gpmpc.plotting.quality import quality
 from gpmpc.plotting.recorded import inputs_figure, timing_figure, tracking_figure
-from gpmpc.plotting.results import Curve, Panel, calibration_figure, error_over_size, over_settings, tracking
+from gpmpc.plotting.results import (
+    Curve,
+    Panel,
+    calibration_figure,
+    error_over_size,
+    innovations_figure,
+    over_settings,
+    tracking,
+)
 from gpmpc.plotting.sweeps import Series, over_variable, search_figure
 
 __all__ = [

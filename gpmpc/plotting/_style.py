@@ -4,6 +4,7 @@ The colours are those of Okabe and Ito (2008), which people who are colour-blind
 dashes as well, so that a black and white print can be read.
 """
 
+import io
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -75,3 +76,10 @@ def add_legend(figure: Figure, handles: Sequence[Any], labels: Sequence[str], **
         labels = [clipped(label, int(characters) - 6) for label in labels]
         columns = max(1, min(len(labels), int(characters / (max(map(len, labels)) + 6))))
         figure.legend(handles, labels, loc="outside lower center", ncols=columns, **options)
+
+
+def png(figure: Figure, dpi: int = 150) -> bytes:
+    """The figure as PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()

@@ -36,9 +36,6 @@ def animate(run: "Run", path: str | Path, frames: int = 150, rate: int = 15) -> 
         path: The file, .gif or .mp4 (which needs ffmpeg).
         frames: At most so many; steps are left out evenly.
         rate: Frames a second.
-
-    Raises:
-        UnsupportedModel: There are no states x, y, z, or no steps.
     """
     if not {"x", "y", "z"} <= run.pose.keys() or not len(run.times):
         raise UnsupportedModel(f"{run.path}: an animation needs steps with positions x, y and z")

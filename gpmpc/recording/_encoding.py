@@ -55,7 +55,7 @@ def pack(step: Step, gp_size: int | None, n: int, m: int, record_problems: bool)
     for name, shape, needed in zip(_ARRAYS, shapes, expected, strict=False):
         if shape != needed:
             raise ShapeError(f"step {step.k}: {name} must be {needed}; got {shape}")
-    return PackedStep(step, step.gp_size if gp_size is None else gp_size, shapes, b"".join(arrays))
+    return PackedStep(step, step.gp_size or gp_size or 0, shapes, b"".join(arrays))
 
 
 class StepCopy:

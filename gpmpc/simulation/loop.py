@@ -217,6 +217,7 @@ class History:
     def add(self, moment: Moment, reference: Array, decided: Command) -> None:
         """Adds a step that was to be at a reference state (n,)."""
         decision, n = decided.decision, len(moment.state)
+        learned = None if decision is None else decision.learned
         step = Step(
             time=moment.time,
             k=moment.k,
@@ -227,6 +228,8 @@ class History:
             decision=decision,
             innovation=moment.measured - (self.rows[-1].expected if self.rows else np.nan),
             belief_covariance=moment.covariance,
+            gp_size=0 if learned is None else learned.size,
+            gp_version=0 if learned is None else learned.version,
             failed=decided.failed,
             status=decided.status,
         )

@@ -11,7 +11,7 @@ and the subsets of one seed are nested, so that sizes can be compared in pairs.
 import inspect
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -20,6 +20,7 @@ from gpmpc.datasets import DataSource
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
 from gpmpc.gp import Training, Transitions
+from gpmpc.learning import EpisodicLearning, LearningController, OnlineLearning
 from gpmpc.metrics import find_loss, time_quantiles, tracking_error, violation_rate
 from gpmpc.models import train_with_angles
 from gpmpc.mpc.controller import Reference
@@ -64,6 +65,7 @@ class Experiment:
     noise: Noise | None = None  #: on the plant
     disturbances: Sequence[Disturbance] = ()  #: of the plant
     on_failure: OnFailure = "previous_plan"  #: what is applied where a solve fails
+    learning: OnlineLearning | EpisodicLearning | None = None  #: from the flight, while it flies or after it
     model: DynamicsModel | None = None  #: trained before; None trains one where the controller needs it
 
     def __post_init__(self) -> None:
@@ -80,6 +82,8 @@ class Experiment:
             raise SettingError("plant", f"must have the states, inputs and time step of {system.name}; got {shapes[1]}")
         if self.loop == "model" and not self.learns:
             raise SettingError("loop", "a model loop needs a controller that learns a model; this one knows the plant")
+        if self.learning is not None and not (self.learns and self.loop == "plant"):
+            raise SettingError("learning", "needs a controller that learns a model, and a plant in the loop")
         for disturbance in self.disturbances:
             if not hasattr(disturbance, "disturb_plant"):
                 what = "must each name what it is, such as {_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}}"
@@ -157,6 +161,7 @@ class Flown:
     training: Training | None  #: what was learned; None where the controller knows the plant
     #: where and why the system left the finite numbers, and the rollout ends; None where it did not
     diverged: Diverged | None = None
+    before: tuple["Flown", ...] = ()  #: the episodes
 
 
 def run_trial(
@@ -177,11 +182,41 @@ def run_trial(
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
         Diverged: The system left the finite numbers in its first step.
     """
-    plant, training, model = experiment.flown, None, experiment.model
+    training, model, before = None, experiment.model, []
     if experiment.learns and model is None:
-        training = experiment.learn(experiment.training_rows(), experiment.seed)
+        data = experiment.training_rows()
+        training = experiment.learn(data, experiment.seed)
+        if isinstance(experiment.learning, EpisodicLearning):
+            for k in range(experiment.learning.episodes):
+                seed = int(np.random.SeedSequence([experiment.seed, k]).generate_state(1)[0])
+                before.append(_fly(replace(experiment, seed=seed), prepare, training.posterior, training))
+                data = experiment.learning.with_flight(data, before[-1].rollout)
+                if k + 1 < experiment.learning.episodes:
+                    training = experiment.learn(data, experiment.seed)
+            best = min(before, key=lambda flown: _error(experiment, flown))
+            training = best.training or training
         model = training.posterior
+    return replace(_fly(experiment, prepare, model, training), before=tuple(before))
+
+
+def _error(experiment: Experiment, flown: Flown) -> float:
+    """RMSE of a flight; infinite where it diverged."""
+    system, rollout = experiment.system, flown.rollout
+    error = tracking_error(rollout.states, rollout.references, system.tracked_indices, system.angle_indices).total
+    return error if flown.diverged is None and np.isfinite(error) else np.inf
+
+
+def _fly(
+    experiment: Experiment,
+    prepare: Callable[[Any, Training | None], Callable[[Step], None]] | None,
+    model: DynamicsModel | None,
+    training: Training | None,
+) -> Flown:
+    """Flies with a model, or on the plant's own where it is None."""
+    plant = experiment.flown
     controller = experiment.controller(model if experiment.learns else plant)
+    if isinstance(experiment.learning, OnlineLearning):
+        controller = LearningController(controller, experiment.learning)
     system: System | ModelLoop = plant
     if experiment.loop == "model" and model is not None:
         system = ModelLoop(model, experiment.propagator or best_propagator(model), time_step=plant.time_step)
@@ -222,6 +257,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     system = experiment.system
     error = tracking_error(rollout.states, rollout.references, system.tracked_indices, system.angle_indices)
     at_end = (rollout.states[-2:], rollout.references[-2:], system.tracked_indices, system.angle_indices)
+    episodes = [one if np.isfinite(one := _error(experiment, each)) else None for each in flown.before]
     rmse = {name: float(value) for name, value in zip(system.tracked, error.axes, strict=True)}
     rmse["total"] = error.total
     if flown.diverged is not None or not np.isfinite(error.total):
@@ -248,6 +284,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         "suboptimal": dict(Counter(rollout.statuses[k].name for k in rollout.suboptimal)),
         "iterations": {"mean": float(rollout.iterations.mean()), "largest": int(rollout.iterations.max())},
         "training": learned,
+        "episodes": episodes,
         "times": {"training": None if training is None else training.seconds}
         | {stage: asdict(time_quantiles(np.array([getattr(t, stage) for t in rollout.timings]))) for stage in _STAGES},
     }
@@ -290,6 +327,8 @@ def summary(result: Mapping[str, Any]) -> Table:
     lines.append((f"RMSE [{result['unit']}]", "none: it diverged" if total is None else f"{total:.3g}  ({axes})"))
     if (error := result.get("error_at_end")) is not None:
         lines.append((f"at the end [{result['unit']}]", f"{error:.3g}"))
+    if episodes := result.get("episodes"):
+        lines.append(("episodes before", ", ".join("diverged" if e is None else f"{e:.3g}" for e in episodes)))
     for name, rate in result["violations"].items():
         outside = f"{rate['violations']} of {rate['steps']} steps outside"
         lines.append((f"bounds of {name}", f"{outside} (95 %: {100 * rate['low']:.2g} to {100 * rate['high']:.2g} %)"))

@@ -1,0 +1,148 @@
+"""What learning while flying is worth: a vehicle that becomes a fifth heavier, a wind that changes, and nothing at all.
+
+    .venv/bin/python -m benchmarks.learning [--seeds 20] [--figure docs/figures/learning.png]
+
+The translational quadrotor with the plant in the loop, GPs of 189 dithered transitions, convex GP-MPC with H = 10, one
+step a second. At 20 s it becomes 20 % heavier, or a wind begins, which turns at 50 s; or nothing happens. Compared: the
+model as learned, without and with the controller's own disturbance estimate (gain 0.5), online learning, and a model
+that was trained on the plant that flies after the change (on the plant without wind where the wind changes), which
+flies that plant all along. RMSE of the position [m] from 5 s after a change on, pooled over the seeds; ``ratio`` is to
+the last of these, ``lost`` counts flights farther than 5 m away then. Also by how much a decision takes longer. Each
+cell is kept in ``outputs/benchmarks/learning.json`` and not flown again; remove the file to fly anew.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from benchmarks.quadrotor import DATA, HOVER, NOISE, OUTER, TRAINER, TRAJECTORIES, problem, trained
+from benchmarks.timing import write_results
+from gpmpc.files import write_whole
+from gpmpc.gp import GPPosterior
+from gpmpc.learning import LearningController, OnlineLearning
+from gpmpc.mpc.controller import Controller
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.prediction import PredictionSettings
+from gpmpc.plotting.image import png
+from gpmpc.propagation import Linearization
+from gpmpc.simulation import Gust, Noise, Replaced, Rollout, closed_loop
+from gpmpc.systems import translational
+from gpmpc.trajectories import states_along
+
+HORIZON, STEPS, CHANGE, TURN, LOST = 10, 80, 20, 50, 5.0
+POSITION = [0, 2, 4]
+HEAVY = translational(mass=1.2 * 0.74)
+CHANGES: dict[str, tuple] = {
+    "none": (),
+    "20 % heavier": (Replaced(HEAVY, CHANGE),),
+    "wind": (Gust({"vx": 0.5, "vy": -0.3}, CHANGE, TURN), Gust({"vx": -0.4, "vz": 0.3}, TURN)),
+}
+NOISES = {"process 0.01": NOISE, "measured 0.01": Noise(measurement=[0.01] * 6)}
+WAYS = ("as learned", "disturbance estimate", "online", "trained on the new plant")
+STORE = Path("outputs/benchmarks/learning.json")
+
+
+def controller_of(way: str, model: GPPosterior) -> Controller:
+    """One way to control with a model."""
+    gain = 0.5 if way == "disturbance estimate" else 0.0
+    plain = GPMPC(model, Linearization(), problem(), HORIZON, HOVER, PredictionSettings(disturbance_gain=gain))
+    return LearningController(plain, OnlineLearning()) if way == "online" else plain
+
+
+def flights(way: str, trajectory: str, change: str, noise: str, seeds: int) -> list[Rollout]:
+    """One a seed."""
+    disturbances, model = CHANGES[change], trained(trajectory)
+    if way == "trained on the new plant":
+        if change == "20 % heavier":
+            data = DATA.transitions(HEAVY, TRAJECTORIES[trajectory])
+            model, disturbances = TRAINER(data, seed=0).posterior, (Replaced(HEAVY),)
+        else:
+            disturbances = ()
+    controller = controller_of(way, model)
+    references = states_along(TRAJECTORIES[trajectory], np.arange(STEPS + HORIZON + 1.0))
+    return [
+        closed_loop(
+            OUTER, controller, references, references[0], STEPS,
+            noise=NOISES[noise], disturbances=disturbances, on_failure="previous_plan", seed=seed,
+        )
+        for seed in range(seeds)
+    ]  # fmt: skip
+
+
+def later(change: str) -> np.ndarray:
+    """The steps that count: from 5 s after a change on; all of them where there is none."""
+    k = np.arange(STEPS + 1)
+    after = (k > CHANGE + 5) & ((k <= TURN) | (k > TURN + 5) | (change != "wind"))
+    return after if change != "none" else k > 0
+
+
+def measured(flown: list[Rollout], change: str) -> dict[str, Any]:
+    """RMSE [m], lost flights, and median time of a decision [ms]."""
+    away = np.array([np.linalg.norm((f.states - f.references)[later(change)][:, POSITION], axis=1) for f in flown])
+    return {
+        "rmse": float(np.sqrt(np.mean(away**2))),
+        "lost": int((away.max(1) > LOST).sum()),
+        "decision_ms": 1e3 * float(np.median(np.concatenate([f.seconds for f in flown]))),
+        "fastest_ms": 1e3 * float(min(f.seconds[5:].min() for f in flown)),
+    }
+
+
+def main() -> None:
+    """Flies, prints and draws."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--figure", type=Path, default=Path("outputs/benchmarks/learning.png"))
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = json.loads(STORE.read_text())["results"] if STORE.exists() else []
+    print(f"{'':46}" + "".join(f"{way:>28}" for way in WAYS))
+    for trajectory in TRAJECTORIES:
+        for noise in NOISES:
+            for change in CHANGES:
+                cell: dict[str, dict] = {}
+                for way in WAYS:
+                    key: dict[str, Any] = {"trajectory": trajectory, "noise": noise, "change": change, "way": way}
+                    key["seeds"] = arguments.seeds
+                    found = next((row for row in rows if key.items() <= row.items()), None)
+                    if found is None:
+                        found = key | measured(flights(*(way, trajectory, change, noise, arguments.seeds)), change)
+                        rows.append(found)
+                        write_results("learning", rows)
+                    cell[way] = found
+                best = cell[WAYS[-1]]["rmse"]
+                text = "".join(
+                    f"{one['rmse']:10.4f} x{one['rmse'] / best:7.3f} lost {one['lost']:2}" for one in cell.values()
+                )
+                print(f"{trajectory:12}{noise:16}{change:18}{text}", flush=True)
+    keys = "fastest_ms", "decision_ms"
+    unchanged = [row for row in rows if row["change"] == "none"]
+    plain, online = ([min(row[key] for row in unchanged if row["way"] == way) for key in keys] for way in WAYS[::2])
+    more = [after - before for before, after in zip(plain, online, strict=True)]
+    print(f"a decision with online learning takes {more[0]:.2f} ms more (fastest), {more[1]:.2f} ms (median)")
+    arguments.figure.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(arguments.figure, png(figure()))
+    print(f"written to {arguments.figure}")
+
+
+def figure() -> Figure:
+    """How far the vehicle is from its reference, one seed."""
+    drawn = Figure(figsize=(8, 3), layout="constrained")
+    panels = drawn.subplots(1, 2, sharey=True)
+    for axis, change in zip(panels, ("20 % heavier", "wind"), strict=True):
+        for way, colour in zip(WAYS, ("tab:red", "tab:orange", "tab:blue", "tab:gray"), strict=True):
+            (flown,) = flights(way, "elliptical", change, "process 0.01", 1)
+            away = np.linalg.norm((flown.states - flown.references)[:, POSITION], axis=1)
+            axis.semilogy(flown.times[1:], away[1:], color=colour, label=way)
+        axis.set(title=change, xlabel="time [s]")
+    panels[0].set_ylabel("distance to the reference [m]")
+    panels[0].legend(frameon=False, fontsize=8)
+    return drawn
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,167 @@
+"""Online learning never makes a flight worse, finds a changed plant, and gives equal numbers for equal seeds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.exceptions import SettingError, UnsupportedModel
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import SlidingWindow, Trainer, Transitions, append_points, remove_points
+from gpmpc.learning import ChangedModel, Learned, LearningController, OnlineLearning
+from gpmpc.models import Affine, ResidualModel
+from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.policy import ControlLoop
+from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.propagation import Linearization
+from gpmpc.testing import check_model
+
+STEP, NOISE = 0.1, np.array([1e-3, 1e-2])
+PROBLEM = Problem(Tracking([10.0, 1.0], [0.01]), Box([-5.0], [5.0]))
+
+
+def cart(x, u, gain=1.0, wind=0.0):
+    """Position [m] and velocity [m/s] a step later."""
+    rate = x[1] + STEP * (2.0 * gain * np.tanh(u[0] / 2.0) - 0.3 * x[1] + wind)
+    return np.array([x[0] + STEP * rate, rate])
+
+
+def learned_model():
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(-2, 2, (60, 2)), rng.uniform(-4, 4, (60, 1))
+    after = np.array([cart(a, b) + rng.normal(0, NOISE) for a, b in zip(x, u, strict=True)])
+    return Trainer(predicts="difference", restarts=0)(Transitions(x, u, after)).posterior
+
+
+MODEL = learned_model()
+
+
+def flown(learning, changed=None, steps=120, seed=0, sensor=0.0):
+    """Errors of the position, inputs and decisions of a flight along a sine; ``changed`` acts from step 40 on."""
+    controller = GPMPC(MODEL, Linearization(), PROBLEM, 8, [0.0])
+    loop = ControlLoop(controller if learning is None else LearningController(controller, learning))
+    time, rng = STEP * np.arange(steps + 9), np.random.default_rng(seed)
+    reference = np.stack([np.sin(time), np.cos(time)], axis=1)
+    x, errors, decisions = reference[0].copy(), [], []
+    for k in range(steps):
+        u = loop.input(x + sensor * rng.normal(size=2), reference[k : k + 9])
+        x = cart(x, u, **(changed or {}) if k >= 40 else {}) + rng.normal(0, NOISE)
+        errors.append(x[0] - reference[k + 1, 0])
+        decisions.append(loop.last.decision)
+    return np.array(errors), decisions
+
+
+def rms(errors):
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+@pytest.mark.parametrize("sensor", [0.0, 0.03])
+def test_a_plant_that_does_not_change_is_flown_as_without_learning(sensor):
+    for seed in range(2):
+        plain, learning = (flown(way, seed=seed, sensor=sensor)[0] for way in (None, OnlineLearning()))
+        assert rms(learning) <= 1.02 * rms(plain)
+
+
+@pytest.mark.parametrize("changed", [{"gain": 0.7}, {"wind": 0.6}], ids=["actuator", "wind"])
+def test_a_plant_that_changes_is_followed_again_within_seconds(changed):
+    before, lost, found = (
+        rms(np.array([flown(way, acting, seed=seed)[0][60:] for seed in range(3)]))
+        for way, acting in ((None, None), (None, changed), (OnlineLearning(), changed))
+    )
+    assert found < 1.5 * before < 0.5 * lost
+
+
+def test_learning_is_switched_off_where_the_old_plant_comes_back_and_no_measurement_is_lost_on_the_way():
+    steps, learning = [], OnlineLearning()
+    learned = Learned(ChangedModel(MODEL), np.zeros(2), np.full(2, np.nan), np.empty(0), np.empty(0))
+    rng, x = np.random.default_rng(1), np.zeros(2)
+    for k in range(150):
+        u = rng.uniform(-3, 3, 1)
+        x = cart(x, u, wind=0.6 if 40 <= k < 80 else 0.0) + rng.normal(0, NOISE)
+        learned = learning.learn(learned, u, x)
+        steps.append(learned.active)
+    assert not any(steps[:40])
+    assert all(steps[45:80])
+    assert not any(steps[-30:])
+    assert len(learned.model.change) == learning.points
+
+
+def test_equal_seeds_give_equal_bits_and_one_controller_flies_many_flights():
+    one, again = (flown(OnlineLearning(), {"wind": 0.6}) for _ in range(2))
+    assert np.array_equal(one[0], again[0])
+    assert [d.learned.version for d in one[1]] == [d.learned.version for d in again[1]]
+    controller = LearningController(GPMPC(MODEL, Linearization(), PROBLEM, 8, [0.0]))
+    x, reference = Gaussian.certain(np.array([0.5, 0.0])), Reference(np.zeros(2)).over(8)
+    first = controller.control(x, reference)
+    second = controller.control(x, reference, first)
+    controller.control(x, reference, second)
+    assert np.array_equal(controller.control(x, reference).inputs, first.inputs)
+    assert np.array_equal(controller.control(x, reference, first).inputs, second.inputs)
+
+
+def test_a_decision_that_was_not_applied_is_no_point_and_ends_the_use_of_the_change():
+    _, decisions = flown(OnlineLearning(), {"wind": 0.6}, steps=60)
+    before = decisions[-1]
+    assert before.learned.active
+    controller = LearningController(GPMPC(MODEL, Linearization(), PROBLEM, 8, [0.0]))
+    shifted = replace(before, means=np.concatenate([before.means[1:], before.means[-1:]]))
+    state, reference = Gaussian.certain(before.means[2]), Reference(before.means)
+    after = controller.control(state, reference, shifted).learned
+    assert not after.active
+    assert after.model.change is before.learned.model.change
+    assert controller.control(state, reference, before).learned.model.change is not before.learned.model.change
+
+
+def changed_residual():
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(-2, 2, (40, 2)), rng.uniform(-2, 2, (40, 1))
+    after = np.array([cart(a, b) for a, b in zip(x, u, strict=True)]) + rng.normal(0, NOISE, (40, 2))
+    B = torch.tensor([[0.1], [1.0]], dtype=torch.float64)
+    rows = Transitions(x, u, after)
+    model = ResidualModel.train(Affine.identity(2, 1), rows, B, angles=[0], trainer=Trainer(restarts=0))
+    return ChangedModel(model)
+
+
+@pytest.mark.parametrize("changed", [ChangedModel(MODEL), changed_residual()], ids=["posterior", "residual"])
+def test_a_changed_model_keeps_the_promises_of_a_model_and_its_last_innovation_is_what_it_missed(changed):
+    rng = np.random.default_rng(2)
+    x, u = rng.uniform(-1, 1, (12, 2)), rng.uniform(-1, 1, (12, 1))
+    after = np.array([cart(a, b, gain=0.8) for a, b in zip(x, u, strict=True)])
+    points, errors, _ = changed.errors(x, u, after)
+    kernel = np.full(errors.shape[1], 1e-6), 0.3, 50.0, SlidingWindow(20)
+    model = changed.with_points(points[:-1], errors[:-1], *kernel).later(1.0)
+    check_model(model, torch.from_numpy(x), torch.from_numpy(u))
+    larger = model.with_points(points[-1:], errors[-1:], *kernel)
+    found = larger.last_innovation()
+    d = model.change.predict(
+        torch.from_numpy(points[-1:, : -model.gp.input_dim]),
+        torch.from_numpy(np.append(points[-1:, -model.gp.input_dim :], [[model.time]], axis=1)),
+    )
+    np.testing.assert_allclose(found[0], errors[-1] - d.mean.numpy()[0], atol=1e-8)
+    np.testing.assert_allclose(found[1], d.variance.numpy()[0] + 1e-6, rtol=1e-6)
+    alone, later = (abs((after - one.linearize(x, u).mean) @ changed.reach.T).max() for one in (changed, larger))
+    assert later < 0.2 * alone
+
+
+def test_a_window_that_is_full_slides_to_what_appending_and_removing_give():
+    rng = np.random.default_rng(3)
+    window = remove_points(MODEL, range(30, len(MODEL)))
+    slid = plain = window
+    for _ in range(20):
+        x, y = (torch.from_numpy(rng.normal(size=(1, size))) for size in (3, 2))
+        slid = SlidingWindow(30).append(slid, x, y)
+        plain = remove_points(append_points(plain, x, y), [0])
+    torch.testing.assert_close(slid.cholesky, plain.cholesky, rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(slid.weights, plain.weights, rtol=1e-6, atol=1e-8)
+    assert torch.equal(slid.features, plain.features)
+
+
+def test_what_cannot_be_learned_is_refused():
+    with pytest.raises(SettingError, match="with_model"):
+        LearningController(object())
+    with pytest.raises(SettingError, match="memory"):
+        OnlineLearning(memory=0.0)
+    with pytest.raises(UnsupportedModel, match="in host memory; got object"):
+        ChangedModel(object())
