@@ -17,7 +17,6 @@ from matplotlib.patches import Circle
 from gpmpc.gp import Trainer, Transitions, standardize
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc import GPMPC, Box, ControlLoop, Inequality, Problem, Tracking
-from gpmpc.plotting.style import BLACK, BLUE, GREY, VERMILION, styled
 from gpmpc.propagation import Linearization
 from gpmpc.systems import step_many
 from gpmpc.systems.mechanical import planar_quadrotor
@@ -68,18 +67,19 @@ away = float(np.linalg.norm(path[-1, [0, 2]] - GOAL[[0, 2]]))
 print(f"{away:.2f} m from the goal, never nearer than {nearest:.3f} m to a disc, {loop.failures} failures")
 
 
-@styled
 def figure() -> Figure:
     """Draws the path and the discs, which are as large as to hold the vehicle's own size, at four moments."""
     drawn = Figure(figsize=(7, 5), layout="constrained")
     for axis, k in zip(drawn.subplots(2, 2, sharex=True, sharey=True).flat, (10, 21, 32, STEPS), strict=True):
         for place, radius, velocity in zip(centres(times[k]), RADII, VELOCITIES, strict=True):
-            axis.add_patch(Circle((place[0], place[1]), radius, color=VERMILION if velocity.any() else GREY, alpha=0.6))
-        axis.plot(path[: k + 1, 0], path[: k + 1, 2], color=BLUE)
+            axis.add_patch(
+                Circle((place[0], place[1]), radius, color="#d55e00" if velocity.any() else "0.45", alpha=0.6)
+            )
+        axis.plot(path[: k + 1, 0], path[: k + 1, 2], color="#0072b2")
         tilt, at = path[k, 4], path[k, [0, 2]]
         arm = 0.1 * np.array([np.cos(tilt), np.sin(tilt)])
-        axis.plot(*np.transpose([at - arm, at + arm]), color=BLACK, linewidth=3)
-        axis.plot(*GOAL[[0, 2]], "+", color=BLACK, markersize=9)
+        axis.plot(*np.transpose([at - arm, at + arm]), color="black", linewidth=3)
+        axis.plot(*GOAL[[0, 2]], "+", color="black", markersize=9)
         axis.set(title=f"{times[k]:.1f} s", aspect="equal", xlim=(-0.5, 4.5), ylim=(-1.5, 1.5))
     drawn.suptitle("A planar quadrotor's centre among discs; those in vermilion move")
     drawn.supxlabel("x [m]", fontsize="medium")

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 
 from gpmpc.gp import Transitions, standardize, train
 from gpmpc.mpc import GPMPC, Box, LeastSquares, Problem, Tracking
-from gpmpc.plotting.style import BLUE, DASHED, VERMILION, legend_below, name_of, styled
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Rollout, closed_loop
 from gpmpc.systems import step_many
@@ -55,21 +54,21 @@ for name, problem in problems.items():
     print(f"{name:16} {left:.3f} mol/L of the feed left, too hot in {hot:.1%} of the steps")
 
 
-@styled
 def figure(flights: dict[str, Rollout]) -> Figure:
     """Draws concentration, temperature and coolant over time."""
     drawn = Figure(figsize=(7, 5.4), layout="constrained")
     axes = drawn.subplots(3, sharex=True)
-    for (name, flight), color, line in zip(flights.items(), (BLUE, VERMILION), ("-", "--"), strict=True):
+    for (name, flight), color, line in zip(flights.items(), ("#0072b2", "#d55e00"), ("-", "--"), strict=True):
         minutes = flight.times / 60
         for axis, values in zip(axes, (flight.states[:, 0], flight.states[:, 1], flight.inputs[:, 0]), strict=True):
             axis.plot(minutes[: len(values)], values, color=color, linestyle=line, label=name)
-    axes[1].axhline(HOTTEST, color="black", linestyle=DASHED, label="hottest allowed, with 95 %")
+    axes[1].axhline(HOTTEST, color="black", linestyle=":", label="hottest allowed, with 95 %")
     for axis, label in zip(axes, ("concentration", "temperature", "coolant"), strict=True):
-        axis.set_ylabel(name_of(label, reactor.units[label]))
+        axis.set_ylabel(f"{label} [{reactor.units[label]}]")
+        axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_title("A reactor under an economic cost, and held at its operating point")
     axes[2].set_xlabel("time [min]")
-    legend_below(drawn, axes)
+    drawn.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     return drawn
 
 
