@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from gpmpc.compiled import compiled, inline_njit
-from gpmpc.kernels._simd import any_nonzero, larger, largest, load, load_some, store, total, zeros
+from gpmpc.kernels._simd import any_nonzero, clip, larger, largest, load, load_some, store, total, zeros
 from gpmpc.kernels.linalg import dot, multiply
 from gpmpc.qp.dual_iteration import (
     NEGLIGIBLE,
@@ -39,12 +39,12 @@ from gpmpc.qp.record import (
     WORKING,
 )
 from gpmpc.qp.triangular import factorise, multiply_rows, solve_lower, solve_transposed, subtract_rows
-from gpmpc.qp.violations import are_present, choose_guess, list_violated, restore_limits
+from gpmpc.qp.violations import TOLERATED, are_present, choose_guess, list_violated, restore_limits
 from gpmpc.qp.workspace import SHARE, all_finite, is_dense, is_dense_matrix, open_workspace, round_end
 
 SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 
-_ABSENT = 1e20  # a bound of this size or more is none
+_PRESENT = np.nextafter(1e20, 0.0)  # the largest bound that is one
 _NOISE = 2e-14  # violation that a constraint which depends on others may be left with: see ``_worst_violation``
 _LATER = 1e-11  # violation, as a share of the length of q, that waits for the refined x
 _ROUNDS = 10  # returns from the residuals to the iteration
@@ -174,14 +174,26 @@ def start(work, active, guess):
 @inline_njit
 def _read_bounds(work, lower, upper, least):
     """Copies the bounds, with absent ones infinite, and clears mu; returns False if any are crossed or undefined."""
-    wrong = 0
+    wrong = zeros()
+    for p in range(0, len(lower), 8):
+        low, high = _remove_absent(load_some(lower, p)), _remove_absent(load_some(upper, p))
+        wrong = wrong + clip(high - low, -1.0, 0.0)  # infinity less infinity is undefined, and so none of a bound
+        negligible = least * load(work.scale, p)
+        store(work.lower, p, low)
+        store(work.upper, p, high)
+        store(work.negligible, p, negligible)
+        store(work.allowed_low, p, low - (TOLERATED * larger(zeros(), low) + negligible))
+        store(work.allowed_high, p, high + (TOLERATED * larger(zeros(), high) + negligible))
     for p in range(len(lower)):
-        low, high = lower[p], upper[p]
-        low, high = (low if abs(low) < _ABSENT else low * np.inf), (high if abs(high) < _ABSENT else high * np.inf)
-        wrong += not (low <= high) or low == np.inf or high == -np.inf
-        work.lower[p], work.upper[p], work.negligible[p], work.mu[p] = low, high, least * work.scale[p], 0.0
-        restore_limits(work, p)
-    return wrong == 0
+        work.mu[p] = 0.0
+    return not any_nonzero(wrong)
+
+
+@inline_njit
+def _remove_absent(bounds):
+    """Returns eight bounds, those that are absent infinite."""
+    beyond = bounds - clip(bounds, -_PRESENT, _PRESENT)
+    return bounds + (beyond * 1e300) * 1e300
 
 
 @inline_njit

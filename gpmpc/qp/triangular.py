@@ -198,12 +198,17 @@ def _is_symmetric(P, L):
         largest = max(largest, abs(P[i, i]))
     for j in range(len(u)):
         u[j], difference[j] = math.sqrt(j + 2.0), 0.0
+    whole = n // _LANES * _LANES
     for i in range(n):
-        row, product = P[i], zeros()
-        for j in range(0, n, _LANES):
-            entries = load_some(row, j)
+        row, product, weight = P[i], zeros(), u[i]
+        for j in range(0, whole, _LANES):
+            entries = load(row, j)
             product = product + entries * load(u, j)
-            store(difference, j, load(difference, j) - u[i] * entries)
+            store(difference, j, load(difference, j) - weight * entries)
+        if whole < n:
+            entries = load_some(row, whole)
+            product = product + entries * load(u, whole)
+            store(difference, whole, load(difference, whole) - weight * entries)
         difference[i] += total(product)
     for i in range(n):
         skewed += not abs(difference[i]) <= _SKEW * largest

@@ -5,7 +5,7 @@ import numpy as np
 from gpmpc.compiled import inline_njit
 from gpmpc.kernels.linalg import dot
 
-_TOLERATED = 2e-14  # a violation below this share of the bound is none, whatever the constraint's other bound is
+TOLERATED = 2e-14  # a violation below this share of the bound is none, whatever the constraint's other bound is
 
 
 @inline_njit
@@ -15,7 +15,7 @@ def restore_limits(work, p):
     With mu_p = 0 it must stay within its bounds; at a cap it must stay outside the bound that it violates.
     """
     low, high = work.lower[p], work.upper[p]
-    below, above = _TOLERATED * abs(low) + work.negligible[p], _TOLERATED * abs(high) + work.negligible[p]
+    below, above = TOLERATED * abs(low) + work.negligible[p], TOLERATED * abs(high) + work.negligible[p]
     work.allowed_low[p], work.allowed_high[p] = low - below, high + above
     if work.mu[p] > 0.0:
         work.allowed_low[p], work.allowed_high[p] = high - above, np.inf
