@@ -90,10 +90,10 @@ HOUSE = House(ROOT)
 @pytest.mark.parametrize(
     ("what", "count", "most"),
     [
-        ("lines of gpmpc/", HOUSE.lines, 30_590),
-        ("public functions and classes", len(HOUSE.public_names), 540),
+        ("lines of gpmpc/", HOUSE.lines, 31_400),
+        ("public functions and classes", len(HOUSE.public_names), 590),
         ("functions with more than 10 arguments", len(HOUSE.functions_above(10)), 0),
-        ("files of mpc/", HOUSE.mpc_files, 14),
+        ("files of mpc/", HOUSE.mpc_files, 15),
         ("circles of rooms", len(HOUSE.room_circles), 0),
         ("circles of modules", len(HOUSE.module_circles), 0),
     ],

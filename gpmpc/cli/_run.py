@@ -140,6 +140,7 @@ def _recorder(
         "noise_std": " ".join(map(str, experiment.unplanned_noise(training).tolist())),
         "system": flown.name,
         "tracked": " ".join(flown.tracked),
+        "angles": " ".join(flown.angles),
     }
     text = OmegaConf.to_yaml(config, resolve=True)
     recorder = McapRecorder(path, system, config=text, metadata=metadata, live=config.live)

@@ -18,6 +18,7 @@ import torch
 
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gp.posterior import AffineForm, GPPosterior
+from gpmpc.kernels.tape import CONST, INPUT, OPERATIONS, OUTPUT, Tape
 
 
 def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
@@ -40,7 +41,7 @@ def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
     """
     form = getattr(model, "affine_form", None)
     x, u = casadi.MX.sym("state", model.state_dim), casadi.MX.sym("input", model.input_dim)
-    mean, variance = _residual(model, x, u) if form is None else _affine(form, x, u)
+    mean, variance = _residual(model, x, u) if form is None or form.tape is not None else _affine(form, x, u)
     return casadi.Function(name, [x, u], [mean, variance], ["state", "input"], ["mean", "variance"])
 
 
@@ -116,3 +117,37 @@ def _moments(gp: GPPosterior, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, ca
 
 def _numbers(tensor: torch.Tensor) -> casadi.DM:
     return casadi.DM(tensor.detach().double().cpu().numpy())
+
+
+def tape_of(function: casadi.Function) -> Tape | None:
+    """Reads the operations of a CasADi function of dense vectors; None where there are others than a tape has.
+
+    The value is taken column by column, the arguments one after the other.
+    """
+    try:
+        function = function if function.is_a("SXFunction") else function.expand()
+    except RuntimeError:  # it calls what is no expression
+        return None
+    if not all(function.sparsity_in(i).is_dense() for i in range(function.n_in())):
+        return None
+    sizes = [function.numel_in(i) for i in range(function.n_in())]
+    first, places = np.concatenate([[0], np.cumsum(sizes)]), function.sparsity_out(0).find()
+    code = np.zeros((function.n_instructions(), 4), dtype=np.int64)
+    constants = np.zeros(len(code))
+    for k, row in enumerate(code):
+        row[0], inputs, outputs = (
+            function.instruction_id(k),
+            function.instruction_input(k),
+            function.instruction_output(k),
+        )
+        if row[0] not in OPERATIONS:
+            return None
+        row[1] = places[outputs[1]] if row[0] == OUTPUT else outputs[0]
+        if row[0] == INPUT:
+            row[2] = first[inputs[0]] + inputs[1]
+        elif row[0] == CONST:
+            constants[k] = function.instruction_constant(k)
+        else:
+            row[2 : 2 + len(inputs)] = inputs
+            row[3] = inputs[-1]
+    return Tape(code, constants, function.sz_w(), function.numel_out(0))

@@ -11,7 +11,7 @@ deviations in those of the output, and a constant prior mean), so a posterior is
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class AffineForm(NamedTuple):
-    """A model of the form x+ = A x + G u + c + B f(x_s, u_s), through which moments go exactly without angles.
+    """A model x+ = A x + G u + c + f0(x, u) + B f(x_s, u_s); without f0 and angles moments go through it exactly.
 
     None stands for A = 0, G = 0, c = 0, B = I, or a selection of everything.
 
@@ -40,6 +40,7 @@ class AffineForm(NamedTuple):
         states: The states that f depends on.
         inputs: The inputs that f depends on.
         angles: Those of ``states`` that f sees as (sine, cosine), at their place.
+        tape: f0 as a ``gpmpc.kernels.tape.Tape``; None for zero.
     """
 
     f: "GPPosterior"
@@ -50,6 +51,7 @@ class AffineForm(NamedTuple):
     states: list[int] | None = None
     inputs: list[int] | None = None
     angles: tuple[int, ...] = ()
+    tape: Any = None
 
 
 @dataclass(frozen=True, eq=False)

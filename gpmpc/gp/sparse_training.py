@@ -133,7 +133,8 @@ class SparseTrainer:
         chosen = np.random.default_rng(seed).permutation(len(x))[: self.subset]
         exact = self._exact().fit(features[chosen], y[chosen], input_dim, "value", seed)
         theta = log_hyperparameters(exact.posterior, feature_scaling, identity(y))
-        Z = _greedy_points(x, Hyperparameters.from_theta(torch.from_numpy(theta)), self.inducing)
+        kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
+        Z = x[informative_points(x, kernel, self.inducing)]
         _log.info(
             "sparse training: %d inducing points chosen among %d after %.1f s",
             len(Z),
@@ -210,8 +211,8 @@ def _noise_alone(targets: Tensor) -> np.ndarray:
     return (len(targets) / 2 * (2 * math.pi * math.e * targets.square().mean(0)).log()).numpy()
 
 
-def _greedy_points(features: Tensor, hyperparameters: Hyperparameters, count: int) -> Tensor:
-    """Inducing points (M, d) among the features (N, d): each where most is unexplained by those before it.
+def informative_points(features: Tensor, hyperparameters: Sequence[Tensor], count: int) -> list[int]:
+    """Chooses rows of features (N, d): each where most is unexplained by those before it.
 
     A pivoted Cholesky factorisation of sum_a K_a / sn2_a's diagonal. Fewer than ``count`` come back where nothing is
     left to explain: less than round-off of every output's variance.
@@ -232,7 +233,7 @@ def _greedy_points(features: Tensor, hyperparameters: Hyperparameters, count: in
         left = (left - rows[:, step].square()).clamp_min(0)
         left[:, i] = 0
         chosen.append(i)
-    return features[chosen].clone()
+    return chosen
 
 
 class _Bound:

@@ -1,8 +1,8 @@
 """Roll-outs of the mean of GPs with an affine part, under a feedback towards plans.
 
-    u_k = clip(u'_k + K_k (x_k - x'_k)),   x_{k+1} = A x_k + G u_k + c + B f(phi(x_k), u_k)
+    u_k = clip(u'_k + K_k (x_k - x'_k)),   x_{k+1} = A x_k + G u_k + c + f0(x_k, u_k) + B f(phi(x_k), u_k)
 
-phi selects states, and takes angles as sine and cosine.
+f0 is a tape; phi selects states, and takes angles as sine and cosine.
 """
 
 import math
@@ -15,6 +15,7 @@ from gpmpc.compiled import compiled, njit_noalloc
 from gpmpc.kernels._packed import Array, GPArrays
 from gpmpc.kernels._simd import exp, load, total, use_widest_registers, zeros
 from gpmpc.kernels.linalg import aligned_rows, copy, dot
+from gpmpc.kernels.tape import Tape, run_tape
 
 Indices = NDArray[np.intp]
 
@@ -34,6 +35,7 @@ class AffineGPs(NamedTuple):
         states: The state that each feature of f is a function of (d,).
         kinds: Which function: ``PLAIN``, ``SINE`` or ``COSINE`` (d,).
         inputs: The inputs that f depends on (m_s,).
+        tape: f0; ``NO_TAPE`` for zero.
     """
 
     f: GPArrays
@@ -45,6 +47,7 @@ class AffineGPs(NamedTuple):
     states: Indices
     kinds: Indices
     inputs: Indices
+    tape: Tape
 
 
 class Feedback(NamedTuple):
@@ -98,10 +101,10 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
         inputs: To write to.
     """
     use_widest_registers()
-    f, offset, A, G, c, B, columns, kinds, chosen = model
+    f, offset, A, G, c, B, columns, kinds, chosen, tape = model
     (T, H, m), n, d, k_dim = inputs.shape, start.shape[1], len(columns), len(offset)
     work = aligned_rows(2, 8 + d + len(chosen) + k_dim)
-    at, value = work[0], work[1]
+    at, value, point, places, known = work[0], work[1], np.empty(n + m), np.empty(tape.work), np.zeros(n)
     for t in range(T):
         gains = feedback.gains[min(t, len(feedback.gains) - 1)]
         copy(start[t], states[t, 0])
@@ -121,5 +124,11 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
                 at[d + i] = u[chosen[i]]
             for a in range(k_dim):
                 value[a] = offset[a] + _mean(f.points, f.log_signal[a], f.inverse_squares[a], f.weights[a], at)
+            if tape.size > 0:
+                copy(x, point[:n])
+                copy(u, point[n:])
+                run_tape(tape, point, places, known)
             for i in range(n):
-                after[i] = c[i] + disturbance[i] + dot(A[i], x, n) + dot(G[i], u, m) + dot(B[i], value, k_dim)
+                after[i] = (
+                    known[i] + c[i] + disturbance[i] + dot(A[i], x, n) + dot(G[i], u, m) + dot(B[i], value, k_dim)
+                )

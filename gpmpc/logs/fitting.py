@@ -23,21 +23,13 @@ BLOCK = 4  # consecutive windows whose errors are correlated
 
 @dataclass(frozen=True)
 class NominalFit:
-    """A fitted nominal model.
+    """A fitted nominal model."""
 
-    Attributes:
-        model: With its parameters.
-        standard_errors: Of the parameters (P,), robust to the correlation of neighbouring windows.
-        cost: Of the loss, per residual.
-        start_cost: At the start.
-        evaluations: Of the rollouts.
-    """
-
-    model: LogModel
-    standard_errors: Array
-    cost: float
-    start_cost: float
-    evaluations: int
+    model: LogModel  #: with its parameters
+    standard_errors: Array  #: of the parameters (P,), robust to the correlation of neighbouring windows
+    cost: float  #: of the loss, per residual
+    start_cost: float  #: at the start
+    evaluations: int  #: of the rollouts
 
     def to_rows(self) -> list[tuple[str, float, float]]:
         """Name, value and standard error of every parameter."""

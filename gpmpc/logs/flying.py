@@ -31,20 +31,14 @@ DIFFERENCE = 1e-5  # of central differences, relative to entries above one
 class LogDynamics:
     """A model of a log as one of the next state.
 
-    Attributes:
-        model: Without context and without late inputs.
-        input_dim: Number of inputs, m.
-        time_step: [s]
-        noise: Of its outputs; none by default.
-
     Raises:
         SettingError: Its inputs act late, or it has a term of the controller that flew.
     """
 
-    model: LogModel
-    input_dim: int
-    time_step: float
-    noise: OutputNoise | None = None
+    model: LogModel  #: without context and without late inputs
+    input_dim: int  #: number of inputs, m
+    time_step: float  #: [s]
+    noise: OutputNoise | None = None  #: of its outputs; none by default
 
     dtype = torch.float64
     device = torch.device("cpu")
@@ -131,21 +125,13 @@ class LogDynamics:
 
 @dataclass(frozen=True)
 class SavedModel:
-    """A model from a file, with what the file says of it.
+    """A model from a file, with what the file says of it."""
 
-    Attributes:
-        path: Of the file.
-        model: Trained.
-        state_names: Empty where the file has none.
-        input_names: Likewise.
-        time_step: [s]; None where the file has none.
-    """
-
-    path: str
-    model: DynamicsModel
-    state_names: tuple[str, ...] = ()
-    input_names: tuple[str, ...] = ()
-    time_step: float | None = None
+    path: str  #: of the file
+    model: DynamicsModel  #: trained
+    state_names: tuple[str, ...] = ()  #: empty where the file has none
+    input_names: tuple[str, ...] = ()  #: likewise
+    time_step: float | None = None  #: [s]; None where the file has none
 
     def check(self, system: System) -> None:
         """Raises unless states, inputs and time step are a system's.

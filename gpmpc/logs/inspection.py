@@ -34,33 +34,19 @@ FOLLOWS = 0.95  # share of an input's variance that the states explain
 
 @dataclass(frozen=True)
 class Channel:
-    """One channel: its numbers, and a line to draw.
+    """One channel: its numbers, and a line to draw."""
 
-    Attributes:
-        name: With its topic.
-        time: [s] (P,).
-        values: (P,).
-        missing: Share of the rows without a value.
-        repeated: Share of the rows whose value is that of the row before.
-        longest: Rows of the longest stretch of one value.
-        low: Smallest value.
-        high: Largest value.
-        std: Standard deviation.
-        noise: Standard deviation of white noise that the second differences hold.
-        smoothness: Correlation of neighbouring second differences.
-    """
-
-    name: str
-    time: Array
-    values: Array
-    missing: float
-    repeated: float
-    longest: int
-    low: float
-    high: float
-    std: float
-    noise: float
-    smoothness: float
+    name: str  #: with its topic
+    time: Array  #: [s] (P,)
+    values: Array  #: (P,)
+    missing: float  #: share of the rows without a value
+    repeated: float  #: share of the rows whose value is that of the row before
+    longest: int  #: rows of the longest stretch of one value
+    low: float  #: smallest value
+    high: float  #: largest value
+    std: float  #: standard deviation
+    noise: float  #: standard deviation of white noise that the second differences hold
+    smoothness: float  #: correlation of neighbouring second differences
 
     @property
     def remark(self) -> str:
@@ -79,45 +65,28 @@ class Channel:
 
 @dataclass(frozen=True)
 class Delay:
-    """How many rows one channel comes after another.
+    """How many rows one channel comes after another."""
 
-    Attributes:
-        first: Name of the channel that comes first where ``rows`` is positive.
-        second: Name of the other.
-        rows: Median over the blocks.
-        range: Lowest and highest of the blocks.
-        agreement: Share of the blocks within a row of the median.
-        correlation: Median, of the channels' differences.
-    """
-
-    first: str
-    second: str
-    rows: float
-    range: tuple[float, float]
-    agreement: float
-    correlation: float
+    first: str  #: name of the channel that comes first where ``rows`` is positive
+    second: str  #: name of the other
+    rows: float  #: median over the blocks
+    range: tuple[float, float]  #: lowest and highest of the blocks
+    agreement: float  #: share of the blocks within a row of the median
+    correlation: float  #: median, of the channels' differences
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """What is in a log file.
+    """What is in a log file."""
 
-    Attributes:
-        title: The file and its size in words.
-        streams: Name, rows, rate [Hz], jitter (standard deviation over the time step), gaps, longest gap [s], repeated
-            and backward stamps of each.
-        channels: Of all streams.
-        gaps: Begin and end [s] of each, of all streams.
-        delays: The strongest pairs first.
-        follows: Share of the variance that the states explain, by input; only with a mapping.
-    """
-
-    title: str
+    title: str  #: the file and its size in words
+    #: name, rows, rate [Hz], jitter (standard deviation over the time step), gaps, longest gap [s], repeated and
+    #: backward stamps of each
     streams: tuple[tuple[str, int, float, float, int, float, int, int], ...]
-    channels: tuple[Channel, ...]
-    gaps: tuple[tuple[float, float], ...]
-    delays: tuple[Delay, ...]
-    follows: dict[str, float]
+    channels: tuple[Channel, ...]  #: of all streams
+    gaps: tuple[tuple[float, float], ...]  #: begin and end [s] of each, of all streams
+    delays: tuple[Delay, ...]  #: the strongest pairs first
+    follows: dict[str, float]  #: share of the variance that the states explain, by input; only with a mapping
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -31,31 +31,18 @@ NEEDED = ("constant state", "constant velocity", "least squares")  # a model mus
 
 @dataclass(frozen=True)
 class Judgement:
-    """Errors of a model and of the baselines on held-out runs.
+    """Errors of a model and of the baselines on held-out runs."""
 
-    Attributes:
-        groups: Names of the groups of states.
-        units: Of their errors.
-        steps: k.
-        mean: Mean error (k, groups) by the name of the predictor; the model's is "model".
-        rmse: Root mean squared error, likewise.
-        coverage: Share of the entries inside their interval (k, groups).
-        coverage_interval: Exact interval of that share, from independent windows only (k, groups, 2).
-        width: Claimed over actual root mean square (k, groups).
-        windows: Number of predictions.
-        level: Of the intervals.
-    """
-
-    groups: tuple[str, ...]
-    units: tuple[str, ...]
-    steps: tuple[int, ...]
-    mean: dict[str, Array]
-    rmse: dict[str, Array]
-    coverage: Array
-    coverage_interval: Array
-    width: Array
-    windows: int
-    level: float = 0.95
+    groups: tuple[str, ...]  #: names of the groups of states
+    units: tuple[str, ...]  #: of their errors
+    steps: tuple[int, ...]  #: k
+    mean: dict[str, Array]  #: mean error (k, groups) by the name of the predictor; the model's is "model"
+    rmse: dict[str, Array]  #: root mean squared error, likewise
+    coverage: Array  #: share of the entries inside their interval (k, groups)
+    coverage_interval: Array  #: exact interval of that share, from independent windows only (k, groups, 2)
+    width: Array  #: claimed over actual root mean square (k, groups)
+    windows: int  #: number of predictions
+    level: float = 0.95  #: of the intervals
 
     @property
     def losses(self) -> tuple[str, ...]:

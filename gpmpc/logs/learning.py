@@ -47,33 +47,19 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Learned:
-    """What was learned from a log.
+    """What was learned from a log."""
 
-    Attributes:
-        model: Fitted to all runs.
-        noise: Of its outputs.
-        fit: Of the nominal part, to all runs.
-        candidates: Every structure that was tried, in order.
-        ranges: Smallest and largest value (2, n + m) of the states and inputs in the log.
-        rows: Of the log.
-        runs: Names of the runs.
-        state_names: As the file's columns are called (n,).
-        input_names: Likewise (m,).
-        context_names: Likewise.
-        time_step: [s]
-    """
-
-    model: LogModel
-    noise: OutputNoise
-    fit: NominalFit
-    candidates: tuple[Candidate, ...]
-    ranges: Array
-    rows: int
-    runs: tuple[str, ...]
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    context_names: tuple[str, ...]
-    time_step: float
+    model: LogModel  #: fitted to all runs
+    noise: OutputNoise  #: of its outputs
+    fit: NominalFit  #: of the nominal part, to all runs
+    candidates: tuple[Candidate, ...]  #: every structure that was tried, in order
+    ranges: Array  #: smallest and largest value (2, n + m) of the states and inputs in the log
+    rows: int  #: of the log
+    runs: tuple[str, ...]  #: names of the runs
+    state_names: tuple[str, ...]  #: as the file's columns are called (n,)
+    input_names: tuple[str, ...]  #: likewise (m,)
+    context_names: tuple[str, ...]  #: likewise
+    time_step: float  #: [s]
 
 
 @dataclass

@@ -31,23 +31,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class LogRun:
-    """One run: K rows in pieces without a gap.
+    """One run: K rows in pieces without a gap."""
 
-    Attributes:
-        name: Of the run.
-        time: [s] (K,).
-        states: (K, n).
-        inputs: (K, m), those applied from the row's time on.
-        context: (K, c).
-        begins: First row of each piece; the first is 0.
-    """
-
-    name: str
-    time: Array
-    states: Array
-    inputs: Array
-    context: Array
-    begins: tuple[int, ...] = (0,)
+    name: str  #: of the run
+    time: Array  #: [s] (K,)
+    states: Array  #: (K, n)
+    inputs: Array  #: (K, m), those applied from the row's time on
+    context: Array  #: (K, c)
+    begins: tuple[int, ...] = (0,)  #: first row of each piece; the first is 0
 
     def __len__(self) -> int:
         return len(self.time)
@@ -66,27 +57,16 @@ class LogRun:
 
 @dataclass(frozen=True)
 class Windows:
-    """W windows of a log: the measured past and what came after; row k of ``states`` goes with row k of ``inputs``.
+    """W windows of a log: the measured past and what came after; row k of ``states`` goes with row k of ``inputs``."""
 
-    Attributes:
-        space: Of the states.
-        time_step: [s]
-        past: Rows before the start of each; the start is row ``past``.
-        states: (W, past + ahead + 1, n).
-        inputs: (W, past + ahead + 1, m).
-        context: At the start, held through a prediction (W, past + 1, c).
-        runs: Number of the run that each is from (W,).
-        times: Of the starts (W,) [s].
-    """
-
-    space: StateSpace
-    time_step: float
-    past: int
-    states: Array
-    inputs: Array
-    context: Array
-    runs: np.ndarray
-    times: Array
+    space: StateSpace  #: of the states
+    time_step: float  #: [s]
+    past: int  #: rows before the start of each; the start is row ``past``
+    states: Array  #: (W, past + ahead + 1, n)
+    inputs: Array  #: (W, past + ahead + 1, m)
+    context: Array  #: at the start, held through a prediction (W, past + 1, c)
+    runs: np.ndarray  #: number of the run that each is from (W,)
+    times: Array  #: of the starts (W,) [s]
 
     def __len__(self) -> int:
         return len(self.states)
@@ -105,20 +85,14 @@ class Windows:
 class Log:
     """Runs of one system at one time step.
 
-    Attributes:
-        mapping: What the columns mean.
-        time_step: [s]
-        runs: At least one.
-        findings: What was noticed on the way.
-
     Raises:
         DataError: There is no run.
     """
 
-    mapping: LogMapping
-    time_step: float
-    runs: tuple[LogRun, ...]
-    findings: tuple[Finding, ...] = ()
+    mapping: LogMapping  #: what the columns mean
+    time_step: float  #: [s]
+    runs: tuple[LogRun, ...]  #: at least one
+    findings: tuple[Finding, ...] = ()  #: what was noticed on the way
 
     def __post_init__(self) -> None:
         if not self.runs:

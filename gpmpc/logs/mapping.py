@@ -57,32 +57,21 @@ _SIGNAL_KEYS = ("columns", "unit", "kind", "order", "frame", "scale", "resample"
 class Signal:
     """Columns of a log that belong together.
 
-    Attributes:
-        name: Such as "attitude".
-        role: States, inputs or context.
-        columns: As they are called in the file.
-        unit: Of the columns in the file.
-        kind: A vector, angles, a quaternion, or Euler angles (roll, pitch, yaw; they become a quaternion).
-        order: Of a quaternion: "xyzw" or "wxyz".
-        frame: "world" or "body", for velocities and rates of a rigid body; empty where it has none.
-        scale: The values are multiplied by it.
-        resample: "hold", "linear" or "spherical"; by default states are interpolated and all else is held.
-        topic: The stream that holds the columns; empty where a file has one.
-
     Raises:
         SettingError: A value is none of those.
     """
 
-    name: str
-    role: Role
-    columns: tuple[str, ...]
-    unit: str = ""
+    name: str  #: such as "attitude"
+    role: Role  #: states, inputs or context
+    columns: tuple[str, ...]  #: as they are called in the file
+    unit: str = ""  #: of the columns in the file
+    #: A vector, angles, a quaternion, or Euler angles (roll, pitch, yaw; they become a quaternion).
     kind: str = "vector"
-    order: str = "xyzw"
-    frame: str = ""
-    scale: float = 1.0
-    resample: str = ""
-    topic: str = ""
+    order: str = "xyzw"  #: of a quaternion: "xyzw" or "wxyz"
+    frame: str = ""  #: "world" or "body", for velocities and rates of a rigid body; empty where it has none
+    scale: float = 1.0  #: the values are multiplied by it
+    resample: str = ""  #: "hold", "linear" or "spherical"; by default states are interpolated and all else is held
+    topic: str = ""  #: the stream that holds the columns; empty where a file has one
 
     def __post_init__(self) -> None:
         key = f"{self.role}.{self.name}"
@@ -122,31 +111,20 @@ class Signal:
 
 @dataclass(frozen=True)
 class LogMapping:
-    """What a log's columns mean, and how its rows are read; see the head of this file.
+    """What a log's columns mean, and how its rows are read; see the head of this file."""
 
-    Attributes:
-        signals: States, inputs and context, in this order.
-        time: Column of the stamps; empty takes the stamps of the messages.
-        time_unit: Of that column.
-        run: Column that names the runs.
-        rate: To which rows are resampled [Hz]; None leaves them as they are.
-        max_gap: No value is carried over a longer gap [s]; 1.5 time steps by default.
-        keep: Ranges (lowest, highest) of columns; rows outside are left out.
-        held: "drop" leaves out rows in which a state's whole signal repeats the row before; "use" takes them.
-        rest: "drop" leaves out parts in which nothing moves; "use" takes them.
-        model: What is known of the system: "rigid_body" or "none".
-    """
-
-    signals: tuple[Signal, ...]
-    time: str = ""
-    time_unit: str = "s"
-    run: str = ""
-    rate: float | None = None
-    max_gap: float | None = None
+    signals: tuple[Signal, ...]  #: states, inputs and context, in this order
+    time: str = ""  #: column of the stamps; empty takes the stamps of the messages
+    time_unit: str = "s"  #: of that column
+    run: str = ""  #: column that names the runs
+    rate: float | None = None  #: to which rows are resampled [Hz]; None leaves them as they are
+    max_gap: float | None = None  #: no value is carried over a longer gap [s]; 1.5 time steps by default
+    #: ranges (lowest, highest) of columns; rows outside are left out.
     keep: dict[str, tuple[float, float]] = field(default_factory=dict)
+    #: "drop" leaves out rows in which a state's whole signal repeats the row before; "use" takes them.
     held: str = "drop"
-    rest: str = "drop"
-    model: str = "none"
+    rest: str = "drop"  #: "drop" leaves out parts in which nothing moves; "use" takes them
+    model: str = "none"  #: what is known of the system: "rigid_body" or "none"
 
     def __post_init__(self) -> None:
         for key in ("rate", "max_gap"):

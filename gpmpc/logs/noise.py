@@ -31,18 +31,12 @@ class OutputNoise:
 
     The level of a prediction, exp(level . (1, z)), multiplies all of them; z are the logarithms of the mean squared
     one-step residuals of each group of outputs over the rows before the start: a rough flight stays rough for a while.
-
-    Attributes:
-        outputs: Of each time constant and output (T, o), in squared units of the outputs, at level one.
-        measurement: Of each entry of a difference of states (e,), likewise.
-        level: Coefficients (1 + groups of outputs,).
-        time_constants: [s]; zero is white.
     """
 
-    outputs: Array
-    measurement: Array
-    level: Array
-    time_constants: tuple[float, ...] = TIME_CONSTANTS
+    outputs: Array  #: of each time constant and output (T, o), in squared units of the outputs, at level one
+    measurement: Array  #: of each entry of a difference of states (e,), likewise
+    level: Array  #: coefficients (1 + groups of outputs,)
+    time_constants: tuple[float, ...] = TIME_CONSTANTS  #: [s]; zero is white
 
 
 def error_variances(model: LogModel, windows: Windows, noise: OutputNoise, steps: Sequence[int]) -> Array:

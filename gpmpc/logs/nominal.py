@@ -61,20 +61,13 @@ class MultirotorNominal:
 
     ``feedback`` describes flights whose attitude a controller held: it predicts such flights, and is no property of
     the vehicle.
-
-    Attributes:
-        motors: Number of inputs, all of them motor signals.
-        torque: Whether the motors' torques are parameters.
-        feedback: Whether the tilt's effect is.
-        thrusts: Whether the inputs are thrusts instead of speeds.
-        voltage: At which ``thrust`` and ``torque`` are stated [V]; zero leaves the voltage out.
     """
 
-    motors: int
-    torque: bool = False
-    feedback: bool = False
-    voltage: float = 0.0
-    thrusts: bool = False
+    motors: int  #: number of inputs, all of them motor signals
+    torque: bool = False  #: whether the motors' torques are parameters
+    feedback: bool = False  #: whether the tilt's effect is
+    voltage: float = 0.0  #: at which ``thrust`` and ``torque`` are stated [V]; zero leaves the voltage out
+    thrusts: bool = False  #: whether the inputs are thrusts instead of speeds
 
     def __post_init__(self) -> None:
         if self.motors < 1:
@@ -119,17 +112,11 @@ class MultirotorNominal:
 
 @dataclass(frozen=True)
 class AffineNominal:
-    """Outputs A z + b of the features z: parameters enter linearly, so least squares one step ahead find them.
+    """Outputs A z + b of the features z: parameters enter linearly, so least squares one step ahead find them."""
 
-    Attributes:
-        kinematics: Has the features.
-        output_dim: o.
-        feature_dim: d, their number; known once it is fitted.
-    """
-
-    kinematics: Any
-    output_dim: int
-    feature_dim: int = 0
+    kinematics: Any  #: has the features
+    output_dim: int  #: o
+    feature_dim: int = 0  #: d, their number; known once it is fitted
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

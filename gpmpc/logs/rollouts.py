@@ -25,15 +25,10 @@ PAST = 20  # rows before them
 
 @dataclass(frozen=True)
 class OutputGP:
-    """GPs that add to some outputs.
+    """GPs that add to some outputs."""
 
-    Attributes:
-        outputs: Their numbers.
-        posterior: Of the features, with ``predicts="value"`` and no inputs of its own.
-    """
-
-    outputs: tuple[int, ...]
-    posterior: GPPosterior
+    outputs: tuple[int, ...]  #: their numbers
+    posterior: GPPosterior  #: of the features, with ``predicts="value"`` and no inputs of its own
 
     def mean(self, features: Array) -> Array:
         """Computes the means (..., k) at features (..., d)."""
@@ -44,23 +39,14 @@ class OutputGP:
 
 @dataclass(frozen=True)
 class LogModel:
-    """A model of the outputs behind a log.
+    """A model of the outputs behind a log."""
 
-    Attributes:
-        kinematics: What the outputs do.
-        nominal: The part with parameters.
-        theta: Its parameters (P,).
-        history: Rows over which each output's disturbance is averaged (o,); zero for none.
-        lag: Rows by which the inputs act late.
-        gps: What is learned besides.
-    """
-
-    kinematics: Kinematics
-    nominal: Nominal
-    theta: Array
-    history: tuple[int, ...]
-    lag: int = 0
-    gps: tuple[OutputGP, ...] = ()
+    kinematics: Kinematics  #: what the outputs do
+    nominal: Nominal  #: the part with parameters
+    theta: Array  #: its parameters (P,)
+    history: tuple[int, ...]  #: rows over which each output's disturbance is averaged (o,); zero for none
+    lag: int = 0  #: rows by which the inputs act late
+    gps: tuple[OutputGP, ...] = ()  #: what is learned besides
 
     def __post_init__(self) -> None:
         if len(self.history) != len(self.kinematics.output_names):

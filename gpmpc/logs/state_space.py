@@ -23,20 +23,14 @@ Kind = Literal["vector", "angle", "quaternion"]
 class StateGroup:
     """Entries of a state that are measured together and judged by one error.
 
-    Attributes:
-        name: Such as "position".
-        entries: Names of the entries; four of a quaternion, x, y, z, w.
-        unit: Of the entries; a quaternion's errors are in rad.
-        kind: How differences are taken.
-
     Raises:
         SettingError: The kind is unknown, or a quaternion has not four entries.
     """
 
-    name: str
-    entries: tuple[str, ...]
-    unit: str = ""
-    kind: Kind = "vector"
+    name: str  #: such as "position"
+    entries: tuple[str, ...]  #: names of the entries; four of a quaternion, x, y, z, w
+    unit: str = ""  #: of the entries; a quaternion's errors are in rad
+    kind: Kind = "vector"  #: how differences are taken
 
     def __post_init__(self) -> None:
         if self.kind not in ("vector", "angle", "quaternion"):

@@ -4,7 +4,7 @@ from gpmpc.dynamics import DynamicsModel, Linearized, linearize, linearize_by_au
 from gpmpc.models.delay import DelayedModel
 from gpmpc.models.disturbance import DisturbedModel
 from gpmpc.models.features import Features, Lags
-from gpmpc.models.nominal import Affine, CasadiFunction
+from gpmpc.models.nominal import Affine, CasadiFunction, KnownModel
 from gpmpc.models.residual import ResidualModel, train_with_angles
 from gpmpc.models.storage import load_model, save_model
 
@@ -15,6 +15,7 @@ __all__ = [
     "DisturbedModel",
     "DynamicsModel",
     "Features",
+    "KnownModel",
     "Lags",
     "Linearized",
     "ResidualModel",

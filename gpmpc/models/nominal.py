@@ -1,4 +1,4 @@
-"""Nominal models x+ = f0(x, u): an affine one, and functions that are written in CasADi."""
+"""Known models x+ = f0(x, u): an affine one, functions that are written in CasADi, and any of them without a GP."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, batched_jacobian, tensors_for, to_array
+from gpmpc.compiled import call_unchecked
+from gpmpc.dynamics import Array, Linearized, batched_jacobian, check_query, tensors_for, to_array
 from gpmpc.exceptions import ShapeError, UnsupportedModel
-from gpmpc.gaussian import check_tensors
+from gpmpc.gaussian import Gaussian, check_tensors
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,54 @@ class Affine:
         return to_array(self.A), to_array(self.B), to_array(self.c)
 
 
+@dataclass(frozen=True)
+class KnownModel:
+    """A known function x+ = f0(x, u) as a model without uncertainty.
+
+    Attributes:
+        function: f0, from x (*batch, n) and u (*batch, m) to (*batch, n), such as ``CasadiFunction``.
+        state_dim: n.
+        input_dim: m.
+    """
+
+    function: Callable[[Tensor, Tensor], Tensor]
+    state_dim: int
+    input_dim: int
+
+    dtype, device = torch.float64, torch.device("cpu")
+
+    @property
+    def tape(self) -> Any:
+        """The function as a tape of compiled loops; None where it has none."""
+        return getattr(self.function, "tape", None)
+
+    @property
+    def output_dim(self) -> int:
+        """Number of outputs, n: the next state."""
+        return self.state_dim
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """Zero (n, n)."""
+        return torch.zeros(self.state_dim, self.state_dim, dtype=self.dtype)
+
+    def predict(self, state: Tensor, input: Tensor) -> Gaussian:
+        """The next state (*batch, n), with zero covariance."""
+        check_query(self, state, input)
+        mean = self.function(state, input)
+        return Gaussian(mean, mean.new_zeros(*mean.shape, self.state_dim))
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises the function at K points (K, n), (K, m)."""
+        mean, A, B = linearize_function(self.function, self, states, inputs)
+        return Linearized(mean, A, B, np.zeros((*mean.shape, self.state_dim)) if covariance else None)
+
+
 class CasadiFunction:
-    """A function that is written in CasADi, linearised by CasADi's derivatives for all points in one call.
+    """A function that is written in CasADi, linearised at all points in one call.
+
+    Its operations are read once and run by compiled loops (``gpmpc.kernels.tape``), or by CasADi where it calls what is
+    no expression.
 
     It serves as nominal model, (state (n,), input (m,)) to the next state (n,), and as effect B(x), state (n,) to
     (n, k). It is evaluated in double precision on the CPU, and torch cannot differentiate it.
@@ -75,6 +122,8 @@ class CasadiFunction:
     """
 
     def __init__(self, source: Any, **parameters: Any):
+        from gpmpc.gp.casadi_ import tape_of  # loads CasADi
+
         is_casadi = hasattr(source, "n_in")
         if is_casadi and parameters:
             raise UnsupportedModel(f"parameters {list(parameters)} are for a function that makes a CasADi function")
@@ -86,7 +135,9 @@ class CasadiFunction:
             raise UnsupportedModel(f"a CasADi function takes vectors (column by column); got {function!r}")
         self.function, self.source, self.parameters = function, None if is_casadi else source, parameters
         jacobians = [f"jac:{self._value}:{name}" for name in names]
-        self._expansion = function.factory("expansion", names, [self._value, *jacobians])
+        self.tape = tape_of(function)
+        if self.tape is None:
+            self._expansion = function.factory("expansion", names, [self._value, *jacobians])
         self._shape = function.size1_out(0), function.size2_out(0)
         self._sizes = [function.size1_in(i) for i in range(len(names))]
         self._mapped: dict[int, Any] = {}
@@ -108,6 +159,17 @@ class CasadiFunction:
     def linearize(self, *arguments: Array) -> tuple[Array, ...]:
         """The values at K points, and their derivatives by each argument (K, rows, d_i) or (K, rows, columns, d_i)."""
         K, (rows, columns) = len(arguments[0]), self._shape
+        if self.tape is not None:
+            from gpmpc.kernels.tape import linearize_tape  # loads numba
+
+            points = np.ascontiguousarray(np.hstack(arguments))
+            values, jacobians = np.empty((K, rows * columns)), np.empty((K, rows * columns, points.shape[1]))
+            call_unchecked(linearize_tape, self.tape, points, values, jacobians)
+            parts = np.split(jacobians, np.cumsum(self._sizes)[:-1], axis=2)
+            if columns == 1:
+                return values, *(np.ascontiguousarray(part) for part in parts)
+            value, *parts = (p.reshape(K, columns, rows, *p.shape[2:]).swapaxes(1, 2) for p in (values, *parts))
+            return tuple(np.ascontiguousarray(part) for part in (value, *parts))
         if K not in self._mapped:
             self._mapped[K] = self._expansion.map(K)
         parts = self._mapped[K](*(argument.T for argument in arguments))

@@ -261,12 +261,13 @@ class ResidualModel:
 
     @property
     def affine_form(self) -> AffineForm | None:
-        """The parts of the model; None unless the nominal model is ``Affine`` and B constant."""
-        nominal = self.nominal
-        if not isinstance(nominal, Affine) or callable(self.B):
+        """The parts of the model; None unless B is constant, and the nominal model ``Affine`` or a tape."""
+        nominal, tape = self.nominal, getattr(self.nominal, "tape", None)
+        if callable(self.B) or not (isinstance(nominal, Affine) or tape is not None):
             return None
+        parts = (nominal.A, nominal.B, nominal.c) if isinstance(nominal, Affine) else (None, None, None)
         selected = list(self.states), list(self.inputs), tuple(self.angles)
-        return AffineForm(self.residual, nominal.A, nominal.B, nominal.c, self.B, *selected)
+        return AffineForm(self.residual, *parts, self.B, *selected, tape)
 
     def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "ResidualModel":
         """Copies the model to another device or type; functions (nominal model, effect) are taken as they are."""

@@ -6,6 +6,7 @@ from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.policy import ControlLoop
 from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem
+from gpmpc.mpc.starts import ManyStarts, kicks
 
 __all__ = [
     "GPMPC",
@@ -16,9 +17,11 @@ __all__ = [
     "Halfspaces",
     "Inequality",
     "LeastSquares",
+    "ManyStarts",
     "NonlinearGPMPC",
     "PredictionSettings",
     "Problem",
     "Reference",
     "Tracking",
+    "kicks",
 ]

@@ -212,7 +212,8 @@ class Request(NamedTuple):
             belief: Of the state.
             reference: Over the horizon.
             previous: The last decision. Of one that is not applicable only ``input`` counts: what was applied.
-            plan: To start from in the place of the last one: inputs (H, m), or these and states (H + 1, n).
+            plan: To start from in the place of the last one: inputs (H, m), or these and states (H + 1, n); with
+                states angles of the reference are taken as they are, turns included.
 
         Raises:
             ShapeError: Belief, reference or plan have other dimensions than the problem and the horizon.
@@ -249,8 +250,8 @@ class Request(NamedTuple):
         kappas = None if reference.kappas is None else _array(reference.kappas)
         if kappas is not None and not np.isfinite(kappas).all():
             raise DataError(f"reference kappas must be finite; got {kappas}")
-        if problem.cost.angles and not found & _BELIEF:
-            states = _unwrapped(states, state, guessed, made, problem.cost.angles)
+        if problem.cost.angles and guessed is None and not found & _BELIEF:
+            states = _unwrapped(states, state, made, problem.cost.angles)
         references = References(states[1:], inputs, last)
         known = {"kappas": kappas, "previous": made, "states": guessed}
         return cls(state, covariance, references, guess, not found & _BELIEF, **known)
@@ -349,14 +350,10 @@ def _read_plan(plan: Any, horizon: int, n: int, m: int) -> tuple[Array, Array | 
     return np.vstack([inputs[:1], inputs]), states
 
 
-def _unwrapped(
-    states: Array, state: Array, guess: Array | None, previous: Decision | None, angles: Sequence[int]
-) -> Array:
+def _unwrapped(states: Array, state: Array, previous: Decision | None, angles: Sequence[int]) -> Array:
     """References (H + 1, n) whose angles are moved by full turns towards the plan, or the state where none is."""
     plan = np.tile(state, (len(states), 1))
-    if guess is not None:
-        plan[:] = guess
-    elif previous is not None:
+    if previous is not None:
         plan[1:] = np.concatenate([previous.means[2:], previous.means[-1:]])
         plan[1:] += full_turns(state - previous.means[1], angles)
     moved, index = states.copy(), list(angles)

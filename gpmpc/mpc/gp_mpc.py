@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from gpmpc.compiled import call_unchecked
-from gpmpc.dynamics import DynamicsModel
+from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.condense import Condenser
@@ -115,7 +115,7 @@ class GPMPC:
             previous: The last decision; one that is not applicable is ignored.
             parameters: Of outputs and smooth constraints, (q,) or by stage (H, q), such as where an obstacle will be.
             plan: To start from in the place of the last one: inputs (H, m), or these and states (H + 1, n), which need
-                not obey the dynamics.
+                not obey the dynamics. With states, angles of the reference are taken as they are, turns included.
 
         Raises:
             ShapeError: Belief, reference, parameters or plan have other dimensions, or reference inputs are missing.
@@ -133,6 +133,7 @@ class GPMPC:
     def _improve(self, prediction: Prediction, request: Request, clock: "_Stopwatch") -> Decision:
         """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
         guess, solution = prediction.plan, None if request.previous is None else request.previous.solution
+        best = None  # the last prediction that a program led to, with its feedback
         globalize = FullStep() if self.iterations == 1 else Globalization(self.prediction, request, self.tolerance)
         status, count = None, 0
         while True:
@@ -144,9 +145,13 @@ class GPMPC:
             count, status = count + 1, solution.status
             if _is_usable(program, solution, prediction.plan):
                 proposed = self._proposed(prediction, program, solution, request.references.previous_input)
+                best = prediction, program.feedback
                 prediction, status = globalize(prediction, program, solution, proposed)
             if status is not None or count == self.iterations:
                 break
+        if best is not None and self.prediction.settings.rolled_out:
+            obeying = self.prediction.roll_out(prediction.plan, *best, request)
+            prediction = obeying if np.isfinite(obeying.plan.states).all() else prediction
         clock.model()
         status = Status.ITERATION_LIMIT if status is None else status
         program = QuadraticProgram.unchecked(*program[:5])
@@ -200,6 +205,15 @@ class GPMPC:
             except FAILURES:
                 decisions[t] = requests[t].failed_decision(Status.NUMERICAL_TROUBLE, timing=clock.timing)
         return decisions
+
+    def gains(self, decision: Decision, parameters: Array | None = None) -> Array:
+        """K_0 .. K_{H-1} (H, m, n) of the feedback u = u_k - K_k (x - x_k) along a decision's plan.
+
+        They are those of the linear-quadratic regulator of the stages, linearised at the plan.
+        """
+        found = linearize(self.prediction.model, decision.means[:-1], decision.inputs, covariance=False)
+        cost = self.prediction.costs.at(Plan(decision.means, decision.inputs, decision.covariances), parameters)
+        return self.prediction.gains(found.A, found.B, cost)
 
     @property
     def bytes_per_question(self) -> int | None:

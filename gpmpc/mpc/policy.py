@@ -13,9 +13,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 
-from gpmpc.exceptions import SettingError, SolverFailure
+from gpmpc.exceptions import SettingError, ShapeError, SolverFailure, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Controller, Decision, Reference, Timing
+from gpmpc.mpc.controller import Controller, Decision, Reference, Timing, full_turns
 from gpmpc.mpc.problem import Problem
 from gpmpc.status import Status
 
@@ -139,6 +139,8 @@ class ControlLoop:
         self.on_failure: OnFailure = on_failure
         self.last: Command | None = None
         self.failures, self._steps = 0, 0
+        self._before: Command | None = None  # the one before the last
+        self._gains: tuple[Decision, np.ndarray] | None = None  # of the last plan that they were needed of
 
     def input(self, state: Any, reference: Any, parameters: Any = None, plan: Any = None) -> np.ndarray:
         """Returns the input to apply now (m,).
@@ -156,15 +158,63 @@ class ControlLoop:
         belief = state if isinstance(state, Gaussian) else Gaussian.certain(np.asarray(state, dtype=float))
         wanted = reference if isinstance(reference, Reference) else Reference(np.asarray(reference, dtype=float))
         known = self.last, self.on_failure, self._steps, parameters, plan
+        self._before = self.last
         self.last = command(self.controller, belief, wanted, *known)
         self.failures, self._steps = self.failures + self.last.failed, self._steps + 1
         return self.last.input.copy()
+
+    def input_between(self, state: Any, share: float) -> np.ndarray:
+        """Returns the input to apply until the next decision (m,): the plan's, corrected by its feedback.
+
+        For plants that take inputs more often than there is time to decide. The feedback is that of the controller's
+        method ``gains``, at the stage of the plan that the time falls into; a late decision goes on along the plan.
+
+        Args:
+            state: Measured (n,).
+            share: Time since the last decision, in time steps of the controller.
+
+        Raises:
+            SettingError: Nothing was decided yet, or a share below zero.
+            ShapeError: A state of another length.
+        """
+        if self.last is None or self.last.plan is None:
+            raise SettingError("input_between", "needs a decision: call input first")
+        check_number("share", share, least=0)
+        plan, state = self.last.plan, np.asarray(state, dtype=float)
+        stage = min(int(share), len(plan.inputs) - 1)
+        input = plan.inputs[stage]
+        if state.shape != plan.means.shape[1:]:
+            raise ShapeError(f"state must have shape {plan.means.shape[1:]}; got {state.shape}")
+        if np.isfinite(plan.means).all() and np.isfinite(state).all():
+            if self._gains is None or self._gains[0] is not plan:
+                self._gains = plan, getattr(self.controller, "gains", _no_gains)(plan)
+            error = state - _state_along(plan.means, min(share, len(plan.inputs)))
+            angles = getattr(getattr(self.controller, "problem", None), "cost", None)
+            error -= full_turns(error, () if angles is None else angles.angles)
+            input = input - self._gains[1][stage] @ error
+        return _within_bounds(self.controller, input, self._before)
 
     def warm_up(self, state: Any, reference: Any, parameters: Any = None) -> None:
         """Decides twice and forgets it, so that everything is compiled before the loop starts."""
         rehearsal = ControlLoop(self.controller, "previous_plan")
         for _ in range(2):
             rehearsal.input(state, reference, parameters)
+
+
+def _no_gains(plan: Decision) -> np.ndarray:
+    """No feedback: the inputs of the plan as they are."""
+    return np.zeros((*plan.inputs.shape, plan.means.shape[1]))
+
+
+def _state_along(states: np.ndarray, time: float) -> np.ndarray:
+    """The state (n,) at a time in steps from s_0 on, by the cubic through the four nearest of s_0 .. s_H (H + 1, n)."""
+    count = min(4, len(states))
+    first = min(max(int(time) - 1, 0), len(states) - count)
+    nodes, value = np.arange(first, first + count), np.zeros(states.shape[1])
+    for i in nodes:
+        others = nodes[nodes != i]
+        value += np.prod((time - others) / (i - others)) * states[i]
+    return value
 
 
 def check_policy(on_failure: str) -> None:

@@ -58,6 +58,7 @@ from gpmpc.mpc.stages import (
     Plan,
     StageCosts,
     StageLinearizer,
+    keep_rates,
 )
 from gpmpc.propagation import Linearization, Propagator
 
@@ -96,6 +97,8 @@ class PredictionSettings:
             state constraints is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"``
             and ``"diagonal"`` are those without feedback.
         disturbance_gain: L in [0, 1], the observer gain of the constant-disturbance estimate; 0 disables it.
+        rolled_out: Ends a decision with a roll-out under the feedback, so that its plan obeys the model's dynamics
+            however few programs it took; for ``"trajectory"``.
 
     Raises:
         SettingError: An unknown form or covariance mode, a gain out of range, or one with ``"velocity"``.
@@ -105,14 +108,18 @@ class PredictionSettings:
     covariance: Covariance = "zero_order"
     feedback: bool = True
     disturbance_gain: float = 0.0
+    rolled_out: bool = False
 
     def __post_init__(self) -> None:
         for key, possible in (("form", FORMS), ("covariance", COVARIANCES)):
             if getattr(self, key) not in possible:
                 names = ", ".join(map(repr, possible))
                 raise SettingError(key, f"must be one of {names}; got {getattr(self, key)!r}")
-        if not isinstance(self.feedback, bool):
-            raise SettingError("feedback", f"must be true or false; got {self.feedback!r}")
+        for key in ("feedback", "rolled_out"):
+            if not isinstance(getattr(self, key), bool):
+                raise SettingError(key, f"must be true or false; got {getattr(self, key)!r}")
+        if self.rolled_out and self.form == "velocity":
+            raise SettingError("rolled_out", "is for plans of form 'trajectory'; got form 'velocity'")
         check_number("disturbance_gain", self.disturbance_gain, least=0)
         if self.disturbance_gain > (self.form != "velocity"):
             velocity = self.form == "velocity"
@@ -194,11 +201,8 @@ class PredictionModel:
 
     def _states(self, request: Request) -> Array | None:
         """The means (H + 1, n) that the first guess of the inputs leads to; None where they are not finite."""
-        (H, m), n = request.initial_guess.shape, len(request.state)
-        nothing, free = (np.zeros((1, H, n)), np.zeros((1, H, m, n))), np.full(m, np.inf)
-        law = Feedback(nothing[0], request.initial_guess[None], nothing[1], -free, free, -free, free, np.zeros(m))
         disturbance = request.disturbance if len(request.disturbance) else None
-        states = self._roll_out(request.state[None], law, disturbance)[0][0]
+        states = self._roll_out.open_loop(request.state[None], request.initial_guess[None], disturbance)[0]
         return states if np.isfinite(states).all() else None
 
     def initial_guess(self, request: Request) -> Plan:
@@ -225,13 +229,13 @@ class PredictionModel:
             if problem.cost.angles:  # a sensor may have taken a turn off
                 means[1:] += full_turns(request.state - last.means[1], problem.cost.angles)
         else:
-            states, shares = request.references.states, np.linspace(1.0, 0.0, H + 1)[1:, None]
-            means[1:] = states + shares * (request.state - states[0])
+            targets, shares = request.references.states, np.linspace(1.0, 0.0, H + 1)[1:, None]
+            means[1:] = targets + shares * (request.state - targets[0])
             if problem.cost.penalized == "deviations":
                 inputs = request.references.inputs.clip(problem.inputs.lower, problem.inputs.upper)
         if problem.input_rates.finite:
             inputs = inputs.copy()
-            _keep_rates(inputs, request.references.previous_input, *problem.input_rates.sides)
+            keep_rates(inputs, request.references.previous_input, *problem.input_rates.sides)
         if not self.linearizer.at_points:
             covariances[1:] = self._first_covariances(means, inputs, request) if last is None else last.covariances[1:]
         return Plan(self.linearizer.state(means, covariances), inputs, covariances)
@@ -287,24 +291,46 @@ class PredictionModel:
             c[n:] = stages.c[0, n:]
         return stages._replace(c=c[None])
 
-    def roll_out(self, towards: Plan, prediction: Prediction, feedback: Array, request: Request) -> Prediction:
+    @property
+    def evaluates(self) -> bool:
+        """Whether plans are compared without derivatives: where the means are all that is predicted."""
+        return self.linearizer.covariance == "none"
+
+    def evaluate(self, plan: Plan, at: Prediction, request: Request) -> Prediction:
+        """The prediction at a plan with the derivatives of another one, ``at``."""
+        disturbance = request.disturbance if len(request.disturbance) else None
+        after = self._roll_out.open_loop(plan.states[:-1], plan.inputs[:, None], disturbance)[:, 1]
+        return self._without(plan, after, at, request)
+
+    def _without(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
+        rows = self.constraints.at(plan, plan.covariances, self.points, request.parameters, request.kappas)
+        stages, cost = at.stages._replace(next=after), self.costs.at(plan, request.parameters)
+        return Prediction(plan, stages, plan.covariances, rows, cost)
+
+    def roll_out(
+        self, towards: Plan, prediction: Prediction, feedback: Array, request: Request, derivatives: bool = True
+    ) -> Prediction:
         """The prediction at the plan that obeys the dynamics under a feedback towards another one, within its bounds.
 
         Args:
             towards: Whose states are followed.
-            prediction: Its first stage gives the feedback, where a program has none.
+            prediction: Its stages give the feedback, where a program has none.
             feedback: Of the program, F_k (H, m, p + m + 1), or nothing (0, m, p + m + 1).
             request: Of the step.
+            derivatives: Whether the stages are linearised where that is not needed to find the plan.
         """
         problem, n, linearizer = self.problem, self.problem.state_dim, self.linearizer
-        gains = np.broadcast_to(-self.gain(prediction.stages, prediction.cost), (self.horizon, problem.input_dim, n))
-        gains = np.ascontiguousarray(feedback[:, :, :n] if len(feedback) else gains)
+        own = -self.gains(*prediction.stages[:2], prediction.cost) if not len(feedback) else feedback
+        gains = np.ascontiguousarray(own[:, :, :n])
         last, disturbance = request.references.previous_input, request.disturbance if len(request.disturbance) else None
         limits = problem.inputs.lower, problem.inputs.upper, problem.input_rates.lower, problem.input_rates.upper
         if linearizer.at_points and all(limit.ndim == 1 for limit in limits):
             law = Feedback(towards.states[None], towards.inputs[None], gains[None], *limits, last)
             states, inputs = self._roll_out(towards.states[:1], law, disturbance)
-            return self.linearize(Plan(states[0], inputs[0], towards.covariances), request)
+            plan = Plan(states[0], inputs[0], towards.covariances)
+            if not derivatives:
+                return self._without(plan, plan.states[1:], prediction, request)
+            return self.linearize(plan, request)
         states, inputs, covariances = (part.copy() for part in towards)
         (low, high), (down, up) = (box.by_stage(self.horizon) for box in (problem.inputs, problem.input_rates))
         parts = []
@@ -324,15 +350,19 @@ class PredictionModel:
         return call_unchecked(_largest_ratio, stages.V, self._prior) if len(self._prior) else math.nan
 
     def gain(self, stages: LinearizedStages, cost: QuadraticCost) -> Array:
-        """K (m, n) of the feedback u = u_k - K (x - mu_k), of states' and inputs' weights; zero without feedback."""
+        """K (m, n) of the feedback u = u_k - K (x - mu_k) at the first stage; zero without feedback."""
+        return self.gains(stages.A[:1], stages.B[:1], cost)[0]
+
+    def gains(self, A: Array, B: Array, cost: QuadraticCost) -> Array:
+        """K_0 .. K_{H-1} (H, m, n) of the feedback u = u_k - K_k (x - mu_k), weighed as at the first stage; or zero."""
         (m, n), Z = (self.problem.input_dim, self.problem.state_dim), cost.squares
         if not self.settings.feedback:
-            return np.zeros((m, n))
-        A, B = np.ascontiguousarray(stages.A[:1, :n, :n]), np.ascontiguousarray(stages.B[:1, :n])
+            return np.zeros((self.horizon, m, n))
+        A, B = np.ascontiguousarray(A[:, :n, :n]), np.ascontiguousarray(B[:, :n])
         Q, R, terminal = np.ascontiguousarray(cost.state[:1, 0]), cost.input[:1], cost.terminal[0]
         if len(Z):
             Q, R, terminal = Q + Z[:1, :n, :n], R + Z[:1, n:-1, n:-1], terminal + Z[-1, :n, :n]
-        return call_unchecked(finite_horizon_lqr, A, B, Q, R, terminal, self.horizon)[0][0]
+        return call_unchecked(finite_horizon_lqr, A, B, Q, R, terminal, self.horizon)[0]
 
     def _first_covariances(self, means: Array, inputs: Array, request: Request) -> Array:
         """Sigma_1 .. Sigma_H (H, n, n) along a first guess, linearised at its points."""
@@ -383,13 +413,3 @@ def _largest_ratio(V, prior):
         for i in range(len(prior)):
             largest = max(largest, V[k, i, i] / prior[i] if prior[i] > 0.0 else 0.0)
     return math.sqrt(largest)
-
-
-@compiled
-def _keep_rates(inputs, last, lower, upper):
-    """Moves inputs (H, m), one after the other, to within their rates from the one before."""
-    for k in range(len(inputs)):
-        for j in range(len(last)):
-            before = inputs[k - 1, j] if k > 0 else last[j]
-            at = min(k, len(lower) - 1)
-            inputs[k, j] = min(max(inputs[k, j], before + lower[at, j]), before + upper[at, j])

@@ -133,6 +133,7 @@ class Globalization:
                 rows = trial.rows if self._model.constraints.smooth else at.rows._replace(E=trial.rows.E)
                 points = trial.stages.next, rows, trial.plan
                 if call_unchecked(_merit, trial.cost, terms, self._defect_prices, *points) <= bound:
+                    trial = self._model.linearize(trial.plan, self._request) if self._model.evaluates else trial
                     return trial, None
             length /= 2.0
         if size**2 <= _ROUND_OFF:  # size^2 of the cost is what could still be gained
@@ -147,7 +148,9 @@ class Globalization:
         for rolled_out in (False, True) if self._model.linearizer.at_points else (True, False):
             try:
                 if rolled_out:
-                    yield self._model.roll_out(towards, at, feedback, self._request)
+                    yield self._model.roll_out(towards, at, feedback, self._request, not self._model.evaluates)
+                elif self._model.evaluates:
+                    yield self._model.evaluate(towards, at, self._request)
                 else:
                     yield self._model.linearize(self._model.canonical(towards), self._request)
             except FAILURES:  # a trial plan may lead the model out of its numbers

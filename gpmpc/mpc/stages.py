@@ -389,3 +389,13 @@ def _directions(F: Array, covariances: Array) -> Array:
     moved = F @ roots
     norms = np.linalg.norm(moved, axis=-1, keepdims=True)
     return np.divide(moved, norms, out=np.zeros_like(moved), where=norms > 0)
+
+
+@compiled
+def keep_rates(inputs, last, lower, upper):
+    """Moves inputs (H, m), one after the other, to within their rates from the one before."""
+    for k in range(len(inputs)):
+        for j in range(len(last)):
+            before = inputs[k - 1, j] if k > 0 else last[j]
+            at = min(k, len(lower) - 1)
+            inputs[k, j] = min(max(inputs[k, j], before + lower[at, j]), before + upper[at, j])

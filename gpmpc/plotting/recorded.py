@@ -33,10 +33,18 @@ _STAGE_COLOURS = (BLUE, SKY, VERMILION)
 
 
 def _tracked_of(run: "Run") -> list[int]:
-    """Indices of the states that errors are reported of, as the recording says; of all where it does not."""
-    tracked = run.metadata.get("run", {}).get("tracked", "").split()
-    found = [run.state_names.index(name) for name in tracked if name in run.state_names]
-    return found or list(range(len(run.state_names)))
+    """Indices of tracked states and angles, as the recording says; of all where it does not."""
+    said, names = run.metadata.get("run", {}), list(run.state_names)
+    drawn = dict.fromkeys(f"{said.get('tracked', '')} {said.get('angles', '')}".split())
+    return [names.index(name) for name in drawn if name in names] or list(range(len(names)))
+
+
+def _reference_of(run: "Run", state: int) -> np.ndarray:
+    """What a state was to be (K,); of an angle at the turn that is nearest to where it was."""
+    reference = run.references[:, state]
+    if run.state_names[state] not in run.metadata.get("run", {}).get("angles", "").split():
+        return reference
+    return reference + 2 * np.pi * np.round((run.states[:, state] - reference) / (2 * np.pi))
 
 
 def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -71,7 +79,7 @@ def tracking_figure(run: "Run") -> Figure:
     axes = figure.subplots(2, len(states), squeeze=False, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
     for column, i in enumerate(states):
         above, below = axes[:, column]
-        reference = run.references[:, i]
+        reference = _reference_of(run, i)
         above.plot(run.times, run.states[:, i], color=FLOWN, linewidth=1.6, label="flown")
         above.plot(run.times, reference, color=REFERENCE, linewidth=1.2, linestyle=DASHED, label="reference")
         name = run.state_names[i]
@@ -92,7 +100,9 @@ def tracking_figure(run: "Run") -> Figure:
         below.plot(run.times, run.states[:, i] - reference, color=FLOWN, linewidth=1.2)
         _failures(run, (above, below))
         below.set_xlabel("time [s]")
-    axes[1, 0].set_ylabel(name_of("error", _unit(run, f"state.{run.state_names[states[0]]}")))
+        units = [_unit(run, f"state.{run.state_names[state]}") for state in states[max(column - 1, 0) : column + 1]]
+        if column == 0 or units[0] != units[1]:
+            below.set_ylabel(name_of("error", units[-1]))
     legend_below(figure, axes.ravel())
     figure.align_ylabels(axes[:, 0])
     return figure

@@ -44,13 +44,13 @@ class Composition:
     G: Any
 
     def __init__(self, form: AffineForm):
-        self.f, self.A, self.G, self.c, self.B, self.states, self.inputs, _ = form
+        self.f, self.A, self.G, self.c, self.B, self.states, self.inputs = form[:7]
 
     @classmethod
     def of(cls, model: Any) -> "Composition | None":
-        """The composition of a model; None where it has no affine form, or one with angles."""
+        """The composition of a model; None where it has no affine form, or one with angles or a tape."""
         form = getattr(model, "affine_form", None)
-        return None if form is None or form.angles else cls(form)
+        return None if form is None or form.angles or form.tape is not None else cls(form)
 
     def seen(self, belief: Gaussian, input: Tensor) -> tuple[Gaussian, Tensor]:
         """Selects from a belief and an input what f depends on."""

@@ -2,7 +2,14 @@
 
 from gpmpc.systems.attitudes import ATTITUDES, attitude_for_thrust_direction
 from gpmpc.systems.coupled import Coupled, attitude_at_yaw, coupled, thrust_direction
-from gpmpc.systems.mechanical import acrobot, cart_pole, double_integrator, pendulum, planar_quadrotor
+from gpmpc.systems.mechanical import (
+    acrobot,
+    cart_pole,
+    double_integrator,
+    double_pendulum,
+    pendulum,
+    planar_quadrotor,
+)
 from gpmpc.systems.quadrotor import Map, Rotational, Translational, rotational, translational
 from gpmpc.systems.reactor import stirred_tank
 from gpmpc.systems.system import Dynamics, Plant, System, cos, exp, sin, step, step_many
@@ -23,6 +30,7 @@ __all__ = [
     "cos",
     "coupled",
     "double_integrator",
+    "double_pendulum",
     "exp",
     "pendulum",
     "planar_quadrotor",

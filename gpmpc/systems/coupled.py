@@ -18,7 +18,15 @@ import numpy as np
 
 from gpmpc.exceptions import check_number
 from gpmpc.systems.attitudes import GRAVITY, attitude_for_thrust_direction
-from gpmpc.systems.quadrotor import ANGLE_UNITS, ATTITUDE, POSITION, POSITION_UNITS, Rotational, Translational
+from gpmpc.systems.quadrotor import (
+    ANGLE_UNITS,
+    ATTITUDE,
+    FOLLOWS_POSITIONS,
+    POSITION,
+    POSITION_UNITS,
+    Rotational,
+    Translational,
+)
 from gpmpc.systems.system import System, cos, sin
 
 
@@ -77,12 +85,9 @@ def coupled(
         input_lower=(0.0, -2.0, -2.0, -2.0),
         input_upper=(20.0, 2.0, 2.0, 2.0),
         initial_input=(7.26, 0.0, 0.0, 0.0),  # the weight m g
-        tracked=("x", "y", "z"),
-        rates={"vx": "x", "vy": "y", "vz": "z"},
         region=((-2.0, -1.0) * 3 + (-0.3, -0.5) * 3, (2.0, 1.0) * 3 + (0.3, 0.5) * 3),
-        lost=10.0,
         pose=POSITION | ATTITUDE,
-        z_down=True,
+        **FOLLOWS_POSITIONS,
     )
 
 

@@ -15,7 +15,16 @@ from gpmpc.systems.simulators import Simulator, library
 from gpmpc.systems.system import System, step
 
 Array = np.ndarray
-OURS = ("acrobot", "cart_pole", "double_integrator", "pendulum", "planar_quadrotor", "stirred_tank", "translational")
+OURS = (
+    "acrobot",
+    "cart_pole",
+    "double_integrator",
+    "double_pendulum",
+    "pendulum",
+    "planar_quadrotor",
+    "stirred_tank",
+    "translational",
+)
 
 
 class Environment(Simulator):

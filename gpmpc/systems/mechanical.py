@@ -1,13 +1,13 @@
-"""Mechanical systems with few states: double integrator, pendulum, cart-pole, acrobot and planar quadrotor.
+"""Mechanical systems with few states: double integrator, pendulum, cart-pole, double pendulum and planar quadrotor.
 
 Angles are zero where a pole or a link stands upright, positive anticlockwise.
 """
 
 from dataclasses import dataclass
 from math import pi
-from typing import Any
+from typing import Any, Literal
 
-from gpmpc.exceptions import check_number
+from gpmpc.exceptions import SettingError, check_number
 from gpmpc.systems.attitudes import GRAVITY
 from gpmpc.systems.system import System, cos, sin
 
@@ -159,8 +159,8 @@ def cart_pole(
 
 
 @dataclass(frozen=True)
-class Acrobot:
-    """Two links in a vertical plane with a torque at the elbow alone (Spong, 1995, eqs. (1)-(2), and its table).
+class DoublePendulum:
+    """Two links in a vertical plane with a torque at one joint (Spong, 1995, eqs. (1)-(2)).
 
     ``shoulder`` is the angle of the first link from upright, ``elbow`` that of the second from the first.
 
@@ -169,12 +169,14 @@ class Acrobot:
         first_length: Of the first link [m].
         centres: From each link's joint to its centre of mass [m].
         inertias: Of the links about their centres of mass [kg m^2].
+        actuated: ``"elbow"`` (an acrobot) or ``"shoulder"`` (a pendubot).
     """
 
-    masses: tuple[float, float] = (1.0, 1.0)  # [kg]
-    first_length: float = 1.0  # [m]
-    centres: tuple[float, float] = (0.5, 1.0)  # [m]
-    inertias: tuple[float, float] = (0.083, 0.33)  # [kg m^2]
+    masses: tuple[float, float]  # [kg]
+    first_length: float  # [m]
+    centres: tuple[float, float]  # [m]
+    inertias: tuple[float, float]  # [kg m^2]
+    actuated: Literal["elbow", "shoulder"] = "elbow"
 
     state_names, input_names = ("shoulder", "shoulder_rate", "elbow", "elbow_rate"), ("torque",)
 
@@ -183,19 +185,22 @@ class Acrobot:
         for key in ("masses", "centres", "inertias"):
             for value in getattr(self, key):
                 check_number(key, value, above=0)
+        if self.actuated not in ("elbow", "shoulder"):
+            raise SettingError("actuated", f"must be 'elbow' or 'shoulder'; got {self.actuated!r}")
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (shoulder, shoulder_rate, elbow, elbow_rate) [rad/s, rad/s^2]."""
         (m1, m2), (c1, c2), (i1, i2), l1 = self.masses, self.centres, self.inertias, self.first_length
         a, da, b, db = x[0], x[1], x[2], x[3]
-        # D (dda, ddb) + h + phi = (0, torque)
+        # D (dda, ddb) + h + phi = torques
         coupling = m2 * l1 * c2
         d11 = m1 * c1**2 + m2 * (l1**2 + c2**2) + 2 * coupling * cos(b) + i1 + i2
         d12 = m2 * c2**2 + coupling * cos(b) + i2
         d22 = m2 * c2**2 + i2
         fall = -m2 * c2 * GRAVITY * sin(a + b)
         r1 = coupling * sin(b) * (2 * da * db + db * db) + (m1 * c1 + m2 * l1) * GRAVITY * sin(a) - fall
-        r2 = u[0] - coupling * sin(b) * da * da - fall
+        r2 = -coupling * sin(b) * da * da - fall
+        r1, r2 = (r1, r2 + u[0]) if self.actuated == "elbow" else (r1 + u[0], r2)
         determinant = d11 * d22 - d12 * d12
         return [da, (d22 * r1 - d12 * r2) / determinant, db, (d11 * r2 - d12 * r1) / determinant]
 
@@ -203,7 +208,7 @@ class Acrobot:
 def acrobot(
     masses: tuple[float, float] = (1.0, 1.0), first_length: float = 1.0, time_step: float = 0.05, torque: float = 10.0
 ) -> System:
-    """Makes an acrobot that hangs at first.
+    """Makes an acrobot that hangs at first (Spong, 1995, and its table).
 
     Args:
         masses: Of the links [kg].
@@ -211,18 +216,51 @@ def acrobot(
         time_step: [s].
         torque: Its largest [N m].
     """
+    links = DoublePendulum((masses[0], masses[1]), first_length, (0.5, 1.0), (0.083, 0.33))
+    return _two_links("acrobot", links, time_step, 10, torque, (4.0, 6.0))
+
+
+def double_pendulum(
+    actuated: Literal["elbow", "shoulder"] = "elbow",
+    masses: tuple[float, float] = (0.5234602302, 0.6255677234),
+    first_length: float = 0.2,
+    centres: tuple[float, float] = (0.2, 0.2556930544),
+    inertias: tuple[float, float] = (0.0109487904, 0.0099708947),
+    time_step: float = 0.02,
+    torque: float = 6.0,
+) -> System:
+    """Makes the double pendulum of the RealAIGym league, which hangs at first (Wiebe et al., 2024).
+
+    Masses, lengths and inertias are those identified for its design C.1, model 1.1; there is no friction.
+
+    Args:
+        actuated: The joint with the motor: ``"elbow"`` (acrobot) or ``"shoulder"`` (pendubot).
+        masses: Of the links [kg].
+        first_length: [m]; the second link is 0.3 m long.
+        centres: From each link's joint to its centre of mass [m].
+        inertias: Of the links about their centres of mass [kg m^2]; published about the joints, 0.031887 and 0.050870.
+        time_step: [s].
+        torque: Its largest [N m].
+    """
+    links = (masses[0], masses[1]), first_length, (centres[0], centres[1]), (inertias[0], inertias[1])
+    return _two_links("double_pendulum", DoublePendulum(*links, actuated), time_step, 2, torque, (20.0, 30.0))
+
+
+def _two_links(
+    name: str, links: DoublePendulum, time_step: float, substeps: int, torque: float, rates: tuple[float, float]
+) -> System:
     return System(
-        Acrobot((masses[0], masses[1]), first_length),
+        links,
         time_step,
-        4,
-        name="acrobot",
+        substeps,
+        name=name,
         units=dict.fromkeys(("shoulder", "elbow"), "rad")
         | dict.fromkeys(("shoulder_rate", "elbow_rate"), "rad/s")
         | {"torque": "N m"},
         input_lower=[-torque],
         input_upper=[torque],
         start=[pi, 0.0, 0.0, 0.0],
-        region=[[0.0, -4.0, -pi, -6.0], [2 * pi, 4.0, pi, 6.0]],
+        region=[[0.0, -rates[0], -pi, -rates[1]], [2 * pi, rates[0], pi, rates[1]]],
         angles=["shoulder", "elbow"],
         rates={"shoulder_rate": "shoulder", "elbow_rate": "elbow"},
     )

@@ -20,6 +20,13 @@ ATTITUDE = {"roll": "phi", "pitch": "theta", "yaw": "psi"}
 POSITION_UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s")
 ANGLE_UNITS = dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys("pqr", "rad/s")
 
+FOLLOWS_POSITIONS: dict[str, Any] = {
+    "tracked": ("x", "y", "z"),
+    "rates": {"vx": "x", "vy": "y", "vz": "z"},
+    "lost": 10.0,  # a hundred times what a controlled one is off; twice where a fifth more mass than learned holds it
+    "z_down": True,
+}
+
 
 @dataclass(frozen=True)
 class Translational:
@@ -149,12 +156,9 @@ def translational(
         input_lower=(0.0, -0.7, -0.7),
         input_upper=(100.0, 0.7, 0.7),
         initial_input=(7.26, 0.0, 0.0),  # the weight m g
-        tracked=("x", "y", "z"),
-        rates={"vx": "x", "vy": "y", "vz": "z"},
         region=((-20.0, -2.0) * 3, (20.0, 2.0) * 3),
-        lost=10.0,  # a hundred times what a controlled one is off; twice where a fifth more mass than learned holds it
         pose=POSITION,
-        z_down=True,
+        **FOLLOWS_POSITIONS,
     )
 
 

@@ -22,7 +22,7 @@ from gpmpc.gp import (
 )
 from gpmpc.gp._kernel import kernel_matrix
 from gpmpc.gp.sparse import collapsed_bound_with_gradient
-from gpmpc.gp.sparse_training import _greedy_points
+from gpmpc.gp.sparse_training import informative_points
 from gpmpc.propagation import MomentMatching, MonteCarlo
 from tests.gp.whole_bound import collapsed_bound
 
@@ -151,11 +151,11 @@ def test_a_frozen_sparse_model_is_conditioned_and_moment_matched_like_any_other(
         Trainer().refit(gp)
 
 
-def test_greedy_points_differ_and_stop_where_nothing_is_left():
+def test_informative_points_differ_and_stop_where_nothing_is_left():
     x, _, settings = problem(100)
-    chosen = _greedy_points(torch.cat([x, x]), Hyperparameters(**settings), 30)
+    chosen = torch.cat([x, x])[informative_points(torch.cat([x, x]), Hyperparameters(**settings), 30)]
     assert len(torch.unique(chosen, dim=0)) == 30
-    assert len(_greedy_points(x[[0, 1, 0, 1, 0]], Hyperparameters(**settings), 5)) == 2
+    assert len(informative_points(x[[0, 1, 0, 1, 0]], Hyperparameters(**settings), 5)) == 2
     random = [
         collapsed_bound(x[i : i + 30], x, problem(100)[1], Hyperparameters(**settings)).sum() for i in range(0, 70, 10)
     ]

@@ -23,7 +23,7 @@ from gpmpc.logs import (
 )
 from gpmpc.logs.learning import choose_rows
 from gpmpc.logs.log import Log, LogRun
-from gpmpc.logs.noise import error_variances
+from gpmpc.logs.noise import error_variances, follow_errors
 from gpmpc.logs.state_space import rotation_quaternion
 
 EXAMPLE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "own_log.py"))
@@ -156,6 +156,22 @@ def test_the_same_rows_in_pieces_of_one_run_or_another_log_give_the_same_model(f
     model = LogModel(RigidBody(one.space), MultirotorNominal(4), np.empty(0), FORCE_ONLY)
     fits = [fit_nominal(model, None, log, steps=10).model.theta for log in (one, other)]
     np.testing.assert_allclose(*fits, rtol=0, atol=1e-9)
+
+
+def test_intervals_follow_a_rougher_run_and_never_its_future(flights):
+    windows = as_log(flights[:2]).windows(20, 20, 2)
+    rng = np.random.default_rng(0)
+    rough = np.where(windows.runs == 1, 3.0, 1.0)[:, None, None]
+    errors, claimed = rough * rng.normal(size=(len(windows), 2, 12)), np.ones((len(windows), 2, 12))
+    scaled = follow_errors(windows, errors, claimed, (10, 20))
+    late = windows.times > 2
+    for run, std in ((0, 1.0), (1, 3.0)):
+        found = np.sqrt(scaled[late & (windows.runs == run)].mean(axis=(0, 2)))
+        np.testing.assert_allclose(found, std, rtol=0.1)
+    np.testing.assert_array_equal(scaled[windows.times < 0.3][:, 1], 1.0)  # no prediction of 20 steps is over
+    changed = errors * np.where(windows.times > 5, 9.0, 1.0)[:, None, None]
+    known = windows.times <= 5
+    np.testing.assert_array_equal(follow_errors(windows, changed, claimed, (10, 20))[known], scaled[known])
 
 
 def test_chosen_rows_cover_what_is_rare():

@@ -14,6 +14,7 @@ from gpmpc.systems import (
     cart_pole,
     coupled,
     double_integrator,
+    double_pendulum,
     pendulum,
     planar_quadrotor,
     rotational,
@@ -33,6 +34,7 @@ ALL = [
         cart_pole,
         coupled,
         double_integrator,
+        double_pendulum,
         pendulum,
         planar_quadrotor,
         rotational,
@@ -88,14 +90,24 @@ def energy(system, x):
         (pendulum(damping=0), [2.0, 1.0]),
         (cart_pole(), [0.0, 1.0, 0.5, -1.0]),
         (acrobot(), [2.0, 1.0, 0.5, -1.0]),
+        (double_pendulum("shoulder"), [2.0, 1.0, 0.5, -1.0]),
     ],
-    ids=["pendulum", "cart_pole", "acrobot"],
+    ids=["pendulum", "cart_pole", "acrobot", "double_pendulum"],
 )
 def test_without_input_and_friction_energy_is_conserved(system, start):
     state, system = np.array(start), replace(system, substeps=20)
     for _ in range(40):
         state = step(system, state, np.zeros(1))
     assert energy(system, state) == pytest.approx(energy(system, start), rel=1e-7)
+
+
+@pytest.mark.parametrize(("actuated", "joint"), [("shoulder", 1), ("elbow", 3)])
+def test_a_motor_of_the_double_pendulum_adds_torque_times_rate_of_its_joint_to_the_energy(actuated, joint):
+    system, state, torque = double_pendulum(actuated), np.array([2.0, 1.0, 0.5, -1.0]), np.array([1.5])
+    system = replace(system, time_step=1e-4)
+    after = step(system, state, torque)
+    work = torque[0] * (state[joint] + after[joint]) / 2 * 1e-4
+    assert energy(system, after) - energy(system, state) == pytest.approx(work, rel=1e-5)
 
 
 def test_the_reactors_operating_point_is_an_unstable_equilibrium():

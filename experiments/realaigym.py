@@ -1,0 +1,403 @@
+"""Plays the double pendulum of the RealAIGym league (simulation board of 2025): swing up from anywhere, and stay there.
+
+``python -m gpmpc.experiments.realaigym robot=acrobot model=residual seeds=0,1 draws=3`` learns a model, lets the
+league's own classes disturb and simulate, and prints the board with a row of ours. Models: ``true`` (the published
+equations and parameters), ``residual`` (a GP beside a rigid body each of whose parameters is 15 % wrong) and ``gp`` (a
+GP alone). They are learned from 60 s: 20 s of random torque, then four times 10 s of the league's own test under the
+model learned so far.
+
+The league's simulator: github.com/dfki-ric-underactuated-lab/double_pendulum, its ``src/python`` on PYTHONPATH.
+"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
+from time import perf_counter
+from typing import Any
+
+import casadi
+import numpy as np
+import torch
+
+from gpmpc.exceptions import GpmpcError, SettingError
+from gpmpc.gp import GPPosterior, Trainer, Transitions, standardize
+from gpmpc.gp.sparse_training import informative_points
+from gpmpc.models import Affine, CasadiFunction, Features, KnownModel, ResidualModel
+from gpmpc.mpc import GPMPC, Box, ControlLoop, Decision, ManyStarts, PredictionSettings, Problem, Reference, Tracking
+from gpmpc.mpc.linear_quadratic import dlqr
+from gpmpc.propagation import Linearization
+from gpmpc.systems import System, double_pendulum, step
+
+Array = np.ndarray
+
+ACTUATED = {"acrobot": "elbow", "pendubot": "shoulder"}
+PUBLISHED = {  # simulation board of 2025: mean score of the best entries, acados with the true model, and MC-PILCO (GP)
+    "acrobot": {"AR-EAPO": 0.658, "VIMPPI": 0.648, "acados MPC": 0.630, "MC-PILCO": 0.307},
+    "pendubot": {"VIMPPI": 0.799, "AR-EAPO": 0.759, "acados MPC": 0.726, "MC-PILCO": 0.509},
+}
+INSTALL = (
+    "the league's simulator is not installed: git clone https://github.com/dfki-ric-underactuated-lab/double_pendulum, "
+    "put its src/python on PYTHONPATH, and pip install dill tabulate lxml filterpy pyyaml sympy"
+)
+PLAN, INPUT = 0.02, 0.002  # time steps of plans and of torques [s]
+TORQUE, LINE, DURATION = 6.0, 0.45, 60.0  # limit [N m], height to be above [m], length of a test [s]
+LENGTHS = 0.2, 0.3  # [m]
+WILD = 25.0, 38.0  # rates beyond which transitions are not learned from [rad/s]
+REPLAN = 5.0  # predicted time below the line above which a plan is given up [s]
+
+
+def state_of(x: Any) -> Array:
+    """Our state (shoulder from upright, its rate, elbow, its rate) of the league's (angles, rates), hanging at zero."""
+    return np.array([x[0] - np.pi, x[2], x[1], x[3]], dtype=float)
+
+
+def heights(states: Array) -> Array:
+    """Height of the tip (...,) over the shoulder [m]."""
+    return LENGTHS[0] * np.cos(states[..., 0]) + LENGTHS[1] * np.cos(states[..., 0] + states[..., 2])
+
+
+def casadi_model(system: System) -> CasadiFunction:
+    """The step of a system as a function that can be linearised."""
+    x, u = casadi.SX.sym("x", len(system.state_names)), casadi.SX.sym("u", len(system.input_names))
+    return CasadiFunction(casadi.Function("successor", [x, u], [casadi.vertcat(*system.successor(x, u))]))
+
+
+def wrong_system(robot: str, error: float, seed: int) -> System:
+    """The pendulum with every mass, length and inertia wrong by a share, up or down at random."""
+    d, signs = double_pendulum(ACTUATED[robot]).dynamics, np.random.default_rng(seed).choice([-1.0, 1.0], 7)
+    values = np.array([*d.masses, d.first_length, *d.centres, *d.inertias]) * (1 + error * signs)
+    parts = {"masses": values[:2], "first_length": values[2], "centres": values[3:5], "inertias": values[5:]}
+    given: Any = {key: tuple(map(float, v)) if np.ndim(v) else float(v) for key, v in parts.items()}
+    return double_pendulum(ACTUATED[robot], **given)
+
+
+@dataclass
+class Pilot:
+    """Flies a plan at 50 Hz and its feedback at 500 Hz, and searches anew when the league takes the pendulum away.
+
+    Attributes:
+        controller: Of plans.
+        joint: With the motor: 0, 1.
+        gain: Share of the feedback that is applied between plans.
+        seconds: Time of each decision [s].
+        searched: Decisions that began without a plan.
+    """
+
+    controller: ManyStarts
+    joint: int
+    gain: float = 1.0
+    seconds: list[float] = field(default_factory=list)
+    searched: list[bool] = field(default_factory=list)
+    _loop: ControlLoop | None = None
+    _last: float = -1.0
+    _count: int = 0
+
+    def torques(self, x: Any, t: float) -> Array:
+        """The torques of both joints (2,) at a state in the league's order and a time [s]."""
+        lost, state = self._loop is None or t - self._last > 1.5 * INPUT, state_of(x)
+        if lost:
+            self._loop, self._count = ControlLoop(self.controller), 0
+        share, self._last = self._count * INPUT / PLAN, t
+        if self._count == 0:
+            begin = perf_counter()
+            torque = self._loop.input(state, Reference(np.zeros(4)))
+            self.seconds.append(perf_counter() - begin)
+            self.searched.append(lost)
+        elif self.gain > 0:
+            torque = self._loop.last.input
+            torque = torque + self.gain * (self._loop.input_between(state, share) - torque)
+        else:
+            torque = self._loop.last.input
+        self._count = (self._count + 1) % round(PLAN / INPUT)
+        out = np.zeros(2)
+        out[self.joint] = np.clip(torque[0], -TORQUE, TORQUE)
+        return out
+
+
+def league_controller(base: type, pilot: Pilot) -> Any:
+    """A controller in the league's interface (``AbstractController`` or what stands for it) that a pilot flies."""
+
+    class GPMPCController(base):
+        def get_control_output_(self, x: Any, t: float | None = None) -> Array:
+            return pilot.torques(x, 0.0 if t is None else t)
+
+    return GPMPCController()
+
+
+def pilot(model: Any, robot: str, horizon: int = 40, programs: int = 10, wild: bool = True, gain: float = 1.0) -> Pilot:
+    """Makes the controller of a model.
+
+    Args:
+        model: Predicts the state 20 ms later.
+        robot: ``"acrobot"`` or ``"pendubot"``.
+        horizon: Stages of 20 ms.
+        programs: Of each start.
+        wild: Whether starts with kicks are taken besides the straight line and the drift.
+        gain: Share of the feedback between plans.
+    """
+    Q, R = np.diag([10.0, 0.1, 10.0, 0.1]), np.array([[0.01]])
+    upright = model.linearize(np.zeros((1, 4)), np.zeros((1, 1)), False)
+    P = _cost_to_go(upright.A[0], upright.B[0], Q, R)
+    problem = Problem(Tracking(Q, R, 10.0 * P, penalized="inputs", angles=(0, 2)), inputs=Box([-TORQUE], [TORQUE]))
+
+    def time_below(decision: Decision, reference: Reference) -> float:
+        """Predicted time below the line, and more where the plan ends away from upright [s]."""
+        off = decision.means[-1] - reference.states[-1]
+        below = PLAN * float(np.sum(heights(decision.means[1:]) < LINE))
+        return below + min(10.0, float(off @ P @ off) / 15.0)
+
+    def make(iterations: int) -> GPMPC:
+        settings = PredictionSettings(covariance="none", rolled_out=True)
+        return GPMPC(model, Linearization(), problem, horizon, [0.0], settings, iterations=iterations, tolerance=1e-2)
+
+    guesses: list[Array | None] = [None, np.zeros((horizon, 1))]
+    if wild:
+        for sign in (0.5, -0.5):
+            kick = np.zeros((horizon, 1))
+            kick[: horizon // 6], kick[horizon // 6 : horizon // 3] = sign * TORQUE, -sign * TORQUE
+            guesses.append(kick)
+    controller = ManyStarts(make(1), make(programs), guesses, (2, 3), time_below, REPLAN)
+    return Pilot(controller, 1 if robot == "acrobot" else 0, gain)
+
+
+def _cost_to_go(A: Array, B: Array, Q: Array, R: Array) -> Array:
+    K = dlqr(A, B, Q, R)
+    closed, P, total = A - B @ K, Q + K.T @ R @ K, np.zeros_like(A)
+    for _ in range(5000):
+        total, P = total + P, closed.T @ P @ closed
+    return (total + total.T) / 2
+
+
+@dataclass
+class Play:
+    """One test of the league's, or its beginning.
+
+    Attributes:
+        score: Share of the time with the tip above the line.
+        states: The league's, every 2 ms (T + 1, 4).
+        torques: Applied (T, 2).
+    """
+
+    score: float
+    states: Array
+    torques: Array
+
+
+def play(who: Pilot, robot: str, seed: int, seconds: float = DURATION, unmodified: bool = False) -> Play:
+    """Runs the league's simulation and disturbances, drawn from a seed.
+
+    Args:
+        who: Flies.
+        robot: ``"acrobot"`` or ``"pendubot"``.
+        seed: Of the disturbances.
+        seconds: Of 60.
+        unmodified: Also the plant's right-hand side is the league's code, which takes ten times longer than ours.
+    """
+    from double_pendulum.analysis.leaderboard import get_uptime
+    from double_pendulum.controller.abstract_controller import AbstractController
+    from double_pendulum.controller.global_policy_testing_controller import GlobalPolicyTestingControllerV2
+    from double_pendulum.model.plant import DoublePendulumPlant
+    from double_pendulum.simulation.simulation import Simulator
+
+    limited, unlimited = (league_parameters(limits) for limits in (torque_limits(robot), [TORQUE, TORQUE]))
+    plant = DoublePendulumPlant(model_pars=unlimited)
+    if not unmodified:
+        plant.rhs = right_hand_side()
+    np.random.seed(seed)  # noqa: NPY002 (the league draws from it)
+    controller = GlobalPolicyTestingControllerV2(
+        league_controller(AbstractController, who),
+        goal=[np.pi, 0.0, 0.0, 0.0],
+        n_disturbances=15,
+        t_max=DURATION,
+        reset_length=0.2,
+        mpar=unlimited,
+    )
+    times, states, torques = Simulator(plant=plant).simulate(0.0, [0.0] * 4, seconds, INPUT, controller, "runge_kutta")
+    times, states = np.array(times), np.array(states)
+    return Play(get_uptime(times, states, mpar=limited) / seconds, states, np.array(torques)[:, :2])
+
+
+def league_parameters(limits: list[float]) -> Any:
+    """The league's parameters of design C.1, model 1.1, without friction and motor inertia, from our system."""
+    from double_pendulum.model.model_parameters import model_parameters
+
+    d, found = double_pendulum().dynamics, model_parameters()
+    found.set_mass(list(d.masses))
+    found.set_length(list(LENGTHS))
+    found.set_com(list(d.centres))
+    found.set_inertia([i + m * r * r for i, m, r in zip(d.inertias, d.masses, d.centres, strict=True)])
+    found.set_gravity(9.81)
+    found.set_motor_inertia(0.0)
+    found.set_damping([0.0, 0.0])
+    found.set_cfric([0.0, 0.0])
+    found.set_torque_limit(limits)
+    return found
+
+
+def torque_limits(robot: str) -> list[float]:
+    """Largest torques of both joints [N m]."""
+    return [0.0, TORQUE] if robot == "acrobot" else [TORQUE, 0.0]
+
+
+def right_hand_side() -> Callable[[float, Array, Array], Array]:
+    """d/dt of the league's state under two torques, by our own equations."""
+    shoulder, elbow = (double_pendulum(ACTUATED[robot]).dynamics for robot in ("pendubot", "acrobot"))
+
+    def derivative(t: float, x: Array, tau: Array) -> Array:
+        state = [x[0] - np.pi, float(x[2]), float(x[1]), float(x[3])]
+        first, second = shoulder.derivative(state, [float(tau[0])]), elbow.derivative(state, [0.0])
+        moved = elbow.derivative(state, [float(tau[1])])
+        return np.array([x[2], x[3], *(first[i] + moved[i] - second[i] for i in (1, 3))])
+
+    return derivative
+
+
+def random_record(robot: str, seconds: float, seed: int) -> list[Play]:
+    """Records of 2 s each, hanging at first, under torques that are drawn anew every 0.1 s."""
+    system = replace(double_pendulum(ACTUATED[robot], time_step=INPUT), substeps=1)
+    rng, joint, records = np.random.default_rng(seed), 1 if robot == "acrobot" else 0, []
+    for _ in range(round(seconds / 2)):
+        state, states, torques = np.array([np.pi, 0.0, 0.0, 0.0]), [], []
+        for k in range(1000):
+            torque = rng.uniform(-TORQUE, TORQUE) if k % 50 == 0 else torques[-1][joint]
+            states.append([state[0] + np.pi, state[2], state[1], state[3]])
+            torques.append(np.eye(2)[joint] * torque)
+            state = step(system, state, np.array([torque]))
+        states.append([state[0] + np.pi, state[2], state[1], state[3]])
+        records.append(Play(0.0, np.array(states), np.array(torques)))
+    return records
+
+
+def transitions(records: list[Play], robot: str, spread: float = 0.05) -> Transitions:
+    """Transitions over 20 ms with a torque that changed by at most ``spread`` [N m], and none on the passive joint."""
+    joint, count = 1 if robot == "acrobot" else 0, round(PLAN / INPUT)
+    states, inputs, after = [], [], []
+    for record in records:
+        for i in range(0, len(record.torques) - count, count // 2):
+            u, ends = record.torques[i : i + count], [state_of(record.states[j]) for j in (i, i + count)]
+            calm = np.abs(ends)[:, [1, 3]].max(axis=0) < WILD
+            if np.ptp(u[:, joint]) <= spread and not u[:, 1 - joint].any() and calm.all():
+                states.append(ends[0])
+                inputs.append([u[:, joint].mean()])
+                after.append(ends[1])
+    return Transitions(np.array(states), np.array(inputs), np.array(after))
+
+
+def learn(data: Transitions, nominal: Any, before: Any = None, points: int = 700) -> ResidualModel:
+    """Learns what a nominal model misses, from the most informative transitions.
+
+    The hyperparameters are trained on half of them, from those of the model ``before`` on.
+    """
+    scales = torch.tensor([1.5, 1.5, 9.0, 1.5, 1.5, 9.0, 9.0], dtype=torch.float64)  # sine, cosine, rate, ..., torque
+    trainer = Trainer(
+        predicts="value", scaling=standardize, restarts=0, subset=None, tolerance=1e-6, signal_to_noise_limit=3e3
+    )
+    x, u = data.states, data.inputs
+    seen = torch.cat(Features(range(4), [0], (0, 2), 4, 1)(x, u), dim=1), data.next_states - nominal(x, u)
+    one, noise = torch.ones(1, dtype=torch.float64), torch.full((1,), 1e-8, dtype=torch.float64)
+    rows = informative_points(seen[0], (scales[None], one, noise), points)
+    features, targets = (part[rows] for part in seen)
+    half, start = points // 2, None if before is None else before.residual
+    found = trainer.fit(features[:half], targets[:half], 1, start=start).posterior
+    kernel = found.lengthscales, found.signal_variance, found.noise_variance
+    posterior = GPPosterior.from_hyperparameters(features, targets, *kernel, 1, "value", found.offset)
+    return ResidualModel(nominal, posterior, torch.eye(4, dtype=torch.float64), range(4), [0], 1, (0, 2))
+
+
+def learned_model(robot: str, kind: str, seed: int, error: float = 0.15) -> Any:
+    """The model of 60 s of interaction: 20 s of random torque, and four times 10 s of the league's test."""
+    if kind == "gp":
+        nominal: Any = Affine.identity(4, 1)
+        nominal.A[[0, 2], [1, 3]] = PLAN  # an angle moves by its rate
+    else:
+        nominal = casadi_model(wrong_system(robot, error, seed))
+    records = random_record(robot, 20.0, seed)
+    model = learn(transitions(records, robot), nominal)
+    for round_ in range(4):
+        who = pilot(model, robot, wild=False, gain=0.0)
+        records.append(play(who, robot, 5000 + 100 * seed + round_, 10.0))
+        _say(f"  round {round_ + 1}: {20 + 10 * (round_ + 1)} s of interaction, score {records[-1].score:.3f}")
+        model = learn(transitions(records, robot), nominal, model)
+    return model
+
+
+def board(robot: str, kind: str, seeds: list[int], draws: list[int], **settings: Any) -> list[dict[str, Any]]:
+    """Plays a number of draws with the model of each seed; prints and returns one row for each play."""
+    rows = []
+    for seed in seeds:
+        begin = perf_counter()
+        model = KnownModel(casadi_model(double_pendulum(ACTUATED[robot])), 4, 1)
+        if kind != "true":
+            model = learned_model(robot, kind, seed)
+        learning = perf_counter() - begin
+        for draw in draws:
+            who = pilot(model, robot, **settings)
+            found, ms = play(who, robot, draw), 1e3 * np.array(who.seconds)
+            search = np.array(who.searched)
+            rows.append(
+                {"robot": robot, "model": kind, "seed": seed, "draw": draw, "score": found.score}
+                | {"learning": learning, "searches": int(search.sum()), "search": float(np.median(ms[search]))}
+                | {"median": float(np.median(ms[~search])), "p99": float(np.quantile(ms[~search], 0.99))}
+            )
+            _say("  " + "  ".join(f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()))
+    return rows
+
+
+def table(robot: str, rows: list[dict[str, Any]]) -> str:
+    """The league's board with rows of ours: a line for each model."""
+    best = max(PUBLISHED[robot].values())
+    lines = [
+        f"| {robot}, simulation 2025 | draws | mean | worst | above the best | decision ms (median, p99) | search ms |"
+    ]
+    lines += ["|---|---|---|---|---|---|---|"]
+    ours = {}
+    for kind in dict.fromkeys(row["model"] for row in rows):
+        mine = [row for row in rows if row["model"] == kind]
+        scores = np.array([row["score"] for row in mine])
+        cells = (
+            f"{len(scores)} of {len({row['seed'] for row in mine})} seeds",
+            f"{scores.mean():.3f}",
+            f"{scores.min():.3f}",
+        )
+        times = [np.median([row[key] for row in mine]) for key in ("median", "p99", "search")]
+        cells += f"{100 * np.mean(scores > best):.0f} %", f"{times[0]:.1f}, {times[1]:.1f}", f"{times[2]:.0f}"
+        ours[f"gpmpc, {kind} model"] = scores.mean(), cells
+    every = [(score, name, ("published", f"{score:.3f}", "", "", "", "")) for name, score in PUBLISHED[robot].items()]
+    every += [(score, name, cells) for name, (score, cells) in ours.items()]
+    lines += [f"| {name} | {' | '.join(cells)} |" for _, name, cells in sorted(every, reverse=True)]
+    return "\n".join(lines)
+
+
+def main(arguments: list[str]) -> int:
+    """Reads ``robot=``, ``model=``, ``seeds=`` and ``draws=``, plays, and prints the board."""
+    given = {"robot": "acrobot", "model": "true", "seeds": "0", "draws": "3"}
+    try:
+        for argument in arguments:
+            key, _, value = argument.partition("=")
+            if key not in given:
+                raise SettingError(key, f"must be one of {', '.join(given)}")
+            given[key] = value
+        if given["robot"] not in ACTUATED:
+            raise SettingError("robot", f"must be one of {', '.join(ACTUATED)}; got {given['robot']!r}")
+        if given["model"] not in ("true", "residual", "gp"):
+            raise SettingError("model", f"must be true, residual or gp; got {given['model']!r}")
+        if not (given["seeds"].replace(",", "").isdigit() and given["draws"].isdigit()):
+            raise SettingError("seeds, draws", "must be numbers such as 0,1 and a number of draws such as 3")
+        if find_spec("double_pendulum") is None:
+            raise SettingError("simulator", INSTALL)
+        seeds = [int(seed) for seed in given["seeds"].split(",")]
+        rows = board(given["robot"], given["model"], seeds, [100 + i for i in range(int(given["draws"]))])
+    except GpmpcError as error:
+        print(f"realaigym: {error}", file=sys.stderr)
+        return 2
+    _say(table(given["robot"], rows))
+    return 0
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,140 @@
+"""The league's experiment: interface, equations, what is learned from, what is said without the simulator."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.experiments import realaigym
+from gpmpc.experiments.realaigym import (
+    ACTUATED,
+    Play,
+    casadi_model,
+    heights,
+    league_controller,
+    learn,
+    main,
+    pilot,
+    random_record,
+    right_hand_side,
+    state_of,
+    table,
+    transitions,
+    wrong_system,
+)
+from gpmpc.models import KnownModel
+from gpmpc.systems import double_pendulum
+
+
+class Interface:
+    """What the league documents of a controller: torques of both joints for angles, rates and a time."""
+
+    def get_control_output(self, x, t=None):
+        return np.asarray(self.get_control_output_(x, t))
+
+
+def true_model(robot):
+    return KnownModel(casadi_model(double_pendulum(ACTUATED[robot])), 4, 1)
+
+
+@pytest.mark.parametrize(("robot", "joint"), [("acrobot", 1), ("pendubot", 0)])
+def test_a_controller_in_the_leagues_interface_plans_at_50_hz_and_drives_one_joint(robot, joint):
+    who = pilot(true_model(robot), robot, horizon=25, programs=3, wild=False)
+    controller, rhs, x = league_controller(Interface, who), right_hand_side(), np.array([0.2, -0.1, 0.0, 0.5])
+    torques = []
+    for k in range(40):
+        torques.append(controller.get_control_output(x, 0.002 * k))
+        x = x + 0.002 * rhs(0.0, x, torques[-1])
+    torques = np.array(torques)
+    assert len(who.seconds) == 4
+    assert who.searched == [True, False, False, False]
+    assert not torques[:, 1 - joint].any()
+    assert np.abs(torques).max() <= 6.0
+    assert len(set(torques[:10, joint])) > 1  # the feedback between plans
+    controller.get_control_output(x, 0.5)  # the league had taken it away: a new search
+    assert who.searched == [True, False, False, False, True]
+
+
+def test_hanging_is_below_and_upright_above_the_line():
+    hanging, upright = state_of([0.0, 0.0, 1.0, 2.0]), state_of([np.pi, 0.0, 0.0, 0.0])
+    assert np.array_equal(hanging, [-np.pi, 1.0, 0.0, 2.0])
+    assert heights(np.array([hanging, upright])) == pytest.approx([-0.5, 0.5])
+
+
+def test_every_parameter_of_the_wrong_body_is_wrong_by_the_share_and_seeds_differ():
+    true, bodies = double_pendulum("elbow").dynamics, [wrong_system("acrobot", 0.15, seed).dynamics for seed in (0, 1)]
+    for body in bodies:
+        for key in ("masses", "first_length", "centres", "inertias"):
+            ratio = np.array(getattr(body, key)) / np.array(getattr(true, key))
+            assert np.allclose(np.abs(ratio - 1), 0.15)
+    assert bodies[0] != bodies[1]
+
+
+def test_learned_from_are_calm_transitions_without_a_torque_on_the_passive_joint():
+    states, torques = np.zeros((101, 4)), np.zeros((100, 2))
+    torques[:, 1] = np.repeat([1.0, 2.5], 50)
+    torques[80:, 0] = 1.0
+    states[:20, 2] = 30.0
+    found = transitions([Play(0.0, states, torques)], "acrobot")
+    # of 18 windows of 10 samples, every 5: 4 begin wild, 1 spans the jump, 3 have a torque on the passive joint
+    assert len(found.states) == 10
+    assert set(found.inputs[:, 0].tolist()) == {1.0, 2.5}
+
+
+def test_a_residual_learned_from_random_torques_predicts_better_than_the_wrong_body():
+    nominal, data = (
+        casadi_model(wrong_system("pendubot", 0.15, 3)),
+        transitions(random_record("pendubot", 5.0, 0), "pendubot"),
+    )
+    test = transitions(random_record("pendubot", 5.0, 1), "pendubot")
+    model = learn(data, nominal, points=80)
+    truth = true_model("pendubot").predict(test.states, test.inputs).mean
+    assert torch.allclose(truth, test.next_states, atol=0.05)
+    errors = [
+        (f(test.states, test.inputs) - test.next_states).square().mean()
+        for f in (lambda x, u: model.predict(x, u).mean, nominal)
+    ]
+    assert errors[0] < 0.1 * errors[1]
+
+
+def test_the_board_is_sorted_and_says_what_share_of_draws_is_above_the_best():
+    rows = [
+        {"model": "gp", "seed": seed, "score": score, "median": 4.0, "p99": 9.0, "search": 600.0}
+        for seed, score in ((0, 0.7), (1, 0.6))
+    ]
+    lines = table("acrobot", rows).splitlines()
+    assert lines[3] == "| gpmpc, gp model | 2 of 2 seeds | 0.650 | 0.600 | 50 % | 4.0, 9.0 | 600 |"
+    assert [line.split("|")[1].strip() for line in lines[2:5]] == ["AR-EAPO", "gpmpc, gp model", "VIMPPI"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "realaigym: simulator: the league's simulator is not installed: git clone https://github.com/dfki-ric"),
+        (["robot=arm"], "realaigym: robot: must be one of acrobot, pendubot; got 'arm'"),
+        (["model=best"], "realaigym: model: must be true, residual or gp; got 'best'"),
+        (["speed=2"], "realaigym: speed: must be one of robot, model, seeds, draws"),
+        (["draws=many"], "realaigym: seeds, draws: must be numbers such as"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, monkeypatch, capsys):
+    monkeypatch.setattr(realaigym, "find_spec", lambda name: None)
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(message)
+    assert said.count("\n") == 1
+
+
+def test_our_equations_are_those_of_the_leagues_simulator(rng):
+    plants = pytest.importorskip("double_pendulum.model.plant")
+    plant, ours = plants.DoublePendulumPlant(model_pars=realaigym.league_parameters([6.0, 6.0])), right_hand_side()
+    for _ in range(20):
+        x, torques = rng.normal(size=4) * [2.0, 2.0, 10.0, 10.0], rng.uniform(-6, 6, 2)
+        assert np.allclose(ours(0.0, x, torques), plant.rhs(0.0, x, torques), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_true_model_swings_up_in_the_unmodified_simulation():
+    pytest.importorskip("double_pendulum")
+    who = pilot(true_model("pendubot"), "pendubot", wild=False)
+    found = realaigym.play(who, "pendubot", 0, seconds=3.0, unmodified=True)
+    assert found.score > 0.6

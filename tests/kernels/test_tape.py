@@ -1,0 +1,63 @@
+"""A tape gives what CasADi gives, value and derivatives, and says where it cannot."""
+
+import casadi
+import numpy as np
+import pytest
+
+from gpmpc.gp.casadi_ import tape_of
+from gpmpc.kernels.gp_rollout import Feedback
+from gpmpc.models import CasadiFunction, KnownModel
+from gpmpc.models.roll_out import RollOut
+from gpmpc.systems import double_pendulum, step
+
+X, U = casadi.SX.sym("x", 3), casadi.SX.sym("u", 2)
+EVERY = casadi.vertcat(
+    X[0] / X[1] - casadi.atan2(X[2], U[0]) + casadi.sqrt(1 + X[0] ** 2),
+    casadi.exp(-X[1]) * casadi.fmin(X[0], U[1]) + casadi.fmax(X[2], U[0]) - casadi.tan(0.3 * X[0]),
+    casadi.tanh(X[2]) * casadi.log(2 + casadi.sin(U[0]) ** 2) + casadi.atan(U[1]) + 1 / (3 + casadi.cos(X[0])),
+    casadi.fabs(X[0]) ** 1.5 + (2 + X[1] ** 2) ** X[2] - 2 * U[1],
+)
+
+
+MATRIX = casadi.horzcat(casadi.vertcat(X[0] * X[1], casadi.sin(X[2])), casadi.vertcat(2.0, X[1] ** 3))
+FUNCTIONS = casadi.Function("f", [X, U], [EVERY]), casadi.Function("f", [X], [MATRIX])
+
+
+@pytest.mark.parametrize("function", FUNCTIONS, ids=["vector", "matrix"])
+def test_a_tape_has_the_values_and_derivatives_of_casadi(function, rng):
+    compiled, plain = CasadiFunction(function), CasadiFunction(function)
+    plain.tape, names = None, function.name_in()
+    plain._expansion = function.factory("e", names, ["o0", *(f"jac:o0:{name}" for name in names)])
+    assert compiled.tape is not None
+    arguments = [rng.uniform(0.2, 2, (7, size)) for size in (3, 2)[: len(names)]]
+    for found, expected in zip(compiled.linearize(*arguments), plain.linearize(*arguments), strict=True):
+        assert found.shape == expected.shape
+        assert np.allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_expressions_of_matrices_are_expanded_and_other_calls_have_no_tape():
+    x = casadi.MX.sym("x", 2)
+    assert tape_of(casadi.Function("f", [x], [casadi.sin(x) @ x.T])) is not None
+    assert tape_of(casadi.Function("f", [X], [casadi.floor(X)])) is None
+    table = casadi.interpolant("table", "bspline", [[0.0, 1.0, 2.0, 3.0, 4.0]], [0.0, 1.0, 4.0, 9.0, 16.0])
+    assert tape_of(casadi.Function("f", [x], [table(x[0])])) is None
+
+
+def test_a_known_model_is_rolled_out_in_one_call_under_a_feedback_within_bounds(rng):
+    system, H = double_pendulum("shoulder"), 12
+    x, u = casadi.SX.sym("x", 4), casadi.SX.sym("u", 1)
+    function = casadi.Function("successor", [x, u], [casadi.vertcat(*system.successor(x, u))])
+    model = KnownModel(CasadiFunction(function), 4, 1)
+    planned, gains = rng.normal(size=(2, H, 4)), rng.normal(size=(2, H, 1, 4))
+    limits = np.array([-6.0]), np.array([6.0]), np.array([-3.0]), np.array([3.0]), np.array([0.5])
+    feedback = Feedback(planned, rng.uniform(-4, 4, (2, H, 1)), gains, *limits)
+    starts, gust = rng.normal(size=(2, 4)), np.array([0.0, 0.1, 0.0, 0.0])
+    states, inputs = RollOut(model)(starts, feedback, gust)
+    for t in range(2):
+        state, last = starts[t], 0.5
+        for k in range(H):
+            wanted = feedback.inputs[t, k, 0] + gains[t, k, 0] @ (state - planned[t, k])
+            last = np.clip(np.clip(wanted, last - 3, last + 3), -6, 6)
+            assert inputs[t, k, 0] == pytest.approx(last, rel=1e-9, abs=1e-12)
+            state = step(system, state, inputs[t, k]) + gust
+            assert np.allclose(states[t, k + 1], state, rtol=1e-9, atol=1e-9)
