@@ -24,7 +24,6 @@ will see the next states and correct what went wrong (Hewing, Kabzan and Zeiling
 finite-horizon LQR at the first stage. It is part of the covariances only: the bounds of the inputs hold for u_k.
 """
 
-import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -161,7 +160,6 @@ class PredictionModel:
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         self.costs = StageCosts(problem, horizon, self.linearizer)
         self._roll_out = RollOut(model)
-        self._prior = self.linearizer.prior_variances()
         self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
 
     def with_model(self, model: DynamicsModel) -> "PredictionModel":
@@ -345,10 +343,6 @@ class PredictionModel:
         stages = LinearizedStages(*map(np.concatenate, zip(*parts, strict=True)))
         return self.predict(Plan(states, inputs, covariances), stages, request)
 
-    def novelty(self, stages: LinearizedStages) -> float:
-        """The largest standard deviation that a stage adds, over the one without data; NaN where that is not known."""
-        return call_unchecked(_largest_ratio, stages.V, self._prior) if len(self._prior) else math.nan
-
     def gain(self, stages: LinearizedStages, cost: QuadraticCost) -> Array:
         """K (m, n) of the feedback u = u_k - K (x - mu_k) at the first stage; zero without feedback."""
         return self.gains(stages.A[:1], stages.B[:1], cost)[0]
@@ -403,13 +397,3 @@ def _predict_covariances(A, B, V, start, K, covariances):
                 for c in range(n):
                     total += moved[i, c] * closed[j, c]
                 after[i, j] = after[j, i] = total
-
-
-@compiled
-def _largest_ratio(V, prior):
-    """The root of the largest V_kii / prior_i."""
-    largest = 0.0
-    for k in range(len(V)):
-        for i in range(len(prior)):
-            largest = max(largest, V[k, i, i] / prior[i] if prior[i] > 0.0 else 0.0)
-    return math.sqrt(largest)

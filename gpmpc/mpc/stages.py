@@ -94,11 +94,11 @@ class StageLinearizer:
 
     def prior_variances(self) -> Array:
         """What V is far from all data (n,), for GPs in an affine form; empty where V is zero or that is not known."""
-        form = getattr(self.model, "affine_form", None)
-        if form is None or not self.at_points or self.covariance == "none":
+        form = getattr(self.model, "affine_form", None) if self.at_points and self.covariance != "none" else None
+        if form is None:
             return np.empty(0)
-        latent = to_array(form.f.signal_variance)
-        found = latent if form.B is None else to_array(form.B) ** 2 @ latent
+        found = to_array(form.f.signal_variance)
+        found = found if form.B is None else to_array(form.B) ** 2 @ found
         return np.ascontiguousarray(found if self._noise is None else found + np.diagonal(self._noise))
 
     def weight(self, Q: Array) -> Array:
@@ -287,8 +287,11 @@ class ConstraintRows:
         self.per_stage, self.soft = len(kappa), bool(np.isfinite(self.prices).any())
         margins = self._kappa if covariance == "zero_order" else np.zeros(self.per_stage)
         self._margins = np.tile(margins, (horizon, 1))
-        mixed = bool((np.count_nonzero(self._F, axis=1) > 1).any())
-        moves = mixed if covariance == "diagonal" else covariance == "full" and self.per_stage > 0
+        moves = (
+            bool((np.count_nonzero(self._F, axis=1) > 1).any())
+            if covariance == "diagonal"
+            else covariance == "full" and self.per_stage > 0
+        )
         self.smooth, moves = bool(self._smooth), moves or bool(self._smooth)
         self._constant = None if moves else self._rows(self._F[None], np.zeros((1, n, n)))
         self._fixed = None
