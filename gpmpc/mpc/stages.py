@@ -94,12 +94,11 @@ class StageLinearizer:
 
     def prior_variances(self) -> Array:
         """What V is far from all data (n,), for GPs in an affine form; empty where V is zero or that is not known."""
-        form = getattr(self.model, "affine_form", None) if self.at_points and self.covariance != "none" else None
-        if form is None:
+        form = getattr(self.model, "affine_form", None)
+        if form is None or not self.at_points or self.covariance == "none":
             return np.empty(0)
-        found = to_array(form.f.signal_variance)
-        found = found if form.B is None else to_array(form.B) ** 2 @ found
-        return np.ascontiguousarray(found if self._noise is None else found + np.diagonal(self._noise))
+        B = np.eye(self._n) if form.B is None else to_array(form.B)
+        return B**2 @ to_array(form.f.signal_variance) + (0.0 if self._noise is None else np.diagonal(self._noise))
 
     def weight(self, Q: Array) -> Array:
         """The weights of s that belong to weights of x (K, n, n): the blocks on their diagonals (K, p / n, n, n)."""
@@ -224,12 +223,7 @@ class StageCosts:
         self.quadratic = QuadraticCost(*weights, PENALIZED.index(cost.penalized), np.empty((0, n + m + 1, n + m + 1)))
 
     def at(self, plan: Plan, parameters: Array | None = None) -> QuadraticCost:
-        """The cost with its outputs linearised along a plan.
-
-        Raises:
-            ShapeError: An output has another shape.
-            DataError: It is not finite.
-        """
+        """The cost with its outputs linearised along a plan; raises what ``expand_function`` does."""
         if not self.outputs:
             return self.quadratic
         n = self._Q.shape[1]
