@@ -78,6 +78,24 @@ def test_the_example_of_a_wall_keeps_the_cart_behind_it_as_often_as_it_says(tmp_
     assert (tmp_path / "wall.png").stat().st_size > 10_000
 
 
+def test_the_example_of_a_reactor_earns_more_than_at_its_operating_point_and_stays_cool(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["reactor.py", str(tmp_path)])
+    names = runpy.run_path(str(EXAMPLES / "reactor.py"), run_name="__main__")
+    economic, held = (flight.states for flight in names["flights"].values())
+    assert economic[100:, 0].mean() < held[100:, 0].mean() - 0.02
+    assert (economic[1:, 1] > names["HOTTEST"]).mean() <= 0.05
+    assert (tmp_path / "reactor.png").stat().st_size > 10_000
+
+
+def test_the_example_of_moving_obstacles_reaches_its_goal_and_touches_none(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["obstacles.py", str(tmp_path)])
+    names = runpy.run_path(str(EXAMPLES / "obstacles.py"), run_name="__main__")
+    assert names["away"] < 0.2
+    assert names["nearest"] > 0.0
+    assert names["loop"].failures == 0
+    assert (tmp_path / "obstacles.png").stat().st_size > 10_000
+
+
 def test_the_example_of_learning_while_flying_finds_the_heavier_vehicle(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["learning.py", str(tmp_path)])
     names = runpy.run_path(str(EXAMPLES / "learning.py"), run_name="__main__")

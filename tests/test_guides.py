@@ -44,6 +44,7 @@ def test_the_loops_of_the_guides_reach_their_goals(path, page):
     names, _ = page(path)
     assert names["reached"] < 0.05
     assert names.get("closest", 0.3) > 0.3 - 0.02
+    assert abs(names.get("away", 0.5) - 0.5) < 0.02
 
 
 def test_a_new_project_runs_at_once(tmp_path, monkeypatch):

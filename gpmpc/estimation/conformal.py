@@ -14,9 +14,14 @@ In a closed loop with another controller it is a measured number, no more.
 
     alpha <- alpha + rate (1 - eta - err),    kappa = quantile of the scores at 1 - alpha
 
-Whatever the plant does, the share of T predictions of stage k that did not hold exceeds 1 - eta by no more than
-(1 + rate (k + 1)) / (rate T), **guaranteed** as long as no score exceeds ``largest``. That is a promise of the long
-run, not of a moment.
+Whatever the plant does, of T predictions of stage k no more than T a + a / rate + k + 1 do not hold, a = 1 - eta the
+share it aims at, **guaranteed** as long as no score exceeds ``largest``: alpha begins at a, and below zero, where kappa
+is the largest, only predictions made before can miss. That is a promise of the long run, not of a moment.
+
+To be at or below 1 - eta with confidence it has to aim lower. Of T decisions m may be misses, m the largest number
+whose exact upper 95 % limit (Clopper and Pearson, 1934) is at or below 1 - eta; so ``decisions=T`` aims at
+
+    a = (m - k - 1) / (T + 1 / rate).
 """
 
 import math
@@ -25,6 +30,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.stats import beta
 
 from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.dynamics import Array, DynamicsModel
@@ -142,23 +148,28 @@ class AdaptiveTube:
     Args:
         tube: Scores to begin with.
         probability: eta.
-        rate: By how much one prediction that did not hold moves alpha; larger adapts faster and varies more.
+        rate: By how much one prediction that did not hold moves alpha; larger adapts faster and varies more, at rare
+            violations most of all. By default (1 - eta) / 5.
         noise: Covariance of the measurements of what ``observe`` is given (n, n); none by default.
         largest: The largest number of standard deviations; twice the largest score of all by default.
+        decisions: After how many the exact upper 95 % limit of the share of violations is to be at or below 1 - eta;
+            by default the share itself is brought to 1 - eta.
 
     Raises:
-        SettingError: A probability not between 0 and 1, or a rate that is not positive.
+        SettingError: A probability not between 0 and 1, a rate that is not positive, or too few decisions to say so.
     """
 
     def __init__(
         self,
         tube: ConformalTube,
         probability: float,
-        rate: float = 0.01,
+        rate: float | None = None,
         noise: Any = None,
         largest: float | None = None,
+        decisions: int | None = None,
     ):
         _check_probability(probability)
+        rate = (1.0 - probability) / 5.0 if rate is None else rate
         check_number("rate", rate, above=0)
         H, (r, n) = tube.horizon, tube.rows.shape
         largest = 2.0 * max(float(tube.scores.max()), 1.0) if largest is None else largest
@@ -166,7 +177,14 @@ class AdaptiveTube:
         self.tube, self.probability = tube, float(probability)
         self.rate, self.largest = float(rate), float(largest)
         self.noise = np.zeros((n, n)) if noise is None else np.ascontiguousarray(noise, dtype=float)
-        self.kappas, self.alphas = np.empty(H), np.full(H, 1.0 - probability)
+        self.allowed = np.full(H, 1.0 - probability)  # a of each stage
+        if decisions is not None:
+            check_number("decisions", decisions, least=1, whole=True)
+            spare = np.arange(1, H + 1) + 1
+            self.allowed = (_most_misses(1.0 - probability, decisions) - spare) / (decisions + 1.0 / rate)
+            if not (self.allowed > 0).all():
+                raise SettingError("decisions", f"are too few for a probability of {probability:g}; got {decisions}")
+        self.kappas, self.alphas = np.empty(H), self.allowed.copy()
         self.counts, self.misses = np.zeros(H), np.zeros(H)
         self._bounds = np.full((H, H, r), np.nan)  # of the plans of the last H steps, by stage and direction
         self._step = 0
@@ -177,7 +195,7 @@ class AdaptiveTube:
         """Compares a state (n,) with what the plans before it said; returns kappa of each stage (H,)."""
         state = np.ascontiguousarray(state, dtype=np.float64)
         self._step += 1
-        numbers = self.rate, 1.0 - self.probability, self.largest
+        numbers = self.rate, self.allowed, self.largest
         parts = self.kappas, self.alphas, self.counts, self.misses
         call_unchecked(_observe, state, self.tube.rows, self._bounds, self._step, numbers, self.tube.scores, parts)
         return self.kappas
@@ -204,6 +222,13 @@ def _check_probability(probability: float) -> None:
         raise SettingError("probability", f"must lie between 0 and 1; got {probability}")
 
 
+def _most_misses(share: float, decisions: int) -> int:
+    """The largest number of misses in so many decisions whose exact upper 95 % limit is at or below a share."""
+    misses = np.arange(int(share * decisions) + 1)
+    limits = beta.ppf(0.95, misses + 1, np.maximum(decisions - misses, 1))
+    return int((limits <= share).sum()) - 1
+
+
 @compiled(locked=True)
 def _observe(state, rows, bounds, step, numbers, scores, parts):
     """Updates alpha and kappa of each stage (H,) by a state (n,); ``bounds`` (H, H, r) hold the last plans."""
@@ -221,7 +246,7 @@ def _observe(state, rows, bounds, step, numbers, scores, parts):
         if known:
             counts[k] += 1.0
             misses[k] += 1.0 if outside else 0.0
-            alphas[k] = min(alphas[k] + rate * (allowed - (1.0 if outside else 0.0)), 1.0)
+            alphas[k] = min(alphas[k] + rate * (allowed[k] - (1.0 if outside else 0.0)), 1.0)
         rank = math.ceil((N + 1) * (1.0 - alphas[k]) - 1e-9)
         kappas[k] = largest if rank > N else scores[max(rank, 1) - 1, k]
     bounds[step % H] = np.nan  # until a plan of this step is remembered

@@ -1,10 +1,11 @@
 """Controllers: from a state and a reference to an input."""
 
 from gpmpc.mpc.controller import Controller, Decision, Reference
+from gpmpc.mpc.cost import LeastSquares, Tracking
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.policy import ControlLoop
 from gpmpc.mpc.prediction import PredictionSettings
-from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem, Tracking
+from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem
 from gpmpc.mpc.starts import ManyStarts, kicks
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "Decision",
     "Halfspaces",
     "Inequality",
+    "LeastSquares",
     "ManyStarts",
     "NonlinearGPMPC",
     "PredictionSettings",

@@ -4,6 +4,7 @@ A controller keeps nothing between calls: what it needs of its last plan is part
 and is handed to it again as ``previous``.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -20,6 +21,7 @@ from gpmpc.status import Status
 
 Array = np.ndarray
 
+_FAR = 0.9  # of the standard deviation without data
 FEASIBLE = 1e-3  # by how much a suboptimal plan may miss hard bounds, in their units: a next step mends it
 _NO_PLAN, _NO_DISTURBANCE = np.empty((0, 0)), np.empty(0)
 _SIGNATURE = f"i8(f8[::1], {3 * 'f8[:, ::1], '}f8[::1], {4 * 'f8[:, ::1], '})".replace(", )", ")")
@@ -101,6 +103,8 @@ class Decision:
             is estimated.
         suboptimal: The solve stopped short of its tolerance, at a limit say, with a plan that keeps its bounds and that
             steps towards the optimum led to (Scokaert, Mayne and Rawlings, 1999).
+        novelty: The largest standard deviation that a stage of the plan adds, over the one that the model has far from
+            all data: near 0 among data, near 1 where the model knows nothing; NaN where that is not known.
         learned: What the flight has taught a controller that learns (``gpmpc.learning``), for its next decision; with
             ``size``, the points of the model that decided, and ``version``, how often it has changed.
     """
@@ -116,6 +120,7 @@ class Decision:
     solution: QPSolution | None = None
     disturbance: Array | None = None
     suboptimal: bool = False
+    novelty: float = math.nan
     learned: Any = None
 
     def __post_init__(self) -> None:
@@ -127,12 +132,17 @@ class Decision:
         return self.status.solved or self.suboptimal
 
     @property
+    def far_from_data(self) -> bool:
+        """Whether the plan leaves the data behind: its model says little more there than before any data."""
+        return self.novelty > _FAR
+
+    @property
     def violation(self) -> float:
         """By how much the plan misses a bound of its last program, in the bound's unit; soft ones may be missed.
 
         Zero but for rounding where all are kept; NaN without a program.
         """
-        return float("nan") if self.solution is None else float(self.solution.violation().max(initial=0.0))
+        return math.nan if self.solution is None else float(self.solution.violation().max(initial=0.0))
 
 
 class Controller(Protocol):

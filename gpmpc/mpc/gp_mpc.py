@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.compiled import call_unchecked
+from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
@@ -87,6 +87,7 @@ class GPMPC:
         self.solver = DualActiveSet() if solver is None else solver
         check_method("solver", self.solver, "solve", "DualActiveSet()")
         self._condenser = Condenser(problem, horizon, len(self.prediction.costs.quadratic.terminal))
+        self._prior = self.prediction.linearizer.prior_variances()
         self._rates = self._condenser.bounds.rate_lower.size
         self.soft = self.prediction.constraints.softness(self._rates)
         if self.soft is not None and not isinstance(self.solver, DualActiveSet):
@@ -160,7 +161,13 @@ class GPMPC:
             return replace(request.failed_decision(status, count, clock.timing), problem=program, solution=solution)
         plan, disturbance = prediction.plan, request.disturbance if self.prediction.settings.disturbance_gain else None
         inputs, beliefs = plan.inputs.copy(), self.prediction.linearizer.moments(plan.states, prediction.covariances)
-        found = program, solution, disturbance, suboptimal
+        found = (
+            program,
+            solution,
+            disturbance,
+            suboptimal,
+            call_unchecked(_largest_ratio, prediction.stages.V, self._prior),
+        )
         return Decision(inputs[0], inputs, *beliefs, status, count, clock.timing, *found)
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
@@ -359,3 +366,13 @@ class _Stopwatch:
         now = perf_counter()
         self._parts[part] += (now - self._last) / max(1, shares)
         self._last = now
+
+
+@compiled
+def _largest_ratio(V, prior):
+    """The root of the largest V_kii / prior_i; NaN without a prior."""
+    largest = 0.0 if len(prior) > 0 else np.nan
+    for k in range(len(V)):
+        for i in range(len(prior)):
+            largest = max(largest, V[k, i, i] / prior[i] if prior[i] > 0.0 else 0.0)
+    return np.sqrt(largest)

@@ -92,6 +92,14 @@ class StageLinearizer:
         moments = {"full": self._full, "diagonal": self._diagonal, "zero_order": self._zero_order}
         self._linearize = self._points if self.at_points else moments[covariance]
 
+    def prior_variances(self) -> Array:
+        """What V is far from all data (n,), for GPs in an affine form; empty where V is zero or that is not known."""
+        form = getattr(self.model, "affine_form", None)
+        if form is None or not self.at_points or self.covariance == "none":
+            return np.empty(0)
+        B = np.eye(self._n) if form.B is None else to_array(form.B)
+        return B**2 @ to_array(form.f.signal_variance) + (0.0 if self._noise is None else np.diagonal(self._noise))
+
     def weight(self, Q: Array) -> Array:
         """The weights of s that belong to weights of x (K, n, n): the blocks on their diagonals (K, p / n, n, n)."""
         if self.covariance == "full":  # tr(Q Sigma) = |vec S|^2 in I_n kron Q
@@ -215,12 +223,7 @@ class StageCosts:
         self.quadratic = QuadraticCost(*weights, PENALIZED.index(cost.penalized), np.empty((0, n + m + 1, n + m + 1)))
 
     def at(self, plan: Plan, parameters: Array | None = None) -> QuadraticCost:
-        """The cost with its outputs linearised along a plan.
-
-        Raises:
-            ShapeError: An output has another shape.
-            DataError: It is not finite.
-        """
+        """The cost with its outputs linearised along a plan; raises what ``expand_function`` does."""
         if not self.outputs:
             return self.quadratic
         n = self._Q.shape[1]
@@ -278,8 +281,11 @@ class ConstraintRows:
         self.per_stage, self.soft = len(kappa), bool(np.isfinite(self.prices).any())
         margins = self._kappa if covariance == "zero_order" else np.zeros(self.per_stage)
         self._margins = np.tile(margins, (horizon, 1))
-        mixed = bool((np.count_nonzero(self._F, axis=1) > 1).any())
-        moves = mixed if covariance == "diagonal" else covariance == "full" and self.per_stage > 0
+        moves = (
+            bool((np.count_nonzero(self._F, axis=1) > 1).any())
+            if covariance == "diagonal"
+            else covariance == "full" and self.per_stage > 0
+        )
         self.smooth, moves = bool(self._smooth), moves or bool(self._smooth)
         self._constant = None if moves else self._rows(self._F[None], np.zeros((1, n, n)))
         self._fixed = None

@@ -132,6 +132,7 @@ class Encoder:
                 gp_size=copy.gp_size,
                 gp_version=step.gp_version,
                 failed=step.failed,
+                novelty=np.nan if decision is None else decision.novelty,
                 **self._bounds,
                 **head,
             ).SerializeToString(),

@@ -48,6 +48,7 @@ _FIELDS = {
         "gp_size": "int64",
         "gp_version": "int64",
         "failed": "bool",
+        "novelty": "double",
     },
     "Stage": {"time": "double", "mean": "State", "std": "State", "input": "Input"},
     "Plan": {"time": "double", "k": "int64", "stages": "repeated Stage", "covariances": "repeated double"},

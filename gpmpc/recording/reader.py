@@ -75,6 +75,7 @@ class Run:
     gp_sizes: Array  # (K,)
     gp_versions: Array  # (K,)
     failed: Array  # (K,) whether the decision was not applied
+    novelties: Array  # (K,) ``novelty`` of the decisions; 0 in files that do not have it
     channels: dict[str, tuple[int, str]]  # number of messages and schema by topic
     metadata: dict[str, dict[str, str]]
     config: str  # text of the resolved configuration
@@ -108,7 +109,12 @@ class Run:
         table |= {f"timing.{name}": self.timings[:, i] for i, name in enumerate(TIMING)}
         residuals = self.residuals.reshape(-1, 3)
         table |= {f"residuals.{name}": residuals[:, i] for i, name in enumerate(("primal", "dual", "gap"))}
-        return table | {"gp_size": self.gp_sizes, "gp_version": self.gp_versions, "failed": self.failed}
+        return table | {
+            "gp_size": self.gp_sizes,
+            "gp_version": self.gp_versions,
+            "failed": self.failed,
+            "novelty": self.novelties,
+        }
 
     def to_pandas(self) -> "pandas.DataFrame":
         """Returns ``columns`` as a data frame, units in its ``attrs``."""
@@ -276,6 +282,7 @@ def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dic
         "gp_sizes": column("gp_size", int),
         "gp_versions": column("gp_version", int),
         "failed": column("failed", bool),
+        "novelties": column("novelty", float),
     }
 
 

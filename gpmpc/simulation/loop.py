@@ -41,6 +41,7 @@ class Rollout:
     timings: tuple[Timing, ...]  # K, where the wall time of every decision went
     time_step: float  # [s]
     suboptimal: tuple[int, ...] = ()  # steps at which a plan was applied whose solve stopped short of its tolerance
+    far_from_data: tuple[int, ...] = ()  # steps whose plan left the model's data behind
 
     @property
     def times(self) -> Array:
@@ -264,6 +265,7 @@ class History:
             timings=tuple(row.timing for row in rows),
             time_step=time_step,
             suboptimal=tuple(s.k for s in steps if not (s.failed or s.status is None or s.status.solved)),
+            far_from_data=tuple(s.k for s in steps if s.decision is not None and s.decision.far_from_data),
         )
 
 

@@ -280,6 +280,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         "lost": _lost(experiment, flown),
         "violations": {name: asdict(rate) | {"rate": rate.rate} for name, rate in violations.items()},
         "failures": dict(Counter(status.name for _, status in rollout.failures)),
+        "far_from_data": len(rollout.far_from_data),
         "suboptimal": dict(Counter(rollout.statuses[k].name for k in rollout.suboptimal)),
         "iterations": {"mean": float(rollout.iterations.mean()), "largest": int(rollout.iterations.max())},
         "training": learned,
@@ -335,6 +336,10 @@ def summary(result: Mapping[str, Any]) -> Table:
     if result.get("suboptimal"):
         stopped = f"{_counted(result['suboptimal'])}: plans that were not optimal yet, applied"
         lines.append(("stopped early", stopped))
+    if far := result.get("far_from_data"):
+        lines.append(
+            ("far from the data", f"the plans of {far} steps: there the model knows little more than its prior")
+        )
     stages = ", ".join(f"{stage} {1e3 * times[stage]['median']:.3g}" for stage in _STAGES[:3])
     median, most = (f"{1e3 * times['total'][key]:.3g}" for key in ("median", "p99"))
     lines.append(("decision [ms]", f"median {median}  ({stages}), 99 % below {most}"))

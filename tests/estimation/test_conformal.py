@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.stats import beta, norm
 
 from gpmpc.estimation import AdaptiveTube, ConformalTube
 from gpmpc.exceptions import DataError, SettingError, ShapeError
@@ -80,6 +81,20 @@ def test_an_adaptive_tube_holds_in_the_long_run_whatever_the_plant_does(plant):
         assert np.allclose(tube.violations, 0.1, atol=0.02)
 
 
+@pytest.mark.parametrize("eta", [0.9, 0.95, 0.99])
+@pytest.mark.parametrize("size", [0.7, 1.4, 2.5])
+def test_a_tube_that_aims_lower_keeps_the_upper_limit_of_its_violations_at_what_is_allowed(eta, size):
+    T, rng = 3000, np.random.default_rng(0)
+    quantiles = norm.ppf(np.arange(1, 400) / 400)[:, None]  # of a noise that the plant's is ``size`` times
+    tube = AdaptiveTube(ConformalTube(quantiles, [[1.0]]), eta, largest=20.0, decisions=T)
+    for x in size * rng.normal(size=T):
+        tube.remember(np.zeros((2, 1)), np.ones((2, 1, 1)))
+        tube.observe([x])
+    misses = tube.misses[0]
+    assert beta.ppf(0.95, misses + 1, T - misses) <= 1 - eta
+    assert size < 1 or misses / T > 0.3 * (1 - eta)
+
+
 def test_plans_are_compared_at_their_own_stage_and_those_of_failed_steps_are_left_out():
     tube = AdaptiveTube(ConformalTube(np.ones((19, 3)), [[1.0]]), 0.9, largest=5.0)
     covariances = np.ones((4, 1, 1))
@@ -108,5 +123,7 @@ def test_misuse_is_refused():
         tube.kappas(1.0)
     with pytest.raises(SettingError, match="rate: must be a number above 0"):
         AdaptiveTube(tube, 0.9, rate=0.0)
+    with pytest.raises(SettingError, match="decisions: are too few for a probability of 0.99; got 100"):
+        AdaptiveTube(tube, 0.99, decisions=100)
     with pytest.raises(ShapeError, match=r"means must be \(6, 2\); got \(5, 2\)"):
         AdaptiveTube(tube, 0.8).remember(np.zeros((5, 2)), np.zeros((5, 2, 2)))

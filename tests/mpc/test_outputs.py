@@ -7,6 +7,8 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp import Transitions, train
+from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc.baselines import LQR, NMPC
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.cost import LeastSquares
@@ -150,6 +152,23 @@ def test_a_plan_that_is_handed_over_is_where_the_iteration_starts():
     before = loop.last.plan
     later = controller.control(start, goal, before, plan=solved.inputs)
     assert np.allclose(later.inputs, solved.inputs, atol=1e-6)
+
+
+def test_a_plan_that_leaves_the_data_is_flagged_and_one_among_them_is_not(rng):
+    states, inputs = rng.uniform(-1, 1, (60, 2)), rng.uniform(-1, 1, (60, 1))
+    after = states + 0.1 * np.stack([np.sin(3 * states[:, 1]), np.sin(3 * inputs[:, 0])], axis=1)
+    data = Transitions(states, inputs, after + rng.normal(0, 1e-3, (60, 2)))
+    problem = Problem(Tracking([1.0, 1.0], [0.1]), Box([-1.0], [1.0]))
+    for model in (train(data, predicts="difference").posterior, ResidualModel.train(Affine.identity(2, 1), data)):
+        controller = GPMPC(model, Linearization(), problem, 5, [0.0])
+        places = [np.full(2, place) for place in (0.2, 4e3)]
+        among, beyond = (controller.control(Gaussian.certain(place), Reference(place)) for place in places)
+        assert among.novelty < 0.2
+        assert not among.far_from_data
+        assert beyond.novelty == pytest.approx(1.0, abs=0.05)
+        assert beyond.far_from_data
+    unknown = GPMPC(model, Linearization(), problem, 5, [0.0], PredictionSettings(covariance="none"))
+    assert not unknown.control(Gaussian.certain(np.zeros(2)), Reference(np.zeros(2))).far_from_data
 
 
 def test_mistakes_are_one_clear_error():

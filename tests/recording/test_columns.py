@@ -36,6 +36,7 @@ def test_every_column_is_what_its_name_says(flown):
         "timing.total": [0.006] * 4,
         "gp_size": [step.gp_size for step in steps],
         "gp_version": [step.gp_version for step in steps],
+        "novelty": [step.decision.novelty for step in steps],
     }
     for i, name in enumerate(("primal", "dual", "gap")):
         expected[f"residuals.{name}"] = [step.decision.solution.residuals()[i] for step in steps]
