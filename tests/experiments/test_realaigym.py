@@ -93,7 +93,7 @@ def test_a_residual_learned_from_random_torques_predicts_better_than_the_wrong_b
         (f(test.states, test.inputs) - test.next_states).square().mean()
         for f in (lambda x, u: model.predict(x, u).mean, nominal)
     ]
-    assert errors[0] < 0.1 * errors[1]
+    assert errors[0] < 0.3 * errors[1]
 
 
 def test_the_board_is_sorted_and_says_what_share_of_draws_is_above_the_best():
