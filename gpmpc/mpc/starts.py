@@ -94,7 +94,7 @@ class ManyStarts:
             goal = _moved(reference, full_turns(previous.means[-1] - reference.states[-1], angles))
             shifted = (np.concatenate([part[1:], part[-1:]]) for part in (previous.means, previous.inputs))
             best, lowest = self._try(self.controller, belief, goal, previous, parameters, *shifted)
-            if lowest <= self.limit:
+            if best.applicable and lowest <= self.limit:
                 return best
         begin, last = perf_counter(), None if previous is None else replace(previous, solution=None)
         for goal, guess in self._candidates(belief.mean.numpy(), reference):

@@ -56,7 +56,7 @@ def flown(asked, model=PENDULUM, unknown=UNKNOWN, steps=40):
         {"disturbance_gain": 0.5, "covariance": "full", "propagator": MomentMatching()},
         {"disturbance_gain": 0.5, "covariance": "diagonal"},
     ],
-    ids=str,
+    ids=lambda settings: " ".join(settings),
 )
 def test_a_constant_error_leaves_no_offset(settings):
     states, decisions = flown(controller(**settings))

@@ -167,3 +167,12 @@ def test_between_decisions_the_plan_is_followed_under_its_feedback():
     assert np.abs(K @ (pushed - plan.means[1])) < np.abs(K @ (left - plan.means[1]))
     with pytest.raises(ShapeError, match="state must have shape"):
         loop.input_between(np.zeros(3), 0.5)
+
+
+def test_a_plan_that_cannot_be_improved_is_searched_for_anew():
+    walls = [Box([-9.0, -9.0], [-8.0, 9.0], penalty=None)]  # far from the state: no program of this controller succeeds
+    parts = pendulum(), [1.0, 0.01], [0.01], 30
+    many = ManyStarts(controller(*parts, constraints=walls), controller(*parts, 15))
+    state, reference = Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros(2))
+    first = many.control(state, reference)
+    assert many.control(state, reference, first).applicable

@@ -14,6 +14,10 @@ from tests.propagation.test_moment_matching import belief, model
 generator = torch.Generator().manual_seed(1)
 
 
+def _name(value):
+    return type(value).__name__
+
+
 def draw(*shape):
     return torch.randn(*shape, generator=generator)
 
@@ -69,7 +73,7 @@ def test_closed_forms_are_autograds_derivatives(propagator, name, batch, choice)
         )
 
 
-@pytest.mark.parametrize("propagator", [MeanEquivalence(), Linearization(), MomentMatching(), Unscented()], ids=str)
+@pytest.mark.parametrize("propagator", [MeanEquivalence(), Linearization(), MomentMatching(), Unscented()], ids=_name)
 def test_closed_forms_by_torch_can_be_differentiated_again(propagator):
     gp, at, control = MODELS["difference"], belief(3), torch.zeros(2)
     step = torch.tensor([1e-5, 0.0, 0.0])
@@ -143,7 +147,7 @@ def value_model(n, m, k):
 
 
 @pytest.mark.parametrize(("n", "k"), [(2, 3), (3, 2)])
-@pytest.mark.parametrize("propagator", [MeanEquivalence(), Linearization(), MomentMatching(), Unscented()], ids=str)
+@pytest.mark.parametrize("propagator", [MeanEquivalence(), Linearization(), MomentMatching(), Unscented()], ids=_name)
 def test_functions_with_more_or_fewer_outputs_than_states_have_derivatives_too(propagator, n, k):
     gp, at, control = value_model(n, 1, k), belief(n), draw(1)
     found, d = differentiate(propagator, gp, at, control)
@@ -167,7 +171,7 @@ def test_no_gradient_flows_through_a_local_model():
 
 
 @pytest.mark.parametrize("choice", ["auto", "torch"])
-@pytest.mark.parametrize("propagator", [*PROPAGATORS[:4], Unscented()], ids=str)
+@pytest.mark.parametrize("propagator", [*PROPAGATORS[:4], Unscented()], ids=_name)
 def test_beliefs_and_inputs_belong_together_or_are_refused(propagator, choice):
     gp, at = MODELS["next state"], belief(3)
     batch = Gaussian(at.mean + draw(2, 3, 3), at.covariance.expand(2, 3, 3, 3))
