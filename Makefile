@@ -20,6 +20,7 @@ lint: $(ENV)  ## Format check, linter, import contracts and types
 	.venv/bin/ruff check .
 	.venv/bin/lint-imports
 	.venv/bin/pyright
+	.venv/bin/mypy gpmpc examples
 
 bench: $(ENV)  ## What everything costs on this machine, beside others; some of it: make bench ONLY="peers qp"
 	for name in $(ONLY); do .venv/bin/python -m benchmarks.$$name || exit 1; done

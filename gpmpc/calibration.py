@@ -90,7 +90,10 @@ class Calibration:
         import pandas
 
         n = len(self.names)
-        table = {"step": [k + 1 for k in range(self.horizon) for _ in range(n)], "state": self.names * self.horizon}
+        table: dict[str, Any] = {
+            "step": [k + 1 for k in range(self.horizon) for _ in range(n)],
+            "state": self.names * self.horizon,
+        }
         table |= {"samples": self.samples.repeat_interleave(n), "rmse": self.rmse.ravel(), "nlpd": self.nlpd.ravel()}
         table |= {f"coverage_{level:g}": self.coverage[..., j].ravel() for j, level in enumerate(self.levels)}
         return pandas.DataFrame(table)
@@ -128,7 +131,8 @@ def calibrate(
     names = tuple(names) or tuple(f"x{i + 1}" for i in range(model.state_dim))
     check_number("horizon", horizon, least=1, whole=True)
     _check(model, recordings, horizon, levels, names)
-    n, like = model.state_dim, {"dtype": model.dtype, "device": model.device}
+    n = model.state_dim
+    like: dict[str, Any] = {"dtype": model.dtype, "device": model.device}
     S = torch.zeros(n, n, **like) if start_covariance is None else start_covariance.to(**like)
     if S.shape != (n, n):
         raise ShapeError(f"start_covariance must be ({n}, {n}); got {tuple(S.shape)}")

@@ -80,7 +80,8 @@ try:
     from numba.core.compiler import Compiler
     from numba.core.cpu import CPUTargetOptions
 except ImportError:
-    _PRIVATE_OPTIONS, _NRT_OPTION = {True: {}, False: {}}, False
+    _NRT_OPTION = False
+    _PRIVATE_OPTIONS: dict[bool, dict[str, Any]] = {True: {}, False: {}}
 else:
     _NRT_OPTION = hasattr(CPUTargetOptions, "_nrt")
 
@@ -122,7 +123,7 @@ else:
     class _KernelCompiler(Compiler):
         """numba's compiler for ``_KernelLibrary``."""
 
-        library = _KernelLibrary
+        library: Any = _KernelLibrary
 
         def define_pipelines(self):
             if self.state.library is None:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context, resource_tracker
-from typing import TypeVar
+from typing import Any, TypeVar
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -38,7 +38,7 @@ def in_processes(
     if not jobs:
         return
     workers, before = min(workers or cores(), len(jobs)), set(active_children())
-    mine = {"initializer": end_with, "initargs": (os.getpid(),)}
+    mine: dict[str, Any] = {"initializer": end_with, "initargs": (os.getpid(),)}
     with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), **mine) as pool:
         try:  # around the start as well: leaving the pool waits for what was begun
             with children_ignore_interrupts():

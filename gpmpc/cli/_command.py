@@ -43,7 +43,7 @@ def _show_usage(given: argparse.Namespace) -> Result:
     return Result()
 
 
-COMMANDS = {
+COMMANDS: dict[str, Command] = {
     "run": run.COMMAND,
     "tune": tune.COMMAND,
     "tables": study.TABLES,

@@ -91,7 +91,8 @@ class _FileMemory(MutableMapping[str, Any]):
     """Outcomes of stages in a JSON file, which another log or other settings begin anew."""
 
     def __init__(self, path: Path, fingerprint: str):
-        self._path, self._content = path, {"fingerprint": fingerprint, "stages": {}}
+        self._path = path
+        self._content: dict[str, Any] = {"fingerprint": fingerprint, "stages": {}}
         try:
             found = json.loads(path.read_text())
             if found["fingerprint"] == fingerprint and isinstance(found["stages"], dict):

@@ -57,7 +57,7 @@ def _info(file: Path) -> Result:
     console.print(f"{file}: {state}", soft_wrap=True, highlight=False, markup=False)
     metadata = [(n, k, v) for n, pairs in run.metadata.items() if n != "units" for k, v in pairs.items()]
     channels = [(topic, schema, str(count)) for topic, (count, schema) in run.channels.items()]
-    tables = [(("topic", "schema", "messages"), channels), (("", ""), [*facts.items()])]
+    tables: list[Any] = [(("topic", "schema", "messages"), channels), (("", ""), [*facts.items()])]
     tables += [(("metadata", "key", "value"), metadata)]
     console.print(terminal([Table(head, [[*map(plain_text, row)] for row in rows]) for head, rows in tables if rows]))
     counts = {topic: count for topic, (count, _) in run.channels.items()}

@@ -134,7 +134,8 @@ class Sweep:
     def progress(self, jobs: Sequence[Job], total: int) -> Iterator[Callable[[str], None]]:
         """Shows one bar for many runs, drawn by a thread that looks at the folders; yields what names it."""
         with progress_bar(self.console) as bar:
-            task, over, done = bar.add_task("flying", total=total), Event(), set()
+            task, over = bar.add_task("flying", total=total), Event()
+            done: set[int] = set()
 
             def look() -> None:
                 done.update(i for i, job in enumerate([*jobs]) if i not in done and job.done)
@@ -191,7 +192,7 @@ def _fly_job(config: DictConfig, wait: bool) -> dict[str, Any]:
 
 def _combinations(overrides: Sequence[str]) -> list[list[str]]:
     """Returns the overrides of every run; of a key given twice, the last one counts."""
-    values = {}
+    values: dict[str, Any] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key, swept = override.get_key_element(), override.is_sweep_override()
         found = [f"{key}={value}" for value in override.sweep_string_iterator()] if swept else [override.input_line]

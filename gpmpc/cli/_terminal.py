@@ -92,10 +92,17 @@ def logging_console() -> "Console":
     from rich.console import Console
     from rich.logging import RichHandler
 
-    console, shown = Console(), set()
+    console = Console()
+    shown: set[str] = set()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        text, known = record.getMessage(), len(shown)
+        shown.add(text)
+        return len(shown) > known
+
     handler = RichHandler(console=console, show_path=False, show_time=False, show_level=False)
     handler.addFilter(lambda record: record.name != _SEARCH)
-    handler.addFilter(lambda record: not (record.getMessage() in shown or shown.add(record.getMessage())))
+    handler.addFilter(is_new)
     log = logging.getLogger("gpmpc")
     log.setLevel(logging.INFO)
     log.handlers, log.propagate = [handler], False

@@ -91,7 +91,8 @@ def _space(overrides: Sequence[str]) -> tuple[dict[str, "Interval | Sequence[str
     """Returns what is searched, by setting, and the settings that stay."""
     from gpmpc.studies.tuning import Interval
 
-    space, fixed = {}, []
+    space: dict[str, Any] = {}
+    fixed: list[Any] = []
     for override in OverridesParser.create().parse_overrides([*overrides]):
         key, value = override.get_key_element(), cast(Any, override.value())
         if key in ("seed", "folder", "launcher") and override.is_sweep_override():

@@ -11,7 +11,7 @@ points without a word, takes no leading batch dimensions of queries, and fails u
 
 import copy
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import gpytorch
 import torch
@@ -99,7 +99,7 @@ def from_gpytorch(
         return GPPosterior.from_hyperparameters(**joined, input_dim=input_dim, predicts=predicts)
     if len(inducing) not in (1, joined["targets"].shape[1]) or any(not torch.equal(Z, inducing[0]) for Z in inducing):
         raise ShapeError("all outputs must be sparse, with the same inducing points (M, d); got different ones")
-    method = "fitc" if gpytorch.settings.sgpr_diagonal_correction.on() else "sgpr"
+    method: Literal["sgpr", "fitc"] = "fitc" if gpytorch.settings.sgpr_diagonal_correction.on() else "sgpr"
     kernel = Hyperparameters(*(joined[name] for name in Hyperparameters._fields))
     return sparse_posterior(
         inducing[0].clone(), joined["inputs"], joined["targets"], kernel, input_dim, predicts, joined["offset"], method

@@ -6,6 +6,7 @@ and the inputs straight to each step.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,7 @@ def fit_least_squares(kinematics: Kinematics, log: Log) -> LogModel:
     x, u, c = cut.states[:, 0], cut.inputs[:, 0], cut.context[:, 0]
     z = kinematics.features(x, u, c)
     y = kinematics.outputs(x, cut.states[:, 1], log.time_step)
-    solution, *_ = np.linalg.lstsq(np.column_stack([z, np.ones(len(z))]), y, rcond=1e-8)
+    solution: Any = np.linalg.lstsq(np.column_stack([z, np.ones(len(z))]), y, rcond=1e-8)[0]
     nominal = AffineNominal(kinematics, y.shape[1], z.shape[1])
     return LogModel(kinematics, nominal, solution.T.ravel(), (0,) * y.shape[1])
 

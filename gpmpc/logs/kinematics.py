@@ -84,7 +84,7 @@ class Increments:
 
     def features(self, states: Array, inputs: Array, context: Array) -> Array:
         """The states, of angles sine and cosine, inputs and context."""
-        parts = []
+        parts: list[Array] = []
         for group, at in zip(self.space.groups, self.space.columns, strict=True):
             own = states[..., at]
             parts += [np.sin(own), np.cos(own)] if group.kind == "angle" else [own]

@@ -123,7 +123,8 @@ def learn(
     if for_control:
         options = {words: grow for words, grow in options.items() if words not in (FEEDBACK, LATE_INPUTS)}
     candidates: list[Candidate] = []
-    best, models = 0, []
+    best = 0
+    models: list[Any] = []
     for words, grow in [("", lambda model: model), *options.items()]:
         trial = grow(structure)
         if trial is None:

@@ -51,8 +51,10 @@ class LogRun:
     def part(self, begin: int, end: int, name: str) -> "LogRun":
         """The rows from ``begin`` to before ``end`` as a run of its own."""
         inner = tuple(b - begin for b in self.begins if begin < b < end)
-        parts = (getattr(self, key)[begin:end] for key in ("time", "states", "inputs", "context"))
-        return LogRun(f"{self.name}, {name}", *parts, begins=(0, *inner))
+        time, states, inputs, context = (
+            getattr(self, key)[begin:end] for key in ("time", "states", "inputs", "context")
+        )
+        return LogRun(f"{self.name}, {name}", time, states, inputs, context, begins=(0, *inner))
 
 
 @dataclass(frozen=True)

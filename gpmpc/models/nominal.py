@@ -172,8 +172,9 @@ class CasadiFunction:
             return tuple(np.ascontiguousarray(part) for part in (value, *parts))
         if K not in self._mapped:
             self._mapped[K] = self._expansion.map(K)
-        parts = self._mapped[K](*(argument.T for argument in arguments))
-        value, *jacobians = (part.full() for part in (parts if isinstance(parts, tuple | list) else [parts]))
+        found_parts: Any = self._mapped[K](*(argument.T for argument in arguments))
+        listed = found_parts if isinstance(found_parts, tuple | list) else [found_parts]
+        value, *jacobians = (part.full() for part in listed)
         found = [self._split(value, K)]
         for jacobian in jacobians:  # rows of a derivative go through a matrix column by column
             by = jacobian.reshape(columns, rows, K, -1).transpose(2, 1, 0, 3)

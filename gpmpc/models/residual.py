@@ -265,9 +265,9 @@ class ResidualModel:
         nominal, tape = self.nominal, getattr(self.nominal, "tape", None)
         if callable(self.B) or not (isinstance(nominal, Affine) or tape is not None):
             return None
-        parts = (nominal.A, nominal.B, nominal.c) if isinstance(nominal, Affine) else (None, None, None)
-        selected = list(self.states), list(self.inputs), tuple(self.angles)
-        return AffineForm(self.residual, *parts, self.B, *selected, tape)
+        A, G, c = (nominal.A, nominal.B, nominal.c) if isinstance(nominal, Affine) else (None, None, None)
+        states, inputs, angles = list(self.states), list(self.inputs), tuple(self.angles)
+        return AffineForm(self.residual, A, G, c, self.B, states, inputs, angles, tape)
 
     def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "ResidualModel":
         """Copies the model to another device or type; functions (nominal model, effect) are taken as they are."""
@@ -324,7 +324,8 @@ def train_with_angles(trainer: Any, angles: Sequence[int], transitions: Transiti
     n, m = transitions.state_dim, transitions.input_dim
     nominal, B, every = Affine.identity(n, m), torch.eye(n, dtype=torch.float64), (list(range(n)), list(range(m)))
     training = _fit(nominal, B, Features(*every, angles, n, m), transitions, trainer, seed)
-    return replace(training, posterior=ResidualModel(nominal, training.posterior, B, *every, m, angles))
+    model: Any = ResidualModel(nominal, training.posterior, B, *every, m, angles)
+    return replace(training, posterior=model)
 
 
 def _fit(
@@ -342,7 +343,7 @@ def _residuals(
 ) -> tuple[Tensor, Tensor]:
     """Features (N, d) and targets (N, k) of the residual GP: the least-squares part of the error of f0."""
     like = B if like is None and isinstance(B, Tensor) else transitions.states if like is None else like
-    to = {"device": like.device, "dtype": like.dtype}
+    to: dict[str, Any] = {"device": like.device, "dtype": like.dtype}
     x, u, after = (t.to(**to) for t in (transitions.states, transitions.inputs, transitions.next_states))
     effect = _effect(B, x)
     if int(torch.linalg.matrix_rank(effect).min()) < effect.shape[-1]:

@@ -69,16 +69,16 @@ def _parts(path: Path, model: Any) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if type(model) not in (GPPosterior, ResidualModel, DelayedModel, DisturbedModel):
         raise UnsupportedModel(f"only {', '.join(_BUILD)} can be saved; got {kind}")
     if isinstance(model, GPPosterior):
-        header, tensors = posterior_parts(path, model)
-        return {"kind": kind, **header}, tensors
+        described, tensors = posterior_parts(path, model)
+        return {"kind": kind, **described}, tensors
     inner, name = (model.residual, "residual") if isinstance(model, ResidualModel) else (model.model, "model")
     nested, inner_tensors = _parts(path, inner)
-    header = {"kind": kind, name: nested}
+    header: dict[str, Any] = {"kind": kind, name: nested}
     tensors = {f"{name}/{key}": value for key, value in inner_tensors.items()}
     if isinstance(model, DelayedModel):
         return header | {"delay": model.delay}, tensors
     if isinstance(model, DisturbedModel):
-        numbers = {"std": list(map(float, model.std)), "decay": list(map(float, model.decay or ()))}
+        numbers: dict[str, Any] = {"std": list(map(float, model.std)), "decay": list(map(float, model.decay or ()))}
         return header | numbers, tensors | {"effect": model.effect}
     header["input_dim"] = model.input_dim
     header |= {key: [int(i) for i in getattr(model, key)] for key in ("states", "inputs", "angles")}

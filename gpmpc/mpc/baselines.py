@@ -14,6 +14,7 @@ minimises the cost (``gpmpc.mpc.linear_quadratic.optimal_feedback``). It knows n
 
 from collections.abc import Sequence
 from time import perf_counter
+from typing import Any
 
 import casadi
 import numpy as np
@@ -143,9 +144,9 @@ class LQR:
         request = Request.read(self.problem, self.horizon, self.initial_input, belief, reference, previous)
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
-        (targets, inputs, last), x = request.references, request.state
+        (targets, wanted, last), x = request.references, request.state
         states = np.vstack([x, targets[:-1]])
-        inputs = request.constant_guess if reference.inputs is None else inputs
+        inputs: Any = request.constant_guess if reference.inputs is None else wanted
         at = linearize(self.model, states, inputs, covariance=False)
         modelled = perf_counter()
         c = at.mean - np.einsum("iab,ib->ia", at.A, states) - np.einsum("iab,ib->ia", at.B, inputs)
@@ -228,7 +229,7 @@ def _build(
         "f": cost,
         "g": casadi.vertcat(*constraints),
     }
-    options = {
+    options: dict[str, Any] = {
         "print_time": False,
         "show_eval_warnings": False,
         "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 500, "bound_relax_factor": 0.0},

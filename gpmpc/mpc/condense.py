@@ -64,7 +64,7 @@ class Condenser:
         self.bounds = InputBounds(
             *problem.inputs.by_stage(horizon), *[side[:rated] for side in problem.input_rates.by_stage(horizon)]
         )
-        compile_for(_condense, _SIGNATURE)  # pyright: ignore[reportArgumentType]
+        compile_for(_condense, _SIGNATURE)  # type: ignore[arg-type]
         self._condense = unchecked_entry_point(_condense)
         n, m = problem.state_dim, problem.input_dim
         self._size, self._rates, self._plain = horizon * m, rated * m, np.empty((0, m, blocks * n + m + 1))

@@ -253,7 +253,7 @@ class Request(NamedTuple):
         if problem.cost.angles and guessed is None and not found & _BELIEF:
             states = _unwrapped(states, state, made, problem.cost.angles)
         references = References(states[1:], inputs, last)
-        known = {"kappas": kappas, "previous": made, "states": guessed}
+        known: dict[str, Any] = {"kappas": kappas, "previous": made, "states": guessed}
         return cls(state, covariance, references, guess, not found & _BELIEF, **known)
 
     @property

@@ -271,8 +271,7 @@ def _conclude(
 def _has_right_shape(controller: Controller, decision: Decision, last: Command | None) -> bool:
     """Whether the inputs of a decision have the shapes (m,) and (H, m)."""
     problem = getattr(controller, "problem", None)
-    known = isinstance(problem, Problem)
-    m = problem.input_dim if known else (decision if last is None else last).input.size
+    m = problem.input_dim if isinstance(problem, Problem) else (decision if last is None else last).input.size
     return decision.input.shape == (m,) == np.shape(decision.inputs)[1:] and len(decision.inputs) > 0
 
 

@@ -287,7 +287,7 @@ class Problem:
     def price(self, constraint: Constraint) -> float:
         """Returns the price of violating a constraint, infinite for a hard one."""
         if constraint.penalty == "exact":
-            return _EXACT * max(part.largest_weight for part in (self.cost, *self.outputs))
+            return _EXACT * max(self.cost.largest_weight, *(part.largest_weight for part in self.outputs), 0.0)
         return math.inf if constraint.penalty is None else float(constraint.penalty)
 
 

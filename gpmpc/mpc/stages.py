@@ -219,8 +219,8 @@ class StageCosts:
             by_stage("reference", output.reference, horizon, 1)
         self._Q, own = Q, linearizer.weight(Q[-1:])[0]
         Q, R = Q if cost.Q.ndim > 2 else cost.Q[None], R if cost.R.ndim > 2 else cost.R[None]
-        weights = [np.ascontiguousarray(part) for part in (linearizer.weight(Q), own, R)]
-        self.quadratic = QuadraticCost(*weights, PENALIZED.index(cost.penalized), np.empty((0, n + m + 1, n + m + 1)))
+        W, own, R = (np.ascontiguousarray(part) for part in (linearizer.weight(Q), own, R))
+        self.quadratic = QuadraticCost(W, own, R, PENALIZED.index(cost.penalized), np.empty((0, n + m + 1, n + m + 1)))
 
     def at(self, plan: Plan, parameters: Array | None = None) -> QuadraticCost:
         """The cost with its outputs linearised along a plan; raises what ``expand_function`` does."""

@@ -102,8 +102,8 @@ class StateFormMPC:
         inputs, states = np.array(self._program.inputs.value), np.array(self._program.states.value)
         beliefs = self.prediction.linearizer.moments(states, prediction.covariances)
         disturbance = request.disturbance if self.prediction.settings.disturbance_gain else None
-        found = status, iterations, timing
-        return Decision(inputs[0], inputs, *beliefs, *found, disturbance=disturbance, suboptimal=suboptimal)
+        ended: Any = {"disturbance": disturbance, "suboptimal": suboptimal}
+        return Decision(inputs[0], inputs, *beliefs, status, iterations, timing, **ended)
 
 
 class _Program:

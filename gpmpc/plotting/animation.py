@@ -65,7 +65,7 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, width_ratios=[1, 1.15], height_ratios=[2.4, 1])
     above, height, near = (figure.add_subplot(grid[place]) for place in ((0, 0), (1, 0), (slice(None), 1)))
-    dashed = {"color": REFERENCE, "linewidth": 1, "linestyle": DASHED}
+    dashed: dict[str, Any] = {"color": REFERENCE, "linewidth": 1, "linestyle": DASHED}
     for axis in (above, near):
         axis.plot(*references.T, **dashed)
         axis.set(xlabel="x [m]", ylabel="y [m]")

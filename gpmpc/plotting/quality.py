@@ -1,6 +1,7 @@
 """The figure of quality over time: what every controller pays in cost, and what its decisions take."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -122,7 +123,7 @@ def _front(axis: Axes, members: Sequence[Mapping]) -> None:
 
 def _legends(axis: Axes, colours: Mapping[str, str], markers: Mapping[int, str], lost: int) -> None:
     """Curves by colour above, horizons by marker beside them."""
-    plain = {"linestyle": "none", "markersize": 5.5}
+    plain: dict[str, Any] = {"linestyle": "none", "markersize": 5.5}
     lines = [Line2D([], [], color=colour, marker="o", markersize=5.5, label=name) for name, colour in colours.items()]
     lines.append(Line2D([], [], color=_OTHERS, marker="o", **plain, label="other settings"))
     lines.append(Line2D([], [], color=_FRONT, linewidth=1.4, label="front: none is better and faster"))

@@ -92,7 +92,7 @@ class DualActiveSet:
         (P, q, G, lower, upper), (softness, memory, size, where) = problem, plan
         record, status = _empty(size), _MISUSE
         try:
-            guess = _NO_RECORD if warm_start is None else warm_start.record  # pyright: ignore[reportAttributeAccessIssue]
+            guess = _NO_RECORD if warm_start is None else warm_start.record  # type: ignore[union-attr]
             if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
                 status = _run(P, q, G, lower, upper, guess, memory, record)
                 if not status:
@@ -166,7 +166,7 @@ class Prepared:
         P, G = self._P, self._G
         record, status = _empty(self._size), _MISUSE
         try:
-            guess = _NO_RECORD if warm_start is None else warm_start.record  # pyright: ignore[reportAttributeAccessIssue]
+            guess = _NO_RECORD if warm_start is None else warm_start.record  # type: ignore[union-attr]
             if q.dtype is lower.dtype is upper.dtype is _FLOAT:
                 status = _run(P, q, G, lower, upper, guess, self._memory, record)
                 if not status:

@@ -160,8 +160,8 @@ def open_workspace(P, q, G, memory, out):
     prepared, capacity = tag != 0.0, most_working(n, M, soft)
     factor, start = memory[_REST : _REST + capacity + 1], (_REST + capacity + 1) * memory.shape[1]
     count, end = M if prepared else capacity + 1, start + n * padded(n)
-    L, rows = _matrix(memory, start, n, padded(n)), _matrix(memory, end, count, n)
-    gram = _matrix(memory, end + count * n, M * prepared, padded(M))
+    L, rows = _matrix(memory, start, n, padded(n)), _matrix(memory, end, count, n)  # pyright: ignore[reportCallIssue]
+    gram = _matrix(memory, end + count * n, M * prepared, padded(M))  # pyright: ignore[reportCallIssue]
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     work = Workspace(
         P, q, G, L, rows, gram, real[0], real[21], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2],

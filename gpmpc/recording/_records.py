@@ -57,8 +57,9 @@ def whole_records(path: Path) -> Iterator[McapRecord]:
                     return
                 if isinstance(record, Channel) and (Schema, record.schema_id) not in declared:
                     return
-                is_new = isinstance(record, Schema | Channel)
-                if is_new and declared.setdefault((type(record), record.id), record) != record:
+                if not isinstance(record, Schema | Channel):
+                    continue
+                if declared.setdefault((type(record), record.id), record) != record:
                     return
                 yield record
     except OSError as error:

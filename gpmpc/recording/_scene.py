@@ -54,7 +54,7 @@ class Scene:
         frames = ((DISPLAY, self._frame, fg.Vector3(), self._display_turn),)
         frames += ((self._frame, VEHICLE, places[0], turns[0]),)
         for channel, (parent, child, place, turn) in zip(self._frames, frames, strict=True):
-            names = {"parent_frame_id": parent, "child_frame_id": child}
+            names: Any = {"parent_frame_id": parent, "child_frame_id": child}
             channel.log(fg.FrameTransform(translation=place, rotation=turn, **names, **at), log_time=nanoseconds)
         at["frame_id"] = self._frame
         for channel, pose in zip(self._poses, poses, strict=False):

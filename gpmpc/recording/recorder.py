@@ -74,7 +74,8 @@ class McapRecorder:
         frames = {"positions": system.frame, "z axis": "down" if system.z_down else "up", "display": "z axis up"}
         config = config if isinstance(config, str) else json.dumps(config, indent=2, default=str)
 
-        self.path, self.address = Path(path), None
+        self.path = Path(path)
+        self.address: str | None = None
         self._n, self._m = len(system.state_names), len(system.input_names)
         self._start, self._record_problems, self._chunk_size = start_time_ns, record_problems, chunk_size
         self._encoder = Encoder(system)

@@ -65,7 +65,8 @@ class Gust(Disturbance):
                 raise SettingError("rates", f"must name states of the plant, {', '.join(names)}; got {name!r}")
         if not self.start <= time < self.stop:
             return plant
-        return _pushed(plant, tuple(float(self.rates.get(name, 0.0)) for name in names))
+        key: Any = plant  # hashable as any object, though no protocol says so
+        return _pushed(key, tuple(float(self.rates.get(name, 0.0)) for name in names))
 
 
 @dataclass(frozen=True)

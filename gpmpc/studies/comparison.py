@@ -106,7 +106,7 @@ def _runs_of(report: Report, key: str, text: str) -> dict[str, Mapping]:
         if value not in values:
             raise SettingError(f"compare {key}", f"{name} was varied over {', '.join(values)}; got {value!r}")
         group[name] = value
-    found = {}
+    found: dict[str, Mapping] = {}
     for cell in report.cells:
         chosen = dict(zip(report.variables, cell.values, strict=True))
         if group.items() <= chosen.items():

@@ -148,10 +148,10 @@ def make_environment(system: System | str, **settings: Any) -> Any:
     gymnasium = library("gymnasium")
     flown: System = getattr(systems, system)(**settings) if isinstance(system, str) else system
 
-    class Environment(gymnasium.Env):
+    class Environment(gymnasium.Env):  # type: ignore[name-defined]
         """A system as an environment."""
 
-        metadata = {"render_modes": []}  # noqa: RUF012
+        metadata: Any = {"render_modes": []}  # noqa: RUF012
 
         def __init__(self) -> None:
             n = len(flown.state_names)

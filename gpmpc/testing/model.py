@@ -1,5 +1,7 @@
 """Check of a dynamics model of your own: ``check_model``."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -28,7 +30,8 @@ def check_model(
         AssertionError: The model breaks a promise; the message says which, and by how much.
     """
     _check_attributes(model)
-    generator, like = torch.Generator().manual_seed(seed), {"dtype": model.dtype, "device": model.device}
+    generator = torch.Generator().manual_seed(seed)
+    like: dict[str, Any] = {"dtype": model.dtype, "device": model.device}
     x = (torch.randn(4, model.state_dim, generator=generator) if states is None else states).to(**like)
     u = (torch.randn(len(x), model.input_dim, generator=generator) if inputs is None else inputs).to(**like)
     exact, numeric = (1e-4, 3e-2) if torch.finfo(model.dtype).eps > 1e-10 else (1e-9, 1e-5)

@@ -227,8 +227,8 @@ def _check_monte_carlo(case: _Case) -> None:
 
 def _check_first_order_correlation(case: _Case) -> None:
     at, scale = case.belief, 1e-6
-    points = (part[None].double().cpu().numpy() for part in (at.mean, case.input))
-    A = torch.from_numpy(linearize(case.model, *map(np.ascontiguousarray, points), covariance=False).A[0]).to(at.mean)
+    x, u = (np.ascontiguousarray(part[None].double().cpu().numpy()) for part in (at.mean, case.input))
+    A = torch.from_numpy(linearize(case.model, x, u, covariance=False).A[0]).to(at.mean)
     got = case(Gaussian(at.mean, scale * at.covariance)).cross_covariance / scale
     promise, floor = "the cross covariance Cov[x, x+] is S A' to first order", float(at.covariance.abs().max())
     require_close(promise, got, at.covariance @ A.mT, 1e-3 + case.sampling_error, floor=floor)
