@@ -47,6 +47,11 @@ def test_the_loops_of_the_guides_reach_their_goals(path, page):
     assert abs(names.get("away", 0.5) - 0.5) < 0.02
 
 
+def test_many_starts_swing_the_cart_pole_of_the_leagues_page_up(page):
+    names, _ = page("docs/league.md")
+    assert abs(names["state"][2]) < 0.2
+
+
 def test_a_new_project_runs_at_once(tmp_path, monkeypatch):
     done = forked("new", "arm", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

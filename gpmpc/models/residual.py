@@ -349,8 +349,9 @@ def _residuals(
     if int(torch.linalg.matrix_rank(effect).min()) < effect.shape[-1]:
         raise SettingError("B", "must have linearly independent columns: equal effects cannot be distinguished")
     missed = after - _nominal(nominal, x, u)
+    Q, R = torch.linalg.qr(effect)  # torch.linalg.lstsq gives other last digits from call to call
     if callable(B):
-        targets = torch.linalg.lstsq(effect, missed[..., None]).solution[..., 0]
+        targets = torch.linalg.solve_triangular(R, Q.mT @ missed[..., None], upper=True)[..., 0]
     else:
-        targets = torch.linalg.lstsq(effect, missed.mT).solution.mT
+        targets = torch.linalg.solve_triangular(R, Q.mT @ missed.mT, upper=True).mT
     return torch.cat(features(x, u), dim=1), targets

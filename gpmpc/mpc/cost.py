@@ -37,7 +37,8 @@ class Tracking:
         R: Input weights, the diagonal (m,) or the matrix (m, m); matrices (H, m, m) by stage.
         terminal: Weight of the last predicted state, one like Q; Q itself (its last one) by default.
         penalized: What R weighs: ``"inputs"``, ``"deviations"`` from the reference inputs, or ``"increments"``.
-        angles: Indices of states whose error is modulo 2 pi: their references move by full turns towards the plan.
+        angles: Indices of states whose error is modulo 2 pi: their references move by full turns towards the plan;
+            None for none.
 
     Raises:
         SettingError: A weight is not symmetric positive semidefinite, R is zero in a direction, or a length is wrong.
@@ -59,7 +60,7 @@ class Tracking:
             raise SettingError("terminal", f"must be a weight of {Q.shape[-1]} states; got {len(terminal)}")
         if self.penalized not in PENALIZED:
             raise SettingError("penalized", f"must be one of {', '.join(map(repr, PENALIZED))}; got {self.penalized!r}")
-        angles = tuple(self.angles)
+        angles = tuple(self.angles or ())
         if not all(isinstance(index, int) and 0 <= index < Q.shape[-1] for index in angles):
             raise SettingError("angles", f"must be indices of {Q.shape[-1]} states; got {self.angles!r}")
         for key, value in (("Q", Q), ("R", R), ("terminal", terminal), ("angles", angles)):

@@ -57,9 +57,8 @@ def whole_records(path: Path) -> Iterator[McapRecord]:
                     return
                 if isinstance(record, Channel) and (Schema, record.schema_id) not in declared:
                     return
-                if not isinstance(record, Schema | Channel):
-                    continue
-                if declared.setdefault((type(record), record.id), record) != record:
+                new = isinstance(record, Schema | Channel)
+                if new and declared.setdefault((type(record), getattr(record, "id", 0)), record) != record:
                     return
                 yield record
     except OSError as error:

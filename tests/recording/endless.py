@@ -6,10 +6,10 @@ A fork needs no start of the interpreter, so that many can be killed. A second w
 import os
 import signal
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 
+from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.recording import McapRecorder, RecordedSystem, Step
 from gpmpc.status import Status
 
@@ -21,16 +21,9 @@ def record(path, steps):
     system = RecordedSystem(["x", "vx", "y", "vy", "z", "vz"], ["U1", "ux", "uy"], time_step=0.01)
     recorder = McapRecorder(path, system, config="seed: 7\n", metadata={"seed": 7})
     for k in range(steps):
-        decision = SimpleNamespace(
-            inputs=rng.standard_normal((H, m)),
-            means=rng.standard_normal((H + 1, n)),
-            covariances=np.tile(np.eye(n), (H + 1, 1, 1)),
-            status=Status.SOLVED,
-            iterations=3,
-            timing=SimpleNamespace(model=0.0, build=0.0, solve=0.0),
-            problem=None,
-            solution=None,
-        )
+        inputs, means = rng.standard_normal((H, m)), rng.standard_normal((H + 1, n))
+        covariances = np.tile(np.eye(n), (H + 1, 1, 1))
+        decision = Decision(inputs[0], inputs, means, covariances, Status.SOLVED, 3, Timing(0.0, 0.0, 0.0))
         vectors = [rng.standard_normal(n) for _ in range(3)]
         recorder.record(Step(k * 0.01, k, *vectors, decision.inputs[0], decision, vectors[0], np.eye(n)))
     print("recorded", flush=True)

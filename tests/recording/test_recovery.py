@@ -87,7 +87,9 @@ def test_a_run_killed_at_twenty_random_moments_is_recovered_every_time(start, tm
         path = tmp_path / f"{i}.mcap"
         process = start(path)
         size = rng.choice([1, rng.uniform(1, 300_000)])  # soon after the start, or in the middle of some chunk
+        deadline = time.monotonic() + 60
         while not path.exists() or path.stat().st_size < size:
+            assert time.monotonic() < deadline, "nothing is recorded"
             time.sleep(0.001)
         time.sleep(rng.uniform(0, 0.02))
         os.kill(process, signal.SIGKILL)
