@@ -71,11 +71,20 @@ def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
                 result = about | _fly(experiment_of(config), folder, config, about)
             folder.finish(result)
         except Exception as error:
+            if _was_interrupted(error):
+                raise KeyboardInterrupt from error
             folder.fail(error, about)
             return outcome | {"error": one_line(error), "mistake": isinstance(error, _MISTAKES)}
         if config.tracker == "mlflow":
             _track(folder, result)
     return outcome | {"result": result}
+
+
+def _was_interrupted(error: BaseException | None) -> bool:
+    """Whether an error came up while a Ctrl-C was being dealt with, as in the settings' own clean-up."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _track(folder: "RunFolder", result: Mapping[str, Any]) -> None:

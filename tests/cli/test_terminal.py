@@ -17,6 +17,7 @@ import pytest
 
 from gpmpc.cli._command import COMMANDS
 from gpmpc.cli._completion import candidates
+from gpmpc.cli._run import _was_interrupted
 from gpmpc.cli._terminal import Output
 from tests.cli.command import PATH, SECONDS, forked
 
@@ -290,6 +291,16 @@ def test_ctrl_c_in_the_middle_of_flights_is_one_line(command, tmp_path):
     _, shown = flying.communicate(timeout=SECONDS)
     advice = "; the same command goes on where it stopped" if "-m" in words else ""
     assert (flying.returncode, shown) == (130, f"\ninterrupted{advice}\n")
+
+
+def test_an_error_that_came_up_while_an_interrupt_was_dealt_with_is_the_interrupt():
+    with pytest.raises(ValueError, match="clean-up") as found:
+        try:
+            raise KeyboardInterrupt
+        finally:
+            raise ValueError("clean-up")
+    assert _was_interrupted(found.value)
+    assert not _was_interrupted(ValueError("of the settings"))
 
 
 POOL = """
