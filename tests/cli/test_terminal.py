@@ -294,11 +294,14 @@ def test_ctrl_c_in_the_middle_of_flights_is_one_line(command, tmp_path):
 
 
 def test_an_error_that_came_up_while_an_interrupt_was_dealt_with_is_the_interrupt():
-    with pytest.raises(ValueError, match="clean-up") as found:
+    def clean_up_badly():
         try:
             raise KeyboardInterrupt
         finally:
             raise ValueError("clean-up")
+
+    with pytest.raises(ValueError, match="clean-up") as found:
+        clean_up_badly()
     assert _was_interrupted(found.value)
     assert not _was_interrupted(ValueError("of the settings"))
 
