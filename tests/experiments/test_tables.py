@@ -20,7 +20,7 @@ from gpmpc.experiments.tables import (
     predict_all,
     summarise,
 )
-from gpmpc.gp import SoftLimits, Transitions, train
+from gpmpc.gp import SoftLimits, Transitions, identity, train
 from gpmpc.studies.document import number
 from gpmpc.studies.study import TrialStore, run_study
 from gpmpc.trajectories import Hover
@@ -240,7 +240,7 @@ def test_the_full_rows_are_the_papers_on_the_authors_data(paper_data, tmp_path, 
         data=PaperData(paper_data),
         trajectories={trajectory: Hover()},
         subsystems=subsystem,
-        model=partial(train, penalty=SoftLimits()),
+        model=partial(train, penalty=SoftLimits(), scaling=identity),
         sizes=[189],
         draws=1,
     )
@@ -272,7 +272,7 @@ def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row
         data=Mixed(),
         trajectories={"elliptical": Hover()},
         subsystems="rotational",
-        model=partial(train, penalty=SoftLimits()),
+        model=partial(train, penalty=SoftLimits(), scaling=identity),
         sizes=[189],
         draws=1,
     )
