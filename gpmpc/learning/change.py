@@ -119,11 +119,9 @@ class ChangedModel(Wrapper):
             kernel = scales, share**2 * gp.signal_variance, variances
             one = features[:1], torch.from_numpy(targets[:1])
             first = self._replaced(change=GPPosterior.from_hyperparameters(*one, *kernel, gp.input_dim + 1, "value"))
-            return (
-                first.with_points(points[1:], targets[1:], *(noise, share, memory, window))
-                if points[1:].size
-                else first
-            )
+            if len(points) == 1:
+                return first
+            return first.with_points(points[1:], targets[1:], noise, share, memory, window)
         before = replace(self.change, noise_variance=variances)  # of these points; the others' is in the factor
         return self._replaced(change=window.append(before, features, torch.from_numpy(targets)))
 

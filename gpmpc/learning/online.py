@@ -144,11 +144,8 @@ class LearningController:
     def __init__(self, controller: GPMPC, learning: OnlineLearning | None = None):
         check_method("controller", controller, "with_model", "GPMPC(...)")
         self.controller, self.learning = controller, OnlineLearning() if learning is None else learning
-        self.horizon, self.problem, self.initial_input = (
-            controller.horizon,
-            controller.problem,
-            controller.initial_input,
-        )
+        self.problem, self.horizon = controller.problem, controller.horizon
+        self.initial_input = controller.initial_input
         self._model = ChangedModel(controller.prediction.model)
 
     def control(

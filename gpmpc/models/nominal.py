@@ -172,8 +172,8 @@ class CasadiFunction:
             return tuple(np.ascontiguousarray(part) for part in (value, *parts))
         if K not in self._mapped:
             self._mapped[K] = self._expansion.map(K)
-        found_parts: Any = self._mapped[K](*(argument.T for argument in arguments))
-        listed = found_parts if isinstance(found_parts, tuple | list) else [found_parts]
+        expanded: Any = self._mapped[K](*(argument.T for argument in arguments))
+        listed = expanded if isinstance(expanded, tuple | list) else [expanded]
         value, *jacobians = (part.full() for part in listed)
         found = [self._split(value, K)]
         for jacobian in jacobians:  # rows of a derivative go through a matrix column by column

@@ -59,11 +59,8 @@ class ManyStarts:
         for one in (self.controller, self.planner):
             if one.prediction.settings.form != "trajectory":
                 raise SettingError("controller", "must be of form 'trajectory', whose plans may start anywhere")
-        self.problem, self.horizon, self.initial_input = (
-            controller.problem,
-            controller.horizon,
-            controller.initial_input,
-        )
+        self.problem, self.horizon = controller.problem, controller.horizon
+        self.initial_input = controller.initial_input
         H, m, angles = self.horizon, self.problem.input_dim, self.problem.cost.angles
         if guesses is None:
             guesses = [None, *kicks(self.problem, H, self.initial_input)]
@@ -145,8 +142,9 @@ class ManyStarts:
                 range(int(np.floor(off)) - count, int(np.ceil(off)) + count + 1), key=lambda k: abs(k - off)
             )
             moves.append(nearest[:count])
-        turns = np.zeros((len(list(product(*moves))), len(state)))
-        turns[:, angles] = 2 * np.pi * np.array(list(product(*moves))).reshape(len(turns), len(angles))
+        chosen = list(product(*moves))
+        turns = np.zeros((len(chosen), len(state)))
+        turns[:, angles] = 2 * np.pi * np.array(chosen).reshape(len(turns), len(angles))
         distances = np.abs(state - reference.states[-1] - turns)[:, angles].sum(axis=1)
         return (_moved(reference, turns[i]) for i in np.argsort(distances, kind="stable"))
 
