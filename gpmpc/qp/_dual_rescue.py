@@ -1,6 +1,5 @@
 """The dual active-set method with doubled digits, for the programs that float64 alone cannot decide.
 
-Rows that are parallel up to 1e-12, or a Hessian at the edge of definiteness, leave few of sixteen digits. Here the same
 Rows that are parallel up to 1e-12, or a Hessian at the edge of definiteness, leave few of sixteen digits. Here the
 iteration of ``gpmpc.qp._dual_iteration`` is written for accuracy: variables and rows are scaled by powers of two, the
 working set has a QR factor computed anew at each change, and x and the multipliers are sums of two floats that Newton's
