@@ -5,7 +5,7 @@ from gpmpc.models.delay import DelayedModel
 from gpmpc.models.disturbance import DisturbedModel
 from gpmpc.models.features import Features, Lags
 from gpmpc.models.nominal import Affine, CasadiFunction, KnownModel
-from gpmpc.models.residual import ResidualModel, train_with_angles
+from gpmpc.models.residual import ResidualModel, train_residual
 from gpmpc.models.storage import load_model, save_model
 
 __all__ = [
@@ -23,5 +23,5 @@ __all__ = [
     "linearize_by_autograd",
     "load_model",
     "save_model",
-    "train_with_angles",
+    "train_residual",
 ]
