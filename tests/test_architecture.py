@@ -50,7 +50,7 @@ def test_recordings_are_written_and_read_without_torch_and_without_compilers():
         ("matplotlib", ["plotting"]),
         ("casadi", ["mpc", "gp/casadi_.py"]),
         ("rich", ["cli", "studies"]),
-        ("mcap", ["recording", "logs/readers.py"]),
+        ("mcap", ["recording", "logs/_readers.py"]),
         ("google.protobuf", ["recording"]),
         ("foxglove", ["recording"]),
         ("pandas", ["recording", "calibration.py", "cli", "studies", "logs"]),
