@@ -31,8 +31,8 @@ from gpmpc.gp.online import SlidingWindow, append_points
 from gpmpc.gp.posterior import AffineForm, GPPosterior
 from gpmpc.gp.training import Trainer, Training
 from gpmpc.gp.transitions import Transitions, check_transitions
-from gpmpc.models.features import Features
-from gpmpc.models.nominal import Affine, CasadiFunction, linearize_function
+from gpmpc.models._features import Features
+from gpmpc.models._nominal import Affine, CasadiFunction, linearize_function
 
 Nominal = Callable[[Tensor, Tensor], Tensor]
 Effect = Tensor | Callable[[Tensor], Tensor]
