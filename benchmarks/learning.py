@@ -28,7 +28,7 @@ from gpmpc.learning import LearningController, OnlineLearning
 from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.controller import Controller
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.plotting.image import png
+from gpmpc.plotting import png
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Gust, Noise, Replaced, Rollout, closed_loop
 from gpmpc.systems import translational

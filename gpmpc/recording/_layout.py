@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from gpmpc.recording._messages import ATTITUDE, PLAN, POSITION, STEP, TIMING
+from gpmpc.recording._reader import Run
 from gpmpc.recording._scene import DISPLAY, VEHICLE
-from gpmpc.recording.reader import Run
 
 _STATE, _MEASURED, _REFERENCE, _BOUND = "#0072b2", "#e69f00", "#000000", "#d55e00"  # Okabe and Ito (2008)
 _PALETTE = (_STATE, _BOUND, "#009e73", "#cc79a7", _MEASURED, "#56b4e9")

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator, PercentFormatter
 
 from gpmpc.plotting._style import BLUE, COLOURS, DASHED, DASHES, VERMILION, add_legend, legend_below, styled
-from gpmpc.plotting.sweeps import Series, draw_quartiles
+from gpmpc.plotting._sweeps import Series, draw_quartiles
 
 if TYPE_CHECKING:
     from gpmpc.calibration import Calibration

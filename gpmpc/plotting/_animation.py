@@ -17,8 +17,8 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from gpmpc.exceptions import UnsupportedModel
+from gpmpc.plotting._recorded import FLOWN, REFERENCE, TUBE
 from gpmpc.plotting._style import DASHED, GREEN, styled
-from gpmpc.plotting.recorded import FLOWN, REFERENCE, TUBE
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
