@@ -9,7 +9,7 @@ from gpmpc.compiled import call_unchecked
 from gpmpc.dynamics import Array, DynamicsModel, linearize, to_array
 from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import AffineForm
-from gpmpc.kernels._packed import GPArrays
+from gpmpc.kernels import GPArrays
 from gpmpc.kernels.gp_rollout import COSINE, PLAIN, SINE, AffineGPs, Feedback, roll_out_gps
 from gpmpc.kernels.tape import NO_TAPE
 from gpmpc.models._features import Features

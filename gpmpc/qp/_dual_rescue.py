@@ -1,10 +1,9 @@
 """The dual active-set method with doubled digits, for the programs that float64 alone cannot decide.
 
-Rows that are parallel up to 1e-12, or a Hessian at the edge of definiteness, leave few of sixteen digits. Here the same
-iteration as in ``gpmpc.qp.dual_iteration`` is written for accuracy: variables and rows are scaled by powers of two, the
+Rows that are parallel up to 1e-12, or a Hessian at the edge of definiteness, leave few of sixteen digits. Here the
+iteration of ``gpmpc.qp._dual_iteration`` is written for accuracy: variables and rows are scaled by powers of two, the
 working set has a QR factor computed anew at each change, and x and the multipliers are sums of two floats that Newton's
 method corrects by residuals without rounding error (iterative refinement, Higham, Accuracy and Stability of Numerical
-Algorithms, 2002, chapter 12). A solve takes milliseconds. With P = L L' and A_W = [L^-1 C_W'; sqrt(softness_W)]:
 
     a = -A_W dmu - [L^-1 r1; 0],   A_W' a = -r2,   L' dx = a
 
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
-from gpmpc.qp import record as layout
+from gpmpc.qp import _record as layout
 from gpmpc.qp.problem import ABSENT
 from gpmpc.qp.solution import proves_infeasibility, zero_row_size
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from gpmpc.compiled import inline_njit
 from gpmpc.kernels.linalg import combine_rows, dot
-from gpmpc.qp.record import INFEASIBLE, ITERATION_LIMIT, SOLVED
-from gpmpc.qp.triangular import (
+from gpmpc.qp._record import INFEASIBLE, ITERATION_LIMIT, SOLVED
+from gpmpc.qp._triangular import (
     append_row,
     delete_row,
     multiply_rows,
@@ -23,7 +23,7 @@ from gpmpc.qp.triangular import (
     solve_transposed,
     subtract_rows,
 )
-from gpmpc.qp.violations import (
+from gpmpc.qp._violations import (
     choose_bad,
     count_bad,
     ignore_violations,

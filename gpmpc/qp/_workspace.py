@@ -16,7 +16,7 @@ from scipy.linalg import solve_triangular
 
 from gpmpc.compiled import inline_njit
 from gpmpc.kernels.linalg import aligned_rows
-from gpmpc.qp.record import HEADER
+from gpmpc.qp._record import HEADER
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class Workspace(NamedTuple):
     softness: Any  # (M,) 1/rho of a quadratic price: added to K_pp
     cap: Any  # (M,) linear price: the largest size of a multiplier
     end: Any  # (M,) leading entries of c_p that may not be zero
-    record: Any  # what the solve returns, see ``gpmpc.qp.record``; in it
+    record: Any  # what the solve returns, see ``gpmpc.qp._record``; in it
     x: Any  # (n,) the point and
     mu: Any  # (M,) its multipliers
     y: Any  # (M,) C x

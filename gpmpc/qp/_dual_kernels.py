@@ -1,8 +1,8 @@
 """The compiled entry point of the dual active set: a warm-started solve whose result is judged by its own residuals.
 
 ``solve`` minimises ``1/2 x'Px + q'x`` subject to ``lower <= [x; Gx] <= upper`` from a guessed working set and writes a
-record (``gpmpc.qp.record``). The guess is corrected until its multipliers have the right signs, then by the dual
-iteration (``gpmpc.qp.dual_iteration``). Nothing is believed without its residuals: x is refined on its working set by
+record (``gpmpc.qp._record``). The guess is corrected until its multipliers have the right signs, then by the dual
+iteration (``gpmpc.qp._dual_iteration``). Nothing is believed without its residuals: x is refined on its working set by
 Newton's method (one step is exact but for rounding) with residuals computed from P, q and G, and handed back to the
 iteration while a bound is violated.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from gpmpc.compiled import compiled, inline_njit
 from gpmpc.kernels._simd import any_nonzero, clip, larger, largest, load, load_some, store, total, zeros
 from gpmpc.kernels.linalg import dot, multiply
-from gpmpc.qp.dual_iteration import (
+from gpmpc.qp._dual_iteration import (
     NEGLIGIBLE,
     add_constraints,
     add_multipliers,
@@ -24,7 +24,7 @@ from gpmpc.qp.dual_iteration import (
     multiply_constraints,
     restore_constraints,
 )
-from gpmpc.qp.record import (
+from gpmpc.qp._record import (
     AGE,
     CONSTRAINTS,
     HEADER,
@@ -38,9 +38,9 @@ from gpmpc.qp.record import (
     VARIABLES,
     WORKING,
 )
-from gpmpc.qp.triangular import factorise, multiply_rows, solve_lower, solve_transposed, subtract_rows
-from gpmpc.qp.violations import TOLERATED, are_present, choose_guess, list_violated, restore_limits
-from gpmpc.qp.workspace import SHARE, all_finite, is_dense, is_dense_matrix, open_workspace, round_end
+from gpmpc.qp._triangular import factorise, multiply_rows, solve_lower, solve_transposed, subtract_rows
+from gpmpc.qp._violations import TOLERATED, are_present, choose_guess, list_violated, restore_limits
+from gpmpc.qp._workspace import SHARE, all_finite, is_dense, is_dense_matrix, open_workspace, round_end
 
 SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
 
@@ -60,7 +60,7 @@ _UNDEFINED = 1e300  # a residual that overflowed; less than infinity, so that re
 
 @compiled(allocates=False, locked=True)
 def solve(P, q, G, lower, upper, guess, memory, out):
-    """Solves one program; ``memory`` is of ``gpmpc.qp.workspace``, ``guess`` a record or empty. Returns a status."""
+    """Solves one program; ``memory`` is of ``gpmpc.qp._workspace``, ``guess`` a record or empty. Returns a status."""
     n, M = P.shape[0], len(P) + len(G)
     shaped = P.shape[1] == n and len(q) == n and G.shape[1] == n and len(lower) == M and len(upper) == M
     dense = is_dense(q) and is_dense(lower) and is_dense(upper) and is_dense(guess)
