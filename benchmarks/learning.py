@@ -26,9 +26,9 @@ from benchmarks.timing import write_results
 from gpmpc.files import write_whole
 from gpmpc.gp import GPPosterior
 from gpmpc.learning import LearningController, OnlineLearning
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.controller import Controller
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Gust, Noise, Replaced, Rollout, closed_loop

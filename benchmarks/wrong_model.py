@@ -21,8 +21,8 @@ from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, tra
 from benchmarks.timing import write_results
 from gpmpc.files import write_whole
 from gpmpc.metrics import tracking_error
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Replaced, Rollout, closed_loop
