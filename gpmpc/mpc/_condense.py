@@ -27,7 +27,7 @@ from numba import types
 from gpmpc.compiled import compile_for, compiled, njit_inner, njit_noalloc, unchecked_entry_point
 from gpmpc.exceptions import ShapeError
 from gpmpc.kernels.linalg import aligned_rows, combine_rows, copy, copy_matrix, dot
-from gpmpc.mpc.linear_quadratic import (
+from gpmpc.mpc._linear_quadratic import (
     DEVIATIONS,
     INCREMENTS,
     CondensedProgram,

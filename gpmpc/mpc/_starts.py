@@ -17,7 +17,7 @@ import torch
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.models.roll_out import RollOut
+from gpmpc.models import RollOut
 from gpmpc.mpc.controller import Array, Decision, Reference, full_turns
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Problem

@@ -25,10 +25,10 @@ import torch
 from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.exceptions import DataError, ProblemError
 from gpmpc.kernels.linalg import dot
+from gpmpc.mpc._linear_quadratic import CondensedProgram, References, evaluate_cost, weight_of_stage
+from gpmpc.mpc._prediction import Prediction, PredictionModel
+from gpmpc.mpc._stages import Plan, price_violations
 from gpmpc.mpc.controller import Request
-from gpmpc.mpc.linear_quadratic import CondensedProgram, References, evaluate_cost, weight_of_stage
-from gpmpc.mpc.prediction import Prediction, PredictionModel
-from gpmpc.mpc.stages import Plan, price_violations
 from gpmpc.qp import QPSolution
 from gpmpc.status import Status
 

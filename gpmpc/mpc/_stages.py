@@ -28,12 +28,11 @@ from gpmpc.dynamics import DynamicsModel, linearize, tensors_for, to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.linalg import dot
-from gpmpc.mpc.cost import PENALIZED, by_stage
-from gpmpc.mpc.linear_quadratic import QuadraticCost, StageRows
+from gpmpc.mpc._cost import PENALIZED, by_stage
+from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows
 from gpmpc.mpc.problem import Inequality, Problem
-from gpmpc.propagation import Propagator, differentiate
+from gpmpc.propagation import Propagator, differentiate, square_roots
 from gpmpc.propagation import linearize as linearize_belief
-from gpmpc.propagation.local_model import square_roots
 from gpmpc.qp import SoftRows
 
 Array = np.ndarray

@@ -30,8 +30,8 @@ from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp import GPPosterior, SlidingWindow, Trainer, Training, Transitions, append_points
 from gpmpc.gp.posterior import AffineForm
 from gpmpc.gp.transitions import check_transitions
-from gpmpc.models.features import Features
-from gpmpc.models.nominal import Affine, CasadiFunction, linearize_function
+from gpmpc.models._features import Features
+from gpmpc.models._nominal import Affine, CasadiFunction, linearize_function
 
 Nominal = Callable[[Tensor, Tensor], Tensor]
 Effect = Tensor | Callable[[Tensor], Tensor]

@@ -37,19 +37,9 @@ from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.gp_rollout import Feedback
 from gpmpc.kernels.linalg import copy_matrix, product
-from gpmpc.models.roll_out import RollOut
-from gpmpc.mpc.controller import (
-    Decision,
-    Reference,
-    Request,
-    check_controller,
-    check_method,
-    full_turns,
-    read_parameters,
-)
-from gpmpc.mpc.linear_quadratic import QuadraticCost, StageRows, finite_horizon_lqr
-from gpmpc.mpc.problem import Problem
-from gpmpc.mpc.stages import (
+from gpmpc.models import RollOut
+from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, finite_horizon_lqr
+from gpmpc.mpc._stages import (
     COVARIANCES,
     ConstraintRows,
     Covariance,
@@ -59,6 +49,16 @@ from gpmpc.mpc.stages import (
     StageLinearizer,
     keep_rates,
 )
+from gpmpc.mpc.controller import (
+    Decision,
+    Reference,
+    Request,
+    check_controller,
+    check_method,
+    full_turns,
+    read_parameters,
+)
+from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator
 
 Array = np.ndarray
@@ -91,7 +91,7 @@ class PredictionSettings:
 
     Attributes:
         form: ``"trajectory"`` or ``"velocity"``; see the module's text.
-        covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see ``gpmpc.mpc.stages``.
+        covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see ``gpmpc.mpc._stages``.
         feedback: Predicts the covariances of ``"zero_order"`` under a feedback, without which no long horizon with
             state constraints is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"``
             and ``"diagonal"`` are those without feedback.
