@@ -16,7 +16,7 @@ import numpy as np
 
 from gpmpc.recording._messages import ATTITUDE, PLAN, POSITION, STEP, TIMING
 from gpmpc.recording._reader import Run
-from gpmpc.recording._scene import DISPLAY, VEHICLE
+from gpmpc.recording._scene import DISPLAY, VEHICLE, WORLD
 
 _STATE, _MEASURED, _REFERENCE, _BOUND = "#0072b2", "#e69f00", "#000000", "#d55e00"  # Okabe and Ito (2008)
 _PALETTE = (_STATE, _BOUND, "#009e73", "#cc79a7", _MEASURED, "#56b4e9")
@@ -42,8 +42,7 @@ def layout(run: Run) -> str:
     panels["RosOut!log"] = {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/log"}
     left, share = "RosOut!log", 25
     if "/pose" in run.channels:
-        frame = run.metadata.get("frames", {}).get("positions", "world")
-        panels["3D!scene"] = _scene(frame, "Position" in groups, "Attitude" in groups)
+        panels["3D!scene"] = _scene("Position" in groups, "Attitude" in groups)
         left, share = _split("column", "3D!scene", left, 78), 50
     whole = {"configById": panels, "globalVariables": {}, "userNodes": {}, "playbackConfig": {"speed": 1}}
     return json.dumps(whole | {"layout": _split("row", left, "Tab!plots", share)}, indent=1) + "\n"
@@ -113,7 +112,7 @@ def _plot(title: str, lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _scene(frame: str, moves: bool, turns: bool) -> dict[str, Any]:
+def _scene(moves: bool, turns: bool) -> dict[str, Any]:
     """Makes the 3D panel: around a vehicle that moves, or on the spot around one that only turns."""
     size = 40 if moves else 4  # [m]
     grid = {"layerId": "foxglove.Grid", "instanceId": "grid", "label": "Grid", "visible": True, "frameLocked": True}
@@ -130,7 +129,7 @@ def _scene(frame: str, moves: bool, turns: bool) -> dict[str, Any]:
             "thetaOffset": 45,
         },  # [m], [deg]
         "scene": {"transforms": {"showLabel": False}},
-        "transforms": {f"frame:{name}": {"visible": False} for name in (frame, VEHICLE)},  # /pose shows where it is
+        "transforms": {f"frame:{name}": {"visible": False} for name in (WORLD, VEHICLE)},  # /pose shows where it is
         "layers": {"grid": grid},
         "topics": {
             "/pose": {"visible": True, "type": "axis", "axisScale": 1.0},
