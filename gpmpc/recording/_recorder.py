@@ -104,7 +104,11 @@ class McapRecorder:
         self._channels, self._log = self._encoder.channels(context), LogChannel("/log", context=context)
         self._scene = Scene(context, system)
         if live:
-            self._serve(context)
+            try:
+                self._server = foxglove.start_server(name=self.path.name, port=_PORT, context=context)
+            except RuntimeError:  # the port is taken
+                self._server = foxglove.start_server(name=self.path.name, port=0, context=context)
+            self.address = f"ws://127.0.0.1:{self._server.port}"
 
     def record(self, step: Step, gp_size: int | None = None) -> None:
         """Takes a copy of a step.
@@ -191,13 +195,6 @@ class McapRecorder:
         if self._server is not None:
             self._server.stop()
         self._sink.close()
-
-    def _serve(self, context: foxglove.Context) -> None:
-        try:
-            self._server = foxglove.start_server(name=self.path.name, port=_PORT, context=context)
-        except RuntimeError:  # the port is taken
-            self._server = foxglove.start_server(name=self.path.name, port=0, context=context)
-        self.address = f"ws://127.0.0.1:{self._server.port}"
 
 
 class _Sink:
