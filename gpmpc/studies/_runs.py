@@ -144,18 +144,16 @@ def read_report(tree: str | Path) -> Report:
     values = {key: {choices[key] for choices in [*filled, *planned]} for key in keys if key != SEED}
     varied = tuple(sorted(key for key in values if len(values[key]) > 1))
     cells: dict[tuple[str, ...], Cell] = {}
-
-    def cell_of(choices: Choices) -> Cell:
-        where = tuple(choices[key] for key in varied)
-        return cells.setdefault(where, Cell(where))
-
-    for choices, run in sorted(zip(filled, runs, strict=True), key=lambda pair: in_order(pair[0][SEED])):
-        cell = cell_of(choices)
-        (cell.runs if run.error is None else cell.failed)[choices[SEED]] = run
-    for choices, plan in sorted(zip(planned, plans, strict=True), key=lambda pair: in_order(pair[0][SEED])):
-        cell, seed = cell_of(choices), choices[SEED]
-        kind = "skipped" if folder_name(_spelled(plan)) in unread else "missing"
-        if seed not in (*cell.runs, *cell.failed, *cell.skipped, *cell.missing):
+    asked = [
+        (choices, None, folder_name(_spelled(plan)) in unread) for choices, plan in zip(planned, plans, strict=True)
+    ]
+    flown = [(choices, run, False) for choices, run in zip(filled, runs, strict=True)]
+    for choices, run, kind in sorted([*flown, *asked], key=lambda each: in_order(each[0][SEED])):
+        where, seed = tuple(choices[key] for key in varied), choices[SEED]
+        cell = cells.setdefault(where, Cell(where))
+        if run is not None:
+            (cell.runs if run.error is None else cell.failed)[seed] = run
+        elif seed not in (*cell.runs, *cell.failed, *cell.skipped, *cell.missing):  # runs of a seed come before plans
             setattr(cell, kind, (*getattr(cell, kind), seed))
     rows = sorted(cells, key=lambda values: [in_order(value) for value in values])
     single = {key: value for key, those in values.items() if len(those) == 1 for value in those if value != "default"}
