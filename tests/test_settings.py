@@ -8,10 +8,10 @@ import pytest
 from gpmpc import datasets
 from gpmpc.datasets import Excitation
 from gpmpc.exceptions import SettingError
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Dropout, Gust

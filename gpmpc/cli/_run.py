@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
@@ -152,13 +153,16 @@ def experiment_of(config: DictConfig) -> "Experiment":
     """Makes the objects that the settings describe."""
     from hydra.utils import instantiate
 
-    from gpmpc.logs.flying import SavedModel
+    from gpmpc.logs import SavedModel
     from gpmpc.simulation import Noise
     from gpmpc.studies.flight import Experiment
 
     config = DictConfig(plain_data(config))
     _check(config)
     system = _system_of(config.system)
+    if known := config.nominal:
+        known = _system_of(known if "_target_" in known else OmegaConf.merge(config.system, known))
+        system = replace(system, nominal=known)
     with open_dict(config):
         for group, part in (("propagation", "propagator"), ("solver", "solver")):
             if config.get(group) and part not in config.controller:

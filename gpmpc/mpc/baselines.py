@@ -9,7 +9,7 @@ repeated: the last plan shifted saves an interior-point method nothing, and led 
 paper's elliptical flight, where the end of a plan costs little.
 
 LQR: along the reference the learned mean is x_{i+1} = A_i x_i + B_i u_i + c_i, for which one Riccati recursion
-minimises the cost (``gpmpc.mpc.linear_quadratic.optimal_feedback``). It knows no bound; what it gives is clipped.
+minimises the cost (``gpmpc.mpc._linear_quadratic.optimal_feedback``). It knows no bound; what it gives is clipped.
 """
 
 from collections.abc import Sequence
@@ -23,10 +23,10 @@ from gpmpc.dynamics import DynamicsModel, check_next_states, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.interrupts import interrupts_after
+from gpmpc.mpc._linear_quadratic import Stages, optimal_feedback
+from gpmpc.mpc._stages import ConstraintRows, Plan, StageCosts, StageLinearizer
 from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_controller
-from gpmpc.mpc.linear_quadratic import Stages, optimal_feedback
 from gpmpc.mpc.problem import Problem
-from gpmpc.mpc.stages import ConstraintRows, Plan, StageCosts, StageLinearizer
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from gpmpc.systems import Plant

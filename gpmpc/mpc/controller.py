@@ -14,7 +14,7 @@ import numpy as np
 from gpmpc.compiled import compile_for, compiled, njit_inner, unchecked_entry_point
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.linear_quadratic import References
+from gpmpc.mpc._linear_quadratic import References
 from gpmpc.mpc.problem import Problem
 from gpmpc.qp import QPSolution, QuadraticProgram
 from gpmpc.status import Status

@@ -1,10 +1,10 @@
 """GP model predictive control: the control step, from a belief and a reference to the input.
 
-The dynamics of the belief are linearised along a plan (``gpmpc.mpc.prediction``), the states eliminated
-(``gpmpc.mpc.condense``), and what is left is a quadratic program in the inputs. One of them a step, of the form
+The dynamics of the belief are linearised along a plan (``_prediction``), the states eliminated
+(``_condense``), and what is left is a quadratic program in the inputs. One of them a step, of the form
 ``trajectory``, is the real-time iteration (Diehl, Bock and Schloeder, 2005); of the form ``velocity`` with moments
-matched it is the convex GP-MPC of Cao, Lai and Alam (2017, section 4). Iterated (``gpmpc.mpc.sqp``), programs solve the
-nonlinear problem itself. Where the iteration ends, in the covariance modes of ``gpmpc.mpc.stages``:
+matched it is the convex GP-MPC of Cao, Lai and Alam (2017, section 4). Iterated (``_sqp``), programs solve the
+nonlinear problem itself. Where the iteration ends, in the covariance modes of ``_stages``:
 
 * ``full``, ``diagonal``: at a KKT point of the expected cost of the propagated belief, tr(Q Sigma) included, under
   chance constraints: the nonlinear GP-MPC of Cao, Lai and Alam (2017, eq. (22)), where moments are matched.
@@ -25,13 +25,13 @@ from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.condense import Condenser
+from gpmpc.mpc._condense import Condenser
+from gpmpc.mpc._linear_quadratic import CondensedProgram, Stages, expand
+from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
+from gpmpc.mpc._sqp import FAILURES, FullStep, Globalization
+from gpmpc.mpc._stages import Covariance, Plan, price_violations
 from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_method
-from gpmpc.mpc.linear_quadratic import CondensedProgram, Stages, expand
-from gpmpc.mpc.prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc.problem import Problem
-from gpmpc.mpc.sqp import FAILURES, FullStep, Globalization
-from gpmpc.mpc.stages import Covariance, Plan, price_violations
 from gpmpc.propagation import Propagator
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
 from gpmpc.status import Status
@@ -53,7 +53,7 @@ class GPMPC:
         prediction: Form, covariance mode, feedback and disturbance estimate.
         solver: Of the quadratic program; ``DualActiveSet()`` by default, which soft constraints need.
         iterations: Quadratic programs a step at most; more than one for the form ``"trajectory"`` only.
-        tolerance: Of more iterations: relative offset and defects of a plan that counts as solved (``gpmpc.mpc.sqp``),
+        tolerance: Of more iterations: relative offset and defects of a plan that counts as solved (``gpmpc.mpc._sqp``),
             estimated from the slower of the last two rates of convergence. 1e-8 may be out of reach.
 
     Attributes:

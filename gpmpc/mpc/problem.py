@@ -1,6 +1,6 @@
 """Declares what a controller makes small and what it keeps: one problem for all controllers.
 
-    minimise    the costs of ``gpmpc.mpc.cost``
+    minimise    the costs of ``gpmpc.mpc._cost``
     subject to  bounds on u_i and on u_i - u_{i-1}, and the constraints of the states x_1 .. x_H
 
 A constraint g'x <= f of a Gaussian state holds with probability eta where g'mu + kappa sqrt(g'Sigma g) <= f,
@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gpmpc.exceptions import SettingError, check_number
-from gpmpc.mpc.cost import Expansion, LeastSquares, Tracking, by_stage, expand_function
+from gpmpc.mpc._cost import Expansion, LeastSquares, Tracking, by_stage, expand_function
 from gpmpc.qp.problem import ABSENT
 
 Array = np.ndarray
@@ -217,7 +217,7 @@ class Inequality(Constraint):
         return np.zeros((self.count, 0)), np.full_like(upper, -math.inf), upper
 
     def expand(self, states: Array, inputs: Array, parameters: Array | None) -> Expansion:
-        """Returns h and its gradients along a plan (H, n), (H, m); see ``gpmpc.mpc.cost.expand_function``."""
+        """Returns h and its gradients along a plan (H, n), (H, m); see ``gpmpc.mpc._cost.expand_function``."""
         return expand_function("h", self.h, self.count, states, inputs, parameters)
 
 

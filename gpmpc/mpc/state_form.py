@@ -20,10 +20,10 @@ import numpy as np
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
+from gpmpc.mpc._sqp import FAILURES
 from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing
-from gpmpc.mpc.prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc.problem import Problem
-from gpmpc.mpc.sqp import FAILURES
 from gpmpc.propagation import Propagator
 from gpmpc.qp.cvxpy_ import STATUSES, TIGHT
 from gpmpc.status import Status

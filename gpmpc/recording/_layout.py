@@ -101,9 +101,8 @@ def _line(path: str, label: str, colour: str, **more: Any) -> dict[str, Any]:
 def _plot(title: str, lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     shown = dict.fromkeys(("showXAxisLabels", "showYAxisLabels", "showLegend"), True)
     # At the top the legend takes its height off the curves; ``sidebarDimension`` is its width [px].
-    legend = {"legendDisplay": "left", "sidebarDimension": 190, "showPlotValuesInLegend": True}
-    plot = {"foxglovePanelTitle": title, "paths": list(lines)} | shown | legend
-    return plot | {"isSynced": True, "xAxisVal": "timestamp"}
+    plot = {"foxglovePanelTitle": title, "paths": list(lines)} | shown
+    return plot | {"legendDisplay": "left", "sidebarDimension": 130, "isSynced": True, "xAxisVal": "timestamp"}
 
 
 def _scene(moves: bool, turns: bool) -> dict[str, Any]:

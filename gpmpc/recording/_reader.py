@@ -301,14 +301,13 @@ def _problem(message: Any) -> RecordedProblem:
 
 def _residuals(problem: RecordedProblem) -> tuple[float, float, float]:
     """Judges a recorded solution; NaN where there is none."""
-    from gpmpc.qp import record
-    from gpmpc.qp.solution import QPSolution
+    from gpmpc.qp import QuadraticProgram, make_solution
 
     if not len(problem.x):
         return np.nan, np.nan, np.nan
     P, q, G, lower, upper, softness, x, multipliers = problem
-    values = np.concatenate([np.zeros(record.HEADER), x, multipliers])
-    return QPSolution(x, (P, q, G, lower, upper), softness, values).residuals()
+    solution = make_solution(QuadraticProgram.unchecked(P, q, G, lower, upper), Status.SOLVED, x, multipliers)
+    return solution._replace(softness=softness).residuals()
 
 
 class Recovery(NamedTuple):

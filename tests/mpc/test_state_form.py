@@ -7,11 +7,11 @@ import pytest
 
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc._prediction import FORMS, PredictionSettings
+from gpmpc.mpc._stages import COVARIANCES
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import FORMS, PredictionSettings
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.mpc.stages import COVARIANCES
 from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MeanEquivalence
 from gpmpc.qp import CvxpySolver
