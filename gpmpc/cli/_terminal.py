@@ -119,8 +119,9 @@ def progress_bar(console: "Console", completed: Callable[[], int] | None = None)
 
     class Bar(progress.Progress):
         def get_renderables(self) -> Iterator[Any]:
-            for task in self.task_ids if completed is not None else ():
-                self.update(task, completed=completed())
+            if completed is not None:
+                for task in self.task_ids:
+                    self.update(task, completed=completed())
             yield from super().get_renderables()
 
     columns = [progress.TextColumn("{task.description}"), progress.BarColumn(), progress.MofNCompleteColumn()]

@@ -81,10 +81,10 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
             axis = int(lacking[1].max() >= lacking[0].max())
             left_out.append(lacking[axis].idxmax())
             both = both.drop(left_out[-1], axis=axis)
-        pairs = [side.loc[both.index, both.columns].mean(axis=0).to_numpy() for side in (first, second)]
-        if len(pairs[0]) >= 2:
+        a_mean, b_mean = (side.loc[both.index, both.columns].mean(axis=0).to_numpy() for side in (first, second))
+        if len(a_mean) >= 2:
             seeds = sorted((n for n in left_out if n.startswith(f"{SEED}=")), key=lambda name: in_order(name[5:]))
-            comparisons.append(_test(measure, *pairs, (*(n for n in left_out if n not in seeds), *seeds)))
+            comparisons.append(_test(measure, a_mean, b_mean, (*(n for n in left_out if n not in seeds), *seeds)))
     if not comparisons:
         raise DataError(f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common")
     return comparisons
@@ -122,7 +122,7 @@ def _test(measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...])
         interval, t_test, standardised = tuple(t.confidence_interval()), t.pvalue, t.statistic / np.sqrt(len(d))
     return Comparison(
         measure=measure,
-        medians=(np.median(a), np.median(b)),
+        medians=(float(np.median(a)), float(np.median(b))),
         quartiles=tuple(np.quantile(d, [0.25, 0.5, 0.75])),
         means=(a.mean(), b.mean()),
         difference=mean,

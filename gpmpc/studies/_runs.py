@@ -144,10 +144,10 @@ def read_report(tree: str | Path) -> Report:
     values = {key: {choices[key] for choices in [*filled, *planned]} for key in keys if key != SEED}
     varied = tuple(sorted(key for key in values if len(values[key]) > 1))
     cells: dict[tuple[str, ...], Cell] = {}
-    asked = [
-        (choices, None, folder_name(_spelled(plan)) in unread) for choices, plan in zip(planned, plans, strict=True)
-    ]
-    flown = [(choices, run, False) for choices, run in zip(filled, runs, strict=True)]
+    names = [folder_name(_spelled(plan)) for plan in plans]
+    kinds = ["skipped" if name in unread else "missing" for name in names]
+    flown = [(choices, run, "") for choices, run in zip(filled, runs, strict=True)]
+    asked = [(choices, None, kind) for choices, kind in zip(planned, kinds, strict=True)]
     for choices, run, kind in sorted([*flown, *asked], key=lambda each: in_order(each[0][SEED])):
         where, seed = tuple(choices[key] for key in varied), choices[SEED]
         cell = cells.setdefault(where, Cell(where))

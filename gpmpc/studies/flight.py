@@ -265,7 +265,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     rollout, problem, training = flown.rollout, flown.controller.problem, flown.training
     system, horizon = experiment.system, flown.controller.horizon
     error, total = _tracking_error(experiment, flown), _error(experiment, flown)
-    rmse: dict[str, float | None] = dict(zip(system.tracked, map(float, error.axes), strict=True)) | {"total": total}
+    rmse: dict[str, Any] = dict(zip(system.tracked, map(float, error.axes), strict=True)) | {"total": total}
     episodes = [one if np.isfinite(one := _error(experiment, each)) else None for each in flown.before]
     violations = {"inputs": violation_rate(rollout.inputs, *(side[0] for side in problem.inputs.by_stage(horizon)))}
     if boxes := [bounds.by_stage(horizon) for bounds in problem.constraints if isinstance(bounds, Box)]:
