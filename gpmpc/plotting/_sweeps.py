@@ -74,7 +74,7 @@ def draw_quartiles(axis: Axes, lines: Sequence[Series], positions: Sequence[str]
             continue
         low, middle, high = np.array([np.quantile(line.values[p], [0.25, 0.5, 0.75]) for p in known]).T
         style: Any = {"color": colour, "marker": "o", "markersize": 4, "linestyle": "none" if numbers is None else "-"}
-        axis.errorbar(place(middles[known]), middle, [middle - low, high - middle], label=line.label, **style)
+        axis.errorbar(place(middles[known]), middle, np.array([middle - low, high - middle]), label=line.label, **style)
         for x, group in zip(middles, line.values, strict=True):
             aside = [0.3 * width * ((j + 0.5) / len(group) * 2 - 1) for j in range(len(group))]
             axis.plot(place(x + np.array(aside)), group, ".", color=colour, alpha=0.45, markersize=5, mew=0)

@@ -113,7 +113,7 @@ class Search:
         """
         order = sorted(range(len(self.costs)), key=lambda i: (self.costs[i], i))
         keys, matter = [*self._space], self.importances()
-        rows = [[i, _shown(self.costs[i]), *(_text(self.candidates[i][k]) for k in keys)] for i in order[:_SHOWN]]
+        rows = [[str(i), _shown(self.costs[i]), *(_text(self.candidates[i][k]) for k in keys)] for i in order[:_SHOWN]]
         tables = [Table(["candidate", "cost", *keys], rows, "Best candidates")]
         if matter:
             share = [[key, f"{100 * value:.0f} %"] for key, value in matter.items()]
