@@ -126,7 +126,7 @@ def evaluation(route: str, x, y, inducing: int):
     from benchmarks.gpytorch_likelihood import GPyTorchLikelihood
     from gpmpc.gp._kernel import Hyperparameters
     from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
-    from gpmpc.gp.sparse import collapsed_bound_with_gradient
+    from gpmpc.gp._sparse import collapsed_bound_with_gradient
 
     theta = np.append(np.linspace(0.5, 1.5, D), [0.5, np.log(30.0)])
     if route == EXACT:

@@ -18,8 +18,7 @@ from gpmpc.gp import Trainer, Transitions, standardize
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc import GPMPC, Box, ControlLoop, Inequality, Problem, Tracking
 from gpmpc.propagation import Linearization
-from gpmpc.systems import step_many
-from gpmpc.systems.mechanical import planar_quadrotor
+from gpmpc.systems import planar_quadrotor, step_many
 
 HORIZON, STEPS = 30, 110
 NOISE = [0.002, 0.02, 0.002, 0.02, 0.002, 0.02]  # standard deviations a step

@@ -16,8 +16,7 @@ from gpmpc.gp import Transitions, standardize, train
 from gpmpc.mpc import GPMPC, Box, LeastSquares, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Rollout, closed_loop
-from gpmpc.systems import step_many
-from gpmpc.systems.reactor import stirred_tank
+from gpmpc.systems import step_many, stirred_tank
 
 HOTTEST, STEPS = 352.0, 200  # [K], [-]
 HOTTEST_STATE = [np.inf, HOTTEST]

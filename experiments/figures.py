@@ -46,7 +46,7 @@ from gpmpc.studies.study import (
     read_model,
     trained_model,
 )
-from gpmpc.systems.attitudes import GRAVITY
+from gpmpc.systems import GRAVITY
 from gpmpc.trajectories import Trajectory
 
 ROOMS = ("gp", "models", "propagation", "kernels", "qp", "mpc", "simulation", "datasets", "systems")

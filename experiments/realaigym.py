@@ -21,8 +21,7 @@ import numpy as np
 import torch
 
 from gpmpc.exceptions import GpmpcError, SettingError
-from gpmpc.gp import GPPosterior, Trainer, Transitions, standardize
-from gpmpc.gp.sparse_training import informative_points
+from gpmpc.gp import GPPosterior, Trainer, Transitions, informative_points, standardize
 from gpmpc.models import Affine, CasadiFunction, Features, KnownModel, ResidualModel
 from gpmpc.mpc import (
     GPMPC,

@@ -162,7 +162,7 @@ def experiment_of(config: DictConfig) -> "Experiment":
     """Makes the objects that the settings describe."""
     from hydra.utils import instantiate
 
-    from gpmpc.logs.flying import SavedModel
+    from gpmpc.logs import SavedModel
     from gpmpc.simulation import Noise
     from gpmpc.studies.flight import Experiment
     from gpmpc.studies.tracking import check_tracker

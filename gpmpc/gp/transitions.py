@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, UnsupportedModel, check_number
-from gpmpc.files import write_whole
-from gpmpc.gp._archive import existing_file, new_file, read_npz, write_npz
+from gpmpc.files import existing_file, new_file, write_whole
+from gpmpc.gp._archive import read_npz, write_npz
 
 _NAMES = ("states", "inputs", "next_states")
 _EXPECTED = "a file of transitions"

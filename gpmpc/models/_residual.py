@@ -27,10 +27,9 @@ from gpmpc.dynamics import (
 )
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.gp.online import SlidingWindow, append_points
-from gpmpc.gp.posterior import AffineForm, GPPosterior
-from gpmpc.gp.training import Trainer, Training
-from gpmpc.gp.transitions import Transitions, check_transitions
+from gpmpc.gp import GPPosterior, SlidingWindow, Trainer, Training, Transitions, append_points
+from gpmpc.gp.posterior import AffineForm
+from gpmpc.gp.transitions import check_transitions
 from gpmpc.models._features import Features
 from gpmpc.models._nominal import Affine, CasadiFunction, linearize_function
 

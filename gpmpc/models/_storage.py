@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import DataError, GpmpcError, UnsupportedModel
-from gpmpc.gp._archive import existing_file, new_file
+from gpmpc.files import existing_file, new_file
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.storage import load_metadata, posterior_of_parts, posterior_parts, read_model, write_model
 from gpmpc.models._delay import DelayedModel

@@ -1,6 +1,7 @@
 """Controllers: from a state and a reference to an input."""
 
 from gpmpc.mpc._cost import LeastSquares, Tracking
+from gpmpc.mpc._linear_quadratic import dlqr
 from gpmpc.mpc._prediction import PredictionSettings
 from gpmpc.mpc._starts import ManyStarts, kicks
 from gpmpc.mpc.controller import Controller, Decision, Reference

@@ -24,7 +24,7 @@ from gpmpc.systems import (
     stirred_tank,
     translational,
 )
-from gpmpc.systems.attitudes import GRAVITY
+from gpmpc.systems._attitudes import GRAVITY
 from gpmpc.trajectories import Hover, Step, Waypoints
 
 ALL = [

@@ -14,10 +14,10 @@ import numpy as np
 
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
-from gpmpc.logs.kinematics import Kinematics
-from gpmpc.logs.log import Log, Windows
-from gpmpc.logs.nominal import Nominal
-from gpmpc.logs.state_space import Array
+from gpmpc.logs._kinematics import Kinematics
+from gpmpc.logs._log import Log, Windows
+from gpmpc.logs._nominal import Nominal
+from gpmpc.logs._state_space import Array
 
 STEPS = 50  # of the rollouts that models are judged by
 PAST = 20  # rows before them

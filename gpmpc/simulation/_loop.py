@@ -16,8 +16,8 @@ from gpmpc.exceptions import Diverged, GpmpcError, SettingError, ShapeError, Sol
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Controller, Reference, Timing
 from gpmpc.mpc.policy import Command, OnFailure, check_policy, command
-from gpmpc.simulation.disturbances import Disturbance
-from gpmpc.simulation.simulator import ModelLoop, ModelSimulator, Noise, PlantSimulator, Simulator, step_together
+from gpmpc.simulation._disturbances import Disturbance
+from gpmpc.simulation._simulator import ModelLoop, ModelSimulator, Noise, PlantSimulator, Simulator, step_together
 from gpmpc.status import Status
 from gpmpc.step import Step
 from gpmpc.systems import Plant

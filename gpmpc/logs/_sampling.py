@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gpmpc.exceptions import DataError
-from gpmpc.logs.state_space import Array, quaternion_inverse, quaternion_product, rotation_quaternion, rotation_vector
+from gpmpc.logs._state_space import Array, quaternion_inverse, quaternion_product, rotation_quaternion, rotation_vector
 
 MOST_OUT_OF_ORDER = 0.05  # of the rows; beyond, the file does not hold one run in the order of time
 

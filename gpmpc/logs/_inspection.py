@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gpmpc.exceptions import DataError
-from gpmpc.logs.log import Log
-from gpmpc.logs.mapping import TIME_UNITS, LogMapping
-from gpmpc.logs.readers import STAMP, read_streams
-from gpmpc.logs.sampling import ordered_stamps
-from gpmpc.logs.state_space import Array
+from gpmpc.logs._log import Log
+from gpmpc.logs._mapping import TIME_UNITS, LogMapping
+from gpmpc.logs._readers import STAMP, read_streams
+from gpmpc.logs._sampling import ordered_stamps
+from gpmpc.logs._state_space import Array
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -118,7 +118,7 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None, log: Log | 
     """Inspects a log file.
 
     Args:
-        path: In a format of ``read_streams``.
+        path: In a format of ``read_log``.
         mapping: Says which columns matter, and which is the time; all numbers by default.
         log: As read with the mapping; gives the inputs' dependence on the states.
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import ndtri
 
-from gpmpc.logs.baselines import Ridge, fit_least_squares, predict_still
-from gpmpc.logs.learning import Learned
-from gpmpc.logs.log import Log, Windows
-from gpmpc.logs.noise import error_variances, follow_errors
-from gpmpc.logs.rollouts import PAST, choose_stride, rollout_errors
-from gpmpc.logs.state_space import Array
+from gpmpc.logs._baselines import Ridge, fit_least_squares, predict_still
+from gpmpc.logs._learning import Learned
+from gpmpc.logs._log import Log, Windows
+from gpmpc.logs._noise import error_variances, follow_errors
+from gpmpc.logs._rollouts import PAST, choose_stride, rollout_errors
+from gpmpc.logs._state_space import Array
 from gpmpc.metrics import binomial_interval
 
 if TYPE_CHECKING:

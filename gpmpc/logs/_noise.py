@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize, nnls
 
-from gpmpc.logs.log import Windows
-from gpmpc.logs.rollouts import LogModel
-from gpmpc.logs.state_space import Array
+from gpmpc.logs._log import Windows
+from gpmpc.logs._rollouts import LogModel
+from gpmpc.logs._state_space import Array
 
 TIME_CONSTANTS = (0.0, 0.05, 0.25, 1.0)  # [s]; zero is white
 FITTED = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps

@@ -17,10 +17,10 @@ from gpmpc.dynamics import DynamicsModel, Linearized, check_query, to_array
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.storage import load_metadata
-from gpmpc.logs.noise import OutputNoise
-from gpmpc.logs.rollouts import LogModel
-from gpmpc.logs.state_space import Array, wrap
-from gpmpc.logs.storage import holds_learned, load_learned
+from gpmpc.logs._noise import OutputNoise
+from gpmpc.logs._rollouts import LogModel
+from gpmpc.logs._state_space import Array, wrap
+from gpmpc.logs._storage import holds_learned, load_learned
 from gpmpc.models import load_model
 from gpmpc.systems import System
 

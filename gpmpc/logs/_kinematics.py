@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from gpmpc.logs.state_space import (
+from gpmpc.logs._state_space import (
     Array,
     StateSpace,
     quaternion_inverse,

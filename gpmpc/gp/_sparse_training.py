@@ -21,10 +21,9 @@ from torch import Tensor
 from gpmpc.exceptions import SettingError, TrainingError, check_number
 from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
 from gpmpc.gp._likelihood import FAILED
+from gpmpc.gp._scaling import Scaling, centre, identity
 from gpmpc.gp._search import LENGTHSCALE_LIMIT, column_std, log_hyperparameters, training_data
-from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.scaling import Scaling, centre, identity
-from gpmpc.gp.sparse import (
+from gpmpc.gp._sparse import (
     JITTER,
     Method,
     check_method,
@@ -33,7 +32,8 @@ from gpmpc.gp.sparse import (
     inducing_factor,
     sparse_posterior,
 )
-from gpmpc.gp.training import Trainer
+from gpmpc.gp._training import Trainer
+from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.transitions import Transitions, check_transitions
 
 _log = logging.getLogger(__name__)

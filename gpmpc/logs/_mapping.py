@@ -28,7 +28,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gpmpc.exceptions import SettingError, check_number
-from gpmpc.logs.state_space import StateGroup, StateSpace
+from gpmpc.logs._state_space import StateGroup, StateSpace
 
 Role = Literal["states", "inputs", "context"]
 ROLES: tuple[Role, ...] = ("states", "inputs", "context")

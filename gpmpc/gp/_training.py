@@ -19,6 +19,9 @@ from torch import Tensor
 from gpmpc.exceptions import DataError, SettingError, TrainingError, UnsupportedModel, check_number
 from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
 from gpmpc.gp._likelihood import FAILED
+from gpmpc.gp._memory import GIB, available_memory
+from gpmpc.gp._online import targets_of
+from gpmpc.gp._scaling import Scaling, centre
 from gpmpc.gp._search import (
     SearchProblem,
     column_std,
@@ -27,11 +30,8 @@ from gpmpc.gp._search import (
     log_hyperparameters,
     training_data,
 )
-from gpmpc.gp.online import targets_of
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.scaling import Scaling, centre
 from gpmpc.gp.transitions import Transitions, check_transitions
-from gpmpc.memory import GIB, available_memory
 
 _log = logging.getLogger(__name__)
 _ONE_THREAD = 1000  # points below which LAPACK's threads wait for each other longer than they work

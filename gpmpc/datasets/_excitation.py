@@ -20,14 +20,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpmpc.datasets.flights import SUBSYSTEMS, check_quadrotor, transitions_of
+from gpmpc.datasets._flights import SUBSYSTEMS, check_quadrotor, transitions_of
 from gpmpc.exceptions import SettingError, check_number, check_numbers
 from gpmpc.gp.transitions import Transitions
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.simulation import Noise, Rollout, closed_loop
-from gpmpc.systems import ATTITUDES, System, attitude_for_thrust_direction, translational
-from gpmpc.systems.attitudes import approached
+from gpmpc.systems import ATTITUDES, System, approach_attitudes, attitude_for_thrust_direction, translational
 from gpmpc.trajectories import Trajectory
 
 
@@ -111,6 +110,6 @@ class ExcitedData:
         angles = attitude_for_thrust_direction(flight.inputs[:, 1], flight.inputs[:, 2], self.attitude)
         count = self.samples + self.rotational.horizon
         chosen = angles[np.random.default_rng(streams).integers(len(angles), size=-(-count // self.hold))]
-        references = approached(chosen, count, self.hold, system.time_step, self.response_time)
+        references = approach_attitudes(chosen, count, self.hold, system.time_step, self.response_time)
         seed = int(streams.generate_state(1)[0])
         return transitions_of(self.rotational.fly(system, references, self.samples, seed), self.samples)

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from gpmpc.exceptions import SettingError
-from gpmpc.logs.state_space import Array, quaternion_inverse, rotate
+from gpmpc.logs._state_space import Array, quaternion_inverse, rotate
 
 
 class Nominal(Protocol):

@@ -15,9 +15,9 @@ from gpmpc.exceptions import SettingError, SolverFailure, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Controller, Reference
 from gpmpc.mpc.policy import Command, OnFailure, check_policy, commands
-from gpmpc.simulation.disturbances import Disturbance
-from gpmpc.simulation.loop import Flight, History, Rollout, check_references, fly, window
-from gpmpc.simulation.simulator import ModelLoop, Noise, PlantSimulator
+from gpmpc.simulation._disturbances import Disturbance
+from gpmpc.simulation._loop import Flight, History, Rollout, check_references, fly, window
+from gpmpc.simulation._simulator import ModelLoop, Noise, PlantSimulator
 from gpmpc.systems import Plant
 
 _MEMORY = 2**30  # [bytes] that the controller may take for all that fly at a time

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from gpmpc.exceptions import DataError
-from gpmpc.logs.log import LogRun
-from gpmpc.logs.mapping import LogMapping, Signal
-from gpmpc.logs.sampling import windows_of
-from gpmpc.logs.state_space import Array, quaternion_inverse, quaternion_product, rotate, rotation_vector
+from gpmpc.logs._log import LogRun
+from gpmpc.logs._mapping import LogMapping, Signal
+from gpmpc.logs._sampling import windows_of
+from gpmpc.logs._state_space import Array, quaternion_inverse, quaternion_product, rotate, rotation_vector
 
 SPAN = 4  # rows on each side of a finite difference: above the noise of one row
 SLOPES = (0.5, 2.0)  # of a signal over the derivative that it should be

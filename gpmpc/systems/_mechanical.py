@@ -8,7 +8,7 @@ from math import pi
 from typing import Any, Literal
 
 from gpmpc.exceptions import SettingError, check_number
-from gpmpc.systems.attitudes import GRAVITY
+from gpmpc.systems._attitudes import GRAVITY
 from gpmpc.systems.system import System, cos, sin
 
 

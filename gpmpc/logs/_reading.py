@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from gpmpc.exceptions import DataError
-from gpmpc.logs.checks import check_plausible
-from gpmpc.logs.log import Finding, Log, LogRun
-from gpmpc.logs.mapping import TIME_UNITS, UNITS, LogMapping, Signal
-from gpmpc.logs.readers import STAMP, read_streams
-from gpmpc.logs.sampling import ordered_stamps, resample
-from gpmpc.logs.state_space import Array, quaternion_from_euler, quaternion_inverse, rotate
+from gpmpc.logs._checks import check_plausible
+from gpmpc.logs._log import Finding, Log, LogRun
+from gpmpc.logs._mapping import TIME_UNITS, UNITS, LogMapping, Signal
+from gpmpc.logs._readers import STAMP, read_streams
+from gpmpc.logs._sampling import ordered_stamps, resample
+from gpmpc.logs._state_space import Array, quaternion_from_euler, quaternion_inverse, rotate
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -41,7 +41,7 @@ def read_log(
     """Reads the runs of one file or several.
 
     Args:
-        files: Each in a format of ``gpmpc.logs.read_streams``.
+        files: Each ends in .csv, .csv.gz, .tsv, .parquet, .npz, .mcap (of this package or of ROS 2) or .ulg.
         mapping: What the columns mean: a YAML file, plain data or a ``LogMapping``.
         partial: Takes what is whole of unfinished recordings.
 

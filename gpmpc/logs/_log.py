@@ -14,9 +14,9 @@ import numpy as np
 from gpmpc.calibration import Recording
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gp import Transitions
-from gpmpc.logs.mapping import LogMapping
-from gpmpc.logs.sampling import windows_of
-from gpmpc.logs.state_space import Array, StateSpace
+from gpmpc.logs._mapping import LogMapping
+from gpmpc.logs._sampling import windows_of
+from gpmpc.logs._state_space import Array, StateSpace
 
 
 @dataclass(frozen=True)

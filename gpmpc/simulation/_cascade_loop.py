@@ -17,9 +17,9 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.policy import Command, OnFailure, check_policy, command
-from gpmpc.simulation.disturbances import Disturbance
-from gpmpc.simulation.loop import Flight, History, Moment, Rollout, check_references, fly, window
-from gpmpc.simulation.simulator import Noise, PlantSimulator
+from gpmpc.simulation._disturbances import Disturbance
+from gpmpc.simulation._loop import Flight, History, Moment, Rollout, check_references, fly, window
+from gpmpc.simulation._simulator import Noise, PlantSimulator
 from gpmpc.step import Step
 from gpmpc.systems import Coupled, Plant
 

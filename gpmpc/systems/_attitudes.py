@@ -28,7 +28,7 @@ def attitudes_along(trajectory: Trajectory, count: int, outer_step: float = OUTE
     return attitude_for_thrust_direction(direction[:, 0], direction[:, 1])
 
 
-def approached(angles: np.ndarray, count: int, hold: int, time_step: float, response_time: float) -> np.ndarray:
+def approach_attitudes(angles: np.ndarray, count: int, hold: int, time_step: float, response_time: float) -> np.ndarray:
     """Rotational states (count, 6) that approach attitudes one after another at first order.
 
     Args:
@@ -51,7 +51,7 @@ def rotational_states_along(trajectory: Trajectory, count: int, time_step: float
     """Rotational states phi, p, theta, q, psi, r (count, 6) [rad, rad/s], one an inner step, of a flight along it."""
     hold = max(1, round(OUTER_STEP / time_step))
     angles = attitudes_along(trajectory, -(-count // hold))
-    return approached(angles, count, hold, time_step, RESPONSE_TIME)
+    return approach_attitudes(angles, count, hold, time_step, RESPONSE_TIME)
 
 
 def attitude_for_thrust_direction(ux: np.ndarray, uy: np.ndarray, convention: str = "exact") -> np.ndarray:

@@ -12,7 +12,7 @@ from math import cos, pi
 from typing import Any
 
 from gpmpc.exceptions import check_number, check_numbers
-from gpmpc.systems.attitudes import GRAVITY, rotational_states_along
+from gpmpc.systems._attitudes import GRAVITY, rotational_states_along
 from gpmpc.systems.system import System
 
 POSITION = {"x": "x", "y": "y", "z": "z"}

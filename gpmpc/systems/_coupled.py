@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from gpmpc.exceptions import check_number
-from gpmpc.systems.attitudes import GRAVITY, attitude_for_thrust_direction
-from gpmpc.systems.quadrotor import (
+from gpmpc.systems._attitudes import GRAVITY, attitude_for_thrust_direction
+from gpmpc.systems._quadrotor import (
     ANGLE_UNITS,
     ATTITUDE,
     FOLLOWS_POSITIONS,

@@ -1,4 +1,4 @@
-from gpmpc import memory
+from gpmpc.gp import _memory as memory
 
 
 def test_a_running_process_has_some_memory_left():

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from gpmpc.exceptions import DataError, ShapeError, check_number
-from gpmpc.logs.log import Log, Windows
-from gpmpc.logs.rollouts import PAST, STEPS, LogModel, choose_stride, rollout_errors
-from gpmpc.logs.state_space import Array
+from gpmpc.logs._log import Log, Windows
+from gpmpc.logs._rollouts import PAST, STEPS, LogModel, choose_stride, rollout_errors
+from gpmpc.logs._state_space import Array
 
 WINDOWS = 300
 EVALUATIONS = 15

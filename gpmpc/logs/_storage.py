@@ -13,13 +13,13 @@ from safetensors.numpy import save
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.files import write_whole
 from gpmpc.gp import GPPosterior
-from gpmpc.logs.fitting import NominalFit
-from gpmpc.logs.kinematics import Increments, Kinematics, RigidBody
-from gpmpc.logs.learning import Candidate, Learned
-from gpmpc.logs.noise import OutputNoise
-from gpmpc.logs.nominal import AffineNominal, MultirotorNominal, Nominal, Still
-from gpmpc.logs.rollouts import LogModel, OutputGP
-from gpmpc.logs.state_space import StateGroup, StateSpace
+from gpmpc.logs._fitting import NominalFit
+from gpmpc.logs._kinematics import Increments, Kinematics, RigidBody
+from gpmpc.logs._learning import Candidate, Learned
+from gpmpc.logs._noise import OutputNoise
+from gpmpc.logs._nominal import AffineNominal, MultirotorNominal, Nominal, Still
+from gpmpc.logs._rollouts import LogModel, OutputGP
+from gpmpc.logs._state_space import StateGroup, StateSpace
 
 FORMAT, VERSION = "gpmpc model of a log", 2
 _KERNEL = ("lengthscales", "signal_variance", "noise_variance")

@@ -15,14 +15,14 @@ import torch
 
 from gpmpc.exceptions import DataError, check_number
 from gpmpc.gp import Trainer, standardize
-from gpmpc.logs.baselines import fit_least_squares
-from gpmpc.logs.fitting import NominalFit, fit_nominal
-from gpmpc.logs.kinematics import Increments, Kinematics, RigidBody
-from gpmpc.logs.log import Log
-from gpmpc.logs.noise import OutputNoise, fit_noise
-from gpmpc.logs.nominal import AffineNominal, MultirotorNominal, Still
-from gpmpc.logs.rollouts import PAST, STEPS, LogModel, OutputGP, choose_stride, rollout_errors
-from gpmpc.logs.state_space import Array
+from gpmpc.logs._baselines import fit_least_squares
+from gpmpc.logs._fitting import NominalFit, fit_nominal
+from gpmpc.logs._kinematics import Increments, Kinematics, RigidBody
+from gpmpc.logs._log import Log
+from gpmpc.logs._noise import OutputNoise, fit_noise
+from gpmpc.logs._nominal import AffineNominal, MultirotorNominal, Still
+from gpmpc.logs._rollouts import PAST, STEPS, LogModel, OutputGP, choose_stride, rollout_errors
+from gpmpc.logs._state_space import Array
 
 AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
 LATE = 3  # rows by which motors may act late

@@ -27,9 +27,9 @@ from gpmpc.dynamics import (
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
+from gpmpc.gp._sparse import sparse_posterior
 from gpmpc.gp.gpytorch_ import exact_inference, members
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.sparse import sparse_posterior
 
 
 def from_gpytorch(

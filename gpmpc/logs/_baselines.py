@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.logs.kinematics import Kinematics
-from gpmpc.logs.log import Log, Windows
-from gpmpc.logs.nominal import AffineNominal
-from gpmpc.logs.rollouts import PAST, LogModel, choose_stride
-from gpmpc.logs.state_space import Array
+from gpmpc.logs._kinematics import Kinematics
+from gpmpc.logs._log import Log, Windows
+from gpmpc.logs._nominal import AffineNominal
+from gpmpc.logs._rollouts import PAST, LogModel, choose_stride
+from gpmpc.logs._state_space import Array
 
 LAGS = (1, 2, 3, 5, 8, 12, 20)  # rows of the past that the ridge regression sees
 BINS = 5  # means of the future inputs that it sees
