@@ -5,7 +5,7 @@ from gpmpc.models._delay import DelayedModel
 from gpmpc.models._disturbance import DisturbedModel
 from gpmpc.models._features import Features, Lags
 from gpmpc.models._nominal import Affine, CasadiFunction, KnownModel, linearize_function
-from gpmpc.models._residual import ResidualModel, train_with_angles
+from gpmpc.models._residual import ResidualModel, train_residual
 from gpmpc.models._roll_out import RollOut
 from gpmpc.models._storage import load_model, save_model
 from gpmpc.models._wrapper import Wrapper
@@ -28,5 +28,5 @@ __all__ = [
     "linearize_function",
     "load_model",
     "save_model",
-    "train_with_angles",
+    "train_residual",
 ]
