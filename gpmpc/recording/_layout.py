@@ -102,7 +102,7 @@ def _plot(title: str, lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     shown = dict.fromkeys(("showXAxisLabels", "showYAxisLabels", "showLegend"), True)
     # At the top the legend takes its height off the curves; ``sidebarDimension`` is its width [px].
     plot = {"foxglovePanelTitle": title, "paths": list(lines)} | shown
-    return plot | {"legendDisplay": "left", "sidebarDimension": 130, "isSynced": True, "xAxisVal": "timestamp"}
+    return plot | {"legendDisplay": "left", "sidebarDimension": 150, "isSynced": True, "xAxisVal": "timestamp"}
 
 
 def _scene(moves: bool, turns: bool) -> dict[str, Any]:
