@@ -15,7 +15,7 @@ import torch
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
-from gpmpc.propagation.propagator import Propagator
+from gpmpc.propagation import Propagator
 from gpmpc.simulation._disturbances import Disturbance
 from gpmpc.systems import Plant, step, step_many
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gpmpc.exceptions import check_number
 from gpmpc.gaussian import Gaussian, square_root
-from gpmpc.propagation.propagator import Propagation, Propagator, checked_input, projected
+from gpmpc.propagation._propagator import Propagation, Propagator, checked_input, projected
 
 _CHUNK = 1000  # samples predicted at once: bounds the memory at about chunk * N * outputs numbers
 

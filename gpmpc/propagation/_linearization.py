@@ -19,8 +19,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation._composition import Composition
-from gpmpc.propagation.propagator import Propagation, Propagator, checked_input, projected
-from gpmpc.propagation.sensitivity import Sensitivity
+from gpmpc.propagation._propagator import Propagation, Propagator, checked_input, projected
+from gpmpc.propagation._sensitivity import Sensitivity
 
 
 class _Expansion(NamedTuple):

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from gpmpc.dynamics import DynamicsModel
-from gpmpc.estimation.consistency import wrapped
-from gpmpc.estimation.measurement import Measurement
+from gpmpc.estimation._consistency import wrapped
+from gpmpc.estimation._measurement import Measurement
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
 from gpmpc.propagation import Linearization, Propagator, Unscented

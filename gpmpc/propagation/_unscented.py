@@ -14,9 +14,9 @@ from torch import Tensor
 
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian, square_root, square_root_differential
-from gpmpc.propagation.linearization import expand
-from gpmpc.propagation.propagator import Propagation, Propagator, checked_input, projected
-from gpmpc.propagation.sensitivity import Sensitivity
+from gpmpc.propagation._linearization import expand
+from gpmpc.propagation._propagator import Propagation, Propagator, checked_input, projected
+from gpmpc.propagation._sensitivity import Sensitivity
 
 
 class Unscented(Propagator):

@@ -26,7 +26,7 @@ from gpmpc.dynamics import Array, to_array
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import SlidingWindow
-from gpmpc.learning.change import ChangedModel
+from gpmpc.learning._change import ChangedModel
 from gpmpc.mpc.controller import Decision, Reference, check_method
 from gpmpc.mpc.gp_mpc import GPMPC
 

@@ -28,12 +28,11 @@ from gpmpc.dynamics import DynamicsModel, linearize, tensors_for, to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.linalg import dot
-from gpmpc.mpc.cost import PENALIZED, by_stage
-from gpmpc.mpc.linear_quadratic import QuadraticCost, StageRows
+from gpmpc.mpc._cost import PENALIZED, by_stage
+from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows
 from gpmpc.mpc.problem import Inequality, Problem
-from gpmpc.propagation import Propagator, differentiate
+from gpmpc.propagation import Propagator, differentiate, square_roots
 from gpmpc.propagation import linearize as linearize_belief
-from gpmpc.propagation.local_model import square_roots
 from gpmpc.qp import SoftRows
 
 Array = np.ndarray
@@ -43,45 +42,25 @@ COVARIANCES = ("full", "diagonal", "zero_order", "none")
 
 
 class Plan(NamedTuple):
-    """Where stages are linearised; it need not obey the dynamics.
+    """Where stages are linearised; it need not obey the dynamics."""
 
-    Attributes:
-        states: s_0 .. s_H (H + 1, p); s_0 is the current one.
-        inputs: u_0 .. u_{H-1} (H, m).
-        covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
-    """
-
-    states: Array
-    inputs: Array
-    covariances: Array
+    states: Array  # s_0 .. s_H (H + 1, p); s_0 is the current one
+    inputs: Array  # u_0 .. u_{H-1} (H, m)
+    covariances: Array  # Sigma_0 .. Sigma_H (H + 1, n, n)
 
 
 class LinearizedStages(NamedTuple):
-    """K affine stage models: K = H along a plan, or K = 1 that is held over the horizon.
+    """K affine stage models: K = H along a plan, or K = 1 that is held over the horizon."""
 
-    Attributes:
-        A: (K, p, p).
-        B: (K, p, m).
-        c: (K, p); the defects of the plan are part of it.
-        next: Where the dynamics lead from the points themselves, F(s_k, u_k) (K, p).
-        V: What a stage adds to A Sigma A' (K, n, n), in the mode ``zero_order``; zero elsewhere.
-    """
-
-    A: Array
-    B: Array
-    c: Array
-    next: Array
-    V: Array
+    A: Array  # (K, p, p)
+    B: Array  # (K, p, m)
+    c: Array  # (K, p); the defects of the plan are part of it
+    next: Array  # where the dynamics lead from the points themselves, F(s_k, u_k) (K, p)
+    V: Array  # what a stage adds to A Sigma A' (K, n, n), in the mode ``zero_order``; zero elsewhere
 
 
 class StageLinearizer:
-    """Linearises the dynamics of the belief at K points in one call, in one covariance mode.
-
-    Args:
-        model: Its mean, and where covariances count its variance.
-        propagator: How the belief moves; ``none`` needs the model's mean only.
-        covariance: See the module's text.
-    """
+    """Linearises the dynamics of the belief at K points in one call, in one covariance mode; see the module's text."""
 
     def __init__(self, model: DynamicsModel, propagator: Propagator, covariance: Covariance):
         self.model, self.propagator, self.covariance, self._n = model, propagator, covariance, model.state_dim
@@ -128,14 +107,7 @@ class StageLinearizer:
     def __call__(
         self, states: Array, inputs: Array, covariances: Array, disturbance: Array | None = None
     ) -> LinearizedStages:
-        """The stage models at K points.
-
-        Args:
-            states: s (K, p), contiguous.
-            inputs: (K, m), contiguous.
-            covariances: Of the states (K, n, n).
-            disturbance: Added to the next means (n,) or (K, n); None for none.
-        """
+        """The stage models at K points s (K, p), u (K, m), Sigma (K, n, n), disturbance (n,) added to the means."""
         after, A, B, V = self._linearize(states, inputs, covariances)
         if disturbance is not None:
             after = after.copy()
@@ -197,15 +169,7 @@ def _constants(A, B, after, states, inputs):
 
 
 class StageCosts:
-    """The cost of a problem's stages: weights, and the squares of its outputs, linearised along a plan.
-
-    Args:
-        problem: With the costs.
-        horizon: H.
-        linearizer: Says what s holds of the belief.
-
-    Attributes:
-        quadratic: The weights alone.
+    """The cost of a problem's stages: the weights alone, ``quadratic``, and the squares of outputs along a plan.
 
     Raises:
         SettingError: Weights or references of another number of stages.
@@ -235,15 +199,9 @@ class StageCosts:
 
 
 class ConstraintRows:
-    """The rows of a problem's constraints: of a box one for each entry with a bound, upper ones first.
-
-    Args:
-        problem: With the constraints.
-        horizon: H.
-        covariance: What s holds of the belief.
+    """The rows of a problem's constraints, r a stage: of a box one for each entry with a bound, upper ones first.
 
     Attributes:
-        per_stage: Number of rows of a stage, r.
         soft: Whether a violation of any has a price.
         prices: Of the rows (r,), infinite where they are hard.
         signs: 1 where a row has upper bounds, -1 where it has lower ones (r,).
@@ -300,14 +258,9 @@ class ConstraintRows:
         parameters: Array | None = None,
         kappas: Array | None = None,
     ) -> StageRows:
-        """The rows, tightened, at a plan and the covariances of its states.
+        """The rows, tightened by the covariances (H + 1, n, n), at a plan where smooth constraints are linearised.
 
-        Args:
-            plan: Where smooth constraints are linearised.
-            covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
-            stages: H, or 1.
-            parameters: Of the smooth constraints (H, q).
-            kappas: By stage (H,), in the place of those of the constraints that have some.
+        ``kappas`` by stage (H,) take the place of those of the constraints that have some.
 
         Raises:
             ShapeError: A smooth constraint gives another shape.

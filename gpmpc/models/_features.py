@@ -16,7 +16,7 @@ from torch import Tensor
 from gpmpc.dynamics import Array
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gp.transitions import Transitions
-from gpmpc.models.nominal import Affine
+from gpmpc.models._nominal import Affine
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import torch
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.models.roll_out import RollOut
+from gpmpc.models import RollOut
 from gpmpc.mpc.controller import Array, Decision, Reference, full_turns
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Problem
@@ -124,44 +124,32 @@ class ManyStarts:
 
     def _candidates(self, state: Array, reference: Reference) -> Iterator[tuple[Reference, tuple[Array, Array]]]:
         """Goals and guesses, guess by guess, the nearest goals first."""
-        goals = list(self._goals(state, reference))
-        for guess in self.guesses:
-            for goal in goals:
-                if guess is None:
-                    shares, targets = np.linspace(1.0, 0.0, self.horizon + 1)[:, None], goal.states
-                    states = targets + shares * (state - targets[0])
-                    yield goal, (states, np.tile(self.initial_input, (self.horizon, 1)))
-                else:
-                    yield goal, (self._roll_out(state, guess), guess)
+        goals, H = list(self._goals(state, reference)), self.horizon
+        for guess, goal in product(self.guesses, goals):
+            if guess is None:
+                shares, targets = np.linspace(1.0, 0.0, H + 1)[:, None], goal.states
+                yield goal, (targets + shares * (state - targets[0]), np.tile(self.initial_input, (H, 1)))
+            else:
+                states = self._rolled_out.open_loop(state[None], np.asarray(guess, dtype=float)[None])[0]
+                yield goal, (states if np.isfinite(states).all() else np.tile(state, (H + 1, 1)), guess)
 
     def _goals(self, state: Array, reference: Reference) -> Iterator[Reference]:
         angles, moves = list(self.problem.cost.angles), []
         for angle, count in zip(angles, self.turns, strict=True):
             off = (state[angle] - reference.states[-1, angle]) / (2 * np.pi)
-            nearest = sorted(
-                range(int(np.floor(off)) - count, int(np.ceil(off)) + count + 1), key=lambda k: abs(k - off)
-            )
-            moves.append(nearest[:count])
+            around = range(int(np.floor(off)) - count, int(np.ceil(off)) + count + 1)
+            moves.append(sorted(around, key=lambda k: abs(k - off))[:count])
         chosen = list(product(*moves))
         turns = np.zeros((len(chosen), len(state)))
         turns[:, angles] = 2 * np.pi * np.array(chosen).reshape(len(turns), len(angles))
         distances = np.abs(state - reference.states[-1] - turns)[:, angles].sum(axis=1)
         return (_moved(reference, turns[i]) for i in np.argsort(distances, kind="stable"))
 
-    def _roll_out(self, state: Array, inputs: Array) -> Array:
-        states = self._rolled_out.open_loop(state[None], np.asarray(inputs, dtype=float)[None])[0]
-        finite = np.isfinite(states).all(axis=1)
-        return states if finite.all() else np.tile(state, (self.horizon + 1, 1))
-
 
 def kicks(problem: Problem, horizon: int, initial_input: Array, share: float = 0.5) -> list[Array]:
     """The initial input held (H, m); for each bounded input a push and a pull, and a pull and a push, of H/6 stages.
 
-    Args:
-        problem: With the bounds.
-        horizon: H.
-        initial_input: (m,).
-        share: Of the way from the initial input to its bounds.
+    ``share`` is the way from the initial input to its bounds.
     """
     drift, length = np.tile(np.asarray(initial_input, dtype=float), (horizon, 1)), max(1, horizon // 6)
     found, bounds = [drift], (problem.inputs.upper, problem.inputs.lower)

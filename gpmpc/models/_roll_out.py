@@ -12,7 +12,7 @@ from gpmpc.gp.posterior import AffineForm
 from gpmpc.kernels import GPArrays
 from gpmpc.kernels.gp_rollout import COSINE, PLAIN, SINE, AffineGPs, Feedback, roll_out_gps
 from gpmpc.kernels.tape import NO_TAPE
-from gpmpc.models.features import Features
+from gpmpc.models._features import Features
 
 
 class RollOut:

@@ -147,13 +147,7 @@ def weight_of_stage(cost, k, H):
 def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
     """Gains K_0 .. K_{H-1} (H, m, n) and the Hessians D_k of the cost in u_k (H, m, m).
 
-    Args:
-        A: (H, n, n), or (1, n, n) where it is constant: then the recursion ends where P settles.
-        B: (H, n, m) or (1, n, m).
-        Q: Of x_0 .. x_{H-1} (H, n, n), or (1, n, n), positive semidefinite.
-        R: (H, m, m) or (1, m, m), positive definite.
-        terminal: T (n, n), positive semidefinite.
-        horizon: H.
+    A, B, Q and R are of H stages or of one that is constant; where all are, the recursion ends where P settles.
     """
     (n, m), constant = B.shape[1:], len(A) == len(Q) == len(R) == 1
     gains, hessians = np.zeros((horizon, m, n)), np.empty((horizon, m, m))
@@ -210,28 +204,22 @@ def optimal_feedback(cost, stages, references):
     for k in range(len(squares)):
         _add_square(squares[k], targets[k], terminal if k == H - 1 else weights[k], p)
     for k in range(H):
-        at = min(k, len(stages.A) - 1)
-        A[k, e, e] = 1.0
+        at, shift = min(k, len(stages.A) - 1), A[k, :, e]
+        shift[e] = 1.0
+        copy_matrix(stages.A[at], A[k, :p, :p])
+        copy_matrix(stages.B[at], B[k, :p])
         for i in range(p):
-            A[k, i, e] = stages.c[at, i]
-            for j in range(p):
-                A[k, i, j] = stages.A[at, i, j]
-            for j in range(n):
-                A[k, i, e] += stages.A[at, i, j] * targets[k - 1, j] if k > 0 else 0.0
-            for j in range(m):
-                B[k, i, j] = stages.B[at, i, j]
-                if cost.penalized == DEVIATIONS:
-                    A[k, i, e] += stages.B[at, i, j] * references.inputs[k, j]
-        for i in range(n):
-            A[k, i, e] -= targets[k, i]
+            shift[i] = stages.c[at, i] - (targets[k, i] if i < n else 0.0)
+            if k > 0:
+                shift[i] += dot(stages.A[at, i], targets[k - 1], n)
+            if cost.penalized == DEVIATIONS:
+                shift[i] += dot(stages.B[at, i], references.inputs[k], m)
         for i in range(e - p):
             B[k, p + i, i] = 1.0
-            if incremental:
-                A[k, p + i, p + i] = 1.0
-                for j in range(p):
-                    A[k, j, p + i] = stages.B[at, j, i]
-            elif cost.penalized == DEVIATIONS:
-                A[k, p + i, e] = references.inputs[k, i]
+            if cost.penalized == DEVIATIONS:
+                shift[p + i] = references.inputs[k, i]
+        if incremental:
+            copy_matrix(B[k], A[k, :, p:e])
     before = np.concatenate((weights[:1], weights))[: H if len(weights) > 1 else 1]  # of stages 0 .. H - 1
     gains, hessians = finite_horizon_lqr(A, B, before, cost.input, terminal, H)
     feedback = np.zeros((H, m, p + m + 1))
@@ -273,12 +261,6 @@ def add_blocks(W, M):
 
 def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
     """The gain K (m, n) of u = -K x that minimises sum_k |x_k|^2_Q + |u_k|^2_R under x_{k+1} = A x_k + B u_k for ever.
-
-    Args:
-        A: (n, n).
-        B: (n, m).
-        Q: (n, n), positive semidefinite.
-        R: (m, m), positive definite.
 
     Raises:
         SettingError: The inputs do not reach a mode that grows.

@@ -21,8 +21,8 @@ from torch import Tensor
 from gpmpc.dynamics import Array, tensors_for, to_array
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.propagation.propagator import Propagator
-from gpmpc.propagation.sensitivity import differentiate
+from gpmpc.propagation._propagator import Propagator
+from gpmpc.propagation._sensitivity import differentiate
 
 
 @dataclass(frozen=True)

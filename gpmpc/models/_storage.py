@@ -26,10 +26,10 @@ from gpmpc.exceptions import DataError, GpmpcError, UnsupportedModel
 from gpmpc.files import existing_file, new_file
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.storage import load_metadata, posterior_of_parts, posterior_parts, read_model, write_model
-from gpmpc.models.delay import DelayedModel
-from gpmpc.models.disturbance import DisturbedModel
-from gpmpc.models.nominal import Affine, CasadiFunction
-from gpmpc.models.residual import ResidualModel
+from gpmpc.models._delay import DelayedModel
+from gpmpc.models._disturbance import DisturbedModel
+from gpmpc.models._nominal import Affine, CasadiFunction
+from gpmpc.models._residual import ResidualModel
 
 
 def save_model(model: Any, path: str | Path, metadata: Mapping[str, Any] | None = None) -> None:

@@ -20,7 +20,7 @@ from torch import Tensor
 from gpmpc.dynamics import Array, DynamicsModel, Linearized, check_next_states, check_query, linearize, to_array
 from gpmpc.exceptions import SettingError, ShapeError, check_numbers
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.models.wrapper import Wrapper, padded
+from gpmpc.models._wrapper import Wrapper, padded
 
 
 @dataclass(frozen=True)

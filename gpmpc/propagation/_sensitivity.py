@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gpmpc.dynamics import batched_jacobian
 from gpmpc.gaussian import Gaussian
-from gpmpc.propagation.propagator import Propagation, Propagator, checked_input
+from gpmpc.propagation._propagator import Propagation, Propagator, checked_input
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,8 @@ from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp import GPPosterior, SlidingWindow, Trainer, Training, Transitions, append_points
 from gpmpc.gp.posterior import AffineForm
 from gpmpc.gp.transitions import check_transitions
-from gpmpc.models.features import Features
-from gpmpc.models.nominal import Affine, CasadiFunction, linearize_function
+from gpmpc.models._features import Features
+from gpmpc.models._nominal import Affine, CasadiFunction, linearize_function
 
 Nominal = Callable[[Tensor, Tensor], Tensor]
 Effect = Tensor | Callable[[Tensor], Tensor]
@@ -307,13 +307,20 @@ def _effect(B: Effect, state: Tensor) -> Tensor:
     return value
 
 
-def train_with_angles(trainer: Any, angles: Sequence[int], transitions: Transitions, seed: int = 0) -> Training:
-    """Trains a model of differences of states that sees angles as sine and cosine.
+def train_residual(
+    trainer: Any,
+    transitions: Transitions,
+    angles: Sequence[int] = (),
+    nominal: Nominal | None = None,
+    seed: int = 0,
+) -> Training:
+    """Trains a residual model of all states and inputs, as ``ResidualModel.train``; returns the whole training.
 
     Args:
         trainer: A ``Trainer`` or ``SparseTrainer``.
-        angles: Indices of states.
         transitions: What was observed.
+        angles: Indices of states that are seen as sine and cosine.
+        nominal: f0; None learns the difference of two states.
         seed: Of the random starts.
 
     Raises:
@@ -321,9 +328,10 @@ def train_with_angles(trainer: Any, angles: Sequence[int], transitions: Transiti
         TrainingError: An output could not be trained.
     """
     n, m = transitions.state_dim, transitions.input_dim
-    nominal, B, every = Affine.identity(n, m), torch.eye(n, dtype=torch.float64), (list(range(n)), list(range(m)))
-    training = _fit(nominal, B, Features(*every, angles, n, m), transitions, trainer, seed)
-    model: Any = ResidualModel(nominal, training.posterior, B, *every, m, angles)
+    known = Affine.identity(n, m) if nominal is None else nominal
+    B, every = torch.eye(n, dtype=torch.float64), (list(range(n)), list(range(m)))
+    training = _fit(known, B, Features(*every, angles, n, m), transitions, trainer, seed)
+    model: Any = ResidualModel(known, training.posterior, B, *every, m, angles)
     return replace(training, posterior=model)
 
 

@@ -37,19 +37,9 @@ from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.gp_rollout import Feedback
 from gpmpc.kernels.linalg import copy_matrix, product
-from gpmpc.models.roll_out import RollOut
-from gpmpc.mpc.controller import (
-    Decision,
-    Reference,
-    Request,
-    check_controller,
-    check_method,
-    full_turns,
-    read_parameters,
-)
-from gpmpc.mpc.linear_quadratic import QuadraticCost, StageRows, finite_horizon_lqr
-from gpmpc.mpc.problem import Problem
-from gpmpc.mpc.stages import (
+from gpmpc.models import RollOut
+from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, finite_horizon_lqr
+from gpmpc.mpc._stages import (
     COVARIANCES,
     ConstraintRows,
     Covariance,
@@ -59,6 +49,16 @@ from gpmpc.mpc.stages import (
     StageLinearizer,
     keep_rates,
 )
+from gpmpc.mpc.controller import (
+    Decision,
+    Reference,
+    Request,
+    check_controller,
+    check_method,
+    full_turns,
+    read_parameters,
+)
+from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator
 
 Array = np.ndarray
@@ -68,21 +68,13 @@ FORMS = ("trajectory", "velocity")
 
 
 class Prediction(NamedTuple):
-    """A plan, the stages linearised at it, the covariances of its states, and the rows tightened by them.
+    """A plan, the stages linearised at it, the covariances of its states, and the rows tightened by them."""
 
-    Attributes:
-        plan: Where the stages were linearised; with ``velocity`` its first stage only.
-        stages: Of it.
-        covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
-        rows: Of the constraints.
-        cost: With outputs linearised at the plan.
-    """
-
-    plan: Plan
+    plan: Plan  # where the stages were linearised; with ``velocity`` its first stage only
     stages: LinearizedStages
-    covariances: Array
+    covariances: Array  # Sigma_0 .. Sigma_H (H + 1, n, n)
     rows: StageRows
-    cost: QuadraticCost
+    cost: QuadraticCost  # with outputs linearised at the plan
 
 
 @dataclass(frozen=True)
@@ -91,7 +83,7 @@ class PredictionSettings:
 
     Attributes:
         form: ``"trajectory"`` or ``"velocity"``; see the module's text.
-        covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see ``gpmpc.mpc.stages``.
+        covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see ``gpmpc.mpc._stages``.
         feedback: Predicts the covariances of ``"zero_order"`` under a feedback, without which no long horizon with
             state constraints is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"``
             and ``"diagonal"`` are those without feedback.
@@ -128,14 +120,6 @@ class PredictionSettings:
 
 class PredictionModel:
     """Predicts beliefs for one problem.
-
-    Args:
-        model: What was learned.
-        propagator: How the belief moves.
-        problem: Weights of the feedback, and constraints.
-        horizon: H.
-        initial_input: The input before the first step (m,).
-        settings: Form, covariance mode, feedback and disturbance estimate.
 
     Raises:
         SettingError: No propagator, or settings that do not belong to the model.
@@ -193,15 +177,11 @@ class PredictionModel:
             raise SettingError("kappas", f"are for covariances of 'zero_order'; this controller has {mode!r}")
         if self.settings.disturbance_gain and request.finite:
             request = request._replace(disturbance=self._disturbance(request))
-        if plan is not None and request.states is None and request.finite:
-            return request._replace(states=self._states(request))
+        if plan is not None and request.states is None and request.finite:  # those that the inputs lead to
+            disturbance = request.disturbance if len(request.disturbance) else None
+            states = self._roll_out.open_loop(request.state[None], request.initial_guess[None], disturbance)[0]
+            request = request._replace(states=states if np.isfinite(states).all() else None)
         return request
-
-    def _states(self, request: Request) -> Array | None:
-        """The means (H + 1, n) that the first guess of the inputs leads to; None where they are not finite."""
-        disturbance = request.disturbance if len(request.disturbance) else None
-        states = self._roll_out.open_loop(request.state[None], request.initial_guess[None], disturbance)[0]
-        return states if np.isfinite(states).all() else None
 
     def initial_guess(self, request: Request) -> Plan:
         """The plan handed over, or the last plan, shifted by a stage.
@@ -310,12 +290,8 @@ class PredictionModel:
     ) -> Prediction:
         """The prediction at the plan that obeys the dynamics under a feedback towards another one, within its bounds.
 
-        Args:
-            towards: Whose states are followed.
-            prediction: Its stages give the feedback, where a program has none.
-            feedback: Of the program, F_k (H, m, p + m + 1), or nothing (0, m, p + m + 1).
-            request: Of the step.
-            derivatives: Whether the stages are linearised where that is not needed to find the plan.
+        The feedback is a program's, F_k (H, m, p + m + 1), or that of the stages of ``prediction`` where there is none
+        (0, m, p + m + 1). Without ``derivatives`` the stages are linearised only where the plan needs it.
         """
         problem, n, linearizer = self.problem, self.problem.state_dim, self.linearizer
         own = -self.gains(*prediction.stages[:2], prediction.cost) if not len(feedback) else feedback

@@ -23,8 +23,7 @@ from gpmpc.dynamics import Array, DynamicsModel, Linearized, linearize, to_array
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, SlidingWindow
-from gpmpc.models.features import Features
-from gpmpc.models.wrapper import Wrapper
+from gpmpc.models import Features, Wrapper
 
 
 @dataclass(frozen=True)

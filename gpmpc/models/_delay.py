@@ -23,7 +23,7 @@ from torch import Tensor
 from gpmpc.dynamics import Array, DynamicsModel, Linearized, check_next_states, check_query, linearize
 from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.models.wrapper import Wrapper, padded
+from gpmpc.models._wrapper import Wrapper, padded
 
 
 @dataclass(frozen=True)

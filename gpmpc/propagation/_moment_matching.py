@@ -12,9 +12,9 @@ from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.propagation._composition import Composition, Latent
 from gpmpc.propagation._moments import moments, moments_with_jacobian
-from gpmpc.propagation.propagator import Propagation, Propagator, checked_input, projected
-from gpmpc.propagation.sensitivity import Sensitivity
-from gpmpc.propagation.unscented import Unscented
+from gpmpc.propagation._propagator import Propagation, Propagator, checked_input, projected
+from gpmpc.propagation._sensitivity import Sensitivity
+from gpmpc.propagation._unscented import Unscented
 
 
 class MomentMatching(Propagator):
