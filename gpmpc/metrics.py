@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -48,8 +48,7 @@ def _check_alike(**given: Tensor) -> None:
         raise ShapeError(f"all must have one shape (N, n); got {got}")
 
 
-@dataclass(frozen=True)
-class _TrackingError:
+class _TrackingError(NamedTuple):
     """Root mean squared distance from the references."""
 
     axes: np.ndarray  # (j,) of every state looked at, in its unit
@@ -75,10 +74,8 @@ def tracking_error(
 def _errors(states: np.ndarray, references: np.ndarray, axes: Sequence[int], angles: Sequence[int]) -> np.ndarray:
     """Differences on some axes (K + 1, j), those of angles in [-pi, pi)."""
     if np.ndim(states) != 2 or np.shape(states) != np.shape(references) or len(states) < 2:
-        raise ShapeError(
-            f"states and references must both be (K + 1, n), K of 1 or more; got {np.shape(states)} and "
-            f"{np.shape(references)}"
-        )
+        got = f"{np.shape(states)} and {np.shape(references)}"
+        raise ShapeError(f"states and references must both be (K + 1, n), K of 1 or more; got {got}")
     n = np.shape(states)[1]
     if not all(-n <= axis < n for axis in axes):
         raise ShapeError(f"axes must be states from 0 to {n - 1}; got {tuple(axes)}")
@@ -89,8 +86,7 @@ def _errors(states: np.ndarray, references: np.ndarray, axes: Sequence[int], ang
     return errors
 
 
-@dataclass(frozen=True)
-class _Loss:
+class _Loss(NamedTuple):
     """Where a flight was lost."""
 
     step: int  # the first step k whose state is too far off
@@ -125,8 +121,7 @@ def find_loss(
     return _Loss(k, float(distances[k]), limit) if beyond[k] else None
 
 
-@dataclass(frozen=True)
-class _ViolationRate:
+class _ViolationRate(NamedTuple):
     """How often bounds were broken."""
 
     violations: int  # steps at which any entry was outside
@@ -180,14 +175,13 @@ def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple
     return float(low), float(high)
 
 
-@dataclass(frozen=True)
-class _TimeQuantiles:
+class _TimeQuantiles(NamedTuple):
     """Of wall times [s]."""
 
-    median: float  # [s]
-    p95: float  # [s]
-    p99: float  # [s]
-    largest: float  # [s]
+    median: float
+    p95: float
+    p99: float
+    largest: float
 
 
 def time_quantiles(seconds: np.ndarray) -> _TimeQuantiles:
