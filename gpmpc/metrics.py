@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -48,7 +48,8 @@ def _check_alike(**given: Tensor) -> None:
         raise ShapeError(f"all must have one shape (N, n); got {got}")
 
 
-class _TrackingError(NamedTuple):
+@dataclass(frozen=True)
+class _TrackingError:
     """Root mean squared distance from the references."""
 
     axes: np.ndarray  # (j,) of every state looked at, in its unit
@@ -86,7 +87,8 @@ def _errors(states: np.ndarray, references: np.ndarray, axes: Sequence[int], ang
     return errors
 
 
-class _Loss(NamedTuple):
+@dataclass(frozen=True)
+class _Loss:
     """Where a flight was lost."""
 
     step: int  # the first step k whose state is too far off
@@ -121,7 +123,8 @@ def find_loss(
     return _Loss(k, float(distances[k]), limit) if beyond[k] else None
 
 
-class _ViolationRate(NamedTuple):
+@dataclass(frozen=True)
+class _ViolationRate:
     """How often bounds were broken."""
 
     violations: int  # steps at which any entry was outside
@@ -175,13 +178,14 @@ def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple
     return float(low), float(high)
 
 
-class _TimeQuantiles(NamedTuple):
+@dataclass(frozen=True)
+class _TimeQuantiles:
     """Of wall times [s]."""
 
-    median: float
-    p95: float
-    p99: float
-    largest: float
+    median: float  # [s]
+    p95: float  # [s]
+    p99: float  # [s]
+    largest: float  # [s]
 
 
 def time_quantiles(seconds: np.ndarray) -> _TimeQuantiles:
