@@ -117,6 +117,12 @@ class Lorenz:
             pieces.append(solver.dense_output())
         return OdeSolution(ends, pieces)
 
+    @cached_property
+    def _samples(self) -> np.ndarray:
+        """Lorenz times of the samples."""
+        ends, each = self._path.ts, self.samples_per_step
+        return np.interp(np.arange(each * (len(ends) - 1) + 1) / each, np.arange(len(ends)), ends)
+
     def _state(self, lorenz_time: np.ndarray) -> np.ndarray:
         return np.reshape([self._path(t) for t in np.ravel(lorenz_time)], (*np.shape(lorenz_time), 3))
 
@@ -126,9 +132,7 @@ class Lorenz:
         if np.any(t < 0) or np.any(t > self.duration):
             rule = f"this Lorenz trajectory is defined from 0 to {self.duration:g} s"
             raise SettingError("duration", f"{rule}; got {t.min():g} to {t.max():g} s")
-        ends, each = self._path.ts, self.samples_per_step
-        samples = np.interp(np.arange(each * (len(ends) - 1) + 1) / each, np.arange(len(ends)), ends)
-        position = t / self.sampling_time
+        samples, position = self._samples, t / self.sampling_time
         index = np.minimum(position.astype(int), len(samples) - 2)
         spacing = samples[index + 1] - samples[index]
         return samples[index] + (position - index) * spacing, spacing / self.sampling_time
