@@ -138,20 +138,22 @@ class PredictionModel:
         check_method("propagator", propagator, "propagate", "Linearization()")
         if not isinstance(settings, PredictionSettings):
             raise SettingError("prediction", f"must be PredictionSettings(...); got {type(settings).__name__}")
-        self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
+        self.propagator, self.problem, self.horizon = propagator, problem, horizon
         self.settings, self.points = settings, horizon if settings.form == "trajectory" else 1
-        self.linearizer = StageLinearizer(model, propagator, settings.covariance)
+        self._set_model(model)
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         self.costs = StageCosts(problem, horizon, self.linearizer)
-        self._roll_out = RollOut(model)
-        self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
 
     def with_model(self, model: DynamicsModel) -> "PredictionModel":
         """Returns the predictions by another model of as many states and inputs."""
         other = copy(self)
-        other.model, other.linearizer = model, StageLinearizer(model, self.propagator, self.settings.covariance)
-        other._at_points = StageLinearizer(model, Linearization(), "zero_order")
+        other._set_model(model)
         return other
+
+    def _set_model(self, model: DynamicsModel) -> None:
+        self.model, self.linearizer = model, StageLinearizer(model, self.propagator, self.settings.covariance)
+        self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
+        self._roll_out = RollOut(model)
 
     def read(
         self,
@@ -178,8 +180,8 @@ class PredictionModel:
         if self.settings.disturbance_gain and request.finite:
             request = request._replace(disturbance=self._disturbance(request))
         if plan is not None and request.states is None and request.finite:  # those that the inputs lead to
-            disturbance = request.disturbance if len(request.disturbance) else None
-            states = self._roll_out.open_loop(request.state[None], request.initial_guess[None], disturbance)[0]
+            start = request.state[None], request.initial_guess[None], request.disturbance
+            states = self._roll_out.open_loop(*start)[0]
             request = request._replace(states=states if np.isfinite(states).all() else None)
         return request
 
@@ -221,8 +223,7 @@ class PredictionModel:
     def linearize(self, plan: Plan, request: Request) -> Prediction:
         """The stages of a plan, linearised in one call, with covariances, rows and cost."""
         K = self.points
-        disturbance = request.disturbance if len(request.disturbance) else None
-        stages = self.linearizer(plan.states[:K], plan.inputs[:K], plan.covariances[:K], disturbance)
+        stages = self.linearizer(plan.states[:K], plan.inputs[:K], plan.covariances[:K], request.disturbance)
         return self.predict(plan, stages, request)
 
     def linearize_many(self, requests: Sequence[Request]) -> list[Prediction]:
@@ -232,7 +233,7 @@ class PredictionModel:
         K, T = self.points, len(requests)
         plans = list(map(self.initial_guess, requests))
         states, inputs, covariances = (np.concatenate([s[:K] for s in parts]) for parts in zip(*plans, strict=True))
-        disturbances = [np.broadcast_to(r.disturbance, (K, len(r.state))) for r in requests if len(r.disturbance)]
+        disturbances = [np.tile(r.disturbance, (K, 1)) for r in requests if r.disturbance is not None]
         disturbance = np.concatenate(disturbances) if disturbances else None
         stages = self.linearizer(states, inputs, covariances, disturbance)
         parts = zip(*(part.reshape(T, K, *part.shape[1:]) for part in stages), strict=True)
@@ -276,8 +277,7 @@ class PredictionModel:
 
     def evaluate(self, plan: Plan, at: Prediction, request: Request) -> Prediction:
         """The prediction at a plan with the derivatives of another one, ``at``."""
-        disturbance = request.disturbance if len(request.disturbance) else None
-        after = self._roll_out.open_loop(plan.states[:-1], plan.inputs[:, None], disturbance)[:, 1]
+        after = self._roll_out.open_loop(plan.states[:-1], plan.inputs[:, None], request.disturbance)[:, 1]
         return self._without(plan, after, at, request)
 
     def _without(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
@@ -296,7 +296,7 @@ class PredictionModel:
         problem, n, linearizer = self.problem, self.problem.state_dim, self.linearizer
         own = -self.gains(*prediction.stages[:2], prediction.cost) if not len(feedback) else feedback
         gains = np.ascontiguousarray(own[:, :, :n])
-        last, disturbance = request.references.previous_input, request.disturbance if len(request.disturbance) else None
+        last, disturbance = request.references.previous_input, request.disturbance
         limits = problem.inputs.lower, problem.inputs.upper, problem.input_rates.lower, problem.input_rates.upper
         if linearizer.at_points and all(limit.ndim == 1 for limit in limits):
             law = Feedback(towards.states[None], towards.inputs[None], gains[None], *limits, last)

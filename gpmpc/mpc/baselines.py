@@ -251,8 +251,7 @@ class StateFormMPC:
             return request.failed_decision(status, iterations, timing)
         inputs, states = np.array(self._program.inputs.value), np.array(self._program.states.value)
         beliefs = self.prediction.linearizer.moments(states, prediction.covariances)
-        disturbance = request.disturbance if self.prediction.settings.disturbance_gain else None
-        ended: Any = {"disturbance": disturbance, "suboptimal": suboptimal}
+        ended: Any = {"disturbance": request.disturbance, "suboptimal": suboptimal}
         return Decision(inputs[0], inputs, *beliefs, status, iterations, timing, **ended)
 
 

@@ -158,10 +158,10 @@ class GPMPC:
         suboptimal = not status.solved and prediction.plan is not guess and self._missed(prediction) <= FEASIBLE
         if not (status.solved or suboptimal):
             return replace(request.failed_decision(status, count, clock.timing), problem=program, solution=solution)
-        plan, disturbance = prediction.plan, request.disturbance if self.prediction.settings.disturbance_gain else None
+        plan = prediction.plan
         inputs, beliefs = plan.inputs.copy(), self.prediction.linearizer.moments(plan.states, prediction.covariances)
         novelty = call_unchecked(_largest_ratio, prediction.stages.V, self._prior)
-        found = program, solution, disturbance, suboptimal, novelty
+        found = program, solution, request.disturbance, suboptimal, novelty
         return Decision(inputs[0], inputs, *beliefs, status, count, clock.timing, *found)
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
