@@ -15,14 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import (
-    Array,
-    Linearized,
-    check_destination,
-    check_query,
-    tensors_for,
-    to_array,
-)
+from gpmpc.dynamics import Array, Linearized, check_destination, check_query, tensors_for, to_array
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp import GPPosterior, SlidingWindow, Trainer, Training, Transitions, append_points

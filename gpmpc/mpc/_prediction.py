@@ -38,12 +38,11 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.gp_rollout import Feedback
 from gpmpc.kernels.linalg import copy_matrix, product
 from gpmpc.models import RollOut
-from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, finite_horizon_lqr
+from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, Stages, finite_horizon_lqr
 from gpmpc.mpc._stages import (
     COVARIANCES,
     ConstraintRows,
     Covariance,
-    LinearizedStages,
     Plan,
     StageCosts,
     StageLinearizer,
@@ -71,7 +70,7 @@ class Prediction(NamedTuple):
     """A plan, the stages linearised at it, the covariances of its states, and the rows tightened by them."""
 
     plan: Plan  # where the stages were linearised; with ``velocity`` its first stage only
-    stages: LinearizedStages
+    stages: Stages
     covariances: Array  # Sigma_0 .. Sigma_H (H + 1, n, n)
     rows: StageRows
     cost: QuadraticCost  # with outputs linearised at the plan
@@ -237,14 +236,14 @@ class PredictionModel:
         disturbance = np.concatenate(disturbances) if disturbances else None
         stages = self.linearizer(states, inputs, covariances, disturbance)
         parts = zip(*(part.reshape(T, K, *part.shape[1:]) for part in stages), strict=True)
-        return list(map(self.predict, plans, map(LinearizedStages._make, parts), requests))
+        return list(map(self.predict, plans, map(Stages._make, parts), requests))
 
     def canonical(self, plan: Plan) -> Plan:
         """A plan whose s are those of its beliefs: with roots that are positive semidefinite."""
         means, covariances = self.linearizer.moments(plan.states, plan.covariances)
         return Plan(self.linearizer.state(means, covariances), plan.inputs, covariances)
 
-    def predict(self, plan: Plan, stages: LinearizedStages, request: Request) -> Prediction:
+    def predict(self, plan: Plan, stages: Stages, request: Request) -> Prediction:
         """Covariances, rows and cost for stages that were linearised at a plan; see ``linearize``."""
         covariances, mode = plan.covariances, self.linearizer.covariance
         cost = self.costs.at(plan, request.parameters)
@@ -259,9 +258,7 @@ class PredictionModel:
         rows = self.constraints.at(plan, covariances, self.points, request.parameters, request.kappas)
         return Prediction(plan, stages, covariances, rows, cost)
 
-    def _increments(
-        self, plan: Plan, stages: LinearizedStages, request: Request, previous: Decision
-    ) -> LinearizedStages:
+    def _increments(self, plan: Plan, stages: Stages, request: Request, previous: Decision) -> Stages:
         """A held linearisation as that of the increments since s_{-1}, the state that the last decision began at."""
         before = self.linearizer.state(previous.means[:1], previous.covariances[:1])[0]
         c = plan.states[0] - stages.A[0] @ before - stages.B[0] @ request.references.previous_input
@@ -316,10 +313,10 @@ class PredictionModel:
             states[k + 1] = stage.next[0]
             covariances[k + 1] = linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
             parts.append(stage)
-        stages = LinearizedStages(*map(np.concatenate, zip(*parts, strict=True)))
+        stages = Stages(*map(np.concatenate, zip(*parts, strict=True)))
         return self.predict(Plan(states, inputs, covariances), stages, request)
 
-    def gain(self, stages: LinearizedStages, cost: QuadraticCost) -> Array:
+    def gain(self, stages: Stages, cost: QuadraticCost) -> Array:
         """K (m, n) of the feedback u = u_k - K (x - mu_k) at the first stage; zero without feedback."""
         return self.gains(stages.A[:1], stages.B[:1], cost)[0]
 
