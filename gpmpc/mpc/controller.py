@@ -23,7 +23,7 @@ Array = np.ndarray
 
 _FAR = 0.9  # of the standard deviation without data
 FEASIBLE = 1e-3  # by how much a suboptimal plan may miss hard bounds, in their units: a next step mends it
-_NO_PLAN, _NO_DISTURBANCE = np.empty((0, 0)), np.empty(0)
+_NO_PLAN = np.empty((0, 0))
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class Request(NamedTuple):
         initial_guess: Inputs (H, m) within their bounds: those handed over; else the last plan's, one step on, the last
             one repeated; else the previous input repeated.
         finite: Whether the belief is. A belief that is not is a bad measurement, not misuse.
-        disturbance: Added to the model's mean at every stage (n,), or nothing (0,).
+        disturbance: Added to the model's mean at every stage (n,); None where nothing is estimated.
         parameters: Of the smooth constraints, by stage (H, q); None where there are none.
         kappas: Of the reference (H,), where it has some.
         previous: The last decision, where its plan may be started from and has this horizon.
@@ -185,7 +185,7 @@ class Request(NamedTuple):
     references: References
     initial_guess: Array
     finite: bool
-    disturbance: Array = _NO_DISTURBANCE
+    disturbance: Array | None = None
     parameters: Array | None = None
     kappas: Array | None = None
     previous: Decision | None = None

@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
+from scipy.interpolate import krogh_interpolate
 
 from gpmpc.exceptions import SettingError, ShapeError, SolverFailure, check_number
 from gpmpc.gaussian import Gaussian
@@ -206,11 +207,8 @@ def _state_along(states: np.ndarray, time: float) -> np.ndarray:
     """The state (n,) at a time in steps from s_0 on, by the cubic through the four nearest of s_0 .. s_H (H + 1, n)."""
     count = min(4, len(states))
     first = min(max(int(time) - 1, 0), len(states) - count)
-    nodes, value = np.arange(first, first + count), np.zeros(states.shape[1])
-    for i in nodes:
-        others = nodes[nodes != i]
-        value += np.prod((time - others) / (i - others)) * states[i]
-    return value
+    nodes = np.arange(first, first + count)
+    return krogh_interpolate(nodes, states[nodes], time)
 
 
 def check_policy(on_failure: str) -> None:
