@@ -134,7 +134,7 @@ class GPMPC:
         guess, solution = prediction.plan, None if request.previous is None else request.previous.solution
         search = Globalization(self.prediction, request, self.tolerance) if self.iterations > 1 else None
         solved_at, status, count = None, None, 0
-        while status is None and count < self.iterations:
+        while True:
             clock.lap("model")
             program = self._condense(prediction, request)
             program = program if search is None else search.correct(program, prediction.plan)
@@ -149,6 +149,8 @@ class GPMPC:
                     prediction = prediction._replace(plan=proposed)
                 else:
                     prediction, status = search(prediction, program, solution, proposed)
+            if status is not None or count == self.iterations:
+                break
         if solved_at is not None and self.prediction.settings.rolled_out:
             obeying = self.prediction.roll_out(prediction.plan, *solved_at, request)
             prediction = obeying if np.isfinite(obeying.plan.states).all() else prediction
