@@ -96,6 +96,12 @@ class Box(Constraint):
 
     Raises:
         SettingError: Crossed bounds, or as for ``Constraint``.
+
+    >>> Box(lower=[-2.0], upper=[1.0]).upper
+    array([1.])
+    >>> Box(lower=[2.0], upper=[1.0])
+    Traceback (most recent call last):
+    gpmpc.exceptions.SettingError
     """
 
     lower: Any = None
