@@ -40,15 +40,10 @@ from gpmpc.propagation import Propagator, rollout
 
 @dataclass(frozen=True)
 class ConformalTube:
-    """Scores of held-out predictions, and the numbers of standard deviations that follow from them.
+    """Scores of held-out predictions, and the numbers of standard deviations that follow from them."""
 
-    Attributes:
-        scores: Those of each stage in a column (N, H), which are sorted.
-        rows: The directions g (r, n) that were compared.
-    """
-
-    scores: Array
-    rows: Array
+    scores: Array  #: those of each stage in a column (N, H), which are sorted
+    rows: Array  #: the directions g (r, n) that were compared
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "scores", np.ascontiguousarray(np.sort(self.scores, axis=0), dtype=float))

@@ -15,7 +15,16 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, Linearized, check_destination, check_query, tensors_for, to_array
+from gpmpc.dynamics import (
+    Array,
+    Linearized,
+    batched_jacobian,
+    check_destination,
+    check_query,
+    predict_by_autograd,
+    tensors_for,
+    to_array,
+)
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp import GPPosterior, SlidingWindow, Trainer, Training, Transitions, append_points
@@ -214,6 +223,24 @@ class ResidualModel:
         V = None if d.covariance is None else B @ d.covariance @ B.swapaxes(-1, -2)
         mean = mean + (B @ d.mean[..., None])[..., 0]
         return Linearized(mean, A + B @ by_state, G + B @ by_input, V)
+
+    def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
+        """``predict`` with its mean's derivatives by x (*batch, n, n) and u (*batch, n, m), which torch can follow."""
+        input = state[..., :0] if input is None else input
+        if callable(self.B):
+            return predict_by_autograd(self, state, input)
+        belief = self.predict(state, input)
+        _, by_features, by_inputs = self.residual.predict_with_jacobian(*self.features(state, input))
+        if isinstance(self.nominal, Affine):
+            A, G = (part.expand(*state.shape[:-1], *part.shape) for part in (self.nominal.A, self.nominal.B))
+        else:
+            (_,), (A, G) = batched_jacobian(lambda x, u: (self.nominal(x, u),), (state, input))
+        places = torch.tensor(list(self.inputs), dtype=torch.long, device=self.device)
+        return (
+            belief,
+            A + self.B @ by_features @ self.features.jacobian(state),
+            G.index_add(-1, places, self.B @ by_inputs),
+        )
 
     @cached_property
     def _constant_effect(self) -> Array:

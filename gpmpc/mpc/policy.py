@@ -27,21 +27,16 @@ _ROUNDING = 1e-4  # share of an input or of 1, whichever is more, by which a loo
 
 @dataclass(frozen=True)
 class Command:
-    """What one step applies, and what the next one needs.
+    """What one step applies, and what the next one needs."""
 
-    Attributes:
-        input: Applied (m,).
-        status: How the step's own solve ended; ``INVALID_MEASUREMENT`` where the controller was not called,
-            ``NUMERICAL_TROUBLE`` where it called a plan solved that must not reach a plant.
-        decision: Of the controller, with this status, a failed iterate perhaps; None where it was not called or
-            returned inputs of another shape.
-        plan: The last applicable decision, shifted to this step. Before the first one that is not, with what was
-            applied as its ``input``; None where nothing was.
-    """
-
-    input: np.ndarray
+    input: np.ndarray  #: applied (m,)
+    #: how the step's own solve ended; ``INVALID_MEASUREMENT`` where the controller was not called,
+    #: ``NUMERICAL_TROUBLE`` where it called a plan solved that must not reach a plant
     status: Status
+    #: of the controller, with this status; None where it was not called or returned inputs of another shape
     decision: Decision | None
+    #: the last applicable decision, shifted to this step; before the first one that is not, with what was applied as
+    #: its ``input``; None where nothing was
     plan: Decision | None
 
     @property
