@@ -35,6 +35,10 @@ class Transitions:
     Raises:
         ShapeError: The three do not belong together.
         DataError: There is no row, or an entry is not finite (its row and column are named, from 1).
+
+    >>> data = Transitions(states=[[0.0], [1.0]], inputs=[[0.5], [0.5]], next_states=[[1.0], [2.0]])
+    >>> len(data), data[1:].states.tolist()
+    (2, [[1.0]])
     """
 
     states: Tensor

@@ -22,9 +22,8 @@ coordinates are used where the diagonal of P exceeds that of the last stage, whi
 """
 
 import numpy as np
-from numba import types
 
-from gpmpc.compiled import compile_for, compiled, njit_inner, njit_noalloc, unchecked_entry_point
+from gpmpc.compiled import call_unchecked, compiled, njit_inner, njit_noalloc
 from gpmpc.exceptions import ShapeError
 from gpmpc.kernels.linalg import aligned_rows, combine_rows, copy, copy_matrix, dot
 from gpmpc.mpc._linear_quadratic import (
@@ -45,59 +44,36 @@ from gpmpc.mpc.problem import Problem
 
 Array = np.ndarray
 
-_LARGEST_GROWTH = (
-    3e7  # quadrotors over 100 stages have 2e7; a doubled-precision solve of a plan from 1e8 on takes 20 ms
-)
+_LARGEST_GROWTH = 3e7  # quadrotors over 100 stages have 2e7; in doubled precision a solve from 1e8 on takes 20 ms
 
 
 class Condenser:
-    """Condenses the stages of one problem.
-
-    Args:
-        problem: Bounds of the inputs.
-        horizon: H.
-        blocks: p / n.
-    """
+    """Condenses the stages of one problem over H stages; ``blocks`` is p / n."""
 
     def __init__(self, problem: Problem, horizon: int, blocks: int):
         rated = horizon if problem.input_rates.finite else 0
         self.bounds = InputBounds(
             *problem.inputs.by_stage(horizon), *[side[:rated] for side in problem.input_rates.by_stage(horizon)]
         )
-        compile_for(_condense, _SIGNATURE)  # type: ignore[arg-type]
-        self._condense = unchecked_entry_point(_condense)
         n, m = problem.state_dim, problem.input_dim
         self._size, self._rates, self._plain = horizon * m, rated * m, np.empty((0, m, blocks * n + m + 1))
 
     def condense(
         self, cost: QuadraticCost, stages: Stages, start: Array, references: References, rows: StageRows
     ) -> CondensedProgram:
-        """Makes the program in the coordinates that suit it; ``expand`` gives inputs and states of its solution.
-
-        Args:
-            cost: Of the extended state.
-            stages: With constant A, B and E, or H of one of them.
-            start: s_0 (p,).
-            references: What is tracked.
-            rows: Bounds of states and inputs.
-        """
-        for array in (
-            *stages,
-            start,
-            rows.E,
-            rows.D,
-            references.states,
-            cost.squares,
-        ):  # the kernel does not look at their strides
+        """Makes the program in the coordinates that suit it; ``expand`` gives inputs and states of its solution."""
+        arrays = *stages, start, rows.E, rows.D, references.states, cost.squares
+        for array in arrays:  # the kernel does not look at their strides
             if not array.flags.c_contiguous:
                 raise ShapeError("stages, rows and references must be contiguous arrays")
         size, count = self._size, self._rates + rows.lower.size
         lower, upper = np.empty((2, size + count))
         P, q, G = np.empty((size, size)), np.empty(size), np.empty((count, size))
         program = CondensedProgram(P, q, G, lower, upper, self._plain)
-        if self._condense(cost, self.bounds, stages, start, references, rows, program) <= _LARGEST_GROWTH:
+        given = cost, self.bounds, stages, start, references, rows
+        if call_unchecked(_condense, *given, program) <= _LARGEST_GROWTH:
             return program
-        return condense_with_feedback(cost, self.bounds, stages, start, references, rows)
+        return call_unchecked(condense_with_feedback, *given)
 
 
 @compiled
@@ -138,14 +114,8 @@ def write_hessian_and_rows(cost, bounds, stages, rows, program):
 @njit_inner
 def _add_varying_stages(cost, stages, rows, H, P, G):
     """Adds 2 Gamma' W Gamma to P, and writes E Gamma to G; whole registers at a time, in padded copies."""
-    (p, m), n, last, E, D, Z = (
-        stages.B.shape[1:],
-        cost.terminal.shape[1],
-        len(stages.A) - 1,
-        rows.E,
-        rows.D,
-        cost.squares,
-    )
+    (p, m), n, last, Z = stages.B.shape[1:], cost.terminal.shape[1], len(stages.A) - 1, cost.squares
+    E, D = rows.E, rows.D
     r = E.shape[1]
     M, MA, MB = _zeros(p, p), _zeros(p, p), _zeros(p, m)
     A, transposed, B = _zeros(p, p), np.empty((p, p)), _zeros(p, m)
@@ -386,12 +356,3 @@ def _mirror(P):
             for i in range(top, min(top + 8, size)):
                 for j in range(left, min(left + 8, i)):
                     P[j, i] = P[i, j]
-
-
-def _record(kind, *fields):
-    return types.NamedTuple([types.Array(types.float64, axes, "C") if axes else types.int64 for axes in fields], kind)
-
-
-_PROGRAM, _VECTOR = _record(CondensedProgram, 2, 1, 2, 1, 1, 3), types.Array(types.float64, 1, "C")
-_GIVEN = _record(QuadraticCost, 4, 3, 3, 0, 3), _record(InputBounds, 2, 2, 2, 2), _record(Stages, 3, 3, 2)
-_SIGNATURE = types.float64(*_GIVEN, _VECTOR, _record(References, 2, 2, 1), _record(StageRows, 3, 3, 2, 2), _PROGRAM)

@@ -1,26 +1,20 @@
-"""Declares what a controller makes small: a list of weighed residuals, of which the tracking error is the first.
+"""Costs: weighed squares of the tracking error, of the inputs, and of outputs that are linearised along a plan.
 
-    sum_{i=1..H} E|x_i - r_i|^2_Q + |v_{i-1}|^2_R + sum_j E|y_j(x_i, u_{i-1}, p_i) - c_j|^2_W
-
-where v is the input itself, its deviation from the reference input, or its increment (Cao, Lai and Alam, 2017, sections
-3.2-3.3). Weights, references c and parameters p may differ by stage; stage i pairs a state with the input that led to
-it. For a Gaussian x_i, E|x - r|^2_Q = |mu - r|^2_Q + tr(Q Sigma).
-
-Outputs are linearised along the plan, y(z') + J (z - z') for y(z), z = [x_i; u_{i-1}], so that a step is one
-of Gauss-Newton. To a stage they add the square [z; 1]' Z [z; 1], where Z = [J, e]' W [J, e] and e = y(z') - J z' - c.
+Outputs are linearised in z = [x_i; u_{i-1}], y(z') + J (z - z'), so that a step is one of Gauss-Newton. To a stage
+they add the square [z; 1]' Z [z; 1], where Z = [J, e]' W [J, e] and e = y(z') - J z' - c.
 """
 
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
-from gpmpc.dynamics import batched_jacobian, to_array
 from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.models import CasadiFunction, linearize_function
 
 Array = np.ndarray
 
@@ -34,7 +28,7 @@ class Tracking:
 
     Attributes:
         Q: State weights, the diagonal (n,) or the matrix (n, n); matrices (H, n, n) by stage.
-        R: Input weights, the diagonal (m,) or the matrix (m, m); matrices (H, m, m) by stage.
+        R: Input weights, likewise (m,), (m, m) or (H, m, m), positive definite.
         terminal: Weight of the last predicted state, one like Q; Q itself (its last one) by default.
         penalized: What R weighs: ``"inputs"``, ``"deviations"`` from the reference inputs, or ``"increments"``.
         angles: Indices of states whose error is modulo 2 pi: their references move by full turns towards the plan;
@@ -52,17 +46,17 @@ class Tracking:
 
     def __post_init__(self) -> None:
         Q, R = _weight("Q", self.Q), _weight("R", self.R)
-        lowest = np.linalg.eigvalsh(R).min()
+        lowest, n = np.linalg.eigvalsh(R).min(), Q.shape[-1]
         if lowest <= 0:
             raise SettingError("R", f"must be positive definite; its smallest eigenvalue is {lowest:.3g}")
-        terminal = Q.reshape(-1, *Q.shape[-2:])[-1] if self.terminal is None else _weight("terminal", self.terminal)
-        if terminal.shape != Q.shape[-2:]:
-            raise SettingError("terminal", f"must be a weight of {Q.shape[-1]} states; got {len(terminal)}")
+        terminal = Q.reshape(-1, n, n)[-1] if self.terminal is None else _weight("terminal", self.terminal)
+        if terminal.shape != (n, n):
+            raise SettingError("terminal", f"must be a weight of {n} states; got {len(terminal)}")
         if self.penalized not in PENALIZED:
             raise SettingError("penalized", f"must be one of {', '.join(map(repr, PENALIZED))}; got {self.penalized!r}")
         angles = tuple(self.angles or ())
-        if not all(isinstance(index, int) and 0 <= index < Q.shape[-1] for index in angles):
-            raise SettingError("angles", f"must be indices of {Q.shape[-1]} states; got {self.angles!r}")
+        if not all(isinstance(index, int) and 0 <= index < n for index in angles):
+            raise SettingError("angles", f"must be indices of {n} states; got {self.angles!r}")
         for key, value in (("Q", Q), ("R", R), ("terminal", terminal), ("angles", angles)):
             object.__setattr__(self, key, value)
 
@@ -105,54 +99,35 @@ class LeastSquares:
             raise SettingError("y", f"must be a function; got {type(self.y).__name__}")
         weight = _weight("weight", self.weight)
         reference = np.zeros(weight.shape[-1]) if self.reference is None else np.array(self.reference, dtype=float)
-        if (
-            reference.ndim not in (1, 2)
-            or reference.shape[-1:] != weight.shape[-1:]
-            or not np.isfinite(reference).all()
-        ):
+        fits = reference.ndim in (1, 2) and reference.shape[-1] == weight.shape[-1]
+        if not (fits and np.isfinite(reference).all()):
             raise SettingError("reference", f"must be {weight.shape[-1]} finite numbers, or these by stage")
         object.__setattr__(self, "weight", weight)
         object.__setattr__(self, "reference", reference)
 
-    @property
-    def largest_weight(self) -> float:
-        """The largest eigenvalue of the weights."""
-        return float(np.linalg.eigvalsh(self.weight).max())
-
     def squares(self, states: Array, inputs: Array, parameters: Array | None) -> Array:
-        """Returns the squares Z (H, n + m + 1, n + m + 1) of its linearisation along a plan; see the module's text.
-
-        Args:
-            states: x_1 .. x_H (H, n).
-            inputs: u_0 .. u_{H-1} (H, m).
-            parameters: (H, q); None where there are none.
-        """
+        """Returns the squares Z (H, n + m + 1, n + m + 1) along a plan x_1 .. x_H, u_0 .. u_{H-1}; see the module."""
         y, J, K = expand_function("y", self.y, self.weight.shape[-1], states, inputs, parameters)
         e = y - self.reference - np.einsum("kri,ki->kr", J, states) - np.einsum("kri,ki->kr", K, inputs)
         rows = np.concatenate([J, K, e[..., None]], axis=2)
         return rows.mT @ self.weight @ rows
 
 
-class Expansion(NamedTuple):
-    """First-order expansions of a function of states and inputs at H stages."""
+def by_stage(key: str, values: Array, horizon: int, dims: int) -> Array:
+    """Returns values of every stage, given of every stage or of one (whose array has ``dims`` axes).
 
-    values: Array  # (H, d)
-    by_state: Array  # (H, d, n)
-    by_input: Array  # (H, d, m)
+    Raises:
+        SettingError: Of another number of stages.
+    """
+    if values.ndim > dims and len(values) != horizon:
+        raise SettingError(key, f"must be given for one stage or all {horizon}; got {len(values)}")
+    return np.ascontiguousarray(np.broadcast_to(values, (horizon, *values.shape[values.ndim - dims :])))
 
 
 def expand_function(
     name: str, function: Any, count: int, states: Array, inputs: Array, parameters: Array | None
-) -> Expansion:
-    """Returns the first-order expansions of a function of states, inputs and parameters, in torch or CasADi.
-
-    Args:
-        name: Of the function, for messages.
-        function: Of the first one, two or all of the arguments.
-        count: d, the number of its values at a stage.
-        states: (H, n).
-        inputs: (H, m).
-        parameters: (H, q); None where there are none.
+) -> tuple[Array, Array, Array]:
+    """Returns a function's values (H, count) along a plan, (H, d, n) and (H, d, m) its derivatives.
 
     Raises:
         SettingError: It takes parameters, and there are none.
@@ -163,14 +138,26 @@ def expand_function(
     arguments = [states, inputs] if parameters is None else [states, inputs, parameters]
     if len(arguments) < least:
         raise SettingError("parameters", f"must come with every call: {name} is a function of them")
-    values, *jacobians = (_expand_casadi if hasattr(function, "n_in") else _expand_torch)(function, arguments[:most])
+    if hasattr(function, "n_in"):
+        values, *jacobians = _casadi_function(function).linearize(*arguments[:most])
+    else:
+        known = [torch.as_tensor(argument) for argument in arguments[2:most]]
+
+        def stacked(*at: torch.Tensor) -> torch.Tensor:
+            value = function(*at, *known)
+            return value.unsqueeze(-1) if value.dim() == 1 else value
+
+        values, *jacobians = linearize_function(stacked, _FLOAT64, *arguments[: min(most, 2)])
     if values.shape != (len(states), count):
         raise ShapeError(f"{name} must give ({len(states)}, {count}); got {values.shape}")
-    if len(jacobians) == 1:
-        jacobians.append(np.zeros((len(states), count, inputs.shape[1])))
-    if not all(np.isfinite(part).all() for part in (values, *jacobians)):
+    by_state, by_input = [*jacobians, np.zeros((len(states), count, inputs.shape[1]))][:2]
+    if not all(np.isfinite(part).all() for part in (values, by_state, by_input)):
         raise DataError(f"{name} or its gradient is not finite along the plan")
-    return Expansion(values, *jacobians)
+    return values, by_state, by_input
+
+
+_FLOAT64 = torch.empty(0, dtype=torch.float64)
+_casadi_function = lru_cache(maxsize=64)(CasadiFunction)
 
 
 @lru_cache(maxsize=256)
@@ -187,51 +174,11 @@ def _arguments(function: Any) -> tuple[int, int]:
     return sum(p.default is p.empty for p in positional), most
 
 
-def _expand_torch(function: Any, arguments: Sequence[Array]) -> list[Array]:
-    tensors = [torch.as_tensor(argument) for argument in arguments]
-
-    def at(*leaves: torch.Tensor) -> tuple[torch.Tensor]:
-        value = function(*leaves, *tensors[2:])
-        return (value.unsqueeze(-1) if value.dim() == 1 else value,)
-
-    (value,), jacobians = batched_jacobian(at, tensors[:2])
-    return [to_array(value), *map(to_array, jacobians)]
-
-
-def _expand_casadi(function: Any, arguments: Sequence[Array]) -> list[Array]:
-    K, expansion = len(arguments[0]), _casadi_expansion(function, len(arguments[0]))
-    value, *jacobians = expansion(*[argument.T for argument in arguments])
-    wide = [jacobian.full().reshape(len(value.full()), K, -1).swapaxes(0, 1) for jacobian in jacobians]
-    return [part.copy() for part in (value.full().T, *wide)]
-
-
-@lru_cache(maxsize=64)
-def _casadi_expansion(function: Any, points: int) -> Any:
-    names, y = function.name_in(), function.name_out(0)
-    return function.factory("expansion", names, [y, *[f"jac:{y}:{name}" for name in names[:2]]]).map(points)
-
-
-def by_stage(key: str, values: Array, horizon: int, dims: int) -> Array:
-    """Returns values of every stage, given of every stage or of one (whose array has ``dims`` axes).
-
-    Raises:
-        SettingError: Of another number of stages.
-    """
-    if values.ndim == dims:
-        return np.ascontiguousarray(np.broadcast_to(values, (horizon, *values.shape)))
-    if len(values) != horizon:
-        raise SettingError(key, f"must be given for one stage or all {horizon}; got {len(values)}")
-    return np.ascontiguousarray(values)
-
-
 def _weight(key: str, value: Any) -> Array:
     """A weight from its diagonal or its matrix, or from those of all stages."""
-    try:
-        weight = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        weight = np.empty(0)
+    weight = read_numbers(key, value, "the diagonal of a weight or a square matrix")
     weight = np.diag(weight) if weight.ndim == 1 else weight
-    if weight.ndim not in (2, 3) or weight.shape != weight.mT.shape or not weight.size:
+    if weight.ndim not in (2, 3) or weight.shape != weight.mT.shape:
         raise SettingError(key, f"must be the diagonal of a weight or a square matrix; got {value!r}")
     if not np.isfinite(weight).all():
         raise SettingError(key, f"must be finite; got {value!r}")
@@ -241,3 +188,14 @@ def _weight(key: str, value: Any) -> Array:
     if lowest < -1e-12 * max(1.0, np.abs(weight).max()):
         raise SettingError(key, f"must be positive semidefinite; its smallest eigenvalue is {lowest:.3g}")
     return weight
+
+
+def read_numbers(key: str, value: Any, rule: str = "a list of numbers, infinite where unbounded") -> Array:
+    """An array from a list."""
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        array = np.empty(())
+    if not (array.ndim and array.size):
+        raise SettingError(key, f"must be {rule}; got {value!r}")
+    return array

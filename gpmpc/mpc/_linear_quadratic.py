@@ -28,11 +28,13 @@ _STABLE = 1e-9  # by how much an eigenvalue may lie outside the unit circle by r
 
 
 class Stages(NamedTuple):
-    """Affine stages s_{k+1} = A_k s_k + B_k u_k + c_k; H of them, or one that is constant over the horizon."""
+    """Affine stages s_{k+1} = A_k s_k + B_k u_k + c_k: K = H along a plan, or K = 1 that is held over the horizon."""
 
-    A: Array  # (H or 1, p, p)
-    B: Array  # (H or 1, p, m)
-    c: Array  # (H or 1, p)
+    A: Array  # (K, p, p)
+    B: Array  # (K, p, m)
+    c: Array  # (K, p); the defects of the plan are part of it
+    next: Array = np.empty((0, 0))  # where the dynamics lead from the points of the plan, F(s_k, u_k) (K, p)
+    V: Array = np.empty((0, 0, 0))  # what a stage adds to A Sigma A' (K, n, n), in the mode ``zero_order``; else zero
 
 
 class QuadraticCost(NamedTuple):
@@ -147,13 +149,7 @@ def weight_of_stage(cost, k, H):
 def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
     """Gains K_0 .. K_{H-1} (H, m, n) and the Hessians D_k of the cost in u_k (H, m, m).
 
-    Args:
-        A: (H, n, n), or (1, n, n) where it is constant: then the recursion ends where P settles.
-        B: (H, n, m) or (1, n, m).
-        Q: Of x_0 .. x_{H-1} (H, n, n), or (1, n, n), positive semidefinite.
-        R: (H, m, m) or (1, m, m), positive definite.
-        terminal: T (n, n), positive semidefinite.
-        horizon: H.
+    A, B, Q and R are of H stages or of one that is constant; where all are, the recursion ends where P settles.
     """
     (n, m), constant = B.shape[1:], len(A) == len(Q) == len(R) == 1
     gains, hessians = np.zeros((horizon, m, n)), np.empty((horizon, m, m))
@@ -210,28 +206,22 @@ def optimal_feedback(cost, stages, references):
     for k in range(len(squares)):
         _add_square(squares[k], targets[k], terminal if k == H - 1 else weights[k], p)
     for k in range(H):
-        at = min(k, len(stages.A) - 1)
-        A[k, e, e] = 1.0
+        at, shift = min(k, len(stages.A) - 1), A[k, :, e]
+        shift[e] = 1.0
+        copy_matrix(stages.A[at], A[k, :p, :p])
+        copy_matrix(stages.B[at], B[k, :p])
         for i in range(p):
-            A[k, i, e] = stages.c[at, i]
-            for j in range(p):
-                A[k, i, j] = stages.A[at, i, j]
-            for j in range(n):
-                A[k, i, e] += stages.A[at, i, j] * targets[k - 1, j] if k > 0 else 0.0
-            for j in range(m):
-                B[k, i, j] = stages.B[at, i, j]
-                if cost.penalized == DEVIATIONS:
-                    A[k, i, e] += stages.B[at, i, j] * references.inputs[k, j]
-        for i in range(n):
-            A[k, i, e] -= targets[k, i]
+            shift[i] = stages.c[at, i] - (targets[k, i] if i < n else 0.0)
+            if k > 0:
+                shift[i] += dot(stages.A[at, i], targets[k - 1], n)
+            if cost.penalized == DEVIATIONS:
+                shift[i] += dot(stages.B[at, i], references.inputs[k], m)
         for i in range(e - p):
             B[k, p + i, i] = 1.0
-            if incremental:
-                A[k, p + i, p + i] = 1.0
-                for j in range(p):
-                    A[k, j, p + i] = stages.B[at, j, i]
-            elif cost.penalized == DEVIATIONS:
-                A[k, p + i, e] = references.inputs[k, i]
+            if cost.penalized == DEVIATIONS:
+                shift[p + i] = references.inputs[k, i]
+        if incremental:
+            copy_matrix(B[k], A[k, :, p:e])
     before = np.concatenate((weights[:1], weights))[: H if len(weights) > 1 else 1]  # of stages 0 .. H - 1
     gains, hessians = finite_horizon_lqr(A, B, before, cost.input, terminal, H)
     feedback = np.zeros((H, m, p + m + 1))
@@ -273,12 +263,6 @@ def add_blocks(W, M):
 
 def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
     """The gain K (m, n) of u = -K x that minimises sum_k |x_k|^2_Q + |u_k|^2_R under x_{k+1} = A x_k + B u_k for ever.
-
-    Args:
-        A: (n, n).
-        B: (n, m).
-        Q: (n, n), positive semidefinite.
-        R: (m, m), positive definite.
 
     Raises:
         SettingError: The inputs do not reach a mode that grows.

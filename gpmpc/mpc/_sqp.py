@@ -46,28 +46,8 @@ _NEAR = 0.2  # relative offset from which steps are remembered: those from far a
 _CREEP = 0.25  # ratio of two offsets above which the Hessian is updated
 
 
-class FullStep:
-    """Takes one program's solution as it is: the real-time iteration."""
-
-    def correct(self, program: CondensedProgram, _: Plan) -> CondensedProgram:
-        """The program itself."""
-        return program
-
-    def __call__(
-        self, at: Prediction, _: CondensedProgram, solution: QPSolution, proposed: Plan
-    ) -> tuple[Prediction, Status | None]:
-        """The prediction with the proposed plan, which is the last one."""
-        return at._replace(plan=proposed), solution.status
-
-
 class Globalization:
-    """Chooses the steps of one request's iteration, and says where it ends.
-
-    Args:
-        model: What predicts.
-        request: Of the step.
-        tolerance: Of relative offset and defects.
-    """
+    """Chooses the steps of one request's iteration, and says where it ends: at a tolerance of offset and defects."""
 
     def __init__(self, model: PredictionModel, request: Request, tolerance: float):
         self._model, self._request, self._tolerance = model, request, tolerance
@@ -102,11 +82,7 @@ class Globalization:
     ) -> tuple[Prediction, Status | None]:
         """The prediction at the next plan, and how the iteration ends: None where it goes on.
 
-        Args:
-            at: Where the program was made.
-            program: As it was solved.
-            solution: Its solution.
-            proposed: The plan that this means.
+        The program was made at the prediction ``at``; ``proposed`` is the plan that its solution means.
         """
         plan, last_rate, prices = at.plan, self._rate, self._model.constraints.prices
         z = solution.z
@@ -175,9 +151,8 @@ def _smallest_cost(R, lower, upper, last):
 def _assess(cost, terms, defect_prices, stages, rows, plan, proposed, z):
     """What a step from a plan to a proposed one promises.
 
-    Returns:
-        Cost with price of violated rows at the plan, curvature of the step in the cost, cost with price promised, the
-        largest defect relative to the states, merit of the plan under new prices of defects, and these prices (p,).
+    Returns cost with price of violated rows at the plan, curvature of the step in the cost, cost with price promised,
+    the largest defect relative to the states, merit of the plan under new prices of defects, and these prices (p,).
     """
     (references, prices, row_price), (A, after) = terms, stages
     zero = References(0.0 * references.states, 0.0 * references.inputs, 0.0 * references.previous_input)
@@ -233,18 +208,11 @@ def _costates(cost, A, plan, targets, E, z):
     return costates
 
 
-@compiled
-def _update(P, step, change):
+def _update(P: Array, step: Array, change: Array) -> None:
     """Updates P towards P step = change, damped so that it stays positive definite (Powell, 1978)."""
-    n = len(P)
-    moved, found = np.empty(n), dot(step, change, n)
-    for i in range(n):
-        moved[i] = dot(P[i], step, n)
-    curvature, share = dot(step, moved, n), 1.0
+    moved = P @ step
+    found, curvature, share = step @ change, step @ moved, 1.0
     if found < 0.2 * curvature:
         share = 0.8 * curvature / (curvature - found)
     damped = share * change + (1.0 - share) * moved
-    found = dot(step, damped, n)
-    for i in range(n):
-        for j in range(n):
-            P[i, j] += damped[i] * damped[j] / found - moved[i] * moved[j] / curvature
+    P += np.outer(damped, damped) / (step @ damped) - np.outer(moved, moved) / curvature

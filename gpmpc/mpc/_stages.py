@@ -26,10 +26,10 @@ import torch
 from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.dynamics import DynamicsModel, linearize, tensors_for, to_array
 from gpmpc.exceptions import SettingError
-from gpmpc.gaussian import Gaussian
+from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
 from gpmpc.kernels.linalg import dot
 from gpmpc.mpc._cost import PENALIZED, by_stage
-from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows
+from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, Stages
 from gpmpc.mpc.problem import Inequality, Problem
 from gpmpc.propagation import Propagator, differentiate, square_roots
 from gpmpc.propagation import linearize as linearize_belief
@@ -42,45 +42,15 @@ COVARIANCES = ("full", "diagonal", "zero_order", "none")
 
 
 class Plan(NamedTuple):
-    """Where stages are linearised; it need not obey the dynamics.
+    """Where stages are linearised; it need not obey the dynamics."""
 
-    Attributes:
-        states: s_0 .. s_H (H + 1, p); s_0 is the current one.
-        inputs: u_0 .. u_{H-1} (H, m).
-        covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
-    """
-
-    states: Array
-    inputs: Array
-    covariances: Array
-
-
-class LinearizedStages(NamedTuple):
-    """K affine stage models: K = H along a plan, or K = 1 that is held over the horizon.
-
-    Attributes:
-        A: (K, p, p).
-        B: (K, p, m).
-        c: (K, p); the defects of the plan are part of it.
-        next: Where the dynamics lead from the points themselves, F(s_k, u_k) (K, p).
-        V: What a stage adds to A Sigma A' (K, n, n), in the mode ``zero_order``; zero elsewhere.
-    """
-
-    A: Array
-    B: Array
-    c: Array
-    next: Array
-    V: Array
+    states: Array  # s_0 .. s_H (H + 1, p); s_0 is the current one
+    inputs: Array  # u_0 .. u_{H-1} (H, m)
+    covariances: Array  # Sigma_0 .. Sigma_H (H + 1, n, n)
 
 
 class StageLinearizer:
-    """Linearises the dynamics of the belief at K points in one call, in one covariance mode.
-
-    Args:
-        model: Its mean, and where covariances count its variance.
-        propagator: How the belief moves; ``none`` needs the model's mean only.
-        covariance: See the module's text.
-    """
+    """Linearises the dynamics of the belief at K points in one call, in one covariance mode; see the module's text."""
 
     def __init__(self, model: DynamicsModel, propagator: Propagator, covariance: Covariance):
         self.model, self.propagator, self.covariance, self._n = model, propagator, covariance, model.state_dim
@@ -124,22 +94,13 @@ class StageLinearizer:
             return states[:, :n], states[:, n:, None] ** 2 * np.eye(n)
         return states, covariances
 
-    def __call__(
-        self, states: Array, inputs: Array, covariances: Array, disturbance: Array | None = None
-    ) -> LinearizedStages:
-        """The stage models at K points.
-
-        Args:
-            states: s (K, p), contiguous.
-            inputs: (K, m), contiguous.
-            covariances: Of the states (K, n, n).
-            disturbance: Added to the next means (n,) or (K, n); None for none.
-        """
+    def __call__(self, states: Array, inputs: Array, covariances: Array, disturbance: Array | None = None) -> Stages:
+        """The stage models at K points s (K, p), u (K, m), Sigma (K, n, n), disturbance (n,) added to the means."""
         after, A, B, V = self._linearize(states, inputs, covariances)
         if disturbance is not None:
             after = after.copy()
             after[:, : self._n] += disturbance
-        return LinearizedStages(A, B, call_unchecked(_constants, A, B, after, states, inputs), after, V)
+        return Stages(A, B, call_unchecked(_constants, A, B, after, states, inputs), after, V)
 
     def _points(self, states: Array, inputs: Array, _: Array) -> tuple[Array, ...]:
         found = linearize(self.model, states, inputs, self.covariance == "zero_order")
@@ -152,8 +113,7 @@ class StageLinearizer:
         moved, d = differentiate(self.propagator, self.model, *self._tensors(states, covariances, inputs))
         A, S = d.mean_by_mean, moved.belief.covariance
         passed = A @ moved.cross_covariance  # mean equivalence passes nothing on
-        eigenvalues, vectors = torch.linalg.eigh(S - (passed + passed.mT) / 2)
-        V = (vectors * eigenvalues.clamp_min(0)[..., None, :]) @ vectors.mT
+        V, _ = nearest_positive_semidefinite(S - (passed + passed.mT) / 2)
         return tuple(map(to_array, (moved.belief.mean, A, d.mean_by_input, V)))
 
     def _full(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
@@ -196,15 +156,7 @@ def _constants(A, B, after, states, inputs):
 
 
 class StageCosts:
-    """The cost of a problem's stages: weights, and the squares of its outputs, linearised along a plan.
-
-    Args:
-        problem: With the costs.
-        horizon: H.
-        linearizer: Says what s holds of the belief.
-
-    Attributes:
-        quadratic: The weights alone.
+    """The cost of a problem's stages: the weights alone, ``quadratic``, and the squares of outputs along a plan.
 
     Raises:
         SettingError: Weights or references of another number of stages.
@@ -234,15 +186,9 @@ class StageCosts:
 
 
 class ConstraintRows:
-    """The rows of a problem's constraints: of a box one for each entry with a bound, upper ones first.
-
-    Args:
-        problem: With the constraints.
-        horizon: H.
-        covariance: What s holds of the belief.
+    """The rows of a problem's constraints, r a stage: of a box one for each entry with a bound, upper ones first.
 
     Attributes:
-        per_stage: Number of rows of a stage, r.
         soft: Whether a violation of any has a price.
         prices: Of the rows (r,), infinite where they are hard.
         signs: 1 where a row has upper bounds, -1 where it has lower ones (r,).
@@ -292,21 +238,11 @@ class ConstraintRows:
             self._fixed = StageRows(self._constant, self._plain, self._lower, self._upper)
 
     def at(
-        self,
-        plan: Plan,
-        covariances: Array,
-        stages: int,
-        parameters: Array | None = None,
-        kappas: Array | None = None,
+        self, plan: Plan, covariances: Array, stages: int, parameters: Array | None = None, kappas: Array | None = None
     ) -> StageRows:
-        """The rows, tightened, at a plan and the covariances of its states.
+        """The rows, tightened by the covariances (H + 1, n, n), at a plan where smooth constraints are linearised.
 
-        Args:
-            plan: Where smooth constraints are linearised.
-            covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
-            stages: H, or 1.
-            parameters: Of the smooth constraints (H, q).
-            kappas: By stage (H,), in the place of those of the constraints that have some.
+        ``kappas`` by stage (H,) take the place of those of the constraints that have some.
 
         Raises:
             ShapeError: A smooth constraint gives another shape.
@@ -380,9 +316,7 @@ def price_violations(prices, rows, plan, hard_price):
 
 def _directions(F: Array, covariances: Array) -> Array:
     """S g / |S g| (K, r, n) for rows g of F (K, r, n) and the symmetric roots S of covariances (K, n, n)."""
-    eigenvalues, vectors = np.linalg.eigh(covariances)
-    roots = (vectors * np.sqrt(np.clip(eigenvalues, 0, None))[:, None, :]) @ vectors.mT
-    moved = F @ roots
+    moved = F @ square_roots(covariances)[0]
     norms = np.linalg.norm(moved, axis=-1, keepdims=True)
     return np.divide(moved, norms, out=np.zeros_like(moved), where=norms > 0)
 

@@ -18,9 +18,12 @@ import torch
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import RollOut
+from gpmpc.mpc._linear_quadratic import References, evaluate_cost
+from gpmpc.mpc._stages import StageCosts, StageLinearizer
 from gpmpc.mpc.controller import Array, Decision, Reference, full_turns
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Problem
+from gpmpc.propagation import Linearization
 
 Criterion = Callable[[Decision, Reference], float]
 
@@ -73,7 +76,9 @@ class ManyStarts:
             raise SettingError("turns", f"must be whole numbers from 1 on, one for each of {len(angles)} angles")
         if budget is not None:
             check_number("budget", budget, above=0, unit="[s]")
-        self.criterion = plan_cost(self.problem) if criterion is None else criterion
+        self.criterion = self._cost if criterion is None else criterion
+        linearizer = StageLinearizer(controller.prediction.model, Linearization(), "none")
+        self._weights = StageCosts(self.problem, H, linearizer).quadratic
         self.limit, self.budget = limit, budget
         self._rolled_out = RollOut(self.planner.prediction.model)
 
@@ -107,6 +112,12 @@ class ManyStarts:
         """Those of ``controller``."""
         return self.controller.gains(decision)
 
+    def _cost(self, decision: Decision, reference: Reference) -> float:
+        """The tracking cost of a plan."""
+        wanted = np.zeros_like(decision.inputs) if reference.inputs is None else np.asarray(reference.inputs)
+        references = References(np.asarray(reference.states[1:]), wanted, decision.inputs[0])
+        return evaluate_cost(self._weights, decision.means, decision.inputs, references, 1.0)
+
     def _try(
         self,
         controller: GPMPC,
@@ -124,44 +135,32 @@ class ManyStarts:
 
     def _candidates(self, state: Array, reference: Reference) -> Iterator[tuple[Reference, tuple[Array, Array]]]:
         """Goals and guesses, guess by guess, the nearest goals first."""
-        goals = list(self._goals(state, reference))
-        for guess in self.guesses:
-            for goal in goals:
-                if guess is None:
-                    shares, targets = np.linspace(1.0, 0.0, self.horizon + 1)[:, None], goal.states
-                    states = targets + shares * (state - targets[0])
-                    yield goal, (states, np.tile(self.initial_input, (self.horizon, 1)))
-                else:
-                    yield goal, (self._roll_out(state, guess), guess)
+        goals, H = list(self._goals(state, reference)), self.horizon
+        for guess, goal in product(self.guesses, goals):
+            if guess is None:
+                shares, targets = np.linspace(1.0, 0.0, H + 1)[:, None], goal.states
+                yield goal, (targets + shares * (state - targets[0]), np.tile(self.initial_input, (H, 1)))
+            else:
+                states = self._rolled_out.open_loop(state[None], np.asarray(guess, dtype=float)[None])[0]
+                yield goal, (states if np.isfinite(states).all() else np.tile(state, (H + 1, 1)), guess)
 
     def _goals(self, state: Array, reference: Reference) -> Iterator[Reference]:
         angles, moves = list(self.problem.cost.angles), []
         for angle, count in zip(angles, self.turns, strict=True):
             off = (state[angle] - reference.states[-1, angle]) / (2 * np.pi)
-            nearest = sorted(
-                range(int(np.floor(off)) - count, int(np.ceil(off)) + count + 1), key=lambda k: abs(k - off)
-            )
-            moves.append(nearest[:count])
+            around = range(int(np.floor(off)) - count, int(np.ceil(off)) + count + 1)
+            moves.append(sorted(around, key=lambda k: abs(k - off))[:count])
         chosen = list(product(*moves))
         turns = np.zeros((len(chosen), len(state)))
         turns[:, angles] = 2 * np.pi * np.array(chosen).reshape(len(turns), len(angles))
         distances = np.abs(state - reference.states[-1] - turns)[:, angles].sum(axis=1)
         return (_moved(reference, turns[i]) for i in np.argsort(distances, kind="stable"))
 
-    def _roll_out(self, state: Array, inputs: Array) -> Array:
-        states = self._rolled_out.open_loop(state[None], np.asarray(inputs, dtype=float)[None])[0]
-        finite = np.isfinite(states).all(axis=1)
-        return states if finite.all() else np.tile(state, (self.horizon + 1, 1))
-
 
 def kicks(problem: Problem, horizon: int, initial_input: Array, share: float = 0.5) -> list[Array]:
     """The initial input held (H, m); for each bounded input a push and a pull, and a pull and a push, of H/6 stages.
 
-    Args:
-        problem: With the bounds.
-        horizon: H.
-        initial_input: (m,).
-        share: Of the way from the initial input to its bounds.
+    ``share`` is the way from the initial input to its bounds.
     """
     drift, length = np.tile(np.asarray(initial_input, dtype=float), (horizon, 1)), max(1, horizon // 6)
     found, bounds = [drift], (problem.inputs.upper, problem.inputs.lower)
@@ -172,21 +171,6 @@ def kicks(problem: Problem, horizon: int, initial_input: Array, share: float = 0
                 inputs[part, j] += share * (side[j] - initial_input[j])
             found.append(inputs)
     return found
-
-
-def plan_cost(problem: Problem) -> Criterion:
-    """The criterion that is the tracking cost of a problem."""
-
-    def value(decision: Decision, reference: Reference) -> float:
-        Q, R = problem.cost.by_stage(len(decision.inputs))
-        off, inputs = decision.means[1:] - reference.states[1:], decision.inputs
-        if problem.cost.penalized == "deviations" and reference.inputs is not None:
-            inputs = inputs - reference.inputs
-        elif problem.cost.penalized == "increments":
-            inputs = np.diff(inputs, axis=0, prepend=inputs[:1])
-        return float(np.einsum("ki,kij,kj", off, Q, off) + np.einsum("ki,kij,kj", inputs, R, inputs))
-
-    return value
 
 
 def _moved(reference: Reference, turns: Array) -> Reference:

@@ -29,7 +29,6 @@ def film(
     positions: Callable[[Array], Array],
     path: str | Path,
     frames: int = 100,
-    rate: int = 15,
     enlarged: float = 1.0,
 ) -> None:
     """Writes a flight as MuJoCo renders it, as a GIF, or as an MP4 by the file's ending.
@@ -40,7 +39,6 @@ def film(
         positions: From a state (n,) to those of the model's joints (nq,).
         path: The file, .gif or .mp4 (which needs ffmpeg).
         frames: At most so many; steps are left out evenly.
-        rate: Frames a second.
         enlarged: Factor of the tube's 2-sigma ellipsoids.
 
     Raises:
@@ -72,7 +70,7 @@ def film(
             clock.set_text(f"{run.times[k]:.2f} s")
             return []
 
-        save_animation(figure, draw, len(run.times), path, frames, rate)
+        save_animation(figure, draw, len(run.times), path, frames)
         scene.rendering.free()
     finally:
         context.free()

@@ -1,4 +1,10 @@
-"""Flies the whole quadrotor: two controllers at two rates on the twelve states.
+"""Flies the whole quadrotor: a cascade of two controllers at two rates, on the twelve states.
+
+The outer controller, on the translational subsystem, decides the thrust U1 and its direction (ux, uy), once a second
+say; the direction, by eq. (2) of Cao, Lai and Alam (2017) inverted, is the attitude that the inner one, on the
+rotational subsystem, takes the vehicle to. (With the plant in the loop an inner loop at 1 Hz is unworkable; 20 Hz flies
+well.) The references of the angular rates are those of a first-order approach to the attitude,
+(angle_d - angle) / response time.
 
 The cascade is one controller at the inner rate. Every outer step begins with the outer controller; then, ``ratio``
 times, the inner one turns the vehicle to where the thrust is to point. Each has its own policy for failures: while the
@@ -12,18 +18,65 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from gpmpc.exceptions import ShapeError, check_number
+from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.cascade import Cascade
-from gpmpc.mpc.controller import Reference
+from gpmpc.mpc.controller import Controller, Reference
 from gpmpc.mpc.policy import Command, OnFailure, check_policy, command
 from gpmpc.simulation._disturbances import Disturbance
 from gpmpc.simulation._loop import Flight, History, Moment, Rollout, check_references, fly, window
 from gpmpc.simulation._simulator import Noise, PlantSimulator
 from gpmpc.step import Step
-from gpmpc.systems import Coupled, Plant
+from gpmpc.systems import ATTITUDES, Coupled, Plant, attitude_at_yaw
 
 _OUTER, _INNER = slice(0, 6), slice(6, 12)
+
+
+@dataclass(frozen=True)
+class Cascade:
+    """An outer and an inner controller, and how the one's inputs are the other's references.
+
+    Attributes:
+        outer: On states x, vx, y, vy, z, vz [m, m/s] and inputs U1 [N], ux, uy [-].
+        inner: On states phi, p, theta, q, psi, r [rad, rad/s] and inputs U2, U3, U4 [N].
+        ratio: Inner steps an outer step.
+        attitude: How thrust direction becomes attitude: ``"exact"`` or ``"paper"``; see
+            ``attitude_for_thrust_direction``.
+        response_time: Of the approach to a new attitude [s].
+
+    Raises:
+        SettingError: A ratio below 1, an unknown attitude, or a response time that is not positive.
+    """
+
+    outer: Controller
+    inner: Controller
+    ratio: int = 20
+    attitude: str = "exact"
+    response_time: float = 0.1  # [s]
+
+    def __post_init__(self) -> None:
+        check_number("ratio", self.ratio, least=1, whole=True)
+        if self.attitude not in ATTITUDES:
+            raise SettingError("attitude", f"must be one of {', '.join(ATTITUDES)}; got {self.attitude!r}")
+        check_number("response_time", self.response_time, above=0, unit="[s]")
+
+    def attitude_reference(self, planned: np.ndarray, angles: np.ndarray, phase: int) -> Reference:
+        """What the inner controller is to follow.
+
+        Args:
+            planned: The outer plan's inputs from the current outer step on (H, 3); the inner horizon looks beyond the
+                first where it reaches the next outer step, and holds the last.
+            angles: Roll, pitch and yaw now (3,) [rad]; yaw is to be zero.
+            phase: Inner steps since the outer step began.
+
+        Returns:
+            Over the inner horizon, with no moments as the inputs that belong to it.
+        """
+        ahead = phase + np.arange(self.inner.horizon + 1)
+        direction = planned[np.minimum(ahead // self.ratio, len(planned) - 1)]
+        states = np.zeros((len(ahead), 6))
+        states[:, [0, 2]] = attitude_at_yaw(direction[:, 1], direction[:, 2], angles[2], self.attitude)
+        states[:, 1::2] = (states[:, ::2] - angles) / self.response_time
+        return Reference(states, np.zeros((self.inner.horizon, 3)))
 
 
 @dataclass(frozen=True)
@@ -71,38 +124,34 @@ def cascade_loop(
             that of the controller that failed.
         Diverged: The plant left the finite numbers; its step is an inner one.
     """
-    check_number("steps", steps, least=1, whole=True)
     check_policy(on_failure)
     names = (tuple(plant.dynamics.state_names), tuple(plant.dynamics.input_names))
     if names != (Coupled.state_names, Coupled.input_names):
         raise ShapeError(f"a cascade flies the states and inputs of Coupled; got {names}")
-    references = check_references(references, steps, cascade.outer.horizon)
+    references, ratio = check_references(references, steps, cascade.outer.horizon), cascade.ratio
     simulator = PlantSimulator(plant, initial, disturbances, noise, seed)
-    outer, inner = (History(None if on_step is None else partial(on_step, loop)) for loop in ("outer", "inner"))
+    calls: Any = (None, None) if on_step is None else [partial(on_step, loop) for loop in ("outer", "inner")]
+    outer = History(simulator, references, ratio * plant.time_step, _OUTER, calls[0])
+    inner = History(simulator, references, plant.time_step, _INNER, calls[1])
     states, inputs = [simulator.mean], []
 
     def decide(j: int, beliefs: Sequence[Gaussian], last: Sequence[_Decided | None]) -> list[_Decided]:
         return [_decide(cascade, references, on_failure, j, beliefs[0], last[0])]
 
     def record(moment: Moment, decided: _Decided) -> None:
-        k, phase = divmod(moment.k, cascade.ratio)
+        k, phase = divmod(moment.k, ratio)
         if phase == 0:
-            outer.add(moment.part(k, _OUTER, decided.outer.input), references.states[k], decided.outer)
-        inner.add(moment.part(moment.k, _INNER, moment.input[1:]), decided.attitude.states[0], decided.inner)
+            outer.add(moment._replace(k=k, input=decided.outer.input), decided.outer)
+        inner.add(moment._replace(input=moment.input[1:]), decided.inner, decided.attitude.states[0])
         states.append(simulator.mean)
         inputs.append(moment.input)
 
     flight = Flight(simulator, record)
-    fly([flight], decide, steps * cascade.ratio, plant.time_step)
+    fly([flight], decide, steps * ratio, plant.time_step)
     if flight.error is not None:
         raise flight.error
-    attitudes = Reference(flight.last.attitude.states[:2])  # at the last step, and at the end
-    return CascadeRollout(
-        states=np.array(states),
-        inputs=np.array(inputs),
-        outer=outer.rollout(simulator, references, cascade.ratio * plant.time_step, _OUTER),
-        inner=inner.rollout(simulator, attitudes, plant.time_step, _INNER),
-    )
+    last = flight.last.attitude.states[1]
+    return CascadeRollout(np.array(states), np.array(inputs), outer.rollout(), inner.rollout(last))
 
 
 class _Decided(NamedTuple):

@@ -6,7 +6,7 @@ a = (v[k+1] - v[k]) / T beside the weight. With z downwards
     U1 / m = |a - g e_z|,   ux = a_x / (U1 / m),   uy = a_y / (U1 / m),
 
 and eq. (2) of Cao, Lai and Alam (2017), inverted, makes roll and pitch of that direction, at a yaw of zero. The inner
-loop approaches each at first order, (angle_d - angle) / response time, as ``gpmpc.mpc.cascade.Cascade`` asks it to.
+loop approaches each at first order, (angle_d - angle) / response time, as ``gpmpc.simulation.Cascade`` asks it to.
 """
 
 import numpy as np

@@ -264,6 +264,10 @@ class System:
 def step(plant: Plant, state: Array, input: Array) -> Array:
     """The next state (n,) of a plant from a state (n,) and an input (m,).
 
+    >>> from gpmpc.systems import pendulum
+    >>> step(pendulum(), [0.1, 0.0], [0.0]).round(3).tolist()
+    [0.102, 0.074]
+
     Raises:
         ShapeError: State or input are of another length.
     """

@@ -10,11 +10,11 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.policy import command
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.status import Status
 from tests.mpc.small_models import double_integrator, pendulum_posterior
@@ -138,3 +138,14 @@ def test_any_model_can_be_wrong():
 def test_a_gain_out_of_range_is_refused(kind, settings, rule):
     with pytest.raises(SettingError, match=rule):
         controller(kind, **settings)
+
+
+@pytest.mark.parametrize("iterations", [1, 30])
+def test_a_controller_for_another_model_is_one_that_was_made_with_it(iterations):
+    other, inputs = pendulum_posterior(seed=3), 2.0 * np.ones((H, 1))
+    asked = controller(covariance="none", rolled_out=True, iterations=iterations).with_model(other)
+    made = controller(model=other, covariance="none", rolled_out=True, iterations=iterations)
+    question = Gaussian.certain([0.3, -0.2]), AT_REST, None, None, inputs
+    found, expected = asked.control(*question), made.control(*question)
+    assert np.array_equal(found.means, expected.means)
+    assert np.array_equal(found.inputs, expected.inputs)
