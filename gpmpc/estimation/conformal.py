@@ -152,8 +152,8 @@ class AdaptiveTube:
             violations most of all. By default (1 - eta) / 5.
         noise: Covariance of the measurements of what ``observe`` is given (n, n); none by default.
         largest: The largest number of standard deviations; twice the largest score of all by default.
-        decisions: After how many the exact upper 95 % limit of the share of violations is to be at or below 1 - eta;
-            by default the share itself is brought to 1 - eta.
+        decisions: After how many predictions of a stage the exact upper 95 % limit of the share that did not hold is to
+            be at or below 1 - eta; by default the share itself is brought to 1 - eta.
 
     Raises:
         SettingError: A probability not between 0 and 1, a rate that is not positive, or too few decisions to say so.
@@ -200,8 +200,15 @@ class AdaptiveTube:
         call_unchecked(_observe, state, self.tube.rows, self._bounds, self._step, numbers, self.tube.scores, parts)
         return self.kappas
 
-    def remember(self, means: Array, covariances: Array) -> None:
-        """Remembers a plan from the current state on, as a decision has it: (H + 1, n) and (H + 1, n, n)."""
+    def remember(self, means: Array, covariances: Array, stages: Any = None) -> None:
+        """Remembers a plan from the current state on.
+
+        Args:
+            means: As a decision has them (H + 1, n).
+            covariances: Likewise (H + 1, n, n).
+            stages: Whether each stage's prediction counts (H,), such as where the plan touches a bound: how often
+                bounds are violated there is what alpha follows then. By default all count.
+        """
         means, covariances = (np.ascontiguousarray(part, dtype=np.float64) for part in (means, covariances))
         if means.shape != (self.tube.horizon + 1, self.tube.rows.shape[1]):
             raise ShapeError(
@@ -209,6 +216,8 @@ class AdaptiveTube:
             )
         bounds = self._bounds[self._step % self.tube.horizon]
         call_unchecked(_remember, means, covariances, self.noise, self.tube.rows, self.kappas, bounds)
+        if stages is not None:
+            bounds[~np.asarray(stages, dtype=bool)] = np.nan
 
     @property
     def violations(self) -> Array:
