@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gpmpc.plotting.animation import PLAN, _scene
+from gpmpc.plotting._animation import PLAN, _scene
 from gpmpc.recording import read_run
 from tests.recording.runs import record_run
 

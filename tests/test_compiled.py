@@ -152,8 +152,8 @@ def test_the_stamp_of_a_kernel_covers_constants_and_callees_and_spares_the_rest(
                 gpmpc.compiled._read_source = read
         return changed
 
-    kernels = covered("gpmpc.qp.dual_kernels")
-    assert {f"gpmpc.qp.{name}" for name in ("dual_iteration", "triangular", "workspace", "record")} <= kernels
+    kernels = covered("gpmpc.qp._dual_kernels")
+    assert {f"gpmpc.qp._{name}" for name in ("dual_iteration", "triangular", "workspace", "record")} <= kernels
     assert {"gpmpc.compiled", "gpmpc.kernels._simd"} <= kernels
     assert not {"gpmpc.qp", "gpmpc.qp.dual_active_set", "gpmpc.qp.primal_active_set"} & kernels
 

@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike
 
 from gpmpc.compiled import call_unchecked
 from gpmpc.exceptions import ShapeError
-from gpmpc.kernels._packed import Array, Packed, pack
-from gpmpc.kernels.gp_moments import CROSS, JACOBIAN, VALUE, evaluate_moments
-from gpmpc.kernels.gp_point import expand_points, linearize_points
+from gpmpc.kernels._gp_moments import CROSS, JACOBIAN, VALUE, evaluate_moments
+from gpmpc.kernels._gp_point import expand_points, linearize_points
+from gpmpc.kernels._packed import Array, GPArrays, Packed, pack
 
 __all__ = [
     "Expansion",
+    "GPArrays",
     "Moments",
     "Packed",
     "linearize",

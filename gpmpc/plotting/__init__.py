@@ -3,12 +3,11 @@
 Every function returns a ``Figure`` made without pyplot, so nothing global is touched and no window opens.
 """
 
-from gpmpc.plotting._style import png
-from gpmpc.plotting.animation import animate, ffmpeg_exists
-from gpmpc.plotting.logs import inspection_figure, judgement_figure
-from gpmpc.plotting.quality import quality
-from gpmpc.plotting.recorded import inputs_figure, timing_figure, tracking_figure
-from gpmpc.plotting.results import (
+from gpmpc.plotting._animation import animate, ffmpeg_exists
+from gpmpc.plotting._logs import inspection_figure, judgement_figure
+from gpmpc.plotting._quality import quality
+from gpmpc.plotting._recorded import inputs_figure, timing_figure, tracking_figure
+from gpmpc.plotting._results import (
     Curve,
     Panel,
     calibration_figure,
@@ -17,7 +16,8 @@ from gpmpc.plotting.results import (
     over_settings,
     tracking,
 )
-from gpmpc.plotting.sweeps import Series, over_variable, search_figure
+from gpmpc.plotting._style import png
+from gpmpc.plotting._sweeps import Series, over_variable, search_figure
 
 __all__ = [
     "Curve",

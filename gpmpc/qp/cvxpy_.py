@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_triangular
 
 from gpmpc.exceptions import ProblemError
-from gpmpc.qp import record as layout
-from gpmpc.qp.dual_rescue import rescue
+from gpmpc.qp import _record as layout
+from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp.primal_active_set import LAST_CHANGES, farkas_ray
 from gpmpc.qp.problem import ABSENT, QuadraticProgram
 from gpmpc.qp.solution import QPSolution, WarmStart, make_solution

@@ -2,11 +2,11 @@
 
 In model predictive control one QP follows another and little changes in between, so the working set of the last
 solution is nearly that of the next. A dual method can start from any guess: it needs no feasible point, only
-multipliers of the right sign (``gpmpc.qp.dual_iteration``). What depends on P and G only can be done beforehand:
+multipliers of the right sign (``gpmpc.qp._dual_iteration``). What depends on P and G only can be done beforehand:
 ``prepared = solver.prepare(P, G)`` once, then ``prepared.solve(q, lower, upper, last_solution)``.
 
 A solution that its own residuals do not support, one whose factors lost too many digits, and an infeasibility without
-Farkas' proof are tried again with doubled digits (``gpmpc.qp.dual_rescue``); what still fails is reported as
+Farkas' proof are tried again with doubled digits (``gpmpc.qp._dual_rescue``); what still fails is reported as
 ``Status.NUMERICAL_TROUBLE``.
 """
 
@@ -18,12 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpmpc.compiled import compile_for, unchecked_entry_point
 from gpmpc.exceptions import ProblemError
-from gpmpc.qp import record as layout
-from gpmpc.qp.dual_kernels import SIGNATURE, solve
-from gpmpc.qp.dual_rescue import rescue
+from gpmpc.qp import _record as layout
+from gpmpc.qp._dual_kernels import SIGNATURE, solve
+from gpmpc.qp._dual_rescue import rescue
+from gpmpc.qp._workspace import most_working, new_memory, prepare_memory
 from gpmpc.qp.problem import QuadraticProgram, SoftRows, stack_softness
 from gpmpc.qp.solution import QPSolution, WarmStart, proves_infeasibility
-from gpmpc.qp.workspace import most_working, new_memory, prepare_memory
 
 Array = NDArray[np.float64]
 _Arrays = tuple[Array, Array, Array, Array, Array]  # P, q, G, lower, upper

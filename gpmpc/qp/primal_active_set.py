@@ -28,8 +28,8 @@ from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 from scipy.optimize import linprog
 
 from gpmpc.exceptions import ProblemError
-from gpmpc.qp import record as layout
-from gpmpc.qp.dual_rescue import rescue
+from gpmpc.qp import _record as layout
+from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp.problem import ABSENT, QuadraticProgram
 from gpmpc.qp.solution import QPSolution, WarmStart, make_solution, proves_infeasibility
 from gpmpc.status import Status

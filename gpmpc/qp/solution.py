@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpmpc.exceptions import ProblemError
-from gpmpc.qp import record as layout
+from gpmpc.qp import _record as layout
 from gpmpc.qp.problem import ABSENT, QuadraticProgram, stack_softness
 from gpmpc.status import Status
 
@@ -48,7 +48,7 @@ class QPSolution(NamedTuple):
         x: (n,) the minimiser; the best iterate if the status is not ``SOLVED``. A view of the record.
         arrays: P, q, G, and the bounds (M,) of the stacked constraints ``[x; Gx]``, as in ``QuadraticProgram``.
         softness: (2, M), see ``gpmpc.qp.problem.stack_softness``.
-        record: The solver's whole result in one array, and a warm start for the next solve; see ``gpmpc.qp.record``.
+        record: The solver's whole result in one array, and a warm start for the next solve; see ``gpmpc.qp._record``.
         build_seconds: Time spent on building or compiling the problem in this call [s].
         solve_seconds: Time spent on solving it [s].
     """

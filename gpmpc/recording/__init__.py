@@ -1,9 +1,9 @@
 """Recordings of runs in MCAP files: writing, live view, reading, replaying, recovering."""
 
+from gpmpc.recording._layout import layout
 from gpmpc.recording._messages import RecordedSystem
-from gpmpc.recording.layout import layout
-from gpmpc.recording.reader import RecordedProblem, Recovery, Run, read_run, recover, replay
-from gpmpc.recording.recorder import McapRecorder
+from gpmpc.recording._reader import RecordedProblem, Recovery, Run, read_run, recover, replay
+from gpmpc.recording._recorder import McapRecorder
 from gpmpc.step import Step
 
 __all__ = [

@@ -11,7 +11,7 @@ import numpy as np
 
 from gpmpc import systems
 from gpmpc.exceptions import SettingError, ShapeError
-from gpmpc.systems.simulators import Simulator, library
+from gpmpc.systems._simulators import Simulator, library
 from gpmpc.systems.system import System, step
 
 Array = np.ndarray

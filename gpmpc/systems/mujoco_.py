@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.systems.simulators import Simulator, library
+from gpmpc.systems._simulators import Simulator, library
 from gpmpc.systems.system import System
 
 Array = np.ndarray

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from gpmpc.plotting.recorded import expected
+from gpmpc.plotting._recorded import expected
 from gpmpc.recording import read_run
 from tests.cli.command import forked, gpmpc
 

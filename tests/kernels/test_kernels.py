@@ -13,7 +13,7 @@ import torch
 from gpmpc import kernels
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.kernels import _simd, gp_point
+from gpmpc.kernels import _gp_point, _simd
 from gpmpc.kernels._packed import pack
 from gpmpc.kernels._rows import largest_size, largest_square, reduce_variance, reduce_variances
 from gpmpc.kernels._simd import NEAR_ZERO, load, store
@@ -373,7 +373,7 @@ def test_sizes_over_points_are_the_largest_ones(dims):
 def test_loops_over_points_may_use_the_widest_registers():
     gps = packed(model())
     kernels.linearize(gps, np.zeros((1, 2)), np.zeros((1, 1)), False, np.zeros(2), False)
-    anew = numba.njit(gp_point.linearize_points.py_func)  # the kernel itself may have been loaded
+    anew = numba.njit(_gp_point.linearize_points.py_func)  # the kernel itself may have been loaded
     x, u, out = np.zeros((1, 2)), np.zeros((1, 1)), (np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2, 1)))
     memory, none = np.empty(7 * gps.arrays.points.shape[1] + 8), np.zeros((0, 2, 2))
     anew(gps.arrays, none, (np.zeros(2), False), x, u, memory, (*out, none))

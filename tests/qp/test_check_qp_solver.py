@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gpmpc.qp import CvxpySolver, DualActiveSet, PrimalActiveSet, make_solution
-from gpmpc.qp import record as layout
+from gpmpc.qp import _record as layout
 from gpmpc.status import Status
 from gpmpc.testing import check_qp_solver
 

@@ -97,7 +97,7 @@ def test_one_solver_and_one_prepared_problem_serve_many_threads(rng):
 START = """
 import numpy as np
 from gpmpc.qp import DualActiveSet
-from gpmpc.qp.dual_kernels import solve
+from gpmpc.qp._dual_kernels import solve
 solution = DualActiveSet().prepare(np.eye(3), np.ones((1, 3))).solve(np.ones(3), np.full(4, -0.5), np.full(4, 0.5))
 assert solution.is_optimal(1e-12), solution
 print(sum(solve.stats.cache_misses.values()))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gpmpc.qp import DualActiveSet
-from gpmpc.qp import record as layout
+from gpmpc.qp import _record as layout
 from gpmpc.status import Status
 from tests.qp.problems import (
     changing,

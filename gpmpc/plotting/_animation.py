@@ -1,0 +1,137 @@
+"""Animates a flight: where the vehicle was, what it planned, and how certain the plan was.
+
+Left the whole flight from above (x, y) and its height, right what the controller saw: its plan with 2-sigma ellipses of
+the predicted positions. These are often far smaller than the plan is long; they are then drawn enlarged, and the factor
+is written into the picture.
+"""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.animation import FFMpegWriter, FuncAnimation, PillowWriter
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
+
+from gpmpc.exceptions import UnsupportedModel
+from gpmpc.plotting._recorded import FLOWN, REFERENCE, TUBE
+from gpmpc.plotting._style import DASHED, GREEN, styled
+
+if TYPE_CHECKING:
+    from gpmpc.recording import Run
+
+_FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+_VISIBLE = 0.06  # an ellipse's half axis, as a share of the view, from which on it is large enough
+PLAN = GREEN
+
+
+def animate(run: "Run", path: str | Path, frames: int = 150, rate: int = 15) -> None:
+    """Writes the flight as a GIF, or as an MP4 by the file's ending.
+
+    Args:
+        run: A recording whose ``pose`` has x, y and z.
+        path: The file, .gif or .mp4 (which needs ffmpeg).
+        frames: At most so many; steps are left out evenly.
+        rate: Frames a second.
+    """
+    if not {"x", "y", "z"} <= run.pose.keys() or not len(run.times):
+        raise UnsupportedModel(f"{run.path}: an animation needs steps with positions x, y and z")
+    figure, draw = _scene(run)
+    shown = np.unique(np.linspace(0, len(run.times) - 1, min(frames, len(run.times))).astype(int))
+    animation = FuncAnimation(figure, draw, frames=shown, blit=False, cache_frame_data=False)
+    writer = FFMpegWriter(fps=rate) if Path(path).suffix == ".mp4" else PillowWriter(fps=rate)
+    animation.save(str(path), writer=writer, dpi=80)
+
+
+def ffmpeg_exists() -> bool:
+    """Whether an MP4 can be written."""
+    return shutil.which("ffmpeg") is not None
+
+
+@styled
+def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
+    """The figure, and the function of a step's number that draws it."""
+    plane = [run.pose["x"], run.pose["y"]]
+    up = run.pose["z"]
+    sign, axis_name = (-1, "-z") if run.metadata.get("frames", {}).get("z axis") != "up" else (1, "z")
+    states, references, plans = run.states[:, plane], run.references[:, plane], run.plan_means[:, :, plane]
+    covariances = run.plan_covariances[:, :, plane][..., plane]
+    whole: Any = np.isfinite(plans).all(axis=2)  # a shorter plan ends in NaN
+
+    figure = Figure(figsize=(10, 5.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(2, 2, width_ratios=[1, 1.15], height_ratios=[2.4, 1])
+    above, height, near = (figure.add_subplot(grid[place]) for place in ((0, 0), (1, 0), (slice(None), 1)))
+    dashed: dict[str, Any] = {"color": REFERENCE, "linewidth": 1, "linestyle": DASHED}
+    for axis in (above, near):
+        axis.plot(*references.T, **dashed)
+        axis.set(xlabel="x [m]", ylabel="y [m]")
+        axis.set_aspect("equal", adjustable="box")
+    height.plot(run.times, sign * run.references[:, up], **dashed)
+    height.set(xlabel="time [s]", ylabel=f"height, {axis_name} [m]")
+    # The last plans lead on from where the flight ends; those of failed solves may be anywhere.
+    drawn = np.concatenate([states, references, plans[whole & ~run.failed[:, None]]])
+    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    _look_at(above, (low + high) / 2, 0.56 * max((high - low).max(), 1.0))
+
+    complete = plans[whole.all(axis=1)]  # half the width of the view that almost every plan fits into [m]
+    half = max(0.62 * float(np.quantile(np.ptp(complete, axis=1).max(axis=1), 0.98)), 0.5) if len(complete) else 1.0
+    stds = run.plan_stds[:, :, plane][whole]
+    largest = 2 * float(np.median(stds.max(axis=1))) if len(stds) else 0.0
+    fitting = (factor for factor in _FACTORS if factor * largest >= _VISIBLE * 2 * half)
+    factor = next(fitting, _FACTORS[-1]) if largest > 0 else 1
+    enlarged = f", the tube {factor} times enlarged" if factor > 1 else ""
+    near.set_title(f"plan with its 2-sigma tube{enlarged}", fontsize="medium")
+    trail, plan = (
+        [axis.plot([], [], color=c, linewidth=w)[0] for axis in (above, near)] for c, w in ((FLOWN, 1.6), (PLAN, 1.4))
+    )
+    plan[1].set(marker="o", markersize=3)
+    vehicle = [axis.plot([], [], "o", color=FLOWN, markersize=7, zorder=5)[0] for axis in (above, near)]
+    target = near.plot([], [], "x", color=REFERENCE, markersize=8, zorder=4)[0]
+    climbed = height.plot([], [], color=FLOWN, linewidth=1.6)[0]
+    lines = [climbed, height.lines[0], plan[1]]
+    figure.legend(lines, ["flown", "reference", "plan"], loc="outside lower center", ncols=3, frameon=False)
+    clock = figure.suptitle(" ", fontsize="medium")
+    tubes: list = []
+
+    def draw(k: int) -> list:
+        for line in trail:
+            line.set_data(*states[: k + 1].T)
+        for line in plan:
+            line.set_data(*plans[k].T)
+        for dot in vehicle:
+            dot.set_data(*states[k, :, None])
+        target.set_data(*references[k, :, None])
+        climbed.set_data(run.times[: k + 1], sign * run.states[: k + 1, up])
+        stages = plans[k][whole[k]]
+        _look_at(near, (stages.min(axis=0) + stages.max(axis=0)) / 2 if whole[k].all() else states[k], half)
+        while tubes:
+            tubes.pop().remove()
+        if covariances[k][whole[k]].any():
+            ellipses = _ellipses(stages, covariances[k][whole[k]], factor, near.transData)
+            tubes.append(near.add_collection(ellipses))
+        distance = 100 * np.linalg.norm((run.states - run.references)[k, [*plane, up]])
+        failed = "; solve failed" if run.failed[k] else ""
+        clock.set_text(f"{run.times[k]:.4g} s: {distance:.1f} cm from the reference{failed}")
+        return []
+
+    draw(0)
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # once is enough: nothing that needs room changes
+    return figure, draw
+
+
+def _look_at(axis, centre: np.ndarray, half: float) -> None:
+    axis.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))
+
+
+def _ellipses(means: np.ndarray, covariances: np.ndarray, factor: int, transform) -> EllipseCollection:
+    """Ellipses of two standard deviations around the planned positions, enlarged by a factor."""
+    values, vectors = np.linalg.eigh(covariances)
+    axes = 4 * factor * np.sqrt(values.clip(0))  # whole axes of the 2-sigma ellipse
+    angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    look = {"facecolors": TUBE, "edgecolors": FLOWN, "alpha": 0.45, "linewidths": 0.6, "zorder": 1}
+    return EllipseCollection(axes[:, 1], axes[:, 0], angles, units="xy", offsets=means, transOffset=transform, **look)

@@ -1,0 +1,207 @@
+"""Figures of the paper's results and of how far predictions can be believed."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, NullLocator, PercentFormatter
+
+from gpmpc.plotting._style import BLUE, COLOURS, DASHED, DASHES, VERMILION, add_legend, legend_below, styled
+from gpmpc.plotting._sweeps import Series, draw_quartiles
+
+if TYPE_CHECKING:
+    from gpmpc.calibration import Calibration
+    from gpmpc.estimation import FilterRun
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One panel of ``error_over_size``."""
+
+    title: str  # above the panel
+    draws: dict[int, list[float]]  # errors of all draws by training size
+    paper: dict[int, float]  # the paper's figure by training size
+
+
+@styled
+def error_over_size(panels: Sequence[Panel], label: str, title: str = "") -> Figure:
+    """Draws of an error over the training size with their quartiles, and the paper's points; logarithmic."""
+    figure, axes = _panels(len(panels), 4.6, 3.4, title)
+    for axis, panel in zip(axes, panels, strict=False):
+        sizes = sorted(panel.draws)
+        axis.set(title=panel.title, xlabel="training points N")
+        if not sizes:  # every fit failed
+            axis.set_axis_off()
+            continue
+        draws = Series("our draws, with their quartiles", [panel.draws[size] for size in sizes])
+        draw_quartiles(axis, [draws], [str(size) for size in sizes])
+        if known := {size: panel.paper[size] for size in sizes if size in panel.paper}:
+            axis.plot([*known], [*known.values()], "o", color=VERMILION, markersize=6, zorder=3, label="paper")
+        axis.set_yscale("log")
+        axis.yaxis.set_minor_locator(NullLocator())
+    legend_below(figure, axes)
+    figure.supylabel(label)
+    return figure
+
+
+def _panels(count: int, width: float, height: float, title: str) -> tuple[Figure, Any]:
+    """Makes a figure of panels in two columns."""
+    columns = min(2, count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(width * columns, height * rows + 0.8 * (rows > 1)), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis in axes[count:]:
+        axis.set_visible(False)
+    return figure, axes
+
+
+@styled
+def calibration_figure(calibration: "Calibration") -> Figure:
+    """Coverage against its nominal level (dashed), log density and error over the steps ahead, a column a state."""
+    n, steps = len(calibration.names), range(1, calibration.horizon + 1)
+    order = sorted(range(len(calibration.levels)), key=calibration.levels.__getitem__)
+    colours = colormaps["Blues"](np.linspace(1.0, 0.5, len(order))[::-1])  # the wider the interval, the darker
+    line = {"marker": "o" if calibration.horizon <= 30 else None, "markersize": 3}
+    figure = Figure(figsize=(1.5 + 2.4 * n, 6.0), layout="constrained")
+    axes = figure.subplots(3, n, squeeze=False, sharex=True)
+    for (above, density, error), i in zip(axes.T, range(n), strict=True):
+        above.set_title(calibration.names[i], fontsize="medium")
+        for j, colour in zip(order, colours, strict=True):
+            above.axhline(calibration.levels[j], color=colour, linestyle=DASHED, linewidth=1)
+            above.plot(steps, calibration.coverage[:, i, j], color=colour, **line)
+        density.plot(steps, calibration.nlpd[:, i], color=colours[-1], **line)
+        error.plot(steps, calibration.rmse[:, i], color=colours[-1], **line)
+        above.set_ylim(0, 1.04)
+        above.yaxis.set_major_formatter(PercentFormatter(1))
+        above.tick_params(labelleft=i == 0)
+        density.yaxis.set_major_locator(MaxNLocator(nbins=5))
+        error.set_ylim(bottom=0)
+        error.yaxis.set_major_locator(MaxNLocator(nbins=5))
+        error.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6, min_n_ticks=1))
+    lowest = 0.0
+    for j, colour in zip(
+        order, colours, strict=True
+    ):  # each level is named at its own line, or just above the last name
+        height = max(calibration.levels[j], lowest)
+        text = f"{100 * calibration.levels[j]:g} %"
+        place = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": "small"}
+        axes[0, -1].annotate(text, (1.03, height), color=colour, **place)
+        lowest = height + 0.085
+    for axis, label in zip(axes[:, 0], ("coverage", "negative log density", "RMSE"), strict=True):
+        axis.set_ylabel(label)
+    figure.supxlabel("steps ahead", fontsize="medium")
+    figure.align_ylabels(axes[:, 0])
+    return figure
+
+
+@styled
+def innovations_figure(run: "FilterRun", time_step: float = 1.0, names: list[str] | None = None) -> Figure:
+    """Draws each measured value's innovations over their standard deviation, and the share outside of 95 %."""
+    deviations = run.innovation_covariances.diagonal(dim1=-2, dim2=-1).sqrt()
+    white = (run.innovations / deviations).cpu().numpy()
+    p, times = white.shape[1], time_step * np.arange(len(white))
+    figure = Figure(figsize=(7.0, 1.0 + 1.4 * p), layout="constrained")
+    for i, axis in enumerate(figure.subplots(p, 1, sharex=True, squeeze=False).ravel()):
+        seen = np.isfinite(white[:, i])
+        outside = 100 * float((np.abs(white[seen, i]) > 1.96).mean()) if seen.any() else np.nan
+        label = f"{outside:.1f} % outside (5 % expected), {100 * float((~seen).mean()):.0f} % missing"
+        axis.plot(times[seen], white[seen, i], ".", color=BLUE, markersize=3, label=label)
+        for limit in (-1.96, 1.96):
+            axis.axhline(limit, color=VERMILION, linewidth=0.8)
+        axis.set_ylabel(names[i] if names is not None else f"y{i + 1}")
+        axis.legend(loc="upper right", fontsize="small")
+        axis.set_xlabel("time [s]" if i == p - 1 else "")
+    figure.suptitle("innovations over their standard deviation")
+    return figure
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line in each panel of a group."""
+
+    label: str  # in the legend
+    at: np.ndarray  # where the values lie on the horizontal axis (K,)
+    values: np.ndarray  # A column a panel (K, p)
+    wanted: np.ndarray | None = None  # what they were to be (K or more, p); None where there is nothing
+    bounds: Sequence[Sequence[float]] | None = None  # lower and upper, an entry a panel; None without
+    interval: np.ndarray | None = None  # lower and upper end of what is doubtful of the first column (K, 2)
+
+
+@styled
+def tracking(groups: Sequence[tuple[Sequence[str], Sequence[Curve]]], title: str = "") -> Figure:
+    """Values over the time steps, a row of panels a group and a panel a column; references grey, bounds dotted."""
+    columns = max(len(labels) for labels, _ in groups)
+    figure = Figure(figsize=(4.0 * columns, 2.7 * len(groups) + 0.7), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(len(groups), columns, squeeze=False, sharex=True)
+    handles: dict[str, Any] = {}
+    for row, (labels, curves) in zip(axes, groups, strict=True):
+        for j, (axis, label) in enumerate(zip(row, labels, strict=False)):
+            wanted = next((c.wanted for c in curves if c.wanted is not None), None)
+            if wanted is not None:
+                (line,) = axis.plot(wanted[: len(curves[0].at), j], color="0.75", linewidth=3.5)
+                handles.setdefault("reference", line)
+            bounded = next((c.bounds for c in curves if c.bounds is not None), None)
+            reach = [c.values[:, j] for c in curves] + ([] if wanted is None else [wanted[:, j]])
+            low, high = min(v.min() for v in reach), max(v.max() for v in reach)
+            room = 0.08 * max(high - low, 1e-6)
+            for bound in () if bounded is None else (bounded[0][j], bounded[1][j]):
+                if low - 5 * room <= bound <= high + 5 * room:  # one that is far away would only flatten the curves
+                    line = axis.axhline(bound, color="0.25", linestyle=":", linewidth=1.2)
+                    handles.setdefault("bound", line)
+            for curve, colour, dash in zip(curves, COLOURS, DASHES, strict=False):
+                (line,) = axis.plot(curve.at, curve.values[:, j], color=colour, linestyle=dash, linewidth=1.3)
+                handles.setdefault(curve.label, line)
+            axis.set_ylabel(label)
+    for axis in axes[-1]:
+        axis.set_xlabel("time step k")
+    add_legend(figure, list(handles.values()), list(handles))
+    return figure
+
+
+@styled
+def over_settings(
+    panels: Mapping[str, Sequence[Curve]],
+    label: str,
+    logarithmic: bool = False,
+    diagonal: bool = False,
+    title: str = "",
+) -> Figure:
+    """One measure over a setting, a panel a title, with intervals; logarithmic, or with the diagonal drawn in."""
+    figure, axes = _panels(len(panels), 4.8, 3.5, title)
+    handles: dict[str, Any] = {}
+    for axis, (heading, curves) in zip(axes, panels.items(), strict=False):
+        axis.set_title(heading)
+        axis.set_xlabel(label)
+        for i, curve in enumerate(curves):
+            colour, dash, value = COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)], curve.values[:, 0]
+            if curve.interval is None:
+                (line,) = axis.plot(
+                    curve.at, value, marker="o", linestyle=dash, color=colour, markersize=4, linewidth=1.3
+                )
+            else:
+                ends = np.abs(curve.interval.T - value)
+                aside = 0.012 * (i - (len(curves) - 1) / 2) * float(curve.at.max())  # intervals beside each other
+                line = axis.errorbar(curve.at + aside, value, ends, fmt="o-", color=colour, markersize=4, capsize=3)
+            handles.setdefault(curve.label, line)
+        if logarithmic:
+            axis.set_xscale("log")
+            reach = np.concatenate([curve.values[:, 0] for curve in curves])
+            if reach.max() > 10 * reach.min() > 0:
+                axis.set_yscale("log")
+            else:
+                axis.set_ylim(0, 1.08 * reach.max())
+            ticks = sorted({int(a) for curve in curves for a in curve.at})
+            axis.set_xticks(ticks, [str(t) for t in ticks])
+            axis.xaxis.set_minor_locator(NullLocator())
+        if diagonal:
+            end = max(float(curve.at.max()) for curve in curves)
+            (line,) = axis.plot([0, end], [0, end], color="0.4", linestyle=DASHED, linewidth=1)
+            handles.setdefault("what is allowed", line)
+            axis.set_ylim(bottom=0)
+    add_legend(figure, list(handles.values()), list(handles))
+    return figure

@@ -1,0 +1,330 @@
+"""The dual active-set method with doubled digits, for the programs that float64 alone cannot decide.
+
+Rows that are parallel up to 1e-12, or a Hessian at the edge of definiteness, leave few of sixteen digits. Here the
+iteration of ``gpmpc.qp._dual_iteration`` is written for accuracy: variables and rows are scaled by powers of two, the
+working set has a QR factor computed anew at each change, and x and the multipliers are sums of two floats that Newton's
+method corrects by residuals without rounding error (iterative refinement, Higham, Accuracy and Stability of Numerical
+
+    a = -A_W dmu - [L^-1 r1; 0],   A_W' a = -r2,   L' dx = a
+
+for the residuals r1 of stationarity and r2 of the working set.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr, solve_triangular
+
+from gpmpc.qp import _record as layout
+from gpmpc.qp.problem import ABSENT
+from gpmpc.qp.solution import proves_infeasibility, zero_row_size
+
+Array = NDArray[np.float64]
+
+NEGLIGIBLE = 1e-26  # violation, as a share of the terms that it is a sum of, that doubled digits cannot tell from none
+_ROUNDING = 1e-14  # share of these terms by which a row may contradict others that it depends on: the data's rounding
+# Distances from the span of the others, as a share of the row, within which a row depends on them. Where rows that
+# differ by rounding only are taken for independent ones, x does not converge: then the next one is tried.
+_DEPENDENT = (1e-14, 1e-13, 1e-12, 1e-10)
+_CONVERGED = 1e-12  # last correction of x, as a share of its size
+_CORRECTIONS = 12
+
+
+@np.errstate(all="ignore")  # what is not finite does not convince
+def rescue(problem: tuple, softness: Array, record: Array, limit: int, late: Callable) -> Array:
+    """The record of a solve that starts from the working set of another, ``record``.
+
+    Args:
+        problem: P, q, G, lower and upper; bounds of 1e20 or more are absent.
+        softness: (2, M), see ``gpmpc.qp.problem.stack_softness``.
+        record: What the kernel wrote.
+        limit: Changes of the working set before ``ITERATION_LIMIT``.
+        late: Whether it is time for ``TIME_LIMIT``.
+    """
+    P, q, G, lower, upper = problem
+    result = record.copy()
+    try:
+        lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
+        for dependent in _DEPENDENT:
+            solve = _Solve((P, q, G, lower, upper), softness, dependent, late)
+            result[layout.STATUS] = solve.run(_names(record, len(q), len(lower)), limit)
+            if result[layout.STATUS] != layout.NUMERICAL_TROUBLE:
+                break
+        solve.write(result)  # pyright: ignore[reportPossiblyUnboundVariable]
+    except TimeoutError:
+        result[layout.STATUS] = layout.TIME_LIMIT
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError):  # not finite, or not positive definite once scaled
+        result[layout.STATUS] = layout.NUMERICAL_TROUBLE
+    return result
+
+
+class _Solve:
+    """One program, scaled, and the state of the iteration: the working set, x, and the multipliers."""
+
+    def __init__(self, problem: tuple, softness: Array, dependent: float, late: Callable):
+        P, q, G, lower, upper = problem
+        n, M = len(q), len(lower)
+        D = _power_of_two(np.sqrt(np.diagonal(P)))
+        E = np.concatenate([1.0 / D, _power_of_two(np.abs(G * D).max(axis=1, initial=0.0))])
+        self.D, self.E, self.n = D, E, n
+        self.P, self.q, self.C = P * np.outer(D, D), q * D, np.vstack([np.eye(n), G * D * E[n:, None]])
+        self.lower, self.upper = lower * E, upper * E
+        self.softness, self.caps = softness[0] * E * E, softness[1] / E
+        self.G, self.bounds, self.late = G, (lower, upper), late
+        self.L = np.linalg.cholesky(self.P)
+        self.columns = solve_triangular(self.L, self.C.T, lower=True)  # L^-1 C'
+        self.norms = np.sqrt((self.columns**2).sum(axis=0) + self.softness)
+        self.dependent = dependent / np.diagonal(self.L).min()
+        self.members: list[int] = []
+        self.sides: list[int] = []
+        self.x, self.mu = np.zeros((2, n)), np.zeros((2, M))
+        self.iterations, self.ray = 0, None
+
+    def run(self, names: Array, limit: int) -> int:
+        """Changes the working set until no constraint is violated; returns the status."""
+        self._guess(names)
+        passed: set[int] = set()
+        while True:
+            if not self._settle():
+                return layout.NUMERICAL_TROUBLE
+            p, side, sense, violation = self._most_violated(passed)
+            if p < 0:
+                return layout.SOLVED
+            if self.iterations >= limit:
+                return layout.ITERATION_LIMIT
+            rounding = _ROUNDING * self._terms_of(p, side)
+            if not self._step_to(p, side, sense, violation, rounding):
+                if self._prove(p, sense):
+                    return layout.INFEASIBLE
+                terms = [self._terms_of(w, s) for w, s in zip(self.members, self.sides, strict=True)]
+                if violation > rounding + _ROUNDING * np.abs(self.r) @ np.array(terms):
+                    return layout.NUMERICAL_TROUBLE
+                passed.add(p)
+
+    def write(self, record: Array) -> None:
+        """Writes x, multipliers (or Farkas' ray) and working set to a record."""
+        n, M, k = self.n, len(self.E), len(self.members)
+        multipliers = self.mu.sum(axis=0) * self.E if self.ray is None else self.ray
+        x = self.x.sum(axis=0) * self.D
+        if not (np.isfinite(x).all() and np.isfinite(multipliers).all()):
+            raise OverflowError
+        record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
+        record[layout.HEADER + n + M :][:k] = [side * (p + 1) for p, side in zip(self.members, self.sides, strict=True)]
+        record[[layout.WORKING, layout.VARIABLES, layout.CONSTRAINTS]] = k, n, M
+        record[layout.ITERATIONS] += self.iterations
+
+    def _bound(self, p: int, side: int) -> float:
+        return self.upper[p] if side > 0 else self.lower[p]
+
+    def _range(self, p: int, side: int) -> tuple[float, float]:
+        """The range of a multiplier at the upper (+1) or lower (-1) bound."""
+        equality, cap = self.lower[p] == self.upper[p], self.caps[p]
+        return (-cap if equality or side < 0 else 0.0), (cap if equality or side > 0 else 0.0)
+
+    def _guess(self, names: Array) -> None:
+        """Starts with the named bounds, except those that depend on others."""
+        guess = {int(abs(name)) - 1: int(np.sign(name)) for name in names}
+        some = [p for p, side in guess.items() if np.isfinite(self._bound(p, side)) and self.norms[p] > 0.0]
+        if some:
+            A = np.vstack([self.columns[:, some], np.diag(np.sqrt(self.softness[some]))]) / self.norms[some]
+            R, order = qr(A, mode="r", pivoting=True)
+            good = np.abs(np.diagonal(R)) > 1e6 * self.dependent
+            self.members = [some[i] for i in order[: len(good)][good]]
+            self.sides = [guess[p] for p in self.members]
+
+    def _factorise(self) -> None:
+        if self.late():
+            raise TimeoutError
+        A = np.vstack([self.columns[:, self.members], np.diag(np.sqrt(self.softness[self.members]))])
+        self.Q, self.R = qr(A, mode="economic")
+
+    def _distance(self, p: int) -> tuple[Array, float]:
+        """The combination r of the working columns nearest to that of constraint p, and its distance."""
+        rest, r = np.append(self.columns[:, p], np.zeros(len(self.members))), np.zeros(len(self.members))
+        for _ in range(2):  # twice is enough
+            part = self.Q.T @ rest
+            rest, r = rest - self.Q @ part, r + solve_triangular(self.R, part)
+        return r, float(np.sqrt(rest @ rest + self.softness[p]))
+
+    def _settle(self) -> bool:
+        """Finds x and the multipliers of the working set; drops the most wrong one until all are in range."""
+        while True:
+            self._factorise()
+            if not self._refine():
+                return False
+            worst, slot = 0.0, -1
+            for i, (p, side) in enumerate(zip(self.members, self.sides, strict=True)):
+                least, most = self._range(p, side)
+                outside = max(self.mu[0, p] - most, least - self.mu[0, p]) * self.norms[p]
+                if outside > worst:
+                    worst, slot = outside, i
+            if slot < 0:
+                return True
+            p = self.members[slot]
+            least, most = self._range(p, self.sides[slot])
+            at_cap = most if self.mu[0, p] > most else least
+            self._drop(slot, at_cap if np.isfinite(at_cap) else 0.0)
+
+    def _drop(self, slot: int, value: float) -> None:
+        self.mu[:, self.members[slot]] = value, 0.0
+        del self.members[slot], self.sides[slot]
+        self.iterations += 1
+
+    def _refine(self) -> bool:
+        """Newton's method on the working set with residuals free of rounding; False if it does not converge."""
+        W, n = self.members, self.n
+        C, b = self.C[W], np.array([self._bound(p, side) for p, side in zip(W, self.sides, strict=True)])
+        S = np.diag(self.softness[W])
+        pulling = np.flatnonzero(self.mu[0])
+        others = np.setdiff1d(pulling, W)  # soft rows at their caps
+        for _ in range(_CORRECTIONS):
+            x, mu = self.x, self.mu
+            r1 = _sum_products(
+                [(self.P, x[0]), (self.P, x[1]), (C.T, mu[0, W]), (C.T, mu[1, W]), (self.C[others].T, mu[0, others])],
+                self.q,
+            )
+            r2 = _sum_products([(C, x[0]), (C, x[1]), (S, -mu[0, W]), (S, -mu[1, W])], -b)
+            slope = np.append(solve_triangular(self.L, r1, lower=True), np.zeros(len(W)))
+            along = solve_triangular(self.R, r2, trans="T")
+            part = self.Q.T @ slope
+            a = self.Q @ (part - along) - slope
+            dx = solve_triangular(self.L, a[:n], trans="T", lower=True)
+            dmu = solve_triangular(self.R, along - part)
+            _add(x, slice(None), dx)
+            _add(mu, W, dmu)
+            size = max(np.abs(x[0]).max(), NEGLIGIBLE * np.abs(self.q).max())
+            if not np.isfinite(size):
+                return False
+            if np.abs(dx).max() <= _CONVERGED * size:
+                box = [i for i, p in enumerate(W) if p < n]  # bounds of variables hold exactly
+                x[0, np.array(W, dtype=int)[box]], x[1, np.array(W, dtype=int)[box]] = b[box], 0.0
+                return True
+        return False
+
+    def _most_violated(self, passed: set[int]) -> tuple[int, int, int, float]:
+        """The constraint violated most, the bound, the direction in which its multiplier moves, and by how much."""
+        y, mu = _sum_products([(self.C, self.x[0]), (self.C, self.x[1])], np.zeros(len(self.C))), self.mu[0]
+        sizes = np.abs(self.C) @ np.abs(self.x[0])
+        above = np.where(np.isfinite(self.upper), y - self.upper, -np.inf) - NEGLIGIBLE * np.abs(self.upper)
+        below = np.where(np.isfinite(self.lower), self.lower - y, -np.inf) - NEGLIGIBLE * np.abs(self.lower)
+        # one at a cap must stay outside its bound: it is violated where it is not
+        excess = np.where(mu > 0.0, -above, np.where(mu < 0.0, -below, np.maximum(above, below)))
+        excess -= NEGLIGIBLE * np.maximum(sizes, np.abs(self.q).max())
+        excess[[*self.members, *passed]] = -np.inf
+        p = int(np.argmax(np.where(self.norms > 0.0, excess / self.norms, excess)))
+        if not excess[p] > 0.0:
+            return -1, 0, 0, 0.0
+        side = int(np.sign(mu[p])) or (1 if above[p] > below[p] else -1)
+        return p, side, (-side if mu[p] else side), float(excess[p])
+
+    def _terms_of(self, p: int, side: int) -> float:
+        """The size of the numbers whose rounding a violation may be; a zero row has those of the other rows only."""
+        if self.C[p].any():
+            return max(abs(self._bound(p, side)), np.abs(self.C[p]) @ np.abs(self.x[0]))
+        return zero_row_size(self.G, *self.bounds)
+
+    def _step_to(self, p: int, side: int, sense: int, violation: float, rounding: float) -> bool:
+        """Moves multipliers until constraint p is satisfied.
+
+        False if it contradicts the working ones, or depends on them and is violated by no more than rounding.
+        """
+        mu = self.mu.sum(axis=0)
+        start = mu[p]
+        while True:
+            self._factorise()
+            r, distance = self._distance(p)
+            free = distance > self.dependent * self.norms[p]
+            step = violation / distance**2 if free else np.inf
+            least, most = self._range(p, side)
+            room = most - mu[p] if sense > 0 else mu[p] - least
+            capped, leaving = room < step, -1
+            step = min(step, room)
+            noise = 1e-14 * np.abs(r * self.norms[self.members]).max(initial=0.0)
+            for i, w in enumerate(self.members):
+                least, most = self._range(w, self.sides[i])
+                rate = sense * r[i]
+                if abs(rate) * self.norms[w] > noise:
+                    room = max(0.0, (mu[w] - (least if rate > 0.0 else most)) / rate)
+                    if room < step:
+                        step, leaving = room, i
+            if step == np.inf or (not free and violation <= rounding):
+                self.r = r
+                self.mu[:, p] = start, 0.0
+                return False
+            mu[self.members] -= sense * step * r
+            mu[p] += sense * step
+            violation -= step * distance**2
+            if leaving < 0:
+                self.mu[:, p] = mu[p], 0.0
+                self.iterations += 1
+                if not capped:
+                    self.members.append(p)
+                    self.sides.append(side)
+                return True
+            w = self.members[leaving]
+            least, most = self._range(w, self.sides[leaving])
+            mu[w] = least if sense * r[leaving] > 0.0 else most
+            self._drop(leaving, mu[w])
+
+    def _prove(self, p: int, sense: int) -> bool:
+        """Whether the last contradiction has Farkas' proof, which becomes the ray."""
+        used = np.abs(self.r) * self.norms[self.members] > self.dependent * self.norms[p]
+        W, sides = np.array(self.members, dtype=int)[used], np.array(self.sides)[used]
+        Q, R = qr(self.columns[:, W], mode="economic")
+        r = self.r[used]
+        for _ in range(3):
+            rest = _sum_products([(self.C[W].T, -r)], self.C[p])
+            r = r + solve_triangular(R, Q.T @ solve_triangular(self.L, rest, lower=True))
+        ray = np.zeros(len(self.E))
+        ray[W], ray[p] = -sense * r, sense
+        for w, side in zip(W, sides, strict=True):
+            if ray[w] * side < 0.0 and self.lower[w] < self.upper[w]:
+                ray[w] = 0.0  # rounding: this bound cannot pull that way
+        proven = proves_infeasibility(ray * self.E, self.G, *self.bounds)
+        self.ray = ray * self.E if proven else None
+        return proven
+
+
+def _names(record: Array, n: int, M: int) -> Array:
+    """The working set of a record, without what is no bound."""
+    start = layout.HEADER + n + M
+    names = record[start : start + int(np.clip(np.nan_to_num(record[layout.WORKING]), 0, M))]
+    return names[(np.abs(names) >= 1.0) & (np.abs(names) <= M)]
+
+
+def _power_of_two(sizes: Array) -> Array:
+    """The powers of two nearest to the reciprocals; one for zero."""
+    return np.exp2(-np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
+
+
+def _add(parts: Array, where, change: Array) -> None:
+    """Adds to a sum of two floats, of which the second holds what the first rounds off."""
+    high, low = parts[0, where], parts[1, where] + change
+    total = high + low
+    parts[0, where], parts[1, where] = total, low - (total - high)
+
+
+def _sum_products(products: list[tuple[Array, Array]], constant: Array) -> Array:
+    """``constant + sum A @ v`` as if in doubled precision (Ogita, Rump and Oishi, 2005)."""
+    terms = [constant[:, None]]
+    for A, v in products:
+        product = A * v
+        A_high, v_high = _leading_half(A), _leading_half(v)
+        A_low, v_low = A - A_high, v - v_high
+        terms += [product, ((A_high * v_high - product) + A_high * v_low + A_low * v_high) + A_low * v_low]
+    total, rest = np.concatenate(terms, axis=1), np.zeros(len(constant))
+    while total.shape[1] > 1:
+        if total.shape[1] % 2:
+            total = np.column_stack([total, np.zeros(len(constant))])
+        a, b = total[:, ::2], total[:, 1::2]
+        total = a + b
+        part = total - a
+        rest += ((a - (total - part)) + (b - part)).sum(axis=1)
+    return total[:, 0] + rest
+
+
+def _leading_half(a: Array) -> Array:
+    """The leading 26 bits of each number."""
+    shifted = 134217729.0 * a
+    return shifted - (shifted - a)

@@ -1,0 +1,390 @@
+"""Reads recorded runs as arrays, solves a recorded quadratic program again, and rescues unfinished files.
+
+A message whose checksum is right may still come from another program, so the sizes of its arrays are checked. A plan
+belongs to the step of its number, wherever it stands.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from mcap.records import Attachment, Channel, Footer, Message, Metadata, Schema
+from mcap.writer import CompressionType, Writer
+
+from gpmpc.exceptions import GpmpcError, RecordingError, SettingError
+from gpmpc.files import whole_file
+from gpmpc.recording import _messages
+from gpmpc.recording._messages import PLAN, QP, QP_ARRAYS, STEP, TIMING, TOPICS
+from gpmpc.recording._records import CONFIG, RECOVERED, room, whole_records
+from gpmpc.status import Status
+
+if TYPE_CHECKING:
+    import pandas
+
+    from gpmpc.qp import QPSolution, QPSolver
+
+Array = np.ndarray
+_STATUSES = tuple(Status)
+
+
+class RecordedProblem(NamedTuple):
+    """A quadratic program as it was solved; letters as in ``gpmpc.qp``."""
+
+    P: Array  # (n, n)
+    q: Array  # (n,)
+    G: Array  # (m, n)
+    lower: Array  # (M,) bounds of the stacked constraints [x; Gx]
+    upper: Array  # (M,)
+    softness: Array  # (2, M) 1/rho and the cap of the multiplier of every stacked constraint
+    x: Array  # (n,) the solution found then; empty where there was none
+    multipliers: Array  # (M,) its multipliers; empty where there was none
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """K recorded steps; n states, m inputs, horizon H (the longest; NaN beyond a shorter one)."""
+
+    path: Path
+    finished: bool  # recorded to its end, every checksum is right; otherwise this is what was saved of it
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    steps: Array  # (K,) their numbers k
+    times: Array  # (K,) [s]
+    references: Array  # (K, n)
+    states: Array  # (K, n) true states
+    measured: Array  # (K, n)
+    inputs: Array  # (K, m) applied inputs
+    input_bounds: Array  # (2, m) lower and upper; infinite where none were given
+    innovations: Array  # (K, n)
+    belief_covariances: Array  # (K, n, n)
+    plan_inputs: Array  # (K, H, m)
+    plan_means: Array  # (K, H + 1, n)
+    plan_stds: Array  # (K, H + 1, n)
+    plan_covariances: Array  # (K, H + 1, n, n)
+    statuses: tuple[Status, ...]
+    iterations: Array  # (K,)
+    active_set_sizes: Array  # (K,)
+    timings: Array  # (K, 4) model, build, solve, total [s]
+    gp_sizes: Array  # (K,)
+    gp_versions: Array  # (K,)
+    failed: Array  # (K,) whether the decision was not applied
+    novelties: Array  # (K,) ``novelty`` of the decisions; 0 in files that do not have it
+    channels: dict[str, tuple[int, str]]  # number of messages and schema by topic
+    metadata: dict[str, dict[str, str]]
+    config: str  # text of the resolved configuration
+    problems: dict[int, RecordedProblem]  # by k; see ``replay``
+
+    @cached_property
+    def pose(self) -> dict[str, int]:
+        """Indices of the states that are x, y, z, roll, pitch and yaw in space, as far as there are any."""
+        named = self.metadata.get("pose", {}).items()
+        return {axis: self.state_names.index(name) for axis, name in named if name in self.state_names}
+
+    @cached_property
+    def residuals(self) -> Array:
+        """Primal and dual residual and duality gap of every recorded solution (K, 3); NaN without one."""
+        nothing = (np.nan, np.nan, np.nan)
+        return np.array([_residuals(self.problems[k]) if k in self.problems else nothing for k in self.steps.tolist()])
+
+    @cached_property
+    def columns(self) -> dict[str, Array]:
+        """The run as a table: a column (K,) per scalar field of ``gpmpc.Step``, in its order."""
+        table: dict[str, Array] = {"time": self.times, "k": self.steps}
+        with np.errstate(invalid="ignore"):  # NaN says it
+            std = np.sqrt(np.diagonal(self.belief_covariances, axis1=1, axis2=2))
+        groups = {"reference": self.references, "state": self.states, "measured": self.measured, "input": self.inputs}
+        groups |= {"innovation": self.innovations, "belief_std": std}
+        for group, values in groups.items():
+            names = self.input_names if group == "input" else self.state_names
+            table |= {f"{group}.{name}": values[:, i] for i, name in enumerate(names)}
+        table |= {"status": np.array([status.name for status in self.statuses], dtype=object)}
+        table |= {"iterations": self.iterations, "active_set_size": self.active_set_sizes}
+        table |= {f"timing.{name}": self.timings[:, i] for i, name in enumerate(TIMING)}
+        residuals = self.residuals.reshape(-1, 3)
+        table |= {f"residuals.{name}": residuals[:, i] for i, name in enumerate(("primal", "dual", "gap"))}
+        return table | {
+            "gp_size": self.gp_sizes,
+            "gp_version": self.gp_versions,
+            "failed": self.failed,
+            "novelty": self.novelties,
+        }
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """Returns ``columns`` as a data frame, units in its ``attrs``."""
+        import pandas
+
+        frame = pandas.DataFrame(self.columns)
+        frame.attrs["units"] = self.metadata.get("units", {})
+        return frame
+
+
+def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
+    """Solves the quadratic program of step k again; its minimiser is unique, so any exact solver finds the same plan.
+
+    Args:
+        run: A run recorded with its problems.
+        k: Number of the step.
+        solver: ``DualActiveSet()`` if omitted, which also takes soft rows.
+
+    Raises:
+        RecordingError: The step or its problem is not in the recording, or it is no convex program.
+    """
+    from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
+
+    recorded = run.problems.get(k)
+    if recorded is None:
+        raise RecordingError(f"{run.path}: holds no quadratic program of step {k}; it holds {len(run.problems)} others")
+    solve = DualActiveSet().solve if solver is None else solver.solve
+    inverse, caps = recorded.softness[:, len(recorded.q) :]
+    try:
+        problem = QuadraticProgram.from_stacked(*recorded[:5])
+        if not inverse.any() and np.isinf(caps).all():
+            return solve(problem)
+        with np.errstate(divide="ignore"):
+            return solve(problem, soft=SoftRows(quadratic=1 / inverse, linear=caps))
+    except GpmpcError as error:
+        raise RecordingError(f"{run.path}: step {k}: {error}") from error
+
+
+def read_run(path: str | Path) -> Run:
+    """Reads a recording, finished or not.
+
+    Raises:
+        RecordingError: There is no such file, or it is no recording of a run.
+    """
+    path = Path(path)
+    metadata: dict[str, dict[str, str]] = {}
+    schemas: dict[int, str] = {}
+    channels: dict[int, Channel] = {}
+    counts: Counter[int] = Counter()
+    messages: dict[str, list[Any]] = {STEP: [], PLAN: [], QP: []}
+    described: _Described | None = None
+    config, finished = "", False
+    for record in whole_records(path):
+        if isinstance(record, Message):
+            counts[record.channel_id] += 1
+            topic = channels[record.channel_id].topic
+            if topic in messages:  # parsed at once, so that one that is damaged ends it before more are in memory
+                if described is None:  # another tool may have moved the metadata behind the messages
+                    everything = whole_records(path) if "run" not in metadata else ()
+                    behind = {more.name: more.metadata for more in everything if isinstance(more, Metadata)}
+                    described = _describe(path, metadata | behind)
+                messages[topic].append(_decode(path, topic, described, record))
+        elif isinstance(record, Schema):
+            schemas[record.id] = record.name
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+        elif isinstance(record, Metadata):
+            metadata.setdefault(record.name, record.metadata)
+        elif isinstance(record, Attachment) and record.name == CONFIG:
+            config = record.data.decode(errors="replace")
+        finished = isinstance(record, Footer)
+    states, inputs, _ = described or _describe(path, metadata)
+    steps, plans = messages[STEP], messages[PLAN]
+    return Run(
+        path=path,
+        finished=finished and RECOVERED not in metadata,
+        state_names=states,
+        input_names=inputs,
+        statuses=tuple(_STATUSES[step.status] for step in steps),
+        **_steps(steps, states, inputs),
+        **_plans(path, plans, steps, states, inputs),
+        channels={channel.topic: (counts[i], schemas.get(channel.schema_id, "")) for i, channel in channels.items()},
+        metadata=metadata,
+        config=config,
+        problems=dict(messages[QP]),
+    )
+
+
+class _Described(NamedTuple):
+    """What the metadata say of the messages."""
+
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    classes: dict[str, Any]
+
+
+def _describe(path: Path, metadata: dict[str, dict[str, str]]) -> _Described:
+    """Finds the names of states and inputs, and builds the classes of the messages."""
+    about = metadata.get("run", {})
+    if not {"state_names", "input_names"} <= about.keys():
+        raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
+    try:
+        states, inputs = (_messages.check_names(key, about[key].split()) for key in ("state_names", "input_names"))
+        classes = _messages.message_classes(_messages.descriptor(states, inputs, "bytes"))
+    except SettingError as error:
+        raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
+    return _Described(states, inputs, classes)
+
+
+def _decode(path: Path, topic: str, described: _Described, record: Message) -> Any:
+    """Parses a message; of a quadratic program it returns its step's number k and itself."""
+    n = len(described.states)
+    try:
+        message = described.classes[TOPICS[topic]].FromString(record.data)
+        if topic == STEP:
+            _numbers(message, "belief_covariance", n, n)
+            if not 0 <= message.status < len(_STATUSES):
+                raise ValueError(f"status {message.status} is unknown")
+        elif topic == PLAN:
+            _numbers(message, "covariances", len(message.stages), n, n)
+            if not message.stages:
+                raise ValueError("it has no stage")
+        return (message.k, _problem(message)) if topic == QP else message
+    except (DecodeError, ValueError) as error:
+        raise RecordingError(f"{path}: message {record.sequence} of {topic} is damaged: {error}") from error
+
+
+def _numbers(message: Any, field: str, *shape: int) -> Array:
+    """Reads a packed array."""
+    data = getattr(message, field)
+    if min(shape) < 0 or len(data) != 8 * math.prod(shape):
+        raise ValueError(f"{field} must be {shape}; got {len(data)} bytes")
+    return np.frombuffer(data).reshape(shape)
+
+
+def _table(messages: Sequence[Any], fields: tuple[str, ...]) -> Array:
+    numbers = attrgetter(*fields)
+    return np.array([numbers(message) for message in messages], dtype=float).reshape(len(messages), len(fields))
+
+
+def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Array]:
+    def column(field: str, kind: type) -> Array:
+        return np.array([getattr(step, field) for step in steps], dtype=kind)
+
+    def table(field: str, names: tuple[str, ...]) -> Array:
+        return _table([getattr(step, field) for step in steps], names)
+
+    bounds = np.tile([[-np.inf], [np.inf]], len(inputs))
+    if steps and steps[0].HasField("input_lower"):  # they are equal in all steps
+        bounds = _table([steps[0].input_lower, steps[0].input_upper], inputs)
+    covariances = np.frombuffer(b"".join(step.belief_covariance for step in steps))
+    return {
+        "times": column("time", float),
+        "steps": column("k", int),
+        "references": table("reference", states),
+        "states": table("state", states),
+        "measured": table("measured", states),
+        "innovations": table("innovation", states),
+        "inputs": table("input", inputs),
+        "input_bounds": bounds,
+        "belief_covariances": covariances.reshape(len(steps), len(states), len(states)),
+        "iterations": column("iterations", int),
+        "active_set_sizes": column("active_set_size", int),
+        "timings": table("timing", TIMING),
+        "gp_sizes": column("gp_size", int),
+        "gp_versions": column("gp_version", int),
+        "failed": column("failed", bool),
+        "novelties": column("novelty", float),
+    }
+
+
+def _numbered(messages: list) -> Iterator[tuple[int, int]]:
+    """Yields of every message its step's number k and, where a number comes again, the how many'th time it is."""
+    seen: Counter[int] = Counter()
+    for message in messages:
+        seen[message.k] += 1
+        yield message.k, seen[message.k]
+
+
+def _plans(path: Path, plans: list, steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Array]:
+    H, n, m = max((len(plan.stages) - 1 for plan in plans), default=0), len(states), len(inputs)
+    if (needed := 8 * len(steps) * (H + 1) * (n * n + 2 * n + m)) > room(path):
+        raise RecordingError(f"{path}: a plan of {H} stages would make arrays of {needed / 1e6:.0f} MB with the others")
+    shapes = {"inputs": (H, m), "means": (H + 1, n), "stds": (H + 1, n), "covariances": (H + 1, n, n)}
+    arrays = {f"plan_{name}": np.full((len(steps), *shape), np.nan) for name, shape in shapes.items()}
+    rows = {key: row for row, key in enumerate(_numbered(steps))}
+    for key, plan in zip(_numbered(plans), plans, strict=True):
+        row, stages = rows.get(key), list(plan.stages)
+        if row is None:
+            continue  # the step is lost
+        arrays["plan_means"][row, : len(stages)] = _table([stage.mean for stage in stages], states)
+        arrays["plan_stds"][row, : len(stages)] = _table([stage.std for stage in stages], states)
+        arrays["plan_inputs"][row, : len(stages) - 1] = _table([stage.input for stage in stages[:-1]], inputs)
+        arrays["plan_covariances"][row, : len(stages)] = _numbers(plan, "covariances", len(stages), n, n)
+    return arrays
+
+
+def _problem(message: Any) -> RecordedProblem:
+    n, m = message.variables, message.rows
+    M, has_solution = n + m, bool(message.x or message.multipliers)
+    shapes = ((n, n), (n,), (m, n), (M,), (M,), (2, M), (n * has_solution,), (M * has_solution,))
+    return RecordedProblem(*(_numbers(message, name, *s) for name, s in zip(QP_ARRAYS, shapes, strict=True)))
+
+
+def _residuals(problem: RecordedProblem) -> tuple[float, float, float]:
+    """Judges a recorded solution; NaN where there is none."""
+    from gpmpc.qp import QuadraticProgram, make_solution
+
+    if not len(problem.x):
+        return np.nan, np.nan, np.nan
+    P, q, G, lower, upper, softness, x, multipliers = problem
+    solution = make_solution(QuadraticProgram.unchecked(P, q, G, lower, upper), Status.SOLVED, x, multipliers)
+    return solution._replace(softness=softness).residuals()
+
+
+class Recovery(NamedTuple):
+    """What was found in a file."""
+
+    messages: int
+    seconds: float  # [s] between the first and the last of them
+    finished: bool  # the run had been recorded to its end; nothing was missing
+
+
+def recover(path: str | Path, output: str | Path) -> Recovery:
+    """Writes everything whole in a recording to a new file with index and footer, which says that it was recovered.
+
+    Args:
+        path: A file that a crash left without footer; an MCAP reader takes it for empty.
+        output: The new file; it appears when it is complete and has been read once.
+
+    Raises:
+        RecordingError: There is no run to recover, or the output cannot be written.
+    """
+    path, output = Path(path), Path(output)
+    try:
+        if output.exists() and path.exists() and output.samefile(path):
+            raise RecordingError(f"{output}: a file cannot be recovered into itself; name another output")
+        with whole_file(output) as file:
+            times = _copy(path, file)
+            file.flush()
+            try:
+                finished = read_run(file.name).finished
+            except RecordingError as error:
+                raise RecordingError(str(error).replace(file.name, str(path), 1)) from error
+    except OSError as error:
+        raise RecordingError(f"{output}: cannot be written: {error.strerror or error}") from error
+    return Recovery(len(times), (max(times) - min(times)) / 1e9 if times else 0.0, finished)
+
+
+def _copy(path: Path, file: BinaryIO) -> list[int]:
+    """Copies whole records; returns the time stamps of the messages [ns]."""
+    writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
+    writer.start(profile="gpmpc", library="gpmpc")
+    schemas, channels, times, finished = {0: 0}, {}, [], False
+    for record in whole_records(path):
+        if isinstance(record, Schema) and record.id not in schemas:
+            schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+        elif isinstance(record, Channel) and record.id not in channels:
+            about = (record.topic, record.message_encoding, schemas[record.schema_id], record.metadata)
+            channels[record.id] = writer.register_channel(*about)
+        elif isinstance(record, Message):
+            channel = channels[record.channel_id]
+            writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
+            times.append(record.log_time)
+        elif isinstance(record, Metadata):
+            writer.add_metadata(record.name, record.metadata)
+        elif isinstance(record, Attachment):
+            writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+        finished = isinstance(record, Footer)
+    if not finished:
+        writer.add_metadata(RECOVERED, {"messages": str(len(times))})
+    writer.finish()
+    return times
