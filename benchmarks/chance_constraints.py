@@ -270,7 +270,7 @@ def fly(plant: Plant, model: ResidualModel, eta: float, quantile: float | None, 
             tube.observe(np.full(n, np.nan))
         for k, w in enumerate(plant.disturbances(steps + 50, np.random.default_rng(seed))):
             ahead = np.arange(k, k + HORIZON + 1)[:, None]
-            target = goal * (1 if plant.turn is None else (-1.0) ** (ahead // plant.turn))
+            target = goal * (-1.0) ** (0 * ahead if plant.turn is None else ahead // plant.turn)
             kappas = np.full(HORIZON, quantile) if tube is None else tube.observe(x).copy()
             last = controller.control(Gaussian.certain(x), Reference(target, kappas=kappas), last)
             deviations = np.sqrt(last.covariances[1:, i, i])
