@@ -6,7 +6,8 @@ Each plant is learned from 200 of its rows and sent to a set point beyond an upp
 
 - the pendulum of ``benchmarks.estimation`` (angle), its noise Gaussian, of heavy tails (Student's t, 3 degrees of
   freedom) or an AR(1) process (correlation 0.6), of equal variance;
-- gymnasium's InvertedPendulum-v5 (angle of the pole while the cart is sent from one side to the other every 25 steps), Gaussian noise;
+- gymnasium's InvertedPendulum-v5 (angle of the pole while the cart is sent from side to side every 25 steps), its
+  noise Gaussian;
 - the quadrotor of ``examples/mujoco_quadrotor.xml`` in MuJoCo and RotorPy's Hummingbird (``pip install rotorpy``):
   climbing at a bounded speed by velocity commands, which an inner controller follows, in a wind that changes as an
   AR(1) process of 1 s. Attitude, rotors and wind are not among the states, which are the three velocities.
@@ -22,7 +23,7 @@ distance to the bound [mrad, mm/s], and the mean cost of a step. Writes ``output
 import argparse
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
@@ -38,15 +39,13 @@ from gpmpc.estimation import AdaptiveTube, ConformalTube, estimate_process_noise
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.systems.gymnasium_ import Environment
 
 WAYS = ("learned noise", "estimated noise", "estimated noise, adaptive", "true noise")
 ALLOWED, ROWS, SCORES = (0.9, 0.95, 0.99), 600, 399
+RATE = 0.4  # of velocity commands, from one to the next [m/s]
 QUADROTOR = Path(__file__).parents[1] / "examples" / "mujoco_quadrotor.xml"
 Array = np.ndarray
 
@@ -69,7 +68,8 @@ class Plant:
         noise: Its standard deviations (n,); None likewise.
         angles: Indices of states that the GP sees as sine and cosine.
         stages: With a bound; all by default.
-        settings: Of the prediction.
+        rate: Of the inputs, from one to the next.
+        share: Of the decisions that touch the bound at least, roughly.
     """
 
     successor: Callable[[Array, Array, Array], Array]
@@ -85,7 +85,8 @@ class Plant:
     angles: Sequence[int] = ()
     stages: Any = None
     turn: int | None = None
-    settings: PredictionSettings = field(default_factory=PredictionSettings)
+    rate: float = np.inf
+    share: float = 0.9
 
 
 def pendulum_plant(kind: str) -> Plant:
@@ -132,6 +133,7 @@ def cart_pole() -> Plant:
     return Plant(
         successor, noise, lambda: np.zeros(4), log, goal=[0.3, 0.0, 0.0, 0.0], bound=(1, 0.1), turn=25,
         weights=([10.0, 1.0, 1.0, 0.1], [1e-2]), limits=[3.0], quantile=NormalDist().inv_cdf, noise=scale,
+        share=0.2,
     )  # fmt: skip
 
 
@@ -146,12 +148,15 @@ def climbing(begin: Callable[[], Array], move: Callable[[Array, Array], Array]) 
 
     def log() -> tuple[Array, Array, Array]:
         rng = np.random.default_rng(1)
-        commands = np.repeat(rng.uniform(-0.6, 0.6, (ROWS // 5, 3)), 5, axis=0)
-        return logged(successor, begin(), commands, wind(ROWS, rng))
+        commands = [np.zeros(3)]
+        for k in range(1, ROWS):
+            change = rng.uniform(-RATE, RATE, 3) if k % 3 == 0 else 0.0
+            commands.append(np.clip(commands[-1] + change, -0.7, 0.7))
+        return logged(successor, begin(), np.array(commands), wind(ROWS, rng))
 
     return Plant(
         successor, wind, begin, log, goal=[0.0, 0.0, 0.8], bound=(2, 0.5),
-        weights=([1.0, 1.0, 1.0], [0.3] * 3), limits=[1.0] * 3, stages=[1],
+        weights=([1.0, 1.0, 1.0], [0.3] * 3), limits=[1.0] * 3, stages=[1], rate=RATE,
     )  # fmt: skip
 
 
@@ -205,9 +210,9 @@ def hummingbird() -> Plant:
     vehicle = Multirotor(quad_params, initial_state=dict(now), control_abstraction="cmd_vel")
 
     def move(command: Array, wind: Array) -> Array:
-        for _ in range(10):
+        for _ in range(20):
             now["wind"] = wind
-            now.update(vehicle.step(now, {"cmd_v": command}, 0.02))
+            now.update(vehicle.step(now, {"cmd_v": command}, 0.01))
         return now["v"].copy()
 
     return climbing(begin, move)
@@ -256,12 +261,16 @@ def fly(plant: Plant, model: ResidualModel, eta: float, quantile: float | None, 
     n, m = model.state_dim, model.input_dim
     box = Box([-np.inf] * n, [upper if j == i else np.inf for j in range(n)], probability=eta, stages=plant.stages)
     cost = Tracking(*plant.weights, penalized="increments")
-    problem = Problem(cost, Box([-u for u in plant.limits], list(plant.limits)), constraints=[box])
-    controller = GPMPC(model, Linearization(process_noise=True), problem, HORIZON, [0.0] * m, plant.settings)
+    problem = Problem(
+        cost, Box([-u for u in plant.limits], list(plant.limits)), Box([-plant.rate] * m, [plant.rate] * m), [box]
+    )
+    controller = GPMPC(model, Linearization(process_noise=True), problem, HORIZON, [0.0] * m)
     tube, row = None, np.eye(n)[[i]]
     if quantile is None:
         quantiles = [NormalDist().inv_cdf((j + 1) / (SCORES + 1)) for j in range(SCORES)]
-        tube = AdaptiveTube(ConformalTube(np.tile(quantiles, (HORIZON, 1)).T, row), eta, decisions=int(0.9 * steps * seeds))
+        tube = AdaptiveTube(
+            ConformalTube(np.tile(quantiles, (HORIZON, 1)).T, row), eta, decisions=int(0.9 * steps * seeds)
+        )
     goal, Q = np.array(plant.goal), np.array(plant.weights[0])
     violations, distances, costs, errors = 0, [], [], []
     for seed in range(seeds):
@@ -314,14 +323,18 @@ def main() -> None:
                 quantile = None if "adaptive" in way else NormalDist().inv_cdf(eta)
                 model = learned if way == "learned noise" else estimated
                 if way == "true noise" and plant.noise is not None and plant.quantile is not None:
-                    model, quantile = replace(learned, noise=torch.diag(torch.tensor(plant.noise**2))), plant.quantile(eta)
+                    model, quantile = (
+                        replace(learned, noise=torch.diag(torch.tensor(plant.noise**2))),
+                        plant.quantile(eta),
+                    )
                 elif way == "true noise":  # of flights with other disturbances
                     other = replace(plant, disturbances=lambda T, rng, p=plant: p.disturbances(T, rng.spawn(1)[0]))
                     quantile = float(np.quantile(fly(other, model, eta, quantile, arguments.steps, 4).errors, eta))
                 found = fly(plant, model, eta, quantile, arguments.steps, arguments.seeds)
                 bad, active = found.violations, found.active
                 limit = float(beta.ppf(0.95, bad + 1, active - bad)) if bad < active else 1.0
-                text += f"{100 * bad / max(active, 1):8.2f}{100 * limit:8.2f}{1e3 * found.distance:8.2f}{found.cost:9.4f}{active:8}"
+                text += f"{100 * bad / max(active, 1):8.2f}{100 * limit:8.2f}{1e3 * found.distance:8.2f}"
+                text += f"{found.cost:9.4f}{active:8}"
                 row = {"plant": name, "way": way, "eta": eta, "violations": bad, "active": active}
                 results.append(row | {"upper_limit": limit, "distance": found.distance, "cost": found.cost})
             print(f"{name:23}{way:26}{text}", flush=True)
