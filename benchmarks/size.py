@@ -3,9 +3,10 @@
     .venv/bin/python -m benchmarks.size
 
 *Lines* are all lines of ``gpmpc/**/*.py``. A *public name* is a function or class at the top level of a module, without
-an underscore at the beginning of its name or of a module's above it; constants are counted apart. *Arguments* are those
-of functions and methods, ``self`` and ``cls`` apart. A *circle* is a set of modules, or of rooms, that import each
-other, wherever the import statement stands. ``tests/test_architecture.py`` holds the limits.
+an underscore at the beginning of its name or of a module's above it, or one that a package takes from a module with an
+underscore; constants are counted apart. *Arguments* are those of functions and methods, ``self`` and ``cls`` apart. A
+*circle* is a set of modules, or of rooms, that import each other, wherever the import statement stands.
+``tests/test_architecture.py`` holds the limits.
 """
 
 import ast
@@ -91,7 +92,12 @@ class House:
     @cached_property
     def public_names(self) -> list[str]:
         """Dotted names of the functions and classes that users may import."""
-        return self._public(_functions_and_classes)
+        taken = [
+            f"{module}.{name}"
+            for module in {name.rpartition(".")[0] for name in self.sources} & set(self.trees)
+            for name in _taken_from_private(self.trees[module].body)
+        ]
+        return self._public(_functions_and_classes) + sorted(taken)
 
     @cached_property
     def public_constants(self) -> list[str]:
@@ -167,6 +173,12 @@ def _functions_and_classes(body: list[ast.stmt]) -> Iterator[str]:
             yield item.name
         elif isinstance(item, ast.If | ast.Try):
             yield from _functions_and_classes(item.body + item.orelse)
+
+
+def _taken_from_private(body: list[ast.stmt]) -> Iterator[str]:
+    for item in body:
+        if isinstance(item, ast.ImportFrom) and any(part.startswith("_") for part in (item.module or "").split(".")):
+            yield from (alias.name for alias in item.names if not alias.name.startswith("_"))
 
 
 def _constants(body: list[ast.stmt]) -> Iterator[str]:
