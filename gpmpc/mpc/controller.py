@@ -62,7 +62,7 @@ class Reference:
         if np.ndim(self.states) == 2:
             return self
         inputs = None if self.inputs is None else np.tile(_array(self.inputs), (horizon, 1))
-        return Reference(np.tile(_array(self.states), (horizon + 1, 1)), inputs)
+        return Reference(np.tile(_array(self.states), (horizon + 1, 1)), inputs, self.kappas)
 
     @property
     def horizon(self) -> int:
