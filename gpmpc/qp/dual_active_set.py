@@ -23,7 +23,7 @@ from gpmpc.qp._dual_kernels import SIGNATURE, solve
 from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp._workspace import most_working, new_memory, prepare_memory
 from gpmpc.qp.problem import QuadraticProgram, SoftRows, stack_softness
-from gpmpc.qp.solution import QPSolution, WarmStart, proves_infeasibility
+from gpmpc.qp.solution import QPSolution, WarmStart, as_record, proves_infeasibility
 
 Array = NDArray[np.float64]
 _Arrays = tuple[Array, Array, Array, Array, Array]  # P, q, G, lower, upper
@@ -199,7 +199,7 @@ def _solve_again(problem: _Arrays, warm_start, plan, solver, status, record, beg
         return solver.time_limit is not None and perf_counter() - began > solver.time_limit
 
     if status == layout.MISUSE:
-        status = solve(P, q, G, lower, upper, _as_record(warm_start, n, M), memory, record)
+        status = solve(P, q, G, lower, upper, as_record(warm_start, n, M), memory, record)
         if status == layout.MISUSE:  # a proper problem: rows that overflow, P at the edge of definiteness
             record[:] = 0.0
             record[[layout.STATUS, layout.VARIABLES, layout.CONSTRAINTS]] = layout.NUMERICAL_TROUBLE, n, M
@@ -233,17 +233,3 @@ def _is_certain(record: Array, G: Array, lower: Array, upper: Array) -> bool:
         start = layout.HEADER + G.shape[1]
         return proves_infeasibility(record[start : start + len(lower)], G, lower, upper)
     return record[layout.STATUS] in (layout.SOLVED, layout.TIME_LIMIT)
-
-
-def _as_record(warm_start: WarmStart, n: int, M: int) -> Array:
-    """Returns whatever can be used of a warm start; nothing if it belongs to a problem of another size."""
-    if warm_start is None:
-        return layout.NO_RECORD
-    if isinstance(warm_start, QPSolution):
-        return np.ascontiguousarray(warm_start.record, dtype=np.float64)
-    active = np.asarray(warm_start)
-    if active.shape != (M,) or active.dtype.kind not in "biuf":
-        raise ProblemError(
-            f"a warm start must be a solution or an active set of shape {(M,)}; got shape {active.shape}"
-        )
-    return layout.warm_record(np.nan_to_num(active), n)

@@ -234,6 +234,24 @@ def make_solution(
     return QPSolution(record[layout.HEADER : layout.HEADER + n], problem, hard, record, build_seconds, solve_seconds)
 
 
+def as_record(warm_start: WarmStart, n: int, M: int) -> Array:
+    """Returns whatever can be used of a warm start.
+
+    Raises:
+        ProblemError: It is neither a solution nor an active set of this size.
+    """
+    if warm_start is None:
+        return layout.NO_RECORD
+    if isinstance(warm_start, QPSolution):
+        return np.ascontiguousarray(warm_start.record, dtype=np.float64)
+    active = np.asarray(warm_start)
+    if active.shape != (M,) or active.dtype.kind not in "biuf":
+        raise ProblemError(
+            f"a warm start must be a solution or an active set of shape {(M,)}; got shape {active.shape}"
+        )
+    return layout.warm_record(np.nan_to_num(active), n)
+
+
 @np.errstate(all="ignore")  # what is not finite proves nothing
 def proves_infeasibility(ray: Array, G: Array, lower: Array, upper: Array) -> bool:
     """Returns whether ``ray`` (M,) is Farkas' proof that no x satisfies ``lower <= [x; Gx] <= upper``.
