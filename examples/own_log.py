@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pandas
+from scipy.spatial.transform import Rotation
 
 from gpmpc.logs import judge, learn, read_log
-from gpmpc.logs.state_space import quaternion_inverse, quaternion_product, rotate, rotation_quaternion
 from gpmpc.plotting import judgement_figure
 
 STEP, THRUST, DRAG = 0.01, 20.0, 0.3  # [s], [m/s2] of all motors at full signal, [1/s]
@@ -38,25 +38,25 @@ def simulate_flights(flights: int, rows: int, seed: int = 0) -> list[pandas.Data
     """Flies a quadrotor along sums of sines under white force and torque noise, all flights at once."""
     rng = np.random.default_rng(seed)
     p, v, w = (np.zeros((flights, 3)) for _ in range(3))
-    q = np.tile([0.0, 0.0, 0.0, 1.0], (flights, 1))
+    attitude = Rotation.identity(flights)
     frequencies, phases = rng.uniform(0.5, 2.0, (2, flights, 3)), rng.uniform(0, 6, (2, flights, 3))
     tables = np.empty((flights, rows, len(NAMES)))
     for k in range(rows):
         target = 0.7 * np.sin(frequencies * k * STEP + phases).sum(axis=0)
         force = 2.0 * (target - p) - 2.5 * v + [0, 0, 9.81]
-        up = rotate(quaternion_inverse(q), force / np.linalg.norm(force, axis=1, keepdims=True))
+        up = attitude.inv().apply(force / np.linalg.norm(force, axis=1, keepdims=True))
         rates = 6 * np.column_stack([-up[:, 1], up[:, 0], np.zeros(flights)])
         moment = (12 * (rates - w) + rng.normal(0, 8, (flights, 3))) / TORQUE  # the noise makes the motors informative
         collective = np.clip(np.linalg.norm(force, axis=1, keepdims=True) / THRUST, 0.1, 0.9)
         motors = np.sqrt(np.clip(collective + moment @ MIXER.T, 0.01, 1))
-        tables[:, k] = np.column_stack([np.full(flights, k * STEP), p, q, v, w, motors])
+        tables[:, k] = np.column_stack([np.full(flights, k * STEP), p, attitude.as_quat(), v, w, motors])
         body_force = np.column_stack([np.zeros((flights, 2)), THRUST * (motors**2).mean(axis=1)])
-        body_force += rng.normal(0, FORCE_NOISE, (flights, 3)) - DRAG * rotate(quaternion_inverse(q), v)
+        body_force += rng.normal(0, FORCE_NOISE, (flights, 3)) - DRAG * attitude.inv().apply(v)
         torque = motors**2 @ MIXER * 4 * TORQUE / 4 + rng.normal(0, TORQUE_NOISE, (flights, 3))
         for _ in range(4):
             w = w + STEP / 4 * torque
-            q = quaternion_product(q, rotation_quaternion(STEP / 4 * w))
-            v = v + STEP / 4 * (rotate(q, body_force) - [0, 0, 9.81])
+            attitude = attitude * Rotation.from_rotvec(STEP / 4 * w)
+            v = v + STEP / 4 * (attitude.apply(body_force) - [0, 0, 9.81])
             p = p + STEP / 4 * v
     return [pandas.DataFrame(table, columns=NAMES) for table in tables]
 

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from gpmpc.plotting._style import BLUE, COLOURS, GREY, ORANGE, legend_below, styled
 
 if TYPE_CHECKING:
-    from gpmpc.logs.inspection import Channel, Inspection
-    from gpmpc.logs.judging import Judgement
+    from gpmpc.logs import Inspection, Judgement
+    from gpmpc.logs._inspection import Channel
 
 _MODEL, _GAP = BLUE, ORANGE
 _OTHERS = (GREY, *COLOURS[1:5])  # told apart without colour by their markers

@@ -12,9 +12,9 @@ import torch
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.logs import Increments, LogDynamics, LogModel, MultirotorNominal, OutputNoise, RigidBody
-from gpmpc.logs.nominal import Still
-from gpmpc.logs.rollouts import OutputGP
-from gpmpc.logs.state_space import StateGroup, StateSpace, rotation_quaternion
+from gpmpc.logs._nominal import Still
+from gpmpc.logs._rollouts import OutputGP
+from gpmpc.logs._state_space import StateGroup, StateSpace, rotation_quaternion
 from gpmpc.testing import check_model
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))

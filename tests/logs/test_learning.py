@@ -21,10 +21,10 @@ from gpmpc.logs import (
     read_log,
     save_learned,
 )
-from gpmpc.logs.learning import choose_rows
-from gpmpc.logs.log import Log, LogRun
-from gpmpc.logs.noise import error_variances, follow_errors
-from gpmpc.logs.state_space import rotation_quaternion
+from gpmpc.logs._learning import choose_rows
+from gpmpc.logs._log import Log, LogRun
+from gpmpc.logs._noise import error_variances, follow_errors
+from gpmpc.logs._state_space import rotation_quaternion
 
 EXAMPLE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "own_log.py"))
 MAPPING = LogMapping.from_dict(EXAMPLE["MAPPING"])
@@ -199,7 +199,7 @@ FLIGHTS = os.environ.get("GPMPC_FLIGHTS")
 @pytest.mark.slow
 @pytest.mark.skipif(not FLIGHTS, reason="GPMPC_FLIGHTS names no folder of flights")
 def test_real_flights_are_predicted_better_than_by_anything_that_costs_nothing():
-    from gpmpc.logs.judging import NEEDED
+    from gpmpc.logs._judging import NEEDED
 
     mapping = {
         "time": "t",

@@ -1,0 +1,303 @@
+"""Learns a model from a log; what is learned is decided by rollouts on runs that it was not fitted to.
+
+Nominal models of growing size are fitted on rollouts and compared; then a GP on each group of outputs, with targets
+averaged over 1, 5 or 10 rows, stays only where the rollouts of held-out runs get better. The noise comes from those
+rollouts as well.
+"""
+
+from collections.abc import Callable, MutableMapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from gpmpc.exceptions import DataError, check_number
+from gpmpc.gp import Trainer, standardize
+from gpmpc.logs._baselines import fit_least_squares
+from gpmpc.logs._fitting import NominalFit, fit_nominal
+from gpmpc.logs._kinematics import Increments, Kinematics, RigidBody
+from gpmpc.logs._log import Log
+from gpmpc.logs._noise import OutputNoise, fit_noise
+from gpmpc.logs._nominal import AffineNominal, MultirotorNominal, Still
+from gpmpc.logs._rollouts import PAST, STEPS, LogModel, OutputGP, choose_stride, rollout_errors
+from gpmpc.logs._state_space import Array
+
+AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
+LATE = 3  # rows by which motors may act late
+FEEDBACK, LATE_INPUTS = "feedback", f"inputs {LATE} rows late"  # structures
+JUDGED = (10, 50)  # steps whose errors decide
+GAIN = 0.01  # least relative improvement for which a model may grow
+LOSS = 0.05  # most relative loss in any group at any step
+WINDOWS = 200  # of a fold
+Progress = Callable[[str], None]
+Grow = Callable[[Any], LogModel | None]
+Memory = MutableMapping[str, Any]  # from a stage's name to plain data; for example of a file
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One model structure and how its rollouts on held-out runs went."""
+
+    name: str
+    errors: Array  # (len(JUDGED), groups) mean Euclidean or geodesic error
+    chosen: bool = False
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What was learned from a log."""
+
+    model: LogModel  #: fitted to all runs
+    noise: OutputNoise  #: of its outputs
+    fit: NominalFit  #: of the nominal part, to all runs
+    candidates: tuple[Candidate, ...]  #: every structure that was tried, in order
+    ranges: Array  #: smallest and largest value (2, n + m) of the states and inputs in the log
+    rows: int  #: of the log
+    runs: tuple[str, ...]  #: names of the runs
+    state_names: tuple[str, ...]  #: as the file's columns are called (n,)
+    input_names: tuple[str, ...]  #: likewise (m,)
+    context_names: tuple[str, ...]  #: likewise
+    time_step: float  #: [s]
+
+
+@dataclass
+class _Folds:
+    """Splits of a log by run, with held-out windows."""
+
+    parts: list[tuple[Log, Log]]
+    steps: int
+    windows: list = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        past = PAST + LATE
+        for _, held_out in self.parts:
+            stride = choose_stride(held_out, self.steps + past, WINDOWS)
+            self.windows.append(held_out.windows(self.steps, past, stride))
+
+    def errors(self, models: Sequence[LogModel]) -> list[Array]:
+        """Of the rollouts of each fold's model on its held-out windows (W, steps, e)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            pairs = zip(self.windows, models, strict=True)
+            return [np.nan_to_num(rollout_errors(cut, model.rollout(cut)), nan=1e9) for cut, model in pairs]
+
+    def judge(self, name: str, models: Sequence[LogModel]) -> Candidate:
+        """Mean error of each group at the steps that decide."""
+        errors = np.concatenate(self.errors(models))
+        at = [min(step, self.steps) - 1 for step in JUDGED]
+        return Candidate(name, self.windows[0].space.distances(errors[:, at]).mean(axis=0))
+
+
+def learn(
+    log: Log,
+    points: int = 300,
+    steps: int = STEPS,
+    seed: int = 0,
+    progress: Progress = lambda text: None,
+    memory: Memory | None = None,
+    for_control: bool = False,
+) -> Learned:
+    """Learns a model of the outputs behind a log.
+
+    Args:
+        log: Of one run at least; several are split by run, one by time.
+        points: Rows that a GP is trained on, chosen by k-means.
+        steps: Of the rollouts.
+        seed: Of every random number.
+        progress: Called with a line at each stage.
+        memory: Holds the outcome of stages that an earlier call with equal arguments went through.
+        for_control: Leaves out what predicts such runs and no controller can plan with: the feedback of the controller
+            that flew, and inputs that act late.
+
+    Raises:
+        DataError: The log is too short for rollouts of that many steps.
+        TrainingError: A GP could not be trained.
+    """
+    check_number("points", points, least=10, whole=True)
+    check_number("steps", steps, least=2, whole=True)
+    kinematics: Kinematics = RigidBody(log.space) if log.mapping.model == "rigid_body" else Increments(log.space)
+    folds = _Folds(_split(log, 2), steps)
+    memory = {} if memory is None else memory
+    name, structure, options = _structures(kinematics, log)
+    if for_control:
+        options = {words: grow for words, grow in options.items() if words not in (FEEDBACK, LATE_INPUTS)}
+    candidates: list[Candidate] = []
+    best = 0
+    models: list[Any] = []
+    for words, grow in [("", lambda model: model), *options.items()]:
+        trial = grow(structure)
+        if trial is None:
+            continue
+        trial_name = f"{name}, {words}" if words else name
+        progress(f"{trial_name}: fitted on rollouts of {steps} steps")
+        if trial_name not in memory:
+            starts = models or [structure] * len(folds.parts)
+            pairs = zip(starts, folds.parts, strict=True)
+            memory[trial_name] = [_fit(trial, m, train, steps).model.theta.tolist() for m, (train, _) in pairs]
+        fitted = [_with_parameters(trial, theta) for theta in memory[trial_name]]
+        candidates.append(folds.judge(trial_name, fitted))
+        if not models or is_better(candidates[-1], candidates[best]):
+            best, models, name, structure = len(candidates) - 1, fitted, trial_name, trial
+    choice: dict[str, int] = {}
+    for group, outputs in kinematics.output_groups.items():
+        base = models
+        for average in AVERAGES:
+            grown = partial(_with_gp, outputs=outputs, average=average, points=points, seed=seed)
+            words = f"{name}, GP on {_words({**choice, group: average})}"
+            progress(words)
+            trained: list[LogModel] = []
+            if words not in memory:
+                trained = [grown(m, train) for m, (train, _) in zip(base, folds.parts, strict=True)]
+                memory[words] = folds.judge(words, trained).errors.tolist()
+            candidates.append(Candidate(words, np.array(memory[words])))
+            if is_better(candidates[-1], candidates[best]):
+                models = trained or [grown(m, train) for m, (train, _) in zip(base, folds.parts, strict=True)]
+                best, choice[group] = len(candidates) - 1, average
+    progress(f"chosen: {candidates[best].name}")
+    progress("noise from the errors of held-out rollouts")
+    errors = folds.errors(models)
+    noise = fit_noise(models, folds.windows, errors)
+    progress("the chosen structure, fitted to all runs")
+    fit = _fit(structure, models[0], log, steps)
+    groups = kinematics.output_groups
+    gps = tuple(_train(fit.model, log, groups[group], average, points, seed) for group, average in choice.items())
+    candidates[best] = replace(candidates[best], chosen=True)
+    values = np.concatenate([np.hstack([run.states, run.inputs]) for run in log])
+    return Learned(
+        replace(fit.model, gps=gps),
+        noise,
+        fit,
+        tuple(candidates),
+        np.stack([values.min(axis=0), values.max(axis=0)]),
+        len(log),
+        tuple(run.name for run in log),
+        log.mapping.column_names("states"),
+        log.mapping.column_names("inputs"),
+        log.mapping.column_names("context"),
+        log.time_step,
+    )
+
+
+def is_better(candidate: Candidate, incumbent: Candidate) -> bool:
+    """Whether a candidate's errors are smaller on the whole, and in no group at no step much larger."""
+    ratio = np.log(np.maximum(candidate.errors, 1e-12) / np.maximum(incumbent.errors, 1e-12))
+    return bool(ratio.mean() < -GAIN and ratio.max() < LOSS)
+
+
+def _words(choice: dict[str, int]) -> str:
+    return " and ".join(f"{group} (averaged over {average})" for group, average in choice.items())
+
+
+def _structures(kinematics: Kinematics, log: Log) -> tuple[str, LogModel, dict[str, Grow]]:
+    """The simplest model, and what may be added to it one after the other; None where an addition makes no sense."""
+    o = len(kinematics.output_names)
+    none, nothing = (0,) * o, np.empty(0)
+    if log.mapping.model != "rigid_body":
+        affine = AffineNominal(kinematics, o)
+        return (
+            "increments",
+            LogModel(kinematics, Still(o), nothing, none),
+            {
+                "least squares": lambda model: replace(model, nominal=affine),
+                "disturbance": lambda model: replace(model, history=(PAST,) * o),
+            },
+        )
+    volts = bool(log.context_names) and log.mapping.of("context")[0].unit in ("V", "mV")
+    voltage = float(np.median(np.concatenate([run.context[:, 0] for run in log]))) if volts else 0.0
+    thrusts = all(signal.unit == "N" for signal in log.mapping.of("inputs"))
+    plain = MultirotorNominal(len(log.input_names), voltage=voltage, thrusts=thrusts)
+    return (
+        "rigid body",
+        LogModel(kinematics, plain, nothing, none),
+        {
+            "force disturbance": lambda model: replace(model, history=(PAST,) * 3 + (0,) * 3),
+            "motor torque": lambda model: replace(model, nominal=replace(model.nominal, torque=True)),
+            FEEDBACK: lambda model: replace(model, nominal=replace(model.nominal, feedback=True)),
+            LATE_INPUTS: lambda model: replace(model, lag=LATE) if model.nominal.torque else None,
+            "torque disturbance": lambda model: (
+                replace(model, history=(*model.history[:3], PAST, PAST, PAST)) if model.nominal.torque else None
+            ),
+        },
+    )
+
+
+def _split(log: Log, count: int) -> list[tuple[Log, Log]]:
+    """Folds by run; of a single run by time."""
+    if len(log.runs) == 1:
+        halves = log.split_by_time(0.5)
+        log = replace(log, runs=tuple(half.runs[0] for half in halves))
+    names = [run.name for run in sorted(log.runs, key=len)]
+    groups = [names[i::count] for i in range(count)]
+    return [log.split(group) for group in groups]
+
+
+def _fit(structure: LogModel, simpler: LogModel, log: Log, steps: int) -> NominalFit:
+    """Fits a structure's nominal part, from the parameters that a simpler model has in common with it."""
+    if not isinstance(structure.nominal, AffineNominal):
+        known = dict(zip(simpler.nominal.parameter_names, simpler.theta, strict=False))
+        pairs = zip(structure.nominal.parameter_names, structure.nominal.start, strict=True)
+        return fit_nominal(structure, np.array([known.get(name, start) for name, start in pairs]), log, steps)
+    affine = fit_least_squares(structure.kinematics, log)  # linear in its many parameters
+    unknown = np.full(len(affine.theta), np.nan)
+    return NominalFit(replace(affine, history=structure.history), unknown, np.nan, np.nan, 1)
+
+
+def _with_parameters(structure: LogModel, theta: Sequence[float]) -> LogModel:
+    nominal = structure.nominal
+    if isinstance(nominal, AffineNominal):
+        structure = replace(structure, nominal=replace(nominal, feature_dim=len(theta) // nominal.output_dim - 1))
+    return structure.with_theta(np.array(theta, dtype=float))
+
+
+def _with_gp(model: LogModel, log: Log, outputs: tuple[int, ...], average: int, points: int, seed: int) -> LogModel:
+    return replace(model, gps=(*model.gps, _train(model, log, outputs, average, points, seed)))
+
+
+def _train(model: LogModel, log: Log, outputs: tuple[int, ...], average: int, points: int, seed: int) -> OutputGP:
+    """Trains a GP on what the nominal part leaves of some outputs, averaged over some rows."""
+    cut = log.windows(average, model.lag)
+    at = slice(cut.past, cut.past + average)
+    x, u = cut.states[:, at], cut.inputs[:, cut.past - model.lag : cut.past - model.lag + average]
+    c = np.broadcast_to(cut.context[:, -1:], (*x.shape[:-1], cut.context.shape[-1]))
+    seen = model.kinematics.outputs(x[:, 0], cut.states[:, cut.past + average], cut.time_step * average)
+    y = seen - model.nominal.outputs(model.theta, x, u, c).mean(axis=1)
+    middle = average // 2
+    z = model.kinematics.features(x[:, middle], u[:, middle], c[:, middle])
+    rows = choose_rows(z, points, seed)
+    trainer = Trainer(predicts="value", scaling=standardize, restarts=1, tolerance=1e-6)
+    y = np.ascontiguousarray(y[rows][:, list(outputs)])
+    return OutputGP(outputs, trainer.fit(torch.from_numpy(z[rows]), torch.from_numpy(y), 0, "value", seed).posterior)
+
+
+def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:
+    """Chooses rows nearest to the centres of k-means that begins with farthest points, so that rare states count.
+
+    Args:
+        features: (N, d); standardised here.
+        count: Of rows; all where there are no more.
+        seed: Of the random starts.
+
+    Raises:
+        DataError: No row.
+    """
+    from scipy.spatial import cKDTree
+
+    if not len(features):
+        raise DataError("no row to choose from")
+    if len(features) <= count:
+        return np.arange(len(features))
+    z = (features - features.mean(axis=0)) / np.maximum(features.std(axis=0), 1e-12)
+    sample = z[np.random.default_rng(seed).permutation(len(z))[: 10 * count]]
+    chosen, distance = [0], np.full(len(sample), np.inf)
+    while len(chosen) < count:  # farthest points (Gonzalez, 1985)
+        distance = np.minimum(distance, np.square(sample - sample[chosen[-1]]).sum(axis=1))
+        chosen.append(int(distance.argmax()))
+    centres = sample[chosen]
+    for _ in range(5):  # of Lloyd's algorithm
+        nearest = cKDTree(centres).query(sample)[1]
+        members = np.bincount(nearest, minlength=count)
+        for j in range(z.shape[1]):
+            sums = np.bincount(nearest, sample[:, j], minlength=count)
+            centres[:, j] = np.where(members > 0, sums / np.maximum(members, 1), centres[:, j])
+    return np.unique(cKDTree(z).query(centres)[1])
