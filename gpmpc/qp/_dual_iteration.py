@@ -45,17 +45,9 @@ _BAD = 0.5  # those violated by more than this share of the worst
 
 @inline_njit
 def iterate(work, active, k, count, margin, iterations, batches):
-    """Changes the working set until no constraint is violated by more than ``margin``.
+    """Changes the working set until no constraint is violated by more than ``margin``, in units of ``scale``.
 
-    Args:
-        work: The program.
-        active: The working set.
-        k: Its size.
-        count: How many constraints are violated, and listed; ``-1 - g`` where y is not known yet, and the first g
-            candidates, a guess, are to enter before.
-        margin: In units of ``scale``.
-        iterations: So far.
-        batches: So far.
+    ``count`` of them are, and listed; ``-1 - g`` says that y is not known yet, and that g guessed candidates enter first.
 
     Returns:
         ``SOLVED``, ``INFEASIBLE`` or ``ITERATION_LIMIT``, the size of the working set, iterations and batches so far,
