@@ -47,7 +47,7 @@ _BAD = 0.5  # those violated by more than this share of the worst
 def iterate(work, active, k, count, margin, iterations, batches):
     """Changes the working set until no constraint is violated by more than ``margin``, in units of ``scale``.
 
-    ``count`` of them are, and listed; ``-1 - g`` says that y is not known yet and that g guessed candidates enter first.
+    ``count`` are, and listed; ``-1 - g`` says that y is not known yet and that g guessed candidates enter first.
 
     Returns:
         ``SOLVED``, ``INFEASIBLE`` or ``ITERATION_LIMIT``, the size of the working set, iterations and batches so far,
