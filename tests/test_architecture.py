@@ -91,7 +91,7 @@ HOUSE = House(ROOT)
     ("what", "count", "most"),
     [
         ("lines of gpmpc/", HOUSE.lines, 31_200),
-        ("public functions and classes", len(HOUSE.public_names), 545),
+        ("public functions and classes", len(HOUSE.public_names + HOUSE.exported_names), 545),
         ("functions with more than 10 arguments", len(HOUSE.functions_above(10)), 0),
         ("files of mpc/", HOUSE.mpc_files, 15),
         ("circles of rooms", len(HOUSE.room_circles), 0),

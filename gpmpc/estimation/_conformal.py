@@ -140,8 +140,8 @@ class AdaptiveTube:
             violations most of all. By default (1 - eta) / 5.
         noise: Covariance of the measurements of what ``observe`` is given (n, n); none by default.
         largest: The largest number of standard deviations; twice the largest score of all by default.
-        decisions: After how many the exact upper 95 % limit of the share of violations is to be at or below 1 - eta;
-            by default the share itself is brought to 1 - eta.
+        decisions: After how many predictions of a stage the exact upper 95 % limit of the share that did not hold is to
+            be at or below 1 - eta; by default the share itself is brought to 1 - eta.
 
     Raises:
         SettingError: A probability not between 0 and 1, a rate that is not positive, or too few decisions to say so.
@@ -195,15 +195,25 @@ class AdaptiveTube:
         self._bounds[self._step % H] = np.nan  # until a plan of this step is remembered
         return self.kappas
 
-    def remember(self, means: Array, covariances: Array) -> None:
-        """Remembers a plan from the current state on, as a decision has it: (H + 1, n) and (H + 1, n, n)."""
+    def remember(self, means: Array, covariances: Array, stages: Any = None) -> None:
+        """Remembers a plan from the current state on.
+
+        Args:
+            means: As a decision has them (H + 1, n).
+            covariances: Likewise (H + 1, n, n).
+            stages: Whether each stage's prediction counts (H,), such as where the plan touches a bound: how often
+                bounds are violated there is what alpha follows then. By default all count.
+        """
         means, covariances = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
         G, expected = self.tube.rows, (self.tube.horizon + 1, self.tube.rows.shape[1])
         if means.shape != expected:
             raise ShapeError(f"means must be {expected}; got {means.shape}")
         variances = np.einsum("ri,kij,rj->kr", G, covariances[1:] + self.noise, G)
         margins = self.kappas[:, None] * np.sqrt(variances.clip(0.0))
-        self._bounds[self._step % self.tube.horizon] = means[1:] @ G.T + margins
+        bounds = means[1:] @ G.T + margins
+        if stages is not None:
+            bounds[~np.asarray(stages, dtype=bool)] = np.nan
+        self._bounds[self._step % self.tube.horizon] = bounds
 
     @property
     def violations(self) -> Array:
