@@ -21,7 +21,7 @@ from gpmpc.logs._kinematics import Increments, Kinematics, RigidBody
 from gpmpc.logs._log import Log
 from gpmpc.logs._noise import OutputNoise, fit_noise
 from gpmpc.logs._nominal import AffineNominal, MultirotorNominal, Still
-from gpmpc.logs._rollouts import PAST, STEPS, LogModel, OutputGP, choose_stride, rollout_errors
+from gpmpc.logs._rollouts import PAST, STEPS, LogModel, OutputGP, choose_stride, finite_errors
 from gpmpc.logs._state_space import Array
 
 AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
@@ -76,17 +76,11 @@ class _Folds:
             stride = choose_stride(held_out, self.steps + past, WINDOWS)
             self.windows.append(held_out.windows(self.steps, past, stride))
 
-    def errors(self, models: Sequence[LogModel]) -> list[Array]:
-        """Of the rollouts of each fold's model on its held-out windows (W, steps, e)."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            pairs = zip(self.windows, models, strict=True)
-            return [np.nan_to_num(rollout_errors(cut, model.rollout(cut)), nan=1e9) for cut, model in pairs]
-
     def judge(self, name: str, models: Sequence[LogModel]) -> Candidate:
         """Mean error of each group at the steps that decide."""
-        errors = np.concatenate(self.errors(models))
-        at = [min(step, self.steps) - 1 for step in JUDGED]
-        return Candidate(name, self.windows[0].space.distances(errors[:, at]).mean(axis=0))
+        steps, pairs = [min(step, self.steps) for step in JUDGED], zip(self.windows, models, strict=True)
+        errors = np.concatenate([finite_errors(cut, model, steps) for cut, model in pairs])
+        return Candidate(name, self.windows[0].space.distances(errors).mean(axis=0))
 
 
 def learn(
@@ -156,8 +150,7 @@ def learn(
                 best, choice[group] = len(candidates) - 1, average
     progress(f"chosen: {candidates[best].name}")
     progress("noise from the errors of held-out rollouts")
-    errors = folds.errors(models)
-    noise = fit_noise(models, folds.windows, errors)
+    noise = fit_noise(models, [held_out for _, held_out in folds.parts], steps)
     progress("the chosen structure, fitted to all runs")
     fit = _fit(structure, models[0], log, steps)
     groups = kinematics.output_groups

@@ -126,6 +126,13 @@ def rollout_errors(windows: Windows, predicted: Array, steps: Any = None) -> Arr
     return windows.space.difference(predicted[..., steps - 1, :], windows.states[:, windows.past + steps])
 
 
+def finite_errors(windows: Windows, model: LogModel, steps: Any = None) -> Array:
+    """Computes the errors of a model's rollouts, of which those that diverge are 1e9."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = rollout_errors(windows, model.rollout(windows), steps)
+    return np.nan_to_num(errors, nan=1e9, posinf=1e9, neginf=-1e9)
+
+
 def choose_stride(log: Log, rows: int, most: int) -> int:
     """The stride at which windows of that many rows are ``most`` at most."""
     count = sum(max(b - a - rows, 0) for run in log.runs for a, b in run.pieces)

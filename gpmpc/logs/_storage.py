@@ -45,7 +45,6 @@ def save_learned(learned: Learned, path: str | Path) -> None:
         "history": model.history,
         "lag": model.lag,
         "gps": [gp.outputs for gp in model.gps],
-        "time_constants": learned.noise.time_constants,
         "fit": [learned.fit.cost, learned.fit.start_cost, learned.fit.evaluations],
         "candidates": [[c.name, c.chosen, c.errors.tolist()] for c in learned.candidates],
         "rows": learned.rows,
@@ -115,9 +114,7 @@ def _learned(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Learned:
     model = LogModel(kinematics, nominal, arrays["theta"], tuple(header["history"]), header["lag"], tuple(gps))
     return Learned(
         model,
-        OutputNoise(
-            arrays["noise/outputs"], arrays["noise/measurement"], arrays["noise/level"], tuple(header["time_constants"])
-        ),
+        OutputNoise(arrays["noise/outputs"], arrays["noise/measurement"], arrays["noise/level"]),
         NominalFit(model, arrays["standard_errors"], *header["fit"]),
         tuple(Candidate(name, np.array(errors), chosen) for name, chosen, errors in header["candidates"]),
         arrays["ranges"],
