@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from gpmpc.dynamics import DynamicsModel, Linearized, check_query, to_array
-from gpmpc.exceptions import DataError, GpmpcError, SettingError
+from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.storage import load_metadata
 from gpmpc.logs._noise import OutputNoise
 from gpmpc.logs._rollouts import LogModel
 from gpmpc.logs._state_space import Array, wrap
-from gpmpc.logs._storage import holds_learned, load_learned
+from gpmpc.logs._storage import KIND, load_learned
 from gpmpc.models import load_model
 from gpmpc.systems import System
 
@@ -160,16 +160,14 @@ def load_flyable(path: str | Path) -> SavedModel:
         DataError: The file is missing, damaged or of another kind.
         SettingError: What is in it cannot be flown.
     """
-    if holds_learned(path):
+    header = load_metadata(path)
+    if header.get("kind") == KIND:
         learned = load_learned(path)
         if learned.context_names:
             context = ", ".join(learned.context_names)
             raise SettingError("model", f"{path} needs a context ({context}), which is not known in flight")
         flown = LogDynamics(learned.model, len(learned.input_names), learned.time_step, learned.noise)
         return SavedModel(str(path), flown, learned.state_names, learned.input_names, learned.time_step)
-    try:
-        said = load_metadata(path).get("metadata") or {}
-        states, inputs = (tuple(said.get(key) or ()) for key in ("states", "inputs"))
-        return SavedModel(str(path), load_model(path), states, inputs, said.get("time_step"))
-    except GpmpcError as error:
-        raise DataError(str(error)) from error
+    said = header.get("metadata") or {}
+    states, inputs = (tuple(said.get(key) or ()) for key in ("states", "inputs"))
+    return SavedModel(str(path), load_model(path), states, inputs, said.get("time_step"))

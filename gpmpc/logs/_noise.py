@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize, nnls
+from scipy.optimize import nnls
 
 from gpmpc.logs._log import Log, Windows
 from gpmpc.logs._rollouts import PAST, LogModel, choose_stride, finite_errors
@@ -27,22 +27,15 @@ WINDOWS, LINEARIZED = 2000, 200  # of a fold: whose errors count, and along whic
 
 @dataclass(frozen=True)
 class OutputNoise:
-    """Variances of the sources of a model's errors.
+    """Variances of the sources of a model's errors."""
 
-    The level of a prediction, exp(level . (1, z)), multiplies all of them; z are the logarithms of the mean squared
-    one-step residuals of each group of outputs over the rows before the start: a rough flight stays rough for a while.
-    """
-
-    outputs: Array  #: of each of ``TIME_CONSTANTS`` and output (T, o), in squared units of the outputs, at level one
+    outputs: Array  #: of each of ``TIME_CONSTANTS`` and output (T, o), in squared units of the outputs
     measurement: Array  #: of each entry of a difference of states (e,), likewise
-    level: Array  #: coefficients (1 + groups of outputs,)
 
 
 def error_variances(model: LogModel, windows: Windows, noise: OutputNoise, steps: Sequence[int]) -> Array:
     """Computes the variances (W, len(steps), e) of a model's errors at some steps after the starts of windows."""
-    weights = np.concatenate([noise.outputs.ravel(), noise.measurement])
-    level = np.exp(_regressors(model, _past_squares(model, windows)) @ noise.level)
-    return level[:, None, None] * (_responses(model, windows, steps) @ weights)
+    return _responses(model, windows, steps) @ np.concatenate([noise.outputs.ravel(), noise.measurement])
 
 
 def follow_errors(windows: Windows, errors: Array, variances: Array, steps: Sequence[int]) -> Array:
@@ -73,21 +66,6 @@ def follow_errors(windows: Windows, errors: Array, variances: Array, steps: Sequ
     return scaled
 
 
-def _past_squares(model: LogModel, windows: Windows) -> Array:
-    """Mean squares (W, o) of the residuals one step ahead over the rows before each start."""
-    first = model.lag
-    x, u = windows.states[:, first : windows.past + 1], windows.inputs[:, : windows.past - model.lag]
-    y = model.kinematics.outputs(x[:, :-1], x[:, 1:], windows.time_step)
-    return np.square(y - model.outputs(x[:, :-1], u, windows.context[:, first : windows.past])).mean(axis=1)
-
-
-def _regressors(model: LogModel, squares: Array) -> Array:
-    """One, and the logarithm of each group's mean of ``_past_squares`` (W, 1 + groups)."""
-    groups = model.kinematics.output_groups.values()
-    columns = [np.log(squares[:, list(group)].mean(axis=1) + 1e-12) for group in groups]
-    return np.column_stack([np.ones(len(squares)), *columns])
-
-
 def fit_noise(models: Sequence[LogModel], logs: Sequence[Log], most: int) -> OutputNoise:
     """Finds the noise that explains the errors of rollouts on held-out runs.
 
@@ -100,24 +78,23 @@ def fit_noise(models: Sequence[LogModel], logs: Sequence[Log], most: int) -> Out
         most: Steps of the longest rollouts.
     """
     steps = [step for step in FITTED if step <= most]
-    found: list[tuple[Array, ...]] = []
+    found: list[tuple[Array, Array, Array]] = []
     for model, log in zip(models, logs, strict=True):
         past = max(model.past, PAST)
         cut = log.windows(most, past, choose_stride(log, most + past, WINDOWS))
-        squares = np.square(finite_errors(cut, model, steps))
-        few = slice(None, None, -(-len(cut) // LINEARIZED))  # derivatives are slow, and vary little
-        found.append((squares, squares[few], _responses(model, cut[few], steps), _past_squares(model, cut[few])))
-    squares, some, responses, residuals = (np.concatenate(one) for one in zip(*found, strict=True))
-    mean = np.maximum(squares.mean(axis=0), 1e-300)
-    relative = (responses.mean(axis=0) / mean[..., None]).reshape(-1, responses.shape[-1])
+        few = cut[:: -(-len(cut) // LINEARIZED)]  # derivatives are slow, and vary little
+        x, after = cut.states[:, past], cut.states[:, past + 1]
+        y = model.outputs(x, cut.inputs[:, past - model.lag], cut.context[:, past]) + model.disturbance(cut)
+        residuals = model.kinematics.outputs(x, after, cut.time_step) - y
+        found.append((np.square(finite_errors(cut, model, steps)), _responses(model, few, steps), np.square(residuals)))
+    mean, responses, squares = (np.concatenate(one).mean(axis=0) for one in zip(*found, strict=True))
+    relative = (responses / np.maximum(mean, 1e-300)[..., None]).reshape(-1, responses.shape[-1])
     factor = np.maximum(relative.max(axis=0), 1e-300)
-    alike = _alike(models[0], factor, residuals.mean(axis=0))
+    alike = _alike(models[0], factor, squares)
     targets = np.r_[np.ones(len(relative)), np.zeros(len(alike))]
     variances = nnls(np.vstack([relative / factor, alike]), targets)[0] / factor
-    ratio = (some / np.maximum(responses @ variances, 1e-300)).mean(axis=(1, 2))
-    level = _fit_level(_regressors(models[0], residuals), ratio)
-    by_output, measured = np.split(variances, [len(TIME_CONSTANTS) * residuals.shape[1]])
-    return OutputNoise(by_output.reshape(len(TIME_CONSTANTS), -1), measured, level)
+    by_output, measured = np.split(variances, [len(TIME_CONSTANTS) * len(squares)])
+    return OutputNoise(by_output.reshape(len(TIME_CONSTANTS), -1), measured)
 
 
 def _alike(model: LogModel, factor: Array, squares: Array) -> Array:
@@ -131,21 +108,6 @@ def _alike(model: LogModel, factor: Array, squares: Array) -> Array:
                 row[pair] = scale.mean() / scale * [1.0, -1.0]
                 rows.append(row)
     return np.array(rows).reshape(-1, len(factor))
-
-
-def _fit_level(z: Array, ratio: Array) -> Array:
-    """Fits E ratio = exp(z b) by maximum likelihood of exponential distributions (gamma regression, log link)."""
-    centre = z[:, 1:].mean(axis=0)
-    z = np.column_stack([z[:, :1], z[:, 1:] - centre])
-
-    def objective(b: Array) -> tuple[float, Array]:
-        eta = np.clip(z @ b, -20, 20)
-        scaled = ratio * np.exp(-eta)
-        penalty = np.r_[0.0, b[1:]] / len(z)
-        return float((scaled + eta).mean() + penalty @ b / 2), z.T @ (1 - scaled) / len(z) + penalty
-
-    b = minimize(objective, np.zeros(z.shape[1]), jac=True, method="BFGS").x
-    return np.r_[b[0] - centre @ b[1:], b[1:]]
 
 
 def _responses(model: LogModel, windows: Windows, steps: Sequence[int]) -> Array:

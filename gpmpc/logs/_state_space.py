@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.exceptions import SettingError
 
 Array = NDArray[np.float64]
 Kind = Literal["vector", "angle", "quaternion"]
@@ -110,15 +110,6 @@ class StateSpace:
     def distances(self, errors: Array) -> Array:
         """Computes the Euclidean or geodesic length of each group's error (..., groups) of errors (..., e)."""
         return np.stack([np.linalg.norm(errors[..., at], axis=-1) for at in self.error_columns], axis=-1)
-
-    def check(self, states: Array) -> None:
-        """Raises unless states are (..., n) of this space.
-
-        Raises:
-            ShapeError: Another number of entries.
-        """
-        if np.shape(states)[-1:] != (self.dim,):
-            raise ShapeError(f"states must have {self.dim} entries ({', '.join(self.names)}); got {np.shape(states)}")
 
 
 def _slices(lengths: Sequence[int]) -> tuple[slice, ...]:

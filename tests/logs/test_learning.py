@@ -143,7 +143,7 @@ def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path):
     np.testing.assert_allclose(*variances, rtol=1e-6)
     assert [c.name for c in loaded.candidates] == [c.name for c in learned.candidates]
     (tmp_path / "cut.safetensors").write_bytes((tmp_path / "model.safetensors").read_bytes()[:-100])
-    with pytest.raises(DataError, match="not a readable"):
+    with pytest.raises(DataError, match="damaged"):
         load_learned(tmp_path / "cut.safetensors")
     # What an earlier call has gone through is not done again, and changes nothing.
     again = learn(log, points=40, steps=20, memory=dict(memory))
@@ -162,7 +162,9 @@ def test_learning_is_the_same_whatever_marks_a_gap(tmp_path):
     """Rows that are missing, rows without values, and stamps that jump leave the rows that are there as they are."""
     tables = {way: [] for way in ("missing", "empty", "jump")}
     for run in pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1], rows=300):
-        table = pandas.DataFrame(np.column_stack([run.time, run.states, run.inputs]), columns=["t", "angle", "rate", "u"])
+        table = pandas.DataFrame(
+            np.column_stack([run.time, run.states, run.inputs]), columns=["t", "angle", "rate", "u"]
+        )
         gap = table.index.isin(range(120, 150))
         tables["missing"].append(table[~gap])
         tables["empty"].append(table.assign(rate=table["rate"].where(~gap)))
@@ -177,7 +179,7 @@ def test_learning_is_the_same_whatever_marks_a_gap(tmp_path):
         assert [run.begins for run in log] == [(0, 120)] * 3, way
         learned = learn(log, points=30, steps=10)
         noise = learned.noise
-        numbers = [learned.model.theta, *(c.errors for c in learned.candidates), noise.outputs, noise.level]
+        numbers = [learned.model.theta, *(c.errors for c in learned.candidates), noise.outputs, noise.measurement]
         windows = log.windows(10, 20, 50)
         found.append(np.concatenate([a.ravel() for a in (*numbers, learned.model.rollout(windows), windows.inputs)]))
     np.testing.assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-9)
