@@ -22,11 +22,6 @@ PENALTY = 1.0  # of squared coefficients of standardised columns, per 100 rows
 WINDOWS = 3000
 
 
-def predict_still(windows: Windows, step: int) -> Array:
-    """The state at the start (W, n), whatever the step."""
-    return windows.states[:, windows.past]
-
-
 def fit_least_squares(kinematics: Kinematics, log: Log) -> LogModel:
     """Fits outputs that are affine in the features, one step ahead on all rows."""
     cut = log.windows(1)

@@ -5,7 +5,7 @@ residuals are the errors of the rollouts themselves, each divided by the mean er
 (multiple-step prediction error; Ljung, 1999, section 3.3), with a loss that is linear for outliers.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -61,7 +61,7 @@ def fit_nominal(
     past = max(model.past, PAST)
     cut = log.windows(steps, past, choose_stride(log, steps + past, windows))
     if not len(theta0):
-        return NominalFit(model.with_theta(theta0), theta0, 0.0, 0.0, 0)
+        return NominalFit(replace(model, theta=theta0), theta0, 0.0, 0.0, 0)
     at = np.unique(np.geomspace(1, steps, 8).round().astype(int))
     scale = still_error(cut, at)
 
@@ -96,7 +96,7 @@ def fit_nominal(
     start_cost = float((np.sqrt(1 + first**2) - 1).sum() / first.size)
     errors = _standard_errors(found.x, jacobian(found.x), residuals(found.x[None])[0])
     return NominalFit(
-        model.with_theta(found.x), errors, float(found.cost / first.size), start_cost, found.nfev + found.njev
+        replace(model, theta=found.x), errors, float(found.cost / first.size), start_cost, found.nfev + found.njev
     )
 
 

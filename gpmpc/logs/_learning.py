@@ -6,7 +6,7 @@ rollouts as well.
 """
 
 from collections.abc import Callable, MutableMapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -62,25 +62,19 @@ class Learned:
     time_step: float  #: [s]
 
 
-@dataclass
 class _Folds:
     """Splits of a log by run, with held-out windows."""
 
-    parts: list[tuple[Log, Log]]
-    steps: int
-    windows: list = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        past = PAST + LATE
-        for _, held_out in self.parts:
-            stride = choose_stride(held_out, self.steps + past, WINDOWS)
-            self.windows.append(held_out.windows(self.steps, past, stride))
+    def __init__(self, parts: list[tuple[Log, Log]], steps: int):
+        self.parts, self._at, past = parts, [min(step, steps) for step in JUDGED], PAST + LATE
+        logs = [held_out for _, held_out in parts]
+        self._windows = [log.windows(steps, past, choose_stride(log, steps + past, WINDOWS)) for log in logs]
 
     def judge(self, name: str, models: Sequence[LogModel]) -> Candidate:
         """Mean error of each group at the steps that decide."""
-        steps, pairs = [min(step, self.steps) for step in JUDGED], zip(self.windows, models, strict=True)
-        errors = np.concatenate([finite_errors(cut, model, steps) for cut, model in pairs])
-        return Candidate(name, self.windows[0].space.distances(errors).mean(axis=0))
+        pairs = zip(self._windows, models, strict=True)
+        errors = np.concatenate([finite_errors(cut, model, self._at) for cut, model in pairs])
+        return Candidate(name, self._windows[0].space.distances(errors).mean(axis=0))
 
 
 def learn(
@@ -131,7 +125,7 @@ def learn(
             memory[trial_name] = [_fit(trial, m, train, steps).model.theta.tolist() for m, (train, _) in pairs]
         fitted = [_with_parameters(trial, theta) for theta in memory[trial_name]]
         candidates.append(folds.judge(trial_name, fitted))
-        if not models or is_better(candidates[-1], candidates[best]):
+        if not models or _is_better(candidates[-1], candidates[best]):
             best, models, name, structure = len(candidates) - 1, fitted, trial_name, trial
     choice: dict[str, int] = {}
     for group, outputs in kinematics.output_groups.items():
@@ -145,7 +139,7 @@ def learn(
                 trained = [grown(m, train) for m, (train, _) in zip(base, folds.parts, strict=True)]
                 memory[words] = folds.judge(words, trained).errors.tolist()
             candidates.append(Candidate(words, np.array(memory[words])))
-            if is_better(candidates[-1], candidates[best]):
+            if _is_better(candidates[-1], candidates[best]):
                 models = trained or [grown(m, train) for m, (train, _) in zip(base, folds.parts, strict=True)]
                 best, choice[group] = len(candidates) - 1, average
     progress(f"chosen: {candidates[best].name}")
@@ -158,21 +152,21 @@ def learn(
     candidates[best] = replace(candidates[best], chosen=True)
     values = np.concatenate([np.hstack([run.states, run.inputs]) for run in log])
     return Learned(
-        replace(fit.model, gps=gps),
-        noise,
-        fit,
-        tuple(candidates),
-        np.stack([values.min(axis=0), values.max(axis=0)]),
-        len(log),
-        tuple(run.name for run in log),
-        log.mapping.column_names("states"),
-        log.mapping.column_names("inputs"),
-        log.mapping.column_names("context"),
-        log.time_step,
+        model=replace(fit.model, gps=gps),
+        noise=noise,
+        fit=fit,
+        candidates=tuple(candidates),
+        ranges=np.stack([values.min(axis=0), values.max(axis=0)]),
+        rows=len(log),
+        runs=tuple(run.name for run in log),
+        state_names=log.mapping.column_names("states"),
+        input_names=log.mapping.column_names("inputs"),
+        context_names=log.mapping.column_names("context"),
+        time_step=log.time_step,
     )
 
 
-def is_better(candidate: Candidate, incumbent: Candidate) -> bool:
+def _is_better(candidate: Candidate, incumbent: Candidate) -> bool:
     """Whether a candidate's errors are smaller on the whole, and in no group at no step much larger."""
     ratio = np.log(np.maximum(candidate.errors, 1e-12) / np.maximum(incumbent.errors, 1e-12))
     return bool(ratio.mean() < -GAIN and ratio.max() < LOSS)
@@ -240,7 +234,7 @@ def _with_parameters(structure: LogModel, theta: Sequence[float]) -> LogModel:
     nominal = structure.nominal
     if isinstance(nominal, AffineNominal):
         structure = replace(structure, nominal=replace(nominal, feature_dim=len(theta) // nominal.output_dim - 1))
-    return structure.with_theta(np.array(theta, dtype=float))
+    return replace(structure, theta=np.array(theta, dtype=float))
 
 
 def _with_gp(model: LogModel, log: Log, outputs: tuple[int, ...], average: int, points: int, seed: int) -> LogModel:

@@ -144,6 +144,10 @@ class LogMapping:
         """The signals of one role."""
         return tuple(signal for signal in self.signals if signal.role == role)
 
+    def entries(self, role: Role) -> tuple[str, ...]:
+        """Names of the entries of one role, as they come out."""
+        return tuple(entry for signal in self.of(role) for entry in signal.group.entries)
+
     def column_names(self, role: Role) -> tuple[str, ...]:
         """The columns of one role in the order that they come out in, with what was done to their values."""
         found = []

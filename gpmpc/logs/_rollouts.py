@@ -7,7 +7,7 @@ model says; it is held through the prediction, and so is the context c (a batter
 its future is not known).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -105,10 +105,6 @@ class LogModel:
             x = self.kinematics.step(x, y, windows.time_step)
             found[..., k, :] = x
         return found
-
-    def with_theta(self, theta: Array) -> "LogModel":
-        """The model with other parameters."""
-        return replace(self, theta=theta)
 
 
 def rollout_errors(windows: Windows, predicted: Array, steps: Any = None) -> Array:

@@ -77,9 +77,3 @@ def resample(time: Array, values: Array, grid: Array, rule: str, max_gap: float)
             found = one + share * (other - one)
         usable = exact | ((at >= 0) & (at < len(time) - 1) & (span <= max_gap))
     return np.where(usable[:, None], found, np.nan)
-
-
-def windows_of(pieces: list[tuple[int, int]], past: int, ahead: int, stride: int) -> np.ndarray:
-    """Lists the rows (W,) that have ``past`` rows before and ``ahead`` after them in their own piece (begin, end)."""
-    starts = [np.arange(begin + past, end - ahead, stride) for begin, end in pieces]
-    return np.concatenate([*starts, np.empty(0, dtype=int)]).astype(int)

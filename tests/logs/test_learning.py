@@ -218,7 +218,7 @@ def test_misuse_is_named(flights):
     with pytest.raises(DataError, match="the longest has 1500"):
         fit_nominal(model, None, log, steps=3000)
     with pytest.raises(SettingError, match="past"):
-        model.with_theta(model.nominal.start).rollout(log.windows(10))
+        replace(model, theta=model.nominal.start).rollout(log.windows(10))
 
 
 FLIGHTS = os.environ.get("GPMPC_FLIGHTS")
