@@ -37,9 +37,7 @@ class NominalFit:
         return list(zip(names, self.model.theta.tolist(), self.standard_errors.tolist(), strict=True))
 
 
-def fit_nominal(
-    model: LogModel, theta0: Array | None, log: Log, steps: int = STEPS, windows: int = WINDOWS
-) -> NominalFit:
+def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = STEPS) -> NominalFit:
     """Fits the parameters of a model's nominal part by the errors of its rollouts.
 
     Args:
@@ -47,19 +45,17 @@ def fit_nominal(
         theta0: Where the search begins (P,); the nominal model's ``start`` by default.
         log: All of its runs are used.
         steps: Of the rollouts; errors at eight of them, evenly spread over the logarithm, count.
-        windows: Most windows that are rolled out.
 
     Raises:
         ShapeError: theta0 has another length.
         DataError: No piece of the log is long enough, or the rollouts at theta0 are not finite.
     """
-    for key, value in (("steps", steps), ("windows", windows)):
-        check_number(key, value, least=1, whole=True)
+    check_number("steps", steps, least=1, whole=True)
     theta0 = model.nominal.start if theta0 is None else np.asarray(theta0, dtype=float)
     if theta0.shape != (len(model.nominal.parameter_names),):
         raise ShapeError(f"theta0 must have {len(model.nominal.parameter_names)} entries; got {theta0.shape}")
     past = max(model.past, PAST)
-    cut = log.windows(steps, past, choose_stride(log, steps + past, windows))
+    cut = log.windows(steps, past, choose_stride(log, steps + past, WINDOWS))
     if not len(theta0):
         return NominalFit(replace(model, theta=theta0), theta0, 0.0, 0.0, 0)
     at = np.unique(np.geomspace(1, steps, 8).round().astype(int))

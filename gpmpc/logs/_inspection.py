@@ -17,7 +17,7 @@ from gpmpc.exceptions import DataError
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._readers import STAMP, read_streams
-from gpmpc.logs._sampling import ordered_stamps
+from gpmpc.logs._reading import ordered_stamps
 from gpmpc.logs._state_space import Array
 
 if TYPE_CHECKING:

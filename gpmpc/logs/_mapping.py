@@ -158,9 +158,8 @@ class LogMapping:
             elif turned:
                 names = signal.group.entries
             factor = signal.scale * UNITS.get(signal.unit, ("", 1.0))[1]
-            other = self.model == "rigid_body" and signal.frame == {"m/s": "body", "rad/s": "world"}.get(
-                signal.group.unit
-            )
+            turned_frame = {"m/s": "body", "rad/s": "world"}.get(signal.group.unit)
+            other = self.model == "rigid_body" and signal.frame == turned_frame
             done = f" times {factor:.6g}" * (factor != 1 and not turned) + " in other axes" * other
             found += [f"{name}{done}" for name in names]
         return tuple(found)
