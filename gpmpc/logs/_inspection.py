@@ -166,10 +166,9 @@ def _time(path: str | Path, table: "DataFrame", mapping: LogMapping | None) -> t
 def _channel(name: str, time: Array, values: Array) -> Channel:
     present = np.isfinite(values)
     stride = max(len(values) // DRAWN, 1)
-    if not present.any():
-        nothing = float("nan")
-        return Channel(name, time[::stride], values[::stride], 1.0, 0.0, 0, nothing, nothing, 0.0, 0.0, 0.0)
     known = values[present]
+    if not len(known):
+        return Channel(name, time[::stride], values[::stride], 1.0, 0.0, 0, np.nan, np.nan, 0.0, 0.0, 0.0)
     same = np.diff(known) == 0
     changes = np.flatnonzero(np.r_[True, ~same, True])
     second = np.diff(known, 2)

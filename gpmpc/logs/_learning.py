@@ -5,6 +5,7 @@ averaged over 1, 5 or 10 rows, stays only where the rollouts of held-out runs ge
 rollouts as well.
 """
 
+import warnings
 from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -268,6 +269,7 @@ def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:
     Raises:
         DataError: No row.
     """
+    from scipy.cluster.vq import kmeans2
     from scipy.spatial import cKDTree
 
     if not len(features):
@@ -280,11 +282,7 @@ def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:
     while len(chosen) < count:  # farthest points (Gonzalez, 1985)
         distance = np.minimum(distance, np.square(sample - sample[chosen[-1]]).sum(axis=1))
         chosen.append(int(distance.argmax()))
-    centres = sample[chosen]
-    for _ in range(5):  # of Lloyd's algorithm
-        nearest = cKDTree(centres).query(sample)[1]
-        members = np.bincount(nearest, minlength=count)
-        for j in range(z.shape[1]):
-            sums = np.bincount(nearest, sample[:, j], minlength=count)
-            centres[:, j] = np.where(members > 0, sums / np.maximum(members, 1), centres[:, j])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a centre that loses its members stays
+        centres = kmeans2(sample, sample[chosen], iter=5, minit="matrix")[0]
     return np.unique(cKDTree(z).query(centres)[1])

@@ -10,7 +10,7 @@ import numpy as np
 from gpmpc.exceptions import DataError
 from gpmpc.logs._checks import check_plausible
 from gpmpc.logs._log import Finding, Log, LogRun
-from gpmpc.logs._mapping import TIME_UNITS, UNITS, LogMapping, Signal
+from gpmpc.logs._mapping import ROLES, TIME_UNITS, UNITS, LogMapping, Signal
 from gpmpc.logs._readers import STAMP, read_streams
 from gpmpc.logs._state_space import (
     Array,
@@ -125,30 +125,30 @@ def _tabulate(
     samples = {s.role + s.name: _values(file, tables[s.topic], s, name, findings) for s in mapping.signals}
     outside = {topic: _outside(file, table, mapping) for topic, table in tables.items()}
     if mapping.rate is None:
-        (topic,) = stamps
-        values = {
-            role: _side_by_side([samples[s.role + s.name] for s in mapping.of(role)], len(tables[topic]))
-            for role in ("states", "inputs", "context")
-        }
-        return _Table(name, stamps[topic].time, values, outside[topic], stamps[topic].after_reversal)
-    begin = max(found.time[0] for found in stamps.values())
-    end = min(found.time[-1] for found in stamps.values())
-    if not end > begin:
-        raise DataError(f"{file}: the topics {', '.join(stamps)} have no time in common")
-    grid = begin + np.arange(int(np.floor((end - begin) * mapping.rate * (1 + 1e-12))) + 1) / mapping.rate
+        ((grid, breaks),) = ((found.time, found.after_reversal) for found in stamps.values())
+    else:
+        begin = max(found.time[0] for found in stamps.values())
+        end = min(found.time[-1] for found in stamps.values())
+        if not end > begin:
+            raise DataError(f"{file}: the topics {', '.join(stamps)} have no time in common")
+        grid = begin + np.arange(int(np.floor((end - begin) * mapping.rate * (1 + 1e-12))) + 1) / mapping.rate
+        breaks = np.zeros(len(grid), dtype=bool)
+
+    def on_grid(topic: str, values: Array, rule: str, max_gap: float | None) -> Array:
+        if mapping.rate is None:
+            return values
+        time = stamps[topic].time
+        usual = max(float(np.median(np.diff(time))), 1 / mapping.rate)
+        return resample(time, values, grid, rule, max_gap or 1.5 * usual)
+
     values = {}
-    for role in ("states", "inputs", "context"):
-        parts = []
-        for s in mapping.of(role):
-            time, own = stamps[s.topic].time, samples[s.role + s.name]
-            usual = max(float(np.median(np.diff(time))), 1 / mapping.rate)
-            parts.append(resample(time, own, grid, s.rule, mapping.max_gap or 1.5 * usual))
-        values[role] = _side_by_side(parts, len(grid))
+    for role in ROLES:
+        parts = [on_grid(s.topic, samples[s.role + s.name], s.rule, mapping.max_gap) for s in mapping.of(role)]
+        values[role] = np.concatenate([np.empty((len(grid), 0)), *parts], axis=1)
     left_out = np.zeros(len(grid), dtype=bool)
-    for topic, found in stamps.items():
-        if outside[topic].any():
-            left_out |= resample(found.time, outside[topic][:, None].astype(float), grid, "hold", np.inf)[:, 0] > 0
-    return _Table(name, grid, values, left_out, np.zeros(len(grid), dtype=bool))
+    for topic, rows in outside.items():
+        left_out |= on_grid(topic, rows[:, None].astype(float), "hold", np.inf)[:, 0] > 0
+    return _Table(name, grid, values, left_out, breaks)
 
 
 def _time(label: str, table: "DataFrame", mapping: LogMapping) -> Array:
@@ -231,10 +231,6 @@ def _outside(file: Path, table: "DataFrame", mapping: LogMapping) -> np.ndarray:
     return outside
 
 
-def _side_by_side(parts: Sequence[Array], length: int) -> Array:
-    return np.concatenate(parts, axis=1) if parts else np.empty((length, 0))
-
-
 def _spread(tables: Sequence[_Table]) -> Array:
     """Usual spread of each state (n,) over all runs: half of the range of 80 % of the rows."""
     states = np.concatenate([table.values["states"] for table in tables])
@@ -248,7 +244,7 @@ def _spread(tables: Sequence[_Table]) -> Array:
 
 def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping, findings: list[Finding]) -> LogRun | None:
     """Leaves out what cannot be used, and marks where a new piece begins; None where nothing is left."""
-    states, inputs, context = (table.values[role] for role in ("states", "inputs", "context"))
+    states, inputs, context = (table.values[role] for role in ROLES)
     usable = np.ones(len(table.time), dtype=bool)
 
     def leave_out(rows: np.ndarray, kind: str, text: str) -> None:
