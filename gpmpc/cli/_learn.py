@@ -2,7 +2,7 @@
 
 import argparse
 import json
-from collections.abc import Iterator, MutableMapping
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -87,36 +87,21 @@ def _fingerprint(log: "Log", given: argparse.Namespace) -> str:
     return digest.hexdigest()
 
 
-class _FileMemory(MutableMapping[str, Any]):
+class _FileMemory(dict[str, Any]):
     """Outcomes of stages in a JSON file, which another log or other settings begin anew."""
 
     def __init__(self, path: Path, fingerprint: str):
-        self._path = path
-        self._content: dict[str, Any] = {"fingerprint": fingerprint, "stages": {}}
-        try:
+        self._path, self._fingerprint = path, fingerprint
+        with suppress(OSError, ValueError, KeyError, TypeError):  # nothing there, or nothing whole
             found = json.loads(path.read_text())
-            if found["fingerprint"] == fingerprint and isinstance(found["stages"], dict):
-                self._content = found
-        except (OSError, ValueError, KeyError, TypeError):
-            pass  # nothing there, or nothing whole
-
-    def __getitem__(self, key: str) -> Any:
-        return self._content["stages"][key]
+            if found["fingerprint"] == fingerprint:
+                self.update(found["stages"])
 
     def __setitem__(self, key: str, value: Any) -> None:
         from gpmpc.files import write_whole
 
-        self._content["stages"][key] = value
-        write_whole(self._path, json.dumps(self._content))
-
-    def __delitem__(self, key: str) -> None:
-        del self._content["stages"][key]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._content["stages"])
-
-    def __len__(self) -> int:
-        return len(self._content["stages"])
+        super().__setitem__(key, value)
+        write_whole(self._path, json.dumps({"fingerprint": self._fingerprint, "stages": self}))
 
 
 def report(
