@@ -6,12 +6,15 @@ residuals are the errors of the rollouts themselves, each divided by the mean er
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from gpmpc.exceptions import DataError, ShapeError, check_number
+from gpmpc.logs._kinematics import Kinematics
 from gpmpc.logs._log import Log, Windows
+from gpmpc.logs._nominal import AffineNominal
 from gpmpc.logs._rollouts import PAST, STEPS, LogModel, choose_stride, rollout_errors
 from gpmpc.logs._state_space import Array
 
@@ -59,7 +62,7 @@ def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = ST
     if not len(theta0):
         return NominalFit(replace(model, theta=theta0), theta0, 0.0, 0.0, 0)
     at = np.unique(np.geomspace(1, steps, 8).round().astype(int))
-    scale = still_error(cut, at)
+    scale = _still_error(cut, at)
 
     def residuals(theta: Array) -> Array:
         """Of parameter vectors (T, P): (T, W, steps, e)."""
@@ -96,7 +99,7 @@ def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = ST
     )
 
 
-def still_error(windows: Windows, at: np.ndarray) -> Array:
+def _still_error(windows: Windows, at: np.ndarray) -> Array:
     """Mean error (steps, e) of a state that does not move, the same for all entries of a group; never zero."""
     start = windows.states[:, windows.past : windows.past + 1]
     errors = rollout_errors(windows, np.repeat(start, windows.ahead, axis=1), at)
@@ -112,3 +115,14 @@ def _standard_errors(theta: Array, J: Array, residuals: Array) -> Array:
     blocks = np.add.reduceat(scores, np.arange(0, len(scores), BLOCK))
     bread = np.linalg.pinv(J.T @ (J * weights[:, None]))
     return np.sqrt(np.maximum(np.diagonal(bread @ (blocks.T @ blocks) @ bread), 0.0))
+
+
+def fit_least_squares(kinematics: Kinematics, log: Log) -> LogModel:
+    """Fits outputs that are affine in the features, one step ahead on all rows."""
+    cut = log.windows(1)
+    x, u, c = cut.states[:, 0], cut.inputs[:, 0], cut.context[:, 0]
+    z = kinematics.features(x, u, c)
+    y = kinematics.outputs(x, cut.states[:, 1], log.time_step)
+    solution: Any = np.linalg.lstsq(np.column_stack([z, np.ones(len(z))]), y, rcond=1e-8)[0]
+    nominal = AffineNominal(kinematics, y.shape[1], z.shape[1])
+    return LogModel(kinematics, nominal, solution.T.ravel(), (0,) * y.shape[1])

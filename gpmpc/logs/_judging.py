@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import ndtri
 
-from gpmpc.logs._baselines import Ridge, fit_least_squares
+from gpmpc.logs._fitting import fit_least_squares
+from gpmpc.logs._kinematics import Kinematics
 from gpmpc.logs._learning import Learned
-from gpmpc.logs._log import Log
+from gpmpc.logs._log import Log, Windows
 from gpmpc.logs._noise import error_variances, follow_errors
 from gpmpc.logs._rollouts import PAST, choose_stride, rollout_errors
 from gpmpc.logs._state_space import Array
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 
 STEPS, LEVEL = (1, 10, 50), 0.95
 WINDOWS = 1000
+RIDGE_WINDOWS = 3000  # to which the ridge regression is fitted
+LAGS = (1, 2, 3, 5, 8, 12, 20)  # rows of the past that it sees
+BINS = 5  # means of the future inputs that it sees
+PENALTY = 0.01  # of its squared coefficients of standardised columns, per row
 CHUNK = 100  # windows linearised at once
 NEEDED = ("constant state", "constant velocity", "least squares")  # a model must beat them
 
@@ -87,7 +92,8 @@ def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = ST
     past = max(model.past, PAST)
     stride = choose_stride(held_out, max(steps) + past, WINDOWS)
     cut = held_out.windows(max(steps), past, stride)
-    start, ridge = cut.states[:, past], Ridge.fit(kinematics, train, steps)
+    start, longest = cut.states[:, past], max(steps)
+    seen = train.windows(longest, PAST, choose_stride(train, longest + PAST, RIDGE_WINDOWS))
     own = rollout_errors(cut, model.rollout(cut), steps)
     with np.errstate(over="ignore", invalid="ignore"):
         affine = rollout_errors(cut, fit_least_squares(kinematics, train).rollout(cut), steps)
@@ -100,7 +106,7 @@ def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = ST
         "constant state": direct(lambda k: start),
         "constant velocity": direct(lambda k: kinematics.coast(start, k * cut.time_step)),
         "least squares": np.nan_to_num(affine, nan=np.inf, posinf=np.inf, neginf=np.inf),
-        "ridge regression": direct(lambda k: ridge.predict(cut, k)),
+        "ridge regression": direct(lambda k: _predict_by_ridge(kinematics, seen, cut, k)),
     }
     distances = {name: space.distances(e) for name, e in errors.items()}
     parts = [cut[i : i + CHUNK] for i in range(0, len(cut), CHUNK)]
@@ -126,3 +132,23 @@ def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = ST
         width=np.sqrt(of_groups(variances) / np.maximum(of_groups(np.square(own)), 1e-300)),
         windows=len(cut),
     )
+
+
+def _predict_by_ridge(kinematics: Kinematics, seen: Windows, windows: Windows, step: int) -> Array:
+    """Predicts states (W, n) at a step straight from past states, past and coming inputs, by a fit to ``seen``."""
+
+    def regressors(cut: Windows) -> Array:
+        start, past, u = cut.states[:, cut.past], cut.past, cut.inputs
+        columns = [kinematics.features(start, u[:, past], cut.context[:, past])]
+        columns += [cut.space.difference(start, cut.states[:, past - lag]) for lag in LAGS]
+        columns += [u[:, past - lag] for lag in LAGS]
+        columns += [u[:, past + rows].mean(axis=1) for rows in np.array_split(np.arange(step), min(BINS, step))]
+        return np.concatenate(columns, axis=1)
+
+    z = regressors(seen)
+    mean, factor = z.mean(axis=0), np.maximum(z.std(axis=0), 1e-12)
+    z, new = (np.column_stack([np.ones(len(a)), (a - mean) / factor]) for a in (z, regressors(windows)))
+    y = seen.space.difference(seen.states[:, seen.past + step], seen.states[:, seen.past])
+    penalty = PENALTY * len(z) * np.diag(np.r_[0.0, np.ones(z.shape[1] - 1)])
+    weights = np.linalg.solve(z.T @ z + penalty, z.T @ y)
+    return windows.space.displace(windows.states[:, windows.past], new @ weights)

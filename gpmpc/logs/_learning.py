@@ -16,8 +16,7 @@ import torch
 
 from gpmpc.exceptions import DataError, check_number
 from gpmpc.gp import Trainer, standardize
-from gpmpc.logs._baselines import fit_least_squares
-from gpmpc.logs._fitting import NominalFit, fit_nominal
+from gpmpc.logs._fitting import NominalFit, fit_least_squares, fit_nominal
 from gpmpc.logs._kinematics import Increments, Kinematics, RigidBody
 from gpmpc.logs._log import Log
 from gpmpc.logs._noise import OutputNoise, fit_noise
