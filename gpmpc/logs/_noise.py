@@ -105,7 +105,7 @@ def _alike(model: LogModel, factor: Array, squares: Array) -> Array:
             for i, j in itertools.pairwise(group):
                 row, pair = np.zeros(len(factor)), [start + i, start + j]
                 scale = factor[pair] * np.maximum(squares[[i, j]], 1e-300)
-                row[pair] = scale.mean() / scale * [1.0, -1.0]
+                row[pair] = scale.min() / scale * [1.0, -1.0]
                 rows.append(row)
     return np.array(rows).reshape(-1, len(factor))
 
