@@ -230,10 +230,9 @@ def describe(cell: dict) -> str:
 
 def draw(cells: list[dict], path: Path) -> None:
     """Median times per solver, and the ratios to DAQP beside their targets."""
-    import matplotlib
+    import matplotlib.pyplot as plt
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+    plt.style.use("gpmpc.plotting.gpmpc")
 
     modes = list(dict.fromkeys(cell["mode"] for cell in cells))
     figure, axes = plt.subplots(2, len(modes), figsize=(5.5 * len(modes), 7.5), squeeze=False, sharex=True)
@@ -259,12 +258,10 @@ def draw(cells: list[dict], path: Path) -> None:
         ratios.axhline(1.0, color="0.5", linewidth=0.8)
         ratios.minorticks_off()
         for axis in (times, ratios):
-            axis.grid(alpha=0.3)
-            axis.legend(fontsize=8, frameon=False)
+            axis.legend(fontsize=8)
     axes[0, 0].set_ylabel("median time per QP [us]")
     axes[1, 0].set_ylabel(f"{OURS} / best DAQP path")
-    figure.tight_layout()
-    figure.savefig(path, dpi=150)
+    figure.savefig(path)
 
 
 def main() -> None:

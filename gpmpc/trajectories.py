@@ -32,7 +32,11 @@ class Trajectory(Protocol):
 
 @dataclass(frozen=True)
 class Elliptical:
-    """The paper's helix: x = a sin(w t), y = b cos(w t), z = z0 + c t."""
+    """The paper's helix: x = a sin(w t), y = b cos(w t), z = z0 + c t.
+
+    >>> Elliptical()(0.0).tolist(), Elliptical().velocity(0.0).tolist()
+    ([0.0, 15.0, -5.0], [1.5, -0.0, -0.25])
+    """
 
     radius_x: float = 15.0  #: semi-axis a [m]
     radius_y: float = 15.0  #: semi-axis b [m]

@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -185,6 +186,9 @@ def experiment_of(config: DictConfig) -> "Experiment":
     if len(config.trajectory) != 1:
         raise SettingError("trajectory", f"choose one; got {', '.join(config.trajectory)}")
     system = _system_of(config.system)
+    if known := config.nominal:
+        known = _system_of(known if "_target_" in known else OmegaConf.merge(config.system, known))
+        system = replace(system, nominal=known)
     for group, part in (("propagation", "propagator"), ("solver", "solver")):
         if config.get(group):
             if part not in config.controller:

@@ -24,8 +24,8 @@ from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._kernel import IGNORED, check_posterior
 from gpmpc.gp._likelihood import FAILED, NegativeLogMarginalLikelihood, Objective
+from gpmpc.gp._scaling import Scaling
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.scaling import Scaling
 
 _log = logging.getLogger(__name__)
 _EXPLORATION = 16  # L-BFGS iterations from every start, before ...
@@ -96,7 +96,7 @@ class SearchProblem:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The end of the search for one output; see ``gpmpc.gp.training.Training``."""
+    """The end of the search for one output; see ``gpmpc.gp._training.Training``."""
 
     theta: np.ndarray
     objective: float

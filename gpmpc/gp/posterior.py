@@ -19,8 +19,8 @@ from torch import Tensor
 from gpmpc.dynamics import Array, Linearized, check_destination, check_query, tensors_for, to_array
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp._kernel import Predicts, check_posterior, factorize
+from gpmpc.gp._scaling import Scaling
 from gpmpc.gp.backend import host_arrays
-from gpmpc.gp.scaling import Scaling
 
 if TYPE_CHECKING:
     from gpmpc.kernels import Packed

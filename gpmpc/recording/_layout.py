@@ -106,8 +106,7 @@ def _plot(title: str, lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "showYAxisLabels": True,
         "showLegend": True,
         "legendDisplay": "left",  # at the top it takes its height off the curves
-        "sidebarDimension": 190,  # width of the legend [px]
-        "showPlotValuesInLegend": True,
+        "sidebarDimension": 150,  # width of the legend [px]
         "isSynced": True,
         "xAxisVal": "timestamp",
     }

@@ -20,9 +20,10 @@ from gpmpc.datasets import DataSource
 from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
 from gpmpc.gp import Training, Transitions
+from gpmpc.gp.casadi_ import successor_function
 from gpmpc.learning import EpisodicLearning, LearningController, OnlineLearning
 from gpmpc.metrics import find_loss, time_quantiles, tracking_error, violation_rate
-from gpmpc.models import train_with_angles
+from gpmpc.models import CasadiFunction, train_residual
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.policy import OnFailure, check_policy
 from gpmpc.mpc.problem import Box
@@ -49,7 +50,7 @@ class Experiment:
     trajectory: Trajectory | None  #: what is followed, from its beginning; None holds the system's goal
     system: System  #: whose transitions are learned; names, units and references are its own
     #: from transitions and a ``seed`` to a ``Training``, such as a ``Trainer``; one that learns differences sees the
-    #: system's angles as sine and cosine
+    #: system's angles as sine and cosine, and learns what the system's nominal model misses
     train: Callable[..., Training]
     #: from a model, or from a ``plant`` where its first argument is called so, to a ``Controller``
     controller: Callable[..., Any]
@@ -128,9 +129,10 @@ class Experiment:
 
     def learn(self, transitions: Transitions, seed: int) -> Training:
         """Trains on transitions; see ``train``."""
-        angles = self.system.angle_indices
-        if angles and getattr(self.train, "predicts", None) == "difference":
-            return train_with_angles(self.train, angles, transitions, seed)
+        angles, known = self.system.angle_indices, self.system.nominal
+        if (angles or known) and getattr(self.train, "predicts", None) == "difference":
+            nominal = known and CasadiFunction(successor_function(known))
+            return train_residual(self.train, transitions, angles, nominal, seed)
         return self.train(transitions, seed=seed)
 
     def references(self, count: int) -> np.ndarray:
@@ -320,6 +322,8 @@ def summary(result: Mapping[str, Any]) -> Table:
     if training:
         from_what = f"{training['size']} rows of {options['data']} data"
         lines.append(("learned from", f"{from_what}, in {times['training']:.2f} s"))
+    if known := result["settings"].get("nominal"):
+        lines.append(("known before", ", ".join(f"{k} {v}" for k, v in known.items())))
     if lost := result.get("lost"):
         lines.append(("lost", f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}"))
     axes = ", ".join(f"{k} {v:.3g}" for k, v in result["rmse"].items() if v is not None and k != "total")

@@ -27,8 +27,15 @@ from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
 from gpmpc.gp._search import column_std, constant_columns
 from gpmpc.gp.casadi_ import casadi_function
 from gpmpc.gp.module import PosteriorModule
-from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, linearize
-from gpmpc.propagation.sensitivity import differentiate
+from gpmpc.propagation import (
+    Linearization,
+    MeanEquivalence,
+    MomentMatching,
+    MonteCarlo,
+    Unscented,
+    differentiate,
+    linearize,
+)
 from tests.gp.whole_bound import collapsed_bound
 
 FEATURES = [1e8, torch.tensor([-1e8, 1e7, 13.75])]

@@ -21,8 +21,8 @@ from gpmpc.gp import (
     standardize,
 )
 from gpmpc.gp._kernel import kernel_matrix
-from gpmpc.gp.sparse import collapsed_bound_with_gradient
-from gpmpc.gp.sparse_training import informative_points
+from gpmpc.gp._sparse import collapsed_bound_with_gradient
+from gpmpc.gp._sparse_training import informative_points
 from gpmpc.propagation import MomentMatching, MonteCarlo
 from tests.gp.whole_bound import collapsed_bound
 
@@ -121,7 +121,7 @@ def test_the_bounds_gradient_is_right():
 
 @pytest.mark.parametrize("method", ["sgpr", "fitc"])
 def test_the_bound_and_its_gradient_in_blocks_are_those_in_one_piece(method, monkeypatch):
-    monkeypatch.setattr("gpmpc.gp.sparse._ENTRIES", 1)  # 64 points at a time
+    monkeypatch.setattr("gpmpc.gp._sparse._ENTRIES", 1)  # 64 points at a time
     x, y, settings = problem(150)
     leaves = [leaf.clone().requires_grad_() for leaf in (x[:12], *settings.values())]
     whole = collapsed_bound(leaves[0], x, y, Hyperparameters(*leaves[1:]), method=method)
@@ -274,7 +274,7 @@ def test_the_best_point_of_a_search_is_kept(monkeypatch):
         values = [objective(np.clip(start + step, *bounds.T))[0] for step in (0.0, 1e-3, 3.0)]
         assert values[-1] > values[0]
 
-    monkeypatch.setattr("gpmpc.gp.sparse_training.minimize", astray)
+    monkeypatch.setattr("gpmpc.gp._sparse_training.minimize", astray)
     training = SparseTrainer(inducing=20).fit(*sines(300, 3, 0.1, seed=1), 0, "value")
     assert (training.objective <= training.initial).all()
 

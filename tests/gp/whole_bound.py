@@ -1,6 +1,6 @@
 """The collapsed bound in one piece, differentiable by all of its tensors, for a comparison with that in blocks."""
 
-from gpmpc.gp.sparse import JITTER, _block_sums, _bound, inducing_factor
+from gpmpc.gp._sparse import JITTER, _block_sums, _bound, inducing_factor
 
 
 def collapsed_bound(inducing, features, targets, hyperparameters, method="sgpr", jitter=JITTER):
