@@ -4,7 +4,7 @@ PYTHON ?= python3
 ENV := .venv/.installed
 ONLY ?= steps peers gp qp
 
-.PHONY: tables figures test lint bench guard docs clean
+.PHONY: tables figures test lint bench guard docs live clean
 
 tables: $(ENV)  ## The paper's Tables 1 and 2 beside ours; settings: make tables SET="draws=50 data=paper data.folder=DIR"
 	.venv/bin/gpmpc tables $(SET)
@@ -31,6 +31,9 @@ guard: $(ENV)  ## Whether anything became slower, against reference kernels in t
 docs: $(ENV)  ## The documentation as a site in docs/_build; a warning is an error
 	.venv/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
 	.venv/bin/python -m sphinx -q -W -b html docs docs/_build
+
+live: $(ENV)  ## A picture of the live view in docs/figures; needs npm and chromium
+	.venv/bin/python docs/live_view.py
 
 $(ENV): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' \

@@ -22,10 +22,10 @@ import torch
 from benchmarks.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
 from benchmarks.quadrotor_sequences import TIGHT
 from benchmarks.timing import write_results
+from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box
-from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
 

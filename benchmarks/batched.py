@@ -23,8 +23,8 @@ import torch
 from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
 from benchmarks.timing import write_results
 from gpmpc.gp import GPPosterior, backend
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import closed_loop, closed_loops
 from gpmpc.trajectories import states_along

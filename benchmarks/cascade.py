@@ -18,13 +18,12 @@ from benchmarks.quadrotor import HOVER, INNER, OUTER, TRAJECTORIES, problem, tra
 from benchmarks.timing import write_results
 from gpmpc.exceptions import GpmpcError
 from gpmpc.metrics import tracking_error
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.propagation import Linearization
-from gpmpc.simulation import Gust, Noise, Replaced, cascade_loop
+from gpmpc.simulation import Cascade, Gust, Noise, Replaced, cascade_loop
 from gpmpc.systems import Coupled, System
 from gpmpc.trajectories import states_along
 

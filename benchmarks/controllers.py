@@ -4,7 +4,7 @@
 
 One process, one thread, process CPU time, GPs on 189 transitions. Instances are recorded on a flight with the plant in
 the loop, with the plans that the one controller made, and then put to each controller in turns, warm-started from its
-own last decision, shifted. ``nonlinear, sqp`` stops at a relative offset of 1e-6 (``gpmpc.mpc.sqp``), ``slsqp`` where a
+own last decision, shifted. ``nonlinear, sqp`` stops at a relative offset of 1e-6 (``gpmpc.mpc``), ``slsqp`` where a
 round lowers the cost by less than 1e-12 of it; one program of the convex ones asks for neither.
 ``cold`` are the same instances without a plan, from the last input held. ``plain slsqp`` is what comes to mind first:
 SciPy's SLSQP on the inputs as they are, from hover, with the same compiled derivatives. ``jacobian`` is one call of
@@ -23,9 +23,9 @@ from benchmarks.quadrotor import HOVER, TRAJECTORIES, Asked, problem, recorded, 
 from benchmarks.timing import write_results
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gp import GPPosterior
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.controller import Decision, Request, Timing
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.status import Status
 

@@ -24,9 +24,9 @@ from gpmpc.estimation import KalmanFilter, Measurement
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.models import DisturbedModel
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.controller import Decision, Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Tracking
 from gpmpc.propagation import Linearization
 

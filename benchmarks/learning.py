@@ -16,6 +16,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from matplotlib.figure import Figure
@@ -25,9 +26,9 @@ from benchmarks.timing import write_results
 from gpmpc.files import write_whole
 from gpmpc.gp import GPPosterior
 from gpmpc.learning import LearningController, OnlineLearning
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.controller import Controller
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Gust, Noise, Replaced, Rollout, closed_loop
@@ -131,16 +132,16 @@ def main() -> None:
 
 def figure() -> Figure:
     """How far the vehicle is from its reference, one seed."""
-    drawn = Figure(figsize=(8, 3), layout="constrained")
-    panels = drawn.subplots(1, 2, sharey=True)
+    plt.style.use("gpmpc.plotting.gpmpc")
+    drawn, panels = plt.subplots(1, 2, sharey=True, figsize=(8, 3.6))
     for axis, change in zip(panels, ("20 % heavier", "wind"), strict=True):
-        for way, colour in zip(WAYS, ("tab:red", "tab:orange", "tab:blue", "tab:gray"), strict=True):
+        for way, look in zip(WAYS, ("C6-.", "C1", "C0", "C2:"), strict=True):
             (flown,) = flights(way, "elliptical", change, "process 0.01", 1)
             away = np.linalg.norm((flown.states - flown.references)[:, POSITION], axis=1)
-            axis.semilogy(flown.times[1:], away[1:], color=colour, label=way)
-        axis.set(title=change, xlabel="time [s]")
+            axis.semilogy(flown.times[1:], away[1:], look, label=way)
+        axis.set(title=f"at 20 s: {change}", xlabel="time [s]")
     panels[0].set_ylabel("distance to the reference [m]")
-    panels[0].legend(frameon=False, fontsize=8)
+    drawn.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return drawn
 
 

@@ -40,9 +40,9 @@ from benchmarks.timing import (
     write_results,
 )
 from gpmpc.gp import GPPosterior
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.controller import Controller, Decision, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status

@@ -20,15 +20,13 @@ import numpy as np
 import torch
 
 from benchmarks.quadrotor import HOVER, INNER, NOISE, OUTER, STATE_BOUNDS, TRAJECTORIES, problem, trained
-from gpmpc.mpc.baselines import LQR, NMPC
-from gpmpc.mpc.cascade import Cascade
+from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc.baselines import LQR, NMPC, StateFormMPC
 from gpmpc.mpc.controller import Controller
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
-from gpmpc.simulation import cascade_loop, closed_loop
+from gpmpc.simulation import Cascade, cascade_loop, closed_loop
 from gpmpc.systems import Coupled, System
 from gpmpc.trajectories import states_along
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle, product
 
+import matplotlib.pyplot as plt
 import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
@@ -21,9 +22,9 @@ from benchmarks.pendulums import pendulum_gp, pendulum_plant, pendulum_reference
 from benchmarks.timing import RESULTS, describe, machine, markdown_table, time_interleaved, write_results
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.controller import Controller, Decision, Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
@@ -32,7 +33,7 @@ from gpmpc.simulation import closed_loop
 RECORDED_STEPS = 40
 STD = 0.01  # [rad, rad/s] of the beliefs: a full covariance is propagated, as with an estimator in the loop
 FIGURE_SIZE, FIGURE_HORIZON = 189, 10  # N and H that the panels hold, or the nearest ones measured
-COLOURS = {"paper's form": "#a4343a", "zero order": "#1f4e79", "mean only": "#3a7d44"}
+LOOKS = {"paper's form": ("C1", "o"), "zero order": ("C0", "s"), "mean only": ("C2", "^")}
 
 
 def main() -> None:
@@ -169,8 +170,8 @@ def speed_figure(rows: Sequence[Mapping]) -> Figure:
     size = min({row["N"] for row in rows}, key=lambda N: abs(N - FIGURE_SIZE))
     horizon = min({row["H"] for row in rows}, key=lambda H: abs(H - FIGURE_HORIZON))
     dims = sorted({row["n"] for row in rows})
-    figure = Figure(figsize=(3.2 * len(dims) + 0.8, 5.6), layout="constrained")
-    axes = figure.subplots(2, len(dims), sharey=True, squeeze=False)
+    plt.style.use("gpmpc.plotting.gpmpc")
+    figure, axes = plt.subplots(2, len(dims), sharey=True, squeeze=False, figsize=(2.6 * len(dims) + 0.8, 5.6))
     for column, n in enumerate(dims):
         here = [row for row in rows if row["n"] == n]
         upper = [row for row in here if row["H"] == horizon], "N", f"training points N (H = {horizon})"
@@ -179,22 +180,21 @@ def speed_figure(rows: Sequence[Mapping]) -> Figure:
             for what in dict.fromkeys(row["what"] for row in panel):
                 line = sorted((row for row in panel if row["what"] == what), key=lambda row: row[key])
                 at, median = [row[key] for row in line], [row["median"] for row in line]
-                axis.plot(at, median, "o-", color=COLOURS[what], markersize=3.5, label=what)
-                axis.fill_between(at, median, [row["p99"] for row in line], color=COLOURS[what], alpha=0.15, lw=0)
+                colour, marker = LOOKS[what]
+                axis.plot(at, median, color=colour, marker=marker, markersize=3.5, label=what)
+                axis.fill_between(at, median, [row["p99"] for row in line], color=colour, alpha=0.15, lw=0)
             axis.set(xscale="log", yscale="log", xlabel=label)
             ticks = sorted({row[key] for row in panel})
-            axis.set_xticks(ticks, [str(tick) for tick in ticks])
+            axis.set_xticks(ticks, [str(tick) for tick in ticks], rotation=45)
             axis.xaxis.set_minor_formatter(NullFormatter())
             axis.yaxis.set_major_locator(LogLocator(10, (1, 2, 5)))
             axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axis.yaxis.set_minor_locator(NullLocator())
-            axis.grid(True, which="major", color="#dddddd", linewidth=0.6)
-        axes[0, column].set_title(f"n = {n}, m = {n // 2}")
+        axes[0, column].set_title(f"{n} states, {n // 2} inputs")
     for axis in axes[:, 0]:
-        axis.set_ylabel("ms per control step")
-    figure.legend(
-        *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8
-    )
+        axis.set_ylabel("time per control step [ms]")
+    figure.suptitle("Decisions of the convex controllers: median, shaded to the 99th percentile")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
 

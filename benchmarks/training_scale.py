@@ -24,7 +24,7 @@ from pathlib import Path
 EXACT, GPYTORCH, SPARSE, GPYTORCH_SPARSE = "exact", "GPyTorch", "sparse", "GPyTorch sparse"
 D, NOISE = 9, 0.05
 TEST_ROWS = 2000
-COLOURS = {EXACT: "C0", GPYTORCH: "C1", SPARSE: "C2", GPYTORCH_SPARSE: "C3"}
+COLOURS = {EXACT: "C0", GPYTORCH: "C1", SPARSE: "C2", GPYTORCH_SPARSE: "C4"}
 
 
 def main() -> None:
@@ -126,7 +126,7 @@ def evaluation(route: str, x, y, inducing: int):
     from benchmarks.gpytorch_likelihood import GPyTorchLikelihood
     from gpmpc.gp._kernel import Hyperparameters
     from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
-    from gpmpc.gp.sparse import collapsed_bound_with_gradient
+    from gpmpc.gp._sparse import collapsed_bound
 
     theta = np.append(np.linspace(0.5, 1.5, D), [0.5, np.log(30.0)])
     if route == EXACT:
@@ -137,7 +137,13 @@ def evaluation(route: str, x, y, inducing: int):
         return lambda: likelihood(theta)
     scales, sf2 = torch.from_numpy(np.exp(theta[None, :D])), torch.tensor([np.exp(1.0)], dtype=torch.float64)
     if route == SPARSE:
-        return lambda: collapsed_bound_with_gradient(x[:inducing], x, y, Hyperparameters(scales, sf2, sf2 / 900))
+        leaves = [part.requires_grad_() for part in (x[:inducing].clone(), scales, sf2.clone(), sf2 / 900)]
+
+        def bound():
+            value = collapsed_bound(leaves[0], x, y, Hyperparameters(*leaves[1:]))
+            return value, torch.autograd.grad(value.sum(), leaves)
+
+        return bound
     return gpytorch_sparse(x, y, inducing, scales, sf2)
 
 
@@ -249,12 +255,10 @@ def described(result: dict) -> str:
 
 def draw(results: list[dict], path: Path, threads: int) -> None:
     """Time and memory over N."""
-    import matplotlib
+    import matplotlib.pyplot as plt
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, (times, memory) = plt.subplots(1, 2, figsize=(11, 4.8))
+    plt.style.use("gpmpc.plotting.gpmpc")
+    figure, (times, memory) = plt.subplots(1, 2, figsize=(9, 5.2))
     lines: dict[tuple, list[dict]] = {}
     for result in results:
         if result["what"] in ("evaluation", "training"):
@@ -269,16 +273,17 @@ def draw(results: list[dict], path: Path, threads: int) -> None:
         if what == "evaluation":
             memory.loglog(x, [max(one["megabytes"], 0.1) for one in line], **look)
     sizes = sorted({one["size"] for one in results if one["route"] == EXACT})
-    memory.loglog(sizes, [8 * size**2 / 2**20 for size in sizes], color="0.6", zorder=0, label="one N x N matrix")
-    times.set(ylabel=f"processor time [s], {threads} thread(s)", title="value and gradient; whole trainings")
-    memory.set(ylabel="peak memory beyond the imports [MB]", title="value and gradient")
+    memory.loglog(sizes, [8 * size**2 / 2**20 for size in sizes], color="C7", zorder=0, label="one N x N matrix")
+    times.set(ylabel=f"processor time [s], {threads} thread(s)", title="time")
+    memory.set(ylabel="peak beyond the imports [MB]", title="memory of one evaluation")
     for axis in (times, memory):
         axis.set_xlabel("training points N")
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=8, frameon=False)
-    figure.suptitle("Training one output of nine features")
-    figure.tight_layout()
-    figure.savefig(path, dpi=150)
+    figure.suptitle("One output of nine features: the likelihood with its gradient, and whole trainings")
+    handles, labels = (
+        a + b[-1:] for a, b in zip(*(x.get_legend_handles_labels() for x in (times, memory)), strict=True)
+    )
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    figure.savefig(path)
 
 
 if __name__ == "__main__":

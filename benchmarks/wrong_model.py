@@ -12,6 +12,7 @@ how the heavier vehicle comes to its altitude.
 import argparse
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from matplotlib.figure import Figure
@@ -20,8 +21,8 @@ from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, tra
 from benchmarks.timing import write_results
 from gpmpc.files import write_whole
 from gpmpc.metrics import tracking_error
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Replaced, Rollout, closed_loop
@@ -42,7 +43,7 @@ WAYS = {
     "trajectory, L = 1": PredictionSettings(disturbance_gain=1.0),
     "velocity": PredictionSettings("velocity", "none"),
 }
-COLOURS = ("tab:red", "tab:orange", "tab:blue", "tab:gray")
+LINES = ("C6-.", "C1-", "C0-", "C2--")
 
 
 def main() -> None:
@@ -95,18 +96,18 @@ def pooled(flown: list[Rollout]) -> float:
 
 def altitudes(shown: dict[tuple, Rollout]) -> Figure:
     """How far the heavier vehicle is from its altitude, the first seed of the process noise."""
-    figure = Figure(figsize=(8, 3), layout="constrained")
-    axes = figure.subplots(1, len(TRAJECTORIES), sharey=True)
+    plt.style.use("gpmpc.plotting.gpmpc")
+    figure, axes = plt.subplots(1, len(TRAJECTORIES), sharey=True, figsize=(8, 3.6))
     for axis, trajectory in zip(axes, TRAJECTORIES, strict=True):
-        for way, colour in zip(WAYS, COLOURS, strict=True):
+        for way, look in zip(WAYS, LINES, strict=True):
             flight = shown[trajectory, way, "20 % heavier", "process 0.01"]
             away = (flight.states - flight.references)[:41, ALTITUDE]
-            dashes = "--" if way == "velocity" else "-"
-            axis.plot(np.arange(len(away)), away, color=colour, linestyle=dashes, label=way)
+            axis.plot(np.arange(len(away)), away, look, label=way)
         axis.axhline(0, color="black", linewidth=0.5)
         axis.set(title=trajectory, xlabel="time [s]")
-    axes[0].set_ylabel("error of z [m]")
-    axes[0].legend(frameon=False)
+    axes[0].set_ylabel("error of z, downwards [m]")
+    figure.suptitle("A quadrotor a fifth heavier than its model; L: gain of the disturbance estimate")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
 
 

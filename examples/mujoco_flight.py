@@ -23,8 +23,8 @@ from gpmpc.logs import (
     read_log,
     save_learned,
 )
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Rollout, closed_loop

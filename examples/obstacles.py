@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import casadi
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from matplotlib.figure import Figure
@@ -18,8 +19,7 @@ from gpmpc.gp import Trainer, Transitions, standardize
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc import GPMPC, Box, ControlLoop, Inequality, Problem, Tracking
 from gpmpc.propagation import Linearization
-from gpmpc.systems import step_many
-from gpmpc.systems.mechanical import planar_quadrotor
+from gpmpc.systems import planar_quadrotor, step_many
 
 HORIZON, STEPS = 30, 110
 NOISE = [0.002, 0.02, 0.002, 0.02, 0.002, 0.02]  # standard deviations a step
@@ -69,13 +69,12 @@ print(f"{away:.2f} m from the goal, never nearer than {nearest:.3f} m to a disc,
 
 def figure() -> Figure:
     """Draws the path and the discs, which are as large as to hold the vehicle's own size, at four moments."""
-    drawn = Figure(figsize=(7, 5), layout="constrained")
-    for axis, k in zip(drawn.subplots(2, 2, sharex=True, sharey=True).flat, (10, 21, 32, STEPS), strict=True):
+    plt.style.use("gpmpc.plotting.gpmpc")
+    drawn, axes = plt.subplots(2, 2, sharex=True, sharey=True, figsize=(7, 5))
+    for axis, k in zip(axes.flat, (10, 21, 32, STEPS), strict=True):
         for place, radius, velocity in zip(centres(times[k]), RADII, VELOCITIES, strict=True):
-            axis.add_patch(
-                Circle((place[0], place[1]), radius, color="#d55e00" if velocity.any() else "0.45", alpha=0.6)
-            )
-        axis.plot(path[: k + 1, 0], path[: k + 1, 2], color="#0072b2")
+            axis.add_patch(Circle((place[0], place[1]), radius, color="C1" if velocity.any() else "C7", alpha=0.6))
+        axis.plot(path[: k + 1, 0], path[: k + 1, 2], color="C0")
         tilt, at = path[k, 4], path[k, [0, 2]]
         arm = 0.1 * np.array([np.cos(tilt), np.sin(tilt)])
         axis.plot(*np.transpose([at - arm, at + arm]), color="black", linewidth=3)
@@ -87,4 +86,4 @@ def figure() -> Figure:
     return drawn
 
 
-figure().savefig(Path(sys.argv[1] if len(sys.argv) > 1 else ".") / "obstacles.png", dpi=150)
+figure().savefig(Path(sys.argv[1] if len(sys.argv) > 1 else ".") / "obstacles.png")

@@ -8,6 +8,7 @@ reactor.png there.
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from matplotlib.figure import Figure
@@ -16,8 +17,7 @@ from gpmpc.gp import Transitions, standardize, train
 from gpmpc.mpc import GPMPC, Box, LeastSquares, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Rollout, closed_loop
-from gpmpc.systems import step_many
-from gpmpc.systems.reactor import stirred_tank
+from gpmpc.systems import step_many, stirred_tank
 
 HOTTEST, STEPS = 352.0, 200  # [K], [-]
 HOTTEST_STATE = [np.inf, HOTTEST]
@@ -56,20 +56,19 @@ for name, problem in problems.items():
 
 def figure(flights: dict[str, Rollout]) -> Figure:
     """Draws concentration, temperature and coolant over time."""
-    drawn = Figure(figsize=(7, 5.4), layout="constrained")
-    axes = drawn.subplots(3, sharex=True)
-    for (name, flight), color, line in zip(flights.items(), ("#0072b2", "#d55e00"), ("-", "--"), strict=True):
+    plt.style.use("gpmpc.plotting.gpmpc")
+    drawn, axes = plt.subplots(3, sharex=True, figsize=(7, 5.4))
+    for (name, flight), color, line in zip(flights.items(), ("C0", "C1"), ("-", "--"), strict=True):
         minutes = flight.times / 60
         for axis, values in zip(axes, (flight.states[:, 0], flight.states[:, 1], flight.inputs[:, 0]), strict=True):
             axis.plot(minutes[: len(values)], values, color=color, linestyle=line, label=name)
     axes[1].axhline(HOTTEST, color="black", linestyle=":", label="hottest allowed, with 95 %")
     for axis, label in zip(axes, ("concentration", "temperature", "coolant"), strict=True):
         axis.set_ylabel(f"{label} [{reactor.units[label]}]")
-        axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_title("A reactor under an economic cost, and held at its operating point")
     axes[2].set_xlabel("time [min]")
-    drawn.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    drawn.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return drawn
 
 
-figure(flights).savefig(Path(sys.argv[1] if len(sys.argv) > 1 else ".") / "reactor.png", dpi=150)
+figure(flights).savefig(Path(sys.argv[1] if len(sys.argv) > 1 else ".") / "reactor.png")

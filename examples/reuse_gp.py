@@ -8,9 +8,9 @@ with noise.
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Transitions, load_posterior, save_posterior, train
@@ -46,18 +46,20 @@ push = np.where(np.arange(20) < 8, 2.5, -1.0)  # [N m]
 start = Gaussian(torch.tensor([1.0, 0.0]).double(), torch.diag(torch.tensor([0.1, 0.2]).double() ** 2))
 forecast = rollout(MomentMatching(), gp, start, torch.from_numpy(push)[:, None])
 
-figure = Figure(figsize=(7, 4.6), layout="constrained")
-axes, times = figure.subplots(2, 1, sharex=True), STEP * np.arange(21)
+plt.style.use("gpmpc.plotting.gpmpc")
+(figure, axes), times = plt.subplots(2, 1, sharex=True, figsize=(7, 4.6)), STEP * np.arange(21)
 runs = [pendulum(push, *rng.normal([1.0, 0.0], [0.1, 0.2])) for _ in range(15)]
 for i, (axis, label) in enumerate(zip(axes, ("angle [rad]", "rate [rad/s]"), strict=True)):
     mean = np.append(start.mean[i], forecast.mean[:, i])
     reach = 1.96 * np.sqrt(np.append(start.variance[i], forecast.variance[:, i]))
-    axis.plot(times, mean, color="#08306b", linewidth=2, zorder=3, label="forecast")
-    axis.fill_between(times, mean - reach, mean + reach, color="#4292c6", alpha=0.3, linewidth=0, label="95 %")
+    axis.plot(times, mean, color="C0", linewidth=2, zorder=3, label="forecast")
+    axis.fill_between(
+        times, mean - reach, mean + reach, color="C5", alpha=0.5, linewidth=0, label="95 % of what may come"
+    )
     lines = axis.plot(times, np.array(runs)[:, :, i].T, color="0.35", linewidth=0.6)
     lines[0].set_label("what happens")
     axis.set_ylabel(label)
-    axis.spines[["top", "right"]].set_visible(False)
-axes[0].legend(frameon=False)
+axes[0].set_title("A pendulum from an uncertain start: 15 runs, and their forecast by moment matching")
+figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 axes[1].set_xlabel("time [s]")
-figure.savefig(folder / "tube.png", dpi=150)
+figure.savefig(folder / "tube.png")

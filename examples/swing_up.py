@@ -16,7 +16,6 @@ class Pendulum:
     state_names, input_names = ("cosine", "sine", "rate"), ("torque",)
 
     def derivative(self, x, u):
-        """d/dt of the state."""
         return [-x[1] * x[2], x[0] * x[2], 15.0 * x[1] + 3.0 * u[0]]
 
 
@@ -31,6 +30,7 @@ controller = GPMPC(gp, Linearization(), problem, horizon=30, initial_input=[0.0]
 flight = closed_loop(plant, controller, [1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], steps=100)
 
 print("upright after", flight.times[np.abs(flight.states[:, 0] - 1) > 0.01][-1].round(2), "s")
-plt.legend(plt.plot(flight.times, flight.states), Pendulum.state_names, title="dashed: torque")
+plt.style.use("gpmpc.plotting.gpmpc")
+plt.legend(plt.plot(flight.times, flight.states), Pendulum.state_names, title="over time [s]; dashed: torque")
 plt.step(flight.times[1:], flight.inputs, "k--")
 plt.savefig("swing_up.png")

@@ -6,8 +6,8 @@ Run as `python examples/wall.py FOLDER` (the present folder by default); it writ
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 
 from gpmpc.gp import Transitions, standardize, train
 from gpmpc.mpc import GPMPC, Box, Problem, Tracking
@@ -43,11 +43,13 @@ for name, probability in (("mean behind the wall", None), ("95 % of what may com
     beyond = (flights[name].states[1:, 0] > WALL).mean()
     print(f"{name:24} beyond the wall in {beyond:4.1%} of the steps")
 
-axis = (figure := Figure(figsize=(7, 3.4), layout="constrained")).subplots()
-for (name, flight), color in zip(flights.items(), ("#d55e00", "#0072b2"), strict=True):
+plt.style.use("gpmpc.plotting.gpmpc")
+figure, axis = plt.subplots(figsize=(7, 3.4))
+for (name, flight), color in zip(flights.items(), ("C1", "C0"), strict=True):
     axis.plot(flight.times, flight.states[:, 0], color=color, linewidth=1, label=name)
 axis.axhline(WALL, color="black", linewidth=2, label="wall")
-axis.set(xlabel="time [s]", ylabel="position [m]", ylim=(0.9, 1.04), title="A cart at a wall, gusts of 0.05 m/s a step")
-axis.spines[["top", "right"]].set_visible(False)
-axis.legend(frameon=False, loc="lower right", ncols=3)
-figure.savefig(Path(sys.argv[1] if len(sys.argv) > 1 else ".") / "wall.png", dpi=150)
+axis.set(
+    xlabel="time [s]", ylabel="position [m]", ylim=(0.9, 1.04), title="A cart at a wall, gusts of 0.05 m/s per step"
+)
+figure.legend(loc="outside lower center", ncols=3)
+figure.savefig(Path(sys.argv[1] if len(sys.argv) > 1 else ".") / "wall.png")

@@ -29,10 +29,10 @@ from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.experiments.subsystems import SCALINGS, SYSTEMS, check_subsystems
 from gpmpc.gp import Scaling, Transitions
 from gpmpc.metrics import tracking_error, violation_rate
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.controller import Controller, Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Constraint, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import ModelLoop, Noise, Rollout, closed_loop, rehearse
@@ -46,7 +46,7 @@ from gpmpc.studies.study import (
     read_model,
     trained_model,
 )
-from gpmpc.systems.attitudes import GRAVITY
+from gpmpc.systems import GRAVITY
 from gpmpc.trajectories import Trajectory
 
 ROOMS = ("gp", "models", "propagation", "kernels", "qp", "mpc", "simulation", "datasets", "systems")

@@ -21,11 +21,20 @@ import numpy as np
 import torch
 
 from gpmpc.exceptions import GpmpcError, SettingError
-from gpmpc.gp import GPPosterior, Trainer, Transitions, standardize
-from gpmpc.gp.sparse_training import informative_points
+from gpmpc.gp import GPPosterior, Trainer, Transitions, informative_points, standardize
 from gpmpc.models import Affine, CasadiFunction, Features, KnownModel, ResidualModel
-from gpmpc.mpc import GPMPC, Box, ControlLoop, Decision, ManyStarts, PredictionSettings, Problem, Reference, Tracking
-from gpmpc.mpc.linear_quadratic import dlqr
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    ControlLoop,
+    Decision,
+    ManyStarts,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+    dlqr,
+)
 from gpmpc.propagation import Linearization
 from gpmpc.systems import System, double_pendulum, step
 

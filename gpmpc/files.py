@@ -1,10 +1,12 @@
-"""Writes files in one piece or not at all, whenever the process or the machine dies."""
+"""Checks names of files, and writes files in one piece or not at all, whenever the process or the machine dies."""
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+from gpmpc.exceptions import DataError, SettingError
 
 
 @contextmanager
@@ -41,3 +43,38 @@ def remove_partial(folder: Path) -> None:
     """Removes what processes that were killed have left of ``write_whole``, where nobody else is writing now."""
     for left in folder.glob(".*.partial"):
         left.unlink(missing_ok=True)
+
+
+def existing_file(path: str | Path, expected: str) -> Path:
+    """The path of a file that is there.
+
+    Raises:
+        SettingError: It is no path.
+        DataError: There is no file, or it cannot be looked at.
+    """
+    try:
+        found = _path(path).is_file()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be looked at ({error.strerror}); expected {expected}") from error
+    if not found:
+        raise DataError(f"{path}: no such file; expected {expected}")
+    return Path(path)
+
+
+def new_file(path: str | Path) -> Path:
+    """The path of a file that can be written.
+
+    Raises:
+        SettingError: It is no path.
+        DataError: The folder does not exist.
+    """
+    path = _path(path)
+    if not path.parent.is_dir():
+        raise DataError(f"{path}: the folder {path.parent} does not exist")
+    return path
+
+
+def _path(path: Any) -> Path:
+    if not isinstance(path, str | Path):
+        raise SettingError("path", f"must be the name of one file; got {path!r}")
+    return Path(path)

@@ -48,6 +48,9 @@ class Gaussian:
 
         Tensors and arrays of floating point keep their type; everything else becomes float64.
 
+        >>> Gaussian.certain([1.0, 2.0]).variance.tolist()
+        [0.0, 0.0]
+
         Raises:
             ShapeError: No vector of numbers was given.
         """

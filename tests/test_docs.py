@@ -3,6 +3,7 @@
 ``tests/test_guides.py`` and ``tests/logs`` follow the guides.
 """
 
+import doctest
 import importlib
 import pkgutil
 import re
@@ -96,6 +97,17 @@ def test_the_python_of_a_page_runs_in_its_order(path, page):
     text = read(path)
     assert text.count("```python") > 0
     page(path, given=GIVEN)
+
+
+EXAMPLES = [path for path in sorted(ROOT.glob("gpmpc/**/*.py")) if ">>> " in path.read_text()]
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_the_examples_in_docstrings_print_what_they_show(path):
+    module = importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
+    done = doctest.testmod(module, optionflags=doctest.IGNORE_EXCEPTION_DETAIL)
+    assert done.attempted
+    assert not done.failed
 
 
 def test_every_page_with_python_is_followed_by_a_test():

@@ -12,10 +12,10 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, Transitions, append_points, train
 from gpmpc.models import Affine, ResidualModel
+from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching, rollout
 from gpmpc.qp import DualActiveSet
 from gpmpc.simulation import Gust, closed_loop

@@ -8,13 +8,12 @@ import pytest
 from gpmpc import datasets
 from gpmpc.datasets import Excitation
 from gpmpc.exceptions import SettingError
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.propagation import Linearization
-from gpmpc.simulation import Dropout, Gust
+from gpmpc.simulation import Cascade, Dropout, Gust
 from gpmpc.systems import Coupled, Map, Rotational, System, Translational
 from gpmpc.trajectories import Elliptical, Step, Waypoints
 from tests.mpc.small_models import double_integrator

@@ -1,7 +1,7 @@
 """Where transitions come from: random inputs, flights of our own, dithered flights, the authors' files."""
 
-from gpmpc.datasets.excitation import Excitation, ExcitedData
-from gpmpc.datasets.flights import SUBSYSTEMS, DataSource, NMPCData, PaperData, Tracking
-from gpmpc.datasets.random_data import RandomData
+from gpmpc.datasets._excitation import Excitation, ExcitedData
+from gpmpc.datasets._flights import SUBSYSTEMS, DataSource, NMPCData, PaperData, Tracking
+from gpmpc.datasets._random_data import RandomData
 
 __all__ = ["SUBSYSTEMS", "DataSource", "Excitation", "ExcitedData", "NMPCData", "PaperData", "RandomData", "Tracking"]

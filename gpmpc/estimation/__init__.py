@@ -1,11 +1,11 @@
 """Estimation of what is not measured: states, disturbances, delays, noise; and how far predictions can be believed."""
 
-from gpmpc.estimation.conformal import AdaptiveTube, ConformalTube
-from gpmpc.estimation.consistency import Consistency, autocorrelation, estimation_errors, normalized_errors
-from gpmpc.estimation.delay import DelayEstimate, estimate_delay
-from gpmpc.estimation.kalman import FilterRun, KalmanFilter, LateMeasurements, Update, smooth
-from gpmpc.estimation.measurement import Measurement
-from gpmpc.estimation.noise import ProcessNoise, estimate_process_noise, with_process_noise
+from gpmpc.estimation._conformal import AdaptiveTube, ConformalTube
+from gpmpc.estimation._consistency import Consistency, autocorrelation, estimation_errors, normalized_errors
+from gpmpc.estimation._delay import DelayEstimate, estimate_delay
+from gpmpc.estimation._kalman import FilterRun, KalmanFilter, LateMeasurements, Update, smooth
+from gpmpc.estimation._measurement import Measurement
+from gpmpc.estimation._noise import ProcessNoise, estimate_process_noise, with_process_noise
 
 __all__ = [
     "AdaptiveTube",

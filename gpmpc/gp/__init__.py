@@ -1,17 +1,17 @@
 """Gaussian process models of dynamics: data, training, and the frozen posterior that predicts."""
 
+from gpmpc.gp._gpytorch_posteriors import KernelPosterior, from_gpytorch
 from gpmpc.gp._kernel import Hyperparameters
+from gpmpc.gp._online import SlidingWindow, append_points, append_transitions, remove_points
+from gpmpc.gp._scaling import Scaling, centre, identity, min_max, standardize
 from gpmpc.gp._search import SoftLimits
+from gpmpc.gp._sparse import sparse_posterior
+from gpmpc.gp._sparse_training import SparseTrainer, informative_points
+from gpmpc.gp._training import Trainer, Training, train
 from gpmpc.gp.backend import backend
 from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
-from gpmpc.gp.gpytorch_posteriors import KernelPosterior, from_gpytorch
-from gpmpc.gp.online import SlidingWindow, append_points, append_transitions, remove_points
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.scaling import Scaling, centre, identity, min_max, standardize
-from gpmpc.gp.sparse import sparse_posterior
-from gpmpc.gp.sparse_training import SparseTrainer, SparseTraining
 from gpmpc.gp.storage import load_metadata, load_posterior, save_posterior
-from gpmpc.gp.training import Trainer, Training, train
 from gpmpc.gp.transitions import Transitions
 
 __all__ = [
@@ -22,7 +22,6 @@ __all__ = [
     "SlidingWindow",
     "SoftLimits",
     "SparseTrainer",
-    "SparseTraining",
     "Trainer",
     "Training",
     "Transitions",
@@ -33,6 +32,7 @@ __all__ = [
     "exact_inference",
     "from_gpytorch",
     "identity",
+    "informative_points",
     "load_metadata",
     "load_posterior",
     "min_max",

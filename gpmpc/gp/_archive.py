@@ -1,4 +1,4 @@
-"""The names of files, and the .npz files of transitions and of the models of gpmpc 1.
+"""The .npz files of transitions and of the models of gpmpc 1.
 
 Such a file is a zip of ``.npy`` arrays, each with its own CRC-32, and mostly of a ``header.json`` with a checksum of
 itself and of the arrays' names, sizes and CRCs: parts that changed places are noticed. No pickle: reading runs no code.
@@ -14,39 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.exceptions import DataError, SettingError
-
 _HEADER = "header.json"
 _EXPANSION = 20  # times what a file holds: more than numbers shrink by
-
-
-def existing_file(path: str | Path, expected: str) -> Path:
-    """The path of a file that is there.
-
-    Raises:
-        SettingError: It is no path.
-        DataError: There is no file, or it cannot be looked at.
-    """
-    try:
-        found = _path(path).is_file()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be looked at ({error.strerror}); expected {expected}") from error
-    if not found:
-        raise DataError(f"{path}: no such file; expected {expected}")
-    return Path(path)
-
-
-def new_file(path: str | Path) -> Path:
-    """The path of a file that can be written.
-
-    Raises:
-        SettingError: It is no path.
-        DataError: The folder does not exist.
-    """
-    path = _path(path)
-    if not path.parent.is_dir():
-        raise DataError(f"{path}: the folder {path.parent} does not exist")
-    return path
 
 
 def write_npz(header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -82,9 +51,3 @@ def _checksum(header: dict[str, Any], archive: zipfile.ZipFile) -> str:
     parts = sorted((i.filename, i.file_size, i.CRC) for i in archive.infolist() if i.filename.endswith(".npy"))
     said = {key: value for key, value in header.items() if key != "checksum"}
     return hashlib.sha256(json.dumps([said, parts], sort_keys=True).encode()).hexdigest()
-
-
-def _path(path: Any) -> Path:
-    if not isinstance(path, str | Path):
-        raise SettingError("path", f"must be the name of one file; got {path!r}")
-    return Path(path)

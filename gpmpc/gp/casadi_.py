@@ -45,6 +45,12 @@ def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
     return casadi.Function(name, [x, u], [mean, variance], ["state", "input"], ["mean", "variance"])
 
 
+def successor_function(plant: Any) -> casadi.Function:
+    """Writes the next state of a plant, such as a ``System``, as a CasADi function of state (n,) and input (m,)."""
+    x, u = (casadi.SX.sym("x", len(plant.dynamics.state_names)), casadi.SX.sym("u", len(plant.dynamics.input_names)))
+    return casadi.Function("successor", [x, u], [casadi.vertcat(*plant.successor(x, u))])
+
+
 def _affine(form: AffineForm, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:
     """Mean and variance (k,) of a model with an affine form."""
     seen = (x, u)

@@ -19,8 +19,8 @@ from torch import Tensor
 from gpmpc.dynamics import Array, Linearized, check_destination, check_query, tensors_for, to_array
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp._kernel import Predicts, check_posterior, factorize
+from gpmpc.gp._scaling import Scaling
 from gpmpc.gp.backend import host_arrays
-from gpmpc.gp.scaling import Scaling
 
 if TYPE_CHECKING:
     from gpmpc.kernels import Packed
@@ -251,17 +251,9 @@ class GPPosterior:
         return Linearized(to_array(self._mean(k, x)), to_array(A), to_array(B), V)
 
     def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
-        """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""
-        input = state[..., :0] if input is None else input
-        check_query(self, state, input)
-        if host_arrays(self.weights, state, input) is None:
-            k, difference = self._correlations(state, input)
-            return self._belief(k, state), *self._jacobian(k, difference)
-        batch, count = state.shape[:-1], state.shape[:-1].numel()
-        x, u = state.numpy().reshape(count, self.state_dim), input.numpy().reshape(count, self.input_dim)
-        found = [part for part in self.linearize(x, u) if part is not None]
-        mean, A, B, V = (torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found)
-        return Gaussian(mean, V), A, B
+        """``predict``, and its mean's derivatives by state (*batch, k, n) and input (*batch, k, m), all by torch."""
+        k, difference = self._correlations(state, input)
+        return self._belief(k, state), *self._jacobian(k, difference)
 
     def mean_hessian(self, state: Tensor, input: Tensor | None = None) -> Tensor:
         """The mean's second derivatives by the state (*batch, k, n, n)."""

@@ -25,8 +25,8 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, UnsupportedModel
-from gpmpc.files import write_whole
-from gpmpc.gp._archive import existing_file, new_file, read_npz
+from gpmpc.files import existing_file, new_file, write_whole
+from gpmpc.gp._archive import read_npz
 from gpmpc.gp._kernel import check_posterior
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.provenance import now, versions

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, UnsupportedModel, check_number
-from gpmpc.files import write_whole
-from gpmpc.gp._archive import existing_file, new_file, read_npz, write_npz
+from gpmpc.files import existing_file, new_file, write_whole
+from gpmpc.gp._archive import read_npz, write_npz
 
 _NAMES = ("states", "inputs", "next_states")
 _EXPECTED = "a file of transitions"
@@ -35,6 +35,10 @@ class Transitions:
     Raises:
         ShapeError: The three do not belong together.
         DataError: There is no row, or an entry is not finite (its row and column are named, from 1).
+
+    >>> data = Transitions(states=[[0.0], [1.0]], inputs=[[0.5], [0.5]], next_states=[[1.0], [2.0]])
+    >>> len(data), data[1:].states.tolist()
+    (2, [[1.0]])
     """
 
     states: Tensor

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.gp._archive import existing_file, new_file
+from gpmpc.files import existing_file, new_file
 from gpmpc.gp.storage import posterior_of_parts, posterior_parts, read_model, write_model
 from gpmpc.logs._fitting import NominalFit
 from gpmpc.logs._kinematics import Increments, Kinematics, RigidBody

@@ -1,12 +1,14 @@
 """Dynamics models: the protocol, and models made of a known part and a learned one."""
 
 from gpmpc.dynamics import DynamicsModel, Linearized, linearize, linearize_by_autograd
-from gpmpc.models.delay import DelayedModel
-from gpmpc.models.disturbance import DisturbedModel
-from gpmpc.models.features import Features, Lags
-from gpmpc.models.nominal import Affine, CasadiFunction, KnownModel
-from gpmpc.models.residual import ResidualModel, train_with_angles
-from gpmpc.models.storage import load_model, save_model
+from gpmpc.models._delay import DelayedModel
+from gpmpc.models._disturbance import DisturbedModel
+from gpmpc.models._features import Features, Lags
+from gpmpc.models._nominal import Affine, CasadiFunction, KnownModel, linearize_function
+from gpmpc.models._residual import ResidualModel, train_residual
+from gpmpc.models._roll_out import RollOut
+from gpmpc.models._storage import load_model, save_model
+from gpmpc.models._wrapper import Wrapper
 
 __all__ = [
     "Affine",
@@ -19,9 +21,12 @@ __all__ = [
     "Lags",
     "Linearized",
     "ResidualModel",
+    "RollOut",
+    "Wrapper",
     "linearize",
     "linearize_by_autograd",
+    "linearize_function",
     "load_model",
     "save_model",
-    "train_with_angles",
+    "train_residual",
 ]

@@ -1,12 +1,13 @@
 """Controllers: from a state and a reference to an input."""
 
+from gpmpc.mpc._cost import LeastSquares, Tracking
+from gpmpc.mpc._linear_quadratic import dlqr
+from gpmpc.mpc._prediction import PredictionSettings
+from gpmpc.mpc._starts import ManyStarts, kicks
 from gpmpc.mpc.controller import Controller, Decision, Reference
-from gpmpc.mpc.cost import LeastSquares, Tracking
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.policy import ControlLoop
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem
-from gpmpc.mpc.starts import ManyStarts, kicks
 
 __all__ = [
     "GPMPC",
@@ -23,5 +24,6 @@ __all__ = [
     "Problem",
     "Reference",
     "Tracking",
+    "dlqr",
     "kicks",
 ]

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from gpmpc.compiled import compile_for, compiled, njit_inner, unchecked_entry_point
+from gpmpc.compiled import call_unchecked, compiled, njit_inner
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.linear_quadratic import References
+from gpmpc.mpc._linear_quadratic import References
 from gpmpc.mpc.problem import Problem
 from gpmpc.qp import QPSolution, QuadraticProgram
 from gpmpc.status import Status
@@ -24,8 +24,6 @@ Array = np.ndarray
 _FAR = 0.9  # of the standard deviation without data
 FEASIBLE = 1e-3  # by how much a suboptimal plan may miss hard bounds, in their units: a next step mends it
 _NO_PLAN, _NO_DISTURBANCE = np.empty((0, 0)), np.empty(0)
-_SIGNATURE = f"i8(f8[::1], {3 * 'f8[:, ::1], '}f8[::1], {4 * 'f8[:, ::1], '})".replace(", )", ")")
-_BELIEF, _STATES, _INPUTS, _PREVIOUS = 1, 2, 4, 8  # what may not be finite
 
 
 @dataclass(frozen=True)
@@ -47,14 +45,15 @@ class Reference:
     kappas: Array | None = None
 
     def __post_init__(self) -> None:
-        if np.ndim(self.states) == 1:
-            if self.inputs is not None and np.ndim(self.inputs) != 1:
-                raise ShapeError(f"inputs of a set point must be (m,); got {np.shape(self.inputs)}")
+        shape, wide = np.shape(self.states), None if self.inputs is None else np.shape(self.inputs)
+        if len(shape) == 1:
+            if wide is not None and len(wide) != 1:
+                raise ShapeError(f"inputs of a set point must be (m,); got {wide}")
             return
-        if np.ndim(self.states) != 2 or len(self.states) < 2:
-            raise ShapeError(f"reference states must be (H + 1, n), H of 1 or more; got {np.shape(self.states)}")
-        if self.inputs is not None and (np.ndim(self.inputs) != 2 or len(self.inputs) != len(self.states) - 1):
-            raise ShapeError(f"reference inputs must be ({len(self.states) - 1}, m); got {np.shape(self.inputs)}")
+        if len(shape) != 2 or shape[0] < 2:
+            raise ShapeError(f"reference states must be (H + 1, n), H of 1 or more; got {shape}")
+        if wide is not None and (len(wide) != 2 or wide[0] != shape[0] - 1):
+            raise ShapeError(f"reference inputs must be ({shape[0] - 1}, m); got {wide}")
         if self.kappas is not None and np.shape(self.kappas) != (self.horizon,):
             raise ShapeError(f"kappas must be ({self.horizon},); got {np.shape(self.kappas)}")
 
@@ -75,9 +74,9 @@ class Reference:
 class Timing:
     """Wall time of the parts of a decision [s]."""
 
-    model: float  # propagation and linearisation
-    build: float  # from the local model to the optimisation problem
-    solve: float  # of the optimisation problem
+    model: float = 0.0  # propagation and linearisation
+    build: float = 0.0  # from the local model to the optimisation problem
+    solve: float = 0.0  # of the optimisation problem
 
     @property
     def total(self) -> float:
@@ -203,17 +202,10 @@ class Request(NamedTuple):
         previous: Decision | None,
         plan: Any = None,
     ) -> "Request":
-        """Validates the arguments of ``Controller.control``.
+        """Validates the arguments of ``Controller.control`` for H stages of a problem.
 
-        Args:
-            problem: Of n states and m inputs.
-            horizon: H.
-            initial_input: Taken for the previous input where there is no decision before (m,).
-            belief: Of the state.
-            reference: Over the horizon.
-            previous: The last decision. Of one that is not applicable only ``input`` counts: what was applied.
-            plan: To start from in the place of the last one: inputs (H, m), or these and states (H + 1, n); with
-                states angles of the reference are taken as they are, turns included.
+        ``initial_input`` is taken for the previous one where there is no decision before; of one that is not applicable
+        only ``input`` counts: what was applied. For ``plan`` see ``GPMPC.control``.
 
         Raises:
             ShapeError: Belief, reference or plan have other dimensions than the problem and the horizon.
@@ -227,34 +219,33 @@ class Request(NamedTuple):
         reference, n, m = reference.over(horizon), problem.state_dim, problem.input_dim
         state, covariance, states = _array(belief.mean), _array(belief.covariance), _array(reference.states)
         if state.shape != (n,) or states.shape != (horizon + 1, n):
-            raise ShapeError(
-                f"state and reference must have shapes ({n},) and ({horizon + 1}, {n}); "
-                f"got {state.shape} and {states.shape}"
-            )
+            expected = f"({n},) and ({horizon + 1}, {n})"
+            raise ShapeError(f"state and reference must have shapes {expected}; got {state.shape} and {states.shape}")
         inputs = np.zeros((horizon, m)) if reference.inputs is None else _array(reference.inputs)
         if inputs.shape != (horizon, m):
             raise ShapeError(f"reference inputs must have shape ({horizon}, {m}); got {inputs.shape}")
         last, guess = _array(initial_input if previous is None else previous.input), np.empty((horizon, m))
         usable = previous is not None and previous.applicable and np.shape(previous.inputs) == guess.shape
-        made, previous = previous if usable else None, None
+        made = previous if usable else None
         first, guessed = (_NO_PLAN if made is None else _array(made.inputs)), None
         if plan is not None:
             first, guessed = _read_plan(plan, horizon, n, m)
-        found = _run(state, covariance, states, inputs, last, first, *problem.inputs.sides, guess)
-        if found & _PREVIOUS:
+        given, limits = (state, covariance, states, inputs), problem.inputs.sides
+        finite = call_unchecked(_check, *given, last, first, *limits, guess)
+        if not finite[3]:
             last = _array(initial_input)
-            found = _run(state, covariance, states, inputs, last, first, *problem.inputs.sides, guess)
-        for part, name, values in ((_STATES, "states", states), (_INPUTS, "inputs", inputs)):
-            if found & part:
-                raise DataError(f"reference {name} must be finite; got {values[~np.isfinite(values)][0]}")
+            call_unchecked(_check, *given, last, first, *limits, guess)
         kappas = None if reference.kappas is None else _array(reference.kappas)
+        for name, values, known in (("states", states, finite[1]), ("inputs", inputs, finite[2])):
+            if not known:
+                raise DataError(f"reference {name} must be finite; got {values[~np.isfinite(values)][0]}")
         if kappas is not None and not np.isfinite(kappas).all():
             raise DataError(f"reference kappas must be finite; got {kappas}")
-        if problem.cost.angles and guessed is None and not found & _BELIEF:
+        if problem.cost.angles and guessed is None and finite[0]:
             states = _unwrapped(states, state, made, problem.cost.angles)
         references = References(states[1:], inputs, last)
-        known: dict[str, Any] = {"kappas": kappas, "previous": made, "states": guessed}
-        return cls(state, covariance, references, guess, not found & _BELIEF, **known)
+        more: dict[str, Any] = {"kappas": kappas, "previous": made, "states": guessed}
+        return cls(state, covariance, references, guess, finite[0], **more)
 
     @property
     def constant_guess(self) -> Array:
@@ -271,7 +262,7 @@ class Request(NamedTuple):
             covariances=np.full((H + 1, n, n), np.nan),
             status=status,
             iterations=iterations,
-            timing=timing or Timing(0.0, 0.0, 0.0),
+            timing=timing or Timing(),
         )
 
 
@@ -283,24 +274,14 @@ def check_method(key: str, value: object, method: str, example: str) -> None:
 
 
 def check_controller(problem: Problem, states: int, inputs: int, horizon: int, initial_input: Any) -> Array:
-    """Checks the settings that every controller has against its model, and returns the initial input as an array (m,).
-
-    Raises:
-        SettingError: A horizon below 1, weights of another dimension than the model's, or an initial input of the
-            wrong length.
-    """
-    global _run
-    compile_for(_check, _SIGNATURE)
-    _run = unchecked_entry_point(_check)
+    """Checks the settings that every controller has against its model; returns the initial input as an array (m,)."""
     if not isinstance(problem, Problem):
         raise SettingError("problem", f"must be Problem(...); got {type(problem).__name__}")
     check_number("horizon", horizon, least=1, whole=True)
     check_numbers("initial_input", initial_input, inputs)
     if (problem.state_dim, problem.input_dim) != (states, inputs):
-        raise SettingError(
-            "problem",
-            f"must weigh {states} states and {inputs} inputs; got {problem.state_dim} and {problem.input_dim}",
-        )
+        got = f"{problem.state_dim} and {problem.input_dim}"
+        raise SettingError("problem", f"must weigh {states} states and {inputs} inputs; got {got}")
     return np.array(initial_input, dtype=float)
 
 
@@ -363,16 +344,14 @@ def _unwrapped(states: Array, state: Array, previous: Decision | None, angles: S
 
 @compiled(locked=True)
 def _check(state, covariance, states, inputs, last, plan, lower, upper, guess):
-    """Returns which parts are not finite, a sum of ``_BELIEF`` .. ``_PREVIOUS``, and writes the initial guess."""
+    """Writes the initial guess; returns whether belief, reference states and inputs, and last input are finite."""
     H, m = guess.shape
     for k in range(H):
         for j in range(m):
             u, at = plan[min(k + 1, len(plan) - 1), j] if len(plan) > 0 else last[j], min(k, len(lower) - 1)
             guess[k, j] = min(max(u, lower[at, j]), upper[at, j])
-    found = 0 if _is_finite(state) and _is_finite(covariance.ravel()) else _BELIEF
-    found += 0 if _is_finite(states.ravel()) else _STATES
-    found += 0 if _is_finite(inputs.ravel()) else _INPUTS
-    return found + (0 if _is_finite(last) else _PREVIOUS)
+    belief = _is_finite(state) and _is_finite(covariance.ravel())
+    return belief, _is_finite(states.ravel()), _is_finite(inputs.ravel()), _is_finite(last)
 
 
 @njit_inner
@@ -381,6 +360,3 @@ def _is_finite(values):
     for value in values:
         total += value * 0.0
     return total == 0.0
-
-
-_run = _check  # until it is compiled

@@ -1,10 +1,10 @@
 """GP model predictive control: the control step, from a belief and a reference to the input.
 
-The dynamics of the belief are linearised along a plan (``gpmpc.mpc.prediction``), the states eliminated
-(``gpmpc.mpc.condense``), and what is left is a quadratic program in the inputs. One of them a step, of the form
+The dynamics of the belief are linearised along a plan (``_prediction``), the states eliminated
+(``_condense``), and what is left is a quadratic program in the inputs. One of them a step, of the form
 ``trajectory``, is the real-time iteration (Diehl, Bock and Schloeder, 2005); of the form ``velocity`` with moments
-matched it is the convex GP-MPC of Cao, Lai and Alam (2017, section 4). Iterated (``gpmpc.mpc.sqp``), programs solve the
-nonlinear problem itself. Where the iteration ends, in the covariance modes of ``gpmpc.mpc.stages``:
+matched it is the convex GP-MPC of Cao, Lai and Alam (2017, section 4). Iterated (``_sqp``), programs solve the
+nonlinear problem itself. Where the iteration ends, in the covariance modes of ``_stages``:
 
 * ``full``, ``diagonal``: at a KKT point of the expected cost of the propagated belief, tr(Q Sigma) included, under
   chance constraints: the nonlinear GP-MPC of Cao, Lai and Alam (2017, eq. (22)), where moments are matched.
@@ -25,13 +25,13 @@ from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.condense import Condenser
+from gpmpc.mpc._condense import Condenser
+from gpmpc.mpc._linear_quadratic import CondensedProgram, Stages, expand
+from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
+from gpmpc.mpc._sqp import FAILURES, Globalization
+from gpmpc.mpc._stages import Covariance, Plan, price_violations
 from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_method
-from gpmpc.mpc.linear_quadratic import CondensedProgram, Stages, expand
-from gpmpc.mpc.prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc.problem import Problem
-from gpmpc.mpc.sqp import FAILURES, FullStep, Globalization
-from gpmpc.mpc.stages import Covariance, Plan, price_violations
 from gpmpc.propagation import Propagator
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
 from gpmpc.status import Status
@@ -53,11 +53,8 @@ class GPMPC:
         prediction: Form, covariance mode, feedback and disturbance estimate.
         solver: Of the quadratic program; ``DualActiveSet()`` by default, which soft constraints need.
         iterations: Quadratic programs a step at most; more than one for the form ``"trajectory"`` only.
-        tolerance: Of more iterations: relative offset and defects of a plan that counts as solved (``gpmpc.mpc.sqp``),
+        tolerance: Of more iterations: relative offset and defects of a plan that counts as solved (``gpmpc.mpc._sqp``),
             estimated from the slower of the last two rates of convergence. 1e-8 may be out of reach.
-
-    Attributes:
-        soft: Prices of the rows of the program's G, None where all are hard.
 
     Raises:
         SettingError: A setting is unknown or out of its range, or model and problem have other dimensions.
@@ -89,12 +86,12 @@ class GPMPC:
         self._condenser = Condenser(problem, horizon, len(self.prediction.costs.quadratic.terminal))
         self._prior = self.prediction.linearizer.prior_variances()
         self._rates = self._condenser.bounds.rate_lower.size
-        self.soft = self.prediction.constraints.softness(self._rates)
-        if self.soft is not None and not isinstance(self.solver, DualActiveSet):
-            raise SettingError(
-                "solver",
-                f"soft constraints need DualActiveSet (penalty=None makes them hard); got {type(self.solver).__name__}",
+        self._soft = self.prediction.constraints.softness(self._rates)
+        if self._soft is not None and not isinstance(self.solver, DualActiveSet):
+            got = (
+                f"soft constraints need DualActiveSet (penalty=None makes them hard); got {type(self.solver).__name__}"
             )
+            raise SettingError("solver", got)
 
     def control(
         self,
@@ -134,40 +131,37 @@ class GPMPC:
     def _improve(self, prediction: Prediction, request: Request, clock: "_Stopwatch") -> Decision:
         """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
         guess, solution = prediction.plan, None if request.previous is None else request.previous.solution
-        best = None  # the last prediction that a program led to, with its feedback
-        globalize = FullStep() if self.iterations == 1 else Globalization(self.prediction, request, self.tolerance)
-        status, count = None, 0
-        while True:
-            clock.model()
-            program = globalize.correct(self._condense(prediction, request), prediction.plan)
-            clock.build()
+        search = Globalization(self.prediction, request, self.tolerance) if self.iterations > 1 else None
+        solved_at, status, count = None, None, 0
+        while status is None and count < self.iterations:
+            clock.lap("model")
+            program = self._condense(prediction, request)
+            program = program if search is None else search.correct(program, prediction.plan)
+            clock.lap("build")
             solution = self._solve(program, solution)
-            clock.solve()
+            clock.lap("solve")
             count, status = count + 1, solution.status
             if _is_usable(program, solution, prediction.plan):
-                proposed = self._proposed(prediction, program, solution, request.references.previous_input)
-                best = prediction, program.feedback
-                prediction, status = globalize(prediction, program, solution, proposed)
-            if status is not None or count == self.iterations:
-                break
-        if best is not None and self.prediction.settings.rolled_out:
-            obeying = self.prediction.roll_out(prediction.plan, *best, request)
+                solved_at, proposed = (
+                    (prediction, program.feedback),
+                    self._proposed(prediction, program, solution, request),
+                )
+                if search is None:  # the real-time iteration takes the whole step
+                    prediction = prediction._replace(plan=proposed)
+                else:
+                    prediction, status = search(prediction, program, solution, proposed)
+        if solved_at is not None and self.prediction.settings.rolled_out:
+            obeying = self.prediction.roll_out(prediction.plan, *solved_at, request)
             prediction = obeying if np.isfinite(obeying.plan.states).all() else prediction
-        clock.model()
-        status = Status.ITERATION_LIMIT if status is None else status
-        program = QuadraticProgram.unchecked(*program[:5])
+        clock.lap("model")
+        program, status = QuadraticProgram.unchecked(*program[:5]), Status.ITERATION_LIMIT if status is None else status
         suboptimal = not status.solved and prediction.plan is not guess and self._missed(prediction) <= FEASIBLE
         if not (status.solved or suboptimal):
             return replace(request.failed_decision(status, count, clock.timing), problem=program, solution=solution)
         plan, disturbance = prediction.plan, request.disturbance if self.prediction.settings.disturbance_gain else None
         inputs, beliefs = plan.inputs.copy(), self.prediction.linearizer.moments(plan.states, prediction.covariances)
-        found = (
-            program,
-            solution,
-            disturbance,
-            suboptimal,
-            call_unchecked(_largest_ratio, prediction.stages.V, self._prior),
-        )
+        novelty = call_unchecked(_largest_ratio, prediction.stages.V, self._prior)
+        found = program, solution, disturbance, suboptimal, novelty
         return Decision(inputs[0], inputs, *beliefs, status, count, clock.timing, *found)
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
@@ -185,16 +179,8 @@ class GPMPC:
     ) -> list[Decision]:
         """``control`` for T questions, with the first stages of all of them linearised in one call.
 
-        The quadratic programs are solved one by one. The model's time is shared out equally.
-
-        Args:
-            beliefs: T, one a question.
-            references: T.
-            previous: T decisions, None where there is none.
-            parameters: T, one a question.
-
-        Raises:
-            ShapeError: As for ``control``.
+        The quadratic programs are solved one by one. The model's time is shared out equally. The arguments are lists of
+        those of ``control``, as long as one another.
         """
         own = [None] * len(beliefs) if parameters is None else parameters
         asked = list(zip(beliefs, references, previous, own, strict=True))
@@ -205,10 +191,10 @@ class GPMPC:
             made = self.prediction.linearize_many([requests[t] for t in known])
         except FAILURES:  # one of them spoils the batch: which one, they say alone
             return [self.control(*question) for question in asked]
-        clock.model(len(known))
+        clock.lap("model", len(known))
         for t, prediction in zip(known, made, strict=True):
             try:
-                decisions[t] = self._improve(prediction, requests[t], clock.copy())
+                decisions[t] = self._improve(prediction, requests[t], _Stopwatch(clock.timing.model))
             except FAILURES:
                 decisions[t] = requests[t].failed_decision(Status.NUMERICAL_TROUBLE, timing=clock.timing)
         return decisions
@@ -243,19 +229,12 @@ class GPMPC:
     def build(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
     ) -> QuadraticProgram:
-        """The (first) quadratic program of a step, checked.
+        """The (first) quadratic program of a step, checked; the arguments are those of ``control``.
 
         Its unknowns are the inputs u_0 .. u_{H-1}, one after the other. Rows of G: increments u_k - u_{k-1} where they
-        are bounded, then the bounded states of the stages 1 to H, upper bounds first; ``soft`` has their prices.
-
-        Args:
-            belief: As for ``control``.
-            reference: As for ``control``.
-            previous: As for ``control``.
-            parameters: As for ``control``.
+        are bounded, then the bounded states of the stages 1 to H, upper bounds first.
 
         Raises:
-            ShapeError: As for ``control``.
             DataError: The belief is not finite, or it does not stay so.
             ProblemError: The program is malformed, numerically.
         """
@@ -270,18 +249,20 @@ class GPMPC:
 
     def _solve(self, program: CondensedProgram, warm: QPSolution | None) -> QPSolution:
         if isinstance(self.solver, DualActiveSet):
-            soft = self.soft
+            soft = self._soft
             if soft is not None and len(program.feedback):  # there the bounds of inputs are rows, too
                 soft = self.prediction.constraints.softness(len(program.G) - len(soft.linear) + self._rates)
             return self.solver.solve(QuadraticProgram.unchecked(*program[:5]), warm, soft)
         fits = warm is not None and len(warm.q) == len(program.q) and len(warm.lower) == len(program.lower)
         return self.solver.solve(QuadraticProgram.from_stacked(*program[:5]), warm if fits else None)
 
-    def _proposed(self, prediction: Prediction, program: CondensedProgram, solution: QPSolution, last: Array) -> Plan:
+    def _proposed(
+        self, prediction: Prediction, program: CondensedProgram, solution: QPSolution, request: Request
+    ) -> Plan:
         """The plan of a program's solution: its inputs, and the states that the stages lead to."""
-        stages, start = Stages(*prediction.stages[:3]), prediction.plan.states[0]
+        stages, at = Stages(*prediction.stages[:3]), (prediction.plan.states[0], program.feedback)
         unknowns = np.ascontiguousarray(solution.x, dtype=np.float64)
-        inputs, states = call_unchecked(expand, stages, start, program.feedback, last, unknowns)
+        inputs, states = call_unchecked(expand, stages, *at, request.references.previous_input, unknowns)
         return Plan(states, inputs, prediction.covariances)
 
     def _missed(self, prediction: Prediction) -> float:
@@ -293,15 +274,7 @@ class GPMPC:
 class NonlinearGPMPC(GPMPC):
     """Nonlinear GP-MPC (Cao, Lai and Alam, 2017, eq. (22)): programs of the whole belief, iterated to convergence.
 
-    Args:
-        model: As for ``GPMPC``.
-        propagator: As for ``GPMPC``.
-        problem: As for ``GPMPC``.
-        horizon: As for ``GPMPC``.
-        initial_input: As for ``GPMPC``.
-        covariance: As for ``GPMPC``.
-        iterations: As for ``GPMPC``.
-        tolerance: As for ``GPMPC``.
+    It is ``GPMPC`` of another covariance mode and more iterations; arguments as there.
     """
 
     def __init__(
@@ -315,8 +288,7 @@ class NonlinearGPMPC(GPMPC):
         iterations: int = 100,
         tolerance: float = 1e-5,
     ):
-        settings = PredictionSettings(covariance=covariance)
-        start = problem, horizon, initial_input
+        settings, start = PredictionSettings(covariance=covariance), (problem, horizon, initial_input)
         super().__init__(model, propagator, *start, settings, iterations=iterations, tolerance=tolerance)
 
 
@@ -339,33 +311,19 @@ def _violation(solution: QPSolution) -> float:
 
 
 class _Stopwatch:
-    """Where the time goes, in laps: each call adds the time since the last one to its part."""
+    """Where the time goes: each lap adds the time since the last one to its part."""
 
-    def __init__(self) -> None:
-        self._parts, self._last = [0.0, 0.0, 0.0], perf_counter()
+    def __init__(self, model: float = 0.0) -> None:
+        self._parts, self._last = {"model": model, "build": 0.0, "solve": 0.0}, perf_counter()
 
-    def model(self, shares: int = 1) -> None:
-        self._lap(0, shares)
-
-    def build(self) -> None:
-        self._lap(1)
-
-    def solve(self) -> None:
-        self._lap(2)
-
-    def copy(self) -> "_Stopwatch":
-        other = _Stopwatch()
-        other._parts[:] = self._parts
-        return other
-
-    @property
-    def timing(self) -> Timing:
-        return Timing(*self._parts)
-
-    def _lap(self, part: int, shares: int = 1) -> None:
+    def lap(self, part: str, shares: int = 1) -> None:
         now = perf_counter()
         self._parts[part] += (now - self._last) / max(1, shares)
         self._last = now
+
+    @property
+    def timing(self) -> Timing:
+        return Timing(**self._parts)
 
 
 @compiled

@@ -187,10 +187,11 @@ class ControlLoop:
             raise ShapeError(f"state must have shape {plan.means.shape[1:]}; got {state.shape}")
         if np.isfinite(plan.means).all() and np.isfinite(state).all():
             if self._gains is None or self._gains[0] is not plan:
-                self._gains = plan, getattr(self.controller, "gains", _no_gains)(plan)
+                gains, none = getattr(self.controller, "gains", None), np.zeros((*plan.inputs.shape, len(state)))
+                self._gains = plan, none if gains is None else gains(plan)
             error = state - _state_along(plan.means, min(share, len(plan.inputs)))
-            angles = getattr(getattr(self.controller, "problem", None), "cost", None)
-            error -= full_turns(error, () if angles is None else angles.angles)
+            cost = getattr(getattr(self.controller, "problem", None), "cost", None)
+            error -= full_turns(error, () if cost is None else cost.angles)
             input = input - self._gains[1][stage] @ error
         return _within_bounds(self.controller, input, self._before)
 
@@ -199,11 +200,6 @@ class ControlLoop:
         rehearsal = ControlLoop(self.controller, "previous_plan")
         for _ in range(2):
             rehearsal.input(state, reference, parameters)
-
-
-def _no_gains(plan: Decision) -> np.ndarray:
-    """No feedback: the inputs of the plan as they are."""
-    return np.zeros((*plan.inputs.shape, plan.means.shape[1]))
 
 
 def _state_along(states: np.ndarray, time: float) -> np.ndarray:
@@ -254,8 +250,9 @@ def _conclude(
         rows = plan.inputs, plan.means, plan.covariances
         inputs, means, covariances = (np.concatenate([part[1:], part[-1:]]) for part in rows)
         first = last.input if on_failure == "hold" else inputs[0]
-        shifted = replace(_with_first_input(plan, inputs, first), means=means, covariances=covariances)
-        shifted = _admit(controller, shifted, last)
+        shifted = _admit(
+            controller, replace(_with_first(plan, inputs, first), means=means, covariances=covariances), last
+        )
         if shifted is not None:
             return Command(shifted.input, status, decision, shifted)
     known = getattr(controller, "initial_input", None) if reference.inputs is None else reference.inputs[0]
@@ -264,8 +261,7 @@ def _conclude(
     input = _within_bounds(controller, np.array(known, dtype=float), last)
     H, n = reference.horizon, reference.states.shape[1]
     unknown = np.full((H + 1, n), np.nan), np.full((H + 1, n, n), np.nan)
-    applied = Decision(input, np.tile(input, (H, 1)), *unknown, status, 0, Timing(0.0, 0.0, 0.0))
-    return Command(input, status, decision, applied)
+    return Command(input, status, decision, Decision(input, np.tile(input, (H, 1)), *unknown, status, 0, Timing()))
 
 
 def _has_right_shape(controller: Controller, decision: Decision, last: Command | None) -> bool:
@@ -281,7 +277,7 @@ def _admit(controller: Controller, plan: Decision, last: Command | None) -> Deci
     off = np.abs(input - plan.input)
     if not (off <= _ROUNDING * np.maximum(1.0, np.abs(input))).all() or not np.isfinite(plan.inputs).all():
         return None  # off is NaN where an input is not finite
-    return _with_first_input(plan, plan.inputs, input) if off.any() else plan
+    return _with_first(plan, plan.inputs, input) if off.any() else plan
 
 
 def _within_bounds(controller: Controller, input: np.ndarray, last: Command | None) -> np.ndarray:
@@ -297,5 +293,5 @@ def _within_bounds(controller: Controller, input: np.ndarray, last: Command | No
     return np.minimum(np.maximum(input, low), high)
 
 
-def _with_first_input(plan: Decision, inputs: np.ndarray, first: np.ndarray) -> Decision:
+def _with_first(plan: Decision, inputs: np.ndarray, first: np.ndarray) -> Decision:
     return replace(plan, input=first, inputs=np.concatenate([first[None], inputs[1:]]))

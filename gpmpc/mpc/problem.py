@@ -1,7 +1,11 @@
 """Declares what a controller makes small and what it keeps: one problem for all controllers.
 
-    minimise    the costs of ``gpmpc.mpc.cost``
+    minimise    sum_{i=1..H} E|x_i - r_i|^2_Q + |v_{i-1}|^2_R + sum_j E|y_j(x_i, u_{i-1}, p_i) - c_j|^2_W
     subject to  bounds on u_i and on u_i - u_{i-1}, and the constraints of the states x_1 .. x_H
+
+v is the input itself, its deviation from the reference input, or its increment (Cao, Lai and Alam, 2017, sections
+3.2-3.3). Weights, bounds, references c and parameters p may differ by stage; stage i pairs a state with the input that
+led to it. For a Gaussian x_i, E|x - r|^2_Q = |mu - r|^2_Q + tr(Q Sigma).
 
 A constraint g'x <= f of a Gaussian state holds with probability eta where g'mu + kappa sqrt(g'Sigma g) <= f,
 kappa = Phi^-1(eta); smooth ones, h(x, u, p) <= 0, are linearised along the plan. By default a constraint is soft: a
@@ -19,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gpmpc.exceptions import SettingError, check_number
-from gpmpc.mpc.cost import Expansion, LeastSquares, Tracking, by_stage, expand_function
+from gpmpc.mpc._cost import LeastSquares, Tracking, by_stage, expand_function, read_numbers
 from gpmpc.qp.problem import ABSENT
 
 Array = np.ndarray
@@ -92,6 +96,12 @@ class Box(Constraint):
 
     Raises:
         SettingError: Crossed bounds, or as for ``Constraint``.
+
+    >>> Box(lower=[-2.0], upper=[1.0]).upper
+    array([1.])
+    >>> Box(lower=[2.0], upper=[1.0])
+    Traceback (most recent call last):
+    gpmpc.exceptions.SettingError
     """
 
     lower: Any = None
@@ -100,22 +110,19 @@ class Box(Constraint):
     def __post_init__(self) -> None:
         super().__post_init__()
         given = [("lower", self.lower), ("upper", self.upper)]
-        sides = [None if side is None else _numbers(key, side) for key, side in given]
+        sides = [None if side is None else read_numbers(key, side) for key, side in given]
         shape = next((side.shape for side in sides if side is not None), (0,))
         for (key, value), side, absent in zip(given, sides, (-math.inf, math.inf), strict=True):
             array = np.full(shape, absent) if side is None else side
-            if array.ndim not in (1, 2) or array.shape != shape:
+            if array.ndim not in (1, 2) or array.shape != shape or np.isnan(array).any():
                 raise SettingError(key, f"must be a list of {shape[-1]} numbers, or one by stage; got {value!r}")
             if (-np.sign(absent) * array >= ABSENT).any():
-                raise SettingError(
-                    key, f"no number keeps it: a bound of size {ABSENT:g} or more is none; got {value!r}"
-                )
+                rule = f"no number keeps it: a bound of size {ABSENT:g} or more is none"
+                raise SettingError(key, f"{rule}; got {value!r}")
             object.__setattr__(self, key, array)
         for at in np.argwhere(self.lower > self.upper)[:1]:
-            entry, at = at[-1], tuple(at)
-            raise SettingError(
-                "lower, upper", f"must not cross; entry {entry} has {self.lower[at]:g} above {self.upper[at]:g}"
-            )
+            got = f"entry {at[-1]} has {self.lower[tuple(at)]:g} above {self.upper[tuple(at)]:g}"
+            raise SettingError("lower, upper", f"must not cross; {got}")
 
     @property
     def size(self) -> int:
@@ -167,7 +174,7 @@ class Halfspaces(Constraint):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        F, f = _numbers("F", self.F), _numbers("f", self.f)
+        F, f = read_numbers("F", self.F), read_numbers("f", self.f)
         if F.ndim != 2 or f.ndim not in (1, 2) or f.shape[-1] != len(F):
             raise SettingError("F, f", f"must be (r, n) and (r,) or (H, r); got {F.shape} and {f.shape}")
         if not (np.isfinite(F).all() and np.isfinite(f).all() and F.any(axis=1).all()):
@@ -194,8 +201,7 @@ class Inequality(Constraint):
     where to go: prefer ``radius - distance`` to ``radius**2 - distance**2``.
 
     Attributes:
-        h: A function of tensors or in CasADi, like y of ``LeastSquares``: states, inputs and parameters of all stages
-            to (H, count), or the first of these arguments.
+        h: A function of tensors or in CasADi, like y of ``LeastSquares``, that gives (H, count).
         count: Number of values of h at a stage.
 
     Raises:
@@ -216,8 +222,8 @@ class Inequality(Constraint):
         upper = np.zeros((horizon, self.count))
         return np.zeros((self.count, 0)), np.full_like(upper, -math.inf), upper
 
-    def expand(self, states: Array, inputs: Array, parameters: Array | None) -> Expansion:
-        """Returns h and its gradients along a plan (H, n), (H, m); see ``gpmpc.mpc.cost.expand_function``."""
+    def expand(self, states: Array, inputs: Array, parameters: Array | None) -> tuple[Array, Array, Array]:
+        """Returns h (H, r) and its gradients (H, r, n), (H, r, m) along a plan (H, n), (H, m)."""
         return expand_function("h", self.h, self.count, states, inputs, parameters)
 
 
@@ -255,10 +261,9 @@ class Problem:
             if box.size != self.input_dim:
                 raise SettingError(key, f"must bound {self.input_dim} inputs; got {box.size}")
             object.__setattr__(self, key, box)
-        for key, kind, examples in (
-            ("constraints", Constraint, "Box(...), Halfspaces(...) or Inequality(...)"),
-            ("outputs", LeastSquares, "LeastSquares(...)"),
-        ):
+        examples = "Box(...), Halfspaces(...) or Inequality(...)"
+        kinds = ("constraints", Constraint, examples), ("outputs", LeastSquares, "LeastSquares(...)")
+        for key, kind, examples in kinds:
             value = () if getattr(self, key) is None else getattr(self, key)
             parts = (value,) if isinstance(value, kind) else tuple(value)
             for part in parts:
@@ -286,17 +291,7 @@ class Problem:
 
     def price(self, constraint: Constraint) -> float:
         """Returns the price of violating a constraint, infinite for a hard one."""
-        if constraint.penalty == "exact":
-            return _EXACT * max(self.cost.largest_weight, *(part.largest_weight for part in self.outputs), 0.0)
-        return math.inf if constraint.penalty is None else float(constraint.penalty)
-
-
-def _numbers(key: str, value: Any) -> Array:
-    """An array from a list."""
-    try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        array = np.empty(())
-    if array.ndim == 0 or not array.size or np.isnan(array).any():
-        raise SettingError(key, f"must be a list of numbers, infinite where unbounded; got {value!r}")
-    return array
+        if constraint.penalty != "exact":
+            return math.inf if constraint.penalty is None else float(constraint.penalty)
+        weights = [self.cost.largest_weight, *(np.linalg.eigvalsh(part.weight).max() for part in self.outputs)]
+        return _EXACT * float(max(weights))

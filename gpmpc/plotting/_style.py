@@ -1,15 +1,15 @@
 """Sets how every figure looks: colours, lines, grid, type, names with units, legends below the axes, titles.
 
-The colours are those of Okabe and Ito (2008), which people who are colour-blind tell apart; lines differ in their
-dashes as well, so that a black and white print can be read.
+``gpmpc.mplstyle`` holds matplotlib's own settings, for scripts too. Lines differ in their dashes as well as in their
+colours, so that a black and white print can be read.
 """
 
 import io
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
@@ -20,18 +20,6 @@ ORANGE, SKY, BLACK, GREY = "#e69f00", "#56b4e9", "#000000", "0.45"
 COLOURS = (BLUE, VERMILION, GREEN, _PURPLE, ORANGE, SKY, BLACK, GREY)
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.6)), (0, (6, 2, 1.2, 2)), (0, (3, 3)), (0, (8, 2)))
 DASHED = (0, (4, 3))  # of references and bounds
-_STYLE: Any = {
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "axes.prop_cycle": cycler(color=COLOURS),
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.titlesize": "medium",
-    "figure.titlesize": "medium",
-    "grid.color": "0.92",
-    "legend.frameon": False,
-    "lines.linewidth": 1.4,
-}
 _NAMES = {
     "z": "z, downwards",
     "phi": "roll",
@@ -42,7 +30,7 @@ _NAMES = {
     "uy": "direction uy",
 }
 
-styled = mpl.rc_context(_STYLE)  # a decorator of what makes a figure
+styled = mpl.rc_context(fname=Path(__file__).with_name("gpmpc.mplstyle"))  # a decorator of what makes a figure
 
 
 def name_of(name: str, unit: str = "", z_down: bool = True) -> str:

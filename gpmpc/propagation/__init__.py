@@ -1,12 +1,12 @@
 """Gaussian beliefs pushed through learned models, and the local models that control needs of that."""
 
-from gpmpc.propagation.linearization import Linearization, MeanEquivalence
-from gpmpc.propagation.local_model import LocalModel, linearize, rollout
-from gpmpc.propagation.moment_matching import MomentMatching, best_propagator
-from gpmpc.propagation.monte_carlo import MonteCarlo
-from gpmpc.propagation.propagator import Propagation, Propagator
-from gpmpc.propagation.sensitivity import Sensitivity, differentiate
-from gpmpc.propagation.unscented import Unscented
+from gpmpc.propagation._linearization import Linearization, MeanEquivalence
+from gpmpc.propagation._local_model import LocalModel, linearize, rollout, square_roots
+from gpmpc.propagation._moment_matching import MomentMatching, best_propagator
+from gpmpc.propagation._monte_carlo import MonteCarlo
+from gpmpc.propagation._propagator import Propagation, Propagator
+from gpmpc.propagation._sensitivity import Sensitivity, differentiate
+from gpmpc.propagation._unscented import Unscented
 
 __all__ = [
     "Linearization",
@@ -22,4 +22,5 @@ __all__ = [
     "differentiate",
     "linearize",
     "rollout",
+    "square_roots",
 ]

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.posterior import AffineForm
-from gpmpc.propagation.sensitivity import Sensitivity
+from gpmpc.propagation._sensitivity import Sensitivity
 
 _NOT_WANTED: Any = None
 

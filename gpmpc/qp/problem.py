@@ -101,6 +101,11 @@ class QuadraticProgram(_Arrays):
         G: (m, n) rows.
         lower: (M,) lower bounds of the stacked constraints ``[x; Gx]``.
         upper: (M,) upper bounds likewise.
+
+    >>> from gpmpc.qp import DualActiveSet
+    >>> solution = DualActiveSet().solve(QuadraticProgram(P=[[2, 0], [0, 2]], q=[-2, -4], ub=[0.5, 1]))
+    >>> solution.status.name, solution.x.tolist()
+    ('SOLVED', [0.5, 1.0])
     """
 
     __slots__ = ()

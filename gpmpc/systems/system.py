@@ -86,6 +86,8 @@ class System:
         pose: States that say where it is in space and how it is turned, by x, y, z, roll, pitch, yaw; pictures show it
             there.
         z_down: Whether the z axis of that space points downwards.
+        nominal: What is known of it before anything is learned, as a system with its states, inputs and time step; a
+            model of differences learns what it misses.
 
     Raises:
         SettingError: A number out of range, an unknown name, tracked states of several units, or dynamics without a
@@ -111,6 +113,7 @@ class System:
     references: Callable[[Trajectory, int, float], Array] | None = None
     pose: Mapping[str, str] = field(default_factory=dict)
     z_down: bool = False
+    nominal: "System | None" = None
 
     def __post_init__(self) -> None:
         check_number("time_step", self.time_step, above=0, unit="[s]")
@@ -156,6 +159,10 @@ class System:
             if len(self.region) != 2:
                 raise SettingError("region", f"must be the smallest and the largest states; got {self.region!r}")
             self._set("region", tuple(_floats("region", side, n) for side in self.region))
+        if (known := self.nominal) is not None:
+            own = states, inputs, self.time_step
+            if (found := (known.state_names, known.input_names, known.time_step)) != own:
+                raise SettingError("nominal", f"must have the states, inputs and time step {own}; got {found}")
         self._check_dynamics()
 
     def _set(self, key: str, value: Any) -> None:
@@ -256,6 +263,10 @@ class System:
 
 def step(plant: Plant, state: Array, input: Array) -> Array:
     """The next state (n,) of a plant from a state (n,) and an input (m,).
+
+    >>> from gpmpc.systems import pendulum
+    >>> step(pendulum(), [0.1, 0.0], [0.0]).round(3).tolist()
+    [0.102, 0.074]
 
     Raises:
         ShapeError: State or input are of another length.

@@ -1,7 +1,7 @@
 """Checks of your own models, propagators and QP solvers against the protocols that the rest of gpmpc relies on."""
 
-from gpmpc.testing.model import check_model
-from gpmpc.testing.propagator import check_propagator
-from gpmpc.testing.qp import check_qp_solver
+from gpmpc.testing._model import check_model
+from gpmpc.testing._propagator import check_propagator
+from gpmpc.testing._qp import check_qp_solver
 
 __all__ = ["check_model", "check_propagator", "check_qp_solver"]

@@ -11,7 +11,7 @@ def test_what_the_package_logs_is_told_once_and_a_searchs_evaluations_not_at_all
     try:
         logging_console()
         for _ in range(2):
-            logging.getLogger("gpmpc.gp.scaling").info("constant columns are centred")
+            logging.getLogger("gpmpc.gp._scaling").info("constant columns are centred")
         logging.getLogger("gpmpc.gp._search").info("training: output 1 of 6: evaluation 3")
     finally:
         log.handlers, log.propagate, log.level = before

@@ -25,11 +25,18 @@ from gpmpc.gp import (
 )
 from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
 from gpmpc.gp._search import column_std, constant_columns
+from gpmpc.gp._sparse import collapsed_bound
 from gpmpc.gp.casadi_ import casadi_function
 from gpmpc.gp.module import PosteriorModule
-from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, linearize
-from gpmpc.propagation.sensitivity import differentiate
-from tests.gp.whole_bound import collapsed_bound
+from gpmpc.propagation import (
+    Linearization,
+    MeanEquivalence,
+    MomentMatching,
+    MonteCarlo,
+    Unscented,
+    differentiate,
+    linearize,
+)
 
 FEATURES = [1e8, torch.tensor([-1e8, 1e7, 13.75])]
 TARGETS = [-1e8, torch.tensor([1e8, 0.0])]

@@ -5,7 +5,7 @@ import torch
 
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gp import GPPosterior, SlidingWindow, Transitions, append_transitions, remove_points
-from gpmpc.gp.online import _divergence, _noise_variances, least_informative
+from gpmpc.gp._online import _divergence, _noise_variances, least_informative
 from tests.gp.small_models import residual_model
 
 

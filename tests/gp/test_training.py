@@ -138,7 +138,7 @@ def test_a_start_that_is_known_is_searched_from_over_all_points():
 
 
 def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(monkeypatch):
-    monkeypatch.setattr("gpmpc.gp.training.available_memory", lambda: 2 * 2**20)
+    monkeypatch.setattr("gpmpc.gp._training.available_memory", lambda: 2 * 2**20)
     with pytest.raises(DataError) as refused:
         train(pendulum(400))
     assert str(refused.value) == (
@@ -146,7 +146,7 @@ def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(
         "available: train on 256 points or fewer, or sparse GPs (SparseTrainer)"
     )
     assert len(train(pendulum(250), restarts=0, tolerance=1e-3).posterior) == 250
-    monkeypatch.setattr("gpmpc.gp.training.available_memory", lambda: None)
+    monkeypatch.setattr("gpmpc.gp._training.available_memory", lambda: None)
     assert len(train(pendulum(20), restarts=0).posterior) == 20
 
 

@@ -6,8 +6,7 @@ import pytest
 
 from gpmpc.gp.casadi_ import tape_of
 from gpmpc.kernels.gp_rollout import Feedback
-from gpmpc.models import CasadiFunction, KnownModel
-from gpmpc.models.roll_out import RollOut
+from gpmpc.models import CasadiFunction, KnownModel, RollOut
 from gpmpc.systems import double_pendulum, step
 
 X, U = casadi.SX.sym("x", 3), casadi.SX.sym("u", 2)

@@ -7,8 +7,7 @@ import torch
 from gpmpc.dynamics import linearize
 from gpmpc.gp import GPPosterior
 from gpmpc.kernels.gp_rollout import Feedback
-from gpmpc.models import Affine, DisturbedModel, ResidualModel
-from gpmpc.models.roll_out import RollOut
+from gpmpc.models import Affine, DisturbedModel, ResidualModel, RollOut
 
 GENERATOR = torch.Generator().manual_seed(3)
 

@@ -8,11 +8,11 @@ import torch
 
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.mpc.controller import Reference, Request
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import PrimalActiveSet
 from tests.mpc.systems import HOVER, quadrotor_gp

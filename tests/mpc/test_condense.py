@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import ShapeError
-from gpmpc.mpc.condense import Condenser, condense_with_feedback
-from gpmpc.mpc.cost import PENALIZED
-from gpmpc.mpc.linear_quadratic import QuadraticCost, References, StageRows, Stages, evaluate_cost, expand
+from gpmpc.mpc._condense import Condenser, condense_with_feedback
+from gpmpc.mpc._cost import PENALIZED
+from gpmpc.mpc._linear_quadratic import QuadraticCost, References, StageRows, Stages, evaluate_cost, expand
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
 from gpmpc.status import Status

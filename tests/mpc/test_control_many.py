@@ -10,11 +10,11 @@ from torch.utils._pytree import tree_leaves
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
+from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc._stages import StageLinearizer
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.mpc.stages import StageLinearizer
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from gpmpc.status import Status
 from tests.mpc.systems import HOVER, linear_gaussian, quadrotor_gp

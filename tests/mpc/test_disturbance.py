@@ -9,12 +9,12 @@ import torch
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
+from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.policy import command
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.status import Status
 from tests.mpc.small_models import double_integrator, pendulum_posterior

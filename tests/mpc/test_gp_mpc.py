@@ -9,12 +9,12 @@ import torch
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
+from gpmpc.mpc._prediction import FORMS, PredictionSettings
+from gpmpc.mpc._stages import COVARIANCES
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import FORMS, PredictionSettings
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.mpc.stages import COVARIANCES
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, rollout
 from gpmpc.qp import CvxpySolver, DualActiveSet
 from gpmpc.status import Status

@@ -9,9 +9,9 @@ import torch
 from gpmpc.estimation import AdaptiveTube, ConformalTube
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from tests.mpc.small_models import double_integrator

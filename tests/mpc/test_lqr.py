@@ -7,10 +7,10 @@ import torch
 from gpmpc.dynamics import linearize_by_autograd
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc._linear_quadratic import dlqr, finite_horizon_lqr
 from gpmpc.mpc.baselines import LQR
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
-from gpmpc.mpc.linear_quadratic import dlqr, finite_horizon_lqr
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import MeanEquivalence
 from gpmpc.status import Status

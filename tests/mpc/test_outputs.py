@@ -9,15 +9,14 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Transitions, train
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc.baselines import LQR, NMPC
+from gpmpc.mpc import LeastSquares
+from gpmpc.mpc._prediction import FORMS, PredictionSettings
+from gpmpc.mpc._stages import COVARIANCES
+from gpmpc.mpc.baselines import LQR, NMPC, StateFormMPC
 from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.cost import LeastSquares
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.policy import ControlLoop
-from gpmpc.mpc.prediction import FORMS, PredictionSettings
 from gpmpc.mpc.problem import Box, Inequality, Problem, Tracking
-from gpmpc.mpc.stages import COVARIANCES
-from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from tests.mpc.double_pendulum import ACROBOT, DoublePendulum

@@ -60,7 +60,7 @@ def test_a_problem_that_makes_no_sense_is_refused(arguments, message):
         ({"lower": [-math.inf], "upper": [-1e20]}, "upper: no number keeps it"),
         ({"lower": [0.0, 0.0]}, "upper: must be a list of 2 numbers"),
         ({"lower": 0.0}, "lower: must be a list of numbers"),
-        ({"lower": [math.nan]}, "lower: must be a list of numbers"),
+        ({"lower": [math.nan]}, "lower: must be a list of 1 numbers"),
         ({"probability": 0.5}, r"probability: must lie in \(0.5, 1\); got 0.5"),
         ({"probability": 1.0}, r"probability: must lie in \(0.5, 1\); got 1.0"),
         ({"joint": True}, "joint: needs a probability"),

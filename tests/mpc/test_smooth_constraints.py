@@ -5,10 +5,10 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status

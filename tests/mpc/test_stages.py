@@ -8,7 +8,7 @@ from gpmpc.dynamics import Linearized
 from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc.stages import LinearizedStages, StageLinearizer
+from gpmpc.mpc._stages import LinearizedStages, StageLinearizer
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from tests.mpc.small_models import double_integrator, pendulum_posterior
 

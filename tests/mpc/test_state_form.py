@@ -7,12 +7,12 @@ import pytest
 
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc._prediction import FORMS, PredictionSettings
+from gpmpc.mpc._stages import COVARIANCES
+from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.prediction import FORMS, PredictionSettings
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.mpc.stages import COVARIANCES
-from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization, MeanEquivalence
 from gpmpc.qp import CvxpySolver
 from gpmpc.status import Status
@@ -85,7 +85,7 @@ def test_what_cannot_be_solved_is_reported():
 
 
 def test_importing_the_controllers_does_not_load_cvxpy():
-    modules = "gpmpc.mpc, gpmpc.mpc.gp_mpc, gpmpc.mpc.state_form"
+    modules = "gpmpc.mpc, gpmpc.mpc.gp_mpc, gpmpc.mpc.baselines"
     code = f"import sys, {modules}; print([m for m in ('cvxpy', 'hydra', 'matplotlib') if m in sys.modules])"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
     assert loaded == "[]"

@@ -9,12 +9,11 @@ import torch
 
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.baselines import NMPC
+from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc.baselines import NMPC, StateFormMPC
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.prediction import PredictionSettings
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.mpc.state_form import StateFormMPC
 from gpmpc.propagation import Linearization
 from gpmpc.qp import DualActiveSet, PrimalActiveSet
 from gpmpc.simulation import closed_loop

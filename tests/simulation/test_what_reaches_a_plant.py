@@ -5,12 +5,11 @@ import pytest
 
 from gpmpc.exceptions import ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.cascade import Cascade
 from gpmpc.mpc.controller import Decision, Reference, Timing
 from gpmpc.mpc.policy import command, commands
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
-from gpmpc.simulation import ModelLoop, cascade_loop, closed_loop, closed_loops
+from gpmpc.simulation import Cascade, ModelLoop, cascade_loop, closed_loop, closed_loops
 from gpmpc.status import Status
 from gpmpc.systems import Coupled, System
 from tests.mpc.systems import QUADROTOR, quadrotor_gp

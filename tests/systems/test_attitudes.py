@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gpmpc.systems import System, Translational, step, thrust_direction
-from gpmpc.systems.attitudes import approached, attitudes_along, rotational_states_along
-from gpmpc.systems.quadrotor import GRAVITY
+from gpmpc.systems._attitudes import approach_attitudes, attitudes_along, rotational_states_along
+from gpmpc.systems._quadrotor import GRAVITY
 from gpmpc.trajectories import Elliptical, Hover, Lorenz, states_along
 
 
@@ -29,7 +29,7 @@ def test_hovering_is_level():
 
 def test_an_attitude_is_approached_at_first_order_with_the_rate_that_belongs_to_it():
     angles = np.array([[0.1, -0.2], [0.3, 0.0]])
-    states = approached(angles, 8, 4, 0.05, 0.1)
+    states = approach_attitudes(angles, 8, 4, 0.05, 0.1)
     assert np.array_equal(states[:5, [0, 2]], np.tile(angles[0], (5, 1)))  # it begins where it is to be
     left = np.exp(-0.05 * np.arange(4) / 0.1)[:, None]
     assert states[4:, [0, 2]] == pytest.approx(angles[1] + left * (angles[0] - angles[1]))

@@ -55,3 +55,15 @@ def test_the_papers_protocol_sees_angles_as_they_are_and_a_users_own_may_be_name
     assert training.posterior.features.shape == (12, 3)
     chosen = experiment("system=cart_pole", "controller.problem.cost.angles=[]")
     assert chosen.controller.keywords["problem"].cost.angles == ()
+
+
+def test_a_nominal_model_leaves_less_to_learn():
+    fresh = experiment("system=pendulum", "data.seed=7").training_rows()
+
+    def error(*words):
+        chosen = experiment("system=pendulum", "model.restarts=0", "data.samples=20", *words)
+        model = chosen.learn(chosen.training_rows(), 0).posterior
+        return float((model.predict(fresh.states, fresh.inputs).mean - fresh.next_states).pow(2).mean().sqrt())
+
+    assert error("nominal={mass: 0.8}") < 0.3 * error()
+    assert error("nominal={}") == error()

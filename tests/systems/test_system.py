@@ -24,7 +24,7 @@ from gpmpc.systems import (
     stirred_tank,
     translational,
 )
-from gpmpc.systems.attitudes import GRAVITY
+from gpmpc.systems._attitudes import GRAVITY
 from gpmpc.trajectories import Hover, Step, Waypoints
 
 ALL = [
@@ -145,6 +145,7 @@ def test_a_trajectory_prescribes_the_tracked_states_and_their_rates():
         ({"input_lower": [0.0, 0.0]}, SettingError, "input_lower: must be a list of 1 numbers"),
         ({"start": [0.0]}, SettingError, "start: must be a list of 2 numbers; got"),
         ({"region": [[0.0, 0.0]]}, SettingError, "region: must be the smallest and the largest states"),
+        ({"nominal": pendulum()}, SettingError, "nominal: must have the states, inputs and time step .*position"),
         ({"lost": 0.0}, SettingError, "lost: must be a number above 0"),
     ],
 )

@@ -1,0 +1,232 @@
+"""Posteriors of models that were trained in GPyTorch.
+
+``from_gpytorch`` freezes SE-ARD models to a ``GPPosterior``. ``KernelPosterior`` takes any kernel and mean: GPyTorch
+evaluates the prior, and the rest is one exact Cholesky factorisation of K + sn2 I and
+
+    mean = m(x~) + k' (K + sn2 I)^-1 (y - m(X)),   variance = k(x~, x~) - |L^-1 k|^2
+
+(Rasmussen and Williams, 2006, Algorithm 2.1), because GPyTorch's own prediction turns to an iterative solver above 800
+points without a word, takes no leading batch dimensions of queries, and fails under ``torch.func``.
+"""
+
+import copy
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gpytorch
+import torch
+from torch import Tensor
+
+from gpmpc.dynamics import (
+    Array,
+    Linearized,
+    check_destination,
+    check_query,
+    linearize_by_autograd,
+)
+from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
+from gpmpc.gp._sparse import Method, sparse_posterior
+from gpmpc.gp.gpytorch_ import exact_inference, members
+from gpmpc.gp.posterior import GPPosterior
+
+
+def from_gpytorch(
+    model: Any, likelihood: Any = None, *, input_dim: int, predicts: Predicts = "next_state"
+) -> GPPosterior:
+    """Freezes trained SE-ARD ExactGPs of GPyTorch: one, a batch (one batch dimension, an output each), or a list.
+
+    A sparse one (``InducingPointKernel``) becomes its pseudo-observations; see ``gp.sparse``. Its method is the one by
+    which GPyTorch would predict: FITC, unless its setting ``sgpr_diagonal_correction`` is off. (Then its means are
+    those of SGPR; its variances lack kxx - qxx and vanish far from Z, ours do not.)
+
+    Args:
+        model: An ``ExactGP`` with a zero or constant mean and an ``RBFKernel``, scaled by a ``ScaleKernel`` or
+            not; an ``IndependentModelList``; or a sequence of models over the same inputs.
+        likelihood: Its ``GaussianLikelihood``, or a list of them; the models' own by default.
+        input_dim: m.
+        predicts: What the training targets mean.
+
+    Raises:
+        UnsupportedModel: The kernel, mean or likelihood is another one, or transforms are attached.
+        ShapeError: The models of a list have other training inputs or inducing points, or there is more than one batch
+            dimension.
+    """
+    rows: dict[str, list[Tensor]] = {"targets": [], "lengthscales": []}
+    rows |= {"signal_variance": [], "noise_variance": [], "offset": []}
+    data: Any = None
+    inducing: list[Tensor] = []
+    for one, own in members(model, likelihood):
+        inputs, targets = one.train_inputs[0], one.train_targets
+        inputs = inputs[:, None] if inputs.dim() == 1 else inputs
+        outputs, shared = targets[None] if targets.dim() == 1 else targets, inputs.reshape(-1, *inputs.shape[-2:])
+        data = shared[0] if data is None else data
+        if any(each.shape != data.shape or not torch.equal(each, data) for each in shared):
+            raise ShapeError("all outputs must have the same training inputs (N, d); got different ones")
+        scale, kernel = torch.ones((), dtype=torch.float64), one.covar_module
+        if isinstance(kernel, gpytorch.kernels.InducingPointKernel) and kernel.active_dims is None:
+            inducing += kernel.inducing_points.detach().reshape(-1, *kernel.inducing_points.shape[-2:])
+            kernel = kernel.base_kernel
+        if isinstance(kernel, gpytorch.kernels.ScaleKernel):
+            scale, kernel = kernel.outputscale, kernel.base_kernel
+        if type(kernel) is not gpytorch.kernels.RBFKernel or kernel.active_dims is not None:
+            name = type(kernel).__name__ + (" on some dimensions" if kernel.active_dims is not None else "")
+            rule = "GPPosterior has the SE-ARD kernel: RBFKernel, in a ScaleKernel or not"
+            raise UnsupportedModel(f"{rule}; got {name}. KernelPosterior takes any kernel")
+        if not isinstance(one.mean_module, gpytorch.means.ConstantMean | gpytorch.means.ZeroMean):
+            raise UnsupportedModel(f"the mean must be zero or constant; got {type(one.mean_module).__name__}")
+        k, d = len(outputs), data.shape[1]
+        rows["targets"].append(outputs)
+        rows["lengthscales"].append(kernel.lengthscale.reshape(-1, kernel.lengthscale.shape[-1]).expand(k, d))
+        constant = getattr(one.mean_module, "constant", torch.zeros((), dtype=torch.float64))
+        for name, value in (("signal_variance", scale), ("noise_variance", own.noise), ("offset", constant)):
+            rows[name].append(value.reshape(-1).expand(k).to(targets.device))
+    joined = {name: torch.cat(values).detach().clone() for name, values in rows.items()}
+    features, targets = data.detach().clone(), joined.pop("targets").T.contiguous()
+    offset, kernel = joined.pop("offset"), Hyperparameters(**joined)
+    if not inducing:
+        return GPPosterior.from_hyperparameters(features, targets, *kernel, input_dim, predicts, offset)
+    if len(inducing) not in (1, targets.shape[1]) or any(not torch.equal(Z, inducing[0]) for Z in inducing):
+        raise ShapeError("all outputs must be sparse, with the same inducing points (M, d); got different ones")
+    method: Method = "fitc" if gpytorch.settings.sgpr_diagonal_correction.on() else "sgpr"
+    return sparse_posterior(inducing[0].clone(), features, targets, kernel, input_dim, predicts, offset, method)
+
+
+@dataclass(frozen=True)
+class KernelPosterior:
+    """Exact GPs with any kernels of GPyTorch, frozen; build it with ``from_gpytorch``.
+
+    It works with every propagation but ``MomentMatching``, which has a closed form for the SE-ARD kernel only.
+
+    Attributes:
+        parts: One a GPyTorch model, each with one output or a batch of them.
+        input_dim: m, how many of the last features are controls.
+        predicts: What the targets mean.
+    """
+
+    parts: tuple["_Part", ...]
+    input_dim: int
+    predicts: Predicts
+
+    @classmethod
+    def from_gpytorch(
+        cls, model: Any, likelihood: Any = None, *, input_dim: int, predicts: Predicts = "next_state"
+    ) -> "KernelPosterior":
+        """Freezes trained ExactGPs in float64, which are copied; arguments are as for ``gpmpc.gp.from_gpytorch``.
+
+        Raises:
+            UnsupportedModel: The model is no such, or approximate.
+            ShapeError: The numbers of features differ, or do not go with the numbers of outputs and controls.
+            SettingError: The model is not in float64, or its kernel matrix is not positive definite.
+        """
+        if predicts not in PREDICTS:
+            raise SettingError("predicts", f"must be one of {', '.join(map(repr, PREDICTS))}; got {predicts!r}")
+        parts = tuple(_Part.of(one, own) for one, own in members(model, likelihood))
+        k, widths = sum(part.outputs for part in parts), sorted({part.features.shape[-1] for part in parts})
+        if len(widths) > 1:
+            raise ShapeError(f"all models must have the same number of features; got {widths}")
+        if not 0 <= input_dim < widths[0] or (predicts != "value" and widths[0] != k + input_dim):
+            raise ShapeError(
+                f"the models must have n + m features, one state an output and {input_dim} controls; "
+                f"got {widths[0]} features and {k} outputs"
+            )
+        return cls(parts, input_dim, predicts)
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states, n."""
+        return self.parts[0].features.shape[-1] - self.input_dim
+
+    @property
+    def output_dim(self) -> int:
+        """Number of outputs, k."""
+        return sum(part.outputs for part in self.parts)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of every tensor."""
+        return self.parts[0].cholesky.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Of every tensor."""
+        return self.parts[0].cholesky.device
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """Of the observations (k, k), diagonal."""
+        return torch.diag(torch.cat([part.noise for part in self.parts]))
+
+    def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "KernelPosterior":
+        """Copies the model to another device, or to another type: float32 or float64."""
+        check_destination(device, dtype)
+        return replace(self, parts=tuple(part.to(device, dtype) for part in self.parts))
+
+    def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
+        """The next state's distribution at a certain state and input; see ``GPPosterior.predict``."""
+        input = state[..., :0] if input is None else input
+        check_query(self, state, input)
+        batch, query = state.shape[:-1], torch.cat([state, input], dim=-1)
+        flat = query.reshape(-1, query.shape[-1])
+        means, variances = zip(*(part.predict(flat) for part in self.parts), strict=True)
+        mean, variance = (torch.cat(rows, dim=-1).reshape(*batch, -1) for rows in (means, variances))
+        return Gaussian(mean + state if self.predicts == "difference" else mean, torch.diag_embed(variance))
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises the mean at K points (K, n), (K, m) by torch autograd."""
+        return linearize_by_autograd(self, states, inputs, covariance)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One GPyTorch model with its factorisation: features (k, N, d) or (N, d), without batch for a single one."""
+
+    model: Any
+    features: Tensor
+    cholesky: Tensor
+    weights: Tensor
+    noise: Tensor  # (k,)
+
+    @classmethod
+    def of(cls, model: Any, likelihood: Any) -> "_Part":
+        targets = model.train_targets
+        if isinstance(getattr(model, "covar_module", None), gpytorch.kernels.InducingPointKernel):
+            raise UnsupportedModel("the model is sparse (InducingPointKernel): freeze it by from_gpytorch")
+        copied = copy.deepcopy(model).eval().requires_grad_(False)
+        copied.prediction_strategy = None
+        batch, inputs = targets.shape[:-1], copied.train_inputs[0].detach()
+        features = (inputs[:, None] if inputs.dim() == 1 else inputs).expand(*batch, -1, -1)
+        noise = likelihood.noise.detach().reshape(-1).expand(*batch or (1,)).clone()
+        with exact_inference(), torch.no_grad():
+            prior = copied.forward(features)
+            kernel = prior.lazy_covariance_matrix.to_dense().clone()
+            kernel.diagonal(dim1=-2, dim2=-1).add_(noise.reshape(*batch, 1))
+            cholesky, info = torch.linalg.cholesky_ex(kernel)
+            if bool(info.any()):
+                rule = "its kernel matrix is not positive definite in float64: raise the noise, or drop equal rows"
+                raise SettingError("model", rule)
+            weights = torch.cholesky_solve((targets - prior.mean)[..., None], cholesky)[..., 0]
+        return cls(copied, features, cholesky, weights, noise)
+
+    @property
+    def outputs(self) -> int:
+        return len(self.noise)
+
+    def predict(self, query: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance (B, k) at (B, d)."""
+        size = self.features.shape[-2]
+        joined = torch.cat([self.features, query.expand(*self.features.shape[:-2], -1, -1)], dim=-2)
+        with exact_inference():
+            prior = self.model.forward(joined)  # lazy: only the two blocks below are evaluated
+            covariance = prior.lazy_covariance_matrix
+            k = covariance[..., :size, size:].to_dense()  # (*k, N, B)
+            own = covariance[..., size:, size:].diagonal(dim1=-2, dim2=-1)
+        explained = torch.linalg.solve_triangular(self.cholesky, k, upper=False).square().sum(-2)
+        mean = prior.mean[..., size:] + (self.weights[..., None] * k).sum(-2)
+        variance = (own - explained).clamp_min(0)
+        return mean.reshape(self.outputs, -1).mT, variance.reshape(self.outputs, -1).mT
+
+    def to(self, device: Any, dtype: torch.dtype | None) -> "_Part":
+        tensors = (t.to(device=device, dtype=dtype) for t in (self.features, self.cholesky, self.weights, self.noise))
+        return _Part(copy.deepcopy(self.model).to(device=device, dtype=dtype), *tensors)

@@ -1,0 +1,327 @@
+r"""Points that come and go while a controller runs, without factorising K + sn2 I anew, which is cubic in them.
+
+Adding points extends the Cholesky factor by rows, removing one changes only the block below it, by a rank-one term
+(Gill, Golub, Murray and Saunders, 1974; Osborne, 2010, appendix B, for GPs). With K + sn2 I = L L' and p new points X*,
+
+    L+ = [ L    0 ]        L22 L22' = K(X*, X*) + sn2 I - L21 L21',      L21' = L^-1 K(X, X*)
+         [ L21 L22]
+
+    removing i:  L33+ L33+' = L33 L33' + l32 l32',     l32 = L[i+1:, i]
+
+which is O(N^2) a point. The second is an update by a positive term, which is stable; and the weights are solved for
+from the factor each time, two triangular systems, so that no error is carried along with them.
+
+The least informative point is the one whose removal changes the posterior over functions least, in Kullback-Leibler
+divergence. With and without y_i the two posteriors differ by one factor of the likelihood, which depends on f(x~_i)
+alone; so their divergence is that of two one-dimensional Gaussians, and the leave-one-out formulas (Rasmussen and
+Williams, 2006, eq. (5.12)) give it from P = (K + sn2 I)^-1 and beta = P (y - offset):
+
+    KL_i = 1/2 sum_a [ e_ai - 1 - log e_ai + beta_ai^2 (1 / P_aii - sn2_a) ],     e_ai = sn2_a P_aii
+
+(e is the variance of f(x~_i) with y_i over that without.) Csato and Opper (2002, section 3.3) score |beta_i| / P_ii
+instead, the change of the mean, for one output; this score counts the variance too and adds up over outputs of any
+unit. Of the pseudo-observations of a sparse model, whose noise is correlated, only the variances are counted.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gpmpc.compiled import compiled
+from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel, check_number
+from gpmpc.gaussian import check_tensors
+from gpmpc.gp._kernel import check_positive_definite, kernel_matrix
+from gpmpc.gp.backend import host_arrays
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp.transitions import Transitions, check_transitions
+
+_log = logging.getLogger(__name__)
+_MANY = 0.2  # where more than this part of the points is removed, one factorisation costs less than the updates
+
+
+def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPosterior:
+    """Appends transitions to a posterior's data, in O(N^2) a point; the hyperparameters stay (``Trainer.refit``).
+
+    Raises:
+        ShapeError: The transitions have other dimensions.
+        UnsupportedModel: The GPs predict values, which transitions do not hold: ``append_points``.
+        SettingError: The larger kernel matrix is not positive definite in this dtype.
+    """
+    targets = targets_of(posterior, transitions)
+    return append_points(posterior, transitions.features, targets)
+
+
+def append_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
+    """Appends points x~ = (x, u) (p, n + m) with targets (p, k) to a posterior's data, in O(N^2) a point."""
+    features, targets = _checked_points(posterior, features, targets)
+    size, p = len(posterior), len(features)
+    scales, sf2 = posterior.lengthscales, posterior.signal_variance
+    old_targets = (posterior.targets - posterior.offset).mT[..., None]  # (k, N, 1)
+    new_targets = (targets - posterior.offset).mT[..., None]
+    # One pass over the factor serves the new rows and the first half of the weights.
+    right = torch.cat([kernel_matrix(posterior.features, features, scales, sf2), old_targets], dim=-1)
+    right = torch.linalg.solve_triangular(posterior.cholesky, right, upper=False)
+    L21, w1 = right[..., :p].mT, right[..., p:]
+    corner = kernel_matrix(features, features, scales, sf2) - L21 @ L21.mT
+    corner.diagonal(dim1=-2, dim2=-1).add_(posterior.noise_variance[:, None])
+    L22, info = torch.linalg.cholesky_ex(corner)
+    check_positive_definite(info, sf2, posterior.noise_variance)
+    cholesky = posterior.cholesky.new_empty(posterior.output_dim, size + p, size + p)
+    cholesky[:, :size, :size], cholesky[:, :size, size:] = posterior.cholesky, 0
+    cholesky[:, size:, :size], cholesky[:, size:, size:] = L21, L22
+    w2 = torch.linalg.solve_triangular(L22, new_targets - L21 @ w1, upper=False)
+    weights = torch.linalg.solve_triangular(cholesky.mT, torch.cat([w1, w2], dim=-2), upper=True)[..., 0]
+    features, targets = torch.cat([posterior.features, features]), torch.cat([posterior.targets, targets])
+    return replace(posterior, features=features, targets=targets, cholesky=cholesky, weights=weights)
+
+
+def remove_points(posterior: GPPosterior, indices: Sequence[int] | Tensor) -> GPPosterior:
+    """Removes points (rows of ``features``) from a posterior's data, in O(N^2) a point.
+
+    Raises:
+        SettingError: An index is out of range or stands there twice.
+        DataError: No point is left.
+    """
+    size = len(posterior)
+    removed = _indices(indices, size)
+    if not removed:
+        return posterior
+    chosen = set(removed)
+    kept = torch.tensor([i for i in range(size) if i not in chosen], device=posterior.device)
+    if not len(kept):
+        raise DataError(f"a posterior needs at least one point; removing {len(removed)} of {size} leaves none")
+    if posterior.device.type != "cpu" or posterior.cholesky.requires_grad or len(removed) > _MANY * size:
+        rows = posterior.cholesky[:, kept]
+        first = removed[0]  # nothing changes above it
+        cholesky = rows[:, :, kept]
+        cholesky[:, first:, first:] = torch.linalg.cholesky(rows[:, first:, first:] @ rows[:, first:, first:].mT)
+    else:
+        cholesky = posterior.cholesky.new_zeros(posterior.output_dim, len(kept), len(kept))
+        before = posterior.cholesky.detach().numpy()
+        for factor, smaller in zip(before, cholesky.numpy(), strict=True):
+            _remove(factor, smaller, kept.numpy(), np.array(removed))
+    targets = posterior.targets[kept]
+    right = (targets - posterior.offset).mT[..., None]
+    half = torch.linalg.solve_triangular(cholesky, right, upper=False)
+    weights = torch.linalg.solve_triangular(cholesky.mT, half, upper=True)[..., 0]
+    return replace(posterior, features=posterior.features[kept], targets=targets, cholesky=cholesky, weights=weights)
+
+
+def targets_of(posterior: GPPosterior, transitions: Transitions) -> Tensor:
+    """The targets that a posterior's GPs have for transitions: next states, or differences (N, n).
+
+    Raises:
+        ShapeError: The transitions have other dimensions.
+        UnsupportedModel: The GPs predict values, which transitions do not hold.
+    """
+    check_transitions(transitions)
+    targets = transitions.targets(posterior.predicts)
+    if (transitions.state_dim, transitions.input_dim) != (posterior.state_dim, posterior.input_dim):
+        raise ShapeError(
+            f"the model has {posterior.state_dim} states and {posterior.input_dim} inputs; "
+            f"got transitions with {transitions.state_dim} and {transitions.input_dim}"
+        )
+    return targets
+
+
+@dataclass(frozen=True)
+class SlidingWindow:
+    """Appends new points to a posterior and removes others until it holds no more than a given number.
+
+    New points stay under either rule, unless they alone are more than that (which is logged).
+
+    Attributes:
+        points: How many points the posterior may hold.
+        remove: Which go first. ``"oldest"`` costs O(N^2) a point; ``"least_informative"`` needs the inverse of the
+            kernel matrix, O(N^3) a call.
+
+    Raises:
+        SettingError: Fewer than one point, or an unknown rule.
+    """
+
+    points: int
+    remove: Literal["oldest", "least_informative"] = "oldest"
+
+    def __post_init__(self) -> None:
+        check_number("points", self.points, least=1, whole=True)
+        if self.remove not in ("oldest", "least_informative"):
+            raise SettingError("remove", f"must be 'oldest' or 'least_informative'; got {self.remove!r}")
+
+    def __call__(self, posterior: GPPosterior, transitions: Transitions) -> GPPosterior:
+        """The posterior with the transitions, held to ``points`` points; errors are those of ``append_transitions``."""
+        if not isinstance(posterior, GPPosterior):
+            got = type(posterior).__name__
+            raise UnsupportedModel(f"a window is for a GPPosterior (ResidualModel.append takes one); got {got}")
+        targets = targets_of(posterior, transitions)
+        return self.append(posterior, transitions.features, targets)
+
+    def append(self, posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
+        """The posterior with points x~ (p, n + m) and their targets (p, k), held to ``points`` points."""
+        oldest = self.remove == "oldest" and len(posterior) == self.points and len(features) == 1
+        if oldest and self.points > 1 and host_arrays(posterior.weights) is not None:
+            return _slide(posterior, *_checked_points(posterior, features, targets))
+        larger = append_points(posterior, features, targets)
+        excess, removable = len(larger) - self.points, len(posterior)
+        if excess <= 0:
+            return larger
+        if len(features) > self.points:
+            _log.warning("%d new points exceed the window of %d: some are removed too", len(features), self.points)
+            larger, excess = remove_points(larger, range(len(posterior))), len(features) - self.points
+            removable = len(larger)
+        if self.remove == "oldest":
+            return remove_points(larger, range(excess))
+        return remove_points(larger, least_informative(larger, excess, removable))
+
+
+def least_informative(posterior: GPPosterior, count: int, candidates: int | None = None) -> list[int]:
+    """Which of the first ``candidates`` points to drop, each the least informative when those before it are gone."""
+    P, beta = posterior.precision.clone(), posterior.weights.clone()
+    noise = _noise_variances(posterior)
+    allowed = torch.zeros(len(posterior), dtype=torch.bool, device=posterior.device)
+    allowed[:candidates] = True
+    chosen = []
+    for _ in range(count):
+        score = _divergence(P.diagonal(dim1=-2, dim2=-1), beta, noise)
+        i = int(torch.where(allowed, score, torch.inf).argmin())
+        chosen.append(i)
+        allowed[i] = False
+        # Leaving i out is conditioning the precision matrix: the block inverse of what remains.
+        column, pivot = P[:, :, i].clone(), P[:, i, i].clone()
+        beta -= column * (beta[:, i] / pivot)[:, None]
+        P -= column[:, :, None] * (column / pivot[:, None])[:, None, :]
+        P[:, i, i] = 1.0  # gone: any positive number
+    return chosen
+
+
+def _divergence(P: Tensor, beta: Tensor, noise: Tensor) -> Tensor:
+    e = (noise * P).clamp(max=1.0)
+    return (e - 1 - e.log() + beta**2 * (1 - e) / P).sum(0) / 2
+
+
+def _noise_variances(posterior: GPPosterior) -> Tensor:
+    """Of the targets (k, N): sn2, or what the factor of pseudo-observations has on its diagonal beyond the kernel."""
+    nominal = posterior.noise_variance[:, None].expand_as(posterior.weights)
+    if posterior.has_observation_noise:
+        return nominal
+    diagonal = posterior.cholesky.square().sum(-1) - posterior.signal_variance[:, None]
+    return diagonal.clamp_min(torch.finfo(posterior.dtype).eps)
+
+
+def _slide(posterior: GPPosterior, feature: Tensor, target: Tensor) -> GPPosterior:
+    """``append_points`` and ``remove_points`` of the first point, in one pass over the factor and its memory."""
+    features, targets = torch.cat([posterior.features[1:], feature]), torch.cat([posterior.targets[1:], target])
+    upper = np.empty(posterior.cholesky.shape)
+    hyperparameters = posterior.lengthscales, posterior.signal_variance, posterior.noise_variance
+    scales, sf2, sn2 = (part.numpy() for part in hyperparameters)
+    weights = np.ascontiguousarray((targets - posterior.offset).mT.numpy())
+    before = np.ascontiguousarray(posterior.cholesky.numpy().transpose(0, 2, 1))  # no copy after the first time
+    failed = torch.tensor(_slide_factors(before, upper, features.numpy(), scales, sf2, sn2, weights))
+    check_positive_definite(failed, posterior.signal_variance, posterior.noise_variance)
+    factor = torch.from_numpy(upper.transpose(0, 2, 1))
+    return replace(posterior, features=features, targets=targets, cholesky=factor, weights=torch.from_numpy(weights))
+
+
+@compiled
+def _slide_factors(before, upper, features, scales, sf2, sn2, right):
+    """Writes the transposed factors (k, N, N) without the first and with a new last point; ``right`` becomes weights.
+
+    Column by column of the factor, which is row by row here, so that every loop runs over contiguous memory. Returns
+    which outputs have failed: their matrix is not positive definite.
+    """
+    outputs, N, d = len(before), before.shape[1], features.shape[1]
+    v, new, failed = np.empty(N), np.empty(N), np.zeros(outputs, dtype=np.bool_)
+    for a in range(outputs):
+        U, b = upper[a], right[a]
+        for i in range(N - 1):
+            square = 0.0
+            for c in range(d):
+                square += ((features[i, c] - features[N - 1, c]) / scales[a, c]) ** 2
+            new[i], v[i] = sf2[a] * np.exp(-0.5 * square), before[a, 0, i + 1]
+        rest = sf2[a] + sn2[a]
+        for j in range(N - 1):
+            old, row = before[a, j + 1], U[j]
+            radius = np.hypot(old[j + 1], v[j])
+            c, s = old[j + 1] / radius, v[j] / radius
+            row[:j], row[j] = 0.0, radius
+            w, b[j] = new[j] / radius, b[j] / radius
+            row[N - 1] = w
+            rest -= w * w
+            y = b[j]
+            for i in range(j + 1, N - 1):
+                entry = old[i + 1]
+                mixed = c * entry + s * v[i]
+                v[i] = c * v[i] - s * entry
+                row[i] = mixed
+                new[i] -= w * mixed
+                b[i] -= y * mixed
+            b[N - 1] -= y * w
+        if not rest > 0.0:
+            failed[a] = True
+            return failed
+        U[N - 1, : N - 1], U[N - 1, N - 1] = 0.0, np.sqrt(rest)
+        b[N - 1] /= U[N - 1, N - 1]
+        for j in range(N - 1, -1, -1):
+            total = b[j]
+            for i in range(j + 1, N):
+                total -= U[j, i] * b[i]
+            b[j] = total / U[j, j]
+    return failed
+
+
+@compiled
+def _remove(factor: np.ndarray, smaller: np.ndarray, kept: np.ndarray, removed: np.ndarray) -> None:
+    """Writes the lower factor of the rows that are kept, from that of all (N, N), into ``smaller`` (N - r, N - r).
+
+    Every removed column v is absorbed by the block below it, L L' + v v', through plane rotations; the last one first,
+    so that each meets only columns that stay. Row by row: row i needs the rotations of the columns before it, which
+    are known once their own rows were reached.
+    """
+    size = len(kept)
+    for i in range(size):
+        for j in range(i + 1):
+            smaller[i, j] = factor[kept[i], kept[j]]
+    c, s = np.empty(size), np.empty(size)
+    for which in range(len(removed) - 1, -1, -1):
+        start = removed[which] - which
+        for i in range(start, size):
+            row, v = smaller[i], factor[kept[i], removed[which]]
+            for j in range(start, i):
+                entry = row[j]
+                row[j] = c[j] * entry + s[j] * v
+                v = c[j] * v - s[j] * entry
+            radius = np.hypot(row[i], v)
+            c[i], s[i] = row[i] / radius, v / radius
+            row[i] = radius
+
+
+def _checked_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+    """New points (p, d) and their targets (p, k) in a posterior's type and on its device, after a look at them."""
+    check_tensors(features=features, targets=targets)
+    if features.dim() != 2 or targets.dim() != 2 or len(features) != len(targets) or not len(features):
+        raise ShapeError(
+            "features (p, d) and targets (p, k) need two dimensions and the same number of rows, one or more; "
+            f"got {tuple(features.shape)} and {tuple(targets.shape)}"
+        )
+    for name, value, own in (("features", features, posterior.features), ("targets", targets, posterior.targets)):
+        if value.shape[1] != own.shape[1]:
+            raise ShapeError(f"{name} must have {own.shape[1]} columns like the posterior's; got {value.shape[1]}")
+        if not bool(torch.isfinite(value).all()):
+            raise DataError(f"{name} must be finite; got {value[~torch.isfinite(value)][0]}")
+    return features.to(posterior.features), targets.to(posterior.features)
+
+
+def _indices(indices: Sequence[int] | Tensor, size: int) -> list[int]:
+    """Different indices from 0 to size - 1 in ascending order; negative ones count from the end, as everywhere."""
+    given = indices.tolist() if isinstance(indices, Tensor | np.ndarray) else indices
+    given = [given] if isinstance(given, int) else list(given)
+    if any(isinstance(i, bool) or not isinstance(i, int | np.integer) or not -size <= i < size for i in given):
+        raise SettingError("indices", f"must be whole numbers from {-size} to {size - 1}; got {given}")
+    found = sorted({int(i) % size for i in given})
+    if len(found) != len(given):
+        raise SettingError("indices", f"must be different; got {given}")
+    return found

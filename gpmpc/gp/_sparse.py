@@ -1,0 +1,207 @@
+r"""Sparse GPs: M inducing points stand for N data points, for O(M^2) a prediction instead of O(N^2).
+
+With inducing points Z, Kzz = Lz Lz' and the correlations Kzx with the data, the predictive distributions of SGPR
+(Titsias, 2009, eq. (6); "VFE") and FITC (Snelson and Ghahramani, 2006, eq. (8)) are
+
+    mean = k' beta,   variance = sf2 - k' C k,       k = k(Z, x~)
+    C    = Kzz^-1 - (Kzz + Kzx Lam^-1 Kxz)^-1,       Lam = sn2 I  (SGPR)   or   diag(Kxx - Qxx) + sn2 I  (FITC)
+
+which is an exact GP on M pseudo-observations with correlated noise, K + R = C^-1. So it is frozen to a ``GPPosterior``
+on Z, and all that works with one (moment matching, appending, removing) works at the cost of M points. With
+A = Lz^-1 Kzx Lam^-1/2 and A A' = U diag(b) U',
+
+    C = Lz^-T U diag(b / (1 + b)) U' Lz^-1,   beta = Lz^-T U diag(1 / (1 + b)) U' A Lam^-1/2 (y - offset)
+    cholesky of C^-1:  R', where Q R = diag(sqrt((1 + b) / b)) U' Lz'    (never squared: C^-1 is huge where b is small)
+
+The collapsed bound of Titsias (2009, eq. (9)), for FITC without its last term, measures Z and hyperparameters:
+
+    log N(y | 0, Q + Lam) - tr(Kxx - Qxx) / (2 sn2),     Q = A~' A~,  A~ = Lz^-1 Kzx
+
+It depends on the data through sums over the points alone: with r = Lam^-1/2 y they are A A', A r, r'r and log|Lam|. So
+the points come in blocks that fit the cache, output after output, each computed once more for the derivatives
+(automatic differentiation with checkpoints, Griewank and Walther, 2008, chapter 12): memory stays that of a block, for
+any N. A jitter on Kzz makes u = f(Z) + noise; the bound stays one.
+"""
+
+import math
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.gaussian import check_tensors
+from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
+from gpmpc.gp.posterior import GPPosterior
+
+Method = Literal["sgpr", "fitc"]
+JITTER = 1e-8  # of Kzz, in units of sf2
+_ENTRIES = 200_000  # of a block of A
+_UNINFORMED = 1e-10  # directions in which the data inform less than this (b) get a pseudo-noise of 1 / this
+
+
+class _Sums(NamedTuple):
+    """The sums over the data, of every output: A A' (k, M, M), A r (k, M), r'r (k,) and log|Lam| (k,)."""
+
+    gram: Tensor
+    projections: Tensor
+    squares: Tensor
+    logdet: Tensor
+
+
+def sparse_posterior(
+    inducing: Tensor,
+    features: Tensor,
+    targets: Tensor,
+    hyperparameters: Hyperparameters,
+    input_dim: int,
+    predicts: Predicts = "next_state",
+    offset: Tensor | None = None,
+    method: Method = "sgpr",
+    jitter: float | None = None,
+) -> GPPosterior:
+    """Freezes a sparse GP to M pseudo-observations.
+
+    Args:
+        inducing: Z (M, d), shared by all outputs.
+        features: x~ (N, d), float64 like all that follows.
+        targets: (N, k).
+        hyperparameters: Of the k GPs.
+        input_dim: m, how many of the last features are controls.
+        predicts: What the targets mean.
+        offset: Constant prior means (k,); zero by default.
+        method: ``"sgpr"`` or ``"fitc"``.
+        jitter: Added to the diagonal of Kzz, in units of sf2; by default only where it is needed.
+
+    Raises:
+        ShapeError: The shapes do not belong together.
+        SettingError: Kzz is not positive definite, or what ``GPPosterior.from_hyperparameters`` refuses.
+        DataError: An entry is not finite.
+    """
+    if jitter is not None:
+        check_number("jitter", jitter, least=0)
+    check_method(method)
+    check_tensors(inducing=inducing, features=features, targets=targets)
+    offset = torch.zeros_like(targets[0]) if offset is None else offset
+    if inducing.dim() != 2 or inducing.shape[1:] != features.shape[1:] or not len(inducing):
+        raise ShapeError(f"inducing must be (M, {features.shape[-1]}), M > 0; got {tuple(inducing.shape)}")
+    if len(features) != len(targets):
+        raise ShapeError(f"features and targets need the same number of rows; got {len(features)} and {len(targets)}")
+    # Of one row, for its checks of everything else; the data themselves are checked by their sum.
+    shell = GPPosterior.from_hyperparameters(features[:1], targets[:1], *hyperparameters, input_dim, predicts, offset)
+    for name, value in (("inducing", inducing), ("features", features), ("targets", targets)):
+        if value.dtype != torch.float64 or not bool(torch.isfinite(value).all()):
+            raise SettingError(name, "must be finite and in float64")
+    try:
+        Lz = inducing_factor(inducing, hyperparameters, jitter or 0.0)
+    except SettingError:
+        if jitter is not None:
+            raise
+        Lz = inducing_factor(inducing, hyperparameters, JITTER)
+    sums = data_sums(Lz, inducing, features, targets - offset, hyperparameters, method)
+    # Ascending: the largest rows of what is factorised come first, as QR needs.
+    b, U = torch.linalg.eigh(sums.gram)
+    b = b.clamp_min(_UNINFORMED)
+    upper = torch.linalg.qr(((1 + b) / b).sqrt()[..., None] * (Lz @ U).mT).R
+    cholesky = (upper * upper.diagonal(dim1=-2, dim2=-1).sign()[..., None]).mT.contiguous()
+    projections = U.mT @ sums.projections[..., None]
+    weights = torch.linalg.solve_triangular(Lz.mT, U @ (projections / (1 + b)[..., None]), upper=True)
+    pseudo_targets = (cholesky @ (cholesky.mT @ weights))[..., 0].mT + offset
+    return replace(shell, features=inducing.clone(), targets=pseudo_targets, cholesky=cholesky, weights=weights[..., 0])
+
+
+def check_method(method: str) -> None:
+    """Raises ``SettingError`` unless a method is known."""
+    if method not in ("sgpr", "fitc"):
+        raise SettingError("method", f"must be 'sgpr' or 'fitc'; got {method!r}")
+
+
+def collapsed_bound(
+    inducing: Tensor,
+    features: Tensor,
+    targets: Tensor,
+    hyperparameters: Hyperparameters,
+    method: Method = "sgpr",
+    jitter: float = JITTER,
+) -> Tensor:
+    """The bound on the log marginal likelihood (SGPR), or FITC's own log marginal likelihood, of every output (k,).
+
+    Arguments are as for ``sparse_posterior``; it can be differentiated by inducing points and hyperparameters.
+
+    Raises:
+        SettingError: Kzz is not positive definite, or the method is unknown.
+    """
+    check_method(method)
+    bounds = []
+    for a in range(targets.shape[1]):
+        kernel = hyperparameters.output(a)
+        Lz = inducing_factor(inducing, kernel, jitter)
+        sums = data_sums(Lz, inducing, features, targets[:, a, None], kernel, method)
+        bounds.append(_bound(sums, len(features), kernel, method))
+    return torch.cat(bounds)
+
+
+def data_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method) -> _Sums:
+    """The sums over all points, of every output, in blocks.
+
+    tr(A A') is, in units of the noise, the variance of the data that the inducing points explain.
+    """
+    step, outputs = max(_ENTRIES // len(Z), 64), []
+    for a in range(y.shape[1]):
+        total: Any = 0.0, 0.0, 0.0, 0.0
+        for rows in (slice(begin, begin + step) for begin in range(0, len(x), step)):
+            block = Lz[a, None], Z, x[rows], y[rows, a, None], kernel.output(a), method
+            if torch.is_grad_enabled():
+                part: Any = checkpoint(_block_sums, *block, use_reentrant=False, preserve_rng_state=False)
+            else:
+                part = _block_sums(*block)
+            total = [t + p for t, p in zip(total, part, strict=True)]
+        outputs.append(total)
+    return _Sums(*(torch.cat(of_one) for of_one in zip(*outputs, strict=True)))
+
+
+def inducing_factor(inducing: Tensor, kernel: Hyperparameters, jitter: float) -> Tensor:
+    """Lz (k, M, M), the Cholesky factor of Kzz with a jitter in units of sf2; raises where there is none."""
+    Kzz = kernel_matrix(inducing, inducing, kernel.lengthscales, kernel.signal_variance)
+    Kzz = Kzz + torch.diag_embed((jitter * kernel.signal_variance)[:, None].expand(-1, len(inducing)))
+    Lz, info = torch.linalg.cholesky_ex(Kzz)
+    if bool(info.any()):
+        raise SettingError(
+            "inducing",
+            f"their kernel matrix of output {int(torch.nonzero(info)[0])} is not positive definite: points too near "
+            "each other for its length-scales; take fewer, or a larger jitter",
+        )
+    return Lz
+
+
+def _block_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method) -> _Sums:
+    _, signal_variance, noise_variance = kernel
+    whitened = torch.linalg.solve_triangular(Lz, _cross(Z, x, kernel), upper=False)
+    Lam = noise_variance[:, None].expand(-1, len(x))
+    if method == "fitc":
+        Lam = (signal_variance[:, None] - whitened.square().sum(-2)).clamp_min(0) + Lam
+    root = Lam.sqrt()
+    A, r = whitened / root[:, None, :], y.mT / root
+    return _Sums(A @ A.mT, (A @ r[..., None])[..., 0], r.square().sum(-1), Lam.log().sum(-1))
+
+
+def _bound(sums: _Sums, size: int, kernel: Hyperparameters, method: Method) -> Tensor:
+    eye = torch.eye(sums.gram.shape[-1], dtype=sums.gram.dtype, device=sums.gram.device)
+    LB = torch.linalg.cholesky(sums.gram + eye)
+    explained = torch.linalg.solve_triangular(LB, sums.projections[..., None], upper=False).square().sum((-2, -1))
+    logdet = 2 * LB.diagonal(dim1=-2, dim2=-1).log().sum(-1) + sums.logdet
+    bound = -(size * math.log(2 * math.pi) + logdet + sums.squares - explained) / 2
+    if method == "sgpr":
+        trace = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
+        bound = bound - (size * kernel.signal_variance / kernel.noise_variance - trace) / 2
+    return bound
+
+
+def _cross(inducing: Tensor, features: Tensor, kernel: Hyperparameters) -> Tensor:
+    """Kzx (k, M, N) by one matrix product an output; around a common centre, so that little cancels."""
+    centre, scales = inducing.detach().mean(0), kernel.lengthscales[:, None, :]
+    z, x = (inducing - centre) / scales, (features - centre) / scales
+    half = z.square().sum(-1)[..., :, None] / 2 + x.square().sum(-1)[..., None, :] / 2
+    return kernel.signal_variance[:, None, None] * (z @ x.mT - half).clamp_max(0).exp()

@@ -1,0 +1,227 @@
+"""Training of one exact GP per output by maximum marginal likelihood (Cao, Lai and Alam, 2017, eq. (9)).
+
+Each output is fitted on its own, over theta = (log length-scales, log sf, log(sf / sn)) inside a wide box; see
+``gpmpc.gp._search``. Exact GPs are cubic in time and square in memory over the points: one factor of 200 MB an output
+at N = 5000. What cannot fit is refused before the work.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from threadpoolctl import threadpool_limits
+from torch import Tensor
+
+from gpmpc.exceptions import DataError, SettingError, TrainingError, UnsupportedModel, check_number
+from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
+from gpmpc.gp._likelihood import FAILED
+from gpmpc.gp._memory import GIB, available_memory
+from gpmpc.gp._online import targets_of
+from gpmpc.gp._scaling import Scaling, centre
+from gpmpc.gp._search import (
+    SearchProblem,
+    column_std,
+    constant_columns,
+    find_hyperparameters,
+    log_hyperparameters,
+    restored_theta,
+    training_data,
+)
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp.transitions import Transitions, check_transitions
+
+_log = logging.getLogger(__name__)
+_ONE_THREAD = 1000  # points below which LAPACK's threads wait for each other longer than they work
+_MANY = 1000  # points: from here on the log has a line an output
+
+
+@dataclass(frozen=True)
+class Training:
+    """The result of a training.
+
+    Attributes:
+        posterior: The trained GPs, frozen; of a sparse training, to M pseudo-observations at the inducing points.
+        theta: Rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), in the units of the data.
+        objective: Negative log marginal likelihood plus penalty where the search ended (k,); of a sparse training
+            minus the bound on the log marginal likelihood, in scaled units.
+        explored: Of an exact training, the objective where the exploration from every start ended (k, restarts + 1),
+            over the subset if there is one; of a sparse training, where the search over the bound began (k, 1).
+        evaluations: Of the likelihood or of the bound, all starts and outputs together.
+        seconds: Wall time [s].
+    """
+
+    posterior: GPPosterior
+    theta: np.ndarray
+    objective: np.ndarray
+    explored: np.ndarray
+    evaluations: int
+    seconds: float  # [s]
+
+
+@dataclass(frozen=True)
+class Trainer:
+    """Fits one SE-ARD GP per output to observed transitions.
+
+    Attributes:
+        predicts: What the GPs learn: the next state, the difference to it, or any values, which ``fit`` takes.
+        scaling: How features and targets are scaled for training; what comes out is in the units of the data all the
+            same. The prior mean is what it maps to zero: the targets' mean by default and with ``standardize``, zero
+            with ``identity``.
+        penalty: Added to every output's negative log marginal likelihood, such as ``SoftLimits()``; none by default.
+        restarts: Random starts besides the first, which has l = std(x~), sf = std(y), sn = std(y) / 10.
+        subset: Of more points than this a random subset of as many is searched first, from all starts; the search over
+            all points goes on from its best. None searches over all of them from every start.
+        tolerance: Relative decrease of the objective at which L-BFGS stops.
+        signal_to_noise_limit: The box holds sf / sn within this factor of one. Moment matching needs sf2 / sn2 below
+            about 1e10 in double precision.
+
+    Raises:
+        SettingError: A setting is out of range.
+    """
+
+    predicts: Predicts = "next_state"
+    scaling: Callable[[Tensor, Sequence[str]], Scaling] = centre
+    penalty: Callable[[np.ndarray, np.ndarray], tuple[float, np.ndarray]] | None = None
+    restarts: int = 3
+    subset: int | None = 1000
+    tolerance: float = 1e-8
+    signal_to_noise_limit: float = 1e4
+
+    def __post_init__(self) -> None:
+        if self.predicts not in PREDICTS:
+            raise SettingError("predicts", f"must be one of {', '.join(map(repr, PREDICTS))}; got {self.predicts!r}")
+        check_number("restarts", self.restarts, least=0, whole=True)
+        if self.subset is not None:
+            check_number("subset", self.subset, least=1, whole=True)
+        for key, example in (("scaling", "standardize"), ("penalty", "SoftLimits()")):
+            if not (callable(value := getattr(self, key)) or (key == "penalty" and value is None)):
+                raise SettingError(key, f"must be a function such as {example} of gpmpc.gp; got {value!r}")
+        check_number("tolerance", self.tolerance, above=0)
+        check_number("signal_to_noise_limit", self.signal_to_noise_limit, above=1)
+
+    def __call__(self, transitions: Transitions, seed: int = 0, start: GPPosterior | None = None) -> Training:
+        """Trains on transitions; see ``fit``."""
+        check_transitions(transitions)
+        targets = transitions.targets(self.predicts)
+        return self.fit(transitions.features, targets, transitions.input_dim, seed=seed, start=start)
+
+    def refit(self, posterior: GPPosterior, transitions: Transitions | None = None, seed: int = 0) -> Training:
+        """Trains on the points a posterior holds, and on new ones, from its hyperparameters on.
+
+        With ``restarts=0`` only from them on. The prior mean is that of this trainer's scaling, as in any training.
+
+        Args:
+            posterior: What was learned so far; what it predicts and its number of inputs stay.
+            transitions: Seen besides, if given.
+            seed: Of the random starts.
+
+        Raises:
+            UnsupportedModel: It is no ``GPPosterior``, or stands on a sparse model's pseudo-observations.
+            ShapeError: The transitions have other dimensions.
+            TrainingError: Every start failed for an output, which is named.
+        """
+        _check_start("posterior", posterior)
+        if not posterior.has_observation_noise:
+            raise UnsupportedModel(
+                "the posterior holds a sparse model's pseudo-observations, no data: train again with SparseTrainer"
+            )
+        features, targets = (t.to("cpu", torch.float64) for t in (posterior.features, posterior.targets))
+        if transitions is not None:
+            targets = torch.cat([targets, targets_of(posterior, transitions)])
+            features = torch.cat([features, transitions.features])
+        return self.fit(features, targets, posterior.input_dim, posterior.predicts, seed, start=posterior)
+
+    def fit(
+        self,
+        features: Tensor,
+        targets: Tensor,
+        input_dim: int,
+        predicts: Predicts | None = None,
+        seed: int = 0,
+        start: GPPosterior | None = None,
+    ) -> Training:
+        """Trains on features and any targets.
+
+        Args:
+            features: x~ = (x, u) (N, n + m).
+            targets: (N, k).
+            input_dim: m.
+            predicts: What the targets mean; the trainer's setting by default.
+            seed: Of the random starts.
+            start: Its hyperparameters are the first start instead; the random ones stay where they are.
+
+        Raises:
+            ShapeError: Features and targets do not belong together, or ``start`` has other dimensions.
+            SettingError: They are no float64 tensors in host memory, or the seed is no whole number.
+            UnsupportedModel: ``start`` is no ``GPPosterior``.
+            DataError: An entry is not finite, or the kernel matrices would not fit the memory that is available.
+            TrainingError: Every start failed for an output, which is named.
+        """
+        begin = time.perf_counter()
+        check_number("seed", seed, least=0, whole=True)
+        predicts = predicts or self.predicts
+        features, targets, feature_scaling, target_scaling = training_data(
+            features, targets, input_dim, predicts, self.scaling
+        )
+        (size, d), outputs = features.shape, targets.shape[1]
+        _check_memory(size, outputs)
+        x, y = feature_scaling.scale(features).numpy(), target_scaling.scale(targets).numpy()
+        first: Any = [None] * outputs
+        if start is not None:
+            _check_start("start", start)
+            first = log_hyperparameters(start, feature_scaling, target_scaling)
+        rng = np.random.default_rng(seed)
+        perturbations = rng.normal(size=(outputs, self.restarts + 1, d + 2))
+        rows = None
+        converged = start is not None and not self.restarts  # a subset could not improve on where the search begins
+        if self.subset is not None and size > self.subset and not converged:
+            rows = np.sort(rng.permutation(size)[: self.subset])
+        std = column_std(features.numpy()) / feature_scaling.factor.numpy()
+        found, constant = [], constant_columns(features.numpy())
+        for a in range(outputs):
+            name = f"output {a + 1} of {outputs}"
+            problem = SearchProblem(name, x, y[:, a], first[a], perturbations[a], rows, std, constant)
+            with threadpool_limits(1 if size < _ONE_THREAD else None, user_api="blas"):
+                found.append(find_hyperparameters(problem, self))
+            if size > _MANY:
+                _log.info("training: %s: %d evaluations, %.1f s", name, found[-1].evaluations, found[-1].seconds)
+        failed = [a for a, one in enumerate(found) if one.objective >= FAILED]
+        if failed:
+            raise TrainingError(
+                failed,
+                f"no start of {len(found[0].explored)} led to a positive definite kernel matrix for output "
+                f"{', '.join(str(a) for a in failed)}: lower signal_to_noise_limit, or remove duplicate rows",
+            )
+        theta = restored_theta(np.array([one.theta for one in found]), feature_scaling, target_scaling)
+        kernel, offset = Hyperparameters.from_theta(torch.from_numpy(theta)), target_scaling.offset
+        posterior = GPPosterior.from_hyperparameters(features, targets, *kernel, input_dim, predicts, offset)
+        objective, explored = (np.array([getattr(one, key) for one in found]) for key in ("objective", "explored"))
+        evaluations = sum(one.evaluations for one in found)
+        return Training(posterior, theta, objective, explored, evaluations, time.perf_counter() - begin)
+
+
+def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
+    """``Trainer(**settings)(transitions, seed)``: fits one GP per output in one call."""
+    return Trainer(**settings)(transitions, seed)
+
+
+def _check_start(key: str, posterior: Any) -> None:
+    if not isinstance(posterior, GPPosterior):
+        raise UnsupportedModel(f"{key} must be a GPPosterior; got {type(posterior).__name__}")
+
+
+def _check_memory(size: int, outputs: int) -> None:
+    """Raises ``DataError`` where a training of N points and k outputs would not fit the available memory."""
+    free = available_memory()
+    needed = 8 * size**2 * (outputs + 2)  # of the posterior's factors, and two more while one is made
+    if free is None or needed <= free:
+        return
+    raise DataError(
+        f"exact GPs of {size} points and {outputs} outputs need {needed / GIB:.3g} GiB, {8 * size**2 / GIB:.3g} GiB a "
+        f"kernel matrix; {free / GIB:.3g} GiB are available: train on {int((free / needed) ** 0.5 * size)} points or "
+        "fewer, or sparse GPs (SparseTrainer)"
+    )

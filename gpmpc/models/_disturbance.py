@@ -1,0 +1,138 @@
+"""Disturbance states: what a model does not explain, as part of the state that a filter estimates and a plan predicts.
+
+    x[k+1] = f(x[k], u[k]) + E d[k],     d[k+1] = Phi d[k] + w[k],     w[k] ~ N(0, diag(q)^2)
+
+With Phi = I a disturbance is constant until something says otherwise (a random walk), as for a changed mass; with
+|Phi| < 1 it is an AR(1) process that fades, as wind does. Estimated beside the state by a Kalman filter and predicted
+with it, it leaves no offset between reference and state (Pannocchia and Rawlings, 2003), and its uncertainty is part of
+the tube. For a rigid body, columns of E of the velocities are a force over the mass, those of the rates a torque.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gpmpc.dynamics import Array, DynamicsModel, Linearized, check_next_states, check_query, linearize, to_array
+from gpmpc.exceptions import SettingError, ShapeError, check_numbers
+from gpmpc.gaussian import Gaussian, check_tensors
+from gpmpc.models._wrapper import Wrapper, padded
+
+
+@dataclass(frozen=True)
+class DisturbedModel(Wrapper):
+    """A model with disturbances as further states, (x, d).
+
+    Attributes:
+        model: Without them, of n states.
+        effect: E, by how much each moves the states within a step (n, q), in the model's type.
+        std: Standard deviations of w, by how much each changes from step to step (q,).
+        decay: Diagonal of Phi (q,): 1 for a constant, less than 1 in size for an AR(1) process.
+
+    Raises:
+        ShapeError: E has another number of rows than the model has states.
+        SettingError: A standard deviation is negative, a decay not between -1 and 1, or the model does not predict next
+            states.
+    """
+
+    model: DynamicsModel
+    effect: Tensor
+    std: Sequence[float]
+    decay: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        check_next_states(self.model)
+        check_tensors(effect=self.effect)
+        n, model = self.model.state_dim, self.model
+        if self.effect.dim() != 2 or len(self.effect) != n:
+            raise ShapeError(f"effect must be ({n}, q), a row a state; got {tuple(self.effect.shape)}")
+        if self.effect.dtype != model.dtype or self.effect.device != model.device:
+            got = f"{self.effect.dtype} on {self.effect.device}"
+            raise SettingError("effect", f"must be {model.dtype} on {model.device} like the model; got {got}")
+        check_numbers("std", self.std, self.disturbances, least=0)
+        if self.decay is None:
+            object.__setattr__(self, "decay", [1.0] * self.disturbances)
+        check_numbers("decay", self._decays, self.disturbances)
+        if any(abs(phi) > 1 for phi in self._decays):
+            raise SettingError("decay", f"must lie between -1 and 1; got {list(self._decays)}")
+
+    @property
+    def disturbances(self) -> int:
+        """Number of disturbances, q."""
+        return self.effect.shape[1]
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states, n + q."""
+        return self.model.state_dim + self.disturbances
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """Of the observations, and of the disturbances' changes."""
+        own = torch.as_tensor(list(self.std), dtype=self.dtype, device=self.device).square()
+        return torch.block_diag(self.model.noise_covariance, torch.diag(own))
+
+    def predict(self, state: Tensor, input: Tensor) -> Gaussian:
+        """The next state's distribution at (x, d) (*batch, n + q) and u (*batch, m), without the noise."""
+        check_query(self, state, input)
+        n = self.model.state_dim
+        x, d = state[..., :n], state[..., n:]
+        moved = self.model.predict(x, input)
+        decay = torch.as_tensor(list(self._decays), dtype=self.dtype, device=self.device)
+        mean = torch.cat([moved.mean + d @ self.effect.mT, decay * d], dim=-1)
+        return Gaussian(mean, padded(moved.covariance, self.state_dim))
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises the model at K points, by the inner model's ``linearize``."""
+        n, size, K = self.model.state_dim, self.state_dim, len(states)
+        E, decay = self._arrays
+        inner = linearize(self.model, np.ascontiguousarray(states[:, :n]), inputs, covariance)
+        d = states[:, n:]
+        A, B = np.zeros((K, size, size)), np.zeros((K, size, self.input_dim))
+        A[:, :n, :n], A[:, :n, n:], B[:, :n] = inner.A, E, inner.B
+        A[:, n:, n:] = np.diag(decay)
+        V = None
+        if inner.covariance is not None:
+            V = np.zeros((K, size, size))
+            V[:, :n, :n] = inner.covariance
+        return Linearized(np.concatenate([inner.mean + d @ E.T, d * decay], axis=1), A, B, V)
+
+    def augmented(self, belief: Gaussian, std: Sequence[float] | None = None) -> Gaussian:
+        """The belief over (x, d) before anything was estimated: d is zero, and independent of x.
+
+        Args:
+            belief: Over x: mean (*batch, n).
+            std: Prior standard deviations of d (q,); by default those that an AR(1) process has in the long run. A
+                constant has none: they must be given.
+
+        Raises:
+            SettingError: There is a constant, and no prior.
+        """
+        if std is None:
+            if any(abs(phi) == 1 for phi in self._decays):
+                raise SettingError("std", "must be given for disturbances with decay 1; got None")
+            std = [q / (1 - phi**2) ** 0.5 for q, phi in zip(self.std, self._decays, strict=True)]
+        check_numbers("std", std, self.disturbances, least=0)
+        zero = belief.mean.new_zeros(*belief.mean.shape[:-1], self.disturbances)
+        covariance = padded(belief.covariance, self.state_dim)
+        own = torch.as_tensor([0.0] * self.model.state_dim + list(std), dtype=self.dtype, device=self.device).square()
+        return Gaussian(torch.cat([belief.mean, zero], dim=-1), covariance + torch.diag(own))
+
+    def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "DisturbedModel":
+        """Copies the model to another device or type."""
+        inner: Any = self.model
+        effect = self.effect.to(device=device, dtype=dtype)
+        return DisturbedModel(inner.to(device, dtype), effect, self.std, self.decay)
+
+    @property
+    def _decays(self) -> Sequence[float]:
+        return self.decay or ()
+
+    @cached_property
+    def _arrays(self) -> tuple[Array, Array]:
+        """E and the diagonal of Phi."""
+        return to_array(self.effect), np.array(self._decays, dtype=float)

@@ -1,0 +1,202 @@
+"""Features that a GP sees of a state and an input: selected columns, angles as sine and cosine, and lagged values.
+
+Leaving a column out makes a model invariant to it; the sine and cosine of an angle make it periodic, so that one turn
+more changes nothing. Lagged states and inputs stand in the state of a model (``Lags``), where columns select them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gpmpc.dynamics import Array
+from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.gp.transitions import Transitions
+from gpmpc.models._nominal import Affine
+
+
+@dataclass(frozen=True)
+class Features:
+    """Maps a state and an input to what a GP sees of them.
+
+    Attributes:
+        states: Selected states, in the order of the features.
+        inputs: Selected inputs.
+        angles: Those of the selected states that are seen as (sine, cosine), at their place.
+        state_dim: n, of the state they are selected from.
+        input_dim: m.
+
+    Raises:
+        SettingError: An index is out of range or stands there twice, or an angle is not selected.
+    """
+
+    states: Sequence[int]
+    inputs: Sequence[int]
+    angles: Sequence[int]
+    state_dim: int
+    input_dim: int
+
+    def __post_init__(self) -> None:
+        chosen = {"states": self.state_dim, "inputs": self.input_dim, "angles": self.state_dim}
+        for key, count in chosen.items():
+            indices = getattr(self, key)
+            whole = all(isinstance(i, int) and not isinstance(i, bool) for i in indices)
+            if not whole or any(not 0 <= i < count for i in indices) or len(set(indices)) != len(indices):
+                raise SettingError(key, f"must be different indices from 0 to {count - 1}; got {list(indices)}")
+        if not set(self.angles) <= set(self.states):
+            raise SettingError("angles", f"must be some of the selected states {list(self.states)}; got {self.angles}")
+
+    @property
+    def dim(self) -> int:
+        """Number of features of the state, d."""
+        return len(self.states) + len(self.angles)
+
+    @cached_property
+    def columns(self) -> NDArray[np.intp]:
+        """The state that each feature is a function of (d,)."""
+        return np.array([i for i in self.states for _ in range(1 + (i in self.angles))], dtype=np.intp)
+
+    @cached_property
+    def sines(self) -> NDArray[np.intp]:
+        """Where the sines stand among the features, each before its cosine (a,)."""
+        places = [k for k, i in enumerate(self.columns) if i in self.angles and (k == 0 or self.columns[k - 1] != i)]
+        return np.array(places, dtype=np.intp)
+
+    @cached_property
+    def _selected(self) -> NDArray[np.intp]:
+        """The selected inputs (m_s,)."""
+        return np.array(self.inputs, dtype=np.intp)
+
+    @cached_property
+    def _by_column(self) -> Array:
+        """One in the column of each feature's state (d, n)."""
+        matrix = np.zeros((self.dim, self.state_dim))
+        matrix[np.arange(self.dim), self.columns] = 1.0
+        return matrix
+
+    def __call__(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
+        """The features (*batch, d) of a state (*batch, n), and the selected inputs (*batch, m_s)."""
+        if not self.angles:
+            return state[..., list(self.states)], input[..., list(self.inputs)]
+        parts = [
+            part
+            for i in self.states
+            for part in ((state[..., i].sin(), state[..., i].cos()) if i in self.angles else (state[..., i],))
+        ]
+        return torch.stack(parts, dim=-1), input[..., list(self.inputs)]
+
+    def jacobian(self, state: Tensor) -> Tensor:
+        """The features' derivatives by the state (*batch, d, n), in torch."""
+        matrix = torch.as_tensor(self._by_column, dtype=state.dtype, device=state.device)
+        if not self.angles:
+            return matrix.expand(*state.shape[:-1], *matrix.shape)
+        one = torch.ones_like(state[..., 0])
+        slopes = [
+            part
+            for i in self.states
+            for part in ((state[..., i].cos(), -state[..., i].sin()) if i in self.angles else (one,))
+        ]
+        return torch.stack(slopes, dim=-1)[..., None] * matrix
+
+    def linearize(self, states: Array, inputs: Array) -> tuple[Array, Array, Array | None]:
+        """Features (K, d), selected inputs (K, m_s), and each feature's derivative by its state (K, d); None for one.
+
+        Args:
+            states: (K, n).
+            inputs: (K, m).
+        """
+        z, v, sines = states[:, self.columns], inputs[:, self._selected], self.sines
+        if not self.angles:
+            return z, v, None
+        angle = z[:, sines]
+        sine, cosine, slope = np.sin(angle), np.cos(angle), np.ones_like(z)
+        z[:, sines], z[:, sines + 1] = sine, cosine
+        slope[:, sines], slope[:, sines + 1] = cosine, -sine
+        return z, v, slope
+
+    def chain(self, by_features: Array, by_inputs: Array, slope: Array | None) -> tuple[Array, Array]:
+        """Turns derivatives (K, k, d), (K, k, m_s) by features and selected inputs into those by x and u."""
+        if slope is not None:
+            by_features = by_features * slope[:, None, :]
+        by_input = np.zeros((*by_inputs.shape[:-1], self.input_dim))
+        by_input[..., self._selected] = by_inputs
+        return by_features @ self._by_column, by_input
+
+
+@dataclass(frozen=True)
+class Lags:
+    """The state of a model that remembers: (x_k, x_{k-1}, .., x_{k-p}, u_{k-1}, .., u_{k-q}).
+
+    For systems of which one measurement does not say where they go: a velocity that is not measured, an actuator's lag.
+
+    Attributes:
+        state_dim: n, of what is measured.
+        input_dim: m.
+        states: p, how many earlier states are part of the state.
+        inputs: q, how many earlier inputs are.
+
+    Raises:
+        SettingError: One of them is no whole number of zero or more.
+    """
+
+    state_dim: int
+    input_dim: int
+    states: int = 1
+    inputs: int = 0
+
+    def __post_init__(self) -> None:
+        for key, least in (("state_dim", 1), ("input_dim", 0), ("states", 0), ("inputs", 0)):
+            check_number(key, getattr(self, key), least=least, whole=True)
+
+    @property
+    def dim(self) -> int:
+        """Number of states with the earlier values."""
+        return self.state_dim * (1 + self.states) + self.input_dim * self.inputs
+
+    @cached_property
+    def nominal(self) -> Affine:
+        """The nominal model for ``ResidualModel``: x stays where it is, and earlier values move on by a place."""
+        n, m, shifted = self.state_dim, self.input_dim, self.state_dim * self.states
+        A, B = torch.zeros(self.dim, self.dim, dtype=torch.float64), torch.zeros(self.dim, m, dtype=torch.float64)
+        A[:n, :n] = torch.eye(n)
+        A[n : n + shifted, :shifted] = torch.eye(shifted)
+        first = n + shifted
+        if self.inputs:
+            B[first : first + m] = torch.eye(m)
+            A[first + m :, first : self.dim - m] = torch.eye(self.dim - first - m)
+        return Affine(A, B, torch.zeros(self.dim, dtype=torch.float64))
+
+    @cached_property
+    def B(self) -> Tensor:
+        """Where what is learned acts (dim, n): on x only."""
+        return torch.eye(self.dim, self.state_dim, dtype=torch.float64)
+
+    def augmented(self, states: Array, inputs: Array) -> Array:
+        """States with their earlier values (T - l, dim) of a log; l = max(p, q) rows at its start have none.
+
+        Args:
+            states: x_0 .. x_{T-1} (T, n).
+            inputs: u_0 .. u_{T-2} or more (T - 1 or T, m), each applied from the time of its row on.
+
+        Raises:
+            ShapeError: The two do not belong together, or hold too few rows.
+        """
+        T, first = len(states), max(self.states, self.inputs)
+        wide = np.shape(states)[1:] == (self.state_dim,) and np.shape(inputs)[1:] == (self.input_dim,)
+        if not wide or len(inputs) not in (T - 1, T) or first >= T:
+            raise ShapeError(
+                f"states (T, {self.state_dim}) and inputs (T or T - 1, {self.input_dim}) need T above {first}; "
+                f"got {np.shape(states)} and {np.shape(inputs)}"
+            )
+        before = [states[first - lag : T - lag] for lag in range(self.states + 1)]
+        before += [inputs[first - lag : T - lag] for lag in range(1, self.inputs + 1)]
+        return np.concatenate(before, axis=1)
+
+    def transitions(self, states: Array, inputs: Array) -> Transitions:
+        """Transitions of the state with earlier values, from one log at equal time steps; see ``augmented``."""
+        whole, first = self.augmented(states, inputs), max(self.states, self.inputs)
+        return Transitions(whole[:-1], inputs[first : len(states) - 1], whole[1:])

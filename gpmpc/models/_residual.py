@@ -1,0 +1,364 @@
+"""Residual models: a known nominal model and GPs that learn its error.
+
+    x[k+1] = f0(x[k], u[k]) + B(x[k]) d(phi(x[k], u[k]))
+
+f0 is the nominal model, d a GP, B its effect on the states, and phi what the GP sees of the state and the input:
+selected columns, angles as sine and cosine (Hewing, Kabzan and Zeilinger, 2020, eq. (3), with constant B and columns).
+With ``Affine.identity`` as nominal model d is the difference of two states, and the model a full one with features.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpmpc.dynamics import (
+    Array,
+    Linearized,
+    batched_jacobian,
+    check_destination,
+    check_query,
+    predict_by_autograd,
+    tensors_for,
+    to_array,
+)
+from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.gaussian import Gaussian, check_tensors
+from gpmpc.gp import GPPosterior, SlidingWindow, Trainer, Training, Transitions, append_points
+from gpmpc.gp.posterior import AffineForm
+from gpmpc.gp.transitions import check_transitions
+from gpmpc.models._features import Features
+from gpmpc.models._nominal import Affine, CasadiFunction, linearize_function
+
+Nominal = Callable[[Tensor, Tensor], Tensor]
+Effect = Tensor | Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class ResidualModel:
+    """A nominal model and a GP on its residual.
+
+    Attributes:
+        nominal: f0, from x (*batch, n) and u (*batch, m) to (*batch, n), in torch; an ``Affine`` one allows exact
+            moment matching.
+        residual: d, with ``predicts="value"``.
+        B: Where it acts (n, k), or a function of the state (*batch, n) that gives it (*batch, n, k), in torch or by
+            ``CasadiFunction``; (*batch, n) will do where k = 1.
+        states: The states that d depends on, in its order.
+        inputs: The inputs that d depends on, in its order.
+        input_dim: m, all of them.
+        angles: Those of ``states`` that d sees as (sine, cosine), at their place.
+        noise: Covariance of the observations (n, n); by default that of d's, B diag(sn2) B', which needs a constant B.
+
+    Raises:
+        ShapeError: The parts do not belong together.
+        SettingError: The residual predicts something else, an index is out of range, or the noise is missing.
+    """
+
+    nominal: Nominal
+    residual: GPPosterior
+    B: Effect
+    states: Sequence[int]
+    inputs: Sequence[int]
+    input_dim: int
+    angles: Sequence[int] = ()
+    noise: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        gp = self.residual
+        if not callable(self.B):
+            check_tensors(B=self.B)
+        if getattr(gp, "predicts", None) != "value":
+            raise SettingError("residual", f"must be a GP with predicts='value'; got {getattr(gp, 'predicts', gp)!r}")
+        if callable(self.B):
+            if self.noise is None:
+                raise SettingError("noise", "must be given (n, n) where B is a function of the state; got None")
+        elif self.B.dim() != 2 or self.B.shape[1] != gp.output_dim:
+            raise ShapeError(f"B must be (n, {gp.output_dim}); got {tuple(self.B.shape)}")
+        if (self.features.dim, len(self.inputs)) != (gp.state_dim, gp.input_dim):
+            raise ShapeError(
+                f"the residual has {gp.state_dim} states and {gp.input_dim} inputs; "
+                f"got {self.features.dim} and {len(self.inputs)} selected"
+            )
+        n, m, nominal = self.state_dim, self.input_dim, self.nominal
+        if isinstance(nominal, CasadiFunction):
+            nominal.check_sizes((n, m), (n, 1))
+        if isinstance(self.B, CasadiFunction):
+            self.B.check_sizes((n,), (n, gp.output_dim))
+        parts = {} if callable(self.B) else {"B": (self.B, tuple(self.B.shape))}
+        if self.noise is not None:
+            check_tensors(noise=self.noise)
+            parts["noise"] = (self.noise, (n, n))
+        if isinstance(nominal, Affine):
+            shapes = {"A": (n, n), "B": (n, m), "c": (n,)}
+            parts |= {f"nominal.{name}": (getattr(nominal, name), shape) for name, shape in shapes.items()}
+        for name, (value, shape) in parts.items():
+            if tuple(value.shape) != shape:
+                raise ShapeError(f"{name} must have shape {shape}; got {tuple(value.shape)}")
+            if value.dtype != gp.dtype or value.device != gp.device:
+                raise SettingError(name, f"must be {gp.dtype} on {gp.device}; got {value.dtype} on {value.device}")
+
+    @classmethod
+    def train(
+        cls,
+        nominal: Nominal,
+        transitions: Transitions,
+        B: Effect | None = None,
+        states: Sequence[int] | None = None,
+        inputs: Sequence[int] | None = None,
+        trainer: Any = None,
+        seed: int = 0,
+        angles: Sequence[int] = (),
+    ) -> "ResidualModel":
+        """Learns d from transitions: the part of x[k+1] - f0(x[k], u[k]) that B reaches (least squares).
+
+        Args:
+            nominal: f0; ``Affine.identity(n, m)`` where nothing is known.
+            transitions: What was observed.
+            B: Where d acts (n, k), or a function of the state; on every state by default.
+            states: The states that d depends on; all by default.
+            inputs: The inputs that d depends on; all by default.
+            trainer: A ``Trainer`` or ``SparseTrainer``; its ``predicts`` is not read.
+            seed: Of the random starts.
+            angles: The states that d sees as sine and cosine.
+
+        Raises:
+            ShapeError: ``nominal`` or B do not fit the transitions.
+            SettingError: An index is out of range, the columns of B depend on each other, or there is no trainer.
+            TrainingError: An output could not be trained.
+        """
+        check_transitions(transitions)
+        n, m = transitions.state_dim, transitions.input_dim
+        states = list(range(n)) if states is None else list(states)
+        inputs = list(range(m)) if inputs is None else list(inputs)
+        B = torch.eye(n, dtype=torch.float64) if B is None else B
+        features = Features(states, inputs, list(angles), n, m)
+        training = _fit(nominal, B, features, transitions, Trainer() if trainer is None else trainer, seed)
+        noise = None
+        if callable(B):  # one covariance for all states: its mean over those that were observed
+            effect = _effect(B, transitions.states)
+            noise = (effect @ training.posterior.noise_covariance @ effect.mT).mean(0)
+        return cls(nominal, training.posterior, B, states, inputs, m, list(angles), noise)
+
+    def __len__(self) -> int:
+        return len(self.residual)
+
+    def append(self, transitions: Transitions, window: SlidingWindow | None = None) -> "ResidualModel":
+        """Appends transitions to the data of the residual GP, held to a number of points where a window is given.
+
+        Raises:
+            ShapeError: The transitions have other dimensions.
+        """
+        if (transitions.state_dim, transitions.input_dim) != (self.state_dim, self.input_dim):
+            raise ShapeError(
+                f"the model has {self.state_dim} states and {self.input_dim} inputs; "
+                f"got transitions with {transitions.state_dim} and {transitions.input_dim}"
+            )
+        points = _residuals(self.nominal, self.B, self.features, transitions, like=self.residual.weights)
+        add = append_points if window is None else window.append
+        return replace(self, residual=add(self.residual, *points))
+
+    @cached_property
+    def features(self) -> Features:
+        """What d sees of the state and the input."""
+        return Features(self.states, self.inputs, self.angles, self.state_dim, self.input_dim)
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states, n."""
+        known = self.noise if callable(self.B) else self.B
+        return 0 if known is None else len(known)
+
+    @property
+    def output_dim(self) -> int:
+        """Number of outputs, n: the next state."""
+        return self.state_dim
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the residual GP."""
+        return self.residual.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Of the residual GP."""
+        return self.residual.device
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """Of the observations (n, n)."""
+        if self.noise is None and not callable(self.B):
+            return self.B @ self.residual.noise_covariance @ self.B.mT
+        return torch.as_tensor(self.noise)
+
+    def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
+        """The next state's distribution at a certain state and input: mean (*batch, n), covariance (*batch, n, n)."""
+        input = state[..., :0] if input is None else input
+        check_query(self, state, input)
+        d = self.residual.predict(*self.features(state, input))
+        B = _effect(self.B, state)
+        mean = _nominal(self.nominal, state, input) + (B @ d.mean[..., None])[..., 0]
+        return Gaussian(mean, B @ d.covariance @ B.mT)
+
+    def predict_mean(self, states: Array, inputs: Array) -> Array:
+        """The mean of the next states (K, n) at K points (K, n), (K, m), without derivatives."""
+        x, u = tensors_for(self, states, inputs)
+        with torch.no_grad():
+            known, B = to_array(_nominal(self.nominal, x, u)), to_array(_effect(self.B, x))
+        features, selected, _ = self.features.linearize(states, inputs)
+        d = self.residual.linearize(features, selected, False).mean
+        return known + (B @ d[..., None])[..., 0]
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises the model at K points (K, n), (K, m), by the chain rule around the GP's own ``linearize``.
+
+        A nominal model or an effect with a method ``linearize``, such as ``Affine`` or ``CasadiFunction``, is
+        linearised by it; any other by one batched call of torch autograd.
+        """
+        if hasattr(self.nominal, "linearize"):
+            mean, A, G = linearize_function(self.nominal, self, states, inputs)
+        else:
+            mean, A, G = linearize_function(lambda x, u: _nominal(self.nominal, x, u), self, states, inputs)
+        features, selected, slope = self.features.linearize(states, inputs)
+        d = self.residual.linearize(features, selected, covariance)
+        by_state, by_input = self.features.chain(d.A, d.B, slope)
+        if callable(self.B):
+            B, dB = linearize_function(self.B, self, states)
+            if B.ndim == 2:  # one output
+                B, dB = B[..., None], dB[:, :, None]
+            A = A + (dB * d.mean[:, None, :, None]).sum(2)
+        else:
+            B = self._constant_effect
+        V = None if d.covariance is None else B @ d.covariance @ B.swapaxes(-1, -2)
+        mean = mean + (B @ d.mean[..., None])[..., 0]
+        return Linearized(mean, A + B @ by_state, G + B @ by_input, V)
+
+    def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
+        """``predict`` with its mean's derivatives by x (*batch, n, n) and u (*batch, n, m), which torch can follow."""
+        input = state[..., :0] if input is None else input
+        if callable(self.B):
+            return predict_by_autograd(self, state, input)
+        belief = self.predict(state, input)
+        _, by_features, by_inputs = self.residual.predict_with_jacobian(*self.features(state, input))
+        if isinstance(self.nominal, Affine):
+            A, G = (part.expand(*state.shape[:-1], *part.shape) for part in (self.nominal.A, self.nominal.B))
+        else:
+            (_,), (A, G) = batched_jacobian(lambda x, u: (self.nominal(x, u),), (state, input))
+        places = torch.tensor(list(self.inputs), dtype=torch.long, device=self.device)
+        return (
+            belief,
+            A + self.B @ by_features @ self.features.jacobian(state),
+            G.index_add(-1, places, self.B @ by_inputs),
+        )
+
+    @cached_property
+    def _constant_effect(self) -> Array:
+        return to_array(torch.as_tensor(self.B))
+
+    @property
+    def affine_form(self) -> AffineForm | None:
+        """The parts of the model; None unless B is constant, and the nominal model ``Affine`` or a tape."""
+        nominal, tape = self.nominal, getattr(self.nominal, "tape", None)
+        if callable(self.B) or not (isinstance(nominal, Affine) or tape is not None):
+            return None
+        A, G, c = (nominal.A, nominal.B, nominal.c) if isinstance(nominal, Affine) else (None, None, None)
+        states, inputs, angles = list(self.states), list(self.inputs), tuple(self.angles)
+        return AffineForm(self.residual, A, G, c, self.B, states, inputs, angles, tape)
+
+    def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "ResidualModel":
+        """Copies the model to another device or type; functions (nominal model, effect) are taken as they are."""
+        check_destination(device, dtype)
+        nominal = self.nominal
+        if isinstance(nominal, Affine):
+            nominal = Affine(*(part.to(device=device, dtype=dtype) for part in (nominal.A, nominal.B, nominal.c)))
+        B = self.B if callable(self.B) else self.B.to(device=device, dtype=dtype)
+        noise = None if self.noise is None else self.noise.to(device=device, dtype=dtype)
+        return replace(self, nominal=nominal, residual=self.residual.to(device, dtype), B=B, noise=noise)
+
+
+def _nominal(nominal: Nominal, state: Tensor, input: Tensor) -> Tensor:
+    """f0 (*batch, n), held against the rule that a wrong number of states would otherwise be broadcast."""
+    value = nominal(state, input)
+    if not isinstance(value, Tensor):
+        raise SettingError("nominal", f"must give a torch tensor; got {type(value).__name__}")
+    if value.shape != state.shape:
+        raise ShapeError(
+            f"nominal must give next states of the states' shape {tuple(state.shape)}; got {tuple(value.shape)}"
+        )
+    return value
+
+
+def _effect(B: Effect, state: Tensor) -> Tensor:
+    """B (*batch, n, k) at states (*batch, n), checked."""
+    n = state.shape[-1]
+    if not callable(B):
+        check_tensors(B=B)
+        if B.dim() != 2 or len(B) != n:
+            raise ShapeError(f"B must be ({n}, k), a row a state; got {tuple(B.shape)}")
+        return B
+    value = B(state)
+    check_tensors(B=value)
+    value = value[..., None] if value.shape == state.shape else value  # one output
+    if value.shape[:-1] != state.shape:
+        raise ShapeError(f"B must give (*batch, {n}, k) at {tuple(state.shape)}; got {tuple(value.shape)}")
+    return value
+
+
+def train_residual(
+    trainer: Any,
+    transitions: Transitions,
+    angles: Sequence[int] = (),
+    nominal: Nominal | None = None,
+    seed: int = 0,
+) -> Training:
+    """Trains a residual model of all states and inputs, as ``ResidualModel.train``; returns the whole training.
+
+    Args:
+        trainer: A ``Trainer`` or ``SparseTrainer``.
+        transitions: What was observed.
+        angles: Indices of states that are seen as sine and cosine.
+        nominal: f0; None learns the difference of two states.
+        seed: Of the random starts.
+
+    Raises:
+        SettingError: An index is out of range, or there is no trainer.
+        TrainingError: An output could not be trained.
+    """
+    n, m = transitions.state_dim, transitions.input_dim
+    known = Affine.identity(n, m) if nominal is None else nominal
+    B, every = torch.eye(n, dtype=torch.float64), (list(range(n)), list(range(m)))
+    training = _fit(known, B, Features(*every, angles, n, m), transitions, trainer, seed)
+    model: Any = ResidualModel(known, training.posterior, B, *every, m, angles)
+    return replace(training, posterior=model)
+
+
+def _fit(
+    nominal: Nominal, B: Effect, features: Features, transitions: Transitions, trainer: Any, seed: int
+) -> Training:
+    """The training of the residual GP."""
+    if not hasattr(trainer, "fit"):
+        raise SettingError("trainer", f"must be a Trainer or SparseTrainer; got {trainer!r}")
+    observed = _residuals(nominal, B, features, transitions)
+    return trainer.fit(*observed, len(features.inputs), "value", seed)
+
+
+def _residuals(
+    nominal: Nominal, B: Effect, features: Features, transitions: Transitions, like: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Features (N, d) and targets (N, k) of the residual GP: the least-squares part of the error of f0."""
+    like = B if like is None and isinstance(B, Tensor) else transitions.states if like is None else like
+    to: dict[str, Any] = {"device": like.device, "dtype": like.dtype}
+    x, u, after = (t.to(**to) for t in (transitions.states, transitions.inputs, transitions.next_states))
+    effect = _effect(B, x)
+    if int(torch.linalg.matrix_rank(effect).min()) < effect.shape[-1]:
+        raise SettingError("B", "must have linearly independent columns: equal effects cannot be distinguished")
+    missed = after - _nominal(nominal, x, u)
+    Q, R = torch.linalg.qr(effect)  # torch.linalg.lstsq gives other last digits from call to call
+    if callable(B):
+        targets = torch.linalg.solve_triangular(R, Q.mT @ missed[..., None], upper=True)[..., 0]
+    else:
+        targets = torch.linalg.solve_triangular(R, Q.mT @ missed.mT, upper=True).mT
+    return torch.cat(features(x, u), dim=1), targets

@@ -1,0 +1,375 @@
+"""What a controller predicts with: the first guess of a plan, the stages at it, their covariances, the tightened rows.
+
+Its *form* says where the dynamics are linearised:
+
+* ``trajectory``: at every stage of the last plan, one step on; before the first plan, of the reference. Plans need not
+  obey the dynamics (multiple shooting): what they miss, the defects, is part of the stages.
+* ``velocity``: at the current belief and the last input, one linearisation held over the horizon (Cao, Lai and Alam,
+  2017, section 4): ds_{k+1} = A ds_k + B du_k, which summed up is affine again, c = s_0 - A s_{-1} - B u_{-1}. Between
+  two measured states S does not change, which says nothing of how it will grow: there the rows of S take the c of the
+  linearisation itself.
+
+A constant error of the model leaves an offset between reference and state. ``velocity`` has none: the error is in both
+of two steps, and not in their difference. To ``trajectory`` an estimate of it may be added (Pannocchia and Rawlings,
+2003), which an observer moves by its gain L towards what the last step showed:
+
+    d_k = (1 - L) d_{k-1} + L (mu_k - f(mu_{k-1}, u_{k-1}))
+
+Covariances of ``zero_order`` are predicted under a feedback u = u_k - K (x - mu_k),
+
+    Sigma_{k+1} = (A_k - B_k K) Sigma_k (A_k - B_k K)' + V_k
+
+because without it the uncertainty grows over a long horizon until no input satisfies the bounds, while the next solves
+will see the next states and correct what went wrong (Hewing, Kabzan and Zeilinger, 2020). K is the gain of the
+finite-horizon LQR at the first stage. It is part of the covariances only: the bounds of the inputs hold for u_k.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from gpmpc.compiled import call_unchecked, compiled
+from gpmpc.dynamics import DynamicsModel, check_next_states, linearize
+from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.kernels.gp_rollout import Feedback
+from gpmpc.kernels.linalg import copy_matrix, product
+from gpmpc.models import RollOut
+from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, finite_horizon_lqr
+from gpmpc.mpc._stages import (
+    COVARIANCES,
+    ConstraintRows,
+    Covariance,
+    LinearizedStages,
+    Plan,
+    StageCosts,
+    StageLinearizer,
+    keep_rates,
+)
+from gpmpc.mpc.controller import (
+    Decision,
+    Reference,
+    Request,
+    check_controller,
+    check_method,
+    full_turns,
+    read_parameters,
+)
+from gpmpc.mpc.problem import Problem
+from gpmpc.propagation import Linearization, Propagator
+
+Array = np.ndarray
+
+Form = Literal["trajectory", "velocity"]
+FORMS = ("trajectory", "velocity")
+
+
+class Prediction(NamedTuple):
+    """A plan, the stages linearised at it, the covariances of its states, and the rows tightened by them."""
+
+    plan: Plan  # where the stages were linearised; with ``velocity`` its first stage only
+    stages: LinearizedStages
+    covariances: Array  # Sigma_0 .. Sigma_H (H + 1, n, n)
+    rows: StageRows
+    cost: QuadraticCost  # with outputs linearised at the plan
+
+
+@dataclass(frozen=True)
+class PredictionSettings:
+    """How beliefs are predicted.
+
+    Attributes:
+        form: ``"trajectory"`` or ``"velocity"``; see the module's text.
+        covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see ``gpmpc.mpc._stages``.
+        feedback: Predicts the covariances of ``"zero_order"`` under a feedback, without which no long horizon with
+            state constraints is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"``
+            and ``"diagonal"`` are those without feedback.
+        disturbance_gain: L in [0, 1], the observer gain of the constant-disturbance estimate; 0 disables it.
+        rolled_out: Ends a decision with a roll-out under the feedback, so that its plan obeys the model's dynamics
+            however few programs it took; for ``"trajectory"``.
+
+    Raises:
+        SettingError: An unknown form or covariance mode, a gain out of range, or one with ``"velocity"``.
+    """
+
+    form: Form = "trajectory"
+    covariance: Covariance = "zero_order"
+    feedback: bool = True
+    disturbance_gain: float = 0.0
+    rolled_out: bool = False
+
+    def __post_init__(self) -> None:
+        for key, possible in (("form", FORMS), ("covariance", COVARIANCES)):
+            if getattr(self, key) not in possible:
+                names = ", ".join(map(repr, possible))
+                raise SettingError(key, f"must be one of {names}; got {getattr(self, key)!r}")
+        for key in ("feedback", "rolled_out"):
+            if not isinstance(getattr(self, key), bool):
+                raise SettingError(key, f"must be true or false; got {getattr(self, key)!r}")
+        if self.rolled_out and self.form == "velocity":
+            raise SettingError("rolled_out", "is for plans of form 'trajectory'; got form 'velocity'")
+        check_number("disturbance_gain", self.disturbance_gain, least=0)
+        if self.disturbance_gain > (self.form != "velocity"):
+            velocity = self.form == "velocity"
+            rule = "be 0 for form 'velocity', which needs none" if velocity else "lie between 0 and 1"
+            raise SettingError("disturbance_gain", f"must {rule}; got {self.disturbance_gain}")
+
+
+class PredictionModel:
+    """Predicts beliefs for one problem.
+
+    Raises:
+        SettingError: No propagator, or settings that do not belong to the model.
+    """
+
+    def __init__(
+        self,
+        model: DynamicsModel,
+        propagator: Propagator,
+        problem: Problem,
+        horizon: int,
+        initial_input: Sequence[float] | Array,
+        settings: PredictionSettings,
+    ):
+        self.initial_input = check_controller(problem, *check_next_states(model), horizon, initial_input)
+        check_method("propagator", propagator, "propagate", "Linearization()")
+        if not isinstance(settings, PredictionSettings):
+            raise SettingError("prediction", f"must be PredictionSettings(...); got {type(settings).__name__}")
+        self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
+        self.settings, self.points = settings, horizon if settings.form == "trajectory" else 1
+        self.linearizer = StageLinearizer(model, propagator, settings.covariance)
+        self.constraints = ConstraintRows(problem, horizon, settings.covariance)
+        self.costs = StageCosts(problem, horizon, self.linearizer)
+        self._roll_out = RollOut(model)
+        self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
+
+    def with_model(self, model: DynamicsModel) -> "PredictionModel":
+        """Returns the predictions by another model of as many states and inputs."""
+        other = copy(self)
+        other.model, other.linearizer = model, StageLinearizer(model, self.propagator, self.settings.covariance)
+        other._at_points = StageLinearizer(model, Linearization(), "zero_order")
+        return other
+
+    def read(
+        self,
+        belief: Gaussian,
+        reference: Reference,
+        previous: Decision | None,
+        parameters: Any = None,
+        plan: Any = None,
+    ) -> Request:
+        """The checked arguments of a controller's ``control``, with the disturbance estimate.
+
+        Raises:
+            ShapeError: Belief, reference or plan have other dimensions, or reference inputs are missing.
+        """
+        problem, H = self.problem, self.horizon
+        request = Request.read(problem, H, self.initial_input, belief, reference, previous, plan)
+        if parameters is not None:
+            request = request._replace(parameters=read_parameters(parameters, H))
+        if reference.inputs is None and problem.cost.penalized == "deviations":
+            raise ShapeError(f"penalized 'deviations' needs reference inputs ({H}, {problem.input_dim}); got none")
+        if request.kappas is not None and self.linearizer.covariance != "zero_order":
+            mode = self.linearizer.covariance
+            raise SettingError("kappas", f"are for covariances of 'zero_order'; this controller has {mode!r}")
+        if self.settings.disturbance_gain and request.finite:
+            request = request._replace(disturbance=self._disturbance(request))
+        if plan is not None and request.states is None and request.finite:  # those that the inputs lead to
+            disturbance = request.disturbance if len(request.disturbance) else None
+            states = self._roll_out.open_loop(request.state[None], request.initial_guess[None], disturbance)[0]
+            request = request._replace(states=states if np.isfinite(states).all() else None)
+        return request
+
+    def initial_guess(self, request: Request) -> Plan:
+        """The plan handed over, or the last plan, shifted by a stage.
+
+        Without one it is a line from the state to the last reference along the others, and its inputs are the previous
+        one, or the reference's where R weighs deviations. Inputs handed over without states lead to those of the model.
+
+        Covariances are those of the last plan, unshifted: they depend on the time since the last measurement.
+        """
+        H, n, problem = self.horizon, self.problem.state_dim, self.problem
+        means, covariances = np.empty((H + 1, n)), np.zeros((H + 1, n, n))
+        means[0] = request.state
+        if self.linearizer.covariance != "none":
+            covariances[0] = request.covariance
+        if self.settings.form == "velocity":
+            means[1:], covariances[1:] = request.state, covariances[0]
+            return Plan(self.linearizer.state(means, covariances), request.constant_guess, covariances)
+        inputs, last = request.initial_guess, request.previous
+        if request.states is not None:
+            means[1:] = request.states[1:]
+        elif last is not None:
+            means[1:H], means[H] = last.means[2:], last.means[H]
+            if problem.cost.angles:  # a sensor may have taken a turn off
+                means[1:] += full_turns(request.state - last.means[1], problem.cost.angles)
+        else:
+            targets, shares = request.references.states, np.linspace(1.0, 0.0, H + 1)[1:, None]
+            means[1:] = targets + shares * (request.state - targets[0])
+            if problem.cost.penalized == "deviations":
+                inputs = request.references.inputs.clip(problem.inputs.lower, problem.inputs.upper)
+        if problem.input_rates.finite:
+            inputs = inputs.copy()
+            keep_rates(inputs, request.references.previous_input, *problem.input_rates.sides)
+        if not self.linearizer.at_points:
+            covariances[1:] = self._first_covariances(means, inputs, request) if last is None else last.covariances[1:]
+        return Plan(self.linearizer.state(means, covariances), inputs, covariances)
+
+    def linearize(self, plan: Plan, request: Request) -> Prediction:
+        """The stages of a plan, linearised in one call, with covariances, rows and cost."""
+        K = self.points
+        disturbance = request.disturbance if len(request.disturbance) else None
+        stages = self.linearizer(plan.states[:K], plan.inputs[:K], plan.covariances[:K], disturbance)
+        return self.predict(plan, stages, request)
+
+    def linearize_many(self, requests: Sequence[Request]) -> list[Prediction]:
+        """``linearize`` at the first guesses of many requests, all stages of all of them in one call."""
+        if not requests:
+            return []
+        K, T = self.points, len(requests)
+        plans = list(map(self.initial_guess, requests))
+        states, inputs, covariances = (np.concatenate([s[:K] for s in parts]) for parts in zip(*plans, strict=True))
+        disturbances = [np.broadcast_to(r.disturbance, (K, len(r.state))) for r in requests if len(r.disturbance)]
+        disturbance = np.concatenate(disturbances) if disturbances else None
+        stages = self.linearizer(states, inputs, covariances, disturbance)
+        parts = zip(*(part.reshape(T, K, *part.shape[1:]) for part in stages), strict=True)
+        return list(map(self.predict, plans, map(LinearizedStages._make, parts), requests))
+
+    def canonical(self, plan: Plan) -> Plan:
+        """A plan whose s are those of its beliefs: with roots that are positive semidefinite."""
+        means, covariances = self.linearizer.moments(plan.states, plan.covariances)
+        return Plan(self.linearizer.state(means, covariances), plan.inputs, covariances)
+
+    def predict(self, plan: Plan, stages: LinearizedStages, request: Request) -> Prediction:
+        """Covariances, rows and cost for stages that were linearised at a plan; see ``linearize``."""
+        covariances, mode = plan.covariances, self.linearizer.covariance
+        cost = self.costs.at(plan, request.parameters)
+        if mode == "zero_order":
+            covariances, K = np.empty_like(covariances), self.gain(stages, cost)
+            call_unchecked(_predict_covariances, *stages[:2], stages.V, request.covariance, K, covariances)
+        elif self.settings.form == "velocity" and mode != "none":
+            covariances = np.repeat(self.linearizer.moments(stages.next, covariances)[1], self.horizon + 1, axis=0)
+            covariances[0] = request.covariance
+        if self.settings.form == "velocity" and request.previous is not None:
+            stages = self._increments(plan, stages, request, request.previous)
+        rows = self.constraints.at(plan, covariances, self.points, request.parameters, request.kappas)
+        return Prediction(plan, stages, covariances, rows, cost)
+
+    def _increments(
+        self, plan: Plan, stages: LinearizedStages, request: Request, previous: Decision
+    ) -> LinearizedStages:
+        """A held linearisation as that of the increments since s_{-1}, the state that the last decision began at."""
+        before = self.linearizer.state(previous.means[:1], previous.covariances[:1])[0]
+        c = plan.states[0] - stages.A[0] @ before - stages.B[0] @ request.references.previous_input
+        if not request.covariance.any():
+            n = self.problem.state_dim
+            c[n:] = stages.c[0, n:]
+        return stages._replace(c=c[None])
+
+    @property
+    def evaluates(self) -> bool:
+        """Whether plans are compared without derivatives: where the means are all that is predicted."""
+        return self.linearizer.covariance == "none"
+
+    def evaluate(self, plan: Plan, at: Prediction, request: Request) -> Prediction:
+        """The prediction at a plan with the derivatives of another one, ``at``."""
+        disturbance = request.disturbance if len(request.disturbance) else None
+        after = self._roll_out.open_loop(plan.states[:-1], plan.inputs[:, None], disturbance)[:, 1]
+        return self._without(plan, after, at, request)
+
+    def _without(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
+        rows = self.constraints.at(plan, plan.covariances, self.points, request.parameters, request.kappas)
+        stages, cost = at.stages._replace(next=after), self.costs.at(plan, request.parameters)
+        return Prediction(plan, stages, plan.covariances, rows, cost)
+
+    def roll_out(
+        self, towards: Plan, prediction: Prediction, feedback: Array, request: Request, derivatives: bool = True
+    ) -> Prediction:
+        """The prediction at the plan that obeys the dynamics under a feedback towards another one, within its bounds.
+
+        The feedback is a program's, F_k (H, m, p + m + 1), or that of the stages of ``prediction`` where there is none
+        (0, m, p + m + 1). Without ``derivatives`` the stages are linearised only where the plan needs it.
+        """
+        problem, n, linearizer = self.problem, self.problem.state_dim, self.linearizer
+        own = -self.gains(*prediction.stages[:2], prediction.cost) if not len(feedback) else feedback
+        gains = np.ascontiguousarray(own[:, :, :n])
+        last, disturbance = request.references.previous_input, request.disturbance if len(request.disturbance) else None
+        limits = problem.inputs.lower, problem.inputs.upper, problem.input_rates.lower, problem.input_rates.upper
+        if linearizer.at_points and all(limit.ndim == 1 for limit in limits):
+            law = Feedback(towards.states[None], towards.inputs[None], gains[None], *limits, last)
+            states, inputs = self._roll_out(towards.states[:1], law, disturbance)
+            plan = Plan(states[0], inputs[0], towards.covariances)
+            if not derivatives:
+                return self._without(plan, plan.states[1:], prediction, request)
+            return self.linearize(plan, request)
+        states, inputs, covariances = (part.copy() for part in towards)
+        (low, high), (down, up) = (box.by_stage(self.horizon) for box in (problem.inputs, problem.input_rates))
+        parts = []
+        for k in range(self.horizon):  # of a belief, whose means depend on its covariances
+            input = towards.inputs[k] + gains[k] @ (states[k, :n] - towards.states[k, :n])
+            input = np.clip(input, last + down[k], last + up[k])
+            last = inputs[k] = np.clip(input, low[k], high[k])
+            stage = linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance)
+            states[k + 1] = stage.next[0]
+            covariances[k + 1] = linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
+            parts.append(stage)
+        stages = LinearizedStages(*map(np.concatenate, zip(*parts, strict=True)))
+        return self.predict(Plan(states, inputs, covariances), stages, request)
+
+    def gain(self, stages: LinearizedStages, cost: QuadraticCost) -> Array:
+        """K (m, n) of the feedback u = u_k - K (x - mu_k) at the first stage; zero without feedback."""
+        return self.gains(stages.A[:1], stages.B[:1], cost)[0]
+
+    def gains(self, A: Array, B: Array, cost: QuadraticCost) -> Array:
+        """K_0 .. K_{H-1} (H, m, n) of the feedback u = u_k - K_k (x - mu_k), weighed as at the first stage; or zero."""
+        (m, n), Z = (self.problem.input_dim, self.problem.state_dim), cost.squares
+        if not self.settings.feedback:
+            return np.zeros((self.horizon, m, n))
+        A, B = np.ascontiguousarray(A[:, :n, :n]), np.ascontiguousarray(B[:, :n])
+        Q, R, terminal = np.ascontiguousarray(cost.state[:1, 0]), cost.input[:1], cost.terminal[0]
+        if len(Z):
+            Q, R, terminal = Q + Z[:1, :n, :n], R + Z[:1, n:-1, n:-1], terminal + Z[-1, :n, :n]
+        return call_unchecked(finite_horizon_lqr, A, B, Q, R, terminal, self.horizon)[0]
+
+    def _first_covariances(self, means: Array, inputs: Array, request: Request) -> Array:
+        """Sigma_1 .. Sigma_H (H, n, n) along a first guess, linearised at its points."""
+        stages = self._at_points(means[:-1], inputs, np.zeros((self.horizon, *request.covariance.shape)))
+        covariances = np.empty((self.horizon + 1, *request.covariance.shape))
+        gain = self.gain(stages, self.costs.quadratic)
+        _predict_covariances(stages.A, stages.B, stages.V, request.covariance, gain, covariances)
+        return covariances[1:]
+
+    def _disturbance(self, request: Request) -> Array:
+        """d_k (n,), from the estimate of the last decision and the state that its input led to; at first zero."""
+        previous = request.previous
+        if previous is None:
+            return np.zeros(self.problem.state_dim)
+        before = np.zeros_like(request.state) if previous.disturbance is None else previous.disturbance
+        applied = request.references.previous_input[None]
+        predicted = linearize(self.model, previous.means[:1], applied, covariance=False).mean[0]
+        return before + self.settings.disturbance_gain * (request.state - predicted - before)
+
+
+@compiled
+def _predict_covariances(A, B, V, start, K, covariances):
+    """Writes Sigma_0 .. Sigma_H (H + 1, n, n) of H stages, or of one that is held."""
+    n, m, held = B.shape[1], B.shape[2], len(A) - 1
+    closed, moved = np.empty((n, n)), np.empty((n, n))
+    copy_matrix(start, covariances[0])
+    for k in range(len(covariances) - 1):
+        at, after = min(k, held), covariances[k + 1]
+        for i in range(n):
+            for j in range(n):
+                closed[i, j] = A[at, i, j]
+                for r in range(m):
+                    closed[i, j] -= B[at, i, r] * K[r, j]
+        product(closed, covariances[k], moved)
+        for i in range(n):
+            for j in range(i + 1):
+                total = (V[at, i, j] + V[at, j, i]) / 2.0
+                for c in range(n):
+                    total += moved[i, c] * closed[j, c]
+                after[i, j] = after[j, i] = total

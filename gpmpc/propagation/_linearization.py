@@ -1,0 +1,176 @@
+"""Propagation through a model's expansion at the belief's mean, as in an extended Kalman filter.
+
+With A = dm/dx, H_a = d2m_a/dx2 at (mu, u) and the model's own variance there,
+
+    mu+ = m(mu, u) (+ 1/2 tr(H_a S)),   Sigma+ = A S A' + Var[f(mu, u)] (+ 1/2 tr(H_a S H_b S)),   Cov[x, x+] = S A'
+
+The terms in brackets are those of the second-order filter (Jazwinski, 1970, section 9.3; Girard, Rasmussen, Quinonero
+Candela and Murray-Smith, 2003, for GPs). Mean equivalence leaves A S A' out (Hewing, Kabzan and Zeilinger, 2020).
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gpmpc.dynamics import predict_with_jacobian
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp.backend import host_arrays
+from gpmpc.gp.posterior import GPPosterior
+from gpmpc.propagation._composition import Composition
+from gpmpc.propagation._propagator import Propagation, Propagator, checked_input, projected
+from gpmpc.propagation._sensitivity import Sensitivity
+
+
+class _Expansion(NamedTuple):
+    """The model around a certain state and input."""
+
+    belief: Gaussian  #: the prediction there
+    A: Tensor  #: the mean's derivative by the state (*batch, k, n)
+    B: Tensor  #: by the input (*batch, k, m)
+    variance_by_state: Tensor  #: (*batch, k, n)
+    variance_by_input: Tensor  #: (*batch, k, m)
+    mean_by_state2: Tensor  #: second derivatives (*batch, k, n, n)
+    mean_by_state_input: Tensor  #: (*batch, k, n, m)
+
+
+def expand(model: Any, state: Tensor, input: Tensor) -> _Expansion | None:
+    """The expansion of GPs alone, compiled or by torch; None for other models."""
+    form = getattr(model, "affine_form", None)
+    if form is None or form.B is not None:
+        return None
+    gp = form.f
+    if (arrays := host_arrays(gp.weights, state, input)) is None:
+        parts = _by_torch(gp, state, input)
+    else:
+        from gpmpc import kernels  # loads numba
+
+        batch = state.shape[:-1]
+        flat = arrays[1].reshape(-1, gp.state_dim)
+        found = kernels.point_with_jacobian(gp.packed, flat, arrays[2].reshape(len(flat), gp.input_dim))
+        parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found]
+    mean, A = parts[0] + gp.offset, parts[2]
+    if form.A is not None:
+        mean, A = mean + state, A + form.A
+    return _Expansion(Gaussian(mean, torch.diag_embed(parts[1])), A, *parts[3:])
+
+
+def _by_torch(model: GPPosterior, state: Tensor, input: Tensor) -> list[Tensor]:
+    """The entries of ``kernels.Expansion``."""
+    n, inverse_squares = model.state_dim, model.lengthscales**-2
+    difference = (model.features - torch.cat([state, input], dim=-1)[..., None, :])[..., None, :, :]
+    z = difference * inverse_squares[:, None, :]  # (*batch, k, N, d)
+    k = model.signal_variance[:, None] * torch.exp(-(z * difference).sum(-1) / 2)
+    weighted, explained_by = model.weights * k, model.solve(k)
+    jacobian = (weighted[..., None, :] @ z)[..., 0, :]
+    variance_by = -2 * ((explained_by * k)[..., None, :] @ z)[..., 0, :]
+    own = torch.diag_embed(inverse_squares)[:, :n]
+    second = (weighted[..., None] * z[..., :n]).mT @ z - weighted.sum(-1)[..., None, None] * own
+    variance = (model.signal_variance - model.variance_reduction(k)).clamp_min(0)
+    parts = [half for whole in (jacobian, variance_by, second) for half in (whole[..., :n], whole[..., n:])]
+    return [weighted.sum(-1), variance, *parts]
+
+
+class Linearization(Propagator):
+    """First order, or with the Hessian terms second.
+
+    Args:
+        hessian: Adds the second-order terms.
+        process_noise: Adds the model's noise covariance.
+    """
+
+    def __init__(self, hessian: bool = False, process_noise: bool = False):
+        self.hessian, self.process_noise = hessian, process_noise
+
+    @property
+    def first_order(self) -> bool:
+        """Whether mean, derivatives and variance of the model at the belief's mean are all that it takes."""
+        return not self.hessian
+
+    def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+        """Moves a belief one step on; see ``Propagator.propagate``."""
+        input = checked_input(model, belief, input)
+        at_mean, A, _ = predict_with_jacobian(model, belief.mean, input)
+        return self._propagation(model, belief, input, at_mean, A)
+
+    def differentiate(
+        self, model: Any, belief: Gaussian, input: Tensor | None = None
+    ) -> tuple[Propagation, Sensitivity] | None:
+        """``propagate`` with all derivatives in closed form; None where there is none (always with ``hessian``)."""
+        input = checked_input(model, belief, input)
+        expansion = None if self.hessian else expand(model, belief.mean, input)
+        if expansion is None:
+            return None
+        A = expansion.A
+        AS = A @ belief.covariance
+        by_mean = torch.einsum("...ip,...jpc->...ijc", AS, expansion.mean_by_state2)
+        by_input = torch.einsum("...ip,...jpc->...ijc", AS, expansion.mean_by_state_input)
+        by_covariance = torch.einsum("...ic,...jd->...ijcd", A, A)
+        sensitivity = Sensitivity(
+            A,
+            torch.zeros_like(expansion.mean_by_state2),
+            expansion.B,
+            by_mean + by_mean.transpose(-3, -2) + torch.diag_embed(expansion.variance_by_state.mT).movedim(-3, -1),
+            (by_covariance + by_covariance.mT) / 2,
+            by_input + by_input.transpose(-3, -2) + torch.diag_embed(expansion.variance_by_input.mT).movedim(-3, -1),
+        )
+        return self._propagation(model, belief, input, expansion.belief, A), sensitivity
+
+    def _propagation(self, model: Any, belief: Gaussian, input: Tensor, at_mean: Gaussian, A: Tensor) -> Propagation:
+        S = belief.covariance
+        mean, covariance = at_mean.mean, at_mean.covariance + A @ S @ A.mT
+        if self.hessian:
+            H = _mean_hessian(model, belief.mean, input)
+            HS = H @ S[..., None, :, :]
+            mean = mean + HS.diagonal(dim1=-2, dim2=-1).sum(-1) / 2
+            covariance = covariance + (HS[..., :, None, :, :] * HS[..., None, :, :, :].mT).sum((-2, -1)) / 2
+        return projected((mean, covariance, S @ A.mT), model.noise_covariance if self.process_noise else None)
+
+
+class MeanEquivalence(Propagator):
+    """The prediction at the belief's mean: the uncertainty of the state is dropped.
+
+    Args:
+        process_noise: Adds the model's noise covariance.
+    """
+
+    def __init__(self, process_noise: bool = False):
+        self.process_noise = process_noise
+
+    def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+        """Moves a belief one step on; see ``Propagator.propagate``. State and next state come out uncorrelated."""
+        moved = model.predict(belief.mean, checked_input(model, belief, input))
+        cross = torch.zeros_like(belief.mean[..., :, None].expand(*belief.mean.shape, moved.dim))
+        return projected((moved.mean, moved.covariance, cross), model.noise_covariance if self.process_noise else None)
+
+    def differentiate(
+        self, model: Any, belief: Gaussian, input: Tensor | None = None
+    ) -> tuple[Propagation, Sensitivity] | None:
+        """``propagate`` with all derivatives in closed form; None where the model has none."""
+        certain = Gaussian(belief.mean, torch.zeros_like(belief.covariance))
+        found = Linearization(process_noise=self.process_noise).differentiate(model, certain, input)
+        if found is None:
+            return None
+        moved, d = found
+        return moved, replace(d, covariance_by_covariance=torch.zeros_like(d.covariance_by_covariance))
+
+
+def _mean_hessian(model: Any, state: Tensor, input: Tensor) -> Tensor:
+    """d2m/dx2 (*batch, k, n, n): in closed form for SE-ARD GPs, else by torch autograd."""
+    composition = Composition.of(model)
+    if composition is not None:  # an affine part has no second derivative
+        seen, control = composition.seen(Gaussian.certain(state), input)
+        return composition.outer(composition.f.mean_hessian(seen.mean, control))
+    again = torch.is_grad_enabled() and (state.requires_grad or input.requires_grad)
+    with torch.inference_mode(False), torch.enable_grad():
+        x = state if state.requires_grad and again else state.detach().clone().requires_grad_()
+        _, A, _ = predict_with_jacobian(model, x, input)
+        if not A.requires_grad:  # the model is linear in the state
+            return A.new_zeros(*A.shape, A.shape[-1])
+        rows = [
+            torch.autograd.grad(A[..., a, d].sum(), x, create_graph=again, retain_graph=True, materialize_grads=True)[0]
+            for a in range(A.shape[-2])
+            for d in range(A.shape[-1])
+        ]
+    return torch.stack(rows, dim=-2).unflatten(-2, A.shape[-2:])

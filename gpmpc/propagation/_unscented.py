@@ -1,0 +1,121 @@
+"""Propagation through any model without its derivatives, by a few points that carry the belief's moments.
+
+With n states and lambda = alpha^2 (n + kappa) - n, the points are mu and mu +- sqrt(n + lambda) times the columns of
+the symmetric root of Sigma; the next state's covariance is theirs plus the mean of the model's own (Julier and Uhlmann,
+2004; van der Merwe, 2004). The default parameters give the spherical cubature rule (Arasaratnam and Haykin, 2009),
+whose weights are positive, so that no covariance can come out indefinite.
+"""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpmpc.exceptions import SettingError, check_number
+from gpmpc.gaussian import Gaussian, square_root, square_root_differential
+from gpmpc.propagation._linearization import expand
+from gpmpc.propagation._propagator import Propagation, Propagator, checked_input, projected
+from gpmpc.propagation._sensitivity import Sensitivity
+
+
+class Unscented(Propagator):
+    """The unscented transform.
+
+    Args:
+        alpha: Spread of the points.
+        beta: Weight of the centre in the covariance; 2 is best for Gaussians of small alpha.
+        kappa: Secondary spread.
+        process_noise: Adds the model's noise covariance.
+
+    Raises:
+        SettingError: alpha is not positive, or (at the first step) n + kappa is not.
+    """
+
+    def __init__(self, alpha: float = 1.0, beta: float = 0.0, kappa: float = 0.0, process_noise: bool = False):
+        check_number("alpha", alpha, above=0)
+        check_number("beta", beta)
+        check_number("kappa", kappa)
+        self.alpha, self.beta, self.kappa, self.process_noise = alpha, beta, kappa, process_noise
+
+    def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+        """Moves a belief one step on; see ``Propagator.propagate``."""
+        input = checked_input(model, belief, input)
+        steps, points, controls = self._points(belief, square_root(belief.covariance), input)
+        return self._moments(model, belief, steps, model.predict(points, controls))
+
+    def differentiate(
+        self, model: Any, belief: Gaussian, input: Tensor | None = None
+    ) -> tuple[Propagation, Sensitivity] | None:
+        """``propagate`` with all derivatives, by those of the model at every point; None where it has no closed ones.
+
+        Where Sigma is singular its root has no derivative in the null space; zero is taken there.
+        """
+        input, n = checked_input(model, belief, input), belief.dim
+        r, U = torch.linalg.eigh(belief.covariance)
+        r = r.clamp_min(0).sqrt()
+        steps, points, controls = self._points(belief, U @ (r[..., :, None] * U.mT), input)
+        expansion = expand(model, points, controls)
+        if expansion is None:
+            return None
+        of_mean, of_covariance = self._weights(belief)
+
+        # Of every point by [mu, vec(root), u] (*batch, 2n + 1, k, p): point 1 + j moves with column j of the root.
+        one = math.sqrt(self._spread(n)) * torch.eye(n, dtype=steps.dtype, device=steps.device)
+        ways = torch.cat([torch.zeros_like(one[:1]), one, -one])[:, None, None, :]
+
+        def by_parameters(by_state: Tensor, by_input: Tensor) -> Tensor:
+            by_root = by_state[..., :, None] * ways
+            return torch.cat([by_state, by_root.flatten(-2), by_input], dim=-1)
+
+        moves = by_parameters(expansion.A, expansion.B)
+        mean_by = torch.einsum("i,...iap->...ap", of_mean, moves)
+        mean = torch.einsum("i,...ia->...a", of_mean, expansion.belief.mean)
+        centred = expansion.belief.mean - mean[..., None, :]
+        half = torch.einsum("i,...iap,...ib->...abp", of_covariance, moves - mean_by[..., None, :, :], centred)
+        spread_by = by_parameters(expansion.variance_by_state, expansion.variance_by_input)
+        own = torch.diag_embed(torch.einsum("i,...iap->...pa", of_mean, spread_by)).movedim(-3, -1)
+        covariance_by = half + half.transpose(-3, -2) + own
+
+        def parts(by: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            by_root = by[..., n : n + n * n].unflatten(-1, (n, n))
+            count = by_root.dim() - belief.mean.dim() - 1  # dimensions of what is differentiated
+            columns = ((by_root + by_root.mT) / 2).flatten(-2 - count, -3).movedim(-3, -1)
+            # dR = L(dSigma) is linear, and L its own adjoint.
+            by_covariance = square_root_differential(r, U, columns).movedim(-1, -3)
+            return by[..., :n], by_covariance.reshape(by_root.shape), by[..., n + n * n :]
+
+        of_means, of_covariances = parts(mean_by), parts(covariance_by)
+        return self._moments(model, belief, steps, expansion.belief), Sensitivity(*of_means, *of_covariances)
+
+    def _spread(self, n: int) -> float:
+        """The square of the distance of the points in units of the root: n + lambda."""
+        if n + self.kappa <= 0:
+            raise SettingError("kappa", f"n + kappa must be positive; got {n} states and {self.kappa}")
+        return self.alpha**2 * (n + self.kappa)
+
+    def _weights(self, belief: Gaussian) -> tuple[Tensor, Tensor]:
+        """Of the points in the mean and in the covariance (2n + 1,)."""
+        n, spread = belief.dim, self._spread(belief.dim)
+        of_mean = belief.mean.new_full((2 * n + 1,), 1 / (2 * spread))
+        of_covariance = of_mean.clone()
+        of_mean[0], of_covariance[0] = 1 - n / spread, 2 - n / spread - self.alpha**2 + self.beta
+        return of_mean, of_covariance
+
+    def _points(self, belief: Gaussian, root: Tensor, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Steps from the mean, points (*batch, 2n + 1, n), and the input at each."""
+        columns = math.sqrt(self._spread(belief.dim)) * root  # symmetric: rows are columns
+        steps = torch.cat([torch.zeros_like(columns[..., :1, :]), columns, -columns], dim=-2)
+        points = belief.mean[..., None, :] + steps
+        return steps, points, input[..., None, :].expand(*points.shape[:-1], input.shape[-1])
+
+    def _moments(self, model: Any, belief: Gaussian, steps: Tensor, moved: Gaussian) -> Propagation:
+        of_mean, of_covariance = self._weights(belief)
+        mean = of_mean @ moved.mean
+        centred = moved.mean - mean[..., None, :]
+        covariance = centred.mT @ (of_covariance[:, None] * centred)
+        covariance = covariance + (of_mean[:, None, None] * moved.covariance).sum(-3)
+        return projected(
+            (mean, covariance, steps.mT @ (of_mean[1] * centred)),
+            model.noise_covariance if self.process_noise else None,
+        )

@@ -1,0 +1,187 @@
+"""Flies the whole quadrotor: a cascade of two controllers at two rates, on the twelve states.
+
+The outer controller, on the translational subsystem, decides the thrust U1 and its direction (ux, uy), once a second
+say; the direction, by eq. (2) of Cao, Lai and Alam (2017) inverted, is the attitude that the inner one, on the
+rotational subsystem, takes the vehicle to. (With the plant in the loop an inner loop at 1 Hz is unworkable; 20 Hz flies
+well.) The references of the angular rates are those of a first-order approach to the attitude,
+(angle_d - angle) / response time.
+
+The cascade is one controller at the inner rate. Every outer step begins with the outer controller; then, ``ratio``
+times, the inner one turns the vehicle to where the thrust is to point. Each has its own policy for failures: while the
+outer controller goes on along its last plan, the inner one keeps the vehicle upright, and the other way round.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.controller import Controller, Reference
+from gpmpc.mpc.policy import Command, OnFailure, check_policy, command
+from gpmpc.simulation._disturbances import Disturbance
+from gpmpc.simulation._loop import Flight, History, Moment, Rollout, check_references, fly, window
+from gpmpc.simulation._simulator import Noise, PlantSimulator
+from gpmpc.step import Step
+from gpmpc.systems import ATTITUDES, Coupled, Plant, attitude_at_yaw
+
+_OUTER, _INNER = slice(0, 6), slice(6, 12)
+
+
+@dataclass(frozen=True)
+class Cascade:
+    """An outer and an inner controller, and how the one's inputs are the other's references.
+
+    Attributes:
+        outer: On states x, vx, y, vy, z, vz [m, m/s] and inputs U1 [N], ux, uy [-].
+        inner: On states phi, p, theta, q, psi, r [rad, rad/s] and inputs U2, U3, U4 [N].
+        ratio: Inner steps an outer step.
+        attitude: How thrust direction becomes attitude: ``"exact"`` or ``"paper"``; see
+            ``attitude_for_thrust_direction``.
+        response_time: Of the approach to a new attitude [s].
+
+    Raises:
+        SettingError: A ratio below 1, an unknown attitude, or a response time that is not positive.
+    """
+
+    outer: Controller
+    inner: Controller
+    ratio: int = 20
+    attitude: str = "exact"
+    response_time: float = 0.1  # [s]
+
+    def __post_init__(self) -> None:
+        check_number("ratio", self.ratio, least=1, whole=True)
+        if self.attitude not in ATTITUDES:
+            raise SettingError("attitude", f"must be one of {', '.join(ATTITUDES)}; got {self.attitude!r}")
+        check_number("response_time", self.response_time, above=0, unit="[s]")
+
+    def attitude_reference(self, planned: np.ndarray, angles: np.ndarray, phase: int) -> Reference:
+        """What the inner controller is to follow.
+
+        Args:
+            planned: The outer plan's inputs from the current outer step on (H, 3); the inner horizon looks beyond the
+                first where it reaches the next outer step, and holds the last.
+            angles: Roll, pitch and yaw now (3,) [rad]; yaw is to be zero.
+            phase: Inner steps since the outer step began.
+
+        Returns:
+            Over the inner horizon, with no moments as the inputs that belong to it.
+        """
+        ahead = phase + np.arange(self.inner.horizon + 1)
+        direction = planned[np.minimum(ahead // self.ratio, len(planned) - 1)]
+        states = np.zeros((len(ahead), 6))
+        states[:, [0, 2]] = attitude_at_yaw(direction[:, 1], direction[:, 2], angles[2], self.attitude)
+        states[:, 1::2] = (states[:, ::2] - angles) / self.response_time
+        return Reference(states, np.zeros((self.inner.horizon, 3)))
+
+
+@dataclass(frozen=True)
+class CascadeRollout:
+    """K outer steps of a cascade, K r inner ones."""
+
+    states: np.ndarray  # (K r + 1, 12) of the plant at the inner rate
+    inputs: np.ndarray  # (K r, 4) that were applied, U1 .. U4 [N]
+    outer: Rollout  # at its own rate: states x .. vz, inputs U1, ux, uy as they were decided
+    inner: Rollout  # at its own rate: states phi .. r, its references the attitudes to be reached
+
+
+def cascade_loop(
+    plant: Plant,
+    cascade: Cascade,
+    references: Reference | np.ndarray,
+    initial: Any,
+    steps: int,
+    *,
+    noise: Noise | None = None,
+    disturbances: Sequence[Disturbance] = (),
+    on_failure: OnFailure = "raise",
+    seed: int = 0,
+    on_step: Callable[[Literal["outer", "inner"], Step], None] | None = None,
+) -> CascadeRollout:
+    """Flies a cascade.
+
+    Args:
+        plant: The twelve states at the inner rate, such as ``gpmpc.systems.coupled()``.
+        cascade: The controllers.
+        references: Of the outer loop: states x, vx, y, vy, z, vz (steps + horizon, 6) or more, one an outer step; as a
+            ``Reference`` with the inputs that belong to them.
+        initial: The state (12,), or the ``Gaussian`` that it is drawn from.
+        steps: K, outer steps.
+        noise: On states, measurements and inputs, every inner step.
+        disturbances: What the controllers do not know of.
+        on_failure: Of either controller; see ``closed_loop``.
+        seed: Of all random numbers.
+        on_step: Called with the loop and its step: of the outer one as it begins, of the inner one as it ends.
+
+    Raises:
+        ShapeError: The plant has other states, or references are too few.
+        SettingError: An unknown policy, or negative noise.
+        SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on; its step is
+            that of the controller that failed.
+        Diverged: The plant left the finite numbers; its step is an inner one.
+    """
+    check_policy(on_failure)
+    names = (tuple(plant.dynamics.state_names), tuple(plant.dynamics.input_names))
+    if names != (Coupled.state_names, Coupled.input_names):
+        raise ShapeError(f"a cascade flies the states and inputs of Coupled; got {names}")
+    references, ratio = check_references(references, steps, cascade.outer.horizon), cascade.ratio
+    simulator = PlantSimulator(plant, initial, disturbances, noise, seed)
+    calls: Any = (None, None) if on_step is None else [partial(on_step, loop) for loop in ("outer", "inner")]
+    outer = History(simulator, references, ratio * plant.time_step, _OUTER, calls[0])
+    inner = History(simulator, references, plant.time_step, _INNER, calls[1])
+    states, inputs = [simulator.mean], []
+
+    def decide(j: int, beliefs: Sequence[Gaussian], last: Sequence[_Decided | None]) -> list[_Decided]:
+        return [_decide(cascade, references, on_failure, j, beliefs[0], last[0])]
+
+    def record(moment: Moment, decided: _Decided) -> None:
+        k, phase = divmod(moment.k, ratio)
+        if phase == 0:
+            outer.add(moment._replace(k=k, input=decided.outer.input), decided.outer)
+        inner.add(moment._replace(input=moment.input[1:]), decided.inner, decided.attitude.states[0])
+        states.append(simulator.mean)
+        inputs.append(moment.input)
+
+    flight = Flight(simulator, record)
+    fly([flight], decide, steps * ratio, plant.time_step)
+    if flight.error is not None:
+        raise flight.error
+    last = flight.last.attitude.states[1]
+    return CascadeRollout(np.array(states), np.array(inputs), outer.rollout(), inner.rollout(last))
+
+
+class _Decided(NamedTuple):
+    """What one inner step applies, and what the next one starts from."""
+
+    input: np.ndarray  # U1 .. U4 [N]
+    outer: Command  # of the outer step under way
+    inner: Command
+    attitude: Reference  # of the inner controller
+    angles: np.ndarray  # roll, pitch, yaw as they were last measured [rad]
+
+
+def _decide(
+    cascade: Cascade, references: Reference, on_failure: OnFailure, j: int, belief: Gaussian, last: _Decided | None
+) -> _Decided:
+    k, phase = divmod(j, cascade.ratio)
+    if last is None or phase == 0:
+        ahead, before = window(references, k, cascade.outer.horizon), last and last.outer
+        outer = command(cascade.outer, _part(belief, _OUTER), ahead, before, on_failure, k)
+    else:
+        outer = last.outer
+    measured = belief.mean.cpu().numpy().astype(float)[6::2]
+    # Attitudes start from where the vehicle is, or was when that was last known.
+    angles = np.zeros(3) if last is None else last.angles
+    angles = measured if np.isfinite(measured).all() else angles
+    planned = outer.input[None] if outer.plan is None else outer.plan.inputs
+    attitude = cascade.attitude_reference(planned, angles, phase)
+    inner = command(cascade.inner, _part(belief, _INNER), attitude, last and last.inner, on_failure, j)
+    return _Decided(np.append(outer.input[:1], inner.input), outer, inner, attitude, angles)
+
+
+def _part(belief: Gaussian, states: slice) -> Gaussian:
+    return Gaussian(belief.mean[states], belief.covariance[states, states])

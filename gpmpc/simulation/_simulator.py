@@ -1,0 +1,233 @@
+"""Simulates what stands at the other end of a control loop: a plant, or the learned model itself.
+
+A plant has a state that is stepped, disturbed and measured with noise. A model loop, as in the figures of Cao, Lai and
+Alam (2017), takes the model's own prediction for the next state, mean and covariance carried on; the true plant never
+enters. It shows how a controller and a model get on with each other, not how a vehicle flies.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from gpmpc.dynamics import DynamicsModel
+from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number, check_numbers
+from gpmpc.gaussian import Gaussian
+from gpmpc.propagation import Propagator
+from gpmpc.simulation._disturbances import Disturbance
+from gpmpc.systems import Plant, step, step_many
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class ModelLoop:
+    """A learned model rolled on itself.
+
+    Raises:
+        SettingError: A time step that is not positive, or a negative deviation.
+    """
+
+    model: DynamicsModel  #: it predicts the next state
+    propagator: Propagator  #: how the belief is carried on
+    time_step: float = 1.0  #: time that one step stands for [s]
+    #: standard deviation of every state at the start where only its mean is given; the paper's 0.1
+    initial_std: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_number("time_step", self.time_step, above=0, unit="[s]")
+        check_number("initial_std", self.initial_std, least=0)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """White Gaussian noise, as standard deviations; every source draws from a stream of its own.
+
+    Raises:
+        SettingError: An entry is negative or no number.
+    """
+
+    process: Sequence[float] | None = None  #: added to every next state (n,)
+    measurement: Sequence[float] | None = None  #: added to what is measured (n,)
+    #: added to every input that is applied (m,): an actuator's, or the dither that makes data informative
+    input: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        for key, of in (("process", "state"), ("measurement", "state"), ("input", "input")):
+            values = getattr(self, key)
+            values = values.tolist() if isinstance(values, np.ndarray) else values
+            if isinstance(values, str) or (values is not None and not hasattr(values, "__len__")):
+                what = f"must be a list of standard deviations, one for every {of}"
+                raise SettingError(f"noise.{key}", f"{what}; got {values!r}")
+            check_numbers(f"noise.{key}", values or (), len(values or ()), least=0)
+
+
+class PlantSimulator:
+    """Simulates a plant with disturbances and noise.
+
+    Args:
+        plant: What the controller believes in, and what is there where no disturbance says otherwise.
+        initial: The state (n,), or a belief that it is drawn from; None where the plant is a simulator, which then
+            starts an episode.
+        disturbances: Each changes the plant, and the measurement, that the one before left.
+        noise: On states, measurements and inputs.
+        seed: Of all random numbers.
+
+    Raises:
+        ShapeError: State or noise do not fit the plant.
+        SettingError: The seed is no whole number, the state is not finite, or plant, noise or disturbances are of
+            another kind.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        initial: Any,
+        disturbances: Sequence[Disturbance] = (),
+        noise: Noise | None = None,
+        seed: int = 0,
+    ):
+        check_number("seed", seed, least=0, whole=True)
+        if not hasattr(plant, "dynamics"):
+            what = "must be a plant, such as System(dynamics, 0.1), or a ModelLoop"
+            raise SettingError("system", f"{what}; got {type(plant).__name__}")
+        if not isinstance(noise, Noise | None):
+            raise SettingError("noise", f"must be Noise(...); got {noise!r}")
+        if not isinstance(disturbances, Sequence):
+            raise SettingError("disturbances", f"must be a list of them; got {disturbances!r}")
+        n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
+        self.noise = noise or Noise()
+        for key, length in (("process", n), ("measurement", n), ("input", m)):
+            values = getattr(self.noise, key)
+            if values is not None and len(values) != length:
+                raise ShapeError(f"noise.{key} must have {length} standard deviations; got {len(values)}")
+        # One stream a source: whether states are measured with noise changes nothing about the wind.
+        sources = "initial", "process", "measurement", "input"
+        streams = np.random.SeedSequence(seed).spawn(4)
+        self._streams = {source: np.random.default_rng(s) for source, s in zip(sources, streams, strict=True)}
+        self.plant, self.disturbances, self._steps = plant, tuple(disturbances), 0
+        if initial is None:
+            dynamics: Any = plant.dynamics
+            if not getattr(dynamics, "stateful", False):
+                raise SettingError("initial", "must be a state; a simulator alone starts by itself")
+            initial = dynamics.reset(seed)
+        belief = initial if isinstance(initial, Gaussian) else None
+        self.mean, self.covariance = _check_state(initial if belief is None else belief.mean, n), np.zeros((n, n))
+        if belief is not None:
+            covariance = np.asarray(belief.covariance, dtype=float)
+            self.mean = self._streams["initial"].multivariate_normal(self.mean, covariance)
+        self._disturbed_plant(0.0)  # a disturbance that does not fit is found before the first step
+
+    def measure(self, time: float) -> Gaussian:
+        """Measures the state; the measurement is taken for certain: controllers of this package filter nothing."""
+        measured = self._add_noise("measurement", self.mean)
+        for disturbance in self.disturbances:
+            measured = disturbance.disturb_measurement(measured, time)
+        return Gaussian.certain(measured)
+
+    def _disturbed_plant(self, time: float) -> Plant:
+        plant = self.plant
+        for disturbance in self.disturbances:
+            plant = disturbance.disturb_plant(plant, time)
+        return plant
+
+    def _applied_input(self, input: Array) -> Array:
+        m = len(self.plant.dynamics.input_names)
+        if np.shape(input) != (m,):
+            raise ShapeError(f"the plant takes inputs of shape ({m},); got {np.shape(input)}")
+        return self._add_noise("input", input)
+
+    def _arrive(self, state: Array, applied: Array) -> Array | Diverged:
+        """Returns the input that was applied, or why the plant cannot go on from its next state."""
+        if not np.isfinite(state).all():
+            before = f"it was {self.mean}, input {applied}"
+            return Diverged(self._steps, f"the plant's state is not finite any more; {before}")
+        if getattr(self.plant.dynamics, "ended", False):
+            return Diverged(self._steps, f"the simulator has ended its episode, at state {state}")
+        self.mean = self._add_noise("process", state)
+        self._steps += 1
+        return applied
+
+    def _add_noise(self, source: str, value: Array) -> Array:
+        deviations = getattr(self.noise, source)
+        if deviations is None:
+            return value
+        return value + np.asarray(deviations, dtype=float) * self._streams[source].standard_normal(len(value))
+
+
+class ModelSimulator:
+    """Simulates a model loop.
+
+    Args:
+        loop: Model and propagator.
+        initial: Mean (n,) with covariance ``initial_std``^2 I, or a belief.
+    """
+
+    def __init__(self, loop: ModelLoop, initial: Any):
+        self.loop, self._steps = loop, 0
+        model, n = loop.model, loop.model.state_dim
+        mean, covariance = initial, loop.initial_std**2 * torch.eye(n, dtype=model.dtype)
+        if isinstance(initial, Gaussian):
+            mean, covariance = initial.mean, initial.covariance
+        mean = torch.as_tensor(_check_state(mean, n))
+        self._belief = Gaussian(mean.to(model.device, model.dtype), covariance.to(model.device, model.dtype))
+
+    @property
+    def mean(self) -> Array:
+        """Of the belief (n,)."""
+        return self._belief.mean.cpu().numpy().astype(float)
+
+    @property
+    def covariance(self) -> Array:
+        """Of the belief (n, n)."""
+        return self._belief.covariance.cpu().numpy().astype(float)
+
+    def measure(self, time: float) -> Gaussian:
+        """Returns the belief."""
+        return self._belief
+
+    def step(self, input: Array) -> Array | Diverged:
+        """Carries the belief one step on; returns the input, or why it cannot go on."""
+        like = self._belief.mean
+        control = torch.as_tensor(np.asarray(input, dtype=float)).to(like.device, like.dtype)
+        belief = self.loop.propagator(self.loop.model, self._belief, control)
+        if not bool(torch.isfinite(belief.mean).all() and torch.isfinite(belief.covariance).all()):
+            return Diverged(self._steps, f"the model's belief is not finite any more; its mean is {belief.mean}")
+        self._belief = belief
+        self._steps += 1
+        return input
+
+
+Simulator = PlantSimulator | ModelSimulator
+
+
+def step_together(simulators: Sequence[Any], time: float, inputs: Sequence[Array]) -> list[Array | Diverged]:
+    """Steps simulators of one plant from a time [s] on; returns the inputs that were applied, or why one cannot go on.
+
+    Several plants are stepped in one evaluation.
+
+    Raises:
+        ShapeError: The plant has another number of inputs.
+    """
+    if not simulators or isinstance(simulators[0], ModelSimulator):
+        return [simulator.step(input) for simulator, input in zip(simulators, inputs, strict=True)]
+    applied = [simulator._applied_input(input) for simulator, input in zip(simulators, inputs, strict=True)]
+    plant = simulators[0]._disturbed_plant(time)  # disturbances look at the time, not at a trial
+    with np.errstate(over="ignore", invalid="ignore"):
+        if len(simulators) == 1:
+            states: Any = [step(plant, simulators[0].mean, applied[0])]
+        else:
+            states = step_many(plant, np.array([s.mean for s in simulators]), np.array(applied))
+    return [s._arrive(state, input) for s, state, input in zip(simulators, states, applied, strict=True)]
+
+
+def _check_state(value: Any, n: int) -> Array:
+    """Returns a finite state (n,) as an array of its own."""
+    state = np.array(value.cpu().numpy() if isinstance(value, torch.Tensor) else value, dtype=float)
+    if state.shape != (n,):
+        raise ShapeError(f"the initial state must have shape ({n},); got {state.shape}")
+    if not np.isfinite(state).all():
+        raise SettingError("initial", f"must be finite; got {state}")
+    return state
