@@ -109,7 +109,9 @@ class LogDynamics:
         z, y = np.ascontiguousarray(model.kinematics.features(x, u, nothing)), model.outputs(x, u, nothing)
         V = np.zeros((K, y.shape[1], y.shape[1]))
         for gp in model.gps:
-            V[np.ix_(range(K), gp.outputs, gp.outputs)] += gp.posterior.linearize(z, nothing, True).covariance
+            V[np.ix_(range(K), gp.outputs, gp.outputs)] += np.asarray(
+                gp.posterior.linearize(z, nothing, True).covariance
+            )
         B = self._by_outputs(x, y)
         return B @ V @ B.mT
 
