@@ -36,25 +36,15 @@ _LARGEST = 10.0  # difference of log densities that one step counts for: no outl
 
 @dataclass(frozen=True)
 class Learned:
-    """What a flight has taught so far.
+    """What a flight has taught so far."""
 
-    Attributes:
-        model: With the change.
-        state: Measured at the last step (n,).
-        error: Of the model alone in the last step, as far as a change reaches it (k,).
-        spread: Squared differences of successive errors over those expected of the model's noise, of the last steps.
-        leads: By how much the log density with the change exceeds that without, of the last steps.
-        active: Whether the change is part of the model that plans.
-        version: How often that model has changed.
-    """
-
-    model: ChangedModel
-    state: Array
-    error: Array
-    spread: Array
-    leads: Array
-    active: bool = False
-    version: int = 0
+    model: ChangedModel  #: with the change
+    state: Array  #: measured at the last step (n,)
+    error: Array  #: of the model alone in the last step, as far as a change reaches it (k,)
+    spread: Array  #: squared differences of successive errors over those expected of the model's noise
+    leads: Array  #: by how much the log density with the change exceeds that without, of the last steps
+    active: bool = False  #: whether the change is part of the model that plans
+    version: int = 0  #: how often that model has changed
 
     @property
     def size(self) -> int:
