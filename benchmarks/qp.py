@@ -1,7 +1,6 @@
 """How fast are the QP solvers in closed loop, beside DAQP and CVXPY with Clarabel?
 
     .venv/bin/python -m benchmarks.qp                      # every cell of the table, about ten minutes
-    .venv/bin/python -m benchmarks.qp --quick              # short sequences, horizons 1, 10, 20: about a minute
     .venv/bin/python -m benchmarks.qp --horizons 50 --modes changing --slow-solvers 0
     .venv/bin/python -m benchmarks.qp --rows 6,3           # also with bounds on the positions only
 
@@ -14,18 +13,13 @@ would. *Flushed*: all caches are overwritten before every call.
 
 Times include everything from contiguous arrays to x, so the Python layer of either side. DAQP has two paths, each with
 contiguous arrays: ``Model.update`` + ``Model.solve`` (warm), and ``daqp.solve`` from nothing; ratios are to the faster
-one of the cell. Written to ``--out``: qp.json and qp.png.
+one of the cell. Written to ``outputs/benchmarks/qp.json``.
 """
 
 import argparse
 import gc
-import json
-import os
-import platform
-import sys
 from collections.abc import Callable
 from itertools import product
-from pathlib import Path
 from time import perf_counter
 
 import daqp
@@ -33,17 +27,12 @@ import numpy as np
 
 from benchmarks.quadrotor import TRAJECTORIES
 from benchmarks.quadrotor_sequences import SequenceProblem, flight_sequence, quadrotor_sequence
+from benchmarks.timing import write_results
 from gpmpc.qp import CvxpySolver, DualActiveSet, PrimalActiveSet, QuadraticProgram, make_solution
 from gpmpc.status import Status
 
 OURS, DAQP_WARM, DAQP_COLD = "DualActiveSet", "DAQP update + solve", "DAQP solve"
 PRIMAL, CVXPY = "PrimalActiveSet", "CVXPY + Clarabel"
-TARGETS = {
-    "constant": {1: 0.60, 5: 0.50, 10: 0.45, 20: 0.42, 50: 0.34},
-    "changing": {1: 0.85, 5: 0.57, 10: 0.30, 20: 0.20, 50: 0.09},
-    "elliptical": {1: 0.75, 5: 0.45, 10: 0.50, 20: 0.12},
-    "lorenz": {1: 0.75, 5: 0.45, 10: 0.25, 20: 0.12},
-}
 CACHES = np.zeros(12_000_000)  # 96 MB, more than any cache of the machine
 
 Solve = Callable[[SequenceProblem], tuple[np.ndarray, np.ndarray]]
@@ -218,50 +207,11 @@ def describe(cell: dict) -> str:
     text = f"{cell['mode']:10s} H = {cell['horizon']:3d}, m = {cell['m']:3d}, {cell['active rows']:4.1f} active: "
     text += f"{solvers[OURS]['hot']['median']:8.2f} us, {cell['best DAQP path']} "
     text += f"{solvers[cell['best DAQP path']]['hot']['median']:8.2f} us, ratio {ratio['median']:.3f}"
-    if cell["horizon"] in TARGETS[cell["mode"]]:
-        text += f" (target {TARGETS[cell['mode']][cell['horizon']]:.2f})"
-    text += (
-        f", p99 {ratio['p99']:.3f}, flushed {cell['ratio flushed']['median']:.3f}, KKT {solvers[OURS]['residual']:.0e}"
-    )
+    text += f", p99 {ratio['p99']:.3f}, flushed {cell['ratio flushed']['median']:.3f}"
+    text += f", KKT {solvers[OURS]['residual']:.0e}"
     if CVXPY in solvers:
         text += f", CVXPY {solvers[CVXPY]['hot']['median'] / solvers[OURS]['hot']['median']:.0f} times slower"
     return text
-
-
-def draw(cells: list[dict], path: Path) -> None:
-    """Median times per solver, and the ratios to DAQP beside their targets."""
-    import matplotlib.pyplot as plt
-
-    plt.style.use("gpmpc.plotting.gpmpc")
-
-    modes = list(dict.fromkeys(cell["mode"] for cell in cells))
-    figure, axes = plt.subplots(2, len(modes), figsize=(5.5 * len(modes), 7.5), squeeze=False, sharex=True)
-    for column, mode in enumerate(modes):
-        chosen = [cell for cell in cells if cell["mode"] == mode]
-        times, ratios = axes[:, column]
-        for name in (OURS, DAQP_WARM, DAQP_COLD, PRIMAL, CVXPY):
-            having = [cell for cell in chosen if name in cell["solvers"]]
-            if having:
-                x = [cell["horizon"] for cell in having]
-                times.loglog(x, [cell["solvers"][name]["hot"]["median"] for cell in having], "o-", ms=4, label=name)
-        times.set_title(f"{mode} P, G")
-        x = [cell["horizon"] for cell in chosen]
-        for key, style in (("median", "o-"), ("p99", "s--")):
-            ratios.semilogx(x, [c["ratio hot"][key] for c in chosen], style, color="C0", ms=4, label=f"{key}, hot")
-        ratios.semilogx(
-            x, [c["ratio flushed"]["median"] for c in chosen], "^:", color="C1", ms=4, label="median, flushed"
-        )
-        targets = TARGETS[mode]
-        ratios.semilogx(list(targets), list(targets.values()), "k_", ms=14, label="target for the median, hot")
-        ratios.set(xlabel=f"horizon H (n = 3H, m = {chosen[0]['rows a stage']}H)", xticks=x, xticklabels=x)
-        ratios.set_ylim(bottom=0.0)  # open above: where DAQP is faster has to show
-        ratios.axhline(1.0, color="0.5", linewidth=0.8)
-        ratios.minorticks_off()
-        for axis in (times, ratios):
-            axis.legend(fontsize=8)
-    axes[0, 0].set_ylabel("median time per QP [us]")
-    axes[1, 0].set_ylabel(f"{OURS} / best DAQP path")
-    figure.savefig(path)
 
 
 def main() -> None:
@@ -273,23 +223,13 @@ def main() -> None:
     parser.add_argument("--length", type=int, default=440, help="QPs per cell")
     parser.add_argument("--passes", type=int, default=3, help="turns of each solver")
     parser.add_argument("--slow-solvers", type=int, default=30, help="QPs for Algorithm 1 and CVXPY; 0 leaves them out")
-    parser.add_argument("--quick", action="store_true", help="short sequences, horizons 1, 10, 20")
-    parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks"))
     settings = parser.parse_args()
-    if settings.quick:
-        settings.horizons, settings.length, settings.slow_solvers = "1,10,20", 120, 5
-    settings.out.mkdir(parents=True, exist_ok=True)
     cells = []
     families = map(int, settings.rows.split(","))
     for rows, mode, horizon in product(families, settings.modes.split(","), map(int, settings.horizons.split(","))):
         cells.append(measure_cell(horizon, mode, rows, settings))
         print(describe(cells[-1]), flush=True)
-    machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count(), "threads": 1}
-    versions = {"python": sys.version.split()[0], "numpy": np.__version__, "unit": "microseconds"}
-    (settings.out / "qp.json").write_text(json.dumps({"machine": machine | versions, "cells": cells}, indent=1))
-    first = [cell for cell in cells if cell["rows a stage"] == cells[0]["rows a stage"]]
-    draw(first, settings.out / "qp.png")
-    print(f"written to {settings.out}")
+    write_results("qp", cells, unit="microseconds", numpy=np.__version__)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Measures what recording costs a control loop.
 
-    python benchmarks/recording.py                 # about a minute
-    python benchmarks/recording.py --horizon 20 --seconds 10
+    .venv/bin/python -m benchmarks.recording                 # about a minute
+    .venv/bin/python -m benchmarks.recording --horizon 20 --seconds 10
 
 A step is that of the quadrotor: n = 6, m = 3, a plan over the horizon H with covariances, and the condensed quadratic
 program (3 H variables, 6 H rows). Sixteen different steps take turns: in use, too, a step's numbers have just been
@@ -13,9 +13,7 @@ wait), and how much longer the loop takes than one without a recorder, the two t
 """
 
 import argparse
-import json
 import os
-import platform
 import tempfile
 from pathlib import Path
 from time import perf_counter
@@ -27,6 +25,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from benchmarks.timing import write_results
 from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.recording import McapRecorder, RecordedSystem, Step
@@ -119,7 +118,6 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="of loop a line, each way")
     parser.add_argument("--apart", type=float, default=0.001, help="time between two steps of the plant [s]")
     parser.add_argument("--turns", type=int, default=3)
-    parser.add_argument("--out", type=Path, help="folder of recording.json")
     given = parser.parse_args()
     rows = []
     for horizon in given.horizon:
@@ -133,11 +131,7 @@ def main() -> None:
                 f"{row['file_bytes_per_step'] / 1e3:.1f} kB a step; load average {row['load_average']:.1f}",
                 flush=True,
             )
-    if given.out:
-        given.out.mkdir(parents=True, exist_ok=True)
-        machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
-        document = {"machine": machine, "python": platform.python_version(), "rows": rows}
-        (given.out / "recording.json").write_text(json.dumps(document, indent=2) + "\n")
+    write_results("recording", rows)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,6 @@ buffer, as after other work between two control steps.
 
 import json
 import os
-import platform
-import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +20,7 @@ import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from gpmpc.exceptions import check_number
-from gpmpc.provenance import provenance
+from gpmpc.provenance import processor, provenance
 
 FLUSH_BYTES = 64 * 2**20  # walked through before a flushed call: more than any core's own caches
 WARM_UP_CALLS = 2  # not counted: what is compiled, loaded or allocated once
@@ -119,7 +117,7 @@ def machine() -> dict:
     """Processor, cores, threads, load, and the rates of a matrix product and of reading memory, as plain data."""
     left, numbers = np.ones((MATRIX_SIDE, MATRIX_SIDE)), np.ones(WALK_BYTES // 8)
     return {
-        "processor": _processor(),
+        "processor": processor(),
         "cores": os.cpu_count(),
         "threads": max((pool["num_threads"] for pool in threadpool_info()), default=1),
         "load": round(os.getloadavg()[0], 2),
@@ -136,15 +134,6 @@ def _shortest(call: Callable[[], Any]) -> float:
         call()
         seconds.append(time.thread_time() - began)
     return min(seconds)
-
-
-def _processor() -> str:
-    """Name of the processor, as Linux or else Python tells it."""
-    try:
-        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        found = None
-    return found[1] if found else platform.processor() or platform.machine()
 
 
 def describe(machine: Mapping[str, Any]) -> str:

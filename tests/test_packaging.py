@@ -39,7 +39,7 @@ def test_an_installed_package_finds_its_settings_from_an_empty_directory(wheel, 
     zipfile.ZipFile(wheel).extractall(site)
     code = f"import gpmpc; assert gpmpc.__file__.startswith({str(site)!r}); from gpmpc.cli import main; main()"
     result = subprocess.run(
-        [sys.executable, "-c", code, "tables", "--cfg", "job", "draws=3"],
+        [sys.executable, "-c", code, "tables", "--cfg", "draws=3"],
         cwd=empty,
         env=os.environ | {"PYTHONPATH": str(site)},
         capture_output=True,

@@ -32,9 +32,6 @@ class Parser(argparse.ArgumentParser):
         raise GpmpcError(f"{message}; {self.prog} --help shows how")
 
 
-SHOWN = ("job", "hydra", "all")  # parts of the settings
-
-
 class Command(NamedTuple):
     """One command."""
 
@@ -49,12 +46,10 @@ class Command(NamedTuple):
         parser = Parser(prog=f"gpmpc {name}", description=description, add_help=not self.settings)
         self.add_arguments(parser)
         if self.settings:
-            for names in (("-h", "--help"), ("--resolve",)):
-                parser.add_argument(*names, action="store_true")
-            parser.add_argument("--cfg", "-c", nargs="?", const="job")
-            parser.values["--cfg"] = [*SHOWN]
-            for names in (("--config-name", "-cn"), ("--config-dir", "-cd")):
-                parser.add_argument(*names)
+            parser.add_argument("-h", "--help", action="store_true")
+            parser.add_argument("--cfg", action="store_true")
+            for name in ("--config-name", "--config-dir"):
+                parser.add_argument(name)
             parser.add_argument("overrides", nargs="*")
         return parser
 

@@ -5,9 +5,7 @@ Heavy libraries are imported inside the tasks, so help and completion stay quick
 
 import argparse
 import sys
-from typing import Any, cast
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 import gpmpc
@@ -20,7 +18,7 @@ from gpmpc.cli import _run as run
 from gpmpc.cli import _study as study
 from gpmpc.cli import _tune as tune
 from gpmpc.cli import _warmup as warmup
-from gpmpc.cli._arguments import SHOWN, Command, Result
+from gpmpc.cli._arguments import Command, Result
 from gpmpc.cli._configuration import compose, help_text, model_file, settings
 from gpmpc.cli._mistakes import explain, nearest
 from gpmpc.cli._sweep import sweep
@@ -81,8 +79,7 @@ eval "$(gpmpc completion bash)" completes at TAB; zsh likewise; fish: gpmpc comp
 
 
 def main() -> None:
-    flags = {flag for flag in _FLAGS if flag in sys.argv[1:]}
-    arguments = [argument for argument in sys.argv[1:] if argument not in flags]
+    flags, arguments = {*_FLAGS} & {*sys.argv[1:]}, [each for each in sys.argv[1:] if each not in _FLAGS]
     with redirected_output("error" if "--json" in flags else "nowhere" if "--quiet" in flags else "output"):
         result = _run(arguments, debug="--debug" in flags)
     if "--json" in flags:
@@ -130,16 +127,12 @@ def _with_settings(name: str, command: Command, given: argparse.Namespace) -> Re
         if given.help:
             print(help_text(command.settings, []))
             return Result()
-        if given.cfg not in (None, *SHOWN):  # a setting behind --cfg
-            given.overrides, given.cfg = [given.cfg, *given.overrides], "job"
         if swept and given.cfg:
             raise GpmpcError("--cfg: shows the settings of one run; leave out -m, and give each setting one value")
         if swept:
             return tune.tune(given, config_name) if name == "tune" else sweep(given, config_name)
         config = compose(config_name, given.overrides)
         if given.cfg:
-            parts = [config] * (given.cfg != "hydra") + [cast(Any, HydraConfig.instance().cfg)] * (given.cfg != "job")
-            shown = OmegaConf.create({key: part for each in parts for key, part in each.items()})
-            print(OmegaConf.to_yaml(shown, resolve=given.resolve), end="")
-            return Result(OmegaConf.to_container(shown, resolve=given.resolve))
+            print(OmegaConf.to_yaml(config), end="")
+            return Result(OmegaConf.to_container(config))
         return command.task(config)

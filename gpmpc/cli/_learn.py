@@ -2,18 +2,19 @@
 
 import argparse
 import json
-from collections.abc import Iterator, MutableMapping
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpmpc.cli._arguments import Command, Parser, Result, writing
+from gpmpc.cli._arguments import Command, Parser, Result, write_files, writing
+from gpmpc.files import write_whole
 
 if TYPE_CHECKING:
     from gpmpc.logs import Judgement, Learned, Log
     from gpmpc.studies.document import Document
 
-MODEL, PROGRESS = "model.safetensors", "progress.json"
+_MODEL = "model.safetensors"
 
 
 def _add_arguments(parser: Parser) -> None:
@@ -33,40 +34,36 @@ def _learn(given: argparse.Namespace) -> Result:
     """Learns from logs, judges on held-out runs, and writes model, report and card; goes on where it stopped."""
     from rich.console import Console
 
-    from gpmpc.files import write_whole
     from gpmpc.logs import judge, learn, read_log, save_learned
-    from gpmpc.plotting import judgement_figure, png
+    from gpmpc.studies.document import terminal
 
-    console, folder = Console(), given.to
+    console, folder = Console(soft_wrap=True, highlight=False, markup=False), given.to
     log = read_log(given.files, given.mapping, given.partial)
-    console.print(repr(log), highlight=False, markup=False)
+    console.print(repr(log))
     for finding in log.findings:
-        console.print(f"  {finding.run}: {finding.kind}: {finding.text}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"  {finding.run}: {finding.kind}: {finding.text}")
     train, held_out = _split(log, given.held_out)
     with writing(folder, "to"):
         folder.mkdir(parents=True, exist_ok=True)
-        memory = _FileMemory(folder / PROGRESS, _fingerprint(train, given))
+        memory = _FileMemory(folder / "progress.json", _fingerprint(train, given))
         with console.status("learning") as status:
 
             def show(stage: str) -> None:
                 status.update(stage)
-                console.print(f"  {stage}", soft_wrap=True, highlight=False, markup=False)
+                console.print(f"  {stage}")
 
             learned = learn(train, given.points, given.steps, given.seed, show, memory, given.for_control)
             status.update("judging on held-out runs")
             steps = sorted({step for step in (1, 10, 50) if step <= given.steps} | {given.steps})
             judgement = judge(learned, held_out, train, steps)
-        save_learned(learned, folder / MODEL)
-        document = report(learned, judgement, train, held_out, {"report.png": png(judgement_figure(judgement))})
-        for name, content in (document.files("report") | {"report.html": document.html()}).items():
-            write_whole(folder / name, content)
-        write_whole(folder / "card.md", card(learned, judgement, train, held_out).markdown())
-    from gpmpc.studies.document import terminal
-
-    console.print(terminal(document.tables[:1]))
+        save_learned(learned, folder / _MODEL)
+        document = _report(learned, judgement, train, held_out)
+        card = _card(learned, judgement, train, held_out).markdown()
+        write_files(folder, document.files("report") | {"report.html": document.html(), "card.md": card}, "to")
+    Console().print(terminal(document.tables[:1]))
     for line in judgement.losses:
-        console.print(f"loses: {line}", soft_wrap=True, highlight=False, markup=False)
-    console.print(f"written to {folder}: {MODEL}, report.html, report.md, card.md", soft_wrap=True, highlight=False)
+        console.print(f"loses: {line}")
+    console.print(f"written to {folder}: {_MODEL}, report.html, report.md, card.md")
     return Result({"folder": str(folder), "losses": judgement.losses, "rows": document.data.to_dict("records")})
 
 
@@ -87,75 +84,46 @@ def _fingerprint(log: "Log", given: argparse.Namespace) -> str:
     return digest.hexdigest()
 
 
-class _FileMemory(MutableMapping[str, Any]):
-    """Outcomes of stages in a JSON file, which another log or other settings begin anew."""
+class _FileMemory(dict[str, Any]):
+    """Outcomes of stages, kept in a JSON file; other data or other settings begin it anew."""
 
     def __init__(self, path: Path, fingerprint: str):
-        self._path = path
-        self._content: dict[str, Any] = {"fingerprint": fingerprint, "stages": {}}
-        try:
+        self._path, self._fingerprint = path, fingerprint
+        with suppress(OSError, ValueError, KeyError, TypeError):  # nothing there, or nothing whole
             found = json.loads(path.read_text())
-            if found["fingerprint"] == fingerprint and isinstance(found["stages"], dict):
-                self._content = found
-        except (OSError, ValueError, KeyError, TypeError):
-            pass  # nothing there, or nothing whole
-
-    def __getitem__(self, key: str) -> Any:
-        return self._content["stages"][key]
+            super().__init__(found["stages"] if found["fingerprint"] == fingerprint else {})
 
     def __setitem__(self, key: str, value: Any) -> None:
-        from gpmpc.files import write_whole
-
-        self._content["stages"][key] = value
-        write_whole(self._path, json.dumps(self._content))
-
-    def __delitem__(self, key: str) -> None:
-        del self._content["stages"][key]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._content["stages"])
-
-    def __len__(self) -> int:
-        return len(self._content["stages"])
+        super().__setitem__(key, value)
+        write_whole(self._path, json.dumps({"fingerprint": self._fingerprint, "stages": self}))
 
 
-def report(
-    learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Log", images: dict[str, bytes]
-) -> "Document":
+def _report(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Log") -> "Document":
     """Makes the report: errors beside the baselines, coverage and width, and every candidate."""
+    from gpmpc.plotting import judgement_figure, png
     from gpmpc.studies.document import Document, Table, number
 
     groups = [f"{group} [{unit}]" for group, unit in zip(judgement.groups, judgement.units, strict=True)]
     errors, intervals = [], []
     for k, step in enumerate(judgement.steps):
         for name, mean in judgement.mean.items():
-            rmse = judgement.rmse[name]
-            cells = [f"{number(m)}\n[RMSE {number(r)}]" for m, r in zip(mean[k], rmse[k], strict=True)]
-            errors.append([str(step), name, *cells])
-        cells = []
-        for g in range(len(groups)):
-            low, high = judgement.coverage_interval[k, g]
-            share = f"{judgement.coverage[k, g]:.1%}\n[{low:.1%}, {high:.1%}]"
-            cells.append(f"{share}\nwidth {judgement.width[k, g]:.2f}")
-        intervals.append([str(step), *cells])
+            pairs = zip(mean[k], judgement.rmse[name][k], strict=True)
+            errors.append([step, name, *(f"{number(m)}\n[RMSE {number(r)}]" for m, r in pairs)])
+        each = zip(judgement.coverage[k], judgement.coverage_interval[k], judgement.width[k], strict=True)
+        texts = (f"{share:.1%}\n[{low:.1%}, {high:.1%}]\nwidth {width:.2f}" for share, (low, high), width in each)
+        intervals.append([step, *texts])
     candidates = [
-        [
-            "chosen" if c.chosen else "",
-            c.name,
-            *(" / ".join(number(e) for e in c.errors[:, g]) for g in range(len(groups))),
-        ]
+        ["chosen" if c.chosen else "", c.name, *(" / ".join(map(number, errors)) for errors in c.errors.T)]
         for c in learned.candidates
     ]
+    heading = "Candidates: mean error of held-out rollouts, 10 / 50 steps ahead"
+    level = f"{judgement.level:.0%} intervals: coverage and width"
     return Document(
         "What was learned, judged on runs that it never saw",
         [
             Table(["steps ahead", "predictor", *groups], errors, "Mean error", sections=True),
-            Table(
-                ["steps ahead", *judgement.groups], intervals, f"{judgement.level:.0%} intervals: coverage and width"
-            ),
-            Table(
-                ["", "model", *groups], candidates, "Candidates: mean error of held-out rollouts, 10 / 50 steps ahead"
-            ),
+            Table(["steps ahead", *judgement.groups], intervals, level),
+            Table(["", "model", *groups], candidates, heading),
         ],
         judgement.to_pandas(),
         lead=f"{judgement.windows} predictions on {', '.join(run.name for run in held_out)}; "
@@ -166,31 +134,24 @@ def report(
             "The model loses to no baseline." if not judgement.losses else "The model loses to a baseline: see below.",
         ],
         lists={"Where the model loses": judgement.losses} if judgement.losses else {},
-        images=images,
+        images={"report.png": png(judgement_figure(judgement))},
     )
 
 
-def card(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Log") -> "Document":
+def _card(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Log") -> "Document":
     """Makes the model card: data, ranges, what was left out, what is learned and why, and what must not be trusted."""
     import pandas as pd
 
     from gpmpc.provenance import provenance
-    from gpmpc.studies.document import Document, Table, number
+    from gpmpc.studies.document import Document, Table
 
-    names = [*train.space.names, *train.input_names]
-    ranges = [[n, number(low), number(high)] for n, low, high in zip(names, *learned.ranges, strict=True)]
+    names, outputs = [*train.space.names, *train.input_names], learned.model.kinematics.output_names
     # An affine map has many parameters, and no standard errors.
-    parameters = [[name, number(v), number(error)] for name, v, error in learned.fit.to_rows() if error == error]
-    (chosen,) = [candidate for candidate in learned.candidates if candidate.chosen]
+    parameters = [row for row in learned.fit.to_rows() if row[2] == row[2]]
     left_out = [f"{f.run}: {f.kind}: {f.text}" for f in train.findings if f.run in learned.runs]
-    with_gp = {
-        name for gp in learned.model.gps for name in (learned.model.kinematics.output_names[i] for i in gp.outputs)
-    }
+    with_gp = {outputs[i] for gp in learned.model.gps for i in gp.outputs}
     without = "nominal only; a GP did not make held-out rollouts better"
-    learns = [
-        f"{name}: {'GP on the residual' if name in with_gp else without}"
-        for name in learned.model.kinematics.output_names
-    ]
+    learns = [f"{name}: {'GP on the residual' if name in with_gp else without}" for name in outputs]
     doubts = [f"Loses to a baseline: {loss}" for loss in judgement.losses]
     doubts += ["Outside the ranges below nothing was seen."]
     if getattr(learned.model.nominal, "feedback", False):
@@ -202,18 +163,20 @@ def card(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Lo
         doubts += ["The motors' torque was not found in the log: the model does not turn when the motors say so."]
     made = provenance()
     facts = {
-        "model": chosen.name,
+        "model": next(candidate.name for candidate in learned.candidates if candidate.chosen),
         "rows": len(train),
         "runs": ", ".join(learned.runs),
         "rate": f"{1 / train.time_step:g} Hz",
+        "judged on": ", ".join(run.name for run in held_out),
+        "made": made["created"],
+        "command": made["command"],
     }
-    facts |= {"judged on": ", ".join(run.name for run in held_out), "made": made["created"], "command": made["command"]}
     return Document(
         "Model card",
         [
-            Table(["", ""], [[key, str(value)] for key, value in facts.items()], "What it is"),
+            Table(["", ""], [*facts.items()], "What it is"),
             Table(["parameter", "value", "standard error"], parameters, "Parameters"),
-            Table(["channel", "lowest", "highest"], ranges, "Ranges of the data"),
+            Table(["channel", "lowest", "highest"], [*zip(names, *learned.ranges, strict=True)], "Ranges of the data"),
         ],
         pd.DataFrame(),
         lists={"Outputs": learns, "What must not be trusted": doubts, "Left out of the data": left_out or ["nothing"]},

@@ -23,10 +23,8 @@ def _report(given: argparse.Namespace) -> Result:
     """Writes a tree of runs as one table with figures, and whether two groups of them differ."""
     from rich.console import Console
 
-    from gpmpc.studies.comparison import compare, sentences
     from gpmpc.studies.document import terminal
-    from gpmpc.studies.report import read_report
-    from gpmpc.studies.report_document import notes, report_document, terminal_table
+    from gpmpc.studies.report import compare, notes, read_report, report_document, sentences, terminal_table
 
     console, folder = Console(), given.to or given.tree / "report"
     with console.status("reading runs and drawing"):

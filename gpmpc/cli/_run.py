@@ -6,8 +6,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +19,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gpmpc.cli._arguments import Command, Result, folder_of, writing
 from gpmpc.cli._terminal import print_error
+from gpmpc.cli._tracking import log_to_mlflow
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, check_number
 
 if TYPE_CHECKING:
+    from gpmpc.recording import McapRecorder
     from gpmpc.studies.flight import Experiment
     from gpmpc.studies.run_folder import RunFolder
     from gpmpc.systems import System
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 ASIDE = ("launcher", "folder", "live", "tracker")  # settings that a result does not depend on
 _GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver", "learning")
 _MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
+_CHOICES = {"recorder": ("mcap", "none"), "tracker": ("mlflow", "none"), "live": (True, False)}
 _LOST = 3  # exit code of a run that is finished, and whose flight was lost
 
 
@@ -90,8 +93,6 @@ def _was_interrupted(error: BaseException | None) -> bool:
 
 def _track(folder: "RunFolder", result: Mapping[str, Any]) -> None:
     """Writes a finished run to MLflow; the run stays finished where that fails."""
-    from gpmpc.studies.tracking import log_to_mlflow
-
     try:
         log_to_mlflow(folder.path, result)
     except Exception as error:
@@ -109,41 +110,32 @@ def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, abou
     paths = iter([folder.path / name for name in [*(f"episode_{k}.mcap" for k in episodes), RECORDING]])
     with ExitStack() as stack:
 
-        def prepare(controller: Any, training: Any) -> Callable:
+        def prepare(controller: Any, training: Any) -> Callable[[Any], None]:
             recorder = stack.enter_context(_recorder(experiment, next(paths), config, about, controller, training))
-            callback = partial(recorder.record, gp_size=0 if training is None else len(training.posterior))
-            return _in_real_time(callback, experiment.system.time_step) if config.live else callback
+            if recorder.address:
+                print(f"live view: open {recorder.address} in Foxglove or Lichtblick", file=sys.stderr, flush=True)
+            gp_size, began = 0 if training is None else len(training.posterior), time.monotonic()
+
+            def on_step(step: Any) -> None:
+                recorder.record(step, gp_size)
+                if config.live:  # every step lasts as long as the plant's, so that a viewer can follow
+                    time.sleep(max(0.0, began + step.time + experiment.system.time_step - time.monotonic()))
+
+            return on_step
 
         flown = run_trial(experiment, prepare)
     return metrics(experiment, flown)
 
 
-def _in_real_time(callback: Callable, time_step: float) -> Callable:
-    """Makes every step last as long as the plant's, so that a viewer can follow."""
-    started = time.monotonic()
-
-    def on_step(step: Any) -> None:
-        callback(step)
-        time.sleep(max(0.0, started + step.time + time_step - time.monotonic()))
-
-    return on_step
-
-
 def _recorder(
-    experiment: "Experiment", path: "Path", config: DictConfig, about: dict, controller: Any, training: Any
-) -> Any:
+    experiment: "Experiment", path: Path, config: DictConfig, about: dict, controller: Any, training: Any
+) -> "McapRecorder":
     from gpmpc.recording import McapRecorder, RecordedSystem
 
     flown = experiment.system
-    system = RecordedSystem(
-        flown.state_names,
-        flown.input_names,
-        time_step=flown.time_step,
-        units=flown.units,
-        input_bounds=[side[0] for side in controller.problem.inputs.by_stage(controller.horizon)],
-        pose=flown.pose,
-        z_down=flown.z_down,
-    )
+    bounds = [side[0] for side in controller.problem.inputs.by_stage(controller.horizon)]
+    names = flown.state_names, flown.input_names, flown.time_step, flown.units
+    system = RecordedSystem(*names, input_bounds=bounds, pose=flown.pose, z_down=flown.z_down)
     metadata = {
         "seed": experiment.seed,
         "command": about["provenance"]["command"],
@@ -152,11 +144,9 @@ def _recorder(
         "tracked": " ".join(flown.tracked),
         "angles": " ".join(flown.angles),
     }
-    text = OmegaConf.to_yaml(config, resolve=True)
-    recorder = McapRecorder(path, system, config=text, metadata=metadata, live=config.live)
-    if recorder.address:
-        print(f"live view: open {recorder.address} in Foxglove or Lichtblick", file=sys.stderr, flush=True)
-    return recorder
+    return McapRecorder(
+        path, system, config=OmegaConf.to_yaml(config, resolve=True), metadata=metadata, live=config.live
+    )
 
 
 def experiment_of(config: DictConfig) -> "Experiment":
@@ -166,47 +156,26 @@ def experiment_of(config: DictConfig) -> "Experiment":
     from gpmpc.logs import SavedModel
     from gpmpc.simulation import Noise
     from gpmpc.studies.flight import Experiment
-    from gpmpc.studies.tracking import check_tracker
 
     config = DictConfig(plain_data(config))
-    folder_of(config.folder)
-    check_number("horizon", config.horizon, least=1, whole=True)
-    if not OmegaConf.is_list(config.disturbances):
-        raise SettingError("disturbances", f"must be a list; got {config.disturbances!r}")
-    if config.recorder not in ("mcap", "none", None):
-        raise SettingError("recorder", f"must be 'mcap' or 'none'; got {config.recorder!r}")
-    check_tracker(config.tracker)
-    if config.live not in (True, False):
-        raise SettingError("live", f"must be true or false; got {config.live!r}")
-    if config.live and config.recorder != "mcap":
-        raise SettingError("live", f"needs recorder=mcap; got recorder={config.recorder}")
-    for group in ("data", "trajectory", "system", "model", "controller"):
-        if not config.get(group):
-            raise SettingError(group, "choose one")
-    if len(config.trajectory) != 1:
-        raise SettingError("trajectory", f"choose one; got {', '.join(config.trajectory)}")
+    _check(config)
     system = _system_of(config.system)
     if known := config.nominal:
         known = _system_of(known if "_target_" in known else OmegaConf.merge(config.system, known))
         system = replace(system, nominal=known)
-    for group, part in (("propagation", "propagator"), ("solver", "solver")):
-        if config.get(group):
-            if part not in config.controller:
-                raise SettingError(group, "this controller has none to choose; leave it out")
-            config.controller[part] = config[group]
     with open_dict(config):
+        for group, part in (("propagation", "propagator"), ("solver", "solver")):
+            if config.get(group) and part not in config.controller:
+                raise SettingError(group, "this controller has none to choose; leave it out")
+            if config.get(group):
+                config.controller[part] = config[group]
         size = config.data.pop("size")
-        if config.controller.get("initial_input") is None:
-            config.controller.initial_input = list(system.initial_input)
+        _fill(config.controller, initial_input=system.initial_input)
         problem = config.controller.problem
         if problem.cost.get("Q") is None or problem.cost.get("R") is None:
             raise SettingError("controller.problem.cost", f"has no weights Q and R; {system.name} is to bring them")
-        if problem.cost.get("angles") is None:
-            problem.cost.angles = list(system.angle_indices)
-        box = problem.inputs
-        for side in ("lower", "upper"):
-            if box.get(side) is None:
-                box[side] = list(getattr(system, f"input_{side}"))
+        _fill(problem.cost, angles=system.angle_indices)
+        _fill(problem.inputs, lower=system.input_lower, upper=system.input_upper)
     ((name, trajectory),) = config.trajectory.items()
     parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "controller", "disturbances")}
     other = {key: value for key, value in (config.plant or {}).items() if value != config.system.get(key)}
@@ -228,6 +197,33 @@ def experiment_of(config: DictConfig) -> "Experiment":
         learning=instantiate(config.learning, _convert_="all") if config.get("learning") else None,
         **{key: config[key] for key in ("steps", "seed", "loop", "on_failure")},
     )
+
+
+def _check(config: DictConfig) -> None:
+    """Raises where a setting that no object takes is none of its choices, or a group has none."""
+    folder_of(config.folder)
+    check_number("horizon", config.horizon, least=1, whole=True)
+    if not OmegaConf.is_list(config.disturbances):
+        raise SettingError("disturbances", f"must be a list; got {config.disturbances!r}")
+    for key, choices in _CHOICES.items():
+        if config[key] not in (*choices, None):
+            raise SettingError(key, f"must be {' or '.join(map(repr, choices))}; got {config[key]!r}")
+    if config.tracker == "mlflow" and find_spec("mlflow") is None:
+        raise SettingError("tracker", "needs MLflow: pip install mlflow")
+    if config.live and config.recorder != "mcap":
+        raise SettingError("live", f"needs recorder=mcap; got recorder={config.recorder}")
+    for group in ("data", "trajectory", "system", "model", "controller"):
+        if not config.get(group):
+            raise SettingError(group, "choose one")
+    if len(config.trajectory) != 1:
+        raise SettingError("trajectory", f"choose one; got {', '.join(config.trajectory)}")
+
+
+def _fill(config: DictConfig, **values: Any) -> None:
+    """Sets what is null to lists of numbers."""
+    for key, numbers in values.items():
+        if config.get(key) is None:
+            config[key] = list(numbers)
 
 
 def _system_of(settings: Any) -> "System":

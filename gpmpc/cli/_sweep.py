@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from threading import Event, Thread
 from typing import Any
 
 import hydra
@@ -35,8 +34,6 @@ from gpmpc.compiling import report_compilation
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.parallel import THREADS, children_ignore_interrupts, end_with
 from gpmpc.studies.run_folder import PLAN, Busy, RunFolder, folder_name
-
-_LOOK = 0.5  # between two looks at the folders [s]
 
 
 @dataclass(frozen=True)
@@ -132,28 +129,16 @@ class Sweep:
 
     @contextmanager
     def progress(self, jobs: Sequence[Job], total: int) -> Iterator[Callable[[str], None]]:
-        """Shows one bar for many runs, drawn by a thread that looks at the folders; yields what names it."""
-        with progress_bar(self.console) as bar:
-            task, over = bar.add_task("flying", total=total), Event()
-            done: set[int] = set()
+        """Shows one bar for many runs, which looks at their folders whenever it is drawn; yields what names it."""
+        done: set[int] = set()
 
-            def look() -> None:
-                done.update(i for i, job in enumerate([*jobs]) if i not in done and job.done)
-                bar.update(task, completed=len(done))
+        def completed() -> int:
+            done.update(i for i, job in enumerate([*jobs]) if i not in done and job.done)
+            return len(done)
 
-            def watch() -> None:
-                while not over.wait(_LOOK):
-                    look()
-
-            watcher = Thread(target=watch, daemon=True)
-            look()
-            watcher.start()
-            try:
-                yield lambda text: bar.update(task, description=text)
-            finally:
-                over.set()
-                watcher.join()
-                look()
+        with progress_bar(self.console, completed) as bar:
+            task = bar.add_task("flying", total=total)
+            yield lambda text: bar.update(task, description=text)
 
 
 def sweep(given: Namespace, name: str) -> Result:

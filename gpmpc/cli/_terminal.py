@@ -18,21 +18,20 @@ class Output:
     """A stream that ends the command where nothing can be written to it any more."""
 
     def __init__(self, stream: TextIO):
-        self._stream = stream
-        self.broken = False
+        self._stream, self.broken = stream, False
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        return self._try(self._stream.write, text)
+        return self._try("write", text)
 
     def flush(self) -> None:
-        self._try(self._stream.flush)
+        self._try("flush")
 
-    def _try(self, act: Callable, *arguments: str) -> Any:
+    def _try(self, act: str, *arguments: str) -> Any:
         try:
-            return act(*arguments)
+            return getattr(self._stream, act)(*arguments)
         except OSError as error:
             if not self.broken:
                 self.broken = True
@@ -109,10 +108,22 @@ def logging_console() -> "Console":
     return console
 
 
-def progress_bar(console: "Console") -> "Progress":
-    """Returns a bar with how much is done, for how long, and how long it will still take."""
+def progress_bar(console: "Console", completed: Callable[[], int] | None = None) -> "Progress":
+    """Returns a bar with how much is done, for how long, and how long it will still take.
+
+    Args:
+        console: Where it is drawn.
+        completed: Says how much is done, whenever the bar is drawn; by default its task is told.
+    """
     from rich import progress
+
+    class Bar(progress.Progress):
+        def get_renderables(self) -> Iterator[Any]:
+            if completed is not None:
+                for task in self.task_ids:
+                    self.update(task, completed=completed())
+            yield from super().get_renderables()
 
     columns = [progress.TextColumn("{task.description}"), progress.BarColumn(), progress.MofNCompleteColumn()]
     times = [progress.TimeElapsedColumn(), progress.TextColumn("left"), progress.TimeRemainingColumn()]
-    return progress.Progress(*columns, *times, console=console)
+    return Bar(*columns, *times, console=console, refresh_per_second=2)

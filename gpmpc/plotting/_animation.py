@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.animation import FFMpegWriter, FuncAnimation, PillowWriter
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
@@ -70,7 +71,7 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
         axis.plot(*references.T, **dashed)
         axis.set(xlabel="x [m]", ylabel="y [m]")
         axis.set_aspect("equal", adjustable="box")
-    height.plot(run.times, sign * run.references[:, up], **dashed)
+    (dashes,) = height.plot(run.times, sign * run.references[:, up], **dashed)
     height.set(xlabel="time [s]", ylabel=f"height, {axis_name} [m]")
     # The last plans lead on from where the flight ends; those of failed solves may be anywhere.
     drawn = np.concatenate([states, references, plans[whole & ~run.failed[:, None]]])
@@ -85,34 +86,29 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
     factor = next(fitting, _FACTORS[-1]) if largest > 0 else 1
     enlarged = f", the tube {factor} times enlarged" if factor > 1 else ""
     near.set_title(f"plan with its 2-sigma tube{enlarged}", fontsize="medium")
-    trail, plan = (
-        [axis.plot([], [], color=c, linewidth=w)[0] for axis in (above, near)] for c, w in ((FLOWN, 1.6), (PLAN, 1.4))
-    )
-    plan[1].set(marker="o", markersize=3)
-    vehicle = [axis.plot([], [], "o", color=FLOWN, markersize=7, zorder=5)[0] for axis in (above, near)]
-    target = near.plot([], [], "x", color=REFERENCE, markersize=8, zorder=4)[0]
-    climbed = height.plot([], [], color=FLOWN, linewidth=1.6)[0]
-    lines = [climbed, height.lines[0], plan[1]]
-    figure.legend(lines, ["flown", "reference", "plan"], loc="outside lower center", ncols=3, frameon=False)
+    trails = [axis.plot([], [], color=FLOWN, linewidth=1.6)[0] for axis in (above, near)]
+    ahead = [axis.plot([], [], color=PLAN, linewidth=1.4)[0] for axis in (above, near)]
+    ahead[1].set(marker="o", markersize=3)
+    dots = [axis.plot([], [], "o", color=FLOWN, markersize=7, zorder=5)[0] for axis in (above, near)]
+    (target,) = near.plot([], [], "x", color=REFERENCE, markersize=8, zorder=4)
+    (climbed,) = height.plot([], [], color=FLOWN, linewidth=1.6)
+    shown = [climbed, dashes, ahead[1]]
+    figure.legend(shown, ["flown", "reference", "plan"], loc="outside lower center", ncols=3, frameon=False)
     clock = figure.suptitle(" ", fontsize="medium")
     tubes: list = []
 
     def draw(k: int) -> list:
-        for line in trail:
-            line.set_data(*states[: k + 1].T)
-        for line in plan:
-            line.set_data(*plans[k].T)
-        for dot in vehicle:
-            dot.set_data(*states[k, :, None])
+        for lines, points in ((trails, states[: k + 1]), (ahead, plans[k]), (dots, states[k : k + 1])):
+            for line in lines:
+                line.set_data(*points.T)
         target.set_data(*references[k, :, None])
         climbed.set_data(run.times[: k + 1], sign * run.states[: k + 1, up])
-        stages = plans[k][whole[k]]
+        stages, spread = plans[k][whole[k]], covariances[k][whole[k]]
         _look_at(near, (stages.min(axis=0) + stages.max(axis=0)) / 2 if whole[k].all() else states[k], half)
         while tubes:
             tubes.pop().remove()
-        if covariances[k][whole[k]].any():
-            ellipses = _ellipses(stages, covariances[k][whole[k]], factor, near.transData)
-            tubes.append(near.add_collection(ellipses))
+        if spread.any():
+            tubes.append(near.add_collection(_ellipses(stages, spread, factor, near.transData)))
         distance = 100 * np.linalg.norm((run.states - run.references)[k, [*plane, up]])
         failed = "; solve failed" if run.failed[k] else ""
         clock.set_text(f"{run.times[k]:.4g} s: {distance:.1f} cm from the reference{failed}")
@@ -124,7 +120,7 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
     return figure, draw
 
 
-def _look_at(axis, centre: np.ndarray, half: float) -> None:
+def _look_at(axis: Axes, centre: np.ndarray, half: float) -> None:
     axis.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))
 
 

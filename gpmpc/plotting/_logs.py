@@ -1,6 +1,5 @@
 """Figures of logs: what is in one, and how what was learned from it fares on runs that it never saw."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +9,6 @@ from gpmpc.plotting._style import BLUE, COLOURS, GREY, ORANGE, legend_below, sty
 
 if TYPE_CHECKING:
     from gpmpc.logs import Inspection, Judgement
-    from gpmpc.logs._inspection import Channel
 
 _MODEL, _GAP = BLUE, ORANGE
 _OTHERS = (GREY, *COLOURS[1:5])  # told apart without colour by their markers
@@ -21,31 +19,24 @@ _PER_PAGE = 24  # channels drawn
 @styled
 def judgement_figure(judgement: "Judgement") -> Figure:
     """Draws the errors over the steps for every predictor, with coverage and width of the model's intervals below."""
-    groups = len(judgement.groups)
+    steps, groups = judgement.steps, len(judgement.groups)
     figure = Figure(figsize=(2.6 * groups, 4.8), layout="constrained")
     axes = figure.subplots(2, groups, squeeze=False, gridspec_kw={"height_ratios": [3, 1.6]})
+    others = [name for name in judgement.mean if name != "model"]
     for g, (axis, below) in enumerate(axes.T):
-        others = [name for name in judgement.mean if name != "model"]
         for name, colour, marker in zip(others, _OTHERS, _MARKERS, strict=False):
             errors = np.where(np.isfinite(judgement.mean[name][:, g]), judgement.mean[name][:, g], np.nan)
-            axis.loglog(judgement.steps, errors, color=colour, marker=marker, markersize=4, linewidth=1, label=name)
-        axis.loglog(
-            judgement.steps, judgement.mean["model"][:, g], color=_MODEL, marker="o", linewidth=2, label="model"
-        )
-        axis.set_title(judgement.groups[g])
-        axis.set_ylabel(f"mean error [{judgement.units[g]}]")
-        low, high = np.moveaxis(judgement.coverage_interval[:, g], -1, 0)
-        bars = [judgement.coverage[:, g] - low, high - judgement.coverage[:, g]]
-        below.errorbar(
-            judgement.steps, judgement.coverage[:, g], np.maximum(bars, 0), color=_MODEL, marker="o", capsize=3
-        )
-        below.plot(judgement.steps, judgement.width[:, g], color=_OTHERS[1], marker="s", linestyle="--")
+            axis.loglog(steps, errors, color=colour, marker=marker, markersize=4, linewidth=1, label=name)
+        axis.loglog(steps, judgement.mean["model"][:, g], color=_MODEL, marker="o", linewidth=2, label="model")
+        axis.set(title=judgement.groups[g], ylabel=f"mean error [{judgement.units[g]}]")
+        share, (low, high) = judgement.coverage[:, g], judgement.coverage_interval[:, g].T
+        bars = np.maximum([share - low, high - share], 0)
+        below.errorbar(steps, share, bars, color=_MODEL, marker="o", capsize=3)
+        below.plot(steps, judgement.width[:, g], color=_OTHERS[1], marker="s", linestyle="--")
         below.axhline(judgement.level, color="0.6", linewidth=0.8)
-        below.set_xscale("log")
-        below.set_ylim(0.5, 1.5)
-        below.set_xlabel("steps ahead")
+        below.set(xscale="log", ylim=(0.5, 1.5), xlabel="steps ahead")
         for each in (axis, below):
-            each.set_xticks(judgement.steps, [str(step) for step in judgement.steps])
+            each.set_xticks(steps, [str(step) for step in steps])
             each.minorticks_off()
     axes[1][0].set_ylabel("coverage (solid)\nwidth (dashed)")
     legend_below(figure, axes[0])
@@ -61,18 +52,14 @@ def inspection_figure(inspection: "Inspection") -> Figure:
     figure = Figure(figsize=(10, 1.1 * rows + 1), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True)
     for axis, channel in zip(axes.T.flat, channels, strict=False):
-        _draw(axis, channel, inspection.gaps)
+        axis.plot(channel.time, channel.values, color=_MODEL, linewidth=0.7)
+        for begin, end in inspection.gaps[:200]:
+            axis.axvspan(begin, end, color=_GAP, alpha=0.4, linewidth=0)
+        axis.set_ylabel(channel.name, rotation=0, ha="right", va="center", fontsize=7)
+        axis.tick_params(labelsize=7)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
     for axis in list(axes.T.flat)[len(channels) :]:
         axis.set_visible(False)
     figure.suptitle(inspection.title, fontsize=10)
     return figure
-
-
-def _draw(axis, channel: "Channel", gaps: Sequence[tuple[float, float]]) -> None:
-    axis.plot(channel.time, channel.values, color=_MODEL, linewidth=0.7)
-    for begin, end in gaps[:200]:
-        axis.axvspan(begin, end, color=_GAP, alpha=0.4, linewidth=0)
-    axis.set_ylabel(channel.name, rotation=0, ha="right", va="center", fontsize=7)
-    axis.tick_params(labelsize=7)

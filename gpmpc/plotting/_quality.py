@@ -30,23 +30,29 @@ def quality(rows: Sequence[Mapping]) -> Figure:
     Args:
         rows: Of the quality study; lost ones are counted in the corner.
     """
-    flown, horizons = [row for row in rows if row["lost"] is None], sorted({row["H"] for row in rows})
-    markers = {horizon: _MARKERS[i % len(_MARKERS)] for i, horizon in enumerate(horizons)}
+    flown = [{**row, "excess": 100 * (row["cost"] - 1)} for row in rows if row["lost"] is None]
+    markers = {horizon: _MARKERS[i % len(_MARKERS)] for i, horizon in enumerate(sorted({row["H"] for row in rows}))}
     figure = Figure(figsize=_SIZE, layout="constrained")
     axis = figure.subplots()
     axis.set_title(f"gpmpc quality: {len({row['what'] for row in rows})} choices of settings over the horizon")
     axis.axhline(0, color=BLACK, linewidth=0.8, linestyle=DASHED, zorder=1)
     for row in flown:
-        axis.plot(row["median"], _excess(row), markers[row["H"]], color=_OTHERS, markersize=4, zorder=2)
-    curves = _curves(flown)
-    for (_, line), colour in zip(curves.items(), COLOURS, strict=False):
-        at = [(row["median"], _excess(row)) for row in line]
-        axis.plot(*zip(*at, strict=True), color=colour, zorder=3)
-        for row, (x, y) in zip(line, at, strict=True):
-            axis.plot(x, y, markers[row["H"]], color=colour, markersize=6, zorder=3)
+        axis.plot(row["median"], row["excess"], markers[row["H"]], color=_OTHERS, markersize=4, zorder=2)
+    plain: dict[str, Any] = {"linestyle": "none", "markersize": 5.5}
+    handles = []
+    for (what, line), colour in zip(_curves(flown).items(), COLOURS, strict=False):
+        axis.plot([row["median"] for row in line], [row["excess"] for row in line], color=colour, zorder=3)
+        for row in line:
+            axis.plot(row["median"], row["excess"], markers[row["H"]], color=colour, markersize=6, zorder=3)
+        handles.append(Line2D([], [], color=colour, marker="o", markersize=5.5, label=what))
+    handles.append(Line2D([], [], color=_OTHERS, marker="o", **plain, label="other settings"))
+    handles.append(Line2D([], [], color=_FRONT, linewidth=1.4, label="front: none is better and faster"))
+    handles += [Line2D([], [], color="0.4", marker=kind, **plain, label=f"H = {H}") for H, kind in markers.items()]
     _scales(axis, flown)
-    _front(axis, [row for row in flown if row["front"]])
-    _legends(axis, dict(zip(curves, COLOURS, strict=False)), markers, len(rows) - len(flown))
+    _front(axis, sorted((row for row in flown if row["front"]), key=lambda row: (row["median"], -row["cost"])))
+    figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8.5)
+    if lost := len(rows) - len(flown):
+        axis.text(0.99, 0.98, f"lost: {lost}", transform=axis.transAxes, ha="right", va="top", color=_FRONT)
     return figure
 
 
@@ -66,68 +72,36 @@ def _curves(rows: Sequence[Mapping]) -> dict[str, list[Mapping]]:
     return {what: lines[what] for what in list(best.values())[:_CURVES]}
 
 
-def _excess(row: Mapping) -> float:
-    """[%]."""
-    return 100 * (row["cost"] - 1)
-
-
 def _scales(axis: Axes, rows: Sequence[Mapping]) -> None:
     axis.set_xscale("log")
     axis.set_yscale("symlog", linthresh=_LINEAR, linscale=0.4)
     axis.set_xlabel("median time of a decision [ms], one thread")
     axis.set_ylabel("closed-loop cost above NMPC on the true model")
     plain_numbers(axis.xaxis, few=True)
-    values = [_excess(row) for row in rows] or [0.0]
+    values, times = [row["excess"] for row in rows] or [0.0], [row["median"] for row in rows] or [1.0]
     low, high = min(values), max(values)
     reach = [tick for tick in _TICKS if low * 1.5 - 1 <= tick <= high * 1.5 + 1]
     axis.set_yticks(reach, [f"{tick:+d} %" if tick else "0" for tick in reach])
     axis.yaxis.set_minor_locator(NullLocator())
     axis.set_ylim(min(1.5 * low, 0) - 0.4, 1.7 * max(high, _LINEAR))
-    times = [row["median"] for row in rows] or [1.0]
     axis.set_xlim(min(times) / 1.7, max(times) * 1.6)
 
 
 def _front(axis: Axes, members: Sequence[Mapping]) -> None:
-    """A stair that nobody is below of; its members are numbered, and named under the axis."""
-    members = sorted(members, key=lambda row: (row["median"], -row["cost"]))
+    """Draws a stair that nobody is below of; its members are numbered, and named under the axis."""
     if not members:
         return
-    at = [(row["median"], _excess(row)) for row in members]
+    x, y = [row["median"] for row in members], [row["excess"] for row in members]
     right, top = axis.get_xlim()[1], axis.get_ylim()[1]
-    stair = [(at[0][0], top)]
-    for x, y in at:
-        stair += [(x, stair[-1][1]), (x, y)]
-    axis.plot(*zip(*stair, (right, at[-1][1]), strict=True), color=_FRONT, linewidth=1.4, zorder=1.5)
+    stair: Any = {"color": _FRONT, "linewidth": 1.4, "zorder": 1.5, "drawstyle": "steps-post"}
+    axis.plot([x[0], *x, right], [top, *y, y[-1]], **stair)
     axis.set_xlim(right=right)
     axis.set_ylim(top=top)
-    for number, (x, y) in enumerate(at, 1):
-        axis.plot(x, y, "o", markersize=11, markerfacecolor="none", markeredgecolor=_FRONT, markeredgewidth=1.2)
-        # Below and left of a member of the front there is nobody.
-        axis.annotate(
-            str(number),
-            (x, y),
-            (-9 - 9 * (number % 2), -9),
-            textcoords="offset points",
-            ha="right",
-            va="center",
-            weight="bold",
-        )
+    for number, place in enumerate(zip(x, y, strict=True), 1):
+        axis.plot(*place, "o", markersize=11, markerfacecolor="none", markeredgecolor=_FRONT, markeredgewidth=1.2)
+        beside: Any = {"textcoords": "offset points", "ha": "right", "va": "center", "weight": "bold"}
+        axis.annotate(str(number), place, (-9 - 9 * (number % 2), -9), **beside)  # nobody is below and left of it
     names = [f"{number}  {row['what']} horizon={row['H']}" for number, row in enumerate(members, 1)]
-    axis.figure.legend(
-        handles=[Line2D([], [], linestyle="none", label=name) for name in names],
-        loc="outside lower left",
-        handlelength=0,
-        prop={"family": "monospace", "size": 8.5},
-    )
-
-
-def _legends(axis: Axes, colours: Mapping[str, str], markers: Mapping[int, str], lost: int) -> None:
-    """Curves by colour above, horizons by marker beside them."""
-    plain: dict[str, Any] = {"linestyle": "none", "markersize": 5.5}
-    lines = [Line2D([], [], color=colour, marker="o", markersize=5.5, label=name) for name, colour in colours.items()]
-    lines.append(Line2D([], [], color=_OTHERS, marker="o", **plain, label="other settings"))
-    lines.append(Line2D([], [], color=_FRONT, linewidth=1.4, label="front: none is better and faster"))
-    lines += [Line2D([], [], color="0.4", marker=kind, **plain, label=f"H = {H}") for H, kind in markers.items()]
-    axis.figure.legend(handles=lines, loc="outside upper center", ncols=3, fontsize=8.5)
-    if lost:
-        axis.text(0.99, 0.98, f"lost: {lost}", transform=axis.transAxes, ha="right", va="top", color=_FRONT)
+    handles = [Line2D([], [], linestyle="none", label=name) for name in names]
+    font: Any = {"family": "monospace", "size": 8.5}
+    axis.figure.legend(handles=handles, loc="outside lower left", handlelength=0, prop=font)

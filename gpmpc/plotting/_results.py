@@ -9,7 +9,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator, PercentFormatter
 
-from gpmpc.plotting._style import BLUE, COLOURS, DASHED, DASHES, VERMILION, add_legend, legend_below, styled
+from gpmpc.plotting._style import BLUE, COLOURS, DASHED, DASHES, VERMILION, legend_below, styled
 from gpmpc.plotting._sweeps import Series, draw_quartiles
 
 if TYPE_CHECKING:
@@ -83,13 +83,10 @@ def calibration_figure(calibration: "Calibration") -> Figure:
         error.yaxis.set_major_locator(MaxNLocator(nbins=5))
         error.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6, min_n_ticks=1))
     lowest = 0.0
-    for j, colour in zip(
-        order, colours, strict=True
-    ):  # each level is named at its own line, or just above the last name
+    for j, colour in zip(order, colours, strict=True):  # a level is named at its line, or just above the last name
         height = max(calibration.levels[j], lowest)
-        text = f"{100 * calibration.levels[j]:g} %"
-        place = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": "small"}
-        axes[0, -1].annotate(text, (1.03, height), color=colour, **place)
+        place: Any = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": "small"}
+        axes[0, -1].annotate(f"{100 * calibration.levels[j]:g} %", (1.03, height), color=colour, **place)
         lowest = height + 0.085
     for axis, label in zip(axes[:, 0], ("coverage", "negative log density", "RMSE"), strict=True):
         axis.set_ylabel(label)
@@ -138,28 +135,26 @@ def tracking(groups: Sequence[tuple[Sequence[str], Sequence[Curve]]], title: str
     figure = Figure(figsize=(4.0 * columns, 2.7 * len(groups) + 0.7), layout="constrained")
     figure.suptitle(title)
     axes = figure.subplots(len(groups), columns, squeeze=False, sharex=True)
-    handles: dict[str, Any] = {}
     for row, (labels, curves) in zip(axes, groups, strict=True):
+        wanted = next((c.wanted for c in curves if c.wanted is not None), None)
+        bounds = next((c.bounds for c in curves if c.bounds is not None), ())
         for j, (axis, label) in enumerate(zip(row, labels, strict=False)):
-            wanted = next((c.wanted for c in curves if c.wanted is not None), None)
+            reach = [c.values[:, j] for c in curves]
             if wanted is not None:
-                (line,) = axis.plot(wanted[: len(curves[0].at), j], color="0.75", linewidth=3.5)
-                handles.setdefault("reference", line)
-            bounded = next((c.bounds for c in curves if c.bounds is not None), None)
-            reach = [c.values[:, j] for c in curves] + ([] if wanted is None else [wanted[:, j]])
+                axis.plot(wanted[: len(curves[0].at), j], color="0.75", linewidth=3.5, label="reference")
+                reach.append(wanted[:, j])
             low, high = min(v.min() for v in reach), max(v.max() for v in reach)
-            room = 0.08 * max(high - low, 1e-6)
-            for bound in () if bounded is None else (bounded[0][j], bounded[1][j]):
-                if low - 5 * room <= bound <= high + 5 * room:  # one that is far away would only flatten the curves
-                    line = axis.axhline(bound, color="0.25", linestyle=":", linewidth=1.2)
-                    handles.setdefault("bound", line)
+            near = 0.4 * max(high - low, 1e-6)
+            for bound in (side[j] for side in bounds):
+                if low - near <= bound <= high + near:  # one that is far away would only flatten the curves
+                    axis.axhline(bound, color="0.25", linestyle=":", linewidth=1.2, label="bound")
             for curve, colour, dash in zip(curves, COLOURS, DASHES, strict=False):
-                (line,) = axis.plot(curve.at, curve.values[:, j], color=colour, linestyle=dash, linewidth=1.3)
-                handles.setdefault(curve.label, line)
+                line = {"color": colour, "linestyle": dash, "linewidth": 1.3, "label": curve.label}
+                axis.plot(curve.at, curve.values[:, j], **line)
             axis.set_ylabel(label)
     for axis in axes[-1]:
         axis.set_xlabel("time step k")
-    add_legend(figure, list(handles.values()), list(handles))
+    legend_below(figure, axes.flat)
     return figure
 
 
@@ -173,21 +168,16 @@ def over_settings(
 ) -> Figure:
     """One measure over a setting, a panel a title, with intervals; logarithmic, or with the diagonal drawn in."""
     figure, axes = _panels(len(panels), 4.8, 3.5, title)
-    handles: dict[str, Any] = {}
     for axis, (heading, curves) in zip(axes, panels.items(), strict=False):
-        axis.set_title(heading)
-        axis.set_xlabel(label)
+        axis.set(title=heading, xlabel=label)
         for i, curve in enumerate(curves):
             colour, dash, value = COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)], curve.values[:, 0]
+            line = {"color": colour, "markersize": 4, "label": curve.label}
             if curve.interval is None:
-                (line,) = axis.plot(
-                    curve.at, value, marker="o", linestyle=dash, color=colour, markersize=4, linewidth=1.3
-                )
+                axis.plot(curve.at, value, marker="o", linestyle=dash, linewidth=1.3, **line)
             else:
-                ends = np.abs(curve.interval.T - value)
                 aside = 0.012 * (i - (len(curves) - 1) / 2) * float(curve.at.max())  # intervals beside each other
-                line = axis.errorbar(curve.at + aside, value, ends, fmt="o-", color=colour, markersize=4, capsize=3)
-            handles.setdefault(curve.label, line)
+                axis.errorbar(curve.at + aside, value, np.abs(curve.interval.T - value), fmt="o-", capsize=3, **line)
         if logarithmic:
             axis.set_xscale("log")
             reach = np.concatenate([curve.values[:, 0] for curve in curves])
@@ -200,8 +190,7 @@ def over_settings(
             axis.xaxis.set_minor_locator(NullLocator())
         if diagonal:
             end = max(float(curve.at.max()) for curve in curves)
-            (line,) = axis.plot([0, end], [0, end], color="0.4", linestyle=DASHED, linewidth=1)
-            handles.setdefault("what is allowed", line)
+            axis.plot([0, end], [0, end], color="0.4", linestyle=DASHED, linewidth=1, label="what is allowed")
             axis.set_ylim(bottom=0)
-    add_legend(figure, list(handles.values()), list(handles))
+    legend_below(figure, axes)
     return figure

@@ -73,12 +73,7 @@ def draw_quartiles(axis: Axes, lines: Sequence[Series], positions: Sequence[str]
         if not known:  # a line of failed runs alone
             continue
         low, middle, high = np.array([np.quantile(line.values[p], [0.25, 0.5, 0.75]) for p in known]).T
-        style: dict[str, Any] = {
-            "color": colour,
-            "marker": "o",
-            "markersize": 4,
-            "linestyle": "none" if numbers is None else "-",
-        }
+        style: Any = {"color": colour, "marker": "o", "markersize": 4, "linestyle": "none" if numbers is None else "-"}
         axis.errorbar(place(middles[known]), middle, np.array([middle - low, high - middle]), label=line.label, **style)
         for x, group in zip(middles, line.values, strict=True):
             aside = [0.3 * width * ((j + 0.5) / len(group) * 2 - 1) for j in range(len(group))]

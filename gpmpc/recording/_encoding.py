@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any
 
 import foxglove
 import numpy as np
@@ -16,73 +17,64 @@ from gpmpc.step import Step
 
 Array = np.ndarray
 _ndarray, _float64 = np.ndarray, np.dtype(np.float64)
-_ARRAYS = ("reference", "state", "measured", "innovation", "input", "belief_covariance")
-_ARRAYS += ("inputs", "means", "covariances")
+_NAMES = ("reference", "state", "measured", "innovation", "input", "belief_covariance")
+_NAMES += ("inputs", "means", "covariances")
 _NUMBERS = {status: number for number, status in enumerate(Status)}
 
 
-class PackedStep(NamedTuple):
-    """A step with its arrays copied into one piece of memory: a microsecond, where a copy each takes ten."""
-
-    step: Step  # its numbers hold; its arrays may have changed since
-    gp_size: int
-    shapes: list[tuple[int, ...]]
-    data: bytes
-
-
-def pack(step: Step, gp_size: int | None, n: int, m: int, record_problems: bool) -> PackedStep:
-    """Copies a step."""
-    decision = step.decision
-    problem: tuple[Any, ...] = ()
-    arrays: list[Any] = [step.reference, step.state, step.measured, step.innovation, step.input, step.belief_covariance]
-    expected: list[tuple[int, ...]] = [(n,), (n,), (n,), (n,), (m,), (n, n)]
-    if decision is not None:
-        H, solution, program = len(decision.inputs), decision.solution, decision.problem
-        arrays += [decision.inputs, decision.means, decision.covariances]
-        expected += [(H, m), (H + 1, n), (H + 1, n, n)]
-        if solution is not None:
-            arrays += [solution.x, solution.record]
-            problem = (*solution.arrays, solution.softness)
-        elif program is not None:
-            hard = np.vstack([np.zeros(len(program.lower)), np.full(len(program.lower), np.inf)])
-            problem = (program.P, program.q, program.G, program.lower, program.upper, hard)
-        if record_problems:
-            arrays += problem
-    for i, array in enumerate(arrays):
-        if array.__class__ is not _ndarray or array.dtype is not _float64 or not array.flags.c_contiguous:
-            arrays[i] = np.ascontiguousarray(array, dtype=float)
-    shapes = [array.shape for array in arrays]
-    for name, shape, needed in zip(_ARRAYS, shapes, expected, strict=False):
-        if shape != needed:
-            raise ShapeError(f"step {step.k}: {name} must be {needed}; got {shape}")
-    return PackedStep(step, step.gp_size or gp_size or 0, shapes, b"".join(arrays))
-
-
 class StepCopy:
-    """A step whose arrays are views of its copy.
+    """A step whose arrays are copied into one piece of memory: a microsecond, where a copy each takes ten.
 
     Attributes:
-        step: For its numbers.
+        step: Its numbers hold; its arrays may have changed since.
         gp_size: Transitions that the model holds.
-        reference, state, measured, innovation, input, belief_covariance: As in ``Step``.
-        plan: Inputs, means and covariances; empty without a decision.
-        solution: Of the quadratic program; None without one.
-        problem: P, q, G, lower, upper, softness; empty where they are not recorded.
-        status: How the solve ended.
+        data: The copy.
+
+    Raises:
+        ShapeError: An array does not fit n states and m inputs.
     """
 
-    def __init__(self, packed: PackedStep):
-        self.step, self.gp_size = packed.step, packed.gp_size
-        numbers, ends = np.frombuffer(packed.data), np.cumsum([math.prod(shape) for shape in packed.shapes])
-        arrays = [part.reshape(s) for part, s in zip(np.split(numbers, ends[:-1]), packed.shapes, strict=True)]
-        self.reference, self.state, self.measured, self.innovation, self.input, self.belief_covariance = arrays[:6]
-        self.plan, rest, self.solution = arrays[6:9], arrays[9:], None
+    def __init__(self, step: Step, gp_size: int | None, n: int, m: int, record_problem: bool):
+        decision = step.decision
+        problem: tuple[Any, ...] = ()
+        arrays: list[Any] = [step.reference, step.state, step.measured, step.innovation]
+        arrays += [step.input, step.belief_covariance]
+        expected: list[tuple[int, ...]] = [(n,), (n,), (n,), (n,), (m,), (n, n)]
+        if decision is not None:
+            H, solution, program = len(decision.inputs), decision.solution, decision.problem
+            arrays += [decision.inputs, decision.means, decision.covariances]
+            expected += [(H, m), (H + 1, n), (H + 1, n, n)]
+            if solution is not None:
+                arrays += [solution.x, solution.record]
+                problem = (*solution.arrays, solution.softness)
+            elif program is not None:
+                hard = np.vstack([np.zeros(len(program.lower)), np.full(len(program.lower), np.inf)])
+                problem = (program.P, program.q, program.G, program.lower, program.upper, hard)
+            if record_problem:
+                arrays += problem
+        for i, array in enumerate(arrays):
+            if array.__class__ is not _ndarray or array.dtype is not _float64 or not array.flags.c_contiguous:
+                arrays[i] = np.ascontiguousarray(array, dtype=float)
+        self._shapes = [array.shape for array in arrays]
+        for name, shape, needed in zip(_NAMES, self._shapes, expected, strict=False):
+            if shape != needed:
+                raise ShapeError(f"step {step.k}: {name} must be {needed}; got {shape}")
+        self.step, self.gp_size, self.data = step, step.gp_size or gp_size or 0, b"".join(arrays)
+
+    @cached_property
+    def arrays(self) -> dict[str, Array]:
+        """Views of the copy by name: of the step, and where there are any of its plan, solution and program."""
+        solved = self.step.decision is not None and self.step.decision.solution is not None
+        names = [*_NAMES[: None if self.step.decision else 6], *(("x", "record") if solved else ()), *QP_ARRAYS[:6]]
+        numbers, ends = np.frombuffer(self.data), np.cumsum([math.prod(shape) for shape in self._shapes])
+        parts = zip(names, np.split(numbers, ends[:-1]), self._shapes, strict=False)  # without a program
+        return {name: part.reshape(shape) for name, part, shape in parts}
+
+    @property
+    def status(self) -> Status:
+        """How the solve ended."""
         decision = self.step.decision
-        if decision is not None and decision.solution is not None:
-            self.solution = decision.solution._replace(x=rest[0], record=rest[1])
-            rest = rest[2:]
-        self.problem = rest
-        self.status = self.step.status or (decision and decision.status) or Status.INVALID_MEASUREMENT
+        return self.step.status or (decision and decision.status) or Status.INVALID_MEASUREMENT
 
 
 class Encoder:
@@ -97,7 +89,7 @@ class Encoder:
         self._schema = FileDescriptorSet(file=[_messages.descriptor(self._states, self._inputs)]).SerializeToString()
         own = _messages.message_classes(_messages.descriptor(self._states, self._inputs, "bytes"))
         self._step, self._plan, self._qp = (own[TOPICS[topic]] for topic in (STEP, PLAN, QP))
-        bounds: Any = () if system.input_bounds is None else np.array(system.input_bounds, dtype=float).tolist()
+        bounds = () if system.input_bounds is None else np.array(system.input_bounds, dtype=float)
         self._bounds = {f"input_{side}": self._input(b) for side, b in zip(("lower", "upper"), bounds, strict=False)}
 
     def channels(self, context: foxglove.Context) -> dict[str, foxglove.Channel]:
@@ -110,52 +102,50 @@ class Encoder:
 
     def encode(self, copy: StepCopy) -> Iterator[tuple[str, bytes]]:
         """Yields topics and messages of a step."""
-        step, decision, solution = copy.step, copy.step.decision, copy.solution
+        step, decision, arrays = copy.step, copy.step.decision, copy.arrays
         head = {"time": step.time, "k": step.k}
-        times = (0.0, 0.0, 0.0)
-        if decision is not None:
-            times = decision.timing.model, decision.timing.build, decision.timing.solve
-        yield (
-            STEP,
-            self._step(
-                reference=self._state(copy.reference.tolist()),
-                state=self._state(copy.state.tolist()),
-                measured=self._state(copy.measured.tolist()),
-                innovation=self._state(copy.innovation.tolist()),
-                belief_std=self._state(_deviations(copy.belief_covariance).tolist()),
-                input=self._input(copy.input.tolist()),
-                belief_covariance=copy.belief_covariance.tobytes(),
-                status=_NUMBERS[copy.status],
-                iterations=0 if decision is None else decision.iterations,
-                active_set_size=0 if solution is None else np.count_nonzero(solution.active_set),
-                timing=dict(zip(TIMING, (*times, sum(times)), strict=True)),
-                gp_size=copy.gp_size,
-                gp_version=step.gp_version,
-                failed=step.failed,
-                novelty=np.nan if decision is None else decision.novelty,
-                **self._bounds,
-                **head,
-            ).SerializeToString(),
+        timing, solution = (None, None) if decision is None else (decision.timing, decision.solution)
+        if solution is not None:
+            solution = solution._replace(x=arrays["x"], record=arrays["record"])
+        times = (0.0, 0.0, 0.0) if timing is None else (timing.model, timing.build, timing.solve)
+        groups = {name: self._state(arrays[name]) for name in ("reference", "state", "measured", "innovation")}
+        message = self._step(
+            **head,
+            **groups,
+            belief_std=self._state(_deviations(arrays["belief_covariance"])),
+            input=self._input(arrays["input"]),
+            belief_covariance=arrays["belief_covariance"].tobytes(),
+            status=_NUMBERS[copy.status],
+            iterations=0 if decision is None else decision.iterations,
+            active_set_size=0 if solution is None else np.count_nonzero(solution.active_set),
+            timing=dict(zip(TIMING, (*times, sum(times)), strict=True)),
+            gp_size=copy.gp_size,
+            gp_version=step.gp_version,
+            failed=step.failed,
+            novelty=np.nan if decision is None else decision.novelty,
+            **self._bounds,
         )
-        if copy.plan:
-            inputs, means, covariances = copy.plan
-            plan = self._plan(covariances=covariances.tobytes(), **head)
-            for i, (mean, std) in enumerate(zip(means, _deviations(covariances), strict=True)):
-                last = {"input": self._input(inputs[i].tolist())} if i < len(inputs) else {}
+        yield STEP, message.SerializeToString()
+        if decision is not None:
+            means, stds = arrays["means"], _deviations(arrays["covariances"])
+            plan = self._plan(covariances=arrays["covariances"].tobytes(), **head)
+            inputs = [*({"input": self._input(values)} for values in arrays["inputs"]), {}]  # none at the last stage
+            for i, (mean, std, given) in enumerate(zip(means, stds, inputs, strict=True)):
                 time = step.time + self._time_step * i
-                plan.stages.add(time=time, mean=self._state(mean.tolist()), std=self._state(std.tolist()), **last)
+                plan.stages.add(time=time, mean=self._state(mean), std=self._state(std), **given)
             yield PLAN, plan.SerializeToString()
-        if copy.problem:
-            variables, rows = len(copy.problem[1]), len(copy.problem[2])
-            solved: Any = ((), ()) if solution is None else (solution.x, solution.multipliers)
-            arrays = {k: np.array(a).tobytes() for k, a in zip(QP_ARRAYS, (*copy.problem, *solved), strict=True)}
-            yield QP, self._qp(variables=variables, rows=rows, **arrays, **head).SerializeToString()
+        if "P" in arrays:
+            if solution is not None:
+                arrays = arrays | {"multipliers": solution.multipliers}
+            program = {name: np.array(arrays[name]).tobytes() for name in QP_ARRAYS if name in arrays}
+            size = {"variables": len(arrays["q"]), "rows": len(arrays["G"])}
+            yield QP, self._qp(**size, **program, **head).SerializeToString()
 
-    def _state(self, values: Any) -> dict[str, float]:
-        return dict(zip(self._states, values, strict=True))
+    def _state(self, values: Array) -> dict[str, float]:
+        return dict(zip(self._states, values.tolist(), strict=True))
 
-    def _input(self, values: Any) -> dict[str, float]:
-        return dict(zip(self._inputs, values, strict=True))
+    def _input(self, values: Array) -> dict[str, float]:
+        return dict(zip(self._inputs, values.tolist(), strict=True))
 
 
 def _deviations(covariances: Array) -> Array:

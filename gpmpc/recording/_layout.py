@@ -8,6 +8,7 @@ panel's title is ``foxglovePanelTitle``; a legend at the top takes its size, 240
 the path of a plot has to count from the front (from the end, Lichtblick draws nothing).
 """
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 
 from gpmpc.recording._messages import ATTITUDE, PLAN, POSITION, STEP, TIMING
 from gpmpc.recording._reader import Run
-from gpmpc.recording._scene import DISPLAY, VEHICLE
+from gpmpc.recording._scene import DISPLAY, VEHICLE, WORLD
 
 _STATE, _MEASURED, _REFERENCE, _BOUND = "#0072b2", "#e69f00", "#000000", "#d55e00"  # Okabe and Ito (2008)
 _PALETTE = (_STATE, _BOUND, "#009e73", "#cc79a7", _MEASURED, "#56b4e9")
@@ -42,8 +43,7 @@ def layout(run: Run) -> str:
     panels["RosOut!log"] = {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/log"}
     left, share = "RosOut!log", 25
     if "/pose" in run.channels:
-        frame = run.metadata.get("frames", {}).get("positions", "world")
-        panels["3D!scene"] = _scene(frame, "Position" in groups, "Attitude" in groups)
+        panels["3D!scene"] = _scene("Position" in groups, "Attitude" in groups)
         left, share = _split("column", "3D!scene", left, 78), 50
     whole = {"configById": panels, "globalVariables": {}, "userNodes": {}, "playbackConfig": {"speed": 1}}
     return json.dumps(whole | {"layout": _split("row", left, "Tab!plots", share)}, indent=1) + "\n"
@@ -57,9 +57,9 @@ def _tabs(run: Run, groups: Mapping[str, Sequence[str]]) -> dict[str, _Panels]:
         found = {units.get(field, "?") for field in fields}
         return f" [{found.pop()}]" if len(found) == 1 and not found & {"1", "?"} else ""
 
-    def several(title: str, fields: Mapping[str, str]) -> dict[str, Any]:
-        lines = [_line(path, label, _PALETTE[i % len(_PALETTE)]) for i, (path, label) in enumerate(fields.items())]
-        return _plot(title, lines)
+    def several(title: str, labels: Mapping[str, str]) -> dict[str, Any]:
+        colours = itertools.cycle(_PALETTE)
+        return _plot(title, [_line(path, label, next(colours)) for path, label in labels.items()])
 
     tabs: dict[str, _Panels] = {title: {} for title in (*groups, "Inputs", "Uncertainty", "Solver")}
     for title, names in groups.items():
@@ -99,42 +99,32 @@ def _line(path: str, label: str, colour: str, **more: Any) -> dict[str, Any]:
 
 
 def _plot(title: str, lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    return {
-        "foxglovePanelTitle": title,
-        "paths": list(lines),
-        "showXAxisLabels": True,
-        "showYAxisLabels": True,
-        "showLegend": True,
-        "legendDisplay": "left",  # at the top it takes its height off the curves
-        "sidebarDimension": 150,  # width of the legend [px]
-        "isSynced": True,
-        "xAxisVal": "timestamp",
-    }
+    shown = dict.fromkeys(("showXAxisLabels", "showYAxisLabels", "showLegend"), True)
+    # At the top the legend takes its height off the curves; ``sidebarDimension`` is its width [px].
+    plot = {"foxglovePanelTitle": title, "paths": list(lines)} | shown
+    return plot | {"legendDisplay": "left", "sidebarDimension": 150, "isSynced": True, "xAxisVal": "timestamp"}
 
 
-def _scene(frame: str, moves: bool, turns: bool) -> dict[str, Any]:
+def _scene(moves: bool, turns: bool) -> dict[str, Any]:
     """Makes the 3D panel: around a vehicle that moves, or on the spot around one that only turns."""
     size = 40 if moves else 4  # [m]
     grid = {"layerId": "foxglove.Grid", "instanceId": "grid", "label": "Grid", "visible": True, "frameLocked": True}
     grid |= {"frameId": DISPLAY, "size": size, "divisions": size, "color": "#24824280", "order": 1}
+    camera = {"distance": 25 if moves else 3, "perspective": True, "phi": 60, "thetaOffset": 45}  # [m], [deg]
+    axis = {"visible": True, "type": "axis"}
     return {
         "foxglovePanelTitle": "plan and 2-sigma tube" if moves else "attitude",
         "followMode": "follow-position" if moves else "follow-none",
         "followTf": VEHICLE if moves else DISPLAY,
         "fixedFrame": DISPLAY,
-        "cameraState": {
-            "distance": 25 if moves else 3,
-            "perspective": True,
-            "phi": 60,
-            "thetaOffset": 45,
-        },  # [m], [deg]
+        "cameraState": camera,
         "scene": {"transforms": {"showLabel": False}},
-        "transforms": {f"frame:{name}": {"visible": False} for name in (frame, VEHICLE)},  # /pose shows where it is
+        "transforms": {f"frame:{name}": {"visible": False} for name in (WORLD, VEHICLE)},  # /pose shows where it is
         "layers": {"grid": grid},
         "topics": {
-            "/pose": {"visible": True, "type": "axis", "axisScale": 1.0},
-            "/reference": {"visible": True, "type": "axis", "axisScale": 0.6},
-            "/plan/path": {"visible": turns, "type": "axis", "axisScale": 0.25},  # where it goes, the tube shows
+            "/pose": axis | {"axisScale": 1.0},
+            "/reference": axis | {"axisScale": 0.6},
+            "/plan/path": axis | {"axisScale": 0.25, "visible": turns},  # where it goes, the tube shows
             "/plan/tube": {"visible": moves},
         },
     }

@@ -70,8 +70,7 @@ class RecordedSystem:
     input_bounds: Any = None  # lower and upper bounds of the input (2, m), repeated in every step for plots
     # states of position and attitude (Rz(yaw) Ry(pitch) Rx(roll)) in space, by x, y, z, roll, pitch, yaw
     pose: Mapping[str, str] = field(default_factory=dict)
-    frame: str = "world"  # name of the frame that positions are in
-    z_down: bool = True  # whether that frame's z axis points downwards, as the quadrotor's does
+    z_down: bool = True  # whether the z axis of positions points downwards, as the quadrotor's does
 
     def __post_init__(self) -> None:
         for key in ("state_names", "input_names"):

@@ -6,10 +6,9 @@ belongs to the step of its number, wherever it stands.
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
@@ -32,6 +31,11 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 _STATUSES = tuple(Status)
+_GROUPS = {"references": "reference", "states": "state", "measured": "measured", "innovations": "innovation"}
+_GROUPS |= {"inputs": "input", "timings": "timing"}  # of ``Run``, and of a step's message
+_COLUMNS = {"times": ("time", float), "steps": ("k", int), "iterations": ("iterations", int)}
+_COLUMNS |= {"active_set_sizes": ("active_set_size", int), "gp_sizes": ("gp_size", int)}
+_COLUMNS |= {"gp_versions": ("gp_version", int), "failed": ("failed", bool), "novelties": ("novelty", float)}
 
 
 class RecordedProblem(NamedTuple):
@@ -96,25 +100,27 @@ class Run:
     @cached_property
     def columns(self) -> dict[str, Array]:
         """The run as a table: a column (K,) per scalar field of ``gpmpc.Step``, in its order."""
-        table: dict[str, Array] = {"time": self.times, "k": self.steps}
         with np.errstate(invalid="ignore"):  # NaN says it
             std = np.sqrt(np.diagonal(self.belief_covariances, axis1=1, axis2=2))
-        groups = {"reference": self.references, "state": self.states, "measured": self.measured, "input": self.inputs}
-        groups |= {"innovation": self.innovations, "belief_std": std}
-        for group, values in groups.items():
-            names = self.input_names if group == "input" else self.state_names
-            table |= {f"{group}.{name}": values[:, i] for i, name in enumerate(names)}
-        table |= {"status": np.array([status.name for status in self.statuses], dtype=object)}
-        table |= {"iterations": self.iterations, "active_set_size": self.active_set_sizes}
-        table |= {f"timing.{name}": self.timings[:, i] for i, name in enumerate(TIMING)}
-        residuals = self.residuals.reshape(-1, 3)
-        table |= {f"residuals.{name}": residuals[:, i] for i, name in enumerate(("primal", "dual", "gap"))}
-        return table | {
-            "gp_size": self.gp_sizes,
-            "gp_version": self.gp_versions,
-            "failed": self.failed,
-            "novelty": self.novelties,
-        }
+
+        def each(group: str, names: Sequence[str], values: Array) -> dict[str, Array]:
+            return {f"{group}.{name}": column for name, column in zip(names, values.T, strict=True)}
+
+        return (
+            {"time": self.times, "k": self.steps}
+            | each("reference", self.state_names, self.references)
+            | each("state", self.state_names, self.states)
+            | each("measured", self.state_names, self.measured)
+            | each("input", self.input_names, self.inputs)
+            | each("innovation", self.state_names, self.innovations)
+            | each("belief_std", self.state_names, std)
+            | {"status": np.array([status.name for status in self.statuses], dtype=object)}
+            | {"iterations": self.iterations, "active_set_size": self.active_set_sizes}
+            | each("timing", TIMING, self.timings)
+            | each("residuals", ("primal", "dual", "gap"), self.residuals.reshape(-1, 3))
+            | {"gp_size": self.gp_sizes, "gp_version": self.gp_versions}
+            | {"failed": self.failed, "novelty": self.novelties}
+        )
 
     def to_pandas(self) -> "pandas.DataFrame":
         """Returns ``columns`` as a data frame, units in its ``attrs``."""
@@ -165,7 +171,7 @@ def read_run(path: str | Path) -> Run:
     channels: dict[int, Channel] = {}
     counts: Counter[int] = Counter()
     messages: dict[str, list[Any]] = {STEP: [], PLAN: [], QP: []}
-    described: _Described | None = None
+    described: Any = None
     config, finished = "", False
     for record in whole_records(path):
         if isinstance(record, Message):
@@ -176,7 +182,7 @@ def read_run(path: str | Path) -> Run:
                     everything = whole_records(path) if "run" not in metadata else ()
                     behind = {more.name: more.metadata for more in everything if isinstance(more, Metadata)}
                     described = _describe(path, metadata | behind)
-                messages[topic].append(_decode(path, topic, described, record))
+                messages[topic].append(_decode(path, topic, described[2], len(described[0]), record))
         elif isinstance(record, Schema):
             schemas[record.id] = record.name
         elif isinstance(record, Channel):
@@ -187,7 +193,7 @@ def read_run(path: str | Path) -> Run:
             config = record.data.decode(errors="replace")
         finished = isinstance(record, Footer)
     states, inputs, _ = described or _describe(path, metadata)
-    steps, plans = messages[STEP], messages[PLAN]
+    steps = messages[STEP]
     return Run(
         path=path,
         finished=finished and RECOVERED not in metadata,
@@ -195,7 +201,7 @@ def read_run(path: str | Path) -> Run:
         input_names=inputs,
         statuses=tuple(_STATUSES[step.status] for step in steps),
         **_steps(steps, states, inputs),
-        **_plans(path, plans, steps, states, inputs),
+        **_plans(path, messages[PLAN], steps, states, inputs),
         channels={channel.topic: (counts[i], schemas.get(channel.schema_id, "")) for i, channel in channels.items()},
         metadata=metadata,
         config=config,
@@ -203,41 +209,33 @@ def read_run(path: str | Path) -> Run:
     )
 
 
-class _Described(NamedTuple):
-    """What the metadata say of the messages."""
-
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    classes: dict[str, Any]
-
-
-def _describe(path: Path, metadata: dict[str, dict[str, str]]) -> _Described:
+def _describe(path: Path, metadata: dict[str, dict[str, str]]) -> tuple[tuple[str, ...], tuple[str, ...], dict]:
     """Finds the names of states and inputs, and builds the classes of the messages."""
     about = metadata.get("run", {})
     if not {"state_names", "input_names"} <= about.keys():
         raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
     try:
         states, inputs = (_messages.check_names(key, about[key].split()) for key in ("state_names", "input_names"))
-        classes = _messages.message_classes(_messages.descriptor(states, inputs, "bytes"))
+        return states, inputs, _messages.message_classes(_messages.descriptor(states, inputs, "bytes"))
     except SettingError as error:
         raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
-    return _Described(states, inputs, classes)
 
 
-def _decode(path: Path, topic: str, described: _Described, record: Message) -> Any:
+def _decode(path: Path, topic: str, classes: dict[str, Any], n: int, record: Message) -> Any:
     """Parses a message; of a quadratic program it returns its step's number k and itself."""
-    n = len(described.states)
     try:
-        message = described.classes[TOPICS[topic]].FromString(record.data)
-        if topic == STEP:
-            _numbers(message, "belief_covariance", n, n)
-            if not 0 <= message.status < len(_STATUSES):
-                raise ValueError(f"status {message.status} is unknown")
-        elif topic == PLAN:
+        message = classes[TOPICS[topic]].FromString(record.data)
+        if topic == QP:
+            return message.k, _problem(message)
+        if topic == PLAN:
             _numbers(message, "covariances", len(message.stages), n, n)
             if not message.stages:
                 raise ValueError("it has no stage")
-        return (message.k, _problem(message)) if topic == QP else message
+        else:
+            _numbers(message, "belief_covariance", n, n)
+            if not 0 <= message.status < len(_STATUSES):
+                raise ValueError(f"status {message.status} is unknown")
+        return message
     except (DecodeError, ValueError) as error:
         raise RecordingError(f"{path}: message {record.sequence} of {topic} is damaged: {error}") from error
 
@@ -250,40 +248,23 @@ def _numbers(message: Any, field: str, *shape: int) -> Array:
     return np.frombuffer(data).reshape(shape)
 
 
-def _table(messages: Sequence[Any], fields: tuple[str, ...]) -> Array:
-    numbers = attrgetter(*fields)
-    return np.array([numbers(message) for message in messages], dtype=float).reshape(len(messages), len(fields))
+def _table(messages: Iterable[Any], names: tuple[str, ...]) -> Array:
+    """Reads scalar fields of messages (K, names)."""
+    return np.array([[getattr(message, name) for name in names] for message in messages]).reshape(-1, len(names))
 
 
 def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Array]:
-    def column(field: str, kind: type) -> Array:
-        return np.array([getattr(step, field) for step in steps], dtype=kind)
-
-    def table(field: str, names: tuple[str, ...]) -> Array:
-        return _table([getattr(step, field) for step in steps], names)
-
     bounds = np.tile([[-np.inf], [np.inf]], len(inputs))
     if steps and steps[0].HasField("input_lower"):  # they are equal in all steps
         bounds = _table([steps[0].input_lower, steps[0].input_upper], inputs)
     covariances = np.frombuffer(b"".join(step.belief_covariance for step in steps))
-    return {
-        "times": column("time", float),
-        "steps": column("k", int),
-        "references": table("reference", states),
-        "states": table("state", states),
-        "measured": table("measured", states),
-        "innovations": table("innovation", states),
-        "inputs": table("input", inputs),
-        "input_bounds": bounds,
-        "belief_covariances": covariances.reshape(len(steps), len(states), len(states)),
-        "iterations": column("iterations", int),
-        "active_set_sizes": column("active_set_size", int),
-        "timings": table("timing", TIMING),
-        "gp_sizes": column("gp_size", int),
-        "gp_versions": column("gp_version", int),
-        "failed": column("failed", bool),
-        "novelties": column("novelty", float),
-    }
+    found = {"input_bounds": bounds, "belief_covariances": covariances.reshape(-1, len(states), len(states))}
+    for name, (field, kind) in _COLUMNS.items():
+        found[name] = np.array([getattr(step, field) for step in steps], dtype=kind)
+    for name, field in _GROUPS.items():
+        names = {"input": inputs, "timing": TIMING}.get(field, states)
+        found[name] = _table((getattr(step, field) for step in steps), names)
+    return found
 
 
 def _numbered(messages: list) -> Iterator[tuple[int, int]]:
@@ -302,13 +283,12 @@ def _plans(path: Path, plans: list, steps: list, states: tuple[str, ...], inputs
     arrays = {f"plan_{name}": np.full((len(steps), *shape), np.nan) for name, shape in shapes.items()}
     rows = {key: row for row, key in enumerate(_numbered(steps))}
     for key, plan in zip(_numbered(plans), plans, strict=True):
-        row, stages = rows.get(key), list(plan.stages)
-        if row is None:
-            continue  # the step is lost
-        arrays["plan_means"][row, : len(stages)] = _table([stage.mean for stage in stages], states)
-        arrays["plan_stds"][row, : len(stages)] = _table([stage.std for stage in stages], states)
-        arrays["plan_inputs"][row, : len(stages) - 1] = _table([stage.input for stage in stages[:-1]], inputs)
-        arrays["plan_covariances"][row, : len(stages)] = _numbers(plan, "covariances", len(stages), n, n)
+        if key in rows:  # else the step is lost
+            inside, of_inputs = (rows[key], slice(len(plan.stages))), (rows[key], slice(len(plan.stages) - 1))
+            arrays["plan_means"][inside] = _table((stage.mean for stage in plan.stages), states)
+            arrays["plan_stds"][inside] = _table((stage.std for stage in plan.stages), states)
+            arrays["plan_inputs"][of_inputs] = _table((stage.input for stage in plan.stages[:-1]), inputs)
+            arrays["plan_covariances"][inside] = _numbers(plan, "covariances", len(plan.stages), n, n)
     return arrays
 
 

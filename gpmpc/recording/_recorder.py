@@ -24,10 +24,10 @@ from foxglove.messages import Log, LogLevel, Timestamp
 
 from gpmpc.exceptions import RecordingError, check_number
 from gpmpc.provenance import flattened, provenance
-from gpmpc.recording._encoding import Encoder, PackedStep, StepCopy, pack
+from gpmpc.recording._encoding import Encoder, StepCopy
 from gpmpc.recording._messages import RecordedSystem
 from gpmpc.recording._records import CONFIG, LARGEST
-from gpmpc.recording._scene import Scene
+from gpmpc.recording._scene import WORLD, Scene
 from gpmpc.step import Step
 
 _INTERVAL = 1.0  # [s] after which the next step ends a chunk
@@ -71,7 +71,7 @@ class McapRecorder:
         about = flattened(provenance() | {"host": platform.node()} | dict(metadata or {}))
         about = {key: str(value) for key, value in about.items()}
         about |= {"state_names": " ".join(system.state_names), "input_names": " ".join(system.input_names)}
-        frames = {"positions": system.frame, "z axis": "down" if system.z_down else "up", "display": "z axis up"}
+        frames = {"positions": WORLD, "z axis": "down" if system.z_down else "up", "display": "z axis up"}
         config = config if isinstance(config, str) else json.dumps(config, indent=2, default=str)
 
         self.path = Path(path)
@@ -79,7 +79,7 @@ class McapRecorder:
         self._n, self._m = len(system.state_names), len(system.input_names)
         self._start, self._record_problems, self._chunk_size = start_time_ns, record_problems, chunk_size
         self._encoder = Encoder(system)
-        self._waiting: list[PackedStep] = []
+        self._waiting: list[StepCopy] = []
         self._bytes, self._steps, self._last = 0, 0, time.perf_counter()
         self._error: str | None = None
         self._failed = False
@@ -94,12 +94,8 @@ class McapRecorder:
             compression_level=1,
         )
         self._writer = foxglove.open_mcap(self._sink, context=context, writer_options=options)
-        for name, pairs in (
-            ("run", about),
-            ("units", system.field_units),
-            ("frames", frames),
-            ("pose", dict(system.pose)),
-        ):
+        described = {"run": about, "units": system.field_units, "frames": frames, "pose": dict(system.pose)}
+        for name, pairs in described.items():
             self._writer.write_metadata(name, pairs)
         stamps = {"log_time": start_time_ns, "create_time": start_time_ns}
         self._writer.attach(name=CONFIG, media_type="application/yaml", data=config.encode(), **stamps)
@@ -108,7 +104,11 @@ class McapRecorder:
         self._channels, self._log = self._encoder.channels(context), LogChannel("/log", context=context)
         self._scene = Scene(context, system)
         if live:
-            self._serve(context)
+            try:
+                self._server = foxglove.start_server(name=self.path.name, port=_PORT, context=context)
+            except RuntimeError:  # the port is taken
+                self._server = foxglove.start_server(name=self.path.name, port=0, context=context)
+            self.address = f"ws://127.0.0.1:{self._server.port}"
 
     def record(self, step: Step, gp_size: int | None = None) -> None:
         """Takes a copy of a step.
@@ -123,11 +123,11 @@ class McapRecorder:
         """
         if self._error is not None:
             raise RecordingError(self._error)
-        packed = pack(step, gp_size, self._n, self._m, self._record_problems)
-        size = len(packed.data)
+        copy = StepCopy(step, gp_size, self._n, self._m, self._record_problems)
+        size = len(copy.data)
         if 4 * size > LARGEST:
             raise RecordingError(f"{self.path}: a step of {size} bytes is too large; at most {LARGEST // 4}")
-        self._waiting.append(packed)
+        self._waiting.append(copy)
         self._bytes += size
         if self._server is not None:
             self._serialise()
@@ -170,7 +170,7 @@ class McapRecorder:
 
     def _serialise(self) -> None:
         """Logs the steps that wait: into the open chunk, and to viewers."""
-        for copy in map(StepCopy, self._waiting):
+        for copy in self._waiting:
             stamp = self._start + round(copy.step.time * 1e9)
             for topic, message in self._encoder.encode(copy):
                 self._channels[topic].log(message, log_time=stamp)
@@ -195,13 +195,6 @@ class McapRecorder:
         if self._server is not None:
             self._server.stop()
         self._sink.close()
-
-    def _serve(self, context: foxglove.Context) -> None:
-        try:
-            self._server = foxglove.start_server(name=self.path.name, port=_PORT, context=context)
-        except RuntimeError:  # the port is taken
-            self._server = foxglove.start_server(name=self.path.name, port=0, context=context)
-        self.address = f"ws://127.0.0.1:{self._server.port}"
 
 
 class _Sink:

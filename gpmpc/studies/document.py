@@ -5,9 +5,10 @@ no command in LaTeX, no formula in a spreadsheet, no control sequence in a termi
 """
 
 import json
+import math
 import re
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from html import escape
 from itertools import zip_longest
@@ -49,12 +50,16 @@ pre { padding: .6rem; } li { overflow-wrap: anywhere; }
 
 
 class Table(NamedTuple):
-    """A table of texts."""
+    """A table of texts and numbers."""
 
     header: Sequence[str]  # names of the columns
-    rows: Sequence[Sequence[str]]  # cells; a cell may have several lines, of which those below the first are details
+    rows: Sequence[Sequence[Any]]  # cells; of a text of several lines, those below the first are details
     title: str = ""  # stands above the table
     sections: bool = False  # whether rows of one first cell form a section
+
+    def texts(self) -> list[list[str]]:
+        """Returns the rows as texts, numbers by ``number``."""
+        return [[number(cell) if isinstance(cell, float) else str(cell) for cell in row] for row in self.rows]
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,7 @@ class Document:
         for table in self.tables:
             head, *rows = (
                 f"| {' | '.join(_markdown(cell.replace(chr(10) + '[', ' [').replace(chr(10), ', ')) for cell in row)} |"
-                for row in [table.header, *table.rows]
+                for row in [table.header, *table.texts()]
             )
             out += [f"## {_markdown(table.title)}", ""] if table.title else []
             out += [head, f"|{' --- |' * len(table.header)}", *rows, ""]
@@ -108,7 +113,7 @@ class Document:
             header = [name.replace(", ", "\n").replace(" [", "\n[") for name in table.header]
             out += [f"\\begin{{tabular}}{{{'r' * len(header)}}}", "\\toprule", *_latex_lines(header), "\\midrule"]
             before = None
-            for first, *others in table.rows:
+            for first, *others in table.texts():
                 out += ["\\midrule"] if table.sections and before not in (None, first) else []
                 out += _latex_lines(["" if table.sections and first == before else first, *others])
                 before = first
@@ -125,26 +130,19 @@ class Document:
         parts.append(f'<div class="figures">{"".join(images)}</div>')
         for table in self.tables:
             head = "".join(f"<th>{escape(name)}</th>" for name in table.header)
-            body = "\n".join(f"<tr>{''.join(f'<td>{_html(cell)}</td>' for cell in row)}</tr>" for row in table.rows)
-            parts += [f"<h2>{escape(table.title)}</h2>"] if table.title else []
-            parts.append(
-                f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
-            )
+            body = "\n".join(f"<tr>{''.join(f'<td>{_html(cell)}</td>' for cell in row)}</tr>" for row in table.texts())
+            whole = f"<table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table>"
+            parts += [f"<h2>{escape(table.title)}</h2>"] * bool(table.title) + [f'<div class="wide">{whole}</div>']
         parts += [f"<p>{escape(note)}</p>" for note in self.notes]
         for heading, items in self.lists.items():
             parts.append(f"<h2>{heading}</h2><ul>{''.join(f'<li>{escape(item)}</li>' for item in items)}</ul>")
         for heading, lines in self.code.items():
             text = f"<pre>{escape(chr(10).join(lines))}</pre>"
-            if len(lines) > _FOLDED:
-                text = f"<details><summary>{len(lines)} lines</summary>{text}</details>"
-            parts.append(f"<h2>{heading}</h2>{text}")
+            parts.append(f"<h2>{heading}</h2>{_folded('lines', lines, text) if len(lines) > _FOLDED else text}")
         if self.links:
-            items = (
-                f'<li><a href="{quote(to, errors="surrogateescape")}/">{escape(text)}</a></li>'
-                for text, to in self.links.items()
-            )
-            summary = f"<summary>{len(self.links)} folders</summary>"
-            parts.append(f"<h2>Runs</h2><details>{summary}<ul>{''.join(items)}</ul></details>")
+            quoted = ((quote(to, errors="surrogateescape"), escape(text)) for text, to in self.links.items())
+            items = "".join(f'<li><a href="{to}/">{text}</a></li>' for to, text in quoted)
+            parts.append(f"<h2>Runs</h2>{_folded('folders', self.links, f'<ul>{items}</ul>')}")
         head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
         head += f"<title>{escape(self.title)}</title><style>{_STYLE}</style>"
         return f"<!doctype html>\n<html lang=en><head>{head}</head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
@@ -162,7 +160,7 @@ def json_text(content: Any) -> str:
 
 def number(value: float) -> str:
     """Returns three significant digits: 1.01e-7, 0.0123, 1.46."""
-    if value == 0 or 1e-3 <= abs(value) < 1e4:
+    if value == 0 or 1e-3 <= abs(value) < 1e4 or not math.isfinite(value):
         return f"{value:.3g}"
     mantissa, exponent = f"{value:.2e}".split("e")
     return f"{mantissa}e{int(exponent)}"
@@ -186,20 +184,16 @@ def figure_label(text: str) -> str:
 
 
 def _terminal_table(table: Table) -> TerminalTable:
-    style: dict[str, Any] = {
-        "show_header": any(table.header),
-        "box": box.SIMPLE_HEAD,
-        "padding": (0, 1, 0, 0),
-        "title_justify": "left",
-        "title_style": "bold",
-    }
-    shown = TerminalTable(title=Text(f"\n{table.title}") if table.title else None, **style)
-    columns = list(zip(*table.rows, strict=True)) or [()] * len(table.header)
+    style: Any = {"title_justify": "left", "title_style": "bold", "padding": (0, 1, 0, 0), "box": box.SIMPLE_HEAD}
+    title = Text(f"\n{table.title}") if table.title else None
+    shown = TerminalTable(title=title, show_header=any(table.header), **style)
+    rows = table.texts()
+    columns = list(zip(*rows, strict=True)) or [()] * len(table.header)
     for name, cells in list(zip(table.header, columns, strict=True))[table.sections :]:
         right = not any("\n" in cell or cell[:1].isalpha() for cell in cells)
         shown.add_column(Text(name), justify="right" if right else "left", overflow="fold")
     section = None
-    for row in table.rows:
+    for row in rows:
         if table.sections and row[0] != section:
             section = row[0]
             shown.add_section()
@@ -239,3 +233,8 @@ def _html(text: str) -> str:
     """Escapes a cell; lines below its first are small."""
     first, *below = map(escape, text.split("\n"))
     return first + "".join(f"<small>{line}</small>" for line in below)
+
+
+def _folded(what: str, items: Sized, text: str) -> str:
+    """Returns HTML that a page shows on demand."""
+    return f"<details><summary>{len(items)} {what}</summary>{text}</details>"

@@ -34,6 +34,7 @@ from gpmpc.studies.study import random_rows
 from gpmpc.systems import System
 from gpmpc.trajectories import Trajectory
 
+Prepare = Callable[[Any, Training | None], Callable[[Step], None]]
 _STAGES = ("model", "build", "solve", "total")  # of a decision's time
 
 
@@ -168,7 +169,7 @@ class Flown:
 
 def run_trial(
     experiment: Experiment,
-    prepare: Callable[[Any, Training | None], Callable[[Step], None]] | None = None,
+    prepare: Prepare | None = None,
 ) -> Flown:
     """Trains and flies.
 
@@ -203,14 +204,20 @@ def run_trial(
 
 def _error(experiment: Experiment, flown: Flown) -> float:
     """RMSE of a flight; infinite where it diverged."""
-    system, rollout = experiment.system, flown.rollout
-    error = tracking_error(rollout.states, rollout.references, system.tracked_indices, system.angle_indices).total
+    error = _tracking_error(experiment, flown).total
     return error if flown.diverged is None and np.isfinite(error) else np.inf
+
+
+def _tracking_error(experiment: Experiment, flown: Flown, last: int = 0) -> Any:
+    """RMSE of a flight, or of its last states; 0 takes all."""
+    system, rollout = experiment.system, flown.rollout
+    states, references = rollout.states[-last:], rollout.references[-last:]
+    return tracking_error(states, references, system.tracked_indices, system.angle_indices)
 
 
 def _fly(
     experiment: Experiment,
-    prepare: Callable[[Any, Training | None], Callable[[Step], None]] | None,
+    prepare: Prepare | None,
     model: DynamicsModel | None,
     training: Training | None,
 ) -> Flown:
@@ -256,18 +263,12 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     diverged has no RMSE: None.
     """
     rollout, problem, training = flown.rollout, flown.controller.problem, flown.training
-    system = experiment.system
-    error = tracking_error(rollout.states, rollout.references, system.tracked_indices, system.angle_indices)
-    at_end = (rollout.states[-2:], rollout.references[-2:], system.tracked_indices, system.angle_indices)
+    system, horizon = experiment.system, flown.controller.horizon
+    error, total = _tracking_error(experiment, flown), _error(experiment, flown)
+    rmse: dict[str, Any] = dict(zip(system.tracked, map(float, error.axes), strict=True)) | {"total": total}
     episodes = [one if np.isfinite(one := _error(experiment, each)) else None for each in flown.before]
-    rmse = {name: float(value) for name, value in zip(system.tracked, error.axes, strict=True)}
-    rmse["total"] = error.total
-    if flown.diverged is not None or not np.isfinite(error.total):
-        rmse = dict.fromkeys(rmse)
-    first = [side[0] for side in problem.inputs.by_stage(flown.controller.horizon)]
-    violations = {"inputs": violation_rate(rollout.inputs, *first)}
-    boxes = [bounds.by_stage(flown.controller.horizon) for bounds in problem.constraints if isinstance(bounds, Box)]
-    if boxes:
+    violations = {"inputs": violation_rate(rollout.inputs, *(side[0] for side in problem.inputs.by_stage(horizon)))}
+    if boxes := [bounds.by_stage(horizon) for bounds in problem.constraints if isinstance(bounds, Box)]:
         lower, upper = np.max([box[0][0] for box in boxes], axis=0), np.min([box[1][0] for box in boxes], axis=0)
         violations["states"] = violation_rate(rollout.states[1:], lower, upper)
     learned = None
@@ -277,8 +278,8 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     return {
         "steps": len(rollout.inputs),
         "unit": system.unit,
-        "rmse": rmse,
-        "error_at_end": None if rmse["total"] is None else float(tracking_error(*at_end).total),
+        "rmse": rmse if np.isfinite(total) else dict.fromkeys(rmse),
+        "error_at_end": float(_tracking_error(experiment, flown, last=2).total) if np.isfinite(total) else None,
         "lost": _lost(experiment, flown),
         "violations": {name: asdict(rate) | {"rate": rate.rate} for name, rate in violations.items()},
         "failures": dict(Counter(status.name for _, status in rollout.failures)),
@@ -310,44 +311,38 @@ def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
 
 def summary(result: Mapping[str, Any]) -> Table:
     """Returns a run's metrics in words, a line each."""
-    options, training, times = result["settings"]["options"], result["training"], result["times"]
+    settings, times, rmse, unit = result["settings"], result["times"], result["rmse"], result["unit"]
+    options, (system, plant, model) = settings["options"], (settings.get(k) or {} for k in ("system", "plant", "model"))
     along = "" if options["trajectory"] == "goal" else f" along {options['trajectory']}"
-    lines = [("flight", f"{result['steps']} steps of {options['system']}{along} with {options['controller']}")]
-    system, plant, model = (result["settings"].get(key) or {} for key in ("system", "plant", "model"))
-    other = [f"{k} {v} (learned: {system.get(k)})" for k, v in plant.items() if v != system.get(k)]
-    if other:
-        lines.append(("flown with", ", ".join(other)))
+    lines = {"flight": f"{result['steps']} steps of {options['system']}{along} with {options['controller']}"}
+    if other := [f"{k} {v} (learned: {system.get(k)})" for k, v in plant.items() if v != system.get(k)]:
+        lines["flown with"] = ", ".join(other)
     if path := model.get("path"):
-        lines.append(("model", path))
-    if training:
-        from_what = f"{training['size']} rows of {options['data']} data"
-        lines.append(("learned from", f"{from_what}, in {times['training']:.2f} s"))
-    if known := result["settings"].get("nominal"):
-        lines.append(("known before", ", ".join(f"{k} {v}" for k, v in known.items())))
+        lines["model"] = path
+    if training := result["training"]:
+        lines["learned from"] = f"{training['size']} rows of {options['data']} data, in {times['training']:.2f} s"
+    if known := settings.get("nominal"):
+        lines["known before"] = ", ".join(f"{k} {v}" for k, v in known.items())
     if lost := result.get("lost"):
-        lines.append(("lost", f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}"))
-    axes = ", ".join(f"{k} {v:.3g}" for k, v in result["rmse"].items() if v is not None and k != "total")
-    total = result["rmse"]["total"]
-    lines.append((f"RMSE [{result['unit']}]", "none: it diverged" if total is None else f"{total:.3g}  ({axes})"))
+        lines["lost"] = f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}"
+    axes = ", ".join(f"{k} {v:.3g}" for k, v in rmse.items() if v is not None and k != "total")
+    lines[f"RMSE [{unit}]"] = "none: it diverged" if rmse["total"] is None else f"{rmse['total']:.3g}  ({axes})"
     if (error := result.get("error_at_end")) is not None:
-        lines.append((f"at the end [{result['unit']}]", f"{error:.3g}"))
+        lines[f"at the end [{unit}]"] = f"{error:.3g}"
     if episodes := result.get("episodes"):
-        lines.append(("episodes before", ", ".join("diverged" if e is None else f"{e:.3g}" for e in episodes)))
+        lines["episodes before"] = ", ".join("diverged" if e is None else f"{e:.3g}" for e in episodes)
     for name, rate in result["violations"].items():
-        outside = f"{rate['violations']} of {rate['steps']} steps outside"
-        lines.append((f"bounds of {name}", f"{outside} (95 %: {100 * rate['low']:.2g} to {100 * rate['high']:.2g} %)"))
-    lines.append(("failed solves", _counted(result["failures"]) or "none"))
-    if result.get("suboptimal"):
-        stopped = f"{_counted(result['suboptimal'])}: plans that were not optimal yet, applied"
-        lines.append(("stopped early", stopped))
+        interval = f"{100 * rate['low']:.2g} to {100 * rate['high']:.2g} %"
+        lines[f"bounds of {name}"] = f"{rate['violations']} of {rate['steps']} steps outside (95 %: {interval})"
+    lines["failed solves"] = _counted(result["failures"]) or "none"
+    if stopped := _counted(result.get("suboptimal", {})):
+        lines["stopped early"] = f"{stopped}: plans that were not optimal yet, applied"
     if far := result.get("far_from_data"):
-        lines.append(
-            ("far from the data", f"the plans of {far} steps: there the model knows little more than its prior")
-        )
+        lines["far from the data"] = f"the plans of {far} steps: there the model knows little more than its prior"
     stages = ", ".join(f"{stage} {1e3 * times[stage]['median']:.3g}" for stage in _STAGES[:3])
     median, most = (f"{1e3 * times['total'][key]:.3g}" for key in ("median", "p99"))
-    lines.append(("decision [ms]", f"median {median}  ({stages}), 99 % below {most}"))
-    return Table(("", ""), lines)
+    lines["decision [ms]"] = f"median {median}  ({stages}), 99 % below {most}"
+    return Table(("", ""), [*lines.items()])
 
 
 def _counted(statuses: Mapping[str, int]) -> str:

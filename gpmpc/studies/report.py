@@ -1,257 +1,178 @@
-"""Puts a tree of runs together: what was varied, the results, what failed and what is missing.
+"""Shows a tree of runs: a row a cell, figures over what was varied, what failed and what is missing."""
 
-A *cell* is one combination of the varied settings; its runs differ in their seed. Missing is only what a sweep asked
-for, in the plans that it leaves in the tree. Runs are read from their ``metrics.json`` and ``error.json`` alone. Those
-may be damaged, or of any other origin: numbers are finite and texts are one printable line from here on, and a run that
-cannot give them is skipped, with the reason.
-"""
-
-import json
-import math
-import shlex
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from gpmpc.exceptions import DataError
-from gpmpc.provenance import flattened
-from gpmpc.studies.document import plain_text
-from gpmpc.studies.run_folder import ERROR, METRICS, PLAN, folder_name
+import numpy as np
+import pandas as pd
 
-SEED = "seed"
-_DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError)  # of a file
+from gpmpc.plotting import Series, over_variable, png
+from gpmpc.provenance import now
+from gpmpc.studies._comparison import Comparison, compare, sentences
+from gpmpc.studies._runs import MEASURES, Cell, Report, Run, in_order, read_report
+from gpmpc.studies.document import MISSING, Document, Table, figure_label, plain_text, with_range
+from gpmpc.studies.run_folder import LONGEST_NAME
 
-Choices = dict[str, str]
+__all__ = [
+    "Cell",
+    "Comparison",
+    "Report",
+    "Run",
+    "compare",
+    "notes",
+    "read_report",
+    "report_document",
+    "sentences",
+    "terminal_table",
+]
 
-
-class _Measure(NamedTuple):
-    """One number of a run."""
-
-    label: str  #: with its unit; ``{unit}`` stands for that of the runs' positions or angles
-    of: Callable[[Mapping[str, Any]], float | None]  #: from a run's result to the number; None where the run has none
-    logarithmic: bool = True  #: how it is drawn
-    wall_time: bool = False  #: whether it depends on what else the machine did meanwhile
-
-
-def _outside(result: Mapping[str, Any]) -> float | None:
-    return max((100 * rate["rate"] for rate in result["violations"].values()), default=None)
-
-
-MEASURES = {
-    "rmse": _Measure("RMSE [{unit}]", lambda r: r["rmse"]["total"]),
-    "outside": _Measure("steps outside bounds [%]", _outside, logarithmic=False),
-    "failed": _Measure(
-        "failed solves [%]", lambda r: 100 * sum(r["failures"].values()) / r["steps"], logarithmic=False
-    ),
-    "decision": _Measure("decision, median [ms]", lambda r: 1e3 * r["times"]["total"]["median"], wall_time=True),
-    "training": _Measure("training [s]", lambda r: r["times"]["training"], wall_time=True),
-}
+_DRAWN = ("rmse", "failed", "decision")  # a figure each
+_SHORT = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
+_PARTS = ("q25", "median", "q75")
+_MOST_LINES = 8  # in a figure; what is varied besides is pooled
+_LEGEND = "Median [first to third quartile] over the seeds. In figures, every run is a dot."
 
 
-@dataclass(frozen=True)
-class Run:
-    """One run of a tree."""
+def report_document(
+    report: Report,
+    comparison: Sequence[str] = (),
+    folder: Path | None = None,
+    images: Mapping[str, bytes] | None = None,
+) -> Document:
+    """Returns everything that is written of a report; what is zero everywhere is left out of the LaTeX table.
 
-    folder: Path  #: where it is
-    choices: Choices  #: what was asked for, by key
-    settings: Mapping[str, Any]  #: all of them, by dotted key
-    numbers: Mapping[str, float | None] = field(default_factory=dict)  #: by measure; empty where the run failed
-    unit: str = ""  #: of its errors
-    lost: str | None = None  #: since when and why the flight was lost; None where it was not
-    error: str | None = None  #: why the run failed; None where it did not
-    #: what made it: "date", "commit" and "machine", where it says so
-    origin: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass
-class Cell:
-    """All runs of one combination."""
-
-    values: tuple[str, ...]  #: of the varied settings, in the order of ``Report.variables``
-    runs: dict[str, Run] = field(default_factory=dict)  #: those that finished, by seed
-    failed: dict[str, Run] = field(default_factory=dict)  #: those that failed, by seed
-    missing: tuple[str, ...] = ()  #: seeds asked for of which there is nothing
-    skipped: tuple[str, ...] = ()  #: seeds asked for of which there is something that cannot be read
-
-    def numbers(self, measure: str) -> list[float]:
-        """Returns one measure of all runs that have it, by seed."""
-        return [value for run in self.runs.values() if (value := run.numbers[measure]) is not None]
-
-    @property
-    def lost(self) -> list[Run]:
-        """Runs that finished, and whose flight was lost."""
-        return [run for run in self.runs.values() if run.lost is not None]
-
-
-@dataclass(frozen=True)
-class Report:
-    """A tree of runs."""
-
-    tree: Path  #: where it is
-    variables: tuple[str, ...]  #: settings that were varied, without the seed
-    constants: Choices  #: what was asked for of all runs alike
-    cells: tuple[Cell, ...]  #: in the order of their values
-    skipped: tuple[str, ...] = ()  #: what could not be read of it, with the reason, one line each
-
-    @property
-    def runs(self) -> list[Run]:
-        """Every run that finished or failed, cell by cell."""
-        return [run for cell in self.cells for run in (*cell.runs.values(), *cell.failed.values())]
-
-    def measures(self) -> list[str]:
-        """Returns those of which any run has a number."""
-        return [name for name in MEASURES if any(cell.numbers(name) for cell in self.cells)]
-
-    def label(self, measure: str) -> str:
-        """Returns a measure's name with its unit; with both units where the runs are of both subsystems."""
-        units = {run.unit for cell in self.cells for run in cell.runs.values()}
-        return MEASURES[measure].label.format(unit=" or ".join(sorted(units)) or "m")
-
-    def base_settings(self) -> list[str]:
-        """Returns the settings that all runs share, one ``key: value`` each."""
-        first, *others = self.runs
-        shared = (item for item in first.settings.items() if all(item in run.settings.items() for run in others))
-        return [plain_text(f"{key}: {json.dumps(value)}") for key, value in shared]
-
-    def commands(self) -> list[str]:
-        """Returns the commands that fill the cells in which runs are missing or failed, one a cell.
-
-        Skipped runs are not among them: a run is not flown over what lies in its folder.
-        """
-        commands = []
-        for cell in self.cells:
-            if seeds := sorted([*cell.missing, *cell.failed], key=in_order):
-                chosen = [*self.constants.items(), *zip(self.variables, cell.values, strict=True)]
-                settings = _spelled({key: value for key, value in chosen if value != "default"})
-                sweep = [f"{SEED}={','.join(seeds)}", f"folder={self.tree}"]
-                commands.append(plain_text(shlex.join(["gpmpc", "run", "-m", *settings, *sweep])))
-        return commands
-
-
-def read_report(tree: str | Path) -> Report:
-    """Reads every run below a folder and puts them together.
-
-    Raises:
-        DataError: There is no such folder, or no run in it that can be read.
+    Args:
+        report: All runs.
+        comparison: Lines about two groups of them.
+        folder: Where it goes, for the links to the runs; by default ``report`` in the tree.
+        images: Figures by file name; by default they are drawn.
     """
-    tree = Path(tree)
-    runs, plans, unread, skipped = _read(tree)
-    keys = list(dict.fromkeys([*(key for chosen in [*(run.choices for run in runs), *plans] for key in chosen), SEED]))
-    filled = [{key: run.choices.get(key) or _setting(run.settings, key) for key in keys} for run in runs]
-    found = {frozenset(run.choices.items()): choices for run, choices in zip(runs, filled, strict=True)}
-    planned = [found.get(frozenset(plan.items())) or _as_others(plan, keys, runs) for plan in plans]
-    values = {key: {choices[key] for choices in [*filled, *planned]} for key in keys if key != SEED}
-    varied = tuple(sorted(key for key in values if len(values[key]) > 1))
-    cells: dict[tuple[str, ...], Cell] = {}
-
-    def cell_of(choices: Choices) -> Cell:
-        where = tuple(choices[key] for key in varied)
-        return cells.setdefault(where, Cell(where))
-
-    for choices, run in sorted(zip(filled, runs, strict=True), key=lambda pair: in_order(pair[0][SEED])):
-        cell = cell_of(choices)
-        (cell.runs if run.error is None else cell.failed)[choices[SEED]] = run
-    for choices, plan in sorted(zip(planned, plans, strict=True), key=lambda pair: in_order(pair[0][SEED])):
-        cell, seed = cell_of(choices), choices[SEED]
-        kind = "skipped" if folder_name(_spelled(plan)) in unread else "missing"
-        if seed not in (*cell.runs, *cell.failed, *cell.skipped, *cell.missing):
-            setattr(cell, kind, (*getattr(cell, kind), seed))
-    rows = sorted(cells, key=lambda values: [in_order(value) for value in values])
-    single = {key: value for key, those in values.items() if len(those) == 1 for value in those if value != "default"}
-    return Report(tree, varied, single, tuple(cells[row] for row in rows), tuple(skipped))
+    constants = ", ".join(f"{key}={value}" for key, value in report.constants.items())
+    lists = {"Comparison": list(comparison), **notes(report), "Made": _made(report)}
+    code = {"To fill the gaps": report.commands(), "Settings of all runs": report.base_settings()}
+    start = (folder or report.tree / "report").resolve()
+    return Document(
+        plain_text(report.tree.resolve().name),
+        [_table(report, report.measures())],
+        _numbers(report),
+        lead=f"{_counts(report)}." + (f" All of them: {constants}." if constants else ""),
+        notes=[_LEGEND],
+        lists={heading: items for heading, items in lists.items() if items},
+        code={heading: lines for heading, lines in code.items() if lines},
+        images=_figures(report) if images is None else images,
+        links={
+            plain_text(str(run.folder.relative_to(report.tree))): os.path.relpath(run.folder.resolve(), start)
+            for run in report.runs
+        },
+        latex=[_table(report, _telling(report))],
+    )
 
 
-def in_order(value: str) -> tuple[int, float, str]:
-    """Returns a key that sorts numbers by their size, then words."""
-    try:
-        return 0, float(value), value
-    except ValueError:
-        return 1, 0.0, value
+def _made(report: Report) -> list[str]:
+    """Returns when, from which source and on which machines the runs were made."""
+
+    def every(key: str) -> list[str]:
+        return sorted({run.origin[key] for run in report.runs if key in run.origin})
+
+    dates = " to ".join(dict.fromkeys([*every("date")[:1], *every("date")[-1:]]))
+    shown = {"Runs made": dates, "Commit": "; ".join(every("commit")), "Machine": "; ".join(every("machine"))}
+    shown |= {"Report made": now(), "Tree": str(report.tree.resolve())}
+    return [f"{key}: {plain_text(value)}" for key, value in shown.items() if value]
 
 
-def _read(tree: Path) -> tuple[list[Run], list[Choices], set[str], list[str]]:
-    """Returns every run, finished or failed, what sweeps asked for, names of unread folders, and the reasons."""
-    if not tree.is_dir():
-        raise DataError(f"{tree}: no such folder")
-    results = {path.parent: path for name in (ERROR, METRICS) for path in sorted(tree.rglob(name))}
-    runs, plans, unread, skipped = [], [], set(), []
-    for path in [*results.values(), *sorted(tree.rglob(f"{PLAN}*.json"))]:
-        planned = path.name.startswith(PLAN)
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-            if planned:
-                plans += [_parsed(choices) for choices in content["runs"]]
-            else:
-                runs.append(_run(path, content))
-        except _DAMAGE as error:
-            lacking = f"it lacks {error}; of an older version?"
-            reason = lacking if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
-            skipped.append(plain_text(f"{path}: is not what a {'sweep' if planned else 'run'} writes: {reason}"))
-            unread.add(path.parent.name)
-    if not runs:
-        raise DataError(skipped[0] if skipped else f"{tree}: holds no run, finished or failed")
-    return runs, plans, unread, skipped
+def _counts(report: Report) -> str:
+    """Returns how many runs there are, by how they ended."""
+    finished, lost, failed, missing = (
+        sum(len(getattr(cell, kind)) for cell in report.cells) for kind in ("runs", "lost", "failed", "missing")
+    )
+    text = f"{finished} finished in {len(report.cells)} cells, {failed} failed, {missing} missing"
+    text += f", {len(report.skipped)} skipped" if report.skipped else ""
+    return text + (f"; of those finished, {lost} lost" if lost else "")
 
 
-def _run(path: Path, content: Mapping[str, Any]) -> Run:
-    choices, settings, origin = _parsed(content["choices"]), content["settings"], _origin(content)
-    if not isinstance(settings, Mapping) or not isinstance(settings.get("options", {}), Mapping):
-        raise TypeError("settings and their options are not by name")
-    settings = flattened(settings)
-    if path.name == ERROR:
-        return Run(path.parent, choices, settings, error=plain_text(content["error"]), origin=origin)
-    numbers, lost = {name: _number(name, content) for name in MEASURES}, content.get("lost")
-    if lost:
-        lost = plain_text(", ".join(f"{k} {v}" for k, v in lost.items()) if isinstance(lost, Mapping) else str(lost))
-    return Run(path.parent, choices, settings, numbers, plain_text(content["unit"]), lost or None, origin=origin)
+def terminal_table(report: Report) -> Table:
+    """Returns the table with short headers: median, and the quartiles below it; what is zero everywhere is left out."""
+    shown = {name: short for name, short in _SHORT.items() if name in _telling(report)}
+    units = (report.label(name).rpartition(" [")[2] for name in shown)
+    header = [name.replace(".", ".\n") for name in report.variables or ("runs",)]
+    header += ["seeds", *(f"{short}\n[{unit}" for short, unit in zip(shown.values(), units, strict=True))]
+    return Table(header, _table(report, shown).rows, _counts(report))
 
 
-def _number(name: str, content: Mapping[str, Any]) -> float | None:
-    try:
-        value = MEASURES[name].of(content)
-    except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise ValueError(f"{name}: {error}") from error
-    if value is not None and (type(value) not in (int, float) or not math.isfinite(value)):
-        raise ValueError(f"{name}: must be a finite number; got {value!r:.80}")
-    return None if value is None else float(value)
+def notes(report: Report) -> dict[str, list[str]]:
+    """Returns what has to be known of single runs, by kind: their folders and the reasons."""
+    found = {
+        "Failed": [(run.folder.name, run.error) for cell in report.cells for run in cell.failed.values()],
+        "Lost": [(run.folder.name, run.lost) for cell in report.cells for run in cell.lost],
+    }
+    each = {kind: [f"{plain_text(folder)}: {why}" for folder, why in runs] for kind, runs in found.items()}
+    return {kind: lines for kind, lines in (each | {"Skipped": list(report.skipped)}).items() if lines}
 
 
-def _origin(content: Mapping[str, Any]) -> dict[str, str]:
-    """Returns date, commit and machine of a run, as far as it tells them."""
-    about = content.get("provenance") or {}
-    git, machine, versions = about.get("git") or {}, about.get("machine") or {}, about.get("versions") or {}
-    commit = f"{git['commit'][:10]}{', changed' if git.get('dirty') else ''}" if git else versions.get("gpmpc")
-    named = {"date": about.get("created"), "commit": commit}
-    named["machine"] = ", ".join(f"{value} cores" if key == "cores" else str(value) for key, value in machine.items())
-    return {key: plain_text(str(value)) for key, value in named.items() if value}
+def _table(report: Report, measures: Iterable[str]) -> Table:
+    rows, header = [], [*(report.variables or ("runs",)), "seeds"]
+    for cell in report.cells:
+        named = {"lost": cell.lost, "failed": cell.failed, "missing": cell.missing, "skipped": cell.skipped}
+        seeds = [str(len(cell.runs)), *(f"{len(group)} {word}" for word, group in named.items() if group)]
+        quartiles = [_quartiles(cell.numbers(name)) for name in measures]
+        texts = [MISSING if of is None else with_range(*of) for of in quartiles]
+        rows.append([*(cell.values if report.variables else ("all",)), "\n".join(seeds), *texts])
+    return Table([*header, *map(report.label, measures)], rows)
 
 
-def _parsed(choices: Any) -> Choices:
-    """Returns choices, ``key=value`` each, by key."""
-    if not isinstance(choices, list):
-        raise TypeError(f"choices must be a list; got {choices!r:.80}")
-    return {key: value for key, _, value in (plain_text(choice).partition("=") for choice in choices)}
+def _numbers(report: Report) -> pd.DataFrame:
+    rows = []
+    for cell in report.cells:
+        row: dict[str, Any] = dict(zip(report.variables, cell.values, strict=True))
+        for word in ("finished", "lost", "failed", "missing", "skipped"):
+            row[word] = len(cell.runs if word == "finished" else getattr(cell, word))
+        for measure in report.measures():
+            unit, quartiles = report.label(measure).rpartition(" [")[2], _quartiles(cell.numbers(measure)) or [None] * 3
+            row |= dict(zip((f"{measure}_{part} [{unit}" for part in _PARTS), quartiles, strict=True))
+        rows.append(row)
+    return pd.DataFrame(rows, dtype=object)
 
 
-def _spelled(choices: Choices) -> list[str]:
-    return [f"{key}={value}" if value else key for key, value in choices.items()]
+def _quartiles(values: Sequence[float]) -> list[float] | None:
+    return np.quantile(values, [0.25, 0.5, 0.75]).tolist() if values else None
 
 
-def _as_others(choices: Choices, keys: Iterable[str], runs: Sequence[Run]) -> Choices:
-    """Fills up the choices of a run that is not there from the most alike run that did not choose a key either."""
-    filled = {}
-    for key in keys:
-        others = [run for run in runs if key not in run.choices]
-        alike = max(others, key=lambda run: len(choices.items() & run.choices.items()), default=None)
-        filled[key] = choices.get(key) or ("default" if alike is None else _setting(alike.settings, key))
-    return filled
+def _telling(report: Report) -> list[str]:
+    """Returns the measures that are not zero everywhere."""
+    return [name for name in report.measures() if any(any(cell.numbers(name)) for cell in report.cells)]
 
 
-def _setting(settings: Mapping[str, Any], key: str) -> str:
-    """Returns the value that a run had which did not choose; "default" where the settings do not tell."""
-    value = settings.get(f"options.{key}")
-    value = settings.get(key, "default") if value is None else value
-    if isinstance(value, bool) or value is None:
-        return json.dumps(value)
-    return plain_text(str(value)) if isinstance(value, int | float | str) else "default"
+def _figures(report: Report) -> dict[str, bytes]:
+    """Draws one figure (PNG) a varied setting and measure, by file name."""
+    drawn: dict[str, bytes] = {}
+    for index, variable in enumerate(report.variables):
+        positions = sorted({cell.values[index] for cell in report.cells}, key=in_order)
+        lines = _lines(report, index)
+        for name in (name for name in _DRAWN if name in _telling(report)):
+            series = []
+            for label, cells in lines.items():
+                at: dict[str, list[float]] = {position: [] for position in positions}
+                for cell in cells:
+                    at[cell.values[index]] += cell.numbers(name)
+                series.append(Series(figure_label(label), [*at.values()]))
+            title, label, *ticks = map(figure_label, (variable, report.label(name), *positions))
+            figure = over_variable(title, ticks, label, series, MEASURES[name].logarithmic)
+            file = re.sub(r"[^\w.+-]", "-", f"{name}-over-{variable}"[:LONGEST_NAME], flags=re.ASCII)
+            drawn[f"{file}.png" if f"{file}.png" not in drawn else f"{file}-{index}.png"] = png(figure)
+    return drawn
+
+
+def _lines(report: Report, index: int) -> dict[str, list[Cell]]:
+    """Groups cells by what else was varied; by one setting only where all together were too many lines."""
+    others = [i for i in range(len(report.variables)) if i != index]
+    distinct = {i: {cell.values[i] for cell in report.cells} for i in others}
+    while len({tuple(cell.values[i] for i in others) for cell in report.cells}) > _MOST_LINES:
+        others.remove(max(others, key=lambda i: len(distinct[i])))
+    lines: dict[str, list[Cell]] = {}
+    for cell in report.cells:
+        label = ", ".join(f"{report.variables[i]}={cell.values[i]}" for i in others)
+        lines.setdefault(label or "all", []).append(cell)
+    return lines

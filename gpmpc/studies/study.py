@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -73,25 +73,20 @@ class TrialStore:
     def __init__(self, path: Path):
         self.path = path
         self.records: dict[str, dict] = {}
-        if path.exists():
-            text = path.read_text(encoding="utf-8", errors="replace")
-            for line in text.splitlines():
-                try:
-                    entry = json.loads(line)
-                    self.records[entry["fingerprint"]] = entry["record"]
-                except (ValueError, KeyError, TypeError):
-                    continue
-            if text and not text.endswith("\n"):
-                with path.open("a", encoding="utf-8") as file:
-                    file.write("\n")
+        text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+        for line in text.splitlines():
+            with suppress(ValueError, KeyError, TypeError):
+                entry = json.loads(line)
+                self.records[entry["fingerprint"]] = entry["record"]
+        self._separator = "\n" if text and not text.endswith("\n") else ""  # behind a line that was cut short
 
     def append(self, fingerprint: str, record: dict) -> None:
         """Keeps a record; it is on the disk when this returns."""
         with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"fingerprint": fingerprint, "record": record}) + "\n")
+            file.write(self._separator + json.dumps({"fingerprint": fingerprint, "record": record}) + "\n")
             file.flush()
             os.fsync(file.fileno())
-        self.records[fingerprint] = record
+        self._separator, self.records[fingerprint] = "", record
 
 
 def run_study(

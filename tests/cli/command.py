@@ -17,7 +17,7 @@ IMPORTED = [
     "gpmpc.recording",
 ]
 IMPORTED += ["gpmpc.cli._sweep", "gpmpc.experiments.figures", "gpmpc.experiments.tables"]
-IMPORTED += ["gpmpc.studies.report_document", "gpmpc.studies.flight", "gpmpc.plotting._recorded"]
+IMPORTED += ["gpmpc.studies.report", "gpmpc.studies.flight", "gpmpc.plotting._recorded"]
 SECONDS = 300  # a command may take
 
 _copies = multiprocessing.get_context("forkserver")

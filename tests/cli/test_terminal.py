@@ -44,7 +44,7 @@ def test_a_standard_output_that_takes_nothing_ends_the_command_in_one_line(comma
 
 
 def test_closed_streams_and_those_of_other_letters_do_no_harm(tmp_path):
-    assert shell("$GPMPC run --cfg job >&-", tmp_path).returncode == 0
+    assert shell("$GPMPC run --cfg >&-", tmp_path).returncode == 0
     assert shell("$GPMPC run nope=1 2>&-", tmp_path).returncode == 2
     for code in ("ascii", "latin-1", "utf-8"):
         done = shell("$GPMPC report $'n\\xc3\\xb6\\xe2\\x82\\xac\\xff'", tmp_path, PYTHONIOENCODING=code)
@@ -239,7 +239,7 @@ class Terminal:
         (["completion", "nosh"], "invalid choice: 'nosh'"),
         (["help", "rnu"], "unknown command 'rnu' (did you mean 'run'?)"),
         (["tables", "-m", "draws=1,2"], "unknown option '-m'"),
-        (["run", "-m", "--cfg", "job", "seed=1,2"], "--cfg: shows the settings of one run; leave out -m"),
+        (["run", "-m", "--cfg", "seed=1,2"], "--cfg: shows the settings of one run; leave out -m"),
         (["run", "tolerence=1"], "(did you mean 'model.tolerance' or 'controller.tolerance'"),
         (["run", "controller.problem.cost.q=1"], "(did you mean 'controller.problem.cost.Q'?)"),
         (["run", "--experimental-rerun", "x"], "unknown option '--experimental-rerun'"),

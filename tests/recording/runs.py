@@ -65,7 +65,7 @@ def recorder(path, **settings):
         "pose": POSE,
     } | settings
     of_system = {
-        key: given.pop(key) for key in ("time_step", "units", "input_bounds", "pose", "frame", "z_down") if key in given
+        key: given.pop(key) for key in ("time_step", "units", "input_bounds", "pose", "z_down") if key in given
     }
     system = RecordedSystem(STATES, INPUTS, **of_system)
     return McapRecorder(path, system, **({"config": {"seed": 7}, "metadata": {"seed": 7}} | given))

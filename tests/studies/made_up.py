@@ -9,7 +9,7 @@ from gpmpc.mpc.problem import Box
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
 from gpmpc.studies.flight import Experiment, Flown, metrics
-from gpmpc.studies.report_document import report_document
+from gpmpc.studies.report import report_document
 from gpmpc.studies.run_folder import PLAN, RunFolder, folder_name, record
 from gpmpc.systems import translational
 

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from gpmpc.exceptions import DataError
-from gpmpc.studies.comparison import compare, sentences
+from gpmpc.studies.report import compare, sentences
 from gpmpc.studies.report import read_report as report
 from tests.studies.made_up import made_up_run, metrics_of
 

@@ -3,7 +3,7 @@
 import pytest
 
 from gpmpc.studies.report import read_report as report
-from gpmpc.studies.report_document import terminal_table
+from gpmpc.studies.report import terminal_table
 from tests.studies.made_up import documents, made_up_run, metrics_of
 
 SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}

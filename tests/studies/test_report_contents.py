@@ -8,10 +8,9 @@ import re
 import pytest
 from rich.console import Console
 
-from gpmpc.studies.comparison import compare, sentences
 from gpmpc.studies.document import terminal
+from gpmpc.studies.report import compare, report_document, sentences, terminal_table
 from gpmpc.studies.report import read_report as report
-from gpmpc.studies.report_document import report_document, terminal_table
 from gpmpc.studies.run_folder import ERROR, METRICS, folder_name
 from tests.studies.made_up import SETTINGS, add, chosen, documents, made_up_run, metrics_of, plan
 

@@ -4,11 +4,11 @@ import contextlib
 import json
 import sys
 import types
+from importlib.util import find_spec
 
 import pytest
 
-from gpmpc.exceptions import SettingError
-from gpmpc.studies.tracking import check_tracker, log_to_mlflow
+from gpmpc.cli._tracking import log_to_mlflow
 from tests.cli.command import forked
 
 TINY = ["steps=3", "data.samples=25", "model.restarts=0", "tracker=mlflow"]
@@ -53,12 +53,14 @@ def test_settings_become_parameters_numbers_metrics_and_files_artifacts(monkeypa
     assert store.seen["artifacts"] == str(tmp_path)
 
 
-def test_a_tracker_that_is_unknown_or_not_installed_is_named_before_anything_flies(monkeypatch):
-    with pytest.raises(SettingError, match="tracker: must be 'mlflow' or 'none'; got 'comet'"):
-        check_tracker("comet")
-    monkeypatch.setattr("gpmpc.studies.tracking.find_spec", lambda name: None)
-    with pytest.raises(SettingError, match="tracker: needs MLflow: pip install mlflow"):
-        check_tracker("mlflow")
+def test_a_tracker_that_is_unknown_or_not_installed_is_named_before_anything_flies(tmp_path):
+    wrong = [("comet", "tracker: must be 'mlflow' or 'none'; got 'comet'")]
+    if find_spec("mlflow") is None:
+        wrong.append(("mlflow", "tracker: needs MLflow: pip install mlflow"))
+    for tracker, message in wrong:
+        done = forked("run", f"tracker={tracker}", cwd=tmp_path)
+        assert (done.returncode, done.stderr) == (2, f"gpmpc: {message}\n")
+        assert not list(tmp_path.iterdir())
 
 
 def test_a_run_is_found_in_mlflow_with_its_numbers_and_files(tmp_path):

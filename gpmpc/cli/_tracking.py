@@ -4,22 +4,12 @@ import math
 import os
 import re
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from gpmpc.exceptions import SettingError
 from gpmpc.provenance import flattened
 
 _LONGEST = 6000  # characters of a parameter that MLflow takes
-
-
-def check_tracker(tracker: str | None) -> None:
-    """Raises ``SettingError`` unless a tracker is known and installed."""
-    if tracker not in (None, "none", "mlflow"):
-        raise SettingError("tracker", f"must be 'mlflow' or 'none'; got {tracker!r}")
-    if tracker == "mlflow" and find_spec("mlflow") is None:
-        raise SettingError("tracker", "needs MLflow: pip install mlflow")
 
 
 def log_to_mlflow(folder: Path, result: Mapping[str, Any]) -> None:

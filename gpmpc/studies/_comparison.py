@@ -17,7 +17,7 @@ import pandas as pd
 from scipy import stats
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.studies.report import MEASURES, SEED, Report, in_order
+from gpmpc.studies._runs import MEASURES, SEED, Report, in_order
 
 _LEVEL = 0.05
 _FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
@@ -69,14 +69,11 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         raise SettingError("compare", "errors in m and in rad have no common mean; add subsystem=... to both groups")
     comparisons = []
     for measure in (name for name in report.measures() if not MEASURES[name].wall_time):
-        first, second = (
-            pd.DataFrame.from_dict(
-                {others: {seed: run.numbers[measure] for seed, run in runs.items()} for others, runs in group.items()},
-                orient="index",
-                dtype=float,
-            )
+        numbers = (
+            {others: {seed: run.numbers[measure] for seed, run in runs.items()} for others, runs in group.items()}
             for group in groups
         )
+        first, second = (pd.DataFrame.from_dict(each, orient="index", dtype=float) for each in numbers)
         first, second = first.align(second)  # a row a combination of the other settings, a column a seed
         left_out, both = [], first.notna() & second.notna()
         while both.size and not both.to_numpy().all():  # what lacks the largest share of its runs is left out
@@ -84,11 +81,10 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
             axis = int(lacking[1].max() >= lacking[0].max())
             left_out.append(lacking[axis].idxmax())
             both = both.drop(left_out[-1], axis=axis)
-        pairs = [side.loc[both.index, both.columns].mean(axis=0).to_numpy() for side in (first, second)]
-        if len(pairs[0]) >= 2:
+        a_mean, b_mean = (side.loc[both.index, both.columns].mean(axis=0).to_numpy() for side in (first, second))
+        if len(a_mean) >= 2:
             seeds = sorted((n for n in left_out if n.startswith(f"{SEED}=")), key=lambda name: in_order(name[5:]))
-            names = (*(n for n in left_out if n not in seeds), *seeds)
-            comparisons.append(_test(measure, pairs[0], pairs[1], names))
+            comparisons.append(_test(measure, a_mean, b_mean, (*(n for n in left_out if n not in seeds), *seeds)))
     if not comparisons:
         raise DataError(f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common")
     return comparisons
@@ -119,28 +115,22 @@ def _test(measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...])
     """Compares paired values (n,)."""
     d = a - b
     signed = stats.rankdata(np.abs(d[d != 0])) * np.sign(d[d != 0])
-    if np.ptp(d):
-        t, wilcoxon = stats.ttest_rel(a, b), float(stats.wilcoxon(d).pvalue)
-        mean, interval, t_test, standardised = (
-            d.mean(),
-            t.confidence_interval(),
-            t.pvalue,
-            t.statistic / np.sqrt(len(d)),
-        )
-    else:  # not even by rounding
-        mean, interval, wilcoxon, t_test = d[0], (d[0], d[0]), np.nan, np.nan
-        standardised = np.copysign(np.inf, mean) if mean else 0.0
+    mean, interval, wilcoxon, t_test = d[0], (d[0], d[0]), np.nan, np.nan
+    standardised = np.copysign(np.inf, mean) if mean else 0.0
+    if np.ptp(d):  # else all are equal, and so is their mean without rounding
+        t, mean, wilcoxon = stats.ttest_rel(a, b), d.mean(), stats.wilcoxon(d).pvalue
+        interval, t_test, standardised = tuple(t.confidence_interval()), t.pvalue, t.statistic / np.sqrt(len(d))
     return Comparison(
         measure=measure,
         medians=(float(np.median(a)), float(np.median(b))),
-        quartiles=tuple(np.quantile(d, [0.25, 0.5, 0.75]).tolist()),
-        means=(float(a.mean()), float(b.mean())),
-        difference=float(mean),
-        interval=(float(interval[0]), float(interval[1])),
+        quartiles=tuple(np.quantile(d, [0.25, 0.5, 0.75])),
+        means=(a.mean(), b.mean()),
+        difference=mean,
+        interval=interval,
         wilcoxon=wilcoxon,
-        t_test=float(t_test),
-        rank_biserial=float(signed.sum() / np.abs(signed).sum()) if len(signed) else 0.0,
-        standardised=float(standardised),
+        t_test=t_test,
+        rank_biserial=signed.sum() / np.abs(signed).sum() if len(signed) else 0.0,
+        standardised=standardised,
         pairs=len(d),
         left_out=left_out,
     )
@@ -149,22 +139,18 @@ def _test(measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...])
 def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str) -> list[str]:
     """Returns a line a measure, with everything that a reader needs to doubt it."""
     head = f"A: {a}; B: {b}; pairs are seeds, what else was varied is averaged within a seed. Times are not compared."
-    everywhere = set.intersection(*(set(c.left_out) for c in comparisons))
+    everywhere = [name for name in comparisons[0].left_out if all(name in c.left_out for c in comparisons)]
     if everywhere:
-        names = "; ".join(name for name in comparisons[0].left_out if name in everywhere)
-        head += f" Left out, since A or B lacks runs of it: {names}."
+        head += f" Left out, since A or B lacks runs of it: {'; '.join(everywhere)}."
     lines = [head]
     for c in comparisons:
-        others = "; ".join(name for name in c.left_out if name not in everywhere)
         low, median, high = c.quartiles
-        tests = (
-            f"; Wilcoxon signed-rank p = {c.wilcoxon:.3g}, rank-biserial {c.rank_biserial:.2f}; mean difference "
-            f"{c.difference:.3g} (95 %: {c.interval[0]:.3g} to {c.interval[1]:.3g}), paired t-test p = {c.t_test:.3g}, "
-            f"d_z {c.standardised:.2f}"
-        )
-        lines.append(
-            f"{report.label(c.measure)}: {c.verdict}. Medians {c.medians[0]:.4g} and {c.medians[1]:.4g}; differences "
-            f"{median:.3g} [{low:.3g}, {high:.3g}]{tests if c.interval[0] != c.interval[1] else ''}; n = {c.pairs}"
-            + (f"; left out as well: {others}" if others else "")
-        )
+        line = f"{report.label(c.measure)}: {c.verdict}. Medians {c.medians[0]:.4g} and {c.medians[1]:.4g}; "
+        line += f"differences {median:.3g} [{low:.3g}, {high:.3g}]"
+        if c.interval[0] != c.interval[1]:
+            line += f"; Wilcoxon signed-rank p = {c.wilcoxon:.3g}, rank-biserial {c.rank_biserial:.2f}; mean "
+            line += f"difference {c.difference:.3g} (95 %: {c.interval[0]:.3g} to {c.interval[1]:.3g}), "
+            line += f"paired t-test p = {c.t_test:.3g}, d_z {c.standardised:.2f}"
+        others = "; ".join(name for name in c.left_out if name not in everywhere)
+        lines.append(f"{line}; n = {c.pairs}" + (f"; left out as well: {others}" if others else ""))
     return lines
