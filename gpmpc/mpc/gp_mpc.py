@@ -132,6 +132,7 @@ class GPMPC:
         """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
         guess, solution = prediction.plan, None if request.previous is None else request.previous.solution
         search = Globalization(self.prediction, request, self.tolerance) if self.iterations > 1 else None
+        program: Any = None
         solved_at, status, count = None, None, 0
         while status is None and count < self.iterations:
             clock.lap("model")
@@ -159,10 +160,11 @@ class GPMPC:
         if not (status.solved or suboptimal):
             return replace(request.failed_decision(status, count, clock.timing), problem=program, solution=solution)
         plan, disturbance = prediction.plan, request.disturbance if self.prediction.settings.disturbance_gain else None
-        inputs, beliefs = plan.inputs.copy(), self.prediction.linearizer.moments(plan.states, prediction.covariances)
+        inputs = plan.inputs.copy()
+        means, covariances = self.prediction.linearizer.moments(plan.states, prediction.covariances)
         novelty = call_unchecked(_largest_ratio, prediction.stages.V, self._prior)
-        found = program, solution, disturbance, suboptimal, novelty
-        return Decision(inputs[0], inputs, *beliefs, status, count, clock.timing, *found)
+        solved = status, count, clock.timing, program, solution, disturbance, suboptimal, novelty
+        return Decision(inputs[0], inputs, means, covariances, *solved)
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
         """Returns the controller for another model of as many states and inputs, in microseconds."""
