@@ -2,7 +2,6 @@
 
     .venv/bin/python -m benchmarks.qp                      # every cell of the table, about ten minutes
     .venv/bin/python -m benchmarks.qp --horizons 50 --modes changing --slow-solvers 0
-    .venv/bin/python -m benchmarks.qp --rows 6,3           # also with bounds on the positions only
 
 All solvers solve one sequence of QPs in one process on one thread, each warm-started from its own last solution:
 ``constant`` and ``changing`` are those of ``quadrotor_sequences``, ``elliptical`` and ``lorenz`` those of a learned
@@ -144,7 +143,7 @@ def active_rows(problem: SequenceProblem) -> int:
     return int(np.count_nonzero(solution.active_set))
 
 
-def measure_cell(horizon: int, mode: str, rows: int, settings: argparse.Namespace) -> dict:
+def measure_cell(horizon: int, mode: str, settings: argparse.Namespace) -> dict:
     """All solvers on one sequence."""
     changing = mode != "constant"
     closing = DualActiveSet()
@@ -155,7 +154,7 @@ def measure_cell(horizon: int, mode: str, rows: int, settings: argparse.Namespac
     if mode in TRAJECTORIES:
         problems = flight_sequence(mode, horizon, settings.length)
     else:
-        problems = list(quadrotor_sequence(horizon, changing, settings.length, close_loop, positions_only=rows == 3))
+        problems = list(quadrotor_sequence(horizon, changing, settings.length, close_loop))
     fast = {OURS: ours(changing), DAQP_WARM: daqp_warm(changing), DAQP_COLD: daqp_cold}
     slow = {PRIMAL: by_protocol(PrimalActiveSet()), CVXPY: by_protocol(CvxpySolver("CLARABEL", {}))}
     cell = {
@@ -163,7 +162,6 @@ def measure_cell(horizon: int, mode: str, rows: int, settings: argparse.Namespac
         "mode": mode,
         "n": 3 * horizon,
         "m": len(problems[0].G),
-        "rows a stage": len(problems[0].G) // horizon,
         "QPs": len(problems),
         "active rows": float(np.mean([active_rows(p) for p in problems])),
         "solvers": {},
@@ -219,15 +217,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--horizons", default="1,5,10,20,50", help="comma-separated")
     parser.add_argument("--modes", default="constant,changing,elliptical,lorenz", help="comma-separated")
-    parser.add_argument("--rows", default="6", help="bounded states a stage: 6 (positions, velocities), 3, or 6,3")
     parser.add_argument("--length", type=int, default=440, help="QPs per cell")
     parser.add_argument("--passes", type=int, default=3, help="turns of each solver")
     parser.add_argument("--slow-solvers", type=int, default=30, help="QPs for Algorithm 1 and CVXPY; 0 leaves them out")
     settings = parser.parse_args()
     cells = []
-    families = map(int, settings.rows.split(","))
-    for rows, mode, horizon in product(families, settings.modes.split(","), map(int, settings.horizons.split(","))):
-        cells.append(measure_cell(horizon, mode, rows, settings))
+    for mode, horizon in product(settings.modes.split(","), map(int, settings.horizons.split(","))):
+        cells.append(measure_cell(horizon, mode, settings))
         print(describe(cells[-1]), flush=True)
     write_results("qp", cells, unit="microseconds", numpy=np.__version__)
 

@@ -93,14 +93,8 @@ def _state_limits(times: Array) -> Array:
     return np.where(inside[:, None], NARROW, WIDE).ravel()
 
 
-def quadrotor_sequence(
-    horizon: int, changing: bool, length: int, solve, seed: int = 0, positions_only: bool = False
-) -> Iterator[SequenceProblem]:
-    """The QPs of ``length`` closed-loop steps; ``solve(problem) -> x`` closes the loop.
-
-    With ``positions_only`` the velocities are not bounded: three rows a stage instead of six.
-    """
-    bounded = slice(None, None, 2 if positions_only else 1)
+def quadrotor_sequence(horizon: int, changing: bool, length: int, solve, seed: int = 0) -> Iterator[SequenceProblem]:
+    """The QPs of ``length`` closed-loop steps; ``solve(problem) -> x`` closes the loop."""
     rng = np.random.default_rng(seed)
     weight = np.kron(np.eye(horizon), STATE_WEIGHT)
     box = np.tile(INPUT_LIMIT, horizon)
@@ -115,11 +109,11 @@ def quadrotor_sequence(
             P = 2.0 * (forced.T @ weight @ forced + np.kron(np.eye(horizon), INPUT_WEIGHT))
             prepared = 0.5 * (P + P.T), forced, 2.0 * forced.T @ weight
         P, forced, gradient = prepared
-        G = np.ascontiguousarray(forced[bounded])
+        G = np.ascontiguousarray(forced)
         times = now + TIME_STEP * np.arange(1, horizon + 1)
         drift = free @ state
         q = gradient @ (drift - _reference(times).ravel())
-        limits, offset = _state_limits(times)[bounded], drift[bounded]
+        limits, offset = _state_limits(times), drift
         feasible = G @ np.clip(np.concatenate([plan[3:], plan[-3:]]), -box, box)
         lower = np.concatenate([-box, np.minimum(-limits - offset, feasible - 0.01)])
         upper = np.concatenate([box, np.maximum(limits - offset, feasible + 0.01)])

@@ -3,7 +3,8 @@
     .venv/bin/python -m benchmarks.size
 
 *Lines* are all lines of ``gpmpc/**/*.py``. A *public name* is a function or class at the top level of a module, without
-an underscore at the beginning of its name or of a module's above it; constants are counted apart. *Arguments* are those
+an underscore at the beginning of its name or of a module's above it; constants are counted apart, and so are names that
+packages export from private modules. *Arguments* are those
 of functions and methods, ``self`` and ``cls`` apart. A *circle* is a set of modules, or of rooms, that import each
 other, wherever the import statement stands. ``tests/test_architecture.py`` holds the limits.
 """
@@ -24,6 +25,7 @@ def main() -> None:
     house = House(ROOT)
     print(f"lines of {PACKAGE}/: {house.lines}, files of mpc/: {house.mpc_files}")
     print(f"public names: {len(house.public_names)}, and constants: {len(house.public_constants)}")
+    print(f"names that packages export from private modules: {len(house.exported_names)}")
     print(f"\n{'room':16}{'lines':>8}{'files':>8}{'names':>8}{'constants':>11}")
     names, constants = (Counter(map(_room, found)) for found in (house.public_names, house.public_constants))
     for room, modules in sorted(house.rooms.items(), key=lambda item: -house.lines_of(item[1])):
@@ -103,8 +105,21 @@ class House:
             f"{module}.{name}"
             for module, tree in self.trees.items()
             for name in dict.fromkeys(names(tree.body))
-            if not any(part.startswith("_") for part in (*module.split("."), name))
+            if not _is_private(f"{module}.{name}")
         ]
+
+    @cached_property
+    def exported_names(self) -> list[str]:
+        """Dotted names of the functions and classes of private modules that public ones export by ``__all__``."""
+        found = []
+        for module, tree in self.trees.items():
+            if not _is_private(module):
+                exported = {node.value for part in tree.body if _assigns_all(part) for node in _strings(part)}
+                for part in (part for part in tree.body if isinstance(part, ast.ImportFrom)):
+                    source = self.trees.get(part.module or "") if _is_private(part.module or "") else None
+                    defined = {*_functions_and_classes(source.body)} if source else set()
+                    found += [f"{module}.{alias.name}" for alias in part.names if alias.name in defined & exported]
+        return found
 
     @cached_property
     def arguments(self) -> dict[str, int]:
@@ -159,6 +174,18 @@ class House:
 
 def _room(module: str) -> str:
     return module.split(".")[1] if "." in module else PACKAGE
+
+
+def _is_private(name: str) -> bool:
+    return any(part.startswith("_") for part in name.split("."))
+
+
+def _assigns_all(part: ast.stmt) -> bool:
+    return isinstance(part, ast.Assign) and any(isinstance(t, ast.Name) and t.id == "__all__" for t in part.targets)
+
+
+def _strings(part: ast.stmt) -> Iterator[ast.Constant]:
+    return (node for node in ast.walk(part) if isinstance(node, ast.Constant) and isinstance(node.value, str))
 
 
 def _functions_and_classes(body: list[ast.stmt]) -> Iterator[str]:

@@ -126,7 +126,7 @@ def evaluation(route: str, x, y, inducing: int):
     from benchmarks.gpytorch_likelihood import GPyTorchLikelihood
     from gpmpc.gp._kernel import Hyperparameters
     from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
-    from gpmpc.gp._sparse import collapsed_bound_with_gradient
+    from gpmpc.gp._sparse import collapsed_bound
 
     theta = np.append(np.linspace(0.5, 1.5, D), [0.5, np.log(30.0)])
     if route == EXACT:
@@ -137,7 +137,14 @@ def evaluation(route: str, x, y, inducing: int):
         return lambda: likelihood(theta)
     scales, sf2 = torch.from_numpy(np.exp(theta[None, :D])), torch.tensor([np.exp(1.0)], dtype=torch.float64)
     if route == SPARSE:
-        return lambda: collapsed_bound_with_gradient(x[:inducing], x, y, Hyperparameters(scales, sf2, sf2 / 900))
+        leaves = [part.requires_grad_() for part in (x[:inducing].clone(), scales, sf2.clone(), sf2 / 900)]
+
+        def bound():
+            value = collapsed_bound(leaves[0], x, y, Hyperparameters(*leaves[1:]))
+            value.sum().backward()
+            return value
+
+        return bound
     return gpytorch_sparse(x, y, inducing, scales, sf2)
 
 

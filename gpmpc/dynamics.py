@@ -101,14 +101,9 @@ def linearize_by_autograd(model: Any, states: Array, inputs: Array, covariance: 
         covariance: Whether the covariances are returned.
     """
     _log_slow(type(model).__name__)
-    x, u = tensors_for(model, states, inputs)
-
-    def prediction(x: Tensor, u: Tensor) -> tuple[Tensor, ...]:
-        belief = model.predict(x, u)
-        return (belief.mean, belief.covariance) if covariance else (belief.mean,)
-
-    (mean, *rest), (A, B) = batched_jacobian(prediction, (x, u))
-    return Linearized(to_array(mean), to_array(A), to_array(B), to_array(rest[0]) if rest else None)
+    belief, A, B = predict_by_autograd(model, *tensors_for(model, states, inputs))
+    V = to_array(belief.covariance) if covariance else None
+    return Linearized(to_array(belief.mean), to_array(A), to_array(B), V)
 
 
 @cache

@@ -75,10 +75,8 @@ def tracking_error(
 def _errors(states: np.ndarray, references: np.ndarray, axes: Sequence[int], angles: Sequence[int]) -> np.ndarray:
     """Differences on some axes (K + 1, j), those of angles in [-pi, pi)."""
     if np.ndim(states) != 2 or np.shape(states) != np.shape(references) or len(states) < 2:
-        raise ShapeError(
-            f"states and references must both be (K + 1, n), K of 1 or more; got {np.shape(states)} and "
-            f"{np.shape(references)}"
-        )
+        got = f"{np.shape(states)} and {np.shape(references)}"
+        raise ShapeError(f"states and references must both be (K + 1, n), K of 1 or more; got {got}")
     n = np.shape(states)[1]
     if not all(-n <= axis < n for axis in axes):
         raise ShapeError(f"axes must be states from 0 to {n - 1}; got {tuple(axes)}")

@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from scipy.integrate import RK45
+from scipy.integrate import RK45, OdeSolution
 from scipy.interpolate import PchipInterpolator
 
 from gpmpc.exceptions import SettingError, check_number, check_numbers
@@ -94,13 +94,12 @@ class Lorenz:
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., 3) [m] at times (...) [s]."""
-        lorenz_time, _ = self._lorenz_time(time)
-        return self._dense(lorenz_time) * np.array(self.scale)
+        return self._state(self._lorenz_time(time)[0]) * np.array(self.scale)
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
         """Velocities (..., 3) [m/s] at times (...) [s]; at a sample, that of the interval that begins there."""
         lorenz_time, speed = self._lorenz_time(time)
-        rate = np.moveaxis(self._derivative(0.0, np.moveaxis(self._dense(lorenz_time), -1, 0)), 0, -1)
+        rate = np.moveaxis(self._derivative(0.0, np.moveaxis(self._state(lorenz_time), -1, 0)), 0, -1)
         return rate * speed[..., None] * np.array(self.scale)
 
     def _derivative(self, _: float, state: np.ndarray) -> np.ndarray:
@@ -108,38 +107,35 @@ class Lorenz:
         return np.array([self.sigma * (y - x), x * (self.rho - z) - y, x * y - self.beta * z])
 
     @cached_property
-    def _integration(self) -> tuple[np.ndarray, list]:
-        """Lorenz times of the samples, and the dense output of every accepted step."""
-        steps = int(np.ceil(self.duration / self.sampling_time / self.samples_per_step))
+    def _path(self) -> OdeSolution:
+        """The dense output of every accepted step."""
         solver = RK45(self._derivative, 0.0, np.array(self.start), np.inf, rtol=self.relative_tolerance, atol=1e-6)
-        fractions = np.arange(1, self.samples_per_step + 1) / self.samples_per_step
-        times, pieces = [np.zeros(1)], []
-        for _ in range(steps):
+        ends, pieces = [0.0], []
+        for _ in range(int(np.ceil(self.duration / self.sampling_time / self.samples_per_step))):
             solver.step()
-            times.append(solver.t_old + fractions * (solver.t - solver.t_old))
+            ends.append(solver.t)
             pieces.append(solver.dense_output())
-        return np.concatenate(times), pieces
+        return OdeSolution(ends, pieces)
+
+    @cached_property
+    def _samples(self) -> np.ndarray:
+        """Lorenz times of the samples."""
+        ends, each = self._path.ts, self.samples_per_step
+        return np.interp(np.arange(each * (len(ends) - 1) + 1) / each, np.arange(len(ends)), ends)
+
+    def _state(self, lorenz_time: np.ndarray) -> np.ndarray:
+        return np.reshape([self._path(t) for t in np.ravel(lorenz_time)], (*np.shape(lorenz_time), 3))
 
     def _lorenz_time(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lorenz time at flight times, and its rate of change."""
         t = np.asarray(time, dtype=float)
         if np.any(t < 0) or np.any(t > self.duration):
-            got = f"{t.min():g} to {t.max():g}"
-            raise SettingError(
-                "duration", f"this Lorenz trajectory is defined from 0 to {self.duration:g} s; got {got} s"
-            )
-        samples, _ = self._integration
-        position = t / self.sampling_time
+            rule = f"this Lorenz trajectory is defined from 0 to {self.duration:g} s"
+            raise SettingError("duration", f"{rule}; got {t.min():g} to {t.max():g} s")
+        samples, position = self._samples, t / self.sampling_time
         index = np.minimum(position.astype(int), len(samples) - 2)
         spacing = samples[index + 1] - samples[index]
         return samples[index] + (position - index) * spacing, spacing / self.sampling_time
-
-    def _dense(self, lorenz_time: np.ndarray) -> np.ndarray:
-        samples, pieces = self._integration
-        ends = samples[self.samples_per_step :: self.samples_per_step]
-        piece = np.minimum(np.searchsorted(ends, lorenz_time), len(pieces) - 1)
-        state = [pieces[i](t) for i, t in zip(np.ravel(piece), np.ravel(lorenz_time), strict=True)]
-        return np.reshape(state, (*np.shape(lorenz_time), 3))
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ def test_the_elliptical_trajectory_is_the_papers():
 
 
 def test_lorenz_is_sampled_four_times_an_accepted_step_of_an_adaptive_integration():
-    times, _ = Lorenz()._integration
+    times = Lorenz()._samples
     spacing = np.diff(times)[:188].reshape(-1, 4)
     assert np.allclose(spacing, spacing[:, :1], rtol=1e-9)  # four equal parts of each step
     assert len(np.unique(spacing[:, 0].round(9))) > 20  # and the steps adapt

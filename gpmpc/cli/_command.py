@@ -125,7 +125,7 @@ def _with_settings(name: str, command: Command, given: argparse.Namespace) -> Re
     given.overrides = [choice for word in given.overrides for choice in model_file(word)]
     with settings(given.config_dir):
         if given.help:
-            print(help_text(command.settings, []))
+            print(help_text(command.settings))
             return Result()
         if swept and given.cfg:
             raise GpmpcError("--cfg: shows the settings of one run; leave out -m, and give each setting one value")

@@ -98,8 +98,8 @@ def group_options(name: str) -> dict[str, list[str]]:
     return found
 
 
-def help_text(name: str, overrides: Sequence[str] = ()) -> str:
+def help_text(name: str) -> str:
     """Returns what ``gpmpc COMMAND --help`` prints: how it is used, its choices, every setting with its value."""
     choices = "\n".join(f"{key}: {', '.join(options)}" for key, options in group_options(name).items())
-    every, header = OmegaConf.to_yaml(compose(name, overrides)), HydraConfig.get().help.header
+    every, header = OmegaConf.to_yaml(compose(name)), HydraConfig.get().help.header
     return f"{header}\n\nChoices:\n\n{choices}\n\nEvery setting, with its default:\n\n{every}"

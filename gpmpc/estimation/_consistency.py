@@ -21,19 +21,12 @@ from gpmpc.gaussian import Gaussian
 
 @dataclass(frozen=True)
 class Consistency:
-    """Normalised squared errors, and the band that their mean should lie in.
+    """Normalised squared errors, and the band that their mean should lie in."""
 
-    Attributes:
-        values: One an error (N,); errors without a finite entry are left out.
-        degrees: Degrees of freedom of each: how many entries were finite (N,).
-        band: Lower and upper limit of the mean, per degree of freedom, for independent errors.
-        level: Probability of the band.
-    """
-
-    values: np.ndarray
-    degrees: np.ndarray
-    band: tuple[float, float]
-    level: float
+    values: np.ndarray  #: one an error (N,); errors without a finite entry are left out
+    degrees: np.ndarray  #: degrees of freedom of each: how many entries were finite (N,)
+    band: tuple[float, float]  #: limits of the mean, per degree of freedom, for independent errors
+    level: float  #: probability of the band
 
     @property
     def mean(self) -> float:

@@ -22,19 +22,12 @@ from gpmpc.exceptions import DataError, ShapeError, check_number
 
 @dataclass(frozen=True)
 class DelayEstimate:
-    """An estimated delay.
+    """An estimated delay."""
 
-    Attributes:
-        steps: The delay with the largest correlation [steps].
-        interval: That holds the delay with the confidence asked for [steps].
-        delays: All that were tried (T,) [steps].
-        correlations: Of each (T,), from 0 to 1.
-    """
-
-    steps: float
-    interval: tuple[float, float]
-    delays: Array
-    correlations: Array
+    steps: float  #: the delay with the largest correlation [steps]
+    interval: tuple[float, float]  #: that holds the delay with the confidence asked for [steps]
+    delays: Array  #: all that were tried (T,) [steps]
+    correlations: Array  #: of each (T,), from 0 to 1
 
 
 def estimate_delay(

@@ -26,36 +26,22 @@ from gpmpc.propagation import Linearization, Propagator, Unscented
 
 @dataclass(frozen=True)
 class Update:
-    """A belief after a measurement, and by how much the measurement differed from what was expected.
+    """A belief after a measurement, and by how much the measurement differed from what was expected."""
 
-    Attributes:
-        belief: Over the state (*batch, n).
-        innovation: y - E[y] (*batch, p), NaN where nothing was measured.
-        covariance: Cov[y] + R of the innovation (*batch, p, p), all entries.
-    """
-
-    belief: Gaussian
-    innovation: Tensor
-    covariance: Tensor
+    belief: Gaussian  #: over the state (*batch, n)
+    innovation: Tensor  #: y - E[y] (*batch, p), NaN where nothing was measured
+    covariance: Tensor  #: Cov[y] + R of the innovation (*batch, p, p), all entries
 
 
 @dataclass(frozen=True)
 class FilterRun:
-    """A log of T steps, filtered; see ``KalmanFilter.run``.
+    """A log of T steps, filtered; see ``KalmanFilter.run``."""
 
-    Attributes:
-        predicted: Beliefs before the measurements (T + 1, n), (T + 1, n, n).
-        filtered: Beliefs after them.
-        cross_covariances: Cov[x_k, x_{k+1}] of the predictions (T, n, n).
-        innovations: (T + 1, p), NaN where nothing was measured.
-        innovation_covariances: (T + 1, p, p).
-    """
-
-    predicted: Gaussian
-    filtered: Gaussian
-    cross_covariances: Tensor
-    innovations: Tensor
-    innovation_covariances: Tensor
+    predicted: Gaussian  #: beliefs before the measurements (T + 1, n), (T + 1, n, n)
+    filtered: Gaussian  #: beliefs after them
+    cross_covariances: Tensor  #: Cov[x_k, x_{k+1}] of the predictions (T, n, n)
+    innovations: Tensor  #: (T + 1, p), NaN where nothing was measured
+    innovation_covariances: Tensor  #: (T + 1, p, p)
 
 
 class KalmanFilter:

@@ -25,19 +25,12 @@ from gpmpc.gp.transitions import Transitions, check_transitions
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """The noise of a process, an entry an output.
+    """The noise of a process, an entry an output."""
 
-    Attributes:
-        variance: sigma^2 of a step (k,).
-        correlation: rho, of the noise of a step with that of the next (k,); NaN where rows are in no order of time.
-        rows: How many rows it was estimated from.
-        effective: How many independent rows these are worth, N (1 - rho^2) / (1 + rho^2) (k,).
-    """
-
-    variance: Tensor
-    correlation: Tensor
-    rows: int
-    effective: Tensor
+    variance: Tensor  #: sigma^2 of a step (k,)
+    correlation: Tensor  #: rho, of the noise of a step with the next's (k,); NaN where rows are in no order of time
+    rows: int  #: how many rows it was estimated from
+    effective: Tensor  #: how many independent rows these are worth, N (1 - rho^2) / (1 + rho^2) (k,)
 
     @property
     def long_run_variance(self) -> Tensor:

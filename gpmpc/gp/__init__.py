@@ -6,7 +6,7 @@ from gpmpc.gp._online import SlidingWindow, append_points, append_transitions, r
 from gpmpc.gp._scaling import Scaling, centre, identity, min_max, standardize
 from gpmpc.gp._search import SoftLimits
 from gpmpc.gp._sparse import sparse_posterior
-from gpmpc.gp._sparse_training import SparseTrainer, SparseTraining, informative_points
+from gpmpc.gp._sparse_training import SparseTrainer, informative_points
 from gpmpc.gp._training import Trainer, Training, train
 from gpmpc.gp.backend import backend
 from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
@@ -22,7 +22,6 @@ __all__ = [
     "SlidingWindow",
     "SoftLimits",
     "SparseTrainer",
-    "SparseTraining",
     "Trainer",
     "Training",
     "Transitions",

@@ -11,7 +11,7 @@ points without a word, takes no leading batch dimensions of queries, and fails u
 
 import copy
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import gpytorch
 import torch
@@ -27,7 +27,7 @@ from gpmpc.dynamics import (
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
-from gpmpc.gp._sparse import sparse_posterior
+from gpmpc.gp._sparse import Method, sparse_posterior
 from gpmpc.gp.gpytorch_ import exact_inference, members
 from gpmpc.gp.posterior import GPPosterior
 
@@ -53,19 +53,18 @@ def from_gpytorch(
         ShapeError: The models of a list have other training inputs or inducing points, or there is more than one batch
             dimension.
     """
-    rows: dict[str, list[Tensor]] = {}
+    rows: dict[str, list[Tensor]] = {"targets": [], "lengthscales": []}
+    rows |= {"signal_variance": [], "noise_variance": [], "offset": []}
     data: Any = None
     inducing: list[Tensor] = []
     for one, own in members(model, likelihood):
         inputs, targets = one.train_inputs[0], one.train_targets
         inputs = inputs[:, None] if inputs.dim() == 1 else inputs
-        if targets.dim() > 2:
-            raise ShapeError(f"a batch of models has one batch dimension; got targets {tuple(targets.shape)}")
         outputs, shared = targets[None] if targets.dim() == 1 else targets, inputs.reshape(-1, *inputs.shape[-2:])
         data = shared[0] if data is None else data
         if any(each.shape != data.shape or not torch.equal(each, data) for each in shared):
             raise ShapeError("all outputs must have the same training inputs (N, d); got different ones")
-        scale, kernel = 1.0, one.covar_module
+        scale, kernel = torch.ones((), dtype=torch.float64), one.covar_module
         if isinstance(kernel, gpytorch.kernels.InducingPointKernel) and kernel.active_dims is None:
             inducing += kernel.inducing_points.detach().reshape(-1, *kernel.inducing_points.shape[-2:])
             kernel = kernel.base_kernel
@@ -73,37 +72,25 @@ def from_gpytorch(
             scale, kernel = kernel.outputscale, kernel.base_kernel
         if type(kernel) is not gpytorch.kernels.RBFKernel or kernel.active_dims is not None:
             name = type(kernel).__name__ + (" on some dimensions" if kernel.active_dims is not None else "")
-            raise UnsupportedModel(
-                f"GPPosterior has the SE-ARD kernel: RBFKernel, in a ScaleKernel or not; got {name}. "
-                "KernelPosterior takes any kernel"
-            )
-        if isinstance(one.mean_module, gpytorch.means.ConstantMean):
-            constant = one.mean_module.constant
-        elif isinstance(one.mean_module, gpytorch.means.ZeroMean):
-            constant = torch.zeros((), dtype=torch.float64)
-        else:
+            rule = "GPPosterior has the SE-ARD kernel: RBFKernel, in a ScaleKernel or not"
+            raise UnsupportedModel(f"{rule}; got {name}. KernelPosterior takes any kernel")
+        if not isinstance(one.mean_module, gpytorch.means.ConstantMean | gpytorch.means.ZeroMean):
             raise UnsupportedModel(f"the mean must be zero or constant; got {type(one.mean_module).__name__}")
         k, d = len(outputs), data.shape[1]
-        found = {
-            "targets": outputs,
-            "lengthscales": kernel.lengthscale.reshape(-1, kernel.lengthscale.shape[-1]).expand(k, d),
-            "signal_variance": torch.as_tensor(scale, dtype=torch.float64).reshape(-1).expand(k),
-            "noise_variance": own.noise.reshape(-1).expand(k),
-            "offset": constant.reshape(-1).expand(k),
-        }
-        for name, value in found.items():
-            rows.setdefault(name, []).append(value.detach().to(targets.device))
-    joined = {name: torch.cat(values).clone() for name, values in rows.items()}
-    joined = {"inputs": data.detach().clone(), **joined, "targets": joined["targets"].T.contiguous()}
+        rows["targets"].append(outputs)
+        rows["lengthscales"].append(kernel.lengthscale.reshape(-1, kernel.lengthscale.shape[-1]).expand(k, d))
+        constant = getattr(one.mean_module, "constant", torch.zeros((), dtype=torch.float64))
+        for name, value in (("signal_variance", scale), ("noise_variance", own.noise), ("offset", constant)):
+            rows[name].append(value.reshape(-1).expand(k).to(targets.device))
+    joined = {name: torch.cat(values).detach().clone() for name, values in rows.items()}
+    features, targets = data.detach().clone(), joined.pop("targets").T.contiguous()
+    offset, kernel = joined.pop("offset"), Hyperparameters(**joined)
     if not inducing:
-        return GPPosterior.from_hyperparameters(**joined, input_dim=input_dim, predicts=predicts)
-    if len(inducing) not in (1, joined["targets"].shape[1]) or any(not torch.equal(Z, inducing[0]) for Z in inducing):
+        return GPPosterior.from_hyperparameters(features, targets, *kernel, input_dim, predicts, offset)
+    if len(inducing) not in (1, targets.shape[1]) or any(not torch.equal(Z, inducing[0]) for Z in inducing):
         raise ShapeError("all outputs must be sparse, with the same inducing points (M, d); got different ones")
-    method: Literal["sgpr", "fitc"] = "fitc" if gpytorch.settings.sgpr_diagonal_correction.on() else "sgpr"
-    kernel = Hyperparameters(*(joined[name] for name in Hyperparameters._fields))
-    return sparse_posterior(
-        inducing[0].clone(), joined["inputs"], joined["targets"], kernel, input_dim, predicts, joined["offset"], method
-    )
+    method: Method = "fitc" if gpytorch.settings.sgpr_diagonal_correction.on() else "sgpr"
+    return sparse_posterior(inducing[0].clone(), features, targets, kernel, input_dim, predicts, offset, method)
 
 
 @dataclass(frozen=True)
@@ -126,13 +113,7 @@ class KernelPosterior:
     def from_gpytorch(
         cls, model: Any, likelihood: Any = None, *, input_dim: int, predicts: Predicts = "next_state"
     ) -> "KernelPosterior":
-        """Freezes trained ExactGPs: one, a batch (one batch dimension, an output each), or a list of such.
-
-        Args:
-            model: An ``ExactGP`` in float64; an ``IndependentModelList``; or a sequence of models. It is copied.
-            likelihood: Its ``GaussianLikelihood``, or a list of them; the models' own by default.
-            input_dim: m.
-            predicts: What the training targets mean.
+        """Freezes trained ExactGPs in float64, which are copied; arguments are as for ``gpmpc.gp.from_gpytorch``.
 
         Raises:
             UnsupportedModel: The model is no such, or approximate.
@@ -183,36 +164,18 @@ class KernelPosterior:
         return replace(self, parts=tuple(part.to(device, dtype) for part in self.parts))
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
-        """The next state's distribution at a certain state and input.
-
-        Args:
-            state: x (*batch, n).
-            input: u (*batch, m); may be left out where m = 0.
-
-        Returns:
-            Mean (*batch, k) and diagonal covariance (*batch, k, k) of the latent function.
-
-        Raises:
-            ShapeError: State or input do not fit the model.
-        """
+        """The next state's distribution at a certain state and input; see ``GPPosterior.predict``."""
         input = state[..., :0] if input is None else input
         check_query(self, state, input)
-        return Gaussian(*self._moments(state, input))
+        batch, query = state.shape[:-1], torch.cat([state, input], dim=-1)
+        flat = query.reshape(-1, query.shape[-1])
+        means, variances = zip(*(part.predict(flat) for part in self.parts), strict=True)
+        mean, variance = (torch.cat(rows, dim=-1).reshape(*batch, -1) for rows in (means, variances))
+        return Gaussian(mean + state if self.predicts == "difference" else mean, torch.diag_embed(variance))
 
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
         """Linearises the mean at K points (K, n), (K, m) by torch autograd."""
         return linearize_by_autograd(self, states, inputs, covariance)
-
-    def _moments(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
-        batch = torch.broadcast_shapes(state.shape[:-1], input.shape[:-1])
-        query = torch.cat([state.expand(*batch, -1), input.expand(*batch, -1)], dim=-1)
-        flat = query.reshape(-1, query.shape[-1])
-        means, variances = zip(*(part.predict(flat) for part in self.parts), strict=True)
-        mean = torch.cat(means, dim=-1).reshape(*batch, -1)
-        variance = torch.cat(variances, dim=-1).reshape(*batch, -1)
-        if self.predicts == "difference":
-            mean = mean + state
-        return mean, torch.diag_embed(variance)
 
 
 @dataclass(frozen=True)
@@ -228,8 +191,6 @@ class _Part:
     @classmethod
     def of(cls, model: Any, likelihood: Any) -> "_Part":
         targets = model.train_targets
-        if targets.dim() > 2:
-            raise ShapeError(f"a batch of models has one batch dimension; got targets {tuple(targets.shape)}")
         if isinstance(getattr(model, "covar_module", None), gpytorch.kernels.InducingPointKernel):
             raise UnsupportedModel("the model is sparse (InducingPointKernel): freeze it by from_gpytorch")
         copied = copy.deepcopy(model).eval().requires_grad_(False)
@@ -243,10 +204,8 @@ class _Part:
             kernel.diagonal(dim1=-2, dim2=-1).add_(noise.reshape(*batch, 1))
             cholesky, info = torch.linalg.cholesky_ex(kernel)
             if bool(info.any()):
-                raise SettingError(
-                    "model",
-                    "its kernel matrix is not positive definite in float64: raise the noise, or drop equal rows",
-                )
+                rule = "its kernel matrix is not positive definite in float64: raise the noise, or drop equal rows"
+                raise SettingError("model", rule)
             weights = torch.cholesky_solve((targets - prior.mean)[..., None], cholesky)[..., 0]
         return cls(copied, features, cholesky, weights, noise)
 
@@ -269,8 +228,5 @@ class _Part:
         return mean.reshape(self.outputs, -1).mT, variance.reshape(self.outputs, -1).mT
 
     def to(self, device: Any, dtype: torch.dtype | None) -> "_Part":
-        tensors = (self.features, self.cholesky, self.weights, self.noise)
-        return _Part(
-            copy.deepcopy(self.model).to(device=device, dtype=dtype),
-            *(tensor.to(device=device, dtype=dtype) for tensor in tensors),
-        )
+        tensors = (t.to(device=device, dtype=dtype) for t in (self.features, self.cholesky, self.weights, self.noise))
+        return _Part(copy.deepcopy(self.model).to(device=device, dtype=dtype), *tensors)

@@ -55,14 +55,19 @@ def factorize(inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noi
         kernel = kernel_matrix(inputs, inputs, lengthscales, signal_variance)
         kernel.diagonal(dim1=-2, dim2=-1).add_(noise_variance[:, None])
         cholesky, info = linalg.cholesky_ex(kernel)
-    if bool(info.any()):
-        output = int(nonzero(info)[0])
+    check_positive_definite(info, signal_variance, noise_variance)
+    return cholesky
+
+
+def check_positive_definite(failed: Tensor, signal_variance: Tensor, noise_variance: Tensor) -> None:
+    """Raises ``SettingError`` where the factorisation of an output's K + sn2 I has failed (k,)."""
+    if bool(failed.any()):
+        output = int(nonzero(failed)[0])
         raise SettingError(
             "noise_variance",
-            f"the kernel matrix of output {output} is not positive definite in float64; "
+            f"the kernel matrix of output {output} is not positive definite in {signal_variance.dtype}; "
             f"signal-to-noise ratio {float((signal_variance / noise_variance)[output]):.1e}: raise the noise",
         )
-    return cholesky
 
 
 def _factorize_in_place(

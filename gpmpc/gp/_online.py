@@ -35,7 +35,7 @@ from torch import Tensor
 from gpmpc.compiled import compiled
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel, check_number
 from gpmpc.gaussian import check_tensors
-from gpmpc.gp._kernel import kernel_matrix
+from gpmpc.gp._kernel import check_positive_definite, kernel_matrix
 from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.transitions import Transitions, check_transitions
@@ -70,28 +70,14 @@ def append_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> 
     corner = kernel_matrix(features, features, scales, sf2) - L21 @ L21.mT
     corner.diagonal(dim1=-2, dim2=-1).add_(posterior.noise_variance[:, None])
     L22, info = torch.linalg.cholesky_ex(corner)
-    if bool(info.any()):
-        output = int(torch.nonzero(info)[0])
-        ratio = float((sf2 / posterior.noise_variance)[output])
-        raise SettingError(
-            "noise_variance",
-            f"with the new points the kernel matrix of output {output} is not positive definite in {posterior.dtype}; "
-            f"signal-to-noise ratio {ratio:.1e}: raise the noise",
-        )
+    check_positive_definite(info, sf2, posterior.noise_variance)
     cholesky = posterior.cholesky.new_empty(posterior.output_dim, size + p, size + p)
-    cholesky[:, :size, :size] = posterior.cholesky
-    cholesky[:, :size, size:] = 0
-    cholesky[:, size:, :size] = L21
-    cholesky[:, size:, size:] = L22
+    cholesky[:, :size, :size], cholesky[:, :size, size:] = posterior.cholesky, 0
+    cholesky[:, size:, :size], cholesky[:, size:, size:] = L21, L22
     w2 = torch.linalg.solve_triangular(L22, new_targets - L21 @ w1, upper=False)
     weights = torch.linalg.solve_triangular(cholesky.mT, torch.cat([w1, w2], dim=-2), upper=True)[..., 0]
-    return replace(
-        posterior,
-        features=torch.cat([posterior.features, features]),
-        targets=torch.cat([posterior.targets, targets]),
-        cholesky=cholesky,
-        weights=weights,
-    )
+    features, targets = torch.cat([posterior.features, features]), torch.cat([posterior.targets, targets])
+    return replace(posterior, features=features, targets=targets, cholesky=cholesky, weights=weights)
 
 
 def remove_points(posterior: GPPosterior, indices: Sequence[int] | Tensor) -> GPPosterior:
@@ -167,12 +153,7 @@ class SlidingWindow:
             raise SettingError("remove", f"must be 'oldest' or 'least_informative'; got {self.remove!r}")
 
     def __call__(self, posterior: GPPosterior, transitions: Transitions) -> GPPosterior:
-        """The posterior with the transitions, held to ``points`` points.
-
-        Raises:
-            ShapeError: The transitions have other dimensions.
-            UnsupportedModel: Of another model.
-        """
+        """The posterior with the transitions, held to ``points`` points; errors are those of ``append_transitions``."""
         if not isinstance(posterior, GPPosterior):
             got = type(posterior).__name__
             raise UnsupportedModel(f"a window is for a GPPosterior (ResidualModel.append takes one); got {got}")
@@ -198,16 +179,7 @@ class SlidingWindow:
 
 
 def least_informative(posterior: GPPosterior, count: int, candidates: int | None = None) -> list[int]:
-    """Which points to drop, each being the least informative one when those before it are gone.
-
-    Args:
-        posterior: N points.
-        count: How many are to go.
-        candidates: Only the first this many may go; all by default.
-
-    Returns:
-        Their indices, in the order of their choice.
-    """
+    """Which of the first ``candidates`` points to drop, each the least informative when those before it are gone."""
     P, beta = posterior.precision.clone(), posterior.weights.clone()
     noise = _noise_variances(posterior)
     allowed = torch.zeros(len(posterior), dtype=torch.bool, device=posterior.device)
@@ -248,9 +220,8 @@ def _slide(posterior: GPPosterior, feature: Tensor, target: Tensor) -> GPPosteri
     scales, sf2, sn2 = (part.numpy() for part in hyperparameters)
     weights = np.ascontiguousarray((targets - posterior.offset).mT.numpy())
     before = np.ascontiguousarray(posterior.cholesky.numpy().transpose(0, 2, 1))  # no copy after the first time
-    if not _slide_factors(before, upper, features.numpy(), scales, sf2, sn2, weights):
-        rule = f"with the new point the kernel matrix is not positive definite in {posterior.dtype}: raise the noise"
-        raise SettingError("noise_variance", f"{rule}; got {sn2.tolist()}")
+    failed = torch.tensor(_slide_factors(before, upper, features.numpy(), scales, sf2, sn2, weights))
+    check_positive_definite(failed, posterior.signal_variance, posterior.noise_variance)
     factor = torch.from_numpy(upper.transpose(0, 2, 1))
     return replace(posterior, features=features, targets=targets, cholesky=factor, weights=torch.from_numpy(weights))
 
@@ -259,10 +230,11 @@ def _slide(posterior: GPPosterior, feature: Tensor, target: Tensor) -> GPPosteri
 def _slide_factors(before, upper, features, scales, sf2, sn2, right):
     """Writes the transposed factors (k, N, N) without the first and with a new last point; ``right`` becomes weights.
 
-    Column by column of the factor, which is row by row here, so that every loop runs over contiguous memory.
+    Column by column of the factor, which is row by row here, so that every loop runs over contiguous memory. Returns
+    which outputs have failed: their matrix is not positive definite.
     """
     outputs, N, d = len(before), before.shape[1], features.shape[1]
-    v, new = np.empty(N), np.empty(N)
+    v, new, failed = np.empty(N), np.empty(N), np.zeros(outputs, dtype=np.bool_)
     for a in range(outputs):
         U, b = upper[a], right[a]
         for i in range(N - 1):
@@ -289,7 +261,8 @@ def _slide_factors(before, upper, features, scales, sf2, sn2, right):
                 b[i] -= y * mixed
             b[N - 1] -= y * w
         if not rest > 0.0:
-            return False
+            failed[a] = True
+            return failed
         U[N - 1, : N - 1], U[N - 1, N - 1] = 0.0, np.sqrt(rest)
         b[N - 1] /= U[N - 1, N - 1]
         for j in range(N - 1, -1, -1):
@@ -297,7 +270,7 @@ def _slide_factors(before, upper, features, scales, sf2, sn2, right):
             for i in range(j + 1, N):
                 total -= U[j, i] * b[i]
             b[j] = total / U[j, j]
-    return True
+    return failed
 
 
 @compiled

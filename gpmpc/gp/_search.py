@@ -13,7 +13,7 @@ theta = (log length-scales, log sf, log(sf / sn)), in a wide box around the data
 import logging
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from torch import Tensor
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._kernel import IGNORED, check_posterior
-from gpmpc.gp._likelihood import FAILED, NegativeLogMarginalLikelihood, Objective
+from gpmpc.gp._likelihood import FAILED, NegativeLogMarginalLikelihood
 from gpmpc.gp._scaling import Scaling
 from gpmpc.gp.posterior import GPPosterior
 
@@ -33,7 +33,7 @@ _FINALISTS = 2  # ... this many of the best go on to convergence
 _ITERATIONS = 1000  # of the search to convergence, at most
 _LONGER = 1.0  # mean of log l over log std(x~) at the random starts: smooth dynamics prefer long length-scales
 _CONSTANT = 3e-9  # of its magnitude: a column that moves by no more holds a solver's residue (1e-9); 1e8 +- 0.5 moves
-LENGTHSCALE_LIMIT = 1e4  # the box holds length-scales within this factor of their input's standard deviation
+_LENGTHSCALE_LIMIT = 1e4  # the box holds length-scales within this factor of their input's standard deviation
 _LOG_INTERVAL = 5.0  # [s]
 
 
@@ -69,73 +69,46 @@ class SoftLimits:
         return (position**self.power).sum(), self.power * position ** (self.power - 1) / width
 
 
-@dataclass(frozen=True)
-class SearchProblem:
-    """One output to be fitted; everything in scaled units.
+class SearchProblem(NamedTuple):
+    """One output to be fitted, in scaled units."""
 
-    Attributes:
-        name: For the log, such as "output 2 of 6".
-        inputs: x~ (N, d).
-        targets: (N,).
-        first: theta of the first start (d + 2,); None takes l = std(x~), sf = std(y), sn = std(y) / 10.
-        perturbations: Standard normal (restarts + 1, d + 2); the first row is not used.
-        rows: The subset that the search begins with; None for all points from the start.
-        std: Of the inputs (d,), see ``column_std``.
-        constant: Which inputs are (d,).
-    """
-
-    name: str
-    inputs: np.ndarray
-    targets: np.ndarray
-    first: np.ndarray | None
-    perturbations: np.ndarray
-    rows: np.ndarray | None
-    std: np.ndarray
-    constant: np.ndarray
+    name: str  # for the log, such as "output 2 of 6"
+    inputs: np.ndarray  # x~ (N, d)
+    targets: np.ndarray  # (N,)
+    first: np.ndarray | None  # theta of the first start (d + 2,); None takes l = std(x~), sf = std(y), sn = std(y) / 10
+    perturbations: np.ndarray  # standard normal (restarts + 1, d + 2); the first row is not used
+    rows: np.ndarray | None  # the subset that the search begins with; None for all points from the start
+    std: np.ndarray  # of the inputs (d,), see ``column_std``
+    constant: np.ndarray  # which inputs are (d,)
 
 
-@dataclass(frozen=True)
-class SearchResult:
-    """The end of the search for one output; see ``gpmpc.gp._training.Training``."""
+class SearchResult(NamedTuple):
+    """The end of the search for one output; see ``Training``."""
 
     theta: np.ndarray
-    objective: float
+    objective: float  # FAILED or more where every start failed
     explored: list[float]
     evaluations: int
     seconds: float  # [s]
 
 
 def find_hyperparameters(problem: SearchProblem, settings: Any) -> SearchResult:
-    """Searches for one output's hyperparameters with a ``Trainer``'s settings.
-
-    ``objective`` of the result is ``FAILED`` or more where every start failed.
-    """
+    """Searches for one output's hyperparameters with a ``Trainer``'s settings."""
     begin = time.perf_counter()
-    inputs, targets = problem.inputs, problem.targets
-    log_inputs, log_output = np.log(problem.std), np.log(column_std(targets[:, None])[0])
-    centre = np.append(log_inputs, [log_output, 0.0])
-    reach = np.append(
-        np.full(inputs.shape[1], np.log(LENGTHSCALE_LIMIT)),
-        [np.log(1e6), np.log(settings.signal_to_noise_limit)],
-    )
-
-    def over(rows: np.ndarray | slice) -> _Search:
-        x, y = inputs[rows], targets[rows]
-        objective = _penalized(settings, x, y, log_inputs)
-        return _Search(f"{problem.name}, {len(y)} points", objective, centre, reach, settings.tolerance)
-
+    log_inputs, log_output = np.log(problem.std), np.log(column_std(problem.targets[:, None])[0])
     first = np.append(log_inputs, [log_output, np.log(10.0)])
-    longer = np.append(np.full(inputs.shape[1], _LONGER), [0.0, 0.0])
+    longer = np.append(np.full(len(log_inputs), _LONGER), [0.0, 0.0])
     starts = [first if problem.first is None else problem.first]
     starts += [first + longer + shift for shift in problem.perturbations[1:]]
+    box = search_box(log_inputs, log_output, settings.signal_to_noise_limit)
 
-    search = over(slice(None) if problem.rows is None else problem.rows)
+    search = _Search(problem, slice(None) if problem.rows is None else problem.rows, box, settings)
     ends = [search(start, _EXPLORATION) for start in starts]
     finalists = sorted(ends, key=lambda end: end[1])[:_FINALISTS]
     theta, value = min((search(end, _ITERATIONS) for end, _ in finalists), key=lambda end: end[1])
     evaluations = search.evaluations
     if problem.rows is not None:
-        search = over(slice(None))
+        search = _Search(problem, slice(None), box, settings)
         theta, value = search(theta, _ITERATIONS)
         evaluations += search.evaluations
     # Nothing can be learned about an input that never moved, and nothing is: it drops out of the kernel.
@@ -143,32 +116,48 @@ def find_hyperparameters(problem: SearchProblem, settings: Any) -> SearchResult:
     return SearchResult(theta, value, [end[1] for end in ends], evaluations, time.perf_counter() - begin)
 
 
-class _Search:
-    """L-BFGS in a box around ``centre``; counts the evaluations, and logs them where they take long."""
+def search_box(log_inputs: np.ndarray, log_output: float, signal_to_noise_limit: float) -> tuple[np.ndarray, ...]:
+    """The least and the largest theta (d + 2,), around the logarithms of the data's standard deviations."""
+    reach = np.full(len(log_inputs) + 2, np.log(_LENGTHSCALE_LIMIT))
+    reach[-2:] = np.log(1e6), np.log(signal_to_noise_limit)
+    centre = np.append(log_inputs, [log_output, 0.0])
+    return centre - reach, centre + reach
 
-    def __init__(self, name: str, objective: Objective, centre: np.ndarray, reach: np.ndarray, tolerance: float):
-        self.name, self.objective, self.tolerance = name, objective, tolerance
-        self.lower, self.upper = centre - reach, centre + reach
-        self.evaluations, self.last_log = 0, time.perf_counter()
+
+class _Search:
+    """L-BFGS over some rows; counts the evaluations, and logs them where they take long."""
+
+    def __init__(self, problem: SearchProblem, rows: Any, box: tuple[np.ndarray, ...], settings: Any):
+        self.problem, self.box, self.settings = problem, box, settings
+        self.likelihood = NegativeLogMarginalLikelihood(problem.inputs[rows], problem.targets[rows])
+        self.size, self.evaluations, self.last_log = len(problem.targets[rows]), 0, time.perf_counter()
 
     def __call__(self, start: np.ndarray, iterations: int) -> tuple[np.ndarray, float]:
         """The end point and its objective."""
         outcome = minimize(
-            self._evaluate,
-            np.clip(start, self.lower, self.upper),
+            self._objective,
+            np.clip(start, *self.box),
             jac=True,
             method="L-BFGS-B",
-            bounds=np.column_stack([self.lower, self.upper]),
-            options={"ftol": self.tolerance, "gtol": 1e-6, "maxiter": iterations, "maxfun": 5 * iterations},
+            bounds=np.column_stack(self.box),
+            options={"ftol": self.settings.tolerance, "gtol": 1e-6, "maxiter": iterations, "maxfun": 5 * iterations},
         )
         return outcome.x, float(outcome.fun)
 
-    def _evaluate(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = self.objective(theta)
+    def _objective(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
+        """Negative log marginal likelihood plus penalty, and the gradient."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            value, gradient = self.likelihood(theta)
         self.evaluations += 1
+        if not (np.isfinite(value) and np.isfinite(gradient).all()):
+            value, gradient = FAILED, np.zeros_like(theta)
+        elif self.settings.penalty is not None:
+            wall, slope = self.settings.penalty(theta, np.log(self.problem.std))
+            value, gradient = value + wall, gradient + slope
         if time.perf_counter() - self.last_log > _LOG_INTERVAL:
             self.last_log = time.perf_counter()
-            _log.info("training: %s: evaluation %d, minus log evidence %.8g", self.name, self.evaluations, value)
+            text = "training: %s, %d points: evaluation %d, minus log evidence %.8g"
+            _log.info(text, self.problem.name, self.size, self.evaluations, value)
         return value, gradient
 
 
@@ -185,21 +174,28 @@ def constant_columns(columns: np.ndarray) -> np.ndarray:
     return np.ptp(columns, axis=0) <= _CONSTANT * np.abs(columns).max(axis=0)
 
 
-def training_data(features: Tensor, targets: Tensor, input_dim: int, predicts: str) -> tuple[Tensor, Tensor]:
-    """Features and targets as training takes them, apart from any graph, after a look at both.
-
-    Raises:
-        ShapeError: They do not belong together, or there is no row.
-        SettingError: They are no float64 tensors in host memory, or ``predicts`` is unknown.
-        DataError: An entry is not finite.
-    """
+def training_data(
+    features: Tensor, targets: Tensor, input_dim: int, predicts: str, scaling: Any
+) -> tuple[Tensor, Tensor, Scaling, Scaling]:
+    """Features and targets apart from any graph, and the scalings of both; errors are those of ``Trainer.fit``."""
     given = {"features": features, "targets": targets}
     check_tensors(**given)
     for name, value in given.items():
         if value.device.type != "cpu":
             raise SettingError(name, f"must be in host memory for training ({name}.cpu()); got {value.device}")
     check_posterior(given, input_dim, predicts)
-    return features.detach(), targets.detach()
+    features, targets = features.detach(), targets.detach()
+    n = features.shape[1] - input_dim
+    names = [f"x{i + 1}" for i in range(n)] + [f"u{i + 1}" for i in range(input_dim)]
+    outputs = [f"y{a + 1}" for a in range(targets.shape[1])]
+    return features, targets, scaling(features, names), scaling(targets, outputs)
+
+
+def restored_theta(theta: np.ndarray, features: Scaling, targets: Scaling) -> np.ndarray:
+    """Rows (log l, log sf, log(sf / sn)) in the units of the data, from those in scaled units."""
+    shift = np.tile(np.append(features.factor.log().numpy(), [0.0, 0.0]), (len(theta), 1))
+    shift[:, -2] = targets.factor.log().numpy()
+    return theta + shift
 
 
 def log_hyperparameters(posterior: GPPosterior, features: Scaling, targets: Scaling) -> np.ndarray:
@@ -211,33 +207,9 @@ def log_hyperparameters(posterior: GPPosterior, features: Scaling, targets: Scal
     k, d = len(targets.factor), len(features.factor)
     if posterior.lengthscales.shape != (k, d):
         got = tuple(posterior.lengthscales.shape[::-1])
-        raise ShapeError(
-            f"the posterior to start from must have {d} features and {k} outputs; got {got[0]} and {got[1]}"
-        )
-    length, sf2, sn2 = (
-        t.to("cpu", torch.float64)
-        for t in (posterior.lengthscales, posterior.signal_variance, posterior.noise_variance)
-    )
-    columns = [
-        (length / features.factor).log(),
-        (sf2.sqrt() / targets.factor).log()[:, None],
-        (sf2 / sn2).log()[:, None] / 2,
-    ]
-    return torch.cat(columns, dim=1).numpy()
-
-
-def _penalized(settings: Any, inputs: np.ndarray, targets: np.ndarray, log_std: np.ndarray) -> Objective:
-    """Negative log marginal likelihood plus penalty of one output over theta."""
-    likelihood, penalty = NegativeLogMarginalLikelihood(inputs, targets), settings.penalty
-
-    def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
-        with np.errstate(over="ignore", invalid="ignore"):
-            value, gradient = likelihood(theta)
-        if not (np.isfinite(value) and np.isfinite(gradient).all()):
-            return FAILED, np.zeros_like(theta)
-        if penalty is not None:
-            wall, slope = penalty(theta, log_std)
-            value, gradient = value + wall, gradient + slope
-        return value, gradient
-
-    return objective
+        rule = f"the posterior to start from must have {d} features and {k} outputs"
+        raise ShapeError(f"{rule}; got {got[0]} and {got[1]}")
+    parts = posterior.lengthscales, posterior.signal_variance, posterior.noise_variance
+    length, sf2, sn2 = (part.to("cpu", torch.float64) for part in parts)
+    deviation, ratio = (sf2.sqrt() / targets.factor).log(), (sf2 / sn2).log() / 2
+    return torch.column_stack([(length / features.factor).log(), deviation, ratio]).numpy()

@@ -18,18 +18,18 @@ The collapsed bound of Titsias (2009, eq. (9)), for FITC without its last term, 
     log N(y | 0, Q + Lam) - tr(Kxx - Qxx) / (2 sn2),     Q = A~' A~,  A~ = Lz^-1 Kzx
 
 It depends on the data through sums over the points alone: with r = Lam^-1/2 y they are A A', A r, r'r and log|Lam|. So
-the points come in blocks that fit the cache, output after output: first the sums; then the bound and its derivatives by
-the sums, all M x M; then block by block once more the derivatives of each block's part (automatic differentiation with
-one checkpoint, Griewank and Walther, 2008, chapter 12). Memory stays that of a block, for any N. A jitter on Kzz makes
-u = f(Z) + noise; the bound stays one.
+the points come in blocks that fit the cache, output after output, each computed once more for the derivatives
+(automatic differentiation with checkpoints, Griewank and Walther, 2008, chapter 12): memory stays that of a block, for
+any N. A jitter on Kzz makes u = f(Z) + noise; the bound stays one.
 """
 
 import math
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import check_tensors
@@ -118,124 +118,78 @@ def check_method(method: str) -> None:
         raise SettingError("method", f"must be 'sgpr' or 'fitc'; got {method!r}")
 
 
-def collapsed_bound_with_gradient(
+def collapsed_bound(
     inducing: Tensor,
     features: Tensor,
     targets: Tensor,
     hyperparameters: Hyperparameters,
     method: Method = "sgpr",
     jitter: float = JITTER,
-) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
+) -> Tensor:
     """The bound on the log marginal likelihood (SGPR), or FITC's own log marginal likelihood, of every output (k,).
 
-    Arguments are as for ``sparse_posterior``.
-
-    Returns:
-        The bound, and the derivatives of its sum over the outputs by inducing (M, d), lengthscales (k, d),
-        signal_variance and noise_variance (k,).
+    Arguments are as for ``sparse_posterior``; ``backward`` differentiates it by inducing points and hyperparameters.
 
     Raises:
         SettingError: Kzz is not positive definite, or the method is unknown.
     """
     check_method(method)
-    values, by_inducing, by_others = [], torch.zeros_like(inducing), []
+    bounds = []
     for a in range(targets.shape[1]):
-        y = targets[:, a : a + 1]
-        variables = [v.detach().requires_grad_() for v in (inducing, *hyperparameters.output(a))]
-        Z, kernel = variables[0], Hyperparameters(*variables[1:])
-        with torch.enable_grad():
-            Lz = inducing_factor(Z, kernel, jitter)
-        cut = Lz.detach().requires_grad_()
-        sums = [s.requires_grad_() for s in data_sums(cut, Z, features, y, kernel, method)]
-        with torch.enable_grad():
-            value = _bound(_Sums(*sums), len(features), kernel, method)
-            direct = torch.autograd.grad(value.sum(), [*sums, *variables[2:]], materialize_grads=True)
-        weights, gradients = direct[:4], [torch.zeros_like(v) for v in variables]
-        gradients[2] += direct[4]
-        gradients[3] += direct[5]
-        by_factor = torch.zeros_like(cut)
-        for block in _blocks(len(features), len(inducing)):
-            with torch.enable_grad():
-                part = _block_sums(cut, Z, features[block], y[block], kernel, method)
-                total = torch.stack([(w * s).sum() for w, s in zip(weights, part, strict=True)]).sum()
-                found = torch.autograd.grad(total, [cut, *variables])
-            by_factor += found[0]
-            for gradient, more in zip(gradients, found[1:], strict=True):
-                gradient += more
-        through = torch.autograd.grad(Lz, variables[:3], by_factor)
-        for gradient, more in zip(gradients, through, strict=False):
-            gradient += more
-        values.append(value.detach())
-        by_inducing += gradients[0]
-        by_others.append(gradients[1:])
-    by_lengthscales, by_signal, by_noise = (torch.cat(of_one) for of_one in zip(*by_others, strict=True))
-    return torch.cat(values), (by_inducing, by_lengthscales, by_signal, by_noise)
+        kernel = hyperparameters.output(a)
+        Lz = inducing_factor(inducing, kernel, jitter)
+        sums = data_sums(Lz, inducing, features, targets[:, a, None], kernel, method)
+        bounds.append(_bound(sums, len(features), kernel, method))
+    return torch.cat(bounds)
 
 
-def data_sums(
-    Lz: Tensor,
-    inducing: Tensor,
-    features: Tensor,
-    targets: Tensor,
-    hyperparameters: Hyperparameters,
-    method: Method,
-) -> _Sums:
-    """The sums over all points, of every output, in blocks; no derivatives.
+def data_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method) -> _Sums:
+    """The sums over all points, of every output, in blocks.
 
     tr(A A') is, in units of the noise, the variance of the data that the inducing points explain.
     """
-    outputs = []
-    with torch.no_grad():
-        for a in range(targets.shape[1]):
-            own = hyperparameters.output(a)
-            total = None
-            for block in _blocks(len(features), len(inducing)):
-                part = _block_sums(Lz[a, None], inducing, features[block], targets[block, a, None], own, method)
-                total = part if total is None else _Sums(*(t.add_(p) for t, p in zip(total, part, strict=True)))
-            outputs.append(total)
+    step, outputs = max(_ENTRIES // len(Z), 64), []
+    for a in range(y.shape[1]):
+        total: Any = 0.0, 0.0, 0.0, 0.0
+        for rows in (slice(begin, begin + step) for begin in range(0, len(x), step)):
+            block = Lz[a, None], Z, x[rows], y[rows, a, None], *kernel.output(a), method
+            if torch.is_grad_enabled() and step < len(x):
+                part: Any = checkpoint(_block_sums, *block, use_reentrant=True, preserve_rng_state=False)
+            else:
+                part = _block_sums(*block)
+            total = [t + p for t, p in zip(total, part, strict=True)]
+        outputs.append(total)
     return _Sums(*(torch.cat(of_one) for of_one in zip(*outputs, strict=True)))
 
 
-def inducing_factor(inducing: Tensor, hyperparameters: Hyperparameters, jitter: float) -> Tensor:
-    """Lz (k, M, M), the Cholesky factor of Kzz with a jitter in units of sf2.
-
-    Raises:
-        SettingError: Kzz is not positive definite.
-    """
-    lengthscales, signal_variance, _ = hyperparameters
-    Kzz = kernel_matrix(inducing, inducing, lengthscales, signal_variance)
-    Kzz = Kzz + torch.diag_embed((jitter * signal_variance)[:, None].expand(-1, len(inducing)))
+def inducing_factor(inducing: Tensor, kernel: Hyperparameters, jitter: float) -> Tensor:
+    """Lz (k, M, M), the Cholesky factor of Kzz with a jitter in units of sf2; raises where there is none."""
+    Kzz = kernel_matrix(inducing, inducing, kernel.lengthscales, kernel.signal_variance)
+    Kzz = Kzz + torch.diag_embed((jitter * kernel.signal_variance)[:, None].expand(-1, len(inducing)))
     Lz, info = torch.linalg.cholesky_ex(Kzz)
     if bool(info.any()):
-        output = int(torch.nonzero(info)[0])
         raise SettingError(
             "inducing",
-            f"their kernel matrix of output {output} is not positive definite: points too near each other for its "
-            "length-scales; take fewer, or a larger jitter",
+            f"their kernel matrix of output {int(torch.nonzero(info)[0])} is not positive definite: points too near "
+            "each other for its length-scales; take fewer, or a larger jitter",
         )
     return Lz
 
 
-def _block_sums(
-    Lz: Tensor,
-    inducing: Tensor,
-    features: Tensor,
-    targets: Tensor,
-    hyperparameters: Hyperparameters,
-    method: Method,
-) -> _Sums:
-    lengthscales, signal_variance, noise_variance = hyperparameters
-    whitened = torch.linalg.solve_triangular(Lz, _cross(inducing, features, lengthscales, signal_variance), upper=False)
-    Lam = noise_variance[:, None].expand(-1, len(features))
+def _block_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, *kernel_and_method: Any) -> _Sums:
+    *tensors, method = kernel_and_method
+    kernel = Hyperparameters(*tensors)
+    _, signal_variance, noise_variance = kernel
+    whitened = torch.linalg.solve_triangular(Lz, _cross(Z, x, kernel), upper=False)
+    Lam = noise_variance[:, None].expand(-1, len(x))
     if method == "fitc":
         Lam = (signal_variance[:, None] - whitened.square().sum(-2)).clamp_min(0) + Lam
     root = Lam.sqrt()
-    A, r = whitened / root[:, None, :], targets.mT / root
+    A, r = whitened / root[:, None, :], y.mT / root
     return _Sums(A @ A.mT, (A @ r[..., None])[..., 0], r.square().sum(-1), Lam.log().sum(-1))
 
 
-def _bound(sums: _Sums, size: int, hyperparameters: Hyperparameters, method: Method) -> Tensor:
-    _, signal_variance, noise_variance = hyperparameters
+def _bound(sums: _Sums, size: int, kernel: Hyperparameters, method: Method) -> Tensor:
     eye = torch.eye(sums.gram.shape[-1], dtype=sums.gram.dtype, device=sums.gram.device)
     LB = torch.linalg.cholesky(sums.gram + eye)
     explained = torch.linalg.solve_triangular(LB, sums.projections[..., None], upper=False).square().sum((-2, -1))
@@ -243,19 +197,13 @@ def _bound(sums: _Sums, size: int, hyperparameters: Hyperparameters, method: Met
     bound = -(size * math.log(2 * math.pi) + logdet + sums.squares - explained) / 2
     if method == "sgpr":
         trace = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
-        bound = bound - (size * signal_variance / noise_variance - trace) / 2
+        bound = bound - (size * kernel.signal_variance / kernel.noise_variance - trace) / 2
     return bound
 
 
-def _cross(inducing: Tensor, features: Tensor, lengthscales: Tensor, signal_variance: Tensor) -> Tensor:
+def _cross(inducing: Tensor, features: Tensor, kernel: Hyperparameters) -> Tensor:
     """Kzx (k, M, N) by one matrix product an output; around a common centre, so that little cancels."""
-    centre = inducing.detach().mean(0)
-    z = (inducing - centre) / lengthscales[:, None, :]
-    x = (features - centre) / lengthscales[:, None, :]
+    centre, scales = inducing.detach().mean(0), kernel.lengthscales[:, None, :]
+    z, x = (inducing - centre) / scales, (features - centre) / scales
     half = z.square().sum(-1)[..., :, None] / 2 + x.square().sum(-1)[..., None, :] / 2
-    return signal_variance[:, None, None] * (z @ x.mT - half).clamp_max(0).exp()
-
-
-def _blocks(size: int, inducing: int) -> list[slice]:
-    step = max(_ENTRIES // inducing, 64)
-    return [slice(begin, begin + step) for begin in range(0, size, step)]
+    return kernel.signal_variance[:, None, None] * (z @ x.mT - half).clamp_max(0).exp()

@@ -22,43 +22,21 @@ from gpmpc.exceptions import SettingError, TrainingError, check_number
 from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
 from gpmpc.gp._likelihood import FAILED
 from gpmpc.gp._scaling import Scaling, centre, identity
-from gpmpc.gp._search import LENGTHSCALE_LIMIT, column_std, log_hyperparameters, training_data
+from gpmpc.gp._search import column_std, log_hyperparameters, restored_theta, search_box, training_data
 from gpmpc.gp._sparse import (
     JITTER,
     Method,
     check_method,
-    collapsed_bound_with_gradient,
+    collapsed_bound,
     data_sums,
     inducing_factor,
     sparse_posterior,
 )
-from gpmpc.gp._training import Trainer
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp._training import Trainer, Training
 from gpmpc.gp.transitions import Transitions, check_transitions
 
 _log = logging.getLogger(__name__)
 _EVERY = 10  # iterations between two lines of the log
-
-
-@dataclass(frozen=True)
-class SparseTraining:
-    """The result of a sparse training.
-
-    Attributes:
-        posterior: The trained GPs, frozen to M pseudo-observations at the inducing points.
-        theta: Rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), in the units of the data.
-        objective: Minus the bound on the log marginal likelihood, in scaled units (k,).
-        initial: The same where the search over the bound began (k,).
-        evaluations: Of the bound.
-        seconds: Wall time [s].
-    """
-
-    posterior: GPPosterior
-    theta: np.ndarray
-    objective: np.ndarray
-    initial: np.ndarray
-    evaluations: int
-    seconds: float  # [s]
 
 
 @dataclass(frozen=True)
@@ -105,7 +83,7 @@ class SparseTrainer:
         check_method(self.method)
         replace(self._exact(), scaling=self.scaling)  # which checks the others
 
-    def __call__(self, transitions: Transitions, seed: int = 0) -> SparseTraining:
+    def __call__(self, transitions: Transitions, seed: int = 0) -> Training:
         """Trains on transitions; ``seed`` is that of the subset and of its random starts.
 
         Raises:
@@ -117,17 +95,16 @@ class SparseTrainer:
 
     def fit(
         self, features: Tensor, targets: Tensor, input_dim: int, predicts: Predicts | None = None, seed: int = 0
-    ) -> SparseTraining:
+    ) -> Training:
         """Trains on features x~ = (x, u) (N, n + m) and any targets (N, k)."""
         begin = time.perf_counter()
         check_number("seed", seed, least=0, whole=True)
-        predicts = self.predicts if predicts is None else predicts
-        features, targets = training_data(features, targets, input_dim, predicts)
-        n = features.shape[1] - input_dim
-        names = [f"x{i + 1}" for i in range(n)] + [f"u{i + 1}" for i in range(input_dim)]
+        predicts = predicts or self.predicts
+        features, targets, feature_scaling, target_scaling = training_data(
+            features, targets, input_dim, predicts, self.scaling
+        )
         # A stationary kernel depends on differences; those from one of the points are exact, wherever the data lie.
-        feature_scaling = Scaling(features[0], self.scaling(features, names).factor)
-        target_scaling = self.scaling(targets, [f"y{a + 1}" for a in range(targets.shape[1])])
+        feature_scaling = Scaling(features[0], feature_scaling.factor)
         x, y = feature_scaling.scale(features), target_scaling.scale(targets)
 
         chosen = np.random.default_rng(seed).permutation(len(x))[: self.subset]
@@ -135,12 +112,8 @@ class SparseTrainer:
         theta = log_hyperparameters(exact.posterior, feature_scaling, identity(y))
         kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
         Z = x[informative_points(x, kernel, self.inducing)]
-        _log.info(
-            "sparse training: %d inducing points chosen among %d after %.1f s",
-            len(Z),
-            len(x),
-            time.perf_counter() - begin,
-        )
+        text = "sparse training: %d inducing points chosen among %d after %.1f s"
+        _log.info(text, len(Z), len(x), time.perf_counter() - begin)
         bound = _Bound(self, x, y, torch.from_numpy(column_std(features.numpy())) / feature_scaling.factor, len(Z))
         start = bound.best = bound.vector(self._with_unexplained(theta, Z, x, y), Z)
         if self.iterations:  # of none L-BFGS-B makes one
@@ -155,13 +128,17 @@ class SparseTrainer:
             raise TrainingError(failed, "the inducing points' kernel matrix is not positive definite: raise jitter")
         self._check_learned(_noise_alone(y) - objective, _noise_alone(y[chosen]) - exact.objective, x.shape[1] + 2)
         theta, Z = bound.parts(torch.from_numpy(bound.best))
-        posterior = sparse_posterior(
+        scaled = sparse_posterior(
             Z, x, y, Hyperparameters.from_theta(theta), input_dim, predicts, method=self.method, jitter=self.jitter
-        ).unscaled(feature_scaling, target_scaling)
-        theta = theta.numpy().copy()
-        theta[:, :-2] += feature_scaling.factor.log().numpy()
-        theta[:, -2] += target_scaling.factor.log().numpy()
-        return SparseTraining(posterior, theta, objective, initial, bound.evaluations, time.perf_counter() - begin)
+        )
+        return Training(
+            scaled.unscaled(feature_scaling, target_scaling),
+            restored_theta(theta.numpy(), feature_scaling, target_scaling),
+            objective,
+            initial[:, None],
+            bound.evaluations,
+            time.perf_counter() - begin,
+        )
 
     def _with_unexplained(self, theta: np.ndarray, Z: Tensor, x: Tensor, y: Tensor) -> np.ndarray:
         """Adds to the noise what the inducing points leave unexplained of the signal, on average.
@@ -170,10 +147,11 @@ class SparseTrainer:
         """
         if self.method == "fitc":  # has that noise of its own
             return theta
-        current = Hyperparameters.from_theta(torch.from_numpy(theta))
-        _, sf2, sn2 = current
-        Lz = inducing_factor(Z, current, self.jitter)
-        explained = data_sums(Lz, Z, x, y, current, self.method).gram.diagonal(dim1=-2, dim2=-1).sum(-1)
+        kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
+        _, sf2, sn2 = kernel
+        with torch.no_grad():
+            sums = data_sums(inducing_factor(Z, kernel, self.jitter), Z, x, y, kernel, self.method)
+        explained = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
         sn2 = sn2 + (sf2 - explained * sn2 / len(x)).clamp_min(0)
         return np.column_stack([theta[:, :-1], (sf2 / sn2).log().numpy() / 2])
 
@@ -242,19 +220,17 @@ class _Bound:
     def __init__(self, trainer: SparseTrainer, features: Tensor, targets: Tensor, unit: Tensor, count: int):
         self.trainer, self.x, self.y, self.unit, self.count = trainer, features, targets, unit, count
         self.evaluations, self.iteration, self._last, self._least = 0, 0, np.nan, np.inf
-        outputs, d = targets.shape[1], features.shape[1]
-        log_inputs, log_outputs = self.unit.log().numpy(), np.log(column_std(targets.numpy()))
-        reach = np.append(np.full(d, np.log(LENGTHSCALE_LIMIT)), [np.log(1e6), np.log(trainer.signal_to_noise_limit)])
-        centre = np.array([np.append(log_inputs, [own, 0.0]) for own in log_outputs]).ravel()
-        reach = np.tile(reach, outputs)
-        self.shape = (outputs, d + 2)
-        low, high = centre - reach, centre + reach
+        self.shape = (targets.shape[1], features.shape[1] + 2)
+        log_inputs, limit = unit.log().numpy(), trainer.signal_to_noise_limit
+        boxes = [search_box(log_inputs, own, limit) for own in np.log(column_std(targets.numpy()))]
         # A feature that the subset saw at rest has a length-scale beyond any box (IGNORED); it stays there.
-        smallest, largest = ((edge / self.unit).numpy() for edge in (features.amin(0), features.amax(0)))
+        smallest, largest = ((edge / unit).numpy() for edge in (features.amin(0), features.amax(0)))
         margin = 0.1 * (largest - smallest)
-        low = np.append(low, np.tile(smallest - margin, count))
-        high = np.append(high, np.tile(largest + margin, count))
-        self.box = np.column_stack([low, high])
+        edges = np.tile(smallest - margin, count), np.tile(largest + margin, count)
+        sides = [
+            np.append(np.concatenate(side), edge) for side, edge in zip(zip(*boxes, strict=True), edges, strict=True)
+        ]
+        self.box = np.column_stack(sides)
 
     def vector(self, theta: np.ndarray, Z: Tensor) -> np.ndarray:
         """The start; it widens the box where it must."""
@@ -273,15 +249,12 @@ class _Bound:
         self.evaluations += 1
         variables = torch.from_numpy(vector.copy()).requires_grad_()
         with torch.enable_grad():
-            theta, Z = self.parts(variables)
-            tensors = (Z, *Hyperparameters.from_theta(theta))
-        try:
-            bounds, slopes = self._bounds(tuple(t.detach() for t in tensors))
-        except (SettingError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
-            return FAILED, np.zeros_like(vector)
-        (gradient,) = torch.autograd.grad(tensors, variables, [-slope for slope in slopes])
-        value, gradient = -float(bounds.sum()), gradient.numpy()
-        if not (np.isfinite(value) and np.isfinite(gradient).all()):
+            total = self._bounds(variables).sum()
+            value, gradient = float(total.detach()), np.full_like(vector, np.nan)
+            if math.isfinite(value):
+                total.backward()
+                gradient = torch.as_tensor(variables.grad).numpy()
+        if not np.isfinite(gradient).all():
             return FAILED, np.zeros_like(vector)
         self._last = value
         if value < self._least:
@@ -290,11 +263,8 @@ class _Bound:
 
     def values(self, vector: np.ndarray) -> np.ndarray:
         """Minus the bound of every output (k,); infinite where a matrix is not positive definite."""
-        theta, Z = self.parts(torch.from_numpy(vector))
-        try:
-            return -self._bounds((Z, *Hyperparameters.from_theta(theta)))[0].numpy()
-        except (SettingError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
-            return np.full(self.shape[0], np.inf)
+        with torch.no_grad():
+            return self._bounds(torch.from_numpy(vector)).numpy()
 
     def report(self, _: np.ndarray) -> None:
         """One line of the log every ``_EVERY`` iterations."""
@@ -302,9 +272,10 @@ class _Bound:
         if self.iteration % _EVERY == 0:
             _log.info("sparse training: iteration %d, minus the bound %.6g", self.iteration, self._last)
 
-    def _bounds(self, tensors: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
-        Z, *kernel = tensors
-        trainer = self.trainer
-        return collapsed_bound_with_gradient(
-            Z, self.x, self.y, Hyperparameters(*kernel), trainer.method, trainer.jitter
-        )
+    def _bounds(self, vector: Tensor) -> Tensor:
+        theta, Z = self.parts(vector)
+        kernel, trainer = Hyperparameters.from_theta(theta), self.trainer
+        try:
+            return -collapsed_bound(Z, self.x, self.y, kernel, trainer.method, trainer.jitter)
+        except (SettingError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
+            return torch.full(self.shape[:1], torch.inf, dtype=torch.float64)

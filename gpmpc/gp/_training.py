@@ -28,6 +28,7 @@ from gpmpc.gp._search import (
     constant_columns,
     find_hyperparameters,
     log_hyperparameters,
+    restored_theta,
     training_data,
 )
 from gpmpc.gp.posterior import GPPosterior
@@ -43,12 +44,13 @@ class Training:
     """The result of a training.
 
     Attributes:
-        posterior: The trained GPs, frozen.
-        theta: Rows (log l, log sf, log(sf / sn)), one an output (n, d + 2), in the units of the data.
-        objective: Negative log marginal likelihood plus penalty where the search ended (n,).
-        explored: The same where the exploration from every start ended (n, restarts + 1), over the subset if there is
-            one; ``FAILED`` where none could.
-        evaluations: Likelihood evaluations, all starts and outputs together.
+        posterior: The trained GPs, frozen; of a sparse training, to M pseudo-observations at the inducing points.
+        theta: Rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), in the units of the data.
+        objective: Negative log marginal likelihood plus penalty where the search ended (k,); of a sparse training
+            minus the bound on the log marginal likelihood, in scaled units.
+        explored: Of an exact training, the objective where the exploration from every start ended (k, restarts + 1),
+            over the subset if there is one; of a sparse training, where the search over the bound began (k, 1).
+        evaluations: Of the likelihood or of the bound, all starts and outputs together.
         seconds: Wall time [s].
     """
 
@@ -78,8 +80,7 @@ class Trainer:
             about 1e10 in double precision.
 
     Raises:
-        SettingError: Fewer than no restarts, a subset of none, an unknown ``predicts``, a tolerance
-            that is not positive, or a limit of 1 or less.
+        SettingError: A setting is out of range.
     """
 
     predicts: Predicts = "next_state"
@@ -96,12 +97,11 @@ class Trainer:
         check_number("restarts", self.restarts, least=0, whole=True)
         if self.subset is not None:
             check_number("subset", self.subset, least=1, whole=True)
-        for key in ("scaling", "penalty"):
+        for key, example in (("scaling", "standardize"), ("penalty", "SoftLimits()")):
             if not (callable(value := getattr(self, key)) or (key == "penalty" and value is None)):
-                example = "standardize" if key == "scaling" else "SoftLimits()"
                 raise SettingError(key, f"must be a function such as {example} of gpmpc.gp; got {value!r}")
-        for key, least in (("tolerance", 0), ("signal_to_noise_limit", 1)):
-            check_number(key, getattr(self, key), above=least)
+        check_number("tolerance", self.tolerance, above=0)
+        check_number("signal_to_noise_limit", self.signal_to_noise_limit, above=1)
 
     def __call__(self, transitions: Transitions, seed: int = 0, start: GPPosterior | None = None) -> Training:
         """Trains on transitions; see ``fit``."""
@@ -163,27 +163,25 @@ class Trainer:
         """
         begin = time.perf_counter()
         check_number("seed", seed, least=0, whole=True)
-        predicts = self.predicts if predicts is None else predicts
-        features, targets = training_data(features, targets, input_dim, predicts)
+        predicts = predicts or self.predicts
+        features, targets, feature_scaling, target_scaling = training_data(
+            features, targets, input_dim, predicts, self.scaling
+        )
         (size, d), outputs = features.shape, targets.shape[1]
         _check_memory(size, outputs)
-        names = [f"x{i + 1}" for i in range(d - input_dim)] + [f"u{i + 1}" for i in range(input_dim)]
-        feature_scaling = self.scaling(features, names)
-        target_scaling = self.scaling(targets, [f"y{a + 1}" for a in range(outputs)])
         x, y = feature_scaling.scale(features).numpy(), target_scaling.scale(targets).numpy()
-        first: list[np.ndarray | None] = [None] * outputs
+        first: Any = [None] * outputs
         if start is not None:
             _check_start("start", start)
-            first = list(log_hyperparameters(start, feature_scaling, target_scaling))
+            first = log_hyperparameters(start, feature_scaling, target_scaling)
         rng = np.random.default_rng(seed)
         perturbations = rng.normal(size=(outputs, self.restarts + 1, d + 2))
         rows = None
         converged = start is not None and not self.restarts  # a subset could not improve on where the search begins
         if self.subset is not None and size > self.subset and not converged:
             rows = np.sort(rng.permutation(size)[: self.subset])
-        columns = features.numpy()
-        std, constant = column_std(columns) / feature_scaling.factor.numpy(), constant_columns(columns)
-        found = []
+        std = column_std(features.numpy()) / feature_scaling.factor.numpy()
+        found, constant = [], constant_columns(features.numpy())
         for a in range(outputs):
             name = f"output {a + 1} of {outputs}"
             problem = SearchProblem(name, x, y[:, a], first[a], perturbations[a], rows, std, constant)
@@ -198,21 +196,12 @@ class Trainer:
                 f"no start of {len(found[0].explored)} led to a positive definite kernel matrix for output "
                 f"{', '.join(str(a) for a in failed)}: lower signal_to_noise_limit, or remove duplicate rows",
             )
-        theta = np.array([one.theta for one in found])
-        theta[:, :-2] += feature_scaling.factor.log().numpy()
-        theta[:, -2] += target_scaling.factor.log().numpy()
-        kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
-        posterior = GPPosterior.from_hyperparameters(
-            features, targets, *kernel, input_dim, predicts, offset=target_scaling.offset
-        )
-        return Training(
-            posterior,
-            theta,
-            objective=np.array([one.objective for one in found]),
-            explored=np.array([one.explored for one in found]),
-            evaluations=sum(one.evaluations for one in found),
-            seconds=time.perf_counter() - begin,
-        )
+        theta = restored_theta(np.array([one.theta for one in found]), feature_scaling, target_scaling)
+        kernel, offset = Hyperparameters.from_theta(torch.from_numpy(theta)), target_scaling.offset
+        posterior = GPPosterior.from_hyperparameters(features, targets, *kernel, input_dim, predicts, offset)
+        objective, explored = (np.array([getattr(one, key) for one in found]) for key in ("objective", "explored"))
+        evaluations = sum(one.evaluations for one in found)
+        return Training(posterior, theta, objective, explored, evaluations, time.perf_counter() - begin)
 
 
 def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:

@@ -61,7 +61,8 @@ class BatchExactGP(gpytorch.models.ExactGP):
 def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
     """Builds the GPyTorch model of a posterior; its prior mean is a constant that training leaves alone."""
     model = BatchExactGP(posterior.features, posterior.targets)
-    model.mean_module = gpytorch.means.ConstantMean(batch_shape=posterior.offset.shape).requires_grad_(False)
+    mean = gpytorch.means.ConstantMean(batch_shape=posterior.offset.shape)
+    model.mean_module = mean.requires_grad_(False).double()
     model.mean_module.constant.copy_(posterior.offset)
     deviation, noise = posterior.signal_variance.log() / 2, posterior.noise_variance.log() / 2
     theta = torch.cat([posterior.lengthscales.log(), torch.stack([deviation, deviation - noise], 1)], 1)
@@ -79,6 +80,7 @@ def members(model: Any, likelihood: Any = None) -> list[tuple[Any, Any]]:
 
     Raises:
         UnsupportedModel: One is no single-task ``ExactGP`` with a ``GaussianLikelihood``, or carries transforms.
+        ShapeError: There is more than one batch dimension, or another number of likelihoods.
         SettingError: One is not in float64.
     """
     models = list(model.models) if hasattr(model, "models") else list(model) if isinstance(model, Sequence) else [model]
@@ -96,6 +98,9 @@ def members(model: Any, likelihood: Any = None) -> list[tuple[Any, Any]]:
             raise UnsupportedModel(f"only ExactGP models with training data can be frozen; got {type(one).__name__}")
         if type(own) is not gpytorch.likelihoods.GaussianLikelihood:
             raise UnsupportedModel(f"the likelihood must be a GaussianLikelihood; got {type(own).__name__}")
+        if one.train_targets.dim() > 2:
+            shape = tuple(one.train_targets.shape)
+            raise ShapeError(f"a batch of models has one batch dimension; got targets {shape}")
         for transform in ("input_transform", "outcome_transform"):
             if getattr(one, transform, None) is not None:
                 raise UnsupportedModel(

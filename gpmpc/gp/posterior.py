@@ -251,17 +251,9 @@ class GPPosterior:
         return Linearized(to_array(self._mean(k, x)), to_array(A), to_array(B), V)
 
     def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
-        """``predict``, and its mean's derivatives by the state (*batch, k, n) and by the input (*batch, k, m)."""
-        input = state[..., :0] if input is None else input
-        check_query(self, state, input)
-        if host_arrays(self.weights, state, input) is None:
-            k, difference = self._correlations(state, input)
-            return self._belief(k, state), *self._jacobian(k, difference)
-        batch, count = state.shape[:-1], state.shape[:-1].numel()
-        x, u = state.numpy().reshape(count, self.state_dim), input.numpy().reshape(count, self.input_dim)
-        found = [part for part in self.linearize(x, u) if part is not None]
-        mean, A, B, V = (torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found)
-        return Gaussian(mean, V), A, B
+        """``predict``, and its mean's derivatives by state (*batch, k, n) and input (*batch, k, m), all by torch."""
+        k, difference = self._correlations(state, input)
+        return self._belief(k, state), *self._jacobian(k, difference)
 
     def mean_hessian(self, state: Tensor, input: Tensor | None = None) -> Tensor:
         """The mean's second derivatives by the state (*batch, k, n, n)."""

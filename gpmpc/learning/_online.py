@@ -36,25 +36,15 @@ _LARGEST = 10.0  # difference of log densities that one step counts for: no outl
 
 @dataclass(frozen=True)
 class Learned:
-    """What a flight has taught so far.
+    """What a flight has taught so far."""
 
-    Attributes:
-        model: With the change.
-        state: Measured at the last step (n,).
-        error: Of the model alone in the last step, as far as a change reaches it (k,).
-        spread: Squared differences of successive errors over those expected of the model's noise, of the last steps.
-        leads: By how much the log density with the change exceeds that without, of the last steps.
-        active: Whether the change is part of the model that plans.
-        version: How often that model has changed.
-    """
-
-    model: ChangedModel
-    state: Array
-    error: Array
-    spread: Array
-    leads: Array
-    active: bool = False
-    version: int = 0
+    model: ChangedModel  #: with the change
+    state: Array  #: measured at the last step (n,)
+    error: Array  #: of the model alone in the last step, as far as a change reaches it (k,)
+    spread: Array  #: squared differences of successive errors over those expected of the model's noise
+    leads: Array  #: by how much the log density with the change exceeds that without, of the last steps
+    active: bool = False  #: whether the change is part of the model that plans
+    version: int = 0  #: how often that model has changed
 
     @property
     def size(self) -> int:
@@ -95,13 +85,7 @@ class OnlineLearning:
         check_number("margin", self.margin, least=0)
 
     def learn(self, learned: Learned, input: Array, state: Array) -> Learned:
-        """Learns from one step.
-
-        Args:
-            learned: Before it.
-            input: That was applied (m,).
-            state: Measured after it (n,).
-        """
+        """Learns from one step: the input that was applied (m,), and the state measured after it (n,)."""
         model = learned.model
         points, errors, latent = model.errors(learned.state[None], np.array(input, dtype=float)[None], state[None])
         error, noise = errors[0], model.gp.noise_variance.numpy()
@@ -179,12 +163,10 @@ class LearningController:
 
 
 def noise_ratio(spread: Array, outputs: int) -> float:
-    """How much larger the noise is than a model believes, 1 at least.
+    """How much larger the noise is than a model of k outputs believes, 1 at least.
 
-    Args:
-        spread: Half the squared differences of successive errors over the model's noise, mean over the outputs (w,):
-            what changes slowly has no part in them, and a jump no weight in their median.
-        outputs: k.
+    ``spread`` has half the squared differences of successive errors over the model's noise, mean over the outputs (w,):
+    what changes slowly has no part in them, and a jump no weight in their median.
     """
     return max(1.0, float(np.median(spread)) * outputs / _median(outputs))
 

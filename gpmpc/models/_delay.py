@@ -20,14 +20,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, DynamicsModel, Linearized, check_next_states, check_query, linearize
+from gpmpc.dynamics import Array, DynamicsModel, check_next_states
 from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.models._wrapper import Wrapper, padded
+from gpmpc.models._wrapper import LinearWrapper, padded
 
 
 @dataclass(frozen=True)
-class DelayedModel(Wrapper):
+class DelayedModel(LinearWrapper):
     """A model whose input acts late.
 
     Attributes:
@@ -60,31 +60,14 @@ class DelayedModel(Wrapper):
         """Of the observations; inputs on their way have none."""
         return padded(self.model.noise_covariance, self.state_dim)
 
-    def predict(self, state: Tensor, input: Tensor) -> Gaussian:
-        """The next state's distribution at z (*batch, n + D m) and u (*batch, m)."""
-        check_query(self, state, input)
-        n, m, w = self.model.state_dim, self.input_dim, self._share
-        queue = torch.cat([state[..., n:], input], dim=-1)
-        acting = w * queue[..., :m] + (1 - w) * queue[..., m : 2 * m]
-        moved = self.model.predict(state[..., :n], acting)
-        mean = torch.cat([moved.mean, queue[..., m:]], dim=-1)
-        return Gaussian(mean, padded(moved.covariance, self.state_dim))
-
-    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
-        """Linearises the model at K points, by the undelayed model's ``linearize``."""
-        n, m, w, size = self.model.state_dim, self.input_dim, self._share, self.state_dim
-        queue = np.concatenate([states[:, n:], inputs], axis=1)
-        acting = w * queue[:, :m] + (1 - w) * queue[:, m : 2 * m]
-        inner = linearize(self.model, np.ascontiguousarray(states[:, :n]), acting, covariance)
-        by_queue = np.zeros((len(states), size, (self.pending + 1) * m))
-        by_queue[:, :n, :m] = w * inner.B
-        by_queue[:, :n, m : 2 * m] = (1 - w) * inner.B
-        by_queue[:, n:, m:] = np.eye(self.pending * m)
-        A = np.concatenate([np.zeros((len(states), size, n)), by_queue[:, :, :-m]], axis=2)
-        A[:, :n, :n] = inner.A
-        mean = np.concatenate([inner.mean, queue[:, m:]], axis=1)
-        V = None if inner.covariance is None else _padded_array(inner.covariance, size)
-        return Linearized(mean, A, np.ascontiguousarray(by_queue[:, :, -m:]), V)
+    @cached_property
+    def matrices(self) -> tuple[Array, Array, Array, Array]:
+        """Of ``LinearWrapper``: a mean of the two oldest inputs acts, and the others move on by a place."""
+        (n, m), D, w = (self.model.state_dim, self.input_dim), self.pending, self._share
+        every = np.eye((D + 1) * m)  # of the inputs on their way and the one before them
+        acting, moved = w * every[:m] + (1 - w) * every[m : 2 * m], np.vstack([np.zeros((n, len(every))), every[m:]])
+        Z, L = (np.hstack([np.zeros((len(part), n)), part[:, : D * m]]) for part in (acting, moved))
+        return Z, acting[:, D * m :], L, moved[:, D * m :]
 
     def augmented(self, belief: Gaussian, inputs: Any) -> Gaussian:
         """The belief over z, from one over x and the inputs on their way.
@@ -145,9 +128,3 @@ class DelayedModel(Wrapper):
                 f"first; got {tuple(queue.shape)}"
             )
         return queue
-
-
-def _padded_array(covariance: Array, size: int) -> Array:
-    whole, n = np.zeros((len(covariance), size, size)), covariance.shape[-1]
-    whole[:, :n, :n] = covariance
-    return whole

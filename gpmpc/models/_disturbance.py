@@ -17,14 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, DynamicsModel, Linearized, check_next_states, check_query, linearize, to_array
+from gpmpc.dynamics import Array, DynamicsModel, check_next_states, to_array
 from gpmpc.exceptions import SettingError, ShapeError, check_numbers
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.models._wrapper import Wrapper, padded
+from gpmpc.models._wrapper import LinearWrapper, padded
 
 
 @dataclass(frozen=True)
-class DisturbedModel(Wrapper):
+class DisturbedModel(LinearWrapper):
     """A model with disturbances as further states, (x, d).
 
     Attributes:
@@ -76,30 +76,13 @@ class DisturbedModel(Wrapper):
         own = torch.as_tensor(list(self.std), dtype=self.dtype, device=self.device).square()
         return torch.block_diag(self.model.noise_covariance, torch.diag(own))
 
-    def predict(self, state: Tensor, input: Tensor) -> Gaussian:
-        """The next state's distribution at (x, d) (*batch, n + q) and u (*batch, m), without the noise."""
-        check_query(self, state, input)
-        n = self.model.state_dim
-        x, d = state[..., :n], state[..., n:]
-        moved = self.model.predict(x, input)
-        decay = torch.as_tensor(list(self._decays), dtype=self.dtype, device=self.device)
-        mean = torch.cat([moved.mean + d @ self.effect.mT, decay * d], dim=-1)
-        return Gaussian(mean, padded(moved.covariance, self.state_dim))
-
-    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
-        """Linearises the model at K points, by the inner model's ``linearize``."""
-        n, size, K = self.model.state_dim, self.state_dim, len(states)
-        E, decay = self._arrays
-        inner = linearize(self.model, np.ascontiguousarray(states[:, :n]), inputs, covariance)
-        d = states[:, n:]
-        A, B = np.zeros((K, size, size)), np.zeros((K, size, self.input_dim))
-        A[:, :n, :n], A[:, :n, n:], B[:, :n] = inner.A, E, inner.B
-        A[:, n:, n:] = np.diag(decay)
-        V = None
-        if inner.covariance is not None:
-            V = np.zeros((K, size, size))
-            V[:, :n, :n] = inner.covariance
-        return Linearized(np.concatenate([inner.mean + d @ E.T, d * decay], axis=1), A, B, V)
+    @cached_property
+    def matrices(self) -> tuple[Array, Array, Array, Array]:
+        """Of ``LinearWrapper``: E d is added to f(x, u), and d moves on by Phi."""
+        n, k, m = self.model.state_dim, self.state_dim, self.input_dim
+        L = np.zeros((k, k))
+        L[:n, n:], L[n:, n:] = to_array(self.effect), np.diag(self._decays)
+        return np.zeros((m, k)), np.eye(m), L, np.zeros((k, m))
 
     def augmented(self, belief: Gaussian, std: Sequence[float] | None = None) -> Gaussian:
         """The belief over (x, d) before anything was estimated: d is zero, and independent of x.
@@ -131,8 +114,3 @@ class DisturbedModel(Wrapper):
     @property
     def _decays(self) -> Sequence[float]:
         return self.decay or ()
-
-    @cached_property
-    def _arrays(self) -> tuple[Array, Array]:
-        """E and the diagonal of Phi."""
-        return to_array(self.effect), np.array(self._decays, dtype=float)

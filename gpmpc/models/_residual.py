@@ -9,8 +9,8 @@ With ``Affine.identity`` as nominal model d is the difference of two states, and
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -130,18 +130,8 @@ class ResidualModel:
             SettingError: An index is out of range, the columns of B depend on each other, or there is no trainer.
             TrainingError: An output could not be trained.
         """
-        check_transitions(transitions)
-        n, m = transitions.state_dim, transitions.input_dim
-        states = list(range(n)) if states is None else list(states)
-        inputs = list(range(m)) if inputs is None else list(inputs)
-        B = torch.eye(n, dtype=torch.float64) if B is None else B
-        features = Features(states, inputs, list(angles), n, m)
-        training = _fit(nominal, B, features, transitions, Trainer() if trainer is None else trainer, seed)
-        noise = None
-        if callable(B):  # one covariance for all states: its mean over those that were observed
-            effect = _effect(B, transitions.states)
-            noise = (effect @ training.posterior.noise_covariance @ effect.mT).mean(0)
-        return cls(nominal, training.posterior, B, states, inputs, m, list(angles), noise)
+        trainer = Trainer() if trainer is None else trainer
+        return _train(nominal, transitions, B, (states, inputs, angles), trainer, seed)[0]
 
     def __len__(self) -> int:
         return len(self.residual)
@@ -218,10 +208,8 @@ class ResidualModel:
         A nominal model or an effect with a method ``linearize``, such as ``Affine`` or ``CasadiFunction``, is
         linearised by it; any other by one batched call of torch autograd.
         """
-        if hasattr(self.nominal, "linearize"):
-            mean, A, G = linearize_function(self.nominal, self, states, inputs)
-        else:
-            mean, A, G = linearize_function(lambda x, u: _nominal(self.nominal, x, u), self, states, inputs)
+        nominal = self.nominal if hasattr(self.nominal, "linearize") else partial(_nominal, self.nominal)
+        mean, A, G = linearize_function(nominal, self, states, inputs)
         features, selected, slope = self.features.linearize(states, inputs)
         d = self.residual.linearize(features, selected, covariance)
         by_state, by_input = self.features.chain(d.A, d.B, slope)
@@ -327,22 +315,27 @@ def train_residual(
         SettingError: An index is out of range, or there is no trainer.
         TrainingError: An output could not be trained.
     """
-    n, m = transitions.state_dim, transitions.input_dim
-    known = Affine.identity(n, m) if nominal is None else nominal
-    B, every = torch.eye(n, dtype=torch.float64), (list(range(n)), list(range(m)))
-    training = _fit(known, B, Features(*every, angles, n, m), transitions, trainer, seed)
-    model: Any = ResidualModel(known, training.posterior, B, *every, m, angles)
-    return replace(training, posterior=model)
+    known = Affine.identity(transitions.state_dim, transitions.input_dim) if nominal is None else nominal
+    model, training = _train(known, transitions, None, (None, None, angles), trainer, seed)
+    return replace(training, posterior=cast(Any, model))
 
 
-def _fit(
-    nominal: Nominal, B: Effect, features: Features, transitions: Transitions, trainer: Any, seed: int
-) -> Training:
-    """The training of the residual GP."""
+def _train(
+    nominal: Nominal, transitions: Transitions, B: Effect | None, seen: tuple[Any, Any, Any], trainer: Any, seed: int
+) -> tuple[ResidualModel, Training]:
+    """The model that ``ResidualModel.train`` makes, and the training of its GP; ``seen`` are states, inputs, angles."""
+    check_transitions(transitions)
     if not hasattr(trainer, "fit"):
         raise SettingError("trainer", f"must be a Trainer or SparseTrainer; got {trainer!r}")
-    observed = _residuals(nominal, B, features, transitions)
-    return trainer.fit(*observed, len(features.inputs), "value", seed)
+    n, m = transitions.state_dim, transitions.input_dim
+    states, inputs = (list(range(k)) if some is None else list(some) for some, k in zip(seen, (n, m), strict=False))
+    B, angles = torch.eye(n, dtype=torch.float64) if B is None else B, list(seen[2])
+    observed = _residuals(nominal, B, Features(states, inputs, angles, n, m), transitions)
+    training, noise = trainer.fit(*observed, len(inputs), "value", seed), None
+    if callable(B):  # one covariance for all states: its mean over those that were observed
+        effect = _effect(B, transitions.states)
+        noise = (effect @ training.posterior.noise_covariance @ effect.mT).mean(0)
+    return ResidualModel(nominal, training.posterior, B, states, inputs, m, angles, noise), training
 
 
 def _residuals(

@@ -1,9 +1,13 @@
 """What models around another model, with further states, have in common."""
 
+from functools import cached_property
+
+import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import DynamicsModel
+from gpmpc.dynamics import Array, DynamicsModel, Linearized, check_query, linearize, tensors_for
+from gpmpc.gaussian import Gaussian
 
 
 class Wrapper:
@@ -39,6 +43,36 @@ class Wrapper:
     def device(self) -> torch.device:
         """Of the model that is wrapped."""
         return self.model.device
+
+
+class LinearWrapper(Wrapper):
+    """A model f whose further states are linear: z+ = [f(x, Z z + W u); 0] + L z + M u, x the first n entries of z."""
+
+    @cached_property
+    def matrices(self) -> tuple[Array, Array, Array, Array]:
+        """Z (m, k), W (m, m), L (k, k) and M (k, m), for k states z."""
+        raise NotImplementedError
+
+    def predict(self, state: Tensor, input: Tensor) -> Gaussian:
+        """The next state's distribution at z (*batch, k) and u (*batch, m), without the noise."""
+        check_query(self, state, input)
+        n, (Z, W, L, M) = self.model.state_dim, tensors_for(self, *self.matrices)
+        moved = self.model.predict(state[..., :n], state @ Z.mT + input @ W.mT)
+        mean = torch.nn.functional.pad(moved.mean, (0, self.state_dim - n)) + state @ L.mT + input @ M.mT
+        return Gaussian(mean, padded(moved.covariance, self.state_dim))
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises the model at K points (K, k), (K, m), by the inner model's ``linearize``."""
+        n, K, (Z, W, L, M) = self.model.state_dim, len(states), self.matrices
+        inner = linearize(self.model, np.ascontiguousarray(states[:, :n]), states @ Z.T + inputs @ W.T, covariance)
+        mean, A, B = states @ L.T + inputs @ M.T, np.tile(L, (K, 1, 1)), np.tile(M, (K, 1, 1))
+        mean[:, :n] += inner.mean
+        A[:, :n] += inner.B @ Z
+        A[:, :n, :n] += inner.A
+        B[:, :n] += inner.B @ W
+        more = self.state_dim - n
+        V = None if inner.covariance is None else np.pad(inner.covariance, ((0, 0), (0, more), (0, more)))
+        return Linearized(mean, A, B, V)
 
 
 def padded(covariance: Tensor, size: int) -> Tensor:

@@ -28,11 +28,13 @@ _STABLE = 1e-9  # by how much an eigenvalue may lie outside the unit circle by r
 
 
 class Stages(NamedTuple):
-    """Affine stages s_{k+1} = A_k s_k + B_k u_k + c_k; H of them, or one that is constant over the horizon."""
+    """Affine stages s_{k+1} = A_k s_k + B_k u_k + c_k: K = H along a plan, or K = 1 that is held over the horizon."""
 
-    A: Array  # (H or 1, p, p)
-    B: Array  # (H or 1, p, m)
-    c: Array  # (H or 1, p)
+    A: Array  # (K, p, p)
+    B: Array  # (K, p, m)
+    c: Array  # (K, p); the defects of the plan are part of it
+    next: Array = np.empty((0, 0))  # where the dynamics lead from the points of the plan, F(s_k, u_k) (K, p)
+    V: Array = np.empty((0, 0, 0))  # what a stage adds to A Sigma A' (K, n, n), in the mode ``zero_order``; else zero
 
 
 class QuadraticCost(NamedTuple):

@@ -38,12 +38,11 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.kernels.gp_rollout import Feedback
 from gpmpc.kernels.linalg import copy_matrix, product
 from gpmpc.models import RollOut
-from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, finite_horizon_lqr
+from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, Stages, finite_horizon_lqr
 from gpmpc.mpc._stages import (
     COVARIANCES,
     ConstraintRows,
     Covariance,
-    LinearizedStages,
     Plan,
     StageCosts,
     StageLinearizer,
@@ -71,7 +70,7 @@ class Prediction(NamedTuple):
     """A plan, the stages linearised at it, the covariances of its states, and the rows tightened by them."""
 
     plan: Plan  # where the stages were linearised; with ``velocity`` its first stage only
-    stages: LinearizedStages
+    stages: Stages
     covariances: Array  # Sigma_0 .. Sigma_H (H + 1, n, n)
     rows: StageRows
     cost: QuadraticCost  # with outputs linearised at the plan
@@ -82,8 +81,10 @@ class PredictionSettings:
     """How beliefs are predicted.
 
     Attributes:
-        form: ``"trajectory"`` or ``"velocity"``; see the module's text.
-        covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see ``gpmpc.mpc._stages``.
+        form: Where the dynamics are linearised: ``"trajectory"``, at every stage of the last plan; ``"velocity"``, at
+            the current belief, held over the horizon (Cao, Lai and Alam, 2017, section 4).
+        covariance: What the program holds: ``"full"``, means and roots of the covariances; ``"diagonal"``, means and
+            standard deviations; ``"zero_order"``, means, with covariances predicted beside it; ``"none"``, means alone.
         feedback: Predicts the covariances of ``"zero_order"`` under a feedback, without which no long horizon with
             state constraints is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"``
             and ``"diagonal"`` are those without feedback.
@@ -138,20 +139,22 @@ class PredictionModel:
         check_method("propagator", propagator, "propagate", "Linearization()")
         if not isinstance(settings, PredictionSettings):
             raise SettingError("prediction", f"must be PredictionSettings(...); got {type(settings).__name__}")
-        self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
+        self.propagator, self.problem, self.horizon = propagator, problem, horizon
         self.settings, self.points = settings, horizon if settings.form == "trajectory" else 1
-        self.linearizer = StageLinearizer(model, propagator, settings.covariance)
+        self._set_model(model)
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         self.costs = StageCosts(problem, horizon, self.linearizer)
-        self._roll_out = RollOut(model)
-        self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
 
     def with_model(self, model: DynamicsModel) -> "PredictionModel":
         """Returns the predictions by another model of as many states and inputs."""
         other = copy(self)
-        other.model, other.linearizer = model, StageLinearizer(model, self.propagator, self.settings.covariance)
-        other._at_points = StageLinearizer(model, Linearization(), "zero_order")
+        other._set_model(model)
         return other
+
+    def _set_model(self, model: DynamicsModel) -> None:
+        self.model, self.linearizer = model, StageLinearizer(model, self.propagator, self.settings.covariance)
+        self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
+        self._roll_out = RollOut(model)
 
     def read(
         self,
@@ -178,8 +181,8 @@ class PredictionModel:
         if self.settings.disturbance_gain and request.finite:
             request = request._replace(disturbance=self._disturbance(request))
         if plan is not None and request.states is None and request.finite:  # those that the inputs lead to
-            disturbance = request.disturbance if len(request.disturbance) else None
-            states = self._roll_out.open_loop(request.state[None], request.initial_guess[None], disturbance)[0]
+            start = request.state[None], request.initial_guess[None], request.disturbance
+            states = self._roll_out.open_loop(*start)[0]
             request = request._replace(states=states if np.isfinite(states).all() else None)
         return request
 
@@ -221,8 +224,7 @@ class PredictionModel:
     def linearize(self, plan: Plan, request: Request) -> Prediction:
         """The stages of a plan, linearised in one call, with covariances, rows and cost."""
         K = self.points
-        disturbance = request.disturbance if len(request.disturbance) else None
-        stages = self.linearizer(plan.states[:K], plan.inputs[:K], plan.covariances[:K], disturbance)
+        stages = self.linearizer(plan.states[:K], plan.inputs[:K], plan.covariances[:K], request.disturbance)
         return self.predict(plan, stages, request)
 
     def linearize_many(self, requests: Sequence[Request]) -> list[Prediction]:
@@ -232,18 +234,18 @@ class PredictionModel:
         K, T = self.points, len(requests)
         plans = list(map(self.initial_guess, requests))
         states, inputs, covariances = (np.concatenate([s[:K] for s in parts]) for parts in zip(*plans, strict=True))
-        disturbances = [np.broadcast_to(r.disturbance, (K, len(r.state))) for r in requests if len(r.disturbance)]
+        disturbances = [np.tile(r.disturbance, (K, 1)) for r in requests if r.disturbance is not None]
         disturbance = np.concatenate(disturbances) if disturbances else None
         stages = self.linearizer(states, inputs, covariances, disturbance)
         parts = zip(*(part.reshape(T, K, *part.shape[1:]) for part in stages), strict=True)
-        return list(map(self.predict, plans, map(LinearizedStages._make, parts), requests))
+        return list(map(self.predict, plans, map(Stages._make, parts), requests))
 
     def canonical(self, plan: Plan) -> Plan:
         """A plan whose s are those of its beliefs: with roots that are positive semidefinite."""
         means, covariances = self.linearizer.moments(plan.states, plan.covariances)
         return Plan(self.linearizer.state(means, covariances), plan.inputs, covariances)
 
-    def predict(self, plan: Plan, stages: LinearizedStages, request: Request) -> Prediction:
+    def predict(self, plan: Plan, stages: Stages, request: Request) -> Prediction:
         """Covariances, rows and cost for stages that were linearised at a plan; see ``linearize``."""
         covariances, mode = plan.covariances, self.linearizer.covariance
         cost = self.costs.at(plan, request.parameters)
@@ -258,9 +260,7 @@ class PredictionModel:
         rows = self.constraints.at(plan, covariances, self.points, request.parameters, request.kappas)
         return Prediction(plan, stages, covariances, rows, cost)
 
-    def _increments(
-        self, plan: Plan, stages: LinearizedStages, request: Request, previous: Decision
-    ) -> LinearizedStages:
+    def _increments(self, plan: Plan, stages: Stages, request: Request, previous: Decision) -> Stages:
         """A held linearisation as that of the increments since s_{-1}, the state that the last decision began at."""
         before = self.linearizer.state(previous.means[:1], previous.covariances[:1])[0]
         c = plan.states[0] - stages.A[0] @ before - stages.B[0] @ request.references.previous_input
@@ -276,8 +276,7 @@ class PredictionModel:
 
     def evaluate(self, plan: Plan, at: Prediction, request: Request) -> Prediction:
         """The prediction at a plan with the derivatives of another one, ``at``."""
-        disturbance = request.disturbance if len(request.disturbance) else None
-        after = self._roll_out.open_loop(plan.states[:-1], plan.inputs[:, None], disturbance)[:, 1]
+        after = self._roll_out.open_loop(plan.states[:-1], plan.inputs[:, None], request.disturbance)[:, 1]
         return self._without(plan, after, at, request)
 
     def _without(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
@@ -296,7 +295,7 @@ class PredictionModel:
         problem, n, linearizer = self.problem, self.problem.state_dim, self.linearizer
         own = -self.gains(*prediction.stages[:2], prediction.cost) if not len(feedback) else feedback
         gains = np.ascontiguousarray(own[:, :, :n])
-        last, disturbance = request.references.previous_input, request.disturbance if len(request.disturbance) else None
+        last, disturbance = request.references.previous_input, request.disturbance
         limits = problem.inputs.lower, problem.inputs.upper, problem.input_rates.lower, problem.input_rates.upper
         if linearizer.at_points and all(limit.ndim == 1 for limit in limits):
             law = Feedback(towards.states[None], towards.inputs[None], gains[None], *limits, last)
@@ -316,10 +315,10 @@ class PredictionModel:
             states[k + 1] = stage.next[0]
             covariances[k + 1] = linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
             parts.append(stage)
-        stages = LinearizedStages(*map(np.concatenate, zip(*parts, strict=True)))
+        stages = Stages(*map(np.concatenate, zip(*parts, strict=True)))
         return self.predict(Plan(states, inputs, covariances), stages, request)
 
-    def gain(self, stages: LinearizedStages, cost: QuadraticCost) -> Array:
+    def gain(self, stages: Stages, cost: QuadraticCost) -> Array:
         """K (m, n) of the feedback u = u_k - K (x - mu_k) at the first stage; zero without feedback."""
         return self.gains(stages.A[:1], stages.B[:1], cost)[0]
 

@@ -26,10 +26,10 @@ import torch
 from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.dynamics import DynamicsModel, linearize, tensors_for, to_array
 from gpmpc.exceptions import SettingError
-from gpmpc.gaussian import Gaussian
+from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
 from gpmpc.kernels.linalg import dot
 from gpmpc.mpc._cost import PENALIZED, by_stage
-from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows
+from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, Stages
 from gpmpc.mpc.problem import Inequality, Problem
 from gpmpc.propagation import Propagator, differentiate, square_roots
 from gpmpc.propagation import linearize as linearize_belief
@@ -47,16 +47,6 @@ class Plan(NamedTuple):
     states: Array  # s_0 .. s_H (H + 1, p); s_0 is the current one
     inputs: Array  # u_0 .. u_{H-1} (H, m)
     covariances: Array  # Sigma_0 .. Sigma_H (H + 1, n, n)
-
-
-class LinearizedStages(NamedTuple):
-    """K affine stage models: K = H along a plan, or K = 1 that is held over the horizon."""
-
-    A: Array  # (K, p, p)
-    B: Array  # (K, p, m)
-    c: Array  # (K, p); the defects of the plan are part of it
-    next: Array  # where the dynamics lead from the points themselves, F(s_k, u_k) (K, p)
-    V: Array  # what a stage adds to A Sigma A' (K, n, n), in the mode ``zero_order``; zero elsewhere
 
 
 class StageLinearizer:
@@ -104,15 +94,13 @@ class StageLinearizer:
             return states[:, :n], states[:, n:, None] ** 2 * np.eye(n)
         return states, covariances
 
-    def __call__(
-        self, states: Array, inputs: Array, covariances: Array, disturbance: Array | None = None
-    ) -> LinearizedStages:
+    def __call__(self, states: Array, inputs: Array, covariances: Array, disturbance: Array | None = None) -> Stages:
         """The stage models at K points s (K, p), u (K, m), Sigma (K, n, n), disturbance (n,) added to the means."""
         after, A, B, V = self._linearize(states, inputs, covariances)
         if disturbance is not None:
             after = after.copy()
             after[:, : self._n] += disturbance
-        return LinearizedStages(A, B, call_unchecked(_constants, A, B, after, states, inputs), after, V)
+        return Stages(A, B, call_unchecked(_constants, A, B, after, states, inputs), after, V)
 
     def _points(self, states: Array, inputs: Array, _: Array) -> tuple[Array, ...]:
         found = linearize(self.model, states, inputs, self.covariance == "zero_order")
@@ -125,8 +113,7 @@ class StageLinearizer:
         moved, d = differentiate(self.propagator, self.model, *self._tensors(states, covariances, inputs))
         A, S = d.mean_by_mean, moved.belief.covariance
         passed = A @ moved.cross_covariance  # mean equivalence passes nothing on
-        eigenvalues, vectors = torch.linalg.eigh(S - (passed + passed.mT) / 2)
-        V = (vectors * eigenvalues.clamp_min(0)[..., None, :]) @ vectors.mT
+        V, _ = nearest_positive_semidefinite(S - (passed + passed.mT) / 2)
         return tuple(map(to_array, (moved.belief.mean, A, d.mean_by_input, V)))
 
     def _full(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
@@ -251,12 +238,7 @@ class ConstraintRows:
             self._fixed = StageRows(self._constant, self._plain, self._lower, self._upper)
 
     def at(
-        self,
-        plan: Plan,
-        covariances: Array,
-        stages: int,
-        parameters: Array | None = None,
-        kappas: Array | None = None,
+        self, plan: Plan, covariances: Array, stages: int, parameters: Array | None = None, kappas: Array | None = None
     ) -> StageRows:
         """The rows, tightened by the covariances (H + 1, n, n), at a plan where smooth constraints are linearised.
 
@@ -334,9 +316,7 @@ def price_violations(prices, rows, plan, hard_price):
 
 def _directions(F: Array, covariances: Array) -> Array:
     """S g / |S g| (K, r, n) for rows g of F (K, r, n) and the symmetric roots S of covariances (K, n, n)."""
-    eigenvalues, vectors = np.linalg.eigh(covariances)
-    roots = (vectors * np.sqrt(np.clip(eigenvalues, 0, None))[:, None, :]) @ vectors.mT
-    moved = F @ roots
+    moved = F @ square_roots(covariances)[0]
     norms = np.linalg.norm(moved, axis=-1, keepdims=True)
     return np.divide(moved, norms, out=np.zeros_like(moved), where=norms > 0)
 

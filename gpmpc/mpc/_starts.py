@@ -18,9 +18,12 @@ import torch
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import RollOut
+from gpmpc.mpc._linear_quadratic import References, evaluate_cost
+from gpmpc.mpc._stages import StageCosts, StageLinearizer
 from gpmpc.mpc.controller import Array, Decision, Reference, full_turns
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Problem
+from gpmpc.propagation import Linearization
 
 Criterion = Callable[[Decision, Reference], float]
 
@@ -73,7 +76,9 @@ class ManyStarts:
             raise SettingError("turns", f"must be whole numbers from 1 on, one for each of {len(angles)} angles")
         if budget is not None:
             check_number("budget", budget, above=0, unit="[s]")
-        self.criterion = plan_cost(self.problem) if criterion is None else criterion
+        self.criterion = self._cost if criterion is None else criterion
+        linearizer = StageLinearizer(controller.prediction.model, Linearization(), "none")
+        self._weights = StageCosts(self.problem, H, linearizer).quadratic
         self.limit, self.budget = limit, budget
         self._rolled_out = RollOut(self.planner.prediction.model)
 
@@ -106,6 +111,12 @@ class ManyStarts:
     def gains(self, decision: Decision) -> Array:
         """Those of ``controller``."""
         return self.controller.gains(decision)
+
+    def _cost(self, decision: Decision, reference: Reference) -> float:
+        """The tracking cost of a plan."""
+        wanted = np.zeros_like(decision.inputs) if reference.inputs is None else np.asarray(reference.inputs)
+        references = References(np.asarray(reference.states[1:]), wanted, decision.inputs[0])
+        return evaluate_cost(self._weights, decision.means, decision.inputs, references, 1.0)
 
     def _try(
         self,
@@ -160,21 +171,6 @@ def kicks(problem: Problem, horizon: int, initial_input: Array, share: float = 0
                 inputs[part, j] += share * (side[j] - initial_input[j])
             found.append(inputs)
     return found
-
-
-def plan_cost(problem: Problem) -> Criterion:
-    """The criterion that is the tracking cost of a problem."""
-
-    def value(decision: Decision, reference: Reference) -> float:
-        Q, R = problem.cost.by_stage(len(decision.inputs))
-        off, inputs = decision.means[1:] - reference.states[1:], decision.inputs
-        if problem.cost.penalized == "deviations" and reference.inputs is not None:
-            inputs = inputs - reference.inputs
-        elif problem.cost.penalized == "increments":
-            inputs = np.diff(inputs, axis=0, prepend=inputs[:1])
-        return float(np.einsum("ki,kij,kj", off, Q, off) + np.einsum("ki,kij,kj", inputs, R, inputs))
-
-    return value
 
 
 def _moved(reference: Reference, turns: Array) -> Reference:

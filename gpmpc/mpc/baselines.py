@@ -35,7 +35,7 @@ from gpmpc.dynamics import DynamicsModel, check_next_states
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.interrupts import interrupts_after
-from gpmpc.mpc._linear_quadratic import Stages, optimal_feedback
+from gpmpc.mpc._linear_quadratic import optimal_feedback
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc._sqp import FAILURES
 from gpmpc.mpc._stages import ConstraintRows, Plan, StageCosts, StageLinearizer
@@ -73,12 +73,7 @@ class NMPC:
     """
 
     def __init__(
-        self,
-        plant: Plant,
-        problem: Problem,
-        horizon: int,
-        initial_input: Sequence[float],
-        tolerance: float = 1e-10,
+        self, plant: Plant, problem: Problem, horizon: int, initial_input: Sequence[float], tolerance: float = 1e-10
     ):
         n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
         self.initial_input = check_controller(problem, n, m, horizon, initial_input)
@@ -155,16 +150,16 @@ class LQR:
         (targets, wanted, last), x = request.references, request.state
         states = np.vstack([x, targets[:-1]])
         inputs: Any = request.constant_guess if reference.inputs is None else wanted
-        stages = Stages(*self._linearize(states, inputs, np.empty((0, *request.covariance.shape)))[:3])
+        stages = self._linearize(states, inputs, np.empty((0, *request.covariance.shape)))
         modelled = perf_counter()
-        if not all(np.isfinite(part).all() for part in stages):
+        if not all(np.isfinite(part).all() for part in stages[:3]):
             return request.failed_decision(Status.NUMERICAL_TROUBLE)
         feedback, _ = optimal_feedback(self._cost, stages, request.references)
         if not np.isfinite(feedback).all():
             return request.failed_decision(Status.NUMERICAL_TROUBLE)
         states, inputs, box, rates = [x], [], self.problem.inputs, self.problem.input_rates
         (low, high), (down, up) = (bounds.by_stage(self.horizon) for bounds in (box, rates))
-        for k, (A, B, offset, F) in enumerate(zip(*stages, feedback, strict=True)):
+        for k, (A, B, offset, F) in enumerate(zip(*stages[:3], feedback, strict=True)):
             u = F @ np.concatenate([x, last, [1.0]])
             # The box last: where it and the rates contradict each other, the input must at least exist.
             u = u.clip(last + down[k], last + up[k]).clip(low[k], high[k])
@@ -251,8 +246,7 @@ class StateFormMPC:
             return request.failed_decision(status, iterations, timing)
         inputs, states = np.array(self._program.inputs.value), np.array(self._program.states.value)
         beliefs = self.prediction.linearizer.moments(states, prediction.covariances)
-        disturbance = request.disturbance if self.prediction.settings.disturbance_gain else None
-        ended: Any = {"disturbance": disturbance, "suboptimal": suboptimal}
+        ended: Any = {"disturbance": request.disturbance, "suboptimal": suboptimal}
         return Decision(inputs[0], inputs, *beliefs, status, iterations, timing, **ended)
 
 
@@ -275,33 +269,20 @@ def _build(
     if problem.input_rates.finite:
         constraints.append(casadi.vec(rates))
         g.append(np.array(problem.input_rates.by_stage(H)).reshape(2, -1))
-    unknowns, states = [casadi.vec(x), casadi.vec(u)], np.stack([np.full((H, n), -np.inf), np.full((H, n), np.inf)])
-    box = [np.empty((2, 0)), np.array(problem.inputs.by_stage(H)).reshape(2, -1)]
+    unknowns, box = [casadi.vec(x), casadi.vec(u)], [np.tile([[-np.inf], [np.inf]], H * n)]
+    box.append(np.array(problem.inputs.by_stage(H)).reshape(2, -1))
     rows = ConstraintRows(problem, H, "none")
-    soft = np.isfinite(rows.prices)
     E, _, lower, upper = rows.at(Plan(np.empty((0, n)), np.empty((0, m)), np.empty(0)), np.empty(0), H)
-    single = (np.count_nonzero(E[0], axis=1) == 1) & (E[0].max(axis=1) == 1.0)
-    for e in np.flatnonzero(single & ~soft):
-        j = int(np.argmax(E[0, e]))
-        states[0, :, j] = np.maximum(states[0, :, j], lower[:, e])
-        states[1, :, j] = np.minimum(states[1, :, j], upper[:, e])
-    mixed, priced = np.flatnonzero(~single & ~soft), np.flatnonzero(soft)
-    if mixed.size:
-        constraints.append(casadi.vec(casadi.mtimes(casadi.DM(E[0, mixed]), x)))
-        g.append(np.array([lower[:, mixed], upper[:, mixed]]).reshape(2, -1))
-    if priced.size:
-        slack = casadi.SX.sym("slack", len(priced), H)
-        cost += casadi.sum1(casadi.vec(casadi.DM(rows.prices[priced]) * slack))
-        bounds = np.where(rows.signs > 0, upper, lower)[:, priced]
-        sign, applies = rows.signs[priced], rows.applies[:, priced]
-        beyond = casadi.DM(sign) * (
-            casadi.mtimes(casadi.DM(E[0, priced]), x) - casadi.DM(np.where(applies, bounds, 0).T)
-        )
-        constraints.append(casadi.vec(beyond - slack))
+    soft = np.flatnonzero(np.isfinite(rows.prices))
+    if rows.per_stage:
+        slack, values = casadi.SX.sym("slack", len(soft), H), casadi.mtimes(casadi.DM(E[0]), x)
+        for e, given in zip(soft, casadi.vertsplit(slack) if soft.size else [], strict=True):
+            values[int(e), :] -= rows.signs[e] * given  # what a soft row gives way by, on its side
+            cost += rows.prices[e] * casadi.sum2(given)
+        constraints.append(casadi.vec(values))
+        g.append(np.array([lower, upper]).reshape(2, -1))
         unknowns.append(casadi.vec(slack))
-        g.append(np.array([np.full(applies.shape, -np.inf), np.where(applies, 0.0, np.inf)]).reshape(2, -1))
-        box.append(np.tile([[0.0], [np.inf]], H * len(priced)))
-    box[0] = states.reshape(2, -1)
+        box.append(np.tile([[0.0], [np.inf]], H * len(soft)))
     nlp = {
         "x": casadi.vertcat(*unknowns),
         "p": casadi.vertcat(x0, last, casadi.vec(r), casadi.vec(wanted)),

@@ -23,7 +23,7 @@ Array = np.ndarray
 
 _FAR = 0.9  # of the standard deviation without data
 FEASIBLE = 1e-3  # by how much a suboptimal plan may miss hard bounds, in their units: a next step mends it
-_NO_PLAN, _NO_DISTURBANCE = np.empty((0, 0)), np.empty(0)
+_NO_PLAN = np.empty((0, 0))
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Reference:
         if np.ndim(self.states) == 2:
             return self
         inputs = None if self.inputs is None else np.tile(_array(self.inputs), (horizon, 1))
-        return Reference(np.tile(_array(self.states), (horizon + 1, 1)), inputs)
+        return Reference(np.tile(_array(self.states), (horizon + 1, 1)), inputs, self.kappas)
 
     @property
     def horizon(self) -> int:
@@ -86,40 +86,27 @@ class Timing:
 
 @dataclass(frozen=True)
 class Decision:
-    """What a controller decided at one step.
+    """What a controller decided at one step."""
 
-    Attributes:
-        input: The input to apply now (m,).
-        inputs: The planned inputs (H, m); the first row is ``input``.
-        means: Predicted means of the states (H + 1, n), from the current state on.
-        covariances: Their covariances (H + 1, n, n); zero where the controller does not predict them.
-        status: How the solve ended.
-        iterations: Iterations of the solver.
-        timing: Wall time of the parts.
-        problem: The quadratic program that was solved last, where there is one.
-        solution: Its solution: active set, multipliers, residuals; a warm start for the next.
-        disturbance: Estimate of the model's constant error (n,), added to its mean at every stage; None where nothing
-            is estimated.
-        suboptimal: The solve stopped short of its tolerance, at a limit say, with a plan that keeps its bounds and that
-            steps towards the optimum led to (Scokaert, Mayne and Rawlings, 1999).
-        novelty: The largest standard deviation that a stage of the plan adds, over the one that the model has far from
-            all data: near 0 among data, near 1 where the model knows nothing; NaN where that is not known.
-        learned: What the flight has taught a controller that learns (``gpmpc.learning``), for its next decision; with
-            ``size``, the points of the model that decided, and ``version``, how often it has changed.
-    """
-
-    input: Array
-    inputs: Array
-    means: Array
-    covariances: Array
-    status: Status
-    iterations: int
-    timing: Timing
-    problem: QuadraticProgram | None = None
-    solution: QPSolution | None = None
+    input: Array  #: to apply now (m,)
+    inputs: Array  #: planned (H, m); the first row is ``input``
+    means: Array  #: predicted means of the states (H + 1, n), from the current state on
+    covariances: Array  #: of these (H + 1, n, n); zero where the controller does not predict them
+    status: Status  #: how the solve ended
+    iterations: int  #: of the solver
+    timing: Timing  #: of the parts
+    problem: QuadraticProgram | None = None  #: that was solved last, where there is one
+    solution: QPSolution | None = None  #: of it: active set, multipliers, residuals; a warm start for the next
+    #: estimate of the model's constant error (n,), added to its mean at every stage; None where nothing is estimated
     disturbance: Array | None = None
+    #: the solve stopped short of its tolerance, at a limit say, with a plan that keeps its bounds and that steps
+    #: towards the optimum led to (Scokaert, Mayne and Rawlings, 1999)
     suboptimal: bool = False
+    #: the largest standard deviation that a stage of the plan adds, over the one that the model has far from all data:
+    #: near 0 among data, near 1 where the model knows nothing; NaN where that is not known
     novelty: float = math.nan
+    #: what the flight has taught a controller that learns (``gpmpc.learning``), for its next decision; with ``size``,
+    #: the points of the model that decided, and ``version``, how often it has changed
     learned: Any = None
 
     def __post_init__(self) -> None:
@@ -164,32 +151,20 @@ class Controller(Protocol):
 
 
 class Request(NamedTuple):
-    """The arguments of ``control``, validated and converted to contiguous float64 arrays.
+    """The arguments of ``control``, validated and converted to contiguous float64 arrays."""
 
-    Attributes:
-        state: Mean of the belief (n,).
-        covariance: Of the belief (n, n).
-        references: r_1 .. r_H, reference inputs (zero where there are none), and the input before this step.
-        initial_guess: Inputs (H, m) within their bounds: those handed over; else the last plan's, one step on, the last
-            one repeated; else the previous input repeated.
-        finite: Whether the belief is. A belief that is not is a bad measurement, not misuse.
-        disturbance: Added to the model's mean at every stage (n,), or nothing (0,).
-        parameters: Of the smooth constraints, by stage (H, q); None where there are none.
-        kappas: Of the reference (H,), where it has some.
-        previous: The last decision, where its plan may be started from and has this horizon.
-        states: A first guess of x_0 .. x_H (H + 1, n), where one was handed over.
-    """
-
-    state: Array
-    covariance: Array
-    references: References
+    state: Array  # mean of the belief (n,)
+    covariance: Array  # of the belief (n, n)
+    references: References  # r_1 .. r_H, reference inputs (zero where there are none), and the input before this step
+    #: inputs (H, m) within their bounds: those handed over; else the last plan's, one step on, the last one repeated;
+    #: else the previous input repeated
     initial_guess: Array
-    finite: bool
-    disturbance: Array = _NO_DISTURBANCE
-    parameters: Array | None = None
-    kappas: Array | None = None
-    previous: Decision | None = None
-    states: Array | None = None
+    finite: bool  # whether the belief is; one that is not is a bad measurement, not misuse
+    disturbance: Array | None = None  # added to the model's mean at every stage (n,); None where nothing is estimated
+    parameters: Array | None = None  # of the smooth constraints, by stage (H, q)
+    kappas: Array | None = None  # of the reference (H,), where it has some
+    previous: Decision | None = None  # the last one, where its plan may be started from and has this horizon
+    states: Array | None = None  # a first guess of x_0 .. x_H (H + 1, n), where one was handed over
 
     @classmethod
     def read(

@@ -26,7 +26,7 @@ from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._condense import Condenser
-from gpmpc.mpc._linear_quadratic import CondensedProgram, Stages, expand
+from gpmpc.mpc._linear_quadratic import CondensedProgram, expand
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc._sqp import FAILURES, Globalization
 from gpmpc.mpc._stages import Covariance, Plan, price_violations
@@ -86,6 +86,7 @@ class GPMPC:
         self._condenser = Condenser(problem, horizon, len(self.prediction.costs.quadratic.terminal))
         self._prior = self.prediction.linearizer.prior_variances()
         self._rates = self._condenser.bounds.rate_lower.size
+        self._hard = np.where(np.isinf(self.prediction.constraints.prices), np.inf, 0.0)  # prices: of hard rows alone
         self._soft = self.prediction.constraints.softness(self._rates)
         if self._soft is not None and not isinstance(self.solver, DualActiveSet):
             got = (
@@ -132,9 +133,8 @@ class GPMPC:
         """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
         guess, solution = prediction.plan, None if request.previous is None else request.previous.solution
         search = Globalization(self.prediction, request, self.tolerance) if self.iterations > 1 else None
-        program: Any = None
         solved_at, status, count = None, None, 0
-        while status is None and count < self.iterations:
+        while True:
             clock.lap("model")
             program = self._condense(prediction, request)
             program = program if search is None else search.correct(program, prediction.plan)
@@ -143,28 +143,28 @@ class GPMPC:
             clock.lap("solve")
             count, status = count + 1, solution.status
             if _is_usable(program, solution, prediction.plan):
-                solved_at, proposed = (
-                    (prediction, program.feedback),
-                    self._proposed(prediction, program, solution, request),
-                )
+                proposed = self._proposed(prediction, program, solution, request)
+                solved_at = prediction, program.feedback
                 if search is None:  # the real-time iteration takes the whole step
                     prediction = prediction._replace(plan=proposed)
                 else:
                     prediction, status = search(prediction, program, solution, proposed)
+            if status is not None or count == self.iterations:
+                break
         if solved_at is not None and self.prediction.settings.rolled_out:
             obeying = self.prediction.roll_out(prediction.plan, *solved_at, request)
             prediction = obeying if np.isfinite(obeying.plan.states).all() else prediction
         clock.lap("model")
         program, status = QuadraticProgram.unchecked(*program[:5]), Status.ITERATION_LIMIT if status is None else status
-        suboptimal = not status.solved and prediction.plan is not guess and self._missed(prediction) <= FEASIBLE
+        suboptimal = not status.solved and prediction.plan is not guess
+        suboptimal = suboptimal and price_violations(self._hard, prediction.rows, prediction.plan, 1.0) <= FEASIBLE
         if not (status.solved or suboptimal):
             return replace(request.failed_decision(status, count, clock.timing), problem=program, solution=solution)
-        plan, disturbance = prediction.plan, request.disturbance if self.prediction.settings.disturbance_gain else None
-        inputs = plan.inputs.copy()
+        plan = prediction.plan
         means, covariances = self.prediction.linearizer.moments(plan.states, prediction.covariances)
         novelty = call_unchecked(_largest_ratio, prediction.stages.V, self._prior)
-        solved = status, count, clock.timing, program, solution, disturbance, suboptimal, novelty
-        return Decision(inputs[0], inputs, means, covariances, *solved)
+        inputs, found = plan.inputs.copy(), (program, solution, request.disturbance, suboptimal, novelty)
+        return Decision(inputs[0], inputs, means, covariances, status, count, clock.timing, *found)
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
         """Returns the controller for another model of as many states and inputs, in microseconds."""
@@ -245,9 +245,8 @@ class GPMPC:
         return QuadraticProgram.from_stacked(*self._condense(prediction, request)[:5])
 
     def _condense(self, prediction: Prediction, request: Request) -> CondensedProgram:
-        stages, references = Stages(*prediction.stages[:3]), request.references
-        start = prediction.plan.states[0]
-        return self._condenser.condense(prediction.cost, stages, start, references, prediction.rows)
+        parts = prediction.stages, prediction.plan.states[0], request.references, prediction.rows
+        return self._condenser.condense(prediction.cost, *parts)
 
     def _solve(self, program: CondensedProgram, warm: QPSolution | None) -> QPSolution:
         if isinstance(self.solver, DualActiveSet):
@@ -262,15 +261,10 @@ class GPMPC:
         self, prediction: Prediction, program: CondensedProgram, solution: QPSolution, request: Request
     ) -> Plan:
         """The plan of a program's solution: its inputs, and the states that the stages lead to."""
-        stages, at = Stages(*prediction.stages[:3]), (prediction.plan.states[0], program.feedback)
+        at = prediction.stages, prediction.plan.states[0], program.feedback
         unknowns = np.ascontiguousarray(solution.x, dtype=np.float64)
-        inputs, states = call_unchecked(expand, stages, *at, request.references.previous_input, unknowns)
+        inputs, states = call_unchecked(expand, *at, request.references.previous_input, unknowns)
         return Plan(states, inputs, prediction.covariances)
-
-    def _missed(self, prediction: Prediction) -> float:
-        """Violations of hard constraints by a plan, summed."""
-        prices = np.where(np.isinf(self.prediction.constraints.prices), np.inf, 0.0)
-        return price_violations(prices, prediction.rows, prediction.plan, 1.0)
 
 
 class NonlinearGPMPC(GPMPC):

@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
+from scipy.interpolate import krogh_interpolate
 
 from gpmpc.exceptions import SettingError, ShapeError, SolverFailure, check_number
 from gpmpc.gaussian import Gaussian
@@ -26,21 +27,16 @@ _ROUNDING = 1e-4  # share of an input or of 1, whichever is more, by which a loo
 
 @dataclass(frozen=True)
 class Command:
-    """What one step applies, and what the next one needs.
+    """What one step applies, and what the next one needs."""
 
-    Attributes:
-        input: Applied (m,).
-        status: How the step's own solve ended; ``INVALID_MEASUREMENT`` where the controller was not called,
-            ``NUMERICAL_TROUBLE`` where it called a plan solved that must not reach a plant.
-        decision: Of the controller, with this status, a failed iterate perhaps; None where it was not called or
-            returned inputs of another shape.
-        plan: The last applicable decision, shifted to this step. Before the first one that is not, with what was
-            applied as its ``input``; None where nothing was.
-    """
-
-    input: np.ndarray
+    input: np.ndarray  #: applied (m,)
+    #: how the step's own solve ended; ``INVALID_MEASUREMENT`` where the controller was not called,
+    #: ``NUMERICAL_TROUBLE`` where it called a plan solved that must not reach a plant
     status: Status
+    #: of the controller, with this status; None where it was not called or returned inputs of another shape
     decision: Decision | None
+    #: the last applicable decision, shifted to this step; before the first one that is not, with what was applied as
+    #: its ``input``; None where nothing was
     plan: Decision | None
 
     @property
@@ -206,11 +202,8 @@ def _state_along(states: np.ndarray, time: float) -> np.ndarray:
     """The state (n,) at a time in steps from s_0 on, by the cubic through the four nearest of s_0 .. s_H (H + 1, n)."""
     count = min(4, len(states))
     first = min(max(int(time) - 1, 0), len(states) - count)
-    nodes, value = np.arange(first, first + count), np.zeros(states.shape[1])
-    for i in nodes:
-        others = nodes[nodes != i]
-        value += np.prod((time - others) / (i - others)) * states[i]
-    return value
+    nodes = np.arange(first, first + count)
+    return krogh_interpolate(nodes, states[nodes], time)
 
 
 def check_policy(on_failure: str) -> None:

@@ -24,26 +24,25 @@ from gpmpc.plotting._style import DASHED, GREEN, styled
 if TYPE_CHECKING:
     from gpmpc.recording import Run
 
+_FRAMES, _RATE = 150, 15  # at most so many, steps are left out evenly; frames a second
 _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _VISIBLE = 0.06  # an ellipse's half axis, as a share of the view, from which on it is large enough
 PLAN = GREEN
 
 
-def animate(run: "Run", path: str | Path, frames: int = 150, rate: int = 15) -> None:
+def animate(run: "Run", path: str | Path) -> None:
     """Writes the flight as a GIF, or as an MP4 by the file's ending.
 
     Args:
         run: A recording whose ``pose`` has x, y and z.
         path: The file, .gif or .mp4 (which needs ffmpeg).
-        frames: At most so many; steps are left out evenly.
-        rate: Frames a second.
     """
     if not {"x", "y", "z"} <= run.pose.keys() or not len(run.times):
         raise UnsupportedModel(f"{run.path}: an animation needs steps with positions x, y and z")
     figure, draw = _scene(run)
-    shown = np.unique(np.linspace(0, len(run.times) - 1, min(frames, len(run.times))).astype(int))
+    shown = np.unique(np.linspace(0, len(run.times) - 1, min(_FRAMES, len(run.times))).astype(int))
     animation = FuncAnimation(figure, draw, frames=shown, blit=False, cache_frame_data=False)
-    writer = FFMpegWriter(fps=rate) if Path(path).suffix == ".mp4" else PillowWriter(fps=rate)
+    writer = FFMpegWriter(fps=_RATE) if Path(path).suffix == ".mp4" else PillowWriter(fps=_RATE)
     animation.save(str(path), writer=writer, dpi=80)
 
 

@@ -69,13 +69,7 @@ def by_autograd(
     """``differentiate`` by torch autograd, for any propagator and model that torch can follow."""
     input, n, k = checked_input(model, belief, input), belief.dim, model.output_dim
     with torch.inference_mode(False):  # inference tensors, constants too, could not be saved for backward
-        return _by_autograd(propagator, model, belief, input, n, k)
-
-
-def _by_autograd(
-    propagator: Propagator, model: Any, belief: Gaussian, input: Tensor, n: int, k: int
-) -> tuple[Propagation, Sensitivity]:
-    rows, columns = torch.tril_indices(k, k, device=belief.mean.device)
+        rows, columns = torch.tril_indices(k, k, device=belief.mean.device)
     batch = belief.mean.shape[:-1]
 
     def step(mean: Tensor, covariance: Tensor, control: Tensor) -> tuple[Tensor, ...]:

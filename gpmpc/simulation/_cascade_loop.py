@@ -124,38 +124,34 @@ def cascade_loop(
             that of the controller that failed.
         Diverged: The plant left the finite numbers; its step is an inner one.
     """
-    check_number("steps", steps, least=1, whole=True)
     check_policy(on_failure)
     names = (tuple(plant.dynamics.state_names), tuple(plant.dynamics.input_names))
     if names != (Coupled.state_names, Coupled.input_names):
         raise ShapeError(f"a cascade flies the states and inputs of Coupled; got {names}")
-    references = check_references(references, steps, cascade.outer.horizon)
+    references, ratio = check_references(references, steps, cascade.outer.horizon), cascade.ratio
     simulator = PlantSimulator(plant, initial, disturbances, noise, seed)
-    outer, inner = (History(None if on_step is None else partial(on_step, loop)) for loop in ("outer", "inner"))
+    calls: Any = (None, None) if on_step is None else [partial(on_step, loop) for loop in ("outer", "inner")]
+    outer = History(simulator, references, ratio * plant.time_step, _OUTER, calls[0])
+    inner = History(simulator, references, plant.time_step, _INNER, calls[1])
     states, inputs = [simulator.mean], []
 
     def decide(j: int, beliefs: Sequence[Gaussian], last: Sequence[_Decided | None]) -> list[_Decided]:
         return [_decide(cascade, references, on_failure, j, beliefs[0], last[0])]
 
     def record(moment: Moment, decided: _Decided) -> None:
-        k, phase = divmod(moment.k, cascade.ratio)
+        k, phase = divmod(moment.k, ratio)
         if phase == 0:
-            outer.add(moment.part(k, _OUTER, decided.outer.input), references.states[k], decided.outer)
-        inner.add(moment.part(moment.k, _INNER, moment.input[1:]), decided.attitude.states[0], decided.inner)
+            outer.add(moment._replace(k=k, input=decided.outer.input), decided.outer)
+        inner.add(moment._replace(input=moment.input[1:]), decided.inner, decided.attitude.states[0])
         states.append(simulator.mean)
         inputs.append(moment.input)
 
     flight = Flight(simulator, record)
-    fly([flight], decide, steps * cascade.ratio, plant.time_step)
+    fly([flight], decide, steps * ratio, plant.time_step)
     if flight.error is not None:
         raise flight.error
-    attitudes = Reference(flight.last.attitude.states[:2])  # at the last step, and at the end
-    return CascadeRollout(
-        states=np.array(states),
-        inputs=np.array(inputs),
-        outer=outer.rollout(simulator, references, cascade.ratio * plant.time_step, _OUTER),
-        inner=inner.rollout(simulator, attitudes, plant.time_step, _INNER),
-    )
+    last = flight.last.attitude.states[1]
+    return CascadeRollout(np.array(states), np.array(inputs), outer.rollout(), inner.rollout(last))
 
 
 class _Decided(NamedTuple):

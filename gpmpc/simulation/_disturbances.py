@@ -34,9 +34,6 @@ class Gust(Disturbance):
     """A constant push on single states over a time window, integrated by the plant like any other force.
 
     (Where the dynamics give the next state, it is added to that.)
-
-    Raises:
-        SettingError: A rate is no number, or the window is empty.
     """
 
     #: what is added to the derivative of a state, by its name: ``{"vx": 2.0}`` is an acceleration of 2 m/s^2, the force
@@ -53,12 +50,7 @@ class Gust(Disturbance):
             check_number(f"rates.{name}", rate)
 
     def disturb_plant(self, plant: Plant, time: float) -> Plant:
-        """Returns the plant with the push, inside the window.
-
-        Raises:
-            SettingError: The plant has no such state.
-            UnsupportedModel: The plant is no ``System``, or its dynamics are a simulator's.
-        """
+        """Returns the plant with the push, inside the window; raises where it has no such state, or no equations."""
         names = plant.dynamics.state_names
         for name in self.rates:
             if name not in names:
@@ -71,11 +63,7 @@ class Gust(Disturbance):
 
 @dataclass(frozen=True)
 class Replaced(Disturbance):
-    """Another plant over a time window: another mass, a broken arm.
-
-    Raises:
-        SettingError: The window is empty.
-    """
+    """Another plant over a time window: another mass, a broken arm."""
 
     plant: Plant  #: what acts then
     start: float = 0.0  #: when it begins [s]
@@ -85,14 +73,9 @@ class Replaced(Disturbance):
         _check_window(self.start, self.stop)
 
     def disturb_plant(self, plant: Plant, time: float) -> Plant:
-        """Returns the other plant, inside the window.
-
-        Raises:
-            ShapeError: The two have other states, inputs or time steps.
-        """
-        ours, theirs = (
-            (tuple(p.dynamics.state_names), tuple(p.dynamics.input_names), p.time_step) for p in (plant, self.plant)
-        )
+        """Returns the other plant, inside the window; raises where it has other states, inputs or time steps."""
+        both = (plant, self.plant)
+        ours, theirs = ((*map(tuple, (p.dynamics.state_names, p.dynamics.input_names)), p.time_step) for p in both)
         if ours != theirs:
             raise ShapeError(f"a plant must be replaced by one of the same states, inputs, step {ours}; got {theirs}")
         return self.plant if self.start <= time < self.stop else plant
@@ -100,11 +83,7 @@ class Replaced(Disturbance):
 
 @dataclass(frozen=True)
 class Dropout(Disturbance):
-    """Nothing is measured over a time window: entries of the state are NaN.
-
-    Raises:
-        SettingError: The window is empty, or an entry is no whole number, 0 or more.
-    """
+    """Nothing is measured over a time window: entries of the state are NaN."""
 
     start: float  #: when it begins [s]
     stop: float  #: when it ends [s]
@@ -120,11 +99,7 @@ class Dropout(Disturbance):
             object.__setattr__(self, "entries", tuple(entries))
 
     def disturb_plant(self, plant: Plant, time: float) -> Plant:
-        """Returns the plant.
-
-        Raises:
-            SettingError: The plant has no such entry.
-        """
+        """Returns the plant; raises where it has no such entry."""
         n = len(plant.dynamics.state_names)
         for entry in self.entries or ():
             if entry >= n:

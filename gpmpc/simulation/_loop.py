@@ -1,26 +1,23 @@
-"""Closes the loop: a controller steers a plant, or a learned model, along references.
+"""The loop of every simulation, and the history of its steps.
 
     measure -> decide (by the policy where the controller fails) -> step -> record
 
-``fly`` is the only loop; one flight, a cascade and many trials differ in what decides.
+One seed, many at once, and a cascade, which is a controller at the inner rate, differ in what decides.
 """
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpmpc.exceptions import Diverged, GpmpcError, SettingError, ShapeError, SolverFailure, check_number
+from gpmpc.exceptions import Diverged, ShapeError, SolverFailure, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Controller, Reference, Timing
-from gpmpc.mpc.policy import Command, OnFailure, check_policy, command
-from gpmpc.simulation._disturbances import Disturbance
-from gpmpc.simulation._simulator import ModelLoop, ModelSimulator, Noise, PlantSimulator, Simulator, step_together
+from gpmpc.mpc.controller import Reference, Timing
+from gpmpc.mpc.policy import Command
+from gpmpc.simulation._simulator import Simulator, step_together
 from gpmpc.status import Status
 from gpmpc.step import Step
-from gpmpc.systems import Plant
 
 Array = np.ndarray
 
@@ -60,74 +57,6 @@ class Rollout:
         return tuple((k, s) for k, s in enumerate(self.statuses) if not s.solved and k not in applied)
 
 
-def closed_loop(
-    system: Plant | ModelLoop,
-    controller: Controller,
-    references: Reference | Array | Sequence[float],
-    initial: Any,
-    steps: int,
-    *,
-    noise: Noise | None = None,
-    disturbances: Sequence[Disturbance] = (),
-    on_failure: OnFailure = "raise",
-    seed: int = 0,
-    on_step: Callable[[Step], None] | None = None,
-) -> Rollout:
-    """Runs a controller on a plant, or on a learned model that is rolled on itself.
-
-    Args:
-        system: What is steered.
-        controller: Its feedback law; it sees the next ``controller.horizon`` references.
-        references: Reference states r[0] .. (steps + horizon, n) or more, one a time step, or a set point (n,); as a
-            ``Reference`` with the inputs that belong to them.
-        initial: The state (n,). A ``Gaussian`` is the belief that a model loop starts from, and what a plant's state is
-            drawn from.
-        steps: K.
-        noise: On a plant's states, measurements and inputs.
-        disturbances: Gusts, other plants, dropouts: what the controller does not know of.
-        on_failure: What is applied where a solve fails: ``"previous_plan"``, ``"hold"`` or ``"raise"``; see
-            ``gpmpc.mpc.policy``.
-        seed: Of all random numbers; equal seeds give equal numbers.
-        on_step: Called after every step and outside of everything that is timed, such as a recorder's ``record``.
-
-    Raises:
-        ShapeError: Too few references for the steps and the horizon, or a state of the wrong length.
-        SettingError: An unknown policy, negative noise, or noise in a model loop.
-        SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
-        Diverged: The system left the finite numbers; ``flown`` holds the steps before.
-    """
-    check_number("steps", steps, least=1, whole=True)
-    check_policy(on_failure)
-    references = check_references(references, steps, controller.horizon)
-    if not isinstance(system, ModelLoop):
-        simulator: Simulator = PlantSimulator(system, initial, disturbances, noise, seed)
-    elif disturbances or noise is not None:
-        raise SettingError("disturbances, noise", "need a plant in the loop; got a ModelLoop")
-    else:
-        simulator = ModelSimulator(system, initial)
-    history = History(on_step)
-
-    def decide(k: int, beliefs: Sequence[Gaussian], last: Sequence[Command | None]) -> list[Command]:
-        return [command(controller, beliefs[0], window(references, k, controller.horizon), last[0], on_failure, k)]
-
-    flight = Flight(simulator, history.recording(references))
-    fly([flight], decide, steps, system.time_step)
-    if isinstance(flight.error, Diverged) and history.rows:
-        flight.error.flown = history.rollout(simulator, references, system.time_step)
-    if flight.error is not None:
-        raise flight.error
-    return history.rollout(simulator, references, system.time_step)
-
-
-def rehearse(system: Plant | ModelLoop, controller: Controller, references: Reference, initial: Any) -> None:
-    """Flies the first two steps, without noise, and forgets them: a flight's times then hold no compiling and loading.
-
-    Two, since the second one starts from a plan. What fails here fails again in the flight, and is raised there.
-    """
-    with suppress(GpmpcError):
-        closed_loop(system, controller, references, initial, 2, on_failure="previous_plan")
-
-
 class Moment(NamedTuple):
     """Where a step began, and what was applied."""
 
@@ -137,11 +66,6 @@ class Moment(NamedTuple):
     covariance: Array  # (n, n)
     measured: Array  # (n,)
     input: Array  # (m,)
-
-    def part(self, k: int, states: slice, input: Array) -> "Moment":
-        """Selects some states, of a step numbered k that applied an input."""
-        covariance = self.covariance[states, states]
-        return Moment(k, self.time, self.state[states], covariance, self.measured[states], input)
 
 
 class Flight:
@@ -201,33 +125,48 @@ class _Row(NamedTuple):
     expected_covariance: Array
     iterations: int
     timing: Timing
+    far_from_data: bool
 
 
 class History:
-    """Collects the steps of one loop for its ``Rollout``."""
+    """Collects the steps of one loop for its ``Rollout``.
 
-    def __init__(self, on_step: Callable[[Step], None] | None = None):
+    Args:
+        simulator: What is flown.
+        references: Of the steps, and of the end where there are so many.
+        time_step: [s].
+        states: Which of the simulator's states these are.
+        on_step: Called with every step.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        references: Reference,
+        time_step: float,
+        states: slice = slice(None),
+        on_step: Callable[[Step], None] | None = None,
+    ):
         self.rows: list[_Row] = []
-        self._on_step = on_step
+        self._simulator, self._references, self._time_step = simulator, references, time_step
+        self._states, self._on_step = states, on_step
 
-    def recording(self, references: Reference) -> Callable[[Moment, Command], None]:
-        """Makes the ``record`` of a flight along references."""
-        return lambda moment, decided: self.add(moment, references.states[moment.k], decided)
-
-    def add(self, moment: Moment, reference: Array, decided: Command) -> None:
-        """Adds a step that was to be at a reference state (n,)."""
-        decision, n = decided.decision, len(moment.state)
+    def add(self, moment: Moment, decided: Command, reference: Array | None = None) -> None:
+        """Adds a step; it was to be at the reference state (n,) of its number where no other is given."""
+        decision, part = decided.decision, self._states
+        reference = self._references.states[moment.k] if reference is None else reference
         learned = None if decision is None else decision.learned
+        measured = moment.measured[part]
         step = Step(
             time=moment.time,
             k=moment.k,
             reference=np.asarray(reference, dtype=float),
-            state=moment.state,
-            measured=moment.measured,
+            state=moment.state[part],
+            measured=measured,
             input=np.asarray(moment.input, dtype=float),
             decision=decision,
-            innovation=moment.measured - (self.rows[-1].expected if self.rows else np.nan),
-            belief_covariance=moment.covariance,
+            innovation=measured - (self.rows[-1].expected if self.rows else np.nan),
+            belief_covariance=moment.covariance[part, part],
             gp_size=0 if learned is None else learned.size,
             gp_version=0 if learned is None else learned.version,
             failed=decided.failed,
@@ -235,26 +174,23 @@ class History:
         )
         if self._on_step is not None:
             self._on_step(step)
+        n = len(step.state)
         expected: Any = (np.full(n, np.nan), np.full((n, n), np.nan))
         if decision is not None and not decided.failed:
             expected = np.array(decision.means[1]), np.array(decision.covariances[1])
-        spent: Any = (0, Timing(0.0, 0.0, 0.0)) if decision is None else (decision.iterations, decision.timing)
+        spent: Any = (0, Timing(0.0, 0.0, 0.0), False)
+        if decision is not None:
+            spent = decision.iterations, decision.timing, decision.far_from_data
         self.rows.append(_Row(replace(step, decision=None), *expected, *spent))
 
-    def rollout(self, end: Simulator, references: Reference, time_step: float, states: slice = slice(None)) -> Rollout:
-        """Makes the arrays of all steps.
-
-        Args:
-            end: Where the flight ended.
-            references: The last reference state is the one of the end, where it has so many.
-            time_step: [s].
-            states: Which of the simulator's states these are.
-        """
-        rows, steps = self.rows, [row.step for row in self.rows]
-        last = references.states[min(len(rows), len(references.states) - 1)]
+    def rollout(self, last: Array | None = None) -> Rollout:
+        """Makes the arrays of all steps; ``last`` is the reference state of the end, by default that of its number."""
+        rows, steps, part, end = self.rows, [row.step for row in self.rows], self._states, self._simulator
+        if last is None:
+            last = self._references.states[: len(rows) + 1][-1]
         return Rollout(
-            states=np.array([*(step.state for step in steps), end.mean[states]]),
-            covariances=np.array([*(step.belief_covariance for step in steps), end.covariance[states, states]]),
+            states=np.array([*(step.state for step in steps), end.mean[part]]),
+            covariances=np.array([*(step.belief_covariance for step in steps), end.covariance[part, part]]),
             measured=np.array([step.measured for step in steps]),
             inputs=np.array([step.input for step in steps]),
             references=np.array([*(step.reference for step in steps), last], dtype=float),
@@ -263,9 +199,9 @@ class History:
             statuses=tuple(step.status for step in steps if step.status is not None),
             iterations=np.array([row.iterations for row in rows]),
             timings=tuple(row.timing for row in rows),
-            time_step=time_step,
+            time_step=self._time_step,
             suboptimal=tuple(s.k for s in steps if not (s.failed or s.status is None or s.status.solved)),
-            far_from_data=tuple(s.k for s in steps if s.decision is not None and s.decision.far_from_data),
+            far_from_data=tuple(row.step.k for row in rows if row.far_from_data),
         )
 
 
@@ -280,7 +216,9 @@ def check_references(references: Reference | Array | Sequence[float], steps: int
 
     Raises:
         ShapeError: Too few, or no table.
+        SettingError: The steps are no whole number, 1 or more.
     """
+    check_number("steps", steps, least=1, whole=True)
     references = references if isinstance(references, Reference) else Reference(np.asarray(references, dtype=float))
     references, needed = references.over(steps + horizon), steps + horizon
     if len(references.states) < needed:

@@ -7,7 +7,7 @@ enters. It shows how a controller and a model get on with each other, not how a 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -55,42 +55,13 @@ class Noise:
     input: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        for key in ("process", "measurement", "input"):
+        for key, of in (("process", "state"), ("measurement", "state"), ("input", "input")):
             values = getattr(self, key)
-            if values is not None:
-                values = values.tolist() if isinstance(values, np.ndarray) else values
-                if isinstance(values, str) or not hasattr(values, "__len__"):
-                    what = "must be a list of standard deviations, one for every " + (
-                        "input" if key == "input" else "state"
-                    )
-                    raise SettingError(f"noise.{key}", f"{what}; got {values!r}")
-                check_numbers(f"noise.{key}", values, len(values), least=0)
-
-
-class Simulator(Protocol):
-    """A system under way."""
-
-    @property
-    def mean(self) -> Array:
-        """The state, or the mean of its belief (n,)."""
-        ...
-
-    @property
-    def covariance(self) -> Array:
-        """Of the belief (n, n); zero for a plant's state."""
-        ...
-
-    def measure(self, time: float) -> Gaussian:
-        """Measures the state at a time [s]."""
-        ...
-
-    def step(self, time: float, input: Array) -> Array:
-        """Takes one step from a time [s] on; returns the input that was applied (m,).
-
-        Raises:
-            Diverged: The next state is not finite.
-        """
-        ...
+            values = values.tolist() if isinstance(values, np.ndarray) else values
+            if isinstance(values, str) or (values is not None and not hasattr(values, "__len__")):
+                what = f"must be a list of standard deviations, one for every {of}"
+                raise SettingError(f"noise.{key}", f"{what}; got {values!r}")
+            check_numbers(f"noise.{key}", values or (), len(values or ()), least=0)
 
 
 class PlantSimulator:
@@ -106,8 +77,8 @@ class PlantSimulator:
 
     Raises:
         ShapeError: State or noise do not fit the plant.
-        SettingError: The seed is no whole number, or plant, noise or disturbances are of another kind.
-        DataError: The state is not finite.
+        SettingError: The seed is no whole number, the state is not finite, or plant, noise or disturbances are of
+            another kind.
     """
 
     def __init__(
@@ -127,27 +98,26 @@ class PlantSimulator:
         if not isinstance(disturbances, Sequence):
             raise SettingError("disturbances", f"must be a list of them; got {disturbances!r}")
         n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
-        noise = noise or Noise()
+        self.noise = noise or Noise()
         for key, length in (("process", n), ("measurement", n), ("input", m)):
-            values = getattr(noise, key)
+            values = getattr(self.noise, key)
             if values is not None and len(values) != length:
                 raise ShapeError(f"noise.{key} must have {length} standard deviations; got {len(values)}")
         # One stream a source: whether states are measured with noise changes nothing about the wind.
-        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
-        sources: list[str] = ["initial", "process", "measurement", "input"]
-        self._streams = dict(zip(sources, streams, strict=True))
-        self.plant, self.disturbances, self.noise = plant, tuple(disturbances), noise
+        sources = "initial", "process", "measurement", "input"
+        streams = np.random.SeedSequence(seed).spawn(4)
+        self._streams = {source: np.random.default_rng(s) for source, s in zip(sources, streams, strict=True)}
+        self.plant, self.disturbances, self._steps = plant, tuple(disturbances), 0
         if initial is None:
             dynamics: Any = plant.dynamics
             if not getattr(dynamics, "stateful", False):
                 raise SettingError("initial", "must be a state; a simulator alone starts by itself")
             initial = dynamics.reset(seed)
-        mean, covariance = (initial.mean, initial.covariance) if isinstance(initial, Gaussian) else (initial, None)
-        self.mean = _check_state(mean, n)
-        if covariance is not None:
-            self.mean = self._streams["initial"].multivariate_normal(self.mean, np.asarray(covariance, dtype=float))
-        self.covariance = np.zeros((n, n))
-        self._steps = 0
+        belief = initial if isinstance(initial, Gaussian) else None
+        self.mean, self.covariance = _check_state(initial if belief is None else belief.mean, n), np.zeros((n, n))
+        if belief is not None:
+            covariance = np.asarray(belief.covariance, dtype=float)
+            self.mean = self._streams["initial"].multivariate_normal(self.mean, covariance)
         self._disturbed_plant(0.0)  # a disturbance that does not fit is found before the first step
 
     def measure(self, time: float) -> Gaussian:
@@ -156,18 +126,6 @@ class PlantSimulator:
         for disturbance in self.disturbances:
             measured = disturbance.disturb_measurement(measured, time)
         return Gaussian.certain(measured)
-
-    def step(self, time: float, input: Array) -> Array:
-        """Steps the plant that is there at a time [s]; returns the input that was applied (m,).
-
-        Raises:
-            ShapeError: The plant has another number of inputs.
-            Diverged: The next state is not finite.
-        """
-        applied = self._applied_input(input)
-        with np.errstate(over="ignore", invalid="ignore"):
-            self._arrive(step(self._disturbed_plant(time), self.mean, applied), applied)
-        return applied
 
     def _disturbed_plant(self, time: float) -> Plant:
         plant = self.plant
@@ -181,14 +139,16 @@ class PlantSimulator:
             raise ShapeError(f"the plant takes inputs of shape ({m},); got {np.shape(input)}")
         return self._add_noise("input", input)
 
-    def _arrive(self, state: Array, applied: Array) -> None:
+    def _arrive(self, state: Array, applied: Array) -> Array | Diverged:
+        """Returns the input that was applied, or why the plant cannot go on from its next state."""
         if not np.isfinite(state).all():
             before = f"it was {self.mean}, input {applied}"
-            raise Diverged(self._steps, f"the plant's state is not finite any more; {before}")
+            return Diverged(self._steps, f"the plant's state is not finite any more; {before}")
         if getattr(self.plant.dynamics, "ended", False):
-            raise Diverged(self._steps, f"the simulator has ended its episode, at state {state}")
+            return Diverged(self._steps, f"the simulator has ended its episode, at state {state}")
         self.mean = self._add_noise("process", state)
         self._steps += 1
+        return applied
 
     def _add_noise(self, source: str, value: Array) -> Array:
         deviations = getattr(self.noise, source)
@@ -206,15 +166,13 @@ class ModelSimulator:
     """
 
     def __init__(self, loop: ModelLoop, initial: Any):
-        self.loop, model = loop, loop.model
-        mean, covariance = (initial.mean, initial.covariance) if isinstance(initial, Gaussian) else (initial, None)
-        mean = torch.as_tensor(_check_state(mean, model.state_dim)).to(model.device, model.dtype)
-        if covariance is None:
-            covariance = loop.initial_std**2 * torch.eye(model.state_dim, dtype=model.dtype, device=model.device)
-        else:
-            covariance = torch.as_tensor(covariance).to(model.device, model.dtype)
-        self._belief = Gaussian(mean, covariance)
-        self._steps = 0
+        self.loop, self._steps = loop, 0
+        model, n = loop.model, loop.model.state_dim
+        mean, covariance = initial, loop.initial_std**2 * torch.eye(n, dtype=model.dtype)
+        if isinstance(initial, Gaussian):
+            mean, covariance = initial.mean, initial.covariance
+        mean = torch.as_tensor(_check_state(mean, n))
+        self._belief = Gaussian(mean.to(model.device, model.dtype), covariance.to(model.device, model.dtype))
 
     @property
     def mean(self) -> Array:
@@ -230,45 +188,39 @@ class ModelSimulator:
         """Returns the belief."""
         return self._belief
 
-    def step(self, time: float, input: Array) -> Array:
-        """Carries the belief one step on; returns the input.
-
-        Raises:
-            Diverged: The next belief is not finite.
-        """
+    def step(self, input: Array) -> Array | Diverged:
+        """Carries the belief one step on; returns the input, or why it cannot go on."""
         like = self._belief.mean
         control = torch.as_tensor(np.asarray(input, dtype=float)).to(like.device, like.dtype)
-        self._belief = self.loop.propagator(self.loop.model, self._belief, control)
-        if not bool(torch.isfinite(self._belief.mean).all() and torch.isfinite(self._belief.covariance).all()):
-            raise Diverged(self._steps, f"the model's belief is not finite any more; its mean is {self._belief.mean}")
+        belief = self.loop.propagator(self.loop.model, self._belief, control)
+        if not bool(torch.isfinite(belief.mean).all() and torch.isfinite(belief.covariance).all()):
+            return Diverged(self._steps, f"the model's belief is not finite any more; its mean is {belief.mean}")
+        self._belief = belief
         self._steps += 1
         return input
+
+
+Simulator = PlantSimulator | ModelSimulator
 
 
 def step_together(simulators: Sequence[Any], time: float, inputs: Sequence[Array]) -> list[Array | Diverged]:
     """Steps simulators of one plant from a time [s] on; returns the inputs that were applied, or why one cannot go on.
 
     Several plants are stepped in one evaluation.
+
+    Raises:
+        ShapeError: The plant has another number of inputs.
     """
-    if len(simulators) == 1:
-        try:
-            return [simulators[0].step(time, inputs[0])]
-        except Diverged as error:
-            return [error]
-    if not simulators:
-        return []
-    outcomes: list[Array | Diverged] = []
+    if not simulators or isinstance(simulators[0], ModelSimulator):
+        return [simulator.step(input) for simulator, input in zip(simulators, inputs, strict=True)]
     applied = [simulator._applied_input(input) for simulator, input in zip(simulators, inputs, strict=True)]
     plant = simulators[0]._disturbed_plant(time)  # disturbances look at the time, not at a trial
     with np.errstate(over="ignore", invalid="ignore"):
-        states = step_many(plant, np.array([s.mean for s in simulators]), np.array(applied))
-    for simulator, state, input in zip(simulators, states, applied, strict=True):
-        try:
-            simulator._arrive(state, input)
-            outcomes.append(input)
-        except Diverged as error:
-            outcomes.append(error)
-    return outcomes
+        if len(simulators) == 1:
+            states: Any = [step(plant, simulators[0].mean, applied[0])]
+        else:
+            states = step_many(plant, np.array([s.mean for s in simulators]), np.array(applied))
+    return [s._arrive(state, input) for s, state, input in zip(simulators, states, applied, strict=True)]
 
 
 def _check_state(value: Any, n: int) -> Array:

@@ -58,26 +58,17 @@ class Coupled:
         return [x[1], ux * thrust, x[3], uy * thrust, x[5], GRAVITY - vertical * thrust, *turning]
 
 
-def coupled(
-    mass: float = 0.74,
-    arm: float = 0.21,
-    inertia: tuple[float, float, float] = (0.005, 0.005, 0.0089),
-    gyroscopic: tuple[float, float] = (0.01102, 0.01102),
-    time_step: float = 0.05,
-    substeps: int = 2,
-) -> System:
+def coupled(mass: float = 0.74, time_step: float = 0.05, substeps: int = 2, **parameters: Any) -> System:
     """Makes the whole quadrotor at the rate of its inner loop; ``gpmpc.simulation.cascade_loop`` flies it.
 
     Args:
-        mass: See ``Coupled``.
-        arm: See ``Rotational``.
-        inertia: See ``Rotational``.
-        gyroscopic: See ``Rotational``.
+        mass: [kg].
         time_step: [s].
         substeps: Runge-Kutta steps per time step.
+        parameters: Attributes of ``Rotational``.
     """
     return System(
-        Coupled(mass, Rotational(arm, inertia, gyroscopic)),
+        Coupled(mass, Rotational(**parameters)),
         time_step,
         substeps,
         name="coupled",

@@ -1,6 +1,7 @@
 """Mechanical systems with few states: double integrator, pendulum, cart-pole, double pendulum and planar quadrotor.
 
-Angles are zero where a pole or a link stands upright, positive anticlockwise.
+Angles are zero where a pole or a link stands upright, positive anticlockwise. Each function makes a system with a time
+step [s]; its other arguments are the attributes of the right-hand side.
 """
 
 from dataclasses import dataclass
@@ -12,35 +13,34 @@ from gpmpc.systems._attitudes import GRAVITY
 from gpmpc.systems.system import System, cos, sin
 
 
-@dataclass(frozen=True)
-class DoubleIntegrator:
-    """A mass on a line that a force accelerates.
+class _Body:
+    """Checks that every attribute is a positive number, or none below zero where its name stands in ``may_be_zero``."""
 
-    Attributes:
-        mass: [kg].
-    """
-
-    mass: float = 1.0  # [kg]
-
-    state_names, input_names = ("position", "velocity"), ("force",)
+    may_be_zero: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        _check_positive(self)
+        for key, value in vars(self).items():
+            limits: dict[str, Any] = {"least": 0} if key in self.may_be_zero else {"above": 0}
+            check_number(key, value, **limits)
+
+
+@dataclass(frozen=True)
+class DoubleIntegrator(_Body):
+    """A mass on a line that a force accelerates."""
+
+    mass: float = 1.0  #: [kg]
+
+    state_names, input_names = ("position", "velocity"), ("force",)
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (position, velocity) [m/s, m/s^2]."""
         return [x[1], u[0] / self.mass]
 
 
-def double_integrator(mass: float = 1.0, time_step: float = 0.1) -> System:
-    """Makes a mass on a line.
-
-    Args:
-        mass: [kg].
-        time_step: [s].
-    """
+def double_integrator(time_step: float = 0.1, **parameters: float) -> System:
+    """Makes a mass on a line."""
     return System(
-        DoubleIntegrator(mass),
+        DoubleIntegrator(**parameters),
         time_step,
         1,
         name="double_integrator",
@@ -55,23 +55,15 @@ def double_integrator(mass: float = 1.0, time_step: float = 0.1) -> System:
 
 
 @dataclass(frozen=True)
-class Pendulum:
-    """A uniform rod on a driven joint; its torque is too weak to lift it at once.
+class Pendulum(_Body):
+    """A uniform rod on a driven joint; its torque is too weak to lift it at once."""
 
-    Attributes:
-        mass: [kg].
-        length: [m].
-        damping: Of the joint [N m s].
-    """
-
-    mass: float = 1.0  # [kg]
-    length: float = 1.0  # [m]
-    damping: float = 0.05  # [N m s]
+    mass: float = 1.0  #: [kg]
+    length: float = 1.0  #: [m]
+    damping: float = 0.05  #: of the joint [N m s]
 
     state_names, input_names = ("angle", "rate"), ("torque",)
-
-    def __post_init__(self) -> None:
-        _check_positive(self, "damping")
+    may_be_zero = ("damping",)
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (angle, rate) [rad/s, rad/s^2]."""
@@ -79,17 +71,10 @@ class Pendulum:
         return [x[1], torque / (self.mass * self.length**2 / 3)]
 
 
-def pendulum(mass: float = 1.0, length: float = 1.0, damping: float = 0.05, time_step: float = 0.05) -> System:
-    """Makes a pendulum that hangs at first.
-
-    Args:
-        mass: [kg].
-        length: [m].
-        damping: [N m s].
-        time_step: [s].
-    """
+def pendulum(time_step: float = 0.05, **parameters: float) -> System:
+    """Makes a pendulum that hangs at first."""
     return System(
-        Pendulum(mass, length, damping),
+        Pendulum(**parameters),
         time_step,
         2,
         name="pendulum",
@@ -104,23 +89,14 @@ def pendulum(mass: float = 1.0, length: float = 1.0, damping: float = 0.05, time
 
 
 @dataclass(frozen=True)
-class CartPole:
-    """A pole hinged to a cart on a line (Barto, Sutton and Anderson, 1983, without friction).
+class CartPole(_Body):
+    """A pole hinged to a cart on a line (Barto, Sutton and Anderson, 1983, without friction)."""
 
-    Attributes:
-        cart_mass: [kg].
-        pole_mass: Of the uniform pole [kg].
-        half_length: From the hinge to the pole's centre of mass [m].
-    """
-
-    cart_mass: float = 1.0  # [kg]
-    pole_mass: float = 0.1  # [kg]
-    half_length: float = 0.5  # [m]
+    cart_mass: float = 1.0  #: [kg]
+    pole_mass: float = 0.1  #: of the uniform pole [kg]
+    half_length: float = 0.5  #: from the hinge to the pole's centre of mass [m]
 
     state_names, input_names = ("position", "velocity", "angle", "rate"), ("force",)
-
-    def __post_init__(self) -> None:
-        _check_positive(self)
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (position, velocity, angle, rate) [m/s, m/s^2, rad/s, rad/s^2]."""
@@ -131,19 +107,10 @@ class CartPole:
         return [x[1], push - moment * turn * c / total, x[3], turn]
 
 
-def cart_pole(
-    cart_mass: float = 1.0, pole_mass: float = 0.1, half_length: float = 0.5, time_step: float = 0.05
-) -> System:
-    """Makes a cart-pole whose pole hangs at first; its angle is positive towards growing positions.
-
-    Args:
-        cart_mass: [kg].
-        pole_mass: [kg].
-        half_length: [m].
-        time_step: [s].
-    """
+def cart_pole(time_step: float = 0.05, **parameters: float) -> System:
+    """Makes a cart-pole whose pole hangs at first; its angle is positive towards growing positions."""
     return System(
-        CartPole(cart_mass, pole_mass, half_length),
+        CartPole(**parameters),
         time_step,
         2,
         name="cart_pole",
@@ -163,20 +130,13 @@ class DoublePendulum:
     """Two links in a vertical plane with a torque at one joint (Spong, 1995, eqs. (1)-(2)).
 
     ``shoulder`` is the angle of the first link from upright, ``elbow`` that of the second from the first.
-
-    Attributes:
-        masses: Of the links [kg].
-        first_length: Of the first link [m].
-        centres: From each link's joint to its centre of mass [m].
-        inertias: Of the links about their centres of mass [kg m^2].
-        actuated: ``"elbow"`` (an acrobot) or ``"shoulder"`` (a pendubot).
     """
 
-    masses: tuple[float, float]  # [kg]
-    first_length: float  # [m]
-    centres: tuple[float, float]  # [m]
-    inertias: tuple[float, float]  # [kg m^2]
-    actuated: Literal["elbow", "shoulder"] = "elbow"
+    masses: tuple[float, float]  #: of the links [kg]
+    first_length: float  #: of the first link [m]
+    centres: tuple[float, float]  #: from each link's joint to its centre of mass [m]
+    inertias: tuple[float, float]  #: of the links about their centres of mass [kg m^2]
+    actuated: Literal["elbow", "shoulder"] = "elbow"  #: an acrobot, or a pendubot
 
     state_names, input_names = ("shoulder", "shoulder_rate", "elbow", "elbow_rate"), ("torque",)
 
@@ -208,14 +168,7 @@ class DoublePendulum:
 def acrobot(
     masses: tuple[float, float] = (1.0, 1.0), first_length: float = 1.0, time_step: float = 0.05, torque: float = 10.0
 ) -> System:
-    """Makes an acrobot that hangs at first (Spong, 1995, and its table).
-
-    Args:
-        masses: Of the links [kg].
-        first_length: [m].
-        time_step: [s].
-        torque: Its largest [N m].
-    """
+    """Makes an acrobot that hangs at first (Spong, 1995, and its table); ``torque`` is its largest [N m]."""
     links = DoublePendulum((masses[0], masses[1]), first_length, (0.5, 1.0), (0.083, 0.33))
     return _two_links("acrobot", links, time_step, 10, torque, (4.0, 6.0))
 
@@ -231,16 +184,9 @@ def double_pendulum(
 ) -> System:
     """Makes the double pendulum of the RealAIGym league, which hangs at first (Wiebe et al., 2024).
 
-    Masses, lengths and inertias are those identified for its design C.1, model 1.1; there is no friction.
-
-    Args:
-        actuated: The joint with the motor: ``"elbow"`` (acrobot) or ``"shoulder"`` (pendubot).
-        masses: Of the links [kg].
-        first_length: [m]; the second link is 0.3 m long.
-        centres: From each link's joint to its centre of mass [m].
-        inertias: Of the links about their centres of mass [kg m^2]; published about the joints, 0.031887 and 0.050870.
-        time_step: [s].
-        torque: Its largest [N m].
+    Masses, lengths and inertias are those identified for its design C.1, model 1.1 (inertias were published about the
+    joints, 0.031887 and 0.050870); the second link is 0.3 m long, there is no friction. ``torque`` is its largest
+    [N m].
     """
     links = (masses[0], masses[1]), first_length, (centres[0], centres[1]), (inertias[0], inertias[1])
     return _two_links("double_pendulum", DoublePendulum(*links, actuated), time_step, 2, torque, (20.0, 30.0))
@@ -254,9 +200,7 @@ def _two_links(
         time_step,
         substeps,
         name=name,
-        units=dict.fromkeys(("shoulder", "elbow"), "rad")
-        | dict.fromkeys(("shoulder_rate", "elbow_rate"), "rad/s")
-        | {"torque": "N m"},
+        units=dict(zip((*links.state_names, "torque"), ("rad", "rad/s", "rad", "rad/s", "N m"), strict=True)),
         input_lower=[-torque],
         input_upper=[torque],
         start=[pi, 0.0, 0.0, 0.0],
@@ -267,24 +211,15 @@ def _two_links(
 
 
 @dataclass(frozen=True)
-class PlanarQuadrotor:
-    """A bar with a rotor at each end, in a vertical plane; y points upwards.
+class PlanarQuadrotor(_Body):
+    """A bar with a rotor at each end, in a vertical plane; y points upwards."""
 
-    Attributes:
-        mass: [kg].
-        arm: From the centre to a rotor [m].
-        inertia: [kg m^2].
-    """
-
-    mass: float = 0.74  # [kg]
-    arm: float = 0.21  # [m]
-    inertia: float = 0.005  # [kg m^2]
+    mass: float = 0.74  #: [kg]
+    arm: float = 0.21  #: from the centre to a rotor [m]
+    inertia: float = 0.005  #: [kg m^2]
 
     state_names = ("x", "vx", "y", "vy", "tilt", "tilt_rate")
     input_names = ("right", "left")
-
-    def __post_init__(self) -> None:
-        _check_positive(self)
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (x, vx, y, vy, tilt, tilt_rate) [m/s, m/s^2, rad/s, rad/s^2]."""
@@ -293,18 +228,12 @@ class PlanarQuadrotor:
         return [x[1], -lift * sin(x[4]), x[3], lift * cos(x[4]) - GRAVITY, x[5], turn]
 
 
-def planar_quadrotor(mass: float = 0.74, arm: float = 0.21, inertia: float = 0.005, time_step: float = 0.05) -> System:
-    """Makes a planar quadrotor.
-
-    Args:
-        mass: [kg].
-        arm: [m].
-        inertia: [kg m^2].
-        time_step: [s].
-    """
-    weight = mass * GRAVITY
+def planar_quadrotor(time_step: float = 0.05, **parameters: float) -> System:
+    """Makes a planar quadrotor."""
+    vehicle = PlanarQuadrotor(**parameters)
+    weight = vehicle.mass * GRAVITY
     return System(
-        PlanarQuadrotor(mass, arm, inertia),
+        vehicle,
         time_step,
         2,
         name="planar_quadrotor",
@@ -320,9 +249,3 @@ def planar_quadrotor(mass: float = 0.74, arm: float = 0.21, inertia: float = 0.0
         pose={"x": "x", "z": "y"},
         lost=10.0,
     )
-
-
-def _check_positive(dynamics: Any, *may_be_zero: str) -> None:
-    for key, value in vars(dynamics).items():
-        lowest: dict[str, Any] = {"least": 0} if key in may_be_zero else {"above": 0}
-        check_number(key, value, **lowest)

@@ -98,14 +98,8 @@ class Rotational:
         a1, a3, a5 = (iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz  # [-]
         a2, a4 = self.gyroscopic  # a2 W, a4 W [1/s]
         b1, b2, b3 = self.arm / ixx, self.arm / iyy, self.arm / izz  # [1/(kg m)]
-        return [
-            p,
-            a1 * q * r + a2 * q + b1 * u[0],
-            q,
-            a3 * p * r - a4 * p + b2 * u[1],
-            r,
-            a5 * p * q + b3 * u[2],
-        ]
+        roll, pitch = a1 * q * r + a2 * q + b1 * u[0], a3 * p * r - a4 * p + b2 * u[1]
+        return [p, roll, q, pitch, r, a5 * p * q + b3 * u[2]]
 
 
 @dataclass(frozen=True)
@@ -118,37 +112,25 @@ class Map:
 
     dynamics: Any
 
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """Names of the n states."""
-        return self.dynamics.state_names
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        """Names of the m inputs."""
-        return self.dynamics.input_names
+    def __post_init__(self) -> None:
+        for key in ("state_names", "input_names"):
+            object.__setattr__(self, key, getattr(self.dynamics, key))
 
     def successor(self, x: Any, u: Any) -> Sequence[Any]:
         """x[k+1] = f(x[k], u[k])."""
         return self.dynamics.derivative(x, u)
 
 
-def translational(
-    mass: float = 0.74,
-    frozen_attitude: tuple[float, float] | None = None,
-    time_step: float = 1.0,
-    substeps: int = 1,
-) -> System:
+def translational(time_step: float = 1.0, substeps: int = 1, **parameters: Any) -> System:
     """Makes the translational subsystem; one substep is exact, since its acceleration depends on the input alone.
 
     Args:
-        mass: Of the vehicle [kg].
-        frozen_attitude: See ``Translational``.
         time_step: [s].
         substeps: Runge-Kutta steps per time step.
+        parameters: Attributes of ``Translational``.
     """
     return System(
-        Translational(mass, frozen_attitude),
+        Translational(**parameters),
         time_step,
         substeps,
         name="translational",
@@ -162,24 +144,16 @@ def translational(
     )
 
 
-def rotational(
-    arm: float = 0.21,
-    inertia: tuple[float, float, float] = (0.005, 0.005, 0.0089),
-    gyroscopic: tuple[float, float] = (0.01102, 0.01102),
-    time_step: float = 0.05,
-    substeps: int = 10,
-) -> System:
+def rotational(time_step: float = 0.05, substeps: int = 10, **parameters: Any) -> System:
     """Makes the rotational subsystem at 20 Hz; a trajectory prescribes the attitudes that a flight along it needs.
 
     Args:
-        arm: See ``Rotational``.
-        inertia: See ``Rotational``.
-        gyroscopic: See ``Rotational``.
         time_step: [s].
         substeps: Runge-Kutta steps per time step.
+        parameters: Attributes of ``Rotational``.
     """
     return System(
-        Rotational(arm, inertia, gyroscopic),
+        Rotational(**parameters),
         time_step,
         substeps,
         name="rotational",

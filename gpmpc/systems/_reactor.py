@@ -13,28 +13,17 @@ class StirredTank:
 
     Its operating point, 0.5 mol/L at 350 K and 300 K of the coolant, is unstable. Times are in seconds here, in minutes
     there.
-
-    Attributes:
-        flow: Of the feed [L/min].
-        volume: Of the tank [L].
-        feed_concentration: Of A [mol/L].
-        feed_temperature: [K].
-        rate: k0 of the reaction [1/min].
-        activation: E / R [K].
-        heat: -dH, of the reaction [J/mol].
-        capacity: rho Cp, of the fluid [J/(L K)].
-        transfer: U A, to the coolant [J/(min K)].
     """
 
-    flow: float = 100.0  # [L/min]
-    volume: float = 100.0  # [L]
-    feed_concentration: float = 1.0  # [mol/L]
-    feed_temperature: float = 350.0  # [K]
-    rate: float = 7.2e10  # [1/min]
-    activation: float = 8750.0  # [K]
-    heat: float = 5.0e4  # [J/mol]
-    capacity: float = 239.0  # [J/(L K)]
-    transfer: float = 5.0e4  # [J/(min K)]
+    flow: float = 100.0  #: of the feed [L/min]
+    volume: float = 100.0  #: of the tank [L]
+    feed_concentration: float = 1.0  #: of A [mol/L]
+    feed_temperature: float = 350.0  #: [K]
+    rate: float = 7.2e10  #: k0 of the reaction [1/min]
+    activation: float = 8750.0  #: E / R [K]
+    heat: float = 5.0e4  #: -dH, of the reaction [J/mol]
+    capacity: float = 239.0  #: rho Cp, of the fluid [J/(L K)]
+    transfer: float = 5.0e4  #: U A, to the coolant [J/(min K)]
 
     state_names, input_names = ("concentration", "temperature"), ("coolant",)
 
@@ -50,19 +39,15 @@ class StirredTank:
         return [(exchange * (self.feed_concentration - x[0]) - reaction) / 60, warming / 60]
 
 
-def stirred_tank(
-    feed_concentration: float = 1.0, feed_temperature: float = 350.0, transfer: float = 5.0e4, time_step: float = 3.0
-) -> System:
+def stirred_tank(time_step: float = 3.0, **parameters: float) -> System:
     """Makes the reactor, which is to leave its stable point of low conversion for the unstable one.
 
     Args:
-        feed_concentration: [mol/L].
-        feed_temperature: [K].
-        transfer: [J/(min K)].
         time_step: [s].
+        parameters: Attributes of ``StirredTank``.
     """
     return System(
-        StirredTank(feed_concentration=feed_concentration, feed_temperature=feed_temperature, transfer=transfer),
+        StirredTank(**parameters),
         time_step,
         20,  # a runaway reaction is stiff
         name="stirred_tank",

@@ -196,11 +196,13 @@ def test_on_the_authors_data_the_convex_controller_tracks_within_the_printed_bou
     records = [{**t.labels, **experiment.run_trial(t)} for t in experiment.trials(tmp_path)]
     found = {(row.name, row.trajectory): row for row in summarise(records).itertuples()}
     # The authors' stored runs: 2.98 and 0.884; one step at a time on the map, at best 2.604 and 0.115.
-    for trajectory, limit in (("elliptical", 2.75), ("lorenz", 0.20)):
+    # Without bounds and one step ahead any reference can be met, but where the Lorenz curve is almost free fall (steps
+    # 100 to 107: thrust near zero, so tilts beyond 1.4 rad) the program has local minima 0.2 to 0.3 away from it.
+    for trajectory, limit, free in (("elliptical", 2.75, 0.001), ("lorenz", 0.20, 0.05)):
         assert found["ours", trajectory].total <= limit
         assert found["ours", trajectory].input_excess <= 1e-8
         assert found["ours", trajectory].failed_steps == 0
-        assert found["free", trajectory].total <= 0.001
+        assert found["free", trajectory].total <= free
 
 
 def test_the_nonlinear_controller_starts_from_the_references_own_inputs():

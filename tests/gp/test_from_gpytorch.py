@@ -19,9 +19,9 @@ from gpmpc.dynamics import predict_with_jacobian
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Hyperparameters, KernelPosterior, from_gpytorch
+from gpmpc.gp._sparse import collapsed_bound
 from gpmpc.gp.gpytorch_ import exact_inference
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, differentiate
-from tests.gp.whole_bound import collapsed_bound
 
 
 class Model(gpytorch.models.ExactGP):

@@ -25,6 +25,7 @@ from gpmpc.gp import (
 )
 from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
 from gpmpc.gp._search import column_std, constant_columns
+from gpmpc.gp._sparse import collapsed_bound
 from gpmpc.gp.casadi_ import casadi_function
 from gpmpc.gp.module import PosteriorModule
 from gpmpc.propagation import (
@@ -36,7 +37,6 @@ from gpmpc.propagation import (
     differentiate,
     linearize,
 )
-from tests.gp.whole_bound import collapsed_bound
 
 FEATURES = [1e8, torch.tensor([-1e8, 1e7, 13.75])]
 TARGETS = [-1e8, torch.tensor([1e8, 0.0])]

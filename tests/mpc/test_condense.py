@@ -142,7 +142,7 @@ def test_in_increments_it_is_the_papers_problem(rng):
     n, m, H = 3, 2, 5
     p = n + n * n
     Q, R = spd(rng, n), spd(rng, m)
-    A, B, _ = random_stages(rng, p, m, H, held=True)
+    A, B, *_ = random_stages(rng, p, m, H, held=True)
     A[0, :, n:] = 0.0  # as at a measured state
     s0, before, last = rng.normal(size=p), rng.normal(size=p), rng.normal(size=m)
     targets = rng.normal(size=(H, n))

@@ -138,3 +138,14 @@ def test_any_model_can_be_wrong():
 def test_a_gain_out_of_range_is_refused(kind, settings, rule):
     with pytest.raises(SettingError, match=rule):
         controller(kind, **settings)
+
+
+@pytest.mark.parametrize("iterations", [1, 30])
+def test_a_controller_for_another_model_is_one_that_was_made_with_it(iterations):
+    other, inputs = pendulum_posterior(seed=3), 2.0 * np.ones((H, 1))
+    asked = controller(covariance="none", rolled_out=True, iterations=iterations).with_model(other)
+    made = controller(model=other, covariance="none", rolled_out=True, iterations=iterations)
+    question = Gaussian.certain([0.3, -0.2]), AT_REST, None, None, inputs
+    found, expected = asked.control(*question), made.control(*question)
+    assert np.array_equal(found.means, expected.means)
+    assert np.array_equal(found.inputs, expected.inputs)

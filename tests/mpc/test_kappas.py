@@ -43,6 +43,14 @@ def test_bounds_are_moved_by_the_kappas_of_the_reference():
         assert np.allclose(found.inputs, plain.inputs, atol=1e-9) == (kappas[0] == kappas[-1])
 
 
+def test_a_set_point_keeps_its_kappas():
+    asked, kappas = controller(), np.full(H, 3.0)
+    point = asked.control(START, Reference(FAR.states[0], np.zeros(1), kappas))
+    assert np.array_equal(point.inputs, asked.control(START, replace(FAR, kappas=kappas)).inputs)
+    with pytest.raises(ShapeError, match=r"kappas must be \(6,\); got \(2,\)"):
+        asked.control(START, Reference(FAR.states[0], np.zeros(1), kappas[:2]))
+
+
 def test_a_bound_on_the_mean_stays_one():
     asked = controller(probability=None)
     moved = asked.control(START, replace(FAR, kappas=np.full(H, 4.0)))

@@ -8,7 +8,8 @@ from gpmpc.dynamics import Linearized
 from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc._stages import LinearizedStages, StageLinearizer
+from gpmpc.mpc._linear_quadratic import Stages
+from gpmpc.mpc._stages import StageLinearizer
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from tests.mpc.small_models import double_integrator, pendulum_posterior
 
@@ -36,7 +37,7 @@ def stage_at(mode, propagator, model, belief, input, disturbance=None):
     linearizer = StageLinearizer(model, propagator, mode)
     covariances = belief.covariance.numpy()[None]
     s = linearizer.state(belief.mean.numpy()[None], covariances)
-    return s[0], LinearizedStages(*(part[0] for part in linearizer(s, input.numpy()[None], covariances, disturbance)))
+    return s[0], Stages(*(part[0] for part in linearizer(s, input.numpy()[None], covariances, disturbance)))
 
 
 @pytest.mark.parametrize("noise", [False, True])

@@ -1,0 +1,193 @@
+"""Closes the loop of one seed, or of many at once.
+
+Many seeds are measured, decided for (``control_many``, where the controller has that) and stepped together; a trial's
+numbers are those of ``closed_loop`` with its seed. What grows with their number is memory, so they fly in chunks.
+"""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gpmpc.exceptions import Diverged, GpmpcError, SettingError, SolverFailure, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc.controller import Controller, Reference
+from gpmpc.mpc.policy import Command, OnFailure, check_policy, command, commands
+from gpmpc.simulation._disturbances import Disturbance
+from gpmpc.simulation._loop import Flight, History, Rollout, check_references, fly, window
+from gpmpc.simulation._simulator import ModelLoop, ModelSimulator, Noise, PlantSimulator, Simulator
+from gpmpc.step import Step
+from gpmpc.systems import Plant
+
+Array = np.ndarray
+_MEMORY = 2**30  # [bytes] that the controller may take for all that fly at a time
+
+
+def closed_loop(
+    system: Plant | ModelLoop,
+    controller: Controller,
+    references: Reference | Array | Sequence[float],
+    initial: Any,
+    steps: int,
+    *,
+    noise: Noise | None = None,
+    disturbances: Sequence[Disturbance] = (),
+    on_failure: OnFailure = "raise",
+    seed: int = 0,
+    on_step: Callable[[Step], None] | None = None,
+) -> Rollout:
+    """Runs a controller on a plant, or on a learned model that is rolled on itself.
+
+    Args:
+        system: What is steered.
+        controller: Its feedback law; it sees the next ``controller.horizon`` references.
+        references: Reference states r[0] .. (steps + horizon, n) or more, one a time step, or a set point (n,); as a
+            ``Reference`` with the inputs that belong to them.
+        initial: The state (n,). A ``Gaussian`` is the belief that a model loop starts from, and what a plant's state is
+            drawn from.
+        steps: K.
+        noise: On a plant's states, measurements and inputs.
+        disturbances: Gusts, other plants, dropouts: what the controller does not know of.
+        on_failure: What is applied where a solve fails: ``"previous_plan"``, ``"hold"`` or ``"raise"``; see
+            ``gpmpc.mpc.policy``.
+        seed: Of all random numbers; equal seeds give equal numbers.
+        on_step: Called after every step and outside of everything that is timed, such as a recorder's ``record``.
+
+    Raises:
+        ShapeError: Too few references for the steps and the horizon, or a state of the wrong length.
+        SettingError: An unknown policy, negative noise, or noise in a model loop.
+        SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
+        Diverged: The system left the finite numbers; ``flown`` holds the steps before.
+    """
+    check_policy(on_failure)
+    references = check_references(references, steps, controller.horizon)
+    if not isinstance(system, ModelLoop):
+        simulator: Simulator = PlantSimulator(system, initial, disturbances, noise, seed)
+    elif disturbances or noise is not None:
+        raise SettingError("disturbances, noise", "need a plant in the loop; got a ModelLoop")
+    else:
+        simulator = ModelSimulator(system, initial)
+    history = History(simulator, references, system.time_step, on_step=on_step)
+
+    def decide(k: int, beliefs: Sequence[Gaussian], last: Sequence[Command | None]) -> list[Command]:
+        return [command(controller, beliefs[0], window(references, k, controller.horizon), last[0], on_failure, k)]
+
+    flight = Flight(simulator, history.add)
+    fly([flight], decide, steps, system.time_step)
+    if isinstance(flight.error, Diverged) and history.rows:
+        flight.error.flown = history.rollout()
+    if flight.error is not None:
+        raise flight.error
+    return history.rollout()
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The result of one seed."""
+
+    name: str  # such as "seed 3"
+    seed: int
+    result: Rollout | None  # None where it failed
+    error: str | None  # why it failed, with the kind of the error; None where it did not
+
+
+def closed_loops(
+    plant: Plant,
+    controller: Controller,
+    references: Reference | np.ndarray,
+    initial: Any,
+    steps: int,
+    seeds: int | Sequence[int],
+    *,
+    noise: Noise | None = None,
+    disturbances: Sequence[Disturbance] = (),
+    on_failure: OnFailure = "raise",
+    chunk: int | None = None,
+) -> list[Trial]:
+    """Flies a controller on a plant with many seeds at once.
+
+    Args:
+        plant: What is steered; its right-hand side is evaluated on arrays, an entry a trial.
+        controller: Its feedback law, of all trials; a ``GPMPC`` decides for them together, any other one by one.
+        references: As for ``closed_loop``, of all trials.
+        initial: The state (n,), or the ``Gaussian`` that every trial's is drawn from.
+        steps: K.
+        seeds: One a trial; a number stands for 0 .. seeds - 1.
+        noise: On states, measurements and inputs.
+        disturbances: What the controller does not know of.
+        on_failure: With ``"raise"`` a trial whose solve fails ends, and the others fly on.
+        chunk: How many trials fly at a time; as many as the controller has a gigabyte for by default.
+
+    Returns:
+        One ``Trial`` a seed, in their order; those whose solve failed or whose plant diverged have an error instead of
+        a ``Rollout``.
+
+    Raises:
+        ShapeError: As for ``closed_loop``.
+        SettingError: As for ``closed_loop``; no seeds or equal ones; a model loop, in which a seed changes nothing; or
+            no ``chunk`` where the controller cannot say how much memory a trial takes.
+    """
+    if isinstance(plant, ModelLoop):
+        raise SettingError("plant", "a model loop draws no random numbers, all seeds are one flight; take closed_loop")
+    if getattr(plant.dynamics, "stateful", False):
+        raise SettingError("plant", "a simulator flies one seed after another; take closed_loop")
+    check_policy(on_failure)
+    seeds, horizon = _check_seeds(seeds), controller.horizon
+    references = check_references(references, steps, horizon)
+    size = chunk_size(controller, len(seeds), chunk=chunk)
+
+    def decide(k: int, beliefs: Sequence[Gaussian], last: Sequence[Command | None]) -> list[Command | SolverFailure]:
+        return commands(controller, beliefs, window(references, k, horizon), last, on_failure, k)
+
+    finished: list[Trial] = []
+    for start in range(0, len(seeds), size):
+        some = seeds[start : start + size]
+        simulators = [PlantSimulator(plant, initial, disturbances, noise, seed) for seed in some]
+        histories = [History(simulator, references, plant.time_step) for simulator in simulators]
+        flights = [Flight(*each) for each in zip(simulators, (history.add for history in histories), strict=True)]
+        fly(flights, decide, steps, plant.time_step)
+        for seed, flight, history in zip(some, flights, histories, strict=True):
+            error = flight.error
+            reason = None if error is None else f"{type(error).__name__}: {error}"
+            finished.append(Trial(f"seed {seed}", seed, history.rollout() if error is None else None, reason))
+    return finished
+
+
+def chunk_size(controller: Controller, trials: int, memory: int = _MEMORY, chunk: int | None = None) -> int:
+    """Says how many trials fly at a time: ``chunk`` where it is given, else what fits the memory [bytes].
+
+    A controller with ``control_many`` says what a trial takes (``bytes_per_question``), else ``SettingError``.
+    """
+    if chunk is not None:
+        check_number("chunk", chunk, least=1, whole=True)
+        return min(chunk, trials)
+    if not hasattr(controller, "control_many"):
+        return trials
+    each = getattr(controller, "bytes_per_question", None)
+    if each is None:
+        raise SettingError("chunk", "the memory that this model takes is not known: say how many trials fly at a time")
+    return min(trials, max(1, int(memory // each)))
+
+
+def rehearse(system: Plant | ModelLoop, controller: Controller, references: Reference, initial: Any) -> None:
+    """Flies the first two steps, without noise, and forgets them: a flight's times then hold no compiling and loading.
+
+    Two, since the second one starts from a plan. What fails here fails again in the flight, and is raised there.
+    """
+    with suppress(GpmpcError):
+        closed_loop(system, controller, references, initial, 2, on_failure="previous_plan")
+
+
+def _check_seeds(seeds: int | Sequence[int]) -> list[int]:
+    """Returns the seeds one by one."""
+    if isinstance(seeds, int | np.integer):
+        check_number("seeds", int(seeds), least=1, whole=True)
+        seeds = range(int(seeds))
+    seeds = [int(seed) if isinstance(seed, np.integer) else seed for seed in seeds]
+    for seed in seeds:
+        check_number("seeds", seed, least=0, whole=True)
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise SettingError("seeds", f"must be one or more different whole numbers; got {seeds}")
+    return seeds
