@@ -95,10 +95,6 @@ class ExcitedData:
         """Flies the system; the inputs are those that acted, dither included.
 
         The attitudes that the rotational one flies are those of a flight of ``translational()``.
-
-        Raises:
-            SettingError: The system is neither of the quadrotor's two, or there is no trajectory.
-            SolverFailure: The controller's solver failed at the first step.
         """
         self.check(system, trajectory)
         outer = system if system.name == "translational" else translational()

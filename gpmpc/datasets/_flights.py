@@ -26,11 +26,7 @@ SUBSYSTEMS = ("translational", "rotational")
 
 
 def check_quadrotor(system: System, trajectory: Trajectory | None) -> None:
-    """Raises unless the system is one of the quadrotor's two and there is a trajectory.
-
-    Raises:
-        SettingError: It is not, or there is none.
-    """
+    """Raises ``SettingError`` unless the system is one of the quadrotor's two and there is a trajectory."""
     if system.name not in SUBSYSTEMS:
         what = f"these data are of {' and '.join(SUBSYSTEMS)} alone; data=random is of any system"
         raise SettingError("data", f"{what}; got {system.name!r}")
@@ -80,9 +76,8 @@ class Tracking:
 
     def fly(self, references: np.ndarray, horizon: int, steps: int) -> Rollout:
         """Unconstrained NMPC from rest along references (steps + horizon, n)."""
-        controller = NMPC(
-            self.plant, mpc.Problem(mpc.Tracking(self.Q, self.R, penalized="inputs")), horizon, self.initial_input
-        )
+        problem = mpc.Problem(mpc.Tracking(self.Q, self.R, penalized="inputs"))
+        controller = NMPC(self.plant, problem, horizon, self.initial_input)
         return closed_loop(self.plant, controller, references, np.zeros(len(self.Q)), steps)
 
 
@@ -112,12 +107,7 @@ class NMPCData:
     check = staticmethod(check_quadrotor)
 
     def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions:
-        """Flies the trajectory by the plants of these settings, and for the rotational subsystem its attitude.
-
-        Raises:
-            SettingError: The system is neither of the quadrotor's two, or there is no trajectory.
-            SolverFailure: The controller's solver failed.
-        """
+        """Flies the trajectory by the plants of these settings, and for the rotational subsystem its attitude."""
         self.check(system, trajectory)
         steps = self.samples + self.horizon  # the attitude's references reach this far beyond its last step
         references = np.zeros((steps + self.horizon, 6))  # the velocities are asked to be zero, with little weight
@@ -149,12 +139,7 @@ class PaperData:
     check = staticmethod(check_quadrotor)
 
     def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions:
-        """Reads one file.
-
-        Raises:
-            SettingError: The system is neither of the quadrotor's two, or there is no trajectory.
-            DataError: The file is missing, malformed, or shorter than ``samples``.
-        """
+        """Reads one file; ``DataError`` where it is missing, malformed, or shorter than ``samples``."""
         self.check(system, trajectory)
         part = {"translational": "trans", "rotational": "rotate"}[system.name]
         path = Path(self.folder) / f"ds_nmpc_{name.capitalize()}_{part}.txt"

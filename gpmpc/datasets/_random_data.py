@@ -44,12 +44,7 @@ class RandomData:
             check_number("data.noise", value, least=0)
 
     def check(self, system: System, trajectory: Trajectory | None = None) -> None:
-        """Raises unless the system can be driven at random.
-
-        Raises:
-            SettingError: It has an input without limits, or no region to start from.
-            ShapeError: There are more or fewer deviations of noise than states.
-        """
+        """Raises unless its inputs have limits, it has a region to start from, and noise fits its states."""
         for name, *limits in zip(system.input_names, system.input_lower, system.input_upper, strict=True):
             if not np.isfinite(limits).all():
                 raise SettingError("data", f"random inputs need limits; {name} of {system.name} has none")
@@ -66,8 +61,6 @@ class RandomData:
         ends it.
 
         Raises:
-            SettingError: As ``check`` does.
-            ShapeError: As ``check`` does.
             DataError: Its episodes end at once, over and over.
         """
         self.check(system, trajectory)

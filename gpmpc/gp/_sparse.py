@@ -128,7 +128,7 @@ def collapsed_bound(
 ) -> Tensor:
     """The bound on the log marginal likelihood (SGPR), or FITC's own log marginal likelihood, of every output (k,).
 
-    Arguments are as for ``sparse_posterior``; it can be differentiated by inducing points and hyperparameters.
+    Arguments are as for ``sparse_posterior``; ``backward`` differentiates it by inducing points and hyperparameters.
 
     Raises:
         SettingError: Kzz is not positive definite, or the method is unknown.
@@ -152,9 +152,9 @@ def data_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparamete
     for a in range(y.shape[1]):
         total: Any = 0.0, 0.0, 0.0, 0.0
         for rows in (slice(begin, begin + step) for begin in range(0, len(x), step)):
-            block = Lz[a, None], Z, x[rows], y[rows, a, None], kernel.output(a), method
-            if torch.is_grad_enabled():
-                part: Any = checkpoint(_block_sums, *block, use_reentrant=False, preserve_rng_state=False)
+            block = Lz[a, None], Z, x[rows], y[rows, a, None], *kernel.output(a), method
+            if torch.is_grad_enabled() and step < len(x):
+                part: Any = checkpoint(_block_sums, *block, use_reentrant=True, preserve_rng_state=False)
             else:
                 part = _block_sums(*block)
             total = [t + p for t, p in zip(total, part, strict=True)]
@@ -176,7 +176,9 @@ def inducing_factor(inducing: Tensor, kernel: Hyperparameters, jitter: float) ->
     return Lz
 
 
-def _block_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method) -> _Sums:
+def _block_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, *kernel_and_method: Any) -> _Sums:
+    *tensors, method = kernel_and_method
+    kernel = Hyperparameters(*tensors)
     _, signal_variance, noise_variance = kernel
     whitened = torch.linalg.solve_triangular(Lz, _cross(Z, x, kernel), upper=False)
     Lam = noise_variance[:, None].expand(-1, len(x))

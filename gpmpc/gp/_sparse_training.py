@@ -252,7 +252,8 @@ class _Bound:
             total = self._bounds(variables).sum()
             value, gradient = float(total.detach()), np.full_like(vector, np.nan)
             if math.isfinite(value):
-                gradient = torch.autograd.grad(total, variables)[0].numpy()
+                total.backward()
+                gradient = torch.as_tensor(variables.grad).numpy()
         if not np.isfinite(gradient).all():
             return FAILED, np.zeros_like(vector)
         self._last = value

@@ -6,13 +6,13 @@ where the processor can. Everything here is for compiled code only; arrays are c
 ``load_some`` looks at their length.
 """
 
+import inspect
 import operator
 from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.core.errors import TypingError
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
 from gpmpc.compiled import inline_njit
@@ -40,9 +40,31 @@ class _LanesModel(models.PrimitiveModel):
 LANES = Lanes()
 
 
-def _define(function: Callable[..., Any]) -> Any:
-    """Makes an intrinsic, which compiled code calls without the first argument."""
-    return intrinsic(function)
+def _define(result: types.Type, *operands: Any) -> Callable[[Callable], Any]:
+    """Makes a function of compiled code of one that writes LLVM's instructions for operands of these types.
+
+    ``types.Array`` stands for any array. What is called without the first argument, the builder, returns ``result``.
+    """
+
+    def make(write: Callable) -> Any:
+        def typed(typing_context, *given):
+            kinds = [own if kind is types.Array else kind for kind, own in zip(operands, given, strict=True)]
+
+            def generate(context, builder, signature, arguments):
+                values = [
+                    context.make_array(kind)(context, builder, value) if isinstance(kind, types.Array) else value
+                    for kind, value in zip(kinds, arguments, strict=True)
+                ]
+                value = write(builder, *values)
+                return context.get_dummy_value() if value is None else value
+
+            return result(*kinds), generate
+
+        typed.__name__, typed.__doc__ = write.__name__, write.__doc__
+        typed.__signature__ = inspect.signature(write)  # numba reads the names of the arguments after the first
+        return intrinsic(typed)
+
+    return make
 
 
 def _constant(value, kind=_VECTOR):
@@ -54,14 +76,23 @@ def _spread(builder, value, kind=_VECTOR):
     return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), [0] * _WIDTH))
 
 
-def _pointer(context, builder, array_type, array, index):
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
+def _rotate(builder, values, distance):
+    order = [(i + distance) % _WIDTH for i in range(_WIDTH)]
+    return builder.shuffle_vector(values, values, ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), order))
 
 
-def _call(builder, name, *vectors):
-    kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(vectors))
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), vectors)
+def _pointer(builder, array, index):
+    return builder.bitcast(builder.gep(array.data, [index]), _VECTOR.as_pointer())
+
+
+def _larger(builder, values, others):
+    kind = ir.FunctionType(_VECTOR, [_VECTOR])
+    size = builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.fabs.v8f64"), [others])
+    return builder.select(builder.fcmp_ordered(">", size, values), size, values)
+
+
+def _first_two(builder, values):
+    return [builder.extract_element(values, ir.IntType(64)(i)) for i in range(2)]
 
 
 def _define_operator(function, instruction):
@@ -89,152 +120,89 @@ _define_operator(operator.sub, "fsub")
 _define_operator(operator.mul, "fmul")
 
 
-@_define
-def zeros(typing_context):
+@_define(LANES)
+def zeros(builder):
     """Eight zeros."""
-
-    def generate(context, builder, signature, arguments):
-        return _constant(0.0)
-
-    return LANES(), generate
+    return _constant(0.0)
 
 
-@_define
-def load(typing_context, array, index):
+@_define(LANES, types.Array, types.intp)
+def load(builder, array, index):
     """The entries ``array[index : index + 8]``."""
-
-    def generate(context, builder, signature, arguments):
-        return builder.load(_pointer(context, builder, signature.args[0], *arguments), align=8)
-
-    return LANES(array, types.intp), generate
+    return builder.load(_pointer(builder, array, index), align=8)
 
 
-@_define
-def load_some(typing_context, array, index):
+@_define(LANES, types.Array, types.intp)
+def load_some(builder, array, index):
     """The entries ``array[index : index + 8]``; zeros where the array has ended."""
-
-    def generate(context, builder, signature, arguments):
-        place = _pointer(context, builder, signature.args[0], *arguments)
-        size = context.make_array(signature.args[0])(context, builder, arguments[0]).nitems
-        left = _spread(builder, builder.sub(size, arguments[1]), _INTEGERS)
-        present = builder.icmp_signed("<", ir.Constant(_INTEGERS, list(range(_WIDTH))), left)
-        kind = ir.FunctionType(_VECTOR, [place.type, ir.IntType(32), present.type, _VECTOR])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.masked.load.v8f64.p0v8f64")
-        return builder.call(function, [place, ir.IntType(32)(8), present, _constant(0.0)])
-
-    return LANES(array, types.intp), generate
+    place = _pointer(builder, array, index)
+    left = _spread(builder, builder.sub(array.nitems, index), _INTEGERS)
+    present = builder.icmp_signed("<", ir.Constant(_INTEGERS, list(range(_WIDTH))), left)
+    kind = ir.FunctionType(_VECTOR, [place.type, ir.IntType(32), present.type, _VECTOR])
+    function = cgutils.get_or_insert_function(builder.module, kind, "llvm.masked.load.v8f64.p0v8f64")
+    return builder.call(function, [place, ir.IntType(32)(8), present, _constant(0.0)])
 
 
-@_define
-def store(typing_context, array, index, values):
+@_define(types.none, types.Array, types.intp, LANES)
+def store(builder, array, index, values):
     """``array[index : index + 8] = values``."""
-
-    def generate(context, builder, signature, arguments):
-        builder.store(arguments[2], _pointer(context, builder, signature.args[0], *arguments[:2]), align=8)
-        return context.get_dummy_value()
-
-    return types.none(array, types.intp, LANES), generate
+    builder.store(values, _pointer(builder, array, index), align=8)
 
 
-@_define
-def lane(typing_context, values, index):
-    """One of the eight numbers."""
-
-    def generate(context, builder, signature, arguments):
-        return builder.extract_element(arguments[0], arguments[1])
-
-    return types.float64(LANES, types.intp), generate
-
-
-@_define
-def rotate(typing_context, values, distance):
-    """The entries rotated by a distance that is known when compiling."""
-    if not isinstance(distance, types.IntegerLiteral):
-        raise TypingError("the distance must be a literal")
-    order = [(i + distance.literal_value) % _WIDTH for i in range(_WIDTH)]
-
-    def generate(context, builder, signature, arguments):
-        mask = ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), order)
-        return builder.shuffle_vector(arguments[0], arguments[0], mask)
-
-    return LANES(LANES, distance), generate
-
-
-@_define
-def larger(typing_context, values, others):
+@_define(LANES, LANES, LANES)
+def larger(builder, values, others):
     """Entry by entry the larger one of ``values`` and ``|others|``; NaN in ``others`` is passed over."""
-
-    def generate(context, builder, signature, arguments):
-        size = _call(builder, "llvm.fabs.v8f64", arguments[1])
-        return builder.select(builder.fcmp_ordered(">", size, arguments[0]), size, arguments[0])
-
-    return LANES(LANES, LANES), generate
+    return _larger(builder, values, others)
 
 
-@_define
-def clip(typing_context, values, low, high):
+@_define(LANES, LANES, types.float64, types.float64)
+def clip(builder, values, low, high):
     """The entries, not below ``low`` and not above ``high``; NaN stays."""
-
-    def generate(context, builder, signature, arguments):
-        x, low, high = arguments[0], _spread(builder, arguments[1]), _spread(builder, arguments[2])
-        x = builder.select(builder.fcmp_ordered("<", x, low), low, x)
-        return builder.select(builder.fcmp_ordered(">", x, high), high, x)
-
-    return LANES(LANES, types.float64, types.float64), generate
+    low, high = _spread(builder, low), _spread(builder, high)
+    values = builder.select(builder.fcmp_ordered("<", values, low), low, values)
+    return builder.select(builder.fcmp_ordered(">", values, high), high, values)
 
 
-@_define
-def any_nonzero(typing_context, values):
+@_define(types.boolean, LANES)
+def any_nonzero(builder, values):
     """Whether an entry is not zero, as NaN is not."""
-
-    def generate(context, builder, signature, arguments):
-        nonzero = builder.fcmp_unordered("!=", arguments[0], _constant(0.0))
-        return builder.icmp_unsigned("!=", builder.bitcast(nonzero, ir.IntType(_WIDTH)), ir.IntType(_WIDTH)(0))
-
-    return types.boolean(LANES), generate
+    nonzero = builder.fcmp_unordered("!=", values, _constant(0.0))
+    return builder.icmp_unsigned("!=", builder.bitcast(nonzero, ir.IntType(_WIDTH)), ir.IntType(_WIDTH)(0))
 
 
-@_define
-def power_of_two(typing_context, shifted):
+@_define(LANES, LANES)
+def power_of_two(builder, shifted):
     """2^k for whole numbers k from -1022 to 1023, given as k + ``_SHIFT``."""
-
-    def generate(context, builder, signature, arguments):
-        bits = builder.shl(builder.bitcast(arguments[0], _INTEGERS), _constant(52, _INTEGERS))
-        return builder.bitcast(bits, _VECTOR)
-
-    return LANES(LANES), generate
+    bits = builder.shl(builder.bitcast(shifted, _INTEGERS), _constant(52, _INTEGERS))
+    return builder.bitcast(bits, _VECTOR)
 
 
-@_define
-def use_widest_registers(typing_context):
+@_define(types.none)
+def use_widest_registers(builder):
     """Lets LLVM use registers of 512 bits in the calling function; left alone it stops at 256 (1.6 times slower here).
 
     A frame pointer lets it put vectors that find no register on cache lines of their own. llvmlite knows neither
     attribute by name, hence ``set.add``; ``tests/kernels`` looks whether they arrive.
     """
-
-    def generate(context, builder, signature, arguments):
-        set.add(builder.function.attributes, '"prefer-vector-width"="512"')
-        set.add(builder.function.attributes, '"frame-pointer"="all"')
-        return context.get_dummy_value()
-
-    return types.none(), generate
+    set.add(builder.function.attributes, '"prefer-vector-width"="512"')
+    set.add(builder.function.attributes, '"frame-pointer"="all"')
 
 
-@inline_njit
-def total(values):
+@_define(types.float64, LANES)
+def total(builder, values):
     """The sum of eight numbers."""
-    values = values + rotate(values, 4)
-    values = values + rotate(values, 2)
-    return lane(values, 0) + lane(values, 1)
+    for distance in (4, 2):
+        values = builder.fadd(values, _rotate(builder, values, distance), flags=_FLAGS)
+    return builder.fadd(*_first_two(builder, values), flags=("reassoc", *_FLAGS))
 
 
-@inline_njit
-def largest(values):
+@_define(types.float64, LANES)
+def largest(builder, values):
     """The largest size among eight numbers."""
-    values = larger(values, rotate(values, 4))
-    values = larger(values, rotate(values, 2))
-    return max(lane(values, 0), lane(values, 1))
+    for distance in (4, 2):
+        values = _larger(builder, values, _rotate(builder, values, distance))
+    first, second = _first_two(builder, values)
+    return builder.select(builder.fcmp_ordered(">", first, second), first, second)
 
 
 # exp (Cody and Waite, 1980): x = k ln 2 + r with |r| <= ln(2)/2, exp(x) = 2^k exp(r). Adding _SHIFT leaves k in the

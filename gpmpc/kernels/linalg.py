@@ -163,51 +163,28 @@ def symmetrize(A):
 
 
 @njit_noalloc
-def cholesky(A):
-    """Replaces the lower triangle of A = L L' by L; False where a pivot is not positive. The upper one is not read."""
-    for i in range(len(A)):
+def solve_positive(A, X):
+    """Replaces X by A^-1 X and the lower triangle of A = L L' by L; False where a pivot is not positive."""
+    n, width = X.shape
+    for i in range(n):
         for j in range(i):
             A[i, j] = (A[i, j] - dot(A[i], A[j], j)) / A[j, j]
         pivot = A[i, i] - dot(A[i], A[i], i)
         if not pivot > 0.0:
             return False
         A[i, i] = math.sqrt(pivot)
-    return True
-
-
-@njit_noalloc
-def solve_lower(L, X):
-    """Replaces X by L^-1 X."""
-    for i in range(len(L)):
-        row = X[i]
+    for i in range(n):  # L^-1 X
         for j in range(i):
-            factor, other = L[i, j], X[j]
-            for k in range(len(row)):
-                row[k] -= factor * other[k]
-        for k in range(len(row)):
-            row[k] /= L[i, i]
-
-
-@njit_noalloc
-def solve_lower_transposed(L, X):
-    """Replaces X by L^-T X."""
-    for i in range(len(L) - 1, -1, -1):
-        row = X[i]
-        for j in range(i + 1, len(L)):
-            factor, other = L[j, i], X[j]
-            for k in range(len(row)):
-                row[k] -= factor * other[k]
-        for k in range(len(row)):
-            row[k] /= L[i, i]
-
-
-@njit_noalloc
-def solve_positive(A, X):
-    """Replaces X by A^-1 X and the lower triangle of A by its Cholesky factor; False where A is not positive."""
-    if not cholesky(A):
-        return False
-    solve_lower(A, X)
-    solve_lower_transposed(A, X)
+            for k in range(width):
+                X[i, k] -= A[i, j] * X[j, k]
+        for k in range(width):
+            X[i, k] /= A[i, i]
+    for i in range(n - 1, -1, -1):  # L^-T (L^-1 X)
+        for j in range(i + 1, n):
+            for k in range(width):
+                X[i, k] -= A[j, i] * X[j, k]
+        for k in range(width):
+            X[i, k] /= A[i, i]
     return True
 
 

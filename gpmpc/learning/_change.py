@@ -82,13 +82,7 @@ class ChangedModel(Wrapper):
         return other
 
     def errors(self, states: Array, inputs: Array, next_states: Array) -> tuple[Array, Array, Array]:
-        """Points (phi, u) (N, d) of d, what it was there (N, k), and the variances of f there (N, k).
-
-        Args:
-            states: x (N, n).
-            inputs: u (N, m).
-            next_states: What followed (N, n).
-        """
+        """Points (phi, u) (N, d) of d, what it was there (N, k), and variances of f there (N, k), of N transitions."""
         alone = linearize(self.model, states, inputs)
         variances = np.einsum("ai,nij,aj->na", self.reach, cast(Array, alone.covariance), self.reach)
         points = np.column_stack(self.features.linearize(states, inputs)[:2])
@@ -97,15 +91,9 @@ class ChangedModel(Wrapper):
     def with_points(
         self, points: Array, targets: Array, noise: Array, share: float, memory: float, window: SlidingWindow
     ) -> "ChangedModel":
-        """The model with further points of the change, observed now.
+        """The model with further points (phi, u) (N, d) of the change, observed now with noise of variances (k,).
 
-        Args:
-            points: (phi, u) (N, d).
-            targets: d there (N, k).
-            noise: Their variances (k,).
-            share: Of the kernel, for the first points.
-            memory: Of the kernel, for the first points.
-            window: How many points there may be, and which go.
+        Share and memory are those of the kernel, for the first points; the window says which points go.
 
         Raises:
             SettingError: The kernel matrix is not positive definite.

@@ -85,13 +85,7 @@ class OnlineLearning:
         check_number("margin", self.margin, least=0)
 
     def learn(self, learned: Learned, input: Array, state: Array) -> Learned:
-        """Learns from one step.
-
-        Args:
-            learned: Before it.
-            input: That was applied (m,).
-            state: Measured after it (n,).
-        """
+        """Learns from one step: the input that was applied (m,), and the state measured after it (n,)."""
         model = learned.model
         points, errors, latent = model.errors(learned.state[None], np.array(input, dtype=float)[None], state[None])
         error, noise = errors[0], model.gp.noise_variance.numpy()
@@ -169,12 +163,10 @@ class LearningController:
 
 
 def noise_ratio(spread: Array, outputs: int) -> float:
-    """How much larger the noise is than a model believes, 1 at least.
+    """How much larger the noise is than a model of k outputs believes, 1 at least.
 
-    Args:
-        spread: Half the squared differences of successive errors over the model's noise, mean over the outputs (w,):
-            what changes slowly has no part in them, and a jump no weight in their median.
-        outputs: k.
+    ``spread`` has half the squared differences of successive errors over the model's noise, mean over the outputs (w,):
+    what changes slowly has no part in them, and a jump no weight in their median.
     """
     return max(1.0, float(np.median(spread)) * outputs / _median(outputs))
 

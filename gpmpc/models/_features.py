@@ -103,12 +103,7 @@ class Features:
         return torch.stack(slopes, dim=-1)[..., None] * matrix
 
     def linearize(self, states: Array, inputs: Array) -> tuple[Array, Array, Array | None]:
-        """Features (K, d), selected inputs (K, m_s), and each feature's derivative by its state (K, d); None for one.
-
-        Args:
-            states: (K, n).
-            inputs: (K, m).
-        """
+        """Features (K, d), selected inputs (K, m_s), each feature's derivative (K, d) by its state, None for one."""
         z, v, sines = states[:, self.columns], inputs[:, self._selected], self.sines
         if not self.angles:
             return z, v, None

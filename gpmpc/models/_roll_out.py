@@ -34,13 +34,7 @@ class RollOut:
             self._gps = _known_form(model)
 
     def __call__(self, start: Array, feedback: Feedback, disturbance: Array | None = None) -> tuple[Array, Array]:
-        """Returns states (T, H + 1, n) and inputs (T, H, m).
-
-        Args:
-            start: x_0 (T, n).
-            feedback: Whose plans are followed; contiguous arrays.
-            disturbance: Added to every next state (n,).
-        """
+        """Returns states (T, H + 1, n) and inputs (T, H, m) from x_0 (T, n) on; a disturbance (n,) is added at each."""
         (T, H, m), n = feedback.inputs.shape, start.shape[1]
         states, inputs = np.empty((T, H + 1, n)), np.empty((T, H, m))
         added = np.zeros(n) if disturbance is None else disturbance

@@ -81,8 +81,10 @@ class PredictionSettings:
     """How beliefs are predicted.
 
     Attributes:
-        form: ``"trajectory"`` or ``"velocity"``; see the module's text.
-        covariance: ``"full"``, ``"diagonal"``, ``"zero_order"`` or ``"none"``; see ``gpmpc.mpc._stages``.
+        form: Where the dynamics are linearised: ``"trajectory"``, at every stage of the last plan; ``"velocity"``, at
+            the current belief, held over the horizon (Cao, Lai and Alam, 2017, section 4).
+        covariance: What the program holds: ``"full"``, means and roots of the covariances; ``"diagonal"``, means and
+            standard deviations; ``"zero_order"``, means, with covariances predicted beside it; ``"none"``, means alone.
         feedback: Predicts the covariances of ``"zero_order"`` under a feedback, without which no long horizon with
             state constraints is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"``
             and ``"diagonal"`` are those without feedback.

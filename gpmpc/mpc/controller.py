@@ -86,40 +86,27 @@ class Timing:
 
 @dataclass(frozen=True)
 class Decision:
-    """What a controller decided at one step.
+    """What a controller decided at one step."""
 
-    Attributes:
-        input: The input to apply now (m,).
-        inputs: The planned inputs (H, m); the first row is ``input``.
-        means: Predicted means of the states (H + 1, n), from the current state on.
-        covariances: Their covariances (H + 1, n, n); zero where the controller does not predict them.
-        status: How the solve ended.
-        iterations: Iterations of the solver.
-        timing: Wall time of the parts.
-        problem: The quadratic program that was solved last, where there is one.
-        solution: Its solution: active set, multipliers, residuals; a warm start for the next.
-        disturbance: Estimate of the model's constant error (n,), added to its mean at every stage; None where nothing
-            is estimated.
-        suboptimal: The solve stopped short of its tolerance, at a limit say, with a plan that keeps its bounds and that
-            steps towards the optimum led to (Scokaert, Mayne and Rawlings, 1999).
-        novelty: The largest standard deviation that a stage of the plan adds, over the one that the model has far from
-            all data: near 0 among data, near 1 where the model knows nothing; NaN where that is not known.
-        learned: What the flight has taught a controller that learns (``gpmpc.learning``), for its next decision; with
-            ``size``, the points of the model that decided, and ``version``, how often it has changed.
-    """
-
-    input: Array
-    inputs: Array
-    means: Array
-    covariances: Array
-    status: Status
-    iterations: int
-    timing: Timing
-    problem: QuadraticProgram | None = None
-    solution: QPSolution | None = None
+    input: Array  #: to apply now (m,)
+    inputs: Array  #: planned (H, m); the first row is ``input``
+    means: Array  #: predicted means of the states (H + 1, n), from the current state on
+    covariances: Array  #: of these (H + 1, n, n); zero where the controller does not predict them
+    status: Status  #: how the solve ended
+    iterations: int  #: of the solver
+    timing: Timing  #: of the parts
+    problem: QuadraticProgram | None = None  #: that was solved last, where there is one
+    solution: QPSolution | None = None  #: of it: active set, multipliers, residuals; a warm start for the next
+    #: estimate of the model's constant error (n,), added to its mean at every stage; None where nothing is estimated
     disturbance: Array | None = None
+    #: the solve stopped short of its tolerance, at a limit say, with a plan that keeps its bounds and that steps
+    #: towards the optimum led to (Scokaert, Mayne and Rawlings, 1999)
     suboptimal: bool = False
+    #: the largest standard deviation that a stage of the plan adds, over the one that the model has far from all data:
+    #: near 0 among data, near 1 where the model knows nothing; NaN where that is not known
     novelty: float = math.nan
+    #: what the flight has taught a controller that learns (``gpmpc.learning``), for its next decision; with ``size``,
+    #: the points of the model that decided, and ``version``, how often it has changed
     learned: Any = None
 
     def __post_init__(self) -> None:

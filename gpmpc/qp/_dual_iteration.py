@@ -45,24 +45,30 @@ _BAD = 0.5  # those violated by more than this share of the worst
 
 @inline_njit
 def iterate(work, active, k, count, margin, iterations, batches):
-    """Changes the working set until no constraint is violated; ``count`` are, and listed.
+    """Changes the working set until no constraint is violated by more than ``margin``, in units of ``scale``.
+
+    ``count`` are, and listed; ``-1 - g`` says that y is not known yet and that g guessed candidates enter first.
 
     Returns:
         ``SOLVED``, ``INFEASIBLE`` or ``ITERATION_LIMIT``, the size of the working set, iterations and batches so far,
-        and whether a constraint was passed over because it contradicts others by what may be rounding.
+        whether a constraint was passed over because it contradicts others by what may be rounding, and whether any was
+        violated.
     """
-    complete, passed = True, False  # whether y and the list are those of all constraints
-    while count > 0:
-        if iterations >= work.limit:
-            return ITERATION_LIMIT, k, iterations, batches, passed
-        p = most_violated(work, count)
+    p, chosen, begins, violated, passed = 0, -1 - count, count < 0, False, False
+    complete = True  # whether y and the list are those of all constraints
+    while count != 0:
+        if not begins:
+            if iterations >= work.limit:
+                return ITERATION_LIMIT, k, iterations, batches, passed, True
+            p, chosen, violated = most_violated(work, count), 0, True
+            if complete and batches < _BATCHES and count_bad(work, _BAD * work.excess[p], count) > 1:
+                batches += 1
+                chosen = choose_bad(work, _BAD * work.excess[p], count, work.capacity - k)
         before = k
-        if complete and batches < _BATCHES and count_bad(work, _BAD * work.excess[p], count) > 1:
-            batches += 1
-            chosen = choose_bad(work, _BAD * work.excess[p], count, work.capacity - k)
-            k = add_constraints(work, active, k, chosen)
+        k = add_constraints(work, active, k, chosen)
+        if not begins:
             iterations += k - before
-        several = unsettled = k > before
+        several = unsettled = begins or k > before
         if not several:
             mu_p, scale = work.mu[p], work.scale[p]
             satisfied, k, changes = _satisfy_constraint(work, active, k, p)
@@ -71,7 +77,7 @@ def iterate(work, active, k, count, margin, iterations, batches):
                 size = max(abs(work.y[p]), work.negligible[p] / NEGLIGIBLE)
                 if work.excess[p] * scale > _HOPELESS * size:
                     _write_ray(work, active, k, p)
-                    return INFEASIBLE, k, iterations, batches, passed
+                    return INFEASIBLE, k, iterations, batches, passed, True
                 work.mu[p], passed = mu_p, True  # what it gained on the way belongs to no working set
                 ignore_violations(work, p)
                 unsettled = not work.soft  # else refinement has to do
@@ -79,23 +85,28 @@ def iterate(work, active, k, count, margin, iterations, batches):
                 batches = _BATCHES  # caps may have changed x_u
         if unsettled:
             k = drop_wrong_multipliers(work, active, k)
-        complete = several or work.soft or work.prepared or count == 1 or iterations >= work.limit
-        if not complete:  # first satisfy those that were seen to be violated, then look at all
-            minimise(work, active, k)
-            count = keep_violated(work, margin, count)
-            complete = count == 0
-        if work.prepared:
-            follow_multipliers(work)
-        elif complete:
-            evaluate(work, active, k)
+        if work.prepared and not begins:
+            _follow_multipliers(work)
+        else:
+            _minimise(work, active, k)
+            complete = several or work.soft or work.prepared or count == 1 or iterations >= work.limit
+            if not complete:  # first satisfy those that were seen to be violated, then look at all
+                count = keep_violated(work, margin, count)
+                complete = count == 0
+            if complete:
+                multiply_constraints(work)
+            for i in range(len(work.mu) if work.prepared else 0):
+                work.seen[i] = work.mu[i]
         if complete:
             count = list_violated(work, margin)
-    for i in range(k):  # rounding can take multipliers out of their ranges
-        p = abs(active.name[i]) - 1
-        work.mu[p] = min(max(work.mu[p], active.least[i]), active.most[i])
-    if work.prepared:
-        multiply_constraints(work)  # which x has, but for rounding
-    return SOLVED, k, iterations, batches, passed
+        begins = False
+    if violated:
+        for i in range(k):  # rounding can take multipliers out of their ranges
+            p = abs(active.name[i]) - 1
+            work.mu[p] = min(max(work.mu[p], active.least[i]), active.most[i])
+        if work.prepared:
+            multiply_constraints(work)  # which x has, but for rounding
+    return SOLVED, k, iterations, batches, passed, violated
 
 
 @inline_njit
@@ -330,19 +341,17 @@ def drop_wrong_multipliers(work, active, k):
 
 
 @inline_njit
-def minimise(work, active, k):
+def _minimise(work, active, k):
     """Writes the minimiser of the Lagrangian, ``P x = -(q + C'mu)``, to the first n entries of y."""
     n, y = len(work.x), work.y
-    if work.prepared:
+    if work.prepared or work.soft:  # constraints at their caps have multipliers, too
         add_multipliers(work, active, k)
-        combine_rows(work.gram, n, work.slope, 0, n, y)
+        if work.prepared:
+            combine_rows(work.gram, n, work.slope, 0, n, y)
         for i in range(n):
-            y[i] = -y[i]
-        return
-    if work.soft:  # constraints at their caps have multipliers, too
-        add_multipliers(work, active, k)
-        for i in range(n):
-            y[i] = -work.slope[i]
+            y[i] = -y[i] if work.prepared else -work.slope[i]
+        if work.prepared:
+            return
         solve_transposed(work.L, n, y)
     else:  # L x = v - sum mu_i w_i
         for i in range(n):
@@ -354,17 +363,7 @@ def minimise(work, active, k):
 
 
 @inline_njit
-def evaluate(work, active, k):
-    """Writes ``y = C x`` for the minimiser x of the Lagrangian."""
-    minimise(work, active, k)
-    multiply_constraints(work)
-    if work.prepared:
-        for p in range(len(work.mu)):
-            work.seen[p] = work.mu[p]
-
-
-@inline_njit
-def follow_multipliers(work):
+def _follow_multipliers(work):
     """Moves y of a prepared program by the rows of K whose multipliers have changed."""
     mu, seen, amounts, count, M = work.mu, work.seen, work.excess, 0, len(work.mu)
     for p in range(M):

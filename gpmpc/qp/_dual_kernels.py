@@ -16,10 +16,7 @@ from gpmpc.kernels._simd import any_nonzero, clip, larger, largest, load, load_s
 from gpmpc.kernels.linalg import dot, multiply
 from gpmpc.qp._dual_iteration import (
     NEGLIGIBLE,
-    add_constraints,
     add_multipliers,
-    drop_wrong_multipliers,
-    evaluate,
     iterate,
     multiply_constraints,
     restore_constraints,
@@ -83,20 +80,27 @@ def _solve_opened(work, active, guess, least):
     """Solves the program in the workspace."""
     n, M = len(work.x), len(work.mu)
     known = len(guess) > HEADER and guess[VARIABLES] == n and guess[CONSTRAINTS] == M and 0 <= guess[WORKING] <= M
-    k = start(work, active, guess if known else guess[:0])
-    evaluate(work, active, k)
+    k, guessed = _start(work, active, guess if known else guess[:0])
     pivots, margin, fine = work.settings[SHARE], _LATER / NEGLIGIBLE * least, _FINE
     iterations, rounds = np.int64(0), 0  # for a literal numba compiles callees anew
     status, passed, moved = NUMERICAL_TROUBLE, False, False
     interrupted = known and guess[STATUS] == ITERATION_LIMIT
     batches = np.int64(_BATCHES if interrupted else 0)  # with single steps only the dual objective cannot fall
-    count = list_violated(work, margin)
+    count, near = -1 - guessed, 0.0
     while True:
-        if count > 0:
-            status, k, iterations, batches, passed_now = iterate(work, active, k, count, margin, iterations, batches)
+        if rounds > 0:
+            count = list_violated(work, -near)
+            if count == 0:
+                break
+            if fine > _FINEST:  # a small violation is believed of the best x only
+                fine, count, moved = _FINEST, 0, True
+        if count != 0:
+            status, k, iterations, batches, passed_now, violated = iterate(
+                work, active, k, count, margin, iterations, batches
+            )
             if status != SOLVED:
                 break
-            moved, passed = True, passed or passed_now
+            moved, passed = moved or violated, passed or passed_now
         for i in range(k):  # bounds of variables hold exactly
             p = abs(active.name[i]) - 1
             if p < n:
@@ -115,11 +119,6 @@ def _solve_opened(work, active, guess, least):
             break
         margin, moved = 0.0, False
         near = worst * size / share if fine > _FINEST else 0.0  # what the error of x may hide
-        count = list_violated(work, -near)
-        if count == 0:
-            break
-        if fine > _FINEST:  # a small violation is believed of the best x only
-            fine, count, moved = _FINEST, 0, True
     unsure = passed or rounds == _ROUNDS  # of the violations that are left
     if unsure and status == SOLVED and _worst_violation(work, least) > _NOISE:
         status = NUMERICAL_TROUBLE
@@ -141,8 +140,12 @@ def _solve_opened(work, active, guess, least):
 
 
 @inline_njit
-def start(work, active, guess):
-    """Starts from a guess: x_u, soft rows that stay violated, and the working set; returns its size."""
+def _start(work, active, guess):
+    """Starts from a guess: x_u, soft rows that stay violated, and the working set.
+
+    Returns:
+        How many constraints work already, and how many are guessed to, and are candidates.
+    """
     n, M = len(work.x), len(work.mu)
     work.record[AGE] = 0.0
     if not work.prepared:
@@ -160,15 +163,13 @@ def start(work, active, guess):
     if not work.prepared:
         solve_transposed(work.L, n, work.v)
     if len(guess) == 0:
-        return np.int64(0)
+        return np.int64(0), np.int64(0)
     first = HEADER + n + M
     names, known = guess[first : first + int(guess[WORKING])], work.prepared and guess[TAG] == work.tag
     if known and len(guess) == len(work.record) and guess[AGE] < _OLD and are_present(work, names):
         work.record[AGE] = guess[AGE]
-        k = restore_constraints(work, active, names, guess[first + M :])
-    else:
-        k = add_constraints(work, active, np.int64(0), choose_guess(work, names))
-    return drop_wrong_multipliers(work, active, k)
+        return restore_constraints(work, active, names, guess[first + M :]), np.int64(0)
+    return np.int64(0), choose_guess(work, names)
 
 
 @inline_njit
@@ -239,14 +240,13 @@ def _refine(work, active, k, least, fine):
         The residual, the length of x that it is a share of, and whether x moved.
     """
     worst, size, best, moved = np.inf, 0.0, np.inf, False
-    add_multipliers(work, active, k)
     for attempt in range(_REFINEMENTS + 1):
+        add_multipliers(work, active, k)
         worst, size = _measure_residuals(work, active, k, least)
         if worst <= fine or attempt == _REFINEMENTS or not worst < 0.5 * best:
             break
         best, moved = worst, True
         _take_newton_step(work, active, k)
-        add_multipliers(work, active, k)
     return worst, size, moved
 
 

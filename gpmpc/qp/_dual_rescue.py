@@ -32,7 +32,9 @@ _CORRECTIONS = 12
 
 
 @np.errstate(all="ignore")  # what is not finite does not convince
-def rescue(problem: tuple, softness: Array, record: Array, limit: int, late: Callable) -> Array:
+def rescue(
+    problem: tuple, softness: Array, record: Array, limit: int = 20, late: Callable[[], bool] = lambda: False
+) -> Array:
     """The record of a solve that starts from the working set of another, ``record``.
 
     Args:
@@ -48,7 +50,7 @@ def rescue(problem: tuple, softness: Array, record: Array, limit: int, late: Cal
         lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
         for dependent in _DEPENDENT:
             solve = _Solve((P, q, G, lower, upper), softness, dependent, late)
-            result[layout.STATUS] = solve.run(_names(record, len(q), len(lower)), limit)
+            result[layout.STATUS] = solve.run(layout.working_names(record, len(q), len(lower)), limit)
             if result[layout.STATUS] != layout.NUMERICAL_TROUBLE:
                 break
         solve.write(result)  # pyright: ignore[reportPossiblyUnboundVariable]
@@ -284,13 +286,6 @@ class _Solve:
         proven = proves_infeasibility(ray * self.E, self.G, *self.bounds)
         self.ray = ray * self.E if proven else None
         return proven
-
-
-def _names(record: Array, n: int, M: int) -> Array:
-    """The working set of a record, without what is no bound."""
-    start = layout.HEADER + n + M
-    names = record[start : start + int(np.clip(np.nan_to_num(record[layout.WORKING]), 0, M))]
-    return names[(np.abs(names) >= 1.0) & (np.abs(names) <= M)]
 
 
 def _power_of_two(sizes: Array) -> Array:

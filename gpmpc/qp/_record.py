@@ -51,3 +51,10 @@ def warm_record(active_set: NDArray, variables: int) -> NDArray[np.float64]:
     start = HEADER + variables + constraints
     record[start : start + len(members)] = np.sign(active_set[members]) * (members + 1)
     return record
+
+
+def working_names(record: NDArray, variables: int, constraints: int) -> NDArray[np.float64]:
+    """Returns the working set of a record, without what is no bound."""
+    start = HEADER + variables + constraints
+    names = record[start : start + int(np.clip(np.nan_to_num(record[WORKING]), 0, constraints))]
+    return names[(np.abs(names) >= 1.0) & (np.abs(names) <= constraints)]

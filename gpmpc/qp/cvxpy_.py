@@ -17,9 +17,10 @@ only with Farkas' proof.
 
 import threading
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,15 +29,14 @@ from scipy.linalg import cho_solve, solve_triangular
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import rescue
-from gpmpc.qp.primal_active_set import LAST_CHANGES, farkas_ray
+from gpmpc.qp.primal_active_set import farkas_ray
 from gpmpc.qp.problem import ABSENT, QuadraticProgram
 from gpmpc.qp.solution import QPSolution, WarmStart, make_solution
 from gpmpc.status import Status
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
-_KEPT = 16  # compiled problems per thread
+_STORED = 16  # compiled problems per thread
 STATUSES = {
     "optimal": Status.SOLVED,
     "optimal_inaccurate": Status.SOLVED,
@@ -74,119 +74,84 @@ class CvxpySolver:
             raise ProblemError(f"CVXPY finds no solver named {self.name!r}; it finds {', '.join(installed)}")
 
     def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
-        """The minimiser; a warm start's x is offered to solvers that take one. See ``gpmpc.qp.solver.QPSolver``."""
+        """The minimiser; a warm start's x is offered to solvers that take one. See ``gpmpc.qp.solution.QPSolver``."""
+        import cvxpy
+
         began = perf_counter()
-        lower, upper = problem.lower, problem.upper
-        n, M = len(problem.q), len(lower)
-        form = self._form(n, lower, upper)
-        factor = np.linalg.cholesky(problem.P).T
-        free = -cho_solve((factor, False), problem.q)
-        back = solve_triangular(factor, np.eye(n))  # L^-T
-        columns, offset = np.concatenate([back, problem.G @ back]), np.concatenate([free, problem.G @ free])
-        for side in form.sides:
-            side.rows.value = columns[side.members]
-            side.bound.value = ((lower if side.sign < 0 else upper) - offset)[side.members]
+        P, q, G, lower, upper = problem
+        n, M = len(q), len(lower)
+        program, y, sides = self._form(n, lower, upper)
+        factor = np.linalg.cholesky(P).T
+        free, back = -cho_solve((factor, False), q), solve_triangular(factor, np.eye(n))  # back = L^-T
+        columns, offset = np.concatenate([back, G @ back]), np.concatenate([free, G @ free])
+        for members, sign, rows, bound, _ in sides:
+            rows.value, bound.value = columns[members], ((lower if sign < 0 else upper) - offset)[members]
         warm = False
         if isinstance(warm_start, QPSolution) and len(warm_start.x) == n:
-            warm = True
-            form.y.value = factor @ (warm_start.x - free)
-        built = perf_counter()
-        solutions = []
+            warm, y.value = True, factor @ (warm_start.x - free)
+        built, best, least = perf_counter(), None, np.inf
         for options in (TIGHT.get(self.name, {}), {}) if self.options is None else (self.options,):
-            claim = _solve_form(form, self.name, warm, options)
-            status, x, multipliers = STATUSES.get(claim, Status.NUMERICAL_TROUBLE), np.zeros(n), np.zeros(M)
+            status, x, multipliers = Status.NUMERICAL_TROUBLE, np.zeros(n), np.zeros(M)
+            with warnings.catch_warnings(), suppress(cvxpy.SolverError):
+                warnings.simplefilter("ignore")  # an inaccurate solution is judged by its residuals
+                program.solve(solver=self.name, warm_start=warm, **options)
+                status = STATUSES.get(program.status, status)
             if status is Status.INFEASIBLE:
                 ray = farkas_ray(problem)
                 status, multipliers = (Status.NUMERICAL_TROUBLE, multipliers) if ray is None else (status, ray)
-            elif claim in STATUSES and form.y.value is not None:
-                x = np.clip(free + back @ form.y.value, problem.lb, problem.ub)
-                for side in form.sides:
-                    if side.constraint.dual_value is not None:
-                        multipliers[side.members] += side.sign * np.ravel(side.constraint.dual_value)
-            statistics = form.problem.solver_stats
+            elif status is not Status.NUMERICAL_TROUBLE and y.value is not None:
+                x = np.clip(free + back @ y.value, problem.lb, problem.ub)
+                for members, sign, _, _, constraint in sides:
+                    if constraint.dual_value is not None:
+                        multipliers[members] += sign * np.ravel(constraint.dual_value)
+            size = max(1.0, np.abs(multipliers).max())  # beside which an interior-point method's remains are small
+            statistics = program.solver_stats
             solution = make_solution(
                 problem,
                 status,
                 x,
                 multipliers,
-                active_set=_working(multipliers),
+                active_set=np.sign(multipliers) * (np.abs(multipliers) > 1e-7 * size),
                 iterations=(statistics.num_iters or 0) if statistics else 0,
                 build_seconds=built - began,
                 solve_seconds=perf_counter() - built,
             )
             if status is Status.INFEASIBLE:
                 return solution
-            residual = max(solution.residuals(zero=1.0))  # an interior point does not reach zero
-            solutions.append((float(np.nan_to_num(residual, nan=np.inf)), solution))
-            if status is Status.SOLVED and solutions[-1][0] <= self.tolerance:
+            residual = np.nan_to_num(max(solution.residuals(zero=1.0)), nan=np.inf)  # no interior point reaches zero
+            if status is Status.SOLVED and residual <= self.tolerance:
                 return solution
-        residual, solution = min(solutions, key=lambda pair: pair[0])
-        if solution.status is Status.SOLVED and residual > self.tolerance:
-            solution.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
+            if best is None or residual < least:
+                best, least = solution, residual
+        assert best is not None
+        if best.status is Status.SOLVED:
+            best.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
             if self.options is None:  # its working set may be right all the same
-                solution.record[:] = rescue(problem, solution.softness, solution.record, LAST_CHANGES, lambda: False)
-        return solution
+                best.record[:] = rescue(problem, best.softness, best.record)
+        return best
 
-    def _form(self, n: int, lower: Array, upper: Array) -> "_Form":
-        """The compiled problem for this pattern of bounds, from the thread's own store."""
+    def _form(self, n: int, lower: Array, upper: Array) -> tuple[Any, Any, list]:
+        """The problem compiled for this pattern of bounds, its variable, and its constraints by kind.
+
+        Of each kind (equalities and upper bounds have the sign +1, lower bounds -1): which of the stacked constraints
+        it holds, the sign, the parameters for their rows and bounds, and CVXPY's constraint.
+        """
+        import cvxpy
+
         forms = self._compiled.__dict__.setdefault("forms", {})
         equal = (lower == upper) & (upper < ABSENT)
         below, above = (lower > -ABSENT) & ~equal, (upper < ABSENT) & ~equal
         key = (n, equal.tobytes(), below.tobytes(), above.tobytes())
         if key not in forms:
-            if len(forms) == _KEPT:
+            if len(forms) == _STORED:
                 del forms[next(iter(forms))]
-            forms[key] = _formulate(n, equal, below, above)
+            y, sides = cvxpy.Variable(n), []
+            for members, sign in ((equal, 1.0), (above, 1.0), (below, -1.0)):
+                if members.any():
+                    rows, bound = cvxpy.Parameter((members.sum(), n)), cvxpy.Parameter(members.sum())
+                    at = rows @ y
+                    constraint = at == bound if members is equal else at <= bound if sign > 0 else bound <= at
+                    sides.append((members, sign, rows, bound, constraint))
+            program = cvxpy.Problem(cvxpy.Minimize(0.5 * cvxpy.sum_squares(y)), [side[-1] for side in sides])
+            forms[key] = program, y, sides
         return forms[key]
-
-
-def _solve_form(form: "_Form", name: str, warm: bool, options: dict) -> str:
-    """Hands the problem to the solver; returns what CVXPY says of it."""
-    import cvxpy
-
-    try:
-        with warnings.catch_warnings():  # an inaccurate solution is judged by its residuals
-            warnings.simplefilter("ignore")
-            form.problem.solve(solver=name, warm_start=warm, **options)
-    except cvxpy.SolverError:
-        return "solver_error"
-    return form.problem.status
-
-
-class _Side(NamedTuple):
-    """The constraints of one kind: equalities, upper bounds (sign +1) or lower bounds (sign -1)."""
-
-    members: Mask
-    sign: float
-    rows: Any
-    bound: Any
-    constraint: Any
-
-
-class _Form(NamedTuple):
-    """A CVXPY problem with its parameters."""
-
-    problem: Any
-    y: Any
-    sides: list[_Side]
-
-
-def _formulate(n: int, equal: Mask, below: Mask, above: Mask) -> _Form:
-    import cvxpy
-
-    y, sides = cvxpy.Variable(n), []
-    for members, sign in ((equal, 1.0), (above, 1.0), (below, -1.0)):
-        count = int(members.sum())
-        if count:
-            rows, bound = cvxpy.Parameter((count, n)), cvxpy.Parameter(count)
-            at = rows @ y
-            constraint = at == bound if members is equal else at <= bound if sign > 0 else bound <= at
-            sides.append(_Side(members, sign, rows, bound, constraint))
-    cost = 0.5 * cvxpy.sum_squares(y)
-    return _Form(cvxpy.Problem(cvxpy.Minimize(cost), [side.constraint for side in sides]), y, sides)
-
-
-def _working(multipliers: Array) -> Array:
-    """The signs of the multipliers that are not an interior-point method's remains."""
-    size = max(1.0, np.abs(multipliers).max(initial=0.0))
-    return np.where(np.abs(multipliers) > 1e-7 * size, np.sign(multipliers), 0.0)

@@ -23,16 +23,13 @@ from gpmpc.qp._dual_kernels import SIGNATURE, solve
 from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp._workspace import most_working, new_memory, prepare_memory
 from gpmpc.qp.problem import QuadraticProgram, SoftRows, stack_softness
-from gpmpc.qp.solution import QPSolution, WarmStart, proves_infeasibility
+from gpmpc.qp.solution import QPSolution, WarmStart, as_record, proves_infeasibility
 
 Array = NDArray[np.float64]
 _Arrays = tuple[Array, Array, Array, Array, Array]  # P, q, G, lower, upper
 
-_NO_RECORD, _MISUSE = layout.NO_RECORD, layout.MISUSE  # local names save look-ups
-_FLOAT = np.dtype(np.float64)
-_empty = np.empty
-_new = tuple.__new__  # half the time of a named tuple's own constructor
-
+# Local names save look-ups; ``tuple.__new__`` takes half the time of a named tuple's own constructor.
+_NO_RECORD, _MISUSE, _FLOAT, _empty, _new = layout.NO_RECORD, layout.MISUSE, np.dtype(float), np.empty, tuple.__new__
 _run = solve  # until it is compiled
 _ITERATIONS_PER_CONSTRAINT = 10  # default limit, beyond which the iteration is taken to cycle
 _ITERATIONS_PER_LOOK = 25  # iterations between two looks at the clock
@@ -138,16 +135,15 @@ class Prepared:
         build_seconds: Time that the preparation took [s].
     """
 
-    __slots__ = ("_G", "_P", "_memory", "_size", "_softness", "_solver", "_x", "build_seconds")
+    __slots__ = ("_G", "_P", "_plan", "_solver", "build_seconds")
 
     def __init__(self, solver: DualActiveSet, problem: QuadraticProgram, soft: SoftRows | None):
         began = perf_counter()
         self._P, self._G, self._solver = problem.P, problem.G, solver
-        m, n = problem.G.shape
-        self._softness, self._memory, self._size, self._x = solver._plan((m, n), soft, prepared=True)
+        _, memory, size, _ = self._plan = solver._plan(problem.G.shape, soft, prepared=True)
         # factorises P and measures the rows of G; where numbers overflow, every solve is to find that out by itself
-        if solve(*problem, layout.NO_RECORD, self._memory, np.empty(self._size)) == layout.SOLVED:
-            prepare_memory(self._memory, problem.G)
+        if solve(*problem, layout.NO_RECORD, memory, np.empty(size)) == layout.SOLVED:
+            prepare_memory(memory, problem.G)
         self.build_seconds = perf_counter() - began
 
     def solve(self, q: Array, lower: Array, upper: Array, warm_start: WarmStart = None) -> QPSolution:
@@ -163,21 +159,18 @@ class Prepared:
             ProblemError: Shapes that do not match, NaN, crossed bounds.
         """
         began = perf_counter()  # line by line as in ``DualActiveSet.solve``: a call costs a tenth of a small solve
-        P, G = self._P, self._G
-        record, status = _empty(self._size), _MISUSE
+        P, G, (softness, memory, size, where) = self._P, self._G, self._plan
+        record, status = _empty(size), _MISUSE
         try:
             guess = _NO_RECORD if warm_start is None else warm_start.record  # type: ignore[union-attr]
             if q.dtype is lower.dtype is upper.dtype is _FLOAT:
-                status = _run(P, q, G, lower, upper, guess, self._memory, record)
+                status = _run(P, q, G, lower, upper, guess, memory, record)
                 if not status:
                     problem = P, q, G, lower, upper
-                    return _new(
-                        QPSolution, (record[self._x], problem, self._softness, record, 0.0, perf_counter() - began)
-                    )
+                    return _new(QPSolution, (record[where], problem, softness, record, 0.0, perf_counter() - began))
         except (AttributeError, TypeError):
             pass
-        plan = self._softness, self._memory, self._size, self._x
-        return _solve_again((P, q, G, lower, upper), warm_start, plan, self._solver, status, record, began)
+        return _solve_again((P, q, G, lower, upper), warm_start, self._plan, self._solver, status, record, began)
 
 
 def _solve_again(problem: _Arrays, warm_start, plan, solver, status, record, began) -> QPSolution:
@@ -199,7 +192,7 @@ def _solve_again(problem: _Arrays, warm_start, plan, solver, status, record, beg
         return solver.time_limit is not None and perf_counter() - began > solver.time_limit
 
     if status == layout.MISUSE:
-        status = solve(P, q, G, lower, upper, _as_record(warm_start, n, M), memory, record)
+        status = solve(P, q, G, lower, upper, as_record(warm_start, n, M), memory, record)
         if status == layout.MISUSE:  # a proper problem: rows that overflow, P at the edge of definiteness
             record[:] = 0.0
             record[[layout.STATUS, layout.VARIABLES, layout.CONSTRAINTS]] = layout.NUMERICAL_TROUBLE, n, M
@@ -233,17 +226,3 @@ def _is_certain(record: Array, G: Array, lower: Array, upper: Array) -> bool:
         start = layout.HEADER + G.shape[1]
         return proves_infeasibility(record[start : start + len(lower)], G, lower, upper)
     return record[layout.STATUS] in (layout.SOLVED, layout.TIME_LIMIT)
-
-
-def _as_record(warm_start: WarmStart, n: int, M: int) -> Array:
-    """Returns whatever can be used of a warm start; nothing if it belongs to a problem of another size."""
-    if warm_start is None:
-        return layout.NO_RECORD
-    if isinstance(warm_start, QPSolution):
-        return np.ascontiguousarray(warm_start.record, dtype=np.float64)
-    active = np.asarray(warm_start)
-    if active.shape != (M,) or active.dtype.kind not in "biuf":
-        raise ProblemError(
-            f"a warm start must be a solution or an active set of shape {(M,)}; got shape {active.shape}"
-        )
-    return layout.warm_record(np.nan_to_num(active), n)

@@ -18,6 +18,7 @@ Phase 1, which the paper leaves open, is a linear program: the least t with ``A 
 feasible; if not, its multipliers are Farkas' proof that no x is.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from time import perf_counter
 from typing import NamedTuple
@@ -31,7 +32,7 @@ from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp.problem import ABSENT, QuadraticProgram
-from gpmpc.qp.solution import QPSolution, WarmStart, make_solution, proves_infeasibility
+from gpmpc.qp.solution import QPSolution, WarmStart, as_record, make_solution, proves_infeasibility
 from gpmpc.status import Status
 
 Array = NDArray[np.float64]
@@ -40,7 +41,6 @@ _RANK = 1e-11  # share of the largest pivot of the QR below which a working row 
 _STILL = 1e-13  # share of the size of x below which a direction is zero
 _FULL_STEPS = 2  # unhindered steps on one working set after which what is left of d is rounding
 _INSIDE = 1e-9  # share of the size of a row by which phase 1 may miss it
-LAST_CHANGES = 20  # of the working set, when its last digits are found
 _ZERO_STEPS = 20  # steps of length zero in a row after which Bland's rule breaks a possible cycle
 
 
@@ -77,37 +77,32 @@ class PrimalActiveSet:
 
     @np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen below
     def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
-        """The minimiser, from a warm start of any kind; see ``gpmpc.qp.solver.QPSolver``."""
+        """The minimiser, from a warm start of any kind; see ``gpmpc.qp.solution.QPSolver``."""
         began = perf_counter()
-        lower, upper = problem.lower, problem.upper
-        n, M = len(problem.q), len(lower)
-        rows = _one_sided(problem, lower, upper)
+        n, M = len(problem.q), len(problem.lower)
+        rows = _one_sided(problem)
         start, guess = _read_warm_start(warm_start, n, M)
 
         def finish(status, x, multipliers, active, iterations):
             solution = make_solution(problem, status, x, multipliers, active_set=active, iterations=iterations)
-            if status in (Status.SOLVED, Status.NUMERICAL_TROUBLE):  # checked, and its last digits found
-                solution.record[:] = rescue(problem, solution.softness, solution.record, LAST_CHANGES, lambda: False)
+            if status in (Status.SOLVED, Status.NUMERICAL_TROUBLE):  # it is checked, and its last digits are found
+                solution.record[:] = rescue(problem, solution.softness, solution.record)
                 if solution.status is not Status.INFEASIBLE and not solution.is_optimal(self.tolerance):
                     solution.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
             return solution._replace(solve_seconds=perf_counter() - began)
 
         nothing = np.zeros(M)
-        x, ray = _phase_1(rows, start)
+        x, ray = _phase_1(rows, start, M)
         if ray is not None:
-            multipliers = _stack(rows, np.arange(len(rows.h)), ray, M)
-            proven = proves_infeasibility(multipliers, problem.G, lower, upper)
-            return finish(Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE, x, multipliers, nothing, 0)
+            proven = proves_infeasibility(ray, *problem[2:])
+            return finish(Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE, x, ray, nothing, 0)
         limit = self.iteration_limit or 200 + 20 * len(rows.h)
         working = list(np.flatnonzero(rows.equality | _close_to_guess(rows, x, guess)))
         still = full_steps = 0
         for iteration in range(limit):
-            try:
-                d, multipliers = _minimise_on_rows(
-                    problem.P, problem.P @ x + problem.q, rows.A[working], rows.h[working] - rows.A[working] @ x
-                )
-            except ValueError:  # from SciPy: not finite, or no longer positive definite
-                return finish(Status.NUMERICAL_TROUBLE, x, nothing, nothing, iteration)
+            A, d, multipliers = rows.A[working], np.full(n, np.nan), nothing
+            with suppress(ValueError):  # from SciPy: not finite, or no longer positive definite
+                d, multipliers = _minimise_on_rows(problem.P, problem.P @ x + problem.q, A, rows.h[working] - A @ x)
             if not np.isfinite(d).all():
                 return finish(Status.NUMERICAL_TROUBLE, x, nothing, nothing, iteration)
             if full_steps == _FULL_STEPS or np.abs(d).max() <= _STILL * max(1.0, np.abs(x).max()):
@@ -130,9 +125,9 @@ class PrimalActiveSet:
         return finish(Status.ITERATION_LIMIT, x, nothing, nothing, limit)
 
 
-def _one_sided(problem: QuadraticProgram, lower: Array, upper: Array) -> _Rows:
+def _one_sided(problem: QuadraticProgram) -> _Rows:
     """Every bound that is there as one row ``a'x <= h`` of unit length (zero rows stay zero)."""
-    C = np.vstack([np.eye(len(problem.q)), problem.G])
+    lower, upper, C = problem.lower, problem.upper, np.vstack([np.eye(len(problem.q)), problem.G])
     equal = lower == upper
     above = np.flatnonzero(upper < ABSENT)
     below = np.flatnonzero((lower > -ABSENT) & ~equal)
@@ -145,20 +140,15 @@ def _one_sided(problem: QuadraticProgram, lower: Array, upper: Array) -> _Rows:
 
 def _read_warm_start(warm_start: WarmStart, n: int, M: int) -> tuple[Array, Array]:
     """A point to start near, and an active set (M,) to start with; zeros where the warm start says nothing."""
-    x, active = np.zeros(n), np.zeros(M)
-    if isinstance(warm_start, QPSolution):
-        if len(warm_start.x) == n and warm_start.softness.shape[1] == M:
-            active = warm_start.active_set.astype(np.float64)
-            x = np.where(np.isfinite(warm_start.x), warm_start.x, 0.0)
-    elif warm_start is not None:
-        active = np.nan_to_num(np.asarray(warm_start, dtype=np.float64))
-        if active.shape != (M,):
-            raise ProblemError(f"a warm start must be a solution or an active set of shape {(M,)}; got {active.shape}")
+    record, x, active = as_record(warm_start, n, M), np.zeros(n), np.zeros(M)
+    if len(record) and (record[layout.VARIABLES], record[layout.CONSTRAINTS]) == (n, M):
+        x, names = record[layout.HEADER : layout.HEADER + n], layout.working_names(record, n, M)
+        x, active[np.abs(names).astype(int) - 1] = np.where(np.isfinite(x), x, 0.0), np.sign(names)
     return x, active
 
 
-def _phase_1(rows: _Rows, start: Array) -> tuple[Array, Array | None]:
-    """A feasible point (``start`` if it is one) and None, or ``start`` and a ray that may prove that there is none."""
+def _phase_1(rows: _Rows, start: Array, M: int) -> tuple[Array, Array | None]:
+    """A feasible point (``start`` if it is one) and None, or ``start`` and a ray (M,) that may prove there is none."""
     A, h = np.vstack([rows.A, -rows.A[rows.equality]]), np.concatenate([rows.h, -rows.h[rows.equality]])
     if (A @ start <= h).all():
         return start, None
@@ -171,25 +161,20 @@ def _phase_1(rows: _Rows, start: Array) -> tuple[Array, Array | None]:
         options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
     )
     if least.x is None:
-        return start, np.zeros(len(rows.h))
+        return start, np.zeros(M)
     x = start + least.x[:n]
     if (A @ x - h <= _INSIDE * np.maximum(1.0, np.abs(h))).all():
         return x, None
     weights = -least.ineqlin.marginals
     ray = weights[: len(rows.h)].copy()
     ray[rows.equality] -= weights[len(rows.h) :]
-    return start, ray
+    return start, _stack(rows, np.arange(len(ray)), ray, M)
 
 
 def farkas_ray(problem: QuadraticProgram) -> Array | None:
     """Farkas' proof (M,) that no point is feasible, from phase 1; None if it finds none."""
-    lower, upper = problem.lower, problem.upper
-    rows = _one_sided(problem, lower, upper)
-    _, weights = _phase_1(rows, np.zeros(len(problem.q)))
-    if weights is None:
-        return None
-    ray = _stack(rows, np.arange(len(rows.h)), weights, len(lower))
-    return ray if proves_infeasibility(ray, problem.G, lower, upper) else None
+    _, ray = _phase_1(_one_sided(problem), np.zeros(len(problem.q)), len(problem.lower))
+    return None if ray is None or not proves_infeasibility(ray, *problem[2:]) else ray
 
 
 def _close_to_guess(rows: _Rows, x: Array, guess: Array) -> NDArray[np.bool_]:
@@ -220,13 +205,10 @@ def _step_length(rows: _Rows, x: Array, d: Array, working: list[int]) -> tuple[f
     """Kappa in [0, 1] and the row that blocks, if one does."""
     speed = rows.A @ d
     speed[working] = 0.0
-    room = np.maximum(rows.h - rows.A @ x, 0.0)
-    towards = speed > _STILL * np.linalg.norm(d)
-    if not towards.any():
-        return 1.0, None
-    kappas = np.where(towards, room / np.where(towards, speed, 1.0), np.inf)
-    blocking = int(np.argmin(kappas))
-    return (float(kappas[blocking]), blocking) if kappas[blocking] < 1.0 else (1.0, None)
+    room, towards = np.maximum(rows.h - rows.A @ x, 0.0), speed > _STILL * np.linalg.norm(d)
+    kappas = np.where(towards, room / np.where(towards, speed, 1.0), 1.0)
+    blocking = int(np.argmin(np.append(kappas, 1.0)))  # the last where none blocks before
+    return (float(kappas[blocking]), blocking) if blocking < len(kappas) and kappas[blocking] < 1.0 else (1.0, None)
 
 
 def _stack(rows: _Rows, which, multipliers: Array, M: int) -> Array:

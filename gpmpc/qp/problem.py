@@ -23,10 +23,9 @@ Array = NDArray[np.float64]
 _new = tuple.__new__
 ABSENT = 1e20  # a bound of this size or more is none
 _SYMMETRY = 1e-10  # largest |P - P'| accepted, as a share of the largest diagonal entry
-_LARGE = 300  # variables from which an error tells no eigenvalue: a thousand take seconds
 
 
-def _as_float_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+def _as_float_array(name: str, value: ArrayLike, shape: tuple[int, ...], finite: bool = False) -> Array:
     """Returns ``value`` as a contiguous, writeable float64 array of that shape without NaN; itself if it is one."""
     try:
         array = np.require(value, np.float64, ["C", "A", "W"])
@@ -36,24 +35,17 @@ def _as_float_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Arra
         array = array.copy()
     if array.shape != shape:
         raise ProblemError(f"{name} must have shape {shape}; got {array.shape}")
-    if np.isnan(array).any():
-        raise ProblemError(f"{name} must not contain NaN; it does at index {_first(np.isnan(array))}")
+    for wrong, rule in (
+        (np.isnan(array), "not contain NaN; it does"),
+        (np.isinf(array) & finite, "be finite; it is not"),
+    ):
+        if wrong.any():
+            raise ProblemError(f"{name} must {rule} at index {', '.join(str(i) for i in np.argwhere(wrong)[0])}")
     return array
 
 
-def _first(mask: NDArray[np.bool_]) -> str:
-    """Returns the first true index, printed as the user would write it."""
-    return ", ".join(str(i) for i in np.argwhere(mask)[0])
-
-
-def _check_finite(name: str, array: Array) -> None:
-    if not np.isfinite(array).all():
-        raise ProblemError(f"{name} must be finite; it is not at index {_first(~np.isfinite(array))}")
-
-
 def _check_hessian(P: Array) -> None:
-    """Raises ``ProblemError`` unless P is finite, symmetric and positive definite."""
-    _check_finite("P", P)
+    """Raises ``ProblemError`` unless P, which is finite, is symmetric and positive definite."""
     skew = np.abs(P - P.T)
     if skew.max() > _SYMMETRY * np.abs(np.diagonal(P)).max():
         i, j = np.unravel_index(np.argmax(skew), P.shape)
@@ -64,8 +56,6 @@ def _check_hessian(P: Array) -> None:
     except np.linalg.LinAlgError:
         definite = False
     if not definite:
-        if len(P) > _LARGE:
-            raise ProblemError(f"P ({len(P)} x {len(P)}) must be positive definite; it has no Cholesky factor")
         eigenvalues = np.linalg.eigvalsh(P)
         raise ProblemError(
             f"P must be positive definite; its smallest eigenvalue (number 0 of {len(P)}, in ascending order) is "
@@ -138,20 +128,15 @@ class QuadraticProgram(_Arrays):
         if G is None and (h_lower is not None or h_upper is not None):
             raise ProblemError("h_lower and h_upper bound the rows of G; got bounds without G")
         (n, m), P, q, G = _check_matrices(P, q, G)
-        given = {
-            "lb": (lb, n, -np.inf),
-            "h_lower": (h_lower, m, -np.inf),
-            "ub": (ub, n, np.inf),
-            "h_upper": (h_upper, m, np.inf),
-        }
-        bounds = {
-            name: _as_float_array(name, np.full(size, absent) if value is None else value, (size,))
-            for name, (value, size, absent) in given.items()
-        }
-        _check_bounds("row", bounds["h_lower"], bounds["h_upper"], ("h_lower", "h_upper"))
-        _check_bounds("variable", bounds["lb"], bounds["ub"], ("lb", "ub"))
-        parts = [*bounds.values()]
-        return cls.unchecked(P, q, G, np.concatenate(parts[:2]), np.concatenate(parts[2:]))
+
+        def bound(name: str, value: ArrayLike | None, size: int, absent: float) -> Array:
+            return _as_float_array(name, np.full(size, absent) if value is None else value, (size,))
+
+        low, row_low = bound("lb", lb, n, -np.inf), bound("h_lower", h_lower, m, -np.inf)
+        high, row_high = bound("ub", ub, n, np.inf), bound("h_upper", h_upper, m, np.inf)
+        _check_bounds("row", row_low, row_high, ("h_lower", "h_upper"))
+        _check_bounds("variable", low, high, ("lb", "ub"))
+        return cls.unchecked(P, q, G, np.concatenate([low, row_low]), np.concatenate([high, row_high]))
 
     @classmethod
     def from_stacked(
@@ -202,10 +187,8 @@ def _check_matrices(P: ArrayLike, q: ArrayLike, G: ArrayLike | None) -> tuple[tu
     rows = np.shape(G) if G is not None else (0, n)
     if len(rows) != 2:
         raise ProblemError(f"G must be a matrix of {n} columns; got shape {rows}")
-    P, q = _as_float_array("P", P, (n, n)), _as_float_array("q", q, (n,))
-    G = np.zeros((0, n)) if G is None else _as_float_array("G", G, (rows[0], n))
-    _check_finite("q", q)
-    _check_finite("G", G)
+    P, q = _as_float_array("P", P, (n, n), finite=True), _as_float_array("q", q, (n,), finite=True)
+    G = np.zeros((0, n)) if G is None else _as_float_array("G", G, (rows[0], n), finite=True)
     _check_hessian(P)
     return (n, rows[0]), P, q, G
 

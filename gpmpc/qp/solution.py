@@ -61,26 +61,6 @@ class QPSolution(NamedTuple):
     solve_seconds: float = 0.0
 
     @property
-    def problem(self) -> QuadraticProgram:
-        """What was solved."""
-        return QuadraticProgram.unchecked(*self.arrays)
-
-    @property
-    def q(self) -> Array:
-        """(n,)."""
-        return self.arrays[1]
-
-    @property
-    def lower(self) -> Array:
-        """(M,) lower bounds of the stacked constraints."""
-        return self.arrays[3]
-
-    @property
-    def upper(self) -> Array:
-        """(M,) upper bounds likewise."""
-        return self.arrays[4]
-
-    @property
     def multipliers(self) -> Array:
         """(M,) multipliers of the stacked constraints; Farkas' proof if the status is ``INFEASIBLE``."""
         start = layout.HEADER + len(self.x)
@@ -119,11 +99,17 @@ class QPSolution(NamedTuple):
     def objective(self) -> float:
         """1/2 x'Px + q'x, with the price of violated soft rows [the unit of the cost]."""
         x, (P, q, *_) = self.x, self.arrays
-        return float(0.5 * x @ P @ x + q @ x + self._price(self.violation()))
+        (softness, caps), violation = self.softness, self.violation()
+        soft, linear = softness > 0, np.isfinite(caps)
+        price = 0.5 * np.sum(violation[soft] ** 2 / softness[soft]) + np.sum(caps[linear] * violation[linear])
+        return float(0.5 * x @ P @ x + q @ x + price)
 
     def violation(self) -> Array:
         """(M,) how far each stacked constraint lies outside its bounds, in the constraint's own unit; soft ones too."""
-        return self._violation(self.arrays[2] @ self.x)
+        values, (lower, upper) = np.concatenate([self.x, self.arrays[2] @ self.x]), self.arrays[3:]
+        above = np.where(upper < ABSENT, values - upper, 0.0)
+        below = np.where(lower > -ABSENT, lower - values, 0.0)
+        return np.maximum(0.0, np.maximum(above, below))
 
     @np.errstate(all="ignore")  # the multipliers of a failed solve may be anything
     def residuals(self, zero: float = 1e-12) -> Residuals:
@@ -140,7 +126,7 @@ class QPSolution(NamedTuple):
         free = (np.abs(q) / units).max()
         zero = max(1e-4 * (units * np.abs(x)).max(), zero * free)
 
-        violation = self._violation(rows)
+        violation = self.violation()
         beyond = np.maximum(0.0, violation - np.where(sizes >= caps, np.inf, softness * sizes))
         bound = np.abs(np.where(np.concatenate([x, rows]) > upper, upper, lower))
         own = np.concatenate([np.maximum(np.abs(x), zero / units), np.abs(G) @ np.maximum(np.abs(x), zero / units)])
@@ -166,17 +152,6 @@ class QPSolution(NamedTuple):
     def is_optimal(self, eps: float = 1e-9) -> bool:
         """Whether the residuals, whatever the status says, are all at most ``eps``."""
         return all(residual <= eps for residual in self.residuals())  # which NaN is not
-
-    def _violation(self, rows: Array) -> Array:
-        values, (lower, upper) = np.concatenate([self.x, rows]), self.arrays[3:]
-        above = np.where(upper < ABSENT, values - upper, 0.0)
-        below = np.where(lower > -ABSENT, lower - values, 0.0)
-        return np.maximum(0.0, np.maximum(above, below))
-
-    def _price(self, violation: Array) -> float:
-        softness, caps = self.softness
-        soft, linear = softness > 0, np.isfinite(caps)
-        return float(0.5 * np.sum(violation[soft] ** 2 / softness[soft]) + np.sum(caps[linear] * violation[linear]))
 
 
 WarmStart = QPSolution | NDArray[np.number] | None
@@ -232,6 +207,24 @@ def make_solution(
     record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
     hard = stack_softness(None, n, M - n)
     return QPSolution(record[layout.HEADER : layout.HEADER + n], problem, hard, record, build_seconds, solve_seconds)
+
+
+def as_record(warm_start: WarmStart, n: int, M: int) -> Array:
+    """Returns whatever can be used of a warm start.
+
+    Raises:
+        ProblemError: It is neither a solution nor an active set of this size.
+    """
+    if warm_start is None:
+        return layout.NO_RECORD
+    if isinstance(warm_start, QPSolution):
+        return np.ascontiguousarray(warm_start.record, dtype=np.float64)
+    active = np.asarray(warm_start)
+    if active.shape != (M,) or active.dtype.kind not in "biuf":
+        raise ProblemError(
+            f"a warm start must be a solution or an active set of shape {(M,)}; got shape {active.shape}"
+        )
+    return layout.warm_record(np.nan_to_num(active), n)
 
 
 @np.errstate(all="ignore")  # what is not finite proves nothing

@@ -111,18 +111,18 @@ def closed_loops(
     Args:
         plant: What is steered; its right-hand side is evaluated on arrays, an entry a trial.
         controller: Its feedback law, of all trials; a ``GPMPC`` decides for them together, any other one by one.
-        references: Of all trials; see ``closed_loop``.
+        references: As for ``closed_loop``, of all trials.
         initial: The state (n,), or the ``Gaussian`` that every trial's is drawn from.
         steps: K.
         seeds: One a trial; a number stands for 0 .. seeds - 1.
-        noise: See ``closed_loop``.
-        disturbances: Of all trials.
-        on_failure: See ``closed_loop``; with ``"raise"`` a trial whose solve fails ends, and the others fly on.
+        noise: On states, measurements and inputs.
+        disturbances: What the controller does not know of.
+        on_failure: With ``"raise"`` a trial whose solve fails ends, and the others fly on.
         chunk: How many trials fly at a time; as many as the controller has a gigabyte for by default.
 
     Returns:
-        One ``Trial`` a seed with its ``Rollout``, in the order of the seeds. Trials whose solve failed, by the policy,
-        and whose plant diverged have an error instead.
+        One ``Trial`` a seed, in their order; those whose solve failed or whose plant diverged have an error instead of
+        a ``Rollout``.
 
     Raises:
         ShapeError: As for ``closed_loop``.

@@ -20,7 +20,8 @@ class _Body:
 
     def __post_init__(self) -> None:
         for key, value in vars(self).items():
-            check_number(key, value, **({"least": 0} if key in self.may_be_zero else {"above": 0}))
+            limits: dict[str, Any] = {"least": 0} if key in self.may_be_zero else {"above": 0}
+            check_number(key, value, **limits)
 
 
 @dataclass(frozen=True)

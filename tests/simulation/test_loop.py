@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -151,6 +153,14 @@ def test_every_failure_is_counted_with_step_and_status():
     flight = fly(controller=Feedback(failing=(2, 7)), on_failure="hold")
     assert flight.failures == ((2, Status.ITERATION_LIMIT), (7, Status.ITERATION_LIMIT))
     assert np.array_equal(flight.inputs[2], flight.inputs[1])
+
+
+def test_every_plan_that_leaves_the_data_behind_is_counted_with_its_step():
+    class Astray(Feedback):
+        def control(self, belief, reference, previous=None):
+            return replace(super().control(belief, reference, previous), novelty=0.99 if len(self.seen) == 3 else 0.1)
+
+    assert fly(5, Astray()).far_from_data == (2,)
 
 
 def test_every_step_is_told_as_it_happens():
