@@ -123,12 +123,12 @@ def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:
     import pandas as pd
     from rich.console import Console
 
-    from gpmpc.logs import LogMapping, inspect_log, read_log
+    from gpmpc.logs import LogMapping, inspect_log
     from gpmpc.plotting import inspection_figure, png
     from gpmpc.studies.document import Document, Table, terminal
 
     mapping = LogMapping.load(mapping_file) if mapping_file else None
-    found = inspect_log(file, mapping, read_log(file, mapping) if mapping else None)
+    found = inspect_log(file, mapping)
     streams = ["stream", "rows", "rate [Hz]", "jitter", "gaps", "longest gap [s]", "repeated stamps", "backward stamps"]
     about = ["channel", "lowest", "highest", "std", "white noise", "repeated", "longest [rows]", "smoothness"]
     late = ["channel", "later channel", "rows", "lowest", "highest", "agreement", "correlation"]

@@ -11,7 +11,6 @@ import numpy as np
 from gpmpc.exceptions import DataError
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._mapping import LogMapping, Signal
-from gpmpc.logs._sampling import windows_of
 from gpmpc.logs._state_space import Array, quaternion_inverse, quaternion_product, rotate, rotation_vector
 
 SPAN = 4  # rows on each side of a finite difference: above the noise of one row
@@ -38,14 +37,9 @@ def check_plausible(runs: Sequence[LogRun], step: float, mapping: LogMapping) ->
     before, now, after = (_rows(runs, shift) for shift in (-SPAN, 0, SPAN))
     if len(now) < 50:
         return
-    (_p, v), (q, w) = (
-        (now[:, at] for at in mapping.space.columns[0:3:2]),
-        (now[:, at] for at in mapping.space.columns[1:4:2]),
-    )
-    names = [signal.name for signal in mapping.of("states")]
-    frames = [signal.frame for signal in mapping.of("states")]
-    time = 2 * SPAN * step
-    at = mapping.space.columns
+    at, time = mapping.space.columns, 2 * SPAN * step
+    _, q, v, w = (now[:, columns] for columns in at)
+    names, frames = zip(*((signal.name, signal.frame) for signal in mapping.of("states")), strict=True)
     speed = (after[:, at[0]] - before[:, at[0]]) / time
     _compare(v if frames[2] != "body" else rotate(q, v), speed, names[2], f"the derivative of {names[0]}")
     turn = quaternion_product(quaternion_inverse(before[:, at[1]]), after[:, at[1]])
@@ -72,7 +66,7 @@ def rigid_body_signals(mapping: LogMapping) -> tuple[Signal, ...]:
 
 
 def _rows(runs: Sequence[LogRun], shift: int) -> Array:
-    rows = [run.states[windows_of(run.pieces, SPAN, SPAN, 1) + shift] for run in runs]
+    rows = [run.states[run.starts(SPAN, SPAN) + shift] for run in runs]
     states = np.concatenate(rows)
     return states[:: max(len(states) // MOST_ROWS, 1)]
 

@@ -5,13 +5,16 @@ residuals are the errors of the rollouts themselves, each divided by the mean er
 (multiple-step prediction error; Ljung, 1999, section 3.3), with a loss that is linear for outliers.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from gpmpc.exceptions import DataError, ShapeError, check_number
+from gpmpc.logs._kinematics import Kinematics
 from gpmpc.logs._log import Log, Windows
+from gpmpc.logs._nominal import AffineNominal
 from gpmpc.logs._rollouts import PAST, STEPS, LogModel, choose_stride, rollout_errors
 from gpmpc.logs._state_space import Array
 
@@ -37,9 +40,7 @@ class NominalFit:
         return list(zip(names, self.model.theta.tolist(), self.standard_errors.tolist(), strict=True))
 
 
-def fit_nominal(
-    model: LogModel, theta0: Array | None, log: Log, steps: int = STEPS, windows: int = WINDOWS
-) -> NominalFit:
+def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = STEPS) -> NominalFit:
     """Fits the parameters of a model's nominal part by the errors of its rollouts.
 
     Args:
@@ -47,23 +48,21 @@ def fit_nominal(
         theta0: Where the search begins (P,); the nominal model's ``start`` by default.
         log: All of its runs are used.
         steps: Of the rollouts; errors at eight of them, evenly spread over the logarithm, count.
-        windows: Most windows that are rolled out.
 
     Raises:
         ShapeError: theta0 has another length.
         DataError: No piece of the log is long enough, or the rollouts at theta0 are not finite.
     """
-    for key, value in (("steps", steps), ("windows", windows)):
-        check_number(key, value, least=1, whole=True)
+    check_number("steps", steps, least=1, whole=True)
     theta0 = model.nominal.start if theta0 is None else np.asarray(theta0, dtype=float)
     if theta0.shape != (len(model.nominal.parameter_names),):
         raise ShapeError(f"theta0 must have {len(model.nominal.parameter_names)} entries; got {theta0.shape}")
     past = max(model.past, PAST)
-    cut = log.windows(steps, past, choose_stride(log, steps + past, windows))
+    cut = log.windows(steps, past, choose_stride(log, steps + past, WINDOWS))
     if not len(theta0):
-        return NominalFit(model.with_theta(theta0), theta0, 0.0, 0.0, 0)
+        return NominalFit(replace(model, theta=theta0), theta0, 0.0, 0.0, 0)
     at = np.unique(np.geomspace(1, steps, 8).round().astype(int))
-    scale = still_error(cut, at)
+    scale = _still_error(cut, at)
 
     def residuals(theta: Array) -> Array:
         """Of parameter vectors (T, P): (T, W, steps, e)."""
@@ -96,11 +95,11 @@ def fit_nominal(
     start_cost = float((np.sqrt(1 + first**2) - 1).sum() / first.size)
     errors = _standard_errors(found.x, jacobian(found.x), residuals(found.x[None])[0])
     return NominalFit(
-        model.with_theta(found.x), errors, float(found.cost / first.size), start_cost, found.nfev + found.njev
+        replace(model, theta=found.x), errors, float(found.cost / first.size), start_cost, found.nfev + found.njev
     )
 
 
-def still_error(windows: Windows, at: np.ndarray) -> Array:
+def _still_error(windows: Windows, at: np.ndarray) -> Array:
     """Mean error (steps, e) of a state that does not move, the same for all entries of a group; never zero."""
     start = windows.states[:, windows.past : windows.past + 1]
     errors = rollout_errors(windows, np.repeat(start, windows.ahead, axis=1), at)
@@ -116,3 +115,14 @@ def _standard_errors(theta: Array, J: Array, residuals: Array) -> Array:
     blocks = np.add.reduceat(scores, np.arange(0, len(scores), BLOCK))
     bread = np.linalg.pinv(J.T @ (J * weights[:, None]))
     return np.sqrt(np.maximum(np.diagonal(bread @ (blocks.T @ blocks) @ bread), 0.0))
+
+
+def fit_least_squares(kinematics: Kinematics, log: Log) -> LogModel:
+    """Fits outputs that are affine in the features, one step ahead on all rows."""
+    cut = log.windows(1)
+    x, u, c = cut.states[:, 0], cut.inputs[:, 0], cut.context[:, 0]
+    z = kinematics.features(x, u, c)
+    y = kinematics.outputs(x, cut.states[:, 1], log.time_step)
+    solution: Any = np.linalg.lstsq(np.column_stack([z, np.ones(len(z))]), y, rcond=1e-8)[0]
+    nominal = AffineNominal(kinematics, y.shape[1], z.shape[1])
+    return LogModel(kinematics, nominal, solution.T.ravel(), (0,) * y.shape[1])

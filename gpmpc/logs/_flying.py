@@ -7,20 +7,19 @@ central differences, all stages in one batch; the disturbance from the past is l
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gpmpc.dynamics import DynamicsModel, Linearized, check_query, to_array
-from gpmpc.exceptions import DataError, GpmpcError, SettingError
+from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.storage import load_metadata
 from gpmpc.logs._noise import OutputNoise
 from gpmpc.logs._rollouts import LogModel
 from gpmpc.logs._state_space import Array, wrap
-from gpmpc.logs._storage import holds_learned, load_learned
+from gpmpc.logs._storage import KIND, load_learned
 from gpmpc.models import load_model
 from gpmpc.systems import System
 
@@ -104,16 +103,16 @@ class LogDynamics:
         return after
 
     def _covariance(self, x: Array, u: Array) -> Array:
-        model, nothing = self.model, np.empty((len(x), 0))
-        o = len(model.kinematics.output_names)
-        V = np.zeros((len(x), o, o))
+        model, nothing, K = self.model, np.empty((len(x), 0)), len(x)
         if not model.gps:
-            return np.zeros((len(x), self.state_dim, self.state_dim))
-        z = np.ascontiguousarray(model.kinematics.features(x, u, nothing))
+            return np.zeros((K, self.state_dim, self.state_dim))
+        z, y = np.ascontiguousarray(model.kinematics.features(x, u, nothing)), model.outputs(x, u, nothing)
+        V = np.zeros((K, y.shape[1], y.shape[1]))
         for gp in model.gps:
-            at = np.ix_(range(len(x)), gp.outputs, gp.outputs)
-            V[at] += np.asarray(gp.posterior.linearize(z, nothing, True).covariance)
-        B = self._by_outputs(x, model.outputs(x, u, nothing))
+            V[np.ix_(range(K), gp.outputs, gp.outputs)] += np.asarray(
+                gp.posterior.linearize(z, nothing, True).covariance
+            )
+        B = self._by_outputs(x, y)
         return B @ V @ B.mT
 
     def _by_outputs(self, x: Array, y: Array) -> Array:
@@ -139,15 +138,14 @@ class SavedModel:
         Raises:
             SettingError: They are others.
         """
-        wanted: dict[str, Any] = {"states": system.state_names, "inputs": system.input_names}
-        dims = {"states": self.model.state_dim, "inputs": self.model.input_dim}
-        for key, names in (("states", self.state_names), ("inputs", self.input_names)):
+        for key, dim, names, wanted in (
+            ("states", self.model.state_dim, self.state_names, system.state_names),
+            ("inputs", self.model.input_dim, self.input_names, system.input_names),
+        ):
             own = [name.removeprefix("state.").removeprefix("measured.").removeprefix("input.") for name in names]
-            if dims[key] != len(wanted[key]) or (own and own != list(wanted[key])):
-                found = ", ".join(own) or str(dims[key])
-                raise SettingError(
-                    "model", f"{self.path} has the {key} {found}; {system.name} has {', '.join(wanted[key])}"
-                )
+            if dim != len(wanted) or (own and own != list(wanted)):
+                found = f"the {key} {', '.join(own) or dim}; {system.name} has {', '.join(wanted)}"
+                raise SettingError("model", f"{self.path} has {found}")
         if self.time_step is not None and abs(self.time_step / system.time_step - 1) > 1e-3:
             steps = f"{self.time_step:g} s; {system.name} has {system.time_step:g} s"
             raise SettingError("model", f"{self.path} has time steps of {steps}")
@@ -160,16 +158,14 @@ def load_flyable(path: str | Path) -> SavedModel:
         DataError: The file is missing, damaged or of another kind.
         SettingError: What is in it cannot be flown.
     """
-    if holds_learned(path):
+    header = load_metadata(path)
+    if header.get("kind") == KIND:
         learned = load_learned(path)
         if learned.context_names:
             context = ", ".join(learned.context_names)
             raise SettingError("model", f"{path} needs a context ({context}), which is not known in flight")
         flown = LogDynamics(learned.model, len(learned.input_names), learned.time_step, learned.noise)
         return SavedModel(str(path), flown, learned.state_names, learned.input_names, learned.time_step)
-    try:
-        said = load_metadata(path).get("metadata") or {}
-        states, inputs = (tuple(said.get(key) or ()) for key in ("states", "inputs"))
-        return SavedModel(str(path), load_model(path), states, inputs, said.get("time_step"))
-    except GpmpcError as error:
-        raise DataError(str(error)) from error
+    said = header.get("metadata") or {}
+    states, inputs = (tuple(said.get(key) or ()) for key in ("states", "inputs"))
+    return SavedModel(str(path), load_model(path), states, inputs, said.get("time_step"))

@@ -17,7 +17,7 @@ from gpmpc.exceptions import DataError
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._readers import STAMP, read_streams
-from gpmpc.logs._sampling import ordered_stamps
+from gpmpc.logs._reading import ordered_stamps, read_log
 from gpmpc.logs._state_space import Array
 
 if TYPE_CHECKING:
@@ -114,13 +114,12 @@ class Inspection:
         return tuple(found)
 
 
-def inspect_log(path: str | Path, mapping: LogMapping | None = None, log: Log | None = None) -> Inspection:
+def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspection:
     """Inspects a log file.
 
     Args:
         path: In a format of ``read_log``.
-        mapping: Says which columns matter, and which is the time; all numbers by default.
-        log: As read with the mapping; gives the inputs' dependence on the states.
+        mapping: Says which columns matter, which is the time, and what are states and inputs; all numbers by default.
 
     Raises:
         DataError: The file cannot be read, or no column holds the time.
@@ -151,7 +150,7 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None, log: Log | 
         rows += len(table)
     size = f"{Path(path).name}: {rows} rows, {len(channels)} channels"
     delays = sorted(delays, key=lambda delay: -abs(delay.correlation))[:PAIRS]
-    follows = _dependence(log) if log is not None else {}
+    follows = _dependence(read_log(path, mapping)) if mapping else {}
     return Inspection(size, tuple(tables), tuple(channels), tuple(gaps), tuple(delays), follows)
 
 
@@ -166,10 +165,9 @@ def _time(path: str | Path, table: "DataFrame", mapping: LogMapping | None) -> t
 def _channel(name: str, time: Array, values: Array) -> Channel:
     present = np.isfinite(values)
     stride = max(len(values) // DRAWN, 1)
-    if not present.any():
-        nothing = float("nan")
-        return Channel(name, time[::stride], values[::stride], 1.0, 0.0, 0, nothing, nothing, 0.0, 0.0, 0.0)
     known = values[present]
+    if not len(known):
+        return Channel(name, time[::stride], values[::stride], 1.0, 0.0, 0, np.nan, np.nan, 0.0, 0.0, 0.0)
     same = np.diff(known) == 0
     changes = np.flatnonzero(np.r_[True, ~same, True])
     second = np.diff(known, 2)

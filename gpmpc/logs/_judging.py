@@ -5,14 +5,15 @@ hold, with the exact interval of that frequency (Clopper and Pearson, 1934), and
 variance that is claimed over the root mean squared error. Coverage alone is cheap; a width of one is honest.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import ndtri
 
-from gpmpc.logs._baselines import Ridge, fit_least_squares, predict_still
+from gpmpc.logs._fitting import fit_least_squares
+from gpmpc.logs._kinematics import Kinematics
 from gpmpc.logs._learning import Learned
 from gpmpc.logs._log import Log, Windows
 from gpmpc.logs._noise import error_variances, follow_errors
@@ -23,8 +24,12 @@ from gpmpc.metrics import binomial_interval
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-STEPS = (1, 10, 50)
+STEPS, LEVEL = (1, 10, 50), 0.95
 WINDOWS = 1000
+RIDGE_WINDOWS = 3000  # to which the ridge regression is fitted
+LAGS = (1, 2, 3, 5, 8, 12, 20)  # rows of the past that it sees
+BINS = 5  # means of the future inputs that it sees
+PENALTY = 0.01  # of its squared coefficients of standardised columns, per row
 CHUNK = 100  # windows linearised at once
 NEEDED = ("constant state", "constant velocity", "least squares")  # a model must beat them
 
@@ -42,21 +47,17 @@ class Judgement:
     coverage_interval: Array  #: exact interval of that share, from independent windows only (k, groups, 2)
     width: Array  #: claimed over actual root mean square (k, groups)
     windows: int  #: number of predictions
-    level: float = 0.95  #: of the intervals
+    level: float = LEVEL  #: of the intervals
 
     @property
     def losses(self) -> tuple[str, ...]:
         """Where the model is worse than a baseline, in words; nothing if it never is."""
-        found = []
-        for name, errors in self.mean.items():
-            for k, step in enumerate(self.steps):
-                for g, group in enumerate(self.groups):
-                    if name != "model" and self.mean["model"][k, g] > 1.001 * errors[k, g]:
-                        found.append(
-                            f"{group} {step} steps ahead: {self.mean['model'][k, g]:.3g} {self.units[g]}, "
-                            f"{name} {errors[k, g]:.3g}"
-                        )
-        return tuple(found)
+        own = self.mean["model"]
+        return tuple(
+            f"{self.groups[g]} {self.steps[k]} steps ahead: {own[k, g]:.3g} {self.units[g]}, {name} {errors[k, g]:.3g}"
+            for name, errors in self.mean.items()
+            for k, g in np.argwhere(own > 1.001 * errors)
+        )
 
     def to_pandas(self) -> "DataFrame":
         """A row a predictor, step and group."""
@@ -64,19 +65,18 @@ class Judgement:
 
         rows = []
         for name, mean in self.mean.items():
-            for k, step in enumerate(self.steps):
-                for g, group in enumerate(self.groups):
-                    row = {"predictor": name, "step": step, "group": group, "unit": self.units[g]}
-                    row |= {"mean_error": mean[k, g], "rmse": self.rmse[name][k, g]}
-                    if name == "model":
-                        low, high = self.coverage_interval[k, g]
-                        row |= {"coverage": self.coverage[k, g], "coverage_low": low, "coverage_high": high}
-                        row |= {"width": self.width[k, g]}
-                    rows.append(row)
+            for (k, g), error in np.ndenumerate(mean):
+                row = {"predictor": name, "step": self.steps[k], "group": self.groups[g], "unit": self.units[g]}
+                row |= {"mean_error": error, "rmse": self.rmse[name][k, g]}
+                if name == "model":
+                    low, high = self.coverage_interval[k, g]
+                    row |= {"coverage": self.coverage[k, g], "coverage_low": low, "coverage_high": high}
+                    row |= {"width": self.width[k, g]}
+                rows.append(row)
         return pandas.DataFrame(rows)
 
 
-def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = STEPS, level: float = 0.95) -> Judgement:
+def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = STEPS) -> Judgement:
     """Judges a learned model on a log of other runs.
 
     Args:
@@ -84,63 +84,71 @@ def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = ST
         held_out: Runs that it never saw.
         train: The runs that it was learned from, to which the baselines are fitted.
         steps: k.
-        level: Of the intervals.
 
     Raises:
         DataError: No piece of the held-out log is long enough.
     """
-    model, space = learned.model, held_out.space
+    model, space, kinematics = learned.model, held_out.space, learned.model.kinematics
     past = max(model.past, PAST)
     stride = choose_stride(held_out, max(steps) + past, WINDOWS)
     cut = held_out.windows(max(steps), past, stride)
-    errors = {"model": rollout_errors(cut, model.rollout(cut), steps)}
-    kinematics = model.kinematics
-
-    def direct(predicted: list[Array]) -> Array:
-        return np.stack(
-            [space.difference(x, cut.states[:, past + k]) for x, k in zip(predicted, steps, strict=True)], axis=1
-        )
-
-    start = predict_still(cut, 0)
-    errors["constant state"] = direct([start for _ in steps])
-    errors["constant velocity"] = direct([kinematics.coast(start, k * cut.time_step) for k in steps])
+    start, longest = cut.states[:, past], max(steps)
+    seen = train.windows(longest, PAST, choose_stride(train, longest + PAST, RIDGE_WINDOWS))
+    own = rollout_errors(cut, model.rollout(cut), steps)
     with np.errstate(over="ignore", invalid="ignore"):
         affine = rollout_errors(cut, fit_least_squares(kinematics, train).rollout(cut), steps)
-    errors["least squares"] = np.nan_to_num(affine, nan=np.inf, posinf=np.inf, neginf=np.inf)
-    ridge = Ridge.fit(kinematics, train, steps)
-    errors["ridge regression"] = direct([ridge.predict(cut, k) for k in steps])
-    with np.errstate(invalid="ignore"):
-        distances = {name: space.distances(e) for name, e in errors.items()}
+
+    def direct(predict: Callable[[int], Array]) -> Array:
+        return np.stack([space.difference(predict(k), cut.states[:, past + k]) for k in steps], axis=1)
+
+    errors = {
+        "model": own,
+        "constant state": direct(lambda k: start),
+        "constant velocity": direct(lambda k: kinematics.coast(start, k * cut.time_step)),
+        "least squares": np.nan_to_num(affine, nan=np.inf, posinf=np.inf, neginf=np.inf),
+        "ridge regression": direct(lambda k: _predict_by_ridge(kinematics, seen, cut, k)),
+    }
+    distances = {name: space.distances(e) for name, e in errors.items()}
     parts = [cut[i : i + CHUNK] for i in range(0, len(cut), CHUNK)]
     variances = np.concatenate([error_variances(model, part, learned.noise, steps) for part in parts])
-    variances = follow_errors(cut, errors["model"], variances, steps)
-    coverage, interval, width = _coverage(cut, errors["model"], variances, steps, stride, level)
+    variances = follow_errors(cut, own, variances, steps)
+
+    def of_groups(values: Array) -> Array:  # (W, steps, e) -> (steps, groups)
+        return np.stack([values[..., at].mean(axis=(0, 2)) for at in space.error_columns], axis=-1)
+
+    coverage = of_groups(np.abs(own) <= ndtri((1 + LEVEL) / 2) * np.sqrt(variances))
+    independent = [max(len(cut) * stride // max(step, stride), 1) for step in steps]  # windows that do not overlap
+    intervals = [
+        [binomial_interval(round(c * n), n, LEVEL) for c in row] for row, n in zip(coverage, independent, strict=True)
+    ]
     return Judgement(
-        tuple(group.name for group in space.groups),
-        tuple(group.error_unit for group in space.groups),
-        tuple(steps),
-        {name: d.mean(axis=0) for name, d in distances.items()},
-        {name: np.sqrt(np.square(d).mean(axis=0)) for name, d in distances.items()},
-        coverage,
-        interval,
-        width,
-        len(cut),
-        level,
+        groups=tuple(group.name for group in space.groups),
+        units=tuple(group.error_unit for group in space.groups),
+        steps=tuple(steps),
+        mean={name: d.mean(axis=0) for name, d in distances.items()},
+        rmse={name: np.sqrt(np.square(d).mean(axis=0)) for name, d in distances.items()},
+        coverage=coverage,
+        coverage_interval=np.array(intervals),
+        width=np.sqrt(of_groups(variances) / np.maximum(of_groups(np.square(own)), 1e-300)),
+        windows=len(cut),
     )
 
 
-def _coverage(
-    windows: Windows, errors: Array, variances: Array, steps: Sequence[int], stride: int, level: float
-) -> tuple[Array, Array, Array]:
-    """Share of entries inside their interval, its exact interval, and the width, by step and group."""
-    inside = np.abs(errors) <= ndtri((1 + level) / 2) * np.sqrt(variances)
-    shape = (len(steps), len(windows.space.groups))
-    share, interval, width = np.empty(shape), np.empty((*shape, 2)), np.empty(shape)
-    for g, columns in enumerate(windows.space.error_columns):
-        for k, step in enumerate(steps):
-            share[k, g] = inside[:, k, columns].mean()
-            independent = max(len(windows) * stride // max(step, stride), 1)  # windows that do not overlap
-            interval[k, g] = binomial_interval(round(share[k, g] * independent), independent, level)
-            claimed, actual = variances[:, k, columns].mean(), np.square(errors[:, k, columns]).mean()
-            width[k, g] = np.sqrt(claimed / max(actual, 1e-300))
-    return share, interval, width
+def _predict_by_ridge(kinematics: Kinematics, seen: Windows, windows: Windows, step: int) -> Array:
+    """Predicts states (W, n) at a step straight from past states, past and coming inputs, by a fit to ``seen``."""
+
+    def regressors(cut: Windows) -> Array:
+        start, past, u = cut.states[:, cut.past], cut.past, cut.inputs
+        columns = [kinematics.features(start, u[:, past], cut.context[:, past])]
+        columns += [cut.space.difference(start, cut.states[:, past - lag]) for lag in LAGS]
+        columns += [u[:, past - lag] for lag in LAGS]
+        columns += [u[:, past + rows].mean(axis=1) for rows in np.array_split(np.arange(step), min(BINS, step))]
+        return np.concatenate(columns, axis=1)
+
+    z = regressors(seen)
+    mean, factor = z.mean(axis=0), np.maximum(z.std(axis=0), 1e-12)
+    z, new = (np.column_stack([np.ones(len(a)), (a - mean) / factor]) for a in (z, regressors(windows)))
+    y = seen.space.difference(seen.states[:, seen.past + step], seen.states[:, seen.past])
+    penalty = PENALTY * len(z) * np.diag(np.r_[0.0, np.ones(z.shape[1] - 1)])
+    weights = np.linalg.solve(z.T @ z + penalty, z.T @ y)
+    return windows.space.displace(windows.states[:, windows.past], new @ weights)

@@ -23,38 +23,22 @@ GRAVITY = np.array([0.0, 0.0, -9.80665])  # [m/s2], world
 
 
 class Kinematics(Protocol):
-    """How outputs move a state."""
+    """How outputs move a state of a space: ``step`` and its inverse ``outputs`` [s].
+
+    ``output_groups`` are learned, or not, together; ``features`` are what their GPs see (..., d), and ``coast`` goes on
+    at constant velocities for a time [s].
+    """
 
     @property
-    def space(self) -> StateSpace:
-        """Of the states."""
-        ...
-
+    def space(self) -> StateSpace: ...
     @property
-    def output_names(self) -> tuple[str, ...]:
-        """Names of the o outputs."""
-        ...
-
+    def output_names(self) -> tuple[str, ...]: ...
     @property
-    def output_groups(self) -> dict[str, tuple[int, ...]]:
-        """Outputs that are learned, or not, together."""
-        ...
-
-    def step(self, states: Array, outputs: Array, time_step: float) -> Array:
-        """Computes the next states (..., n) from outputs (..., o)."""
-        ...
-
-    def outputs(self, states: Array, next_states: Array, time: float) -> Array:
-        """Computes the mean outputs (..., o) that lead from one state to the other in a time [s]."""
-        ...
-
-    def features(self, states: Array, inputs: Array, context: Array) -> Array:
-        """Computes what a GP of the outputs sees (..., d)."""
-        ...
-
-    def coast(self, states: Array, time: float) -> Array:
-        """Computes the states after a time [s] at constant velocities."""
-        ...
+    def output_groups(self) -> dict[str, tuple[int, ...]]: ...
+    def step(self, states: Array, outputs: Array, time_step: float) -> Array: ...
+    def outputs(self, states: Array, next_states: Array, time: float) -> Array: ...
+    def features(self, states: Array, inputs: Array, context: Array) -> Array: ...
+    def coast(self, states: Array, time: float) -> Array: ...
 
 
 @dataclass(frozen=True)
@@ -70,16 +54,13 @@ class Increments:
 
     @property
     def output_groups(self) -> dict[str, tuple[int, ...]]:
-        """The groups of the states."""
         groups = zip(self.space.groups, self.space.error_columns, strict=True)
         return {group.name: tuple(range(at.start, at.stop)) for group, at in groups}
 
     def step(self, states: Array, outputs: Array, time_step: float) -> Array:
-        """Adds y dt to the states."""
         return self.space.displace(states, outputs * time_step)
 
     def outputs(self, states: Array, next_states: Array, time: float) -> Array:
-        """The difference over the time."""
         return self.space.difference(next_states, states) / time
 
     def features(self, states: Array, inputs: Array, context: Array) -> Array:
@@ -112,11 +93,9 @@ class RigidBody:
 
     @property
     def output_groups(self) -> dict[str, tuple[int, ...]]:
-        """Force and torque."""
         return {"force": (0, 1, 2), "torque": (3, 4, 5)}
 
     def step(self, states: Array, outputs: Array, time_step: float) -> Array:
-        """See the class."""
         p, q, v, w = states[..., 0:3], states[..., 3:7], states[..., 7:10], states[..., 10:13]
         force, alpha = outputs[..., 0:3], outputs[..., 3:6]
         half_turn = rotation_quaternion((w + alpha * (time_step / 2)) * (time_step / 2))
@@ -142,6 +121,5 @@ class RigidBody:
         return np.concatenate([*parts, inputs, context], axis=-1)
 
     def coast(self, states: Array, time: float) -> Array:
-        """At constant velocity and rate."""
         p, q, v, w = states[..., 0:3], states[..., 3:7], states[..., 7:10], states[..., 10:13]
         return np.concatenate([p + v * time, quaternion_product(q, rotation_quaternion(w * time)), v, w], axis=-1)

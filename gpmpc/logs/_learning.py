@@ -5,8 +5,9 @@ averaged over 1, 5 or 10 rows, stays only where the rollouts of held-out runs ge
 rollouts as well.
 """
 
+import warnings
 from collections.abc import Callable, MutableMapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -15,13 +16,12 @@ import torch
 
 from gpmpc.exceptions import DataError, check_number
 from gpmpc.gp import Trainer, standardize
-from gpmpc.logs._baselines import fit_least_squares
-from gpmpc.logs._fitting import NominalFit, fit_nominal
+from gpmpc.logs._fitting import NominalFit, fit_least_squares, fit_nominal
 from gpmpc.logs._kinematics import Increments, Kinematics, RigidBody
 from gpmpc.logs._log import Log
 from gpmpc.logs._noise import OutputNoise, fit_noise
 from gpmpc.logs._nominal import AffineNominal, MultirotorNominal, Still
-from gpmpc.logs._rollouts import PAST, STEPS, LogModel, OutputGP, choose_stride, rollout_errors
+from gpmpc.logs._rollouts import PAST, STEPS, LogModel, OutputGP, choose_stride, finite_errors
 from gpmpc.logs._state_space import Array
 
 AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
@@ -62,31 +62,19 @@ class Learned:
     time_step: float  #: [s]
 
 
-@dataclass
 class _Folds:
     """Splits of a log by run, with held-out windows."""
 
-    parts: list[tuple[Log, Log]]
-    steps: int
-    windows: list = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        past = PAST + LATE
-        for _, held_out in self.parts:
-            stride = choose_stride(held_out, self.steps + past, WINDOWS)
-            self.windows.append(held_out.windows(self.steps, past, stride))
-
-    def errors(self, models: Sequence[LogModel]) -> list[Array]:
-        """Of the rollouts of each fold's model on its held-out windows (W, steps, e)."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            pairs = zip(self.windows, models, strict=True)
-            return [np.nan_to_num(rollout_errors(cut, model.rollout(cut)), nan=1e9) for cut, model in pairs]
+    def __init__(self, parts: list[tuple[Log, Log]], steps: int):
+        self.parts, self._at, past = parts, [min(step, steps) for step in JUDGED], PAST + LATE
+        logs = [held_out for _, held_out in parts]
+        self._windows = [log.windows(steps, past, choose_stride(log, steps + past, WINDOWS)) for log in logs]
 
     def judge(self, name: str, models: Sequence[LogModel]) -> Candidate:
         """Mean error of each group at the steps that decide."""
-        errors = np.concatenate(self.errors(models))
-        at = [min(step, self.steps) - 1 for step in JUDGED]
-        return Candidate(name, self.windows[0].space.distances(errors[:, at]).mean(axis=0))
+        pairs = zip(self._windows, models, strict=True)
+        errors = np.concatenate([finite_errors(cut, model, self._at) for cut, model in pairs])
+        return Candidate(name, self._windows[0].space.distances(errors).mean(axis=0))
 
 
 def learn(
@@ -137,7 +125,7 @@ def learn(
             memory[trial_name] = [_fit(trial, m, train, steps).model.theta.tolist() for m, (train, _) in pairs]
         fitted = [_with_parameters(trial, theta) for theta in memory[trial_name]]
         candidates.append(folds.judge(trial_name, fitted))
-        if not models or is_better(candidates[-1], candidates[best]):
+        if not models or _is_better(candidates[-1], candidates[best]):
             best, models, name, structure = len(candidates) - 1, fitted, trial_name, trial
     choice: dict[str, int] = {}
     for group, outputs in kinematics.output_groups.items():
@@ -151,13 +139,12 @@ def learn(
                 trained = [grown(m, train) for m, (train, _) in zip(base, folds.parts, strict=True)]
                 memory[words] = folds.judge(words, trained).errors.tolist()
             candidates.append(Candidate(words, np.array(memory[words])))
-            if is_better(candidates[-1], candidates[best]):
+            if _is_better(candidates[-1], candidates[best]):
                 models = trained or [grown(m, train) for m, (train, _) in zip(base, folds.parts, strict=True)]
                 best, choice[group] = len(candidates) - 1, average
     progress(f"chosen: {candidates[best].name}")
     progress("noise from the errors of held-out rollouts")
-    errors = folds.errors(models)
-    noise = fit_noise(models, folds.windows, errors)
+    noise = fit_noise(models, [held_out for _, held_out in folds.parts], steps)
     progress("the chosen structure, fitted to all runs")
     fit = _fit(structure, models[0], log, steps)
     groups = kinematics.output_groups
@@ -165,21 +152,21 @@ def learn(
     candidates[best] = replace(candidates[best], chosen=True)
     values = np.concatenate([np.hstack([run.states, run.inputs]) for run in log])
     return Learned(
-        replace(fit.model, gps=gps),
-        noise,
-        fit,
-        tuple(candidates),
-        np.stack([values.min(axis=0), values.max(axis=0)]),
-        len(log),
-        tuple(run.name for run in log),
-        log.mapping.column_names("states"),
-        log.mapping.column_names("inputs"),
-        log.mapping.column_names("context"),
-        log.time_step,
+        model=replace(fit.model, gps=gps),
+        noise=noise,
+        fit=fit,
+        candidates=tuple(candidates),
+        ranges=np.stack([values.min(axis=0), values.max(axis=0)]),
+        rows=len(log),
+        runs=tuple(run.name for run in log),
+        state_names=log.mapping.column_names("states"),
+        input_names=log.mapping.column_names("inputs"),
+        context_names=log.mapping.column_names("context"),
+        time_step=log.time_step,
     )
 
 
-def is_better(candidate: Candidate, incumbent: Candidate) -> bool:
+def _is_better(candidate: Candidate, incumbent: Candidate) -> bool:
     """Whether a candidate's errors are smaller on the whole, and in no group at no step much larger."""
     ratio = np.log(np.maximum(candidate.errors, 1e-12) / np.maximum(incumbent.errors, 1e-12))
     return bool(ratio.mean() < -GAIN and ratio.max() < LOSS)
@@ -247,7 +234,7 @@ def _with_parameters(structure: LogModel, theta: Sequence[float]) -> LogModel:
     nominal = structure.nominal
     if isinstance(nominal, AffineNominal):
         structure = replace(structure, nominal=replace(nominal, feature_dim=len(theta) // nominal.output_dim - 1))
-    return structure.with_theta(np.array(theta, dtype=float))
+    return replace(structure, theta=np.array(theta, dtype=float))
 
 
 def _with_gp(model: LogModel, log: Log, outputs: tuple[int, ...], average: int, points: int, seed: int) -> LogModel:
@@ -281,6 +268,7 @@ def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:
     Raises:
         DataError: No row.
     """
+    from scipy.cluster.vq import kmeans2
     from scipy.spatial import cKDTree
 
     if not len(features):
@@ -293,11 +281,7 @@ def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:
     while len(chosen) < count:  # farthest points (Gonzalez, 1985)
         distance = np.minimum(distance, np.square(sample - sample[chosen[-1]]).sum(axis=1))
         chosen.append(int(distance.argmax()))
-    centres = sample[chosen]
-    for _ in range(5):  # of Lloyd's algorithm
-        nearest = cKDTree(centres).query(sample)[1]
-        members = np.bincount(nearest, minlength=count)
-        for j in range(z.shape[1]):
-            sums = np.bincount(nearest, sample[:, j], minlength=count)
-            centres[:, j] = np.where(members > 0, sums / np.maximum(members, 1), centres[:, j])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a centre that loses its members stays
+        centres = kmeans2(sample, sample[chosen], iter=5, minit="matrix")[0]
     return np.unique(cKDTree(z).query(centres)[1])

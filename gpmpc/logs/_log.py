@@ -15,7 +15,6 @@ from gpmpc.calibration import Recording
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gp import Transitions
 from gpmpc.logs._mapping import LogMapping
-from gpmpc.logs._sampling import windows_of
 from gpmpc.logs._state_space import Array, StateSpace
 
 
@@ -47,6 +46,11 @@ class LogRun:
     def pieces(self) -> list[tuple[int, int]]:
         """First row, and row after the last, of each piece."""
         return list(zip(self.begins, (*self.begins[1:], len(self)), strict=True))
+
+    def starts(self, past: int, ahead: int, stride: int = 1) -> np.ndarray:
+        """Lists the rows that have ``past`` rows before and ``ahead`` after them in their own piece."""
+        starts = [np.arange(begin + past, end - ahead, stride) for begin, end in self.pieces]
+        return np.concatenate(starts).astype(int)
 
     def part(self, begin: int, end: int, name: str) -> "LogRun":
         """The rows from ``begin`` to before ``end`` as a run of its own."""
@@ -115,15 +119,12 @@ class Log:
     @property
     def input_names(self) -> tuple[str, ...]:
         """Names of the m inputs."""
-        return self._names("inputs")
+        return self.mapping.entries("inputs")
 
     @property
     def context_names(self) -> tuple[str, ...]:
         """Names of the c entries of the context."""
-        return self._names("context")
-
-    def _names(self, role: Any) -> tuple[str, ...]:
-        return tuple(entry for signal in self.mapping.of(role) for entry in signal.group.entries)
+        return self.mapping.entries("context")
 
     def split(self, held_out: Sequence[str]) -> tuple["Log", "Log"]:
         """Splits by run: a log of all others, and one of the named runs.
@@ -148,20 +149,13 @@ class Log:
         check_number("share", share, above=0)
         cuts = [(run, min(max(round(share * len(run)), 1), len(run) - 1)) for run in self.runs]
         first = tuple(run.part(0, cut, "first part") for run, cut in cuts)
-        return replace(self, runs=first), replace(
-            self, runs=tuple(run.part(cut, len(run), "last part") for run, cut in cuts)
-        )
+        last = tuple(run.part(cut, len(run), "last part") for run, cut in cuts)
+        return replace(self, runs=first), replace(self, runs=last)
 
     def transitions(self) -> Transitions:
         """All transitions from one row to the next inside a piece, as data of GPs."""
-        parts = [(run.states[a:b], run.inputs[a:b]) for run in self.runs for a, b in run.pieces if b - a > 1]
-        if not parts:
-            raise DataError("a log needs two rows without a gap between them for a transition; got none")
-        return Transitions(
-            np.concatenate([states[:-1] for states, _ in parts]),
-            np.concatenate([inputs[:-1] for _, inputs in parts]),
-            np.concatenate([states[1:] for states, _ in parts]),
-        )
+        cut = self.windows(1)
+        return Transitions(cut.states[:, 0], cut.inputs[:, 0], cut.states[:, 1])
 
     def episodes(self) -> list[Recording]:
         """Every piece of two rows or more as a recording for ``gpmpc.calibration``."""
@@ -189,12 +183,10 @@ class Log:
             check_number(key, value, least=least, whole=True)
         offsets, parts = np.arange(-past, ahead + 1), []
         for number, run in enumerate(self.runs):
-            starts = windows_of(run.pieces, past, ahead, stride)
+            starts = run.starts(past, ahead, stride)
             rows = starts[:, None] + offsets
-            numbers = np.full(len(rows), number)
-            parts.append(
-                (run.states[rows], run.inputs[rows], run.context[rows[:, : past + 1]], numbers, run.time[starts])
-            )
+            before, numbers = run.context[rows[:, : past + 1]], np.full(len(rows), number)
+            parts.append((run.states[rows], run.inputs[rows], before, numbers, run.time[starts]))
         states, *others = (np.concatenate(one) for one in zip(*parts, strict=True))
         if not len(states):
             longest = max(b - a for run in self.runs for a, b in run.pieces)

@@ -144,6 +144,10 @@ class LogMapping:
         """The signals of one role."""
         return tuple(signal for signal in self.signals if signal.role == role)
 
+    def entries(self, role: Role) -> tuple[str, ...]:
+        """Names of the entries of one role, as they come out."""
+        return tuple(entry for signal in self.of(role) for entry in signal.group.entries)
+
     def column_names(self, role: Role) -> tuple[str, ...]:
         """The columns of one role in the order that they come out in, with what was done to their values."""
         found = []
@@ -154,9 +158,8 @@ class LogMapping:
             elif turned:
                 names = signal.group.entries
             factor = signal.scale * UNITS.get(signal.unit, ("", 1.0))[1]
-            other = self.model == "rigid_body" and signal.frame == {"m/s": "body", "rad/s": "world"}.get(
-                signal.group.unit
-            )
+            turned_frame = {"m/s": "body", "rad/s": "world"}.get(signal.group.unit)
+            other = self.model == "rigid_body" and signal.frame == turned_frame
             done = f" times {factor:.6g}" * (factor != 1 and not turned) + " in other axes" * other
             found += [f"{name}{done}" for name in names]
         return tuple(found)

@@ -12,46 +12,38 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize, nnls
+from scipy.optimize import nnls
 
-from gpmpc.logs._log import Windows
-from gpmpc.logs._rollouts import LogModel
+from gpmpc.logs._log import Log, Windows
+from gpmpc.logs._rollouts import PAST, LogModel, choose_stride, finite_errors
 from gpmpc.logs._state_space import Array
 
 TIME_CONSTANTS = (0.0, 0.05, 0.25, 1.0)  # [s]; zero is white
 FITTED = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps
 DIFFERENCE = 1e-6
 FOLLOWED, PRIOR = 6.0, 1.0  # times of the longest prediction: after which an error is forgotten, that a one weighs
-ALIKE = 0.05  # weight of differences within a group of outputs
+WINDOWS, LINEARIZED = 2000, 200  # of a fold: whose errors count, and along which rollouts are linearised
 
 
 @dataclass(frozen=True)
 class OutputNoise:
-    """Variances of the sources of a model's errors.
+    """Variances of the sources of a model's errors."""
 
-    The level of a prediction, exp(level . (1, z)), multiplies all of them; z are the logarithms of the mean squared
-    one-step residuals of each group of outputs over the rows before the start: a rough flight stays rough for a while.
-    """
-
-    outputs: Array  #: of each time constant and output (T, o), in squared units of the outputs, at level one
+    outputs: Array  #: of each of ``TIME_CONSTANTS`` and output (T, o), in squared units of the outputs
     measurement: Array  #: of each entry of a difference of states (e,), likewise
-    level: Array  #: coefficients (1 + groups of outputs,)
-    time_constants: tuple[float, ...] = TIME_CONSTANTS  #: [s]; zero is white
 
 
 def error_variances(model: LogModel, windows: Windows, noise: OutputNoise, steps: Sequence[int]) -> Array:
     """Computes the variances (W, len(steps), e) of a model's errors at some steps after the starts of windows."""
-    weights = np.concatenate([noise.outputs.ravel(), noise.measurement])
-    level = np.exp(_regressors(model, windows) @ noise.level)
-    return level[:, None, None] * (_responses(model, windows, steps, noise.time_constants) @ weights)
+    return _responses(model, windows, steps) @ np.concatenate([noise.outputs.ravel(), noise.measurement])
 
 
 def follow_errors(windows: Windows, errors: Array, variances: Array, steps: Sequence[int]) -> Array:
     """Scales claimed variances by how predictions of the same run ended that were over before each one began.
 
-    A run may be calmer or rougher than those that the noise was fitted to. For each group of states and each step the
-    scale is the mean of squared errors over claimed variances, weighted by exp(-age / (6 T)), with a one of the weight
-    T added, and T the time of the longest prediction (adaptive conformal inference by variances instead of
+    A run may be calmer or rougher than those that the noise was fitted to. For each entry of the state and each step
+    the scale is the mean of squared errors over claimed variances, weighted by exp(-age / (6 T)), with a one of the
+    weight T added, and T the time of the longest prediction (adaptive conformal inference by variances instead of
     quantiles; Gibbs and Candes, 2021).
 
     Args:
@@ -68,92 +60,68 @@ def follow_errors(windows: Windows, errors: Array, variances: Array, steps: Sequ
         for k, step in enumerate(steps):
             age = times[:, None] - times - (step - 0.5) * windows.time_step
             weights = np.where(age > 0, spacing * np.exp(-np.maximum(age, 0) / (FOLLOWED * longest)), 0.0)
-            for columns in windows.space.error_columns:
-                ratio = (errors[at, k, columns] ** 2 / np.maximum(variances[at, k, columns], 1e-300)).mean(axis=1)
-                scale = (PRIOR * longest + weights @ ratio) / (PRIOR * longest + weights.sum(axis=1))
-                scaled[at, k, columns] *= scale[:, None]
+            ratio = errors[at, k] ** 2 / np.maximum(variances[at, k], 1e-300)
+            prior = PRIOR * longest
+            scaled[at, k] *= (prior + weights @ ratio) / (prior + weights.sum(axis=1, keepdims=True))
     return scaled
 
 
-def _regressors(model: LogModel, windows: Windows) -> Array:
-    """One, and the logarithm of the mean squared residual of each group of outputs in the past (W, 1 + groups)."""
-    first = model.lag
-    x, u = windows.states[:, first : windows.past + 1], windows.inputs[:, : windows.past - model.lag]
-    y = model.kinematics.outputs(x[:, :-1], x[:, 1:], windows.time_step)
-    squares = np.square(y - model.outputs(x[:, :-1], u, windows.context[:, first : windows.past])).mean(axis=1)
-    columns = [
-        np.log(squares[:, list(group)].mean(axis=1) + 1e-12) for group in model.kinematics.output_groups.values()
-    ]
-    return np.column_stack([np.ones(len(windows)), *columns])
+def fit_noise(models: Sequence[LogModel], logs: Sequence[Log], most: int) -> OutputNoise:
+    """Finds the noise that explains the errors of rollouts on held-out runs.
 
-
-def fit_noise(models: Sequence[LogModel], folds: Sequence[Windows], errors: Sequence[Array]) -> OutputNoise:
-    """Finds the noise that explains the errors of rollouts on held-out windows.
+    Where these do not tell the outputs of a group apart, as x from y while the heading turns, the outputs share as the
+    squares of their residuals one step ahead do.
 
     Args:
         models: One a fold.
-        folds: Windows that the fold's model was not fitted to.
-        errors: Of its rollouts there (W, steps, e).
+        logs: Runs that the fold's model was not fitted to.
+        most: Steps of the longest rollouts.
     """
-    steps, outputs = fitted_steps(errors[0].shape[1]), len(models[0].kinematics.output_names)
-    pairs = list(zip(models, folds, strict=True))
-    responses = np.concatenate([_responses(model, cut, steps, TIME_CONSTANTS) for model, cut in pairs])
-    squares = np.concatenate([np.square(e[:, np.array(steps) - 1]) for e in errors])
-    mean = np.maximum(squares.mean(axis=0), 1e-300)
-    relative = (responses.mean(axis=0) / mean[..., None]).reshape(-1, responses.shape[-1])
+    steps = [step for step in FITTED if step <= most]
+    found: list[tuple[Array, Array, Array]] = []
+    for model, log in zip(models, logs, strict=True):
+        past = max(model.past, PAST)
+        cut = log.windows(most, past, choose_stride(log, most + past, WINDOWS))
+        few = cut[:: -(-len(cut) // LINEARIZED)]  # derivatives are slow, and vary little
+        x, after = cut.states[:, past], cut.states[:, past + 1]
+        y = model.outputs(x, cut.inputs[:, past - model.lag], cut.context[:, past]) + model.disturbance(cut)
+        residuals = model.kinematics.outputs(x, after, cut.time_step) - y
+        found.append((np.square(finite_errors(cut, model, steps)), _responses(model, few, steps), np.square(residuals)))
+    mean, responses, squares = (np.concatenate(one).mean(axis=0) for one in zip(*found, strict=True))
+    relative = (responses / np.maximum(mean, 1e-300)[..., None]).reshape(-1, responses.shape[-1])
     factor = np.maximum(relative.max(axis=0), 1e-300)
-    count = len(TIME_CONSTANTS) * outputs
-    alike = _alike(models[0], factor)
-    found = nnls(np.vstack([relative / factor, alike]), np.r_[np.ones(len(relative)), np.zeros(len(alike))])[0] / factor
-    ratio = (squares / np.maximum(responses @ found, 1e-300)).mean(axis=(1, 2))
-    level = _fit_level(np.concatenate([_regressors(model, cut) for model, cut in pairs]), ratio)
-    return OutputNoise(found[:count].reshape(-1, outputs), found[count:], level)
+    alike = _alike(models[0], factor, squares)
+    targets = np.r_[np.ones(len(relative)), np.zeros(len(alike))]
+    variances = nnls(np.vstack([relative / factor, alike]), targets)[0] / factor
+    by_output, measured = np.split(variances, [len(TIME_CONSTANTS) * len(squares)])
+    return OutputNoise(by_output.reshape(len(TIME_CONSTANTS), -1), measured)
 
 
-def _alike(model: LogModel, factor: Array) -> Array:
-    """Rows that draw neighbouring outputs of a group together where the errors do not tell them apart, as x and y."""
-    rows, o = [], len(model.kinematics.output_names)
+def _alike(model: LogModel, factor: Array, squares: Array) -> Array:
+    """Rows of least squares that are zero where the outputs of a group share as the residuals' squares (o,) do."""
+    rows, o = [], len(squares)
     for start in range(0, len(TIME_CONSTANTS) * o, o):
         for group in model.kinematics.output_groups.values():
             for i, j in itertools.pairwise(group):
                 row, pair = np.zeros(len(factor)), [start + i, start + j]
-                row[pair] = ALIKE * factor[pair].mean() / factor[pair] * [1.0, -1.0]
+                scale = factor[pair] * np.maximum(squares[[i, j]], 1e-300)
+                row[pair] = scale.min() / scale * [1.0, -1.0]
                 rows.append(row)
     return np.array(rows).reshape(-1, len(factor))
 
 
-def _fit_level(z: Array, ratio: Array) -> Array:
-    """Fits E ratio = exp(z b) by maximum likelihood of exponential distributions (gamma regression, log link)."""
-    centre = z[:, 1:].mean(axis=0)
-    z = np.column_stack([z[:, :1], z[:, 1:] - centre])
-
-    def objective(b: Array) -> tuple[float, Array]:
-        eta = np.clip(z @ b, -20, 20)
-        scaled = ratio * np.exp(-eta)
-        penalty = np.r_[0.0, b[1:]] / len(z)
-        return float((scaled + eta).mean() + penalty @ b / 2), z.T @ (1 - scaled) / len(z) + penalty
-
-    b = minimize(objective, np.zeros(z.shape[1]), jac=True, method="BFGS").x
-    return np.r_[b[0] - centre @ b[1:], b[1:]]
-
-
-def fitted_steps(most: int) -> list[int]:
-    """The steps at which squared errors are compared."""
-    return [step for step in FITTED if step <= most]
-
-
-def _responses(model: LogModel, windows: Windows, steps: Sequence[int], time_constants: Sequence[float]) -> Array:
+def _responses(model: LogModel, windows: Windows, steps: Sequence[int]) -> Array:
     """Variance of every entry's error (W, s, e, sources) by a unit variance of every source."""
     A, B = _linearized(model, windows, max(steps))
     W, e, o = len(windows), A.shape[-1], B.shape[-1]
-    found = np.empty((W, len(steps), e, len(time_constants) * o + e))
+    found = np.empty((W, len(steps), e, len(TIME_CONSTANTS) * o + e))
     for s, step in enumerate(steps):
         P = np.broadcast_to(np.eye(e), (W, e, e))
         G = np.empty((step, W, e, o))
         for i in range(step - 1, -1, -1):
             G[i] = P @ B[:, i]
             P = P @ A[:, i]
-        for t, constant in enumerate(time_constants):
+        for t, constant in enumerate(TIME_CONSTANTS):
             if constant == 0:
                 total = np.square(G).sum(axis=0)
             else:  # sum over i, j of rho^|i - j| G_i G_j, in one pass
@@ -162,7 +130,7 @@ def _responses(model: LogModel, windows: Windows, steps: Sequence[int], time_con
                     total += g * (g + 2 * tail)
                     tail = rho * (tail + g)
             found[:, s, :, t * o : (t + 1) * o] = total
-        found[:, s, :, len(time_constants) * o :] = np.square(P) + np.eye(e)
+        found[:, s, :, len(TIME_CONSTANTS) * o :] = np.square(P) + np.eye(e)
     return found
 
 

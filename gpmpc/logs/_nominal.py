@@ -15,21 +15,13 @@ from gpmpc.logs._state_space import Array, quaternion_inverse, rotate
 
 
 class Nominal(Protocol):
-    """Outputs as a function of a few parameters."""
+    """Outputs (..., o) as a function of P named parameters, with the point (P,) at which a fit begins."""
 
     @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the P parameters."""
-        ...
-
+    def parameter_names(self) -> tuple[str, ...]: ...
     @property
-    def start(self) -> Array:
-        """Where a fit begins (P,)."""
-        ...
-
-    def outputs(self, theta: Any, states: Array, inputs: Array, context: Array) -> Array:
-        """Computes the outputs (..., o) at states (..., n), inputs (..., m) and context (..., c)."""
-        ...
+    def start(self) -> Array: ...
+    def outputs(self, theta: Any, states: Array, inputs: Array, context: Array) -> Array: ...
 
 
 @dataclass(frozen=True)
@@ -41,11 +33,9 @@ class Still:
 
     @property
     def start(self) -> Array:
-        """No parameter."""
         return np.empty(0)
 
     def outputs(self, theta: Any, states: Array, inputs: Array, context: Array) -> Array:
-        """Zeros."""
         return np.zeros((*states.shape[:-1], self.output_dim))
 
 
@@ -75,7 +65,6 @@ class MultirotorNominal:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
         names = ["thrust", "drag_xy", "drag_z", "damping_x", "damping_y", "damping_z"]
         if self.feedback:
             names += ["feedback_x_by_y", "feedback_x_by_x", "feedback_y_by_x", "feedback_y_by_y"]
@@ -91,7 +80,6 @@ class MultirotorNominal:
         return start
 
     def outputs(self, theta: Any, states: Array, inputs: Array, context: Array) -> Array:
-        """See the class."""
         thrust, drag_xy, drag_z, *rest = theta
         to_body = quaternion_inverse(states[..., 3:7])
         v, w = rotate(to_body, states[..., 7:10]), states[..., 10:13]
@@ -120,16 +108,13 @@ class AffineNominal:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Row after row of (A, b)."""
         return tuple(f"A_{i}_{j}" for i in range(self.output_dim) for j in range(self.feature_dim + 1))
 
     @property
     def start(self) -> Array:
-        """Zeros."""
         return np.zeros(len(self.parameter_names))
 
     def outputs(self, theta: Any, states: Array, inputs: Array, context: Array) -> Array:
-        """A z + b."""
         z = self.kinematics.features(states, inputs, context)
         A = np.asarray(theta, dtype=float).reshape(self.output_dim, self.feature_dim + 1)
         return z @ A[:, :-1].T + A[:, -1]

@@ -65,7 +65,7 @@ def _read_csv(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
         header = file.readline()
     delimiter = max(",;\t", key=header.count)
     names = [name.strip().strip('"') for name in header.strip().split(delimiter)]
-    if any(_is_number(name) for name in names):
+    if pandas.to_numeric(pandas.Series(names), errors="coerce").notna().any():
         raise DataError(f"{path}: the first line holds numbers; expected a header with the names of the columns")
     twice = [name for name in names if names.count(name) > 1]
     if twice:
@@ -74,14 +74,6 @@ def _read_csv(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
         warnings.simplefilter("error", pandas.errors.ParserWarning)
         table = pandas.read_csv(path, sep=delimiter, encoding="utf-8-sig", skipinitialspace=True, index_col=False)
     return {"": table.rename(columns=str.strip)}
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _read_parquet(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
@@ -93,18 +85,16 @@ def _read_parquet(path: Path, topics: tuple[str, ...], partial: bool) -> Streams
 def _read_npz(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     import pandas
 
-    columns: dict[str, Any] = {}
     with np.load(path, allow_pickle=False) as archive:
-        for name in archive.files:
-            values = archive[name]
-            if values.ndim == 1:
-                columns[name] = values
-            elif values.ndim == 2:
-                columns |= {f"{name}[{i}]": values[:, i] for i in range(values.shape[1])}
-    lengths = {name: len(values) for name, values in columns.items()}
+        arrays = {name: archive[name] for name in archive.files if archive[name].ndim in (1, 2)}
+    lengths = {name: len(values) for name, values in arrays.items()}
     if len(set(lengths.values())) > 1:
         raise DataError(f"{path}: arrays must have the same number of rows; got {lengths}")
-    return {"": pandas.DataFrame(columns)}
+    tables = [
+        pandas.DataFrame(a, columns=[name] if a.ndim == 1 else [f"{name}[{i}]" for i in range(a.shape[1])])
+        for name, a in arrays.items()
+    ]
+    return {"": pandas.concat(tables, axis=1) if tables else pandas.DataFrame()}
 
 
 def _read_mcap(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:

@@ -10,10 +10,17 @@ import numpy as np
 from gpmpc.exceptions import DataError
 from gpmpc.logs._checks import check_plausible
 from gpmpc.logs._log import Finding, Log, LogRun
-from gpmpc.logs._mapping import TIME_UNITS, UNITS, LogMapping, Signal
+from gpmpc.logs._mapping import ROLES, TIME_UNITS, UNITS, LogMapping, Signal
 from gpmpc.logs._readers import STAMP, read_streams
-from gpmpc.logs._sampling import ordered_stamps, resample
-from gpmpc.logs._state_space import Array, quaternion_from_euler, quaternion_inverse, rotate
+from gpmpc.logs._state_space import (
+    Array,
+    quaternion_from_euler,
+    quaternion_inverse,
+    quaternion_product,
+    rotate,
+    rotation_quaternion,
+    rotation_vector,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -21,6 +28,8 @@ if TYPE_CHECKING:
 REST_TIME = 0.5  # [s] for which nothing moves at rest
 REST_SHARE = 0.1  # of a state's usual spread that counts as no movement
 MOST_HELD = 0.5  # of the rows; beyond, a signal has another rate than its table
+MOST_OUT_OF_ORDER = 0.05  # of the rows; beyond, the file does not hold one run in the order of time
+RESOLUTION = 1e-6  # [s] of stamps: float64 seconds since 1970 resolve a quarter of it
 
 
 class _Table(NamedTuple):
@@ -116,30 +125,30 @@ def _tabulate(
     samples = {s.role + s.name: _values(file, tables[s.topic], s, name, findings) for s in mapping.signals}
     outside = {topic: _outside(file, table, mapping) for topic, table in tables.items()}
     if mapping.rate is None:
-        (topic,) = stamps
-        values = {
-            role: _side_by_side([samples[s.role + s.name] for s in mapping.of(role)], len(tables[topic]))
-            for role in ("states", "inputs", "context")
-        }
-        return _Table(name, stamps[topic].time, values, outside[topic], stamps[topic].after_reversal)
-    begin = max(found.time[0] for found in stamps.values())
-    end = min(found.time[-1] for found in stamps.values())
-    if not end > begin:
-        raise DataError(f"{file}: the topics {', '.join(stamps)} have no time in common")
-    grid = begin + np.arange(int(np.floor((end - begin) * mapping.rate * (1 + 1e-12))) + 1) / mapping.rate
+        ((grid, breaks),) = ((found.time, found.after_reversal) for found in stamps.values())
+    else:
+        begin = max(found.time[0] for found in stamps.values())
+        end = min(found.time[-1] for found in stamps.values())
+        if not end > begin:
+            raise DataError(f"{file}: the topics {', '.join(stamps)} have no time in common")
+        grid = begin + np.arange(int(np.floor((end - begin) * mapping.rate * (1 + 1e-12))) + 1) / mapping.rate
+        breaks = np.zeros(len(grid), dtype=bool)
+
+    def on_grid(topic: str, values: Array, rule: str, max_gap: float | None) -> Array:
+        if mapping.rate is None:
+            return values
+        time = stamps[topic].time
+        usual = max(float(np.median(np.diff(time))), 1 / mapping.rate)
+        return resample(time, values, grid, rule, max_gap or 1.5 * usual)
+
     values = {}
-    for role in ("states", "inputs", "context"):
-        parts = []
-        for s in mapping.of(role):
-            time, own = stamps[s.topic].time, samples[s.role + s.name]
-            usual = max(float(np.median(np.diff(time))), 1 / mapping.rate)
-            parts.append(resample(time, own, grid, s.rule, mapping.max_gap or 1.5 * usual))
-        values[role] = _side_by_side(parts, len(grid))
+    for role in ROLES:
+        parts = [on_grid(s.topic, samples[s.role + s.name], s.rule, mapping.max_gap) for s in mapping.of(role)]
+        values[role] = np.concatenate([np.empty((len(grid), 0)), *parts], axis=1)
     left_out = np.zeros(len(grid), dtype=bool)
-    for topic, found in stamps.items():
-        if outside[topic].any():
-            left_out |= resample(found.time, outside[topic][:, None].astype(float), grid, "hold", np.inf)[:, 0] > 0
-    return _Table(name, grid, values, left_out, np.zeros(len(grid), dtype=bool))
+    for topic, rows in outside.items():
+        left_out |= on_grid(topic, rows[:, None].astype(float), "hold", np.inf)[:, 0] > 0
+    return _Table(name, grid, values, left_out, breaks)
 
 
 def _time(label: str, table: "DataFrame", mapping: LogMapping) -> Array:
@@ -222,10 +231,6 @@ def _outside(file: Path, table: "DataFrame", mapping: LogMapping) -> np.ndarray:
     return outside
 
 
-def _side_by_side(parts: Sequence[Array], length: int) -> Array:
-    return np.concatenate(parts, axis=1) if parts else np.empty((length, 0))
-
-
 def _spread(tables: Sequence[_Table]) -> Array:
     """Usual spread of each state (n,) over all runs: half of the range of 80 % of the rows."""
     states = np.concatenate([table.values["states"] for table in tables])
@@ -239,7 +244,7 @@ def _spread(tables: Sequence[_Table]) -> Array:
 
 def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping, findings: list[Finding]) -> LogRun | None:
     """Leaves out what cannot be used, and marks where a new piece begins; None where nothing is left."""
-    states, inputs, context = (table.values[role] for role in ("states", "inputs", "context"))
+    states, inputs, context = (table.values[role] for role in ROLES)
     usable = np.ones(len(table.time), dtype=bool)
 
     def leave_out(rows: np.ndarray, kind: str, text: str) -> None:
@@ -297,3 +302,70 @@ def _at_rest(states: Array, inputs: Array, spread: Array, step: float) -> np.nda
     moved = maximum_filter1d(both, size, axis=0) - minimum_filter1d(both, size, axis=0)
     still = (moved <= limit).all(axis=1)
     return binary_dilation(still, np.ones(2 * (size // 2) + 1))
+
+
+class Stamps(NamedTuple):
+    """Stamps (K,) [s] that only increase, with what was wrong with them."""
+
+    rows: np.ndarray  # (K,) of the table, those that are used
+    time: Array  # (K,) [s]
+    after_reversal: np.ndarray  # (K,) whether rows with earlier stamps stood before this one
+    repeated: int
+    backwards: int
+
+
+def ordered_stamps(stamps: Array, where: str) -> Stamps:
+    """Leaves out rows whose stamp is not above all before it.
+
+    Raises:
+        DataError: A stamp is not finite, or time runs backwards for more than 5 % of the rows.
+    """
+    if not np.isfinite(stamps).all():
+        row = int(np.argmin(np.isfinite(stamps)))
+        raise DataError(f"{where}: the time in row {row + 1} is {stamps[row]}; expected a number")
+    latest = np.maximum.accumulate(stamps)
+    rises = np.r_[True, stamps[1:] > latest[:-1]]
+    repeated = np.r_[False, stamps[1:] == stamps[:-1]] & ~rises
+    backwards = ~rises & ~repeated
+    if backwards.sum() > MOST_OUT_OF_ORDER * len(stamps):
+        row = int(np.argmax(backwards))
+        raise DataError(
+            f"{where}: time runs backwards in row {row + 1} (from {stamps[row - 1]:g} to {stamps[row]:g} s), and "
+            f"{int(backwards.sum())} rows come before the latest stamp: name the column of the runs, or order the rows"
+        )
+    rows = np.flatnonzero(rises)
+    reversed_before = np.diff(np.cumsum(backwards)[rows], prepend=0) > 0
+    return Stamps(rows, stamps[rows], reversed_before, int(repeated.sum()), int(backwards.sum()))
+
+
+def resample(time: Array, values: Array, grid: Array, rule: str, max_gap: float) -> Array:
+    """Computes values (G, c) at the times of a grid (G,) from samples (K, c) at times (K,); NaN in and beyond gaps.
+
+    Args:
+        time: Of the samples, increasing [s].
+        values: (K, c); rows with a NaN are left out, so that a gap is one there.
+        grid: [s]
+        rule: "hold" takes the last sample, "linear" interpolates, "spherical" interpolates quaternions.
+        max_gap: Longest time between two samples, and since the last one, that is bridged [s].
+    """
+    present = np.isfinite(values).all(axis=1)
+    time, values = time[present], values[present]
+    if len(time) == 0:
+        return np.full((len(grid), values.shape[1]), np.nan)
+    at = np.searchsorted(time, grid + RESOLUTION, side="right") - 1
+    before, after = np.clip(at, 0, None), np.clip(at + 1, None, len(time) - 1)
+    lag, span = grid - time[before], time[after] - time[before]
+    exact = (at >= 0) & (lag <= RESOLUTION)
+    if rule == "hold":
+        usable = (at >= 0) & (lag <= max_gap)
+        found = values[before]
+    else:
+        share = np.divide(lag, span, out=np.zeros_like(lag), where=span > 0)[:, None]
+        one, other = values[before], values[after]
+        if rule == "spherical":
+            turn = rotation_vector(quaternion_product(quaternion_inverse(one), other))
+            found = quaternion_product(one, rotation_quaternion(share * turn))
+        else:
+            found = one + share * (other - one)
+        usable = exact | ((at >= 0) & (at < len(time) - 1) & (span <= max_gap))
+    return np.where(usable[:, None], found, np.nan)

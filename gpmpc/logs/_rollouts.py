@@ -7,7 +7,7 @@ model says; it is held through the prediction, and so is the context c (a batter
 its future is not known).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -106,10 +106,6 @@ class LogModel:
             found[..., k, :] = x
         return found
 
-    def with_theta(self, theta: Array) -> "LogModel":
-        """The model with other parameters."""
-        return replace(self, theta=theta)
-
 
 def rollout_errors(windows: Windows, predicted: Array, steps: Any = None) -> Array:
     """Computes the differences of predictions from what was measured.
@@ -124,6 +120,13 @@ def rollout_errors(windows: Windows, predicted: Array, steps: Any = None) -> Arr
     """
     steps = np.arange(1, predicted.shape[-2] + 1) if steps is None else np.asarray(steps)
     return windows.space.difference(predicted[..., steps - 1, :], windows.states[:, windows.past + steps])
+
+
+def finite_errors(windows: Windows, model: LogModel, steps: Any = None) -> Array:
+    """Computes the errors of a model's rollouts, of which those that diverge are 1e9."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = rollout_errors(windows, model.rollout(windows), steps)
+    return np.nan_to_num(errors, nan=1e9, posinf=1e9, neginf=-1e9)
 
 
 def choose_stride(log: Log, rows: int, most: int) -> int:

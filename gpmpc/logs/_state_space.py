@@ -13,33 +13,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gpmpc.exceptions import SettingError, ShapeError
-
 Array = NDArray[np.float64]
 Kind = Literal["vector", "angle", "quaternion"]
 
 
 @dataclass(frozen=True)
 class StateGroup:
-    """Entries of a state that are measured together and judged by one error.
-
-    Raises:
-        SettingError: The kind is unknown, or a quaternion has not four entries.
-    """
+    """Entries of a state that are measured together and judged by one error."""
 
     name: str  #: such as "position"
     entries: tuple[str, ...]  #: names of the entries; four of a quaternion, x, y, z, w
     unit: str = ""  #: of the entries; a quaternion's errors are in rad
     kind: Kind = "vector"  #: how differences are taken
-
-    def __post_init__(self) -> None:
-        if self.kind not in ("vector", "angle", "quaternion"):
-            raise SettingError(f"{self.name}.kind", f"must be vector, angle or quaternion; got {self.kind!r}")
-        if not self.entries or (self.kind == "quaternion" and len(self.entries) != 4):
-            raise SettingError(
-                f"{self.name}.columns",
-                f"must name {'four columns of a quaternion' if self.entries else 'a column'}; got {list(self.entries)}",
-            )
 
     @property
     def error_dim(self) -> int:
@@ -48,7 +33,6 @@ class StateGroup:
 
     @property
     def error_unit(self) -> str:
-        """Unit of a difference."""
         return "rad" if self.kind == "quaternion" else self.unit
 
 
@@ -60,7 +44,6 @@ class StateSpace:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the n entries."""
         return tuple(entry for group in self.groups for entry in group.entries)
 
     @cached_property
@@ -110,15 +93,6 @@ class StateSpace:
     def distances(self, errors: Array) -> Array:
         """Computes the Euclidean or geodesic length of each group's error (..., groups) of errors (..., e)."""
         return np.stack([np.linalg.norm(errors[..., at], axis=-1) for at in self.error_columns], axis=-1)
-
-    def check(self, states: Array) -> None:
-        """Raises unless states are (..., n) of this space.
-
-        Raises:
-            ShapeError: Another number of entries.
-        """
-        if np.shape(states)[-1:] != (self.dim,):
-            raise ShapeError(f"states must have {self.dim} entries ({', '.join(self.names)}); got {np.shape(states)}")
 
 
 def _slices(lengths: Sequence[int]) -> tuple[slice, ...]:

@@ -86,9 +86,9 @@ class CvxpySolver:
         columns, offset = np.concatenate([back, G @ back]), np.concatenate([free, G @ free])
         for members, sign, rows, bound, _ in sides:
             rows.value, bound.value = columns[members], ((lower if sign < 0 else upper) - offset)[members]
-        warm = isinstance(warm_start, QPSolution) and len(warm_start.x) == n
-        if warm:
-            y.value = factor @ (warm_start.x - free)
+        warm = False
+        if isinstance(warm_start, QPSolution) and len(warm_start.x) == n:
+            warm, y.value = True, factor @ (warm_start.x - free)
         built, best, least = perf_counter(), None, np.inf
         for options in (TIGHT.get(self.name, {}), {}) if self.options is None else (self.options,):
             status, x, multipliers = Status.NUMERICAL_TROUBLE, np.zeros(n), np.zeros(M)

@@ -32,7 +32,7 @@ def dynamics(kinematics, nominal, theta, inputs, dim, **model):
     one = torch.ones(1, dtype=torch.float64)
     gp = GPPosterior.from_hyperparameters(z, y, 2 * torch.ones(1, dim, dtype=torch.float64), one, 0.1 * one, 0, "value")
     whole = LogModel(kinematics, nominal, theta, (0,) * o, gps=(OutputGP((o - 1,), gp),), **model)
-    noise = OutputNoise(np.ones((4, o)), np.ones(kinematics.space.error_dim), np.zeros(3))
+    noise = OutputNoise(np.ones((4, o)), np.ones(kinematics.space.error_dim))
     return LogDynamics(whole, inputs, 0.02, noise)
 
 

@@ -9,7 +9,7 @@ import pandas
 import pytest
 
 from gpmpc.exceptions import DataError
-from gpmpc.logs import LogMapping, inspect_log, read_log
+from gpmpc.logs import LogMapping, inspect_log
 from gpmpc.plotting import inspection_figure, png
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -59,7 +59,7 @@ def test_what_was_put_in_is_found(table, tmp_path):
 def test_an_input_that_follows_the_states_is_named(table, tmp_path):
     table.to_csv(tmp_path / "log.csv", index=False)
     mapping = LogMapping.from_dict({"time": "t", "states": {"x": ["a"]}, "inputs": {"u": ["u"], "free": ["noisy"]}})
-    found = inspect_log(tmp_path / "log.csv", mapping, read_log(tmp_path / "log.csv", mapping))
+    found = inspect_log(tmp_path / "log.csv", mapping)
     assert found.follows["u"] > 0.99
     assert found.follows["noisy"] < 0.1
     assert any("u follows the states" in warning for warning in found.warnings)
