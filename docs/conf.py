@@ -11,6 +11,7 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
+highlight_language = "none"  # of blocks that name none: commands and what they print
 suppress_warnings = ["ref.python"]  # a word of an attribute's text, such as "states", is another attribute's name
 
 autodoc_member_order = "bysource"

@@ -32,6 +32,7 @@ import numpy as np
 import torch
 from scipy.stats import beta
 
+from gpmpc.compiled import call_unchecked, compiled
 from gpmpc.dynamics import Array, DynamicsModel
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
@@ -181,18 +182,11 @@ class AdaptiveTube:
 
     def observe(self, state: Any) -> Array:
         """Compares a state (n,) with what the plans before it said; returns kappa of each stage (H,)."""
-        stages, (N, H) = np.arange(self.tube.horizon), self.tube.scores.shape
+        state = np.ascontiguousarray(state, dtype=np.float64)
         self._step += 1
-        bounds = self._bounds[(self._step - stages - 1) % H, stages]  # of the plan of k + 1 steps ago at its stage k
-        values = self.tube.rows @ np.asarray(state, dtype=float)
-        known, outside = np.isfinite(bounds + values).all(axis=1), (values > bounds).any(axis=1)
-        self.counts += known
-        self.misses += known & outside
-        moved = np.minimum(self.alphas + self.rate * (self.allowed - outside), 1.0)
-        self.alphas = np.where(known, moved, self.alphas)
-        ranks = np.ceil((N + 1) * (1.0 - self.alphas) - 1e-9).astype(int)
-        self.kappas = np.where(ranks > N, self.largest, self.tube.scores[ranks.clip(1, N) - 1, stages])
-        self._bounds[self._step % H] = np.nan  # until a plan of this step is remembered
+        numbers = self.rate, self.allowed, self.largest
+        parts = self.kappas, self.alphas, self.counts, self.misses
+        call_unchecked(_observe, state, self.tube.rows, self._bounds, self._step, numbers, self.tube.scores, parts)
         return self.kappas
 
     def remember(self, means: Array, covariances: Array, stages: Any = None) -> None:
@@ -204,16 +198,14 @@ class AdaptiveTube:
             stages: Whether each stage's prediction counts (H,), such as where the plan touches a bound: how often
                 bounds are violated there is what alpha follows then. By default all count.
         """
-        means, covariances = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
-        G, expected = self.tube.rows, (self.tube.horizon + 1, self.tube.rows.shape[1])
+        means, covariances = (np.ascontiguousarray(part, dtype=np.float64) for part in (means, covariances))
+        expected = self.tube.horizon + 1, self.tube.rows.shape[1]
         if means.shape != expected:
             raise ShapeError(f"means must be {expected}; got {means.shape}")
-        variances = np.einsum("ri,kij,rj->kr", G, covariances[1:] + self.noise, G)
-        margins = self.kappas[:, None] * np.sqrt(variances.clip(0.0))
-        bounds = means[1:] @ G.T + margins
+        bounds = self._bounds[self._step % self.tube.horizon]
+        call_unchecked(_remember, means, covariances, self.noise, self.tube.rows, self.kappas, bounds)
         if stages is not None:
             bounds[~np.asarray(stages, dtype=bool)] = np.nan
-        self._bounds[self._step % self.tube.horizon] = bounds
 
     @property
     def violations(self) -> Array:
@@ -232,3 +224,40 @@ def _most_misses(share: float, decisions: int) -> int:
     misses = np.arange(int(share * decisions) + 1)
     limits = beta.ppf(0.95, misses + 1, np.maximum(decisions - misses, 1))
     return int((limits <= share).sum()) - 1
+
+
+@compiled(locked=True)
+def _observe(state, rows, bounds, step, numbers, scores, parts):
+    """Updates alpha and kappa of each stage (H,) by a state (n,); ``bounds`` (H, H, r) hold the last plans."""
+    (N, H), (rate, allowed, largest), (kappas, alphas, counts, misses) = scores.shape, numbers, parts
+    for k in range(H):  # the plan of k + 1 steps ago said where the state would be at its stage k
+        known, outside = True, False
+        plan = (step - k - 1) % H
+        for r in range(len(rows)):
+            value = 0.0
+            for i in range(len(state)):
+                value += rows[r, i] * state[i]
+            bound = bounds[plan, k, r]
+            known = known and bound == bound and value == value
+            outside = outside or value > bound
+        if known:
+            counts[k] += 1.0
+            misses[k] += 1.0 if outside else 0.0
+            alphas[k] = min(alphas[k] + rate * (allowed[k] - (1.0 if outside else 0.0)), 1.0)
+        rank = math.ceil((N + 1) * (1.0 - alphas[k]) - 1e-9)
+        kappas[k] = largest if rank > N else scores[max(rank, 1) - 1, k]
+    bounds[step % H] = np.nan  # until a plan of this step is remembered
+
+
+@compiled(locked=True)
+def _remember(means, covariances, noise, rows, kappas, bounds):
+    """Writes the bounds g'mu + kappa sd of a plan, by stage and direction (H, r)."""
+    n = means.shape[1]
+    for k in range(len(kappas)):
+        for r in range(len(rows)):
+            value, variance = 0.0, 0.0
+            for i in range(n):
+                value += rows[r, i] * means[k + 1, i]
+                for j in range(n):
+                    variance += rows[r, i] * (covariances[k + 1, i, j] + noise[i, j]) * rows[r, j]
+            bounds[k, r] = value + kappas[k] * math.sqrt(max(variance, 0.0))

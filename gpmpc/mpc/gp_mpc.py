@@ -161,10 +161,10 @@ class GPMPC:
         if not (status.solved or suboptimal):
             return replace(request.failed_decision(status, count, clock.timing), problem=program, solution=solution)
         plan = prediction.plan
-        inputs, beliefs = plan.inputs.copy(), self.prediction.linearizer.moments(plan.states, prediction.covariances)
+        means, covariances = self.prediction.linearizer.moments(plan.states, prediction.covariances)
         novelty = call_unchecked(_largest_ratio, prediction.stages.V, self._prior)
-        found = program, solution, request.disturbance, suboptimal, novelty
-        return Decision(inputs[0], inputs, *beliefs, status, count, clock.timing, *found)
+        inputs, found = plan.inputs.copy(), (program, solution, request.disturbance, suboptimal, novelty)
+        return Decision(inputs[0], inputs, means, covariances, status, count, clock.timing, *found)
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
         """Returns the controller for another model of as many states and inputs, in microseconds."""

@@ -121,7 +121,7 @@ def timing_figure(run: "Run") -> Figure:
     total = np.sort(milliseconds[:, -1])
     total = total[total > 0] if total.any() else total  # a controller that was not asked took no time
     # A first step that compiles, and those that waited for a core, would leave nothing to be seen of the others.
-    most_of_them = np.quantile(total, 0.98, method="inverted_cdf")
+    most_of_them = float(np.quantile(total, 0.98, method="inverted_cdf"))
     ceiling = 1.15 * min(most_of_them, 5 * float(np.median(total))) or 1.0
     over_time.set(xlabel="time [s]", ylabel="time of a decision [ms]", ylim=(0, ceiling))
     if beyond := int((total > ceiling).sum()):

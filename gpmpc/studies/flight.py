@@ -132,7 +132,7 @@ class Experiment:
         """Trains on transitions; see ``train``."""
         angles, known = self.system.angle_indices, self.system.nominal
         if (angles or known) and getattr(self.train, "predicts", None) == "difference":
-            nominal = known and CasadiFunction(successor_function(known))
+            nominal = None if known is None else CasadiFunction(successor_function(known))
             return train_residual(self.train, transitions, angles, nominal, seed)
         return self.train(transitions, seed=seed)
 

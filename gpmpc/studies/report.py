@@ -130,8 +130,8 @@ def _numbers(report: Report) -> pd.DataFrame:
         for word in ("finished", "lost", "failed", "missing", "skipped"):
             row[word] = len(cell.runs if word == "finished" else getattr(cell, word))
         for measure in report.measures():
-            unit, quartiles = report.label(measure).rpartition(" [")[2], _quartiles(cell.numbers(measure)) or [None] * 3
-            row |= dict(zip((f"{measure}_{part} [{unit}" for part in _PARTS), quartiles, strict=True))
+            names = [f"{measure}_{part} [{report.label(measure).rpartition(' [')[2]}" for part in _PARTS]
+            row |= dict.fromkeys(names) | dict(zip(names, _quartiles(cell.numbers(measure)) or (), strict=False))
         rows.append(row)
     return pd.DataFrame(rows, dtype=object)
 
