@@ -30,6 +30,7 @@ from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Rollout, closed_loop
 from gpmpc.systems import System
 from gpmpc.systems.mujoco_ import mujoco_system
+from gpmpc.systems.mujoco_quadrotor import MODEL
 
 STEP, ROTORS = 0.02, ["u1", "u2", "u3", "u4"]
 STATES = ["px", "py", "pz", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "wx", "wy", "wz"]
@@ -49,9 +50,9 @@ SIGNS = np.array([[1, -1, -1, 1], [-1, -1, 1, 1], [-1, 1, -1, 1]])  # of each ro
 
 
 def quadrotor() -> System:
-    """The vehicle of mujoco_quadrotor.xml by its sensors, quaternions scalar last."""
+    """The package's quadrotor by its sensors, quaternions scalar last."""
     return mujoco_system(
-        Path(__file__).with_name("mujoco_quadrotor.xml"),
+        MODEL,
         actuators=ROTORS,
         sensors=["position", "quaternion", "velocity", "rate"],
         substeps=4,

@@ -69,6 +69,17 @@ def test_a_quadrotor_in_mujoco_flies_better_with_what_its_logs_teach_than_with_i
     assert found["learned, disturbance_gain 0"] < 0.7 * found["data sheet, disturbance_gain 0.3"]
 
 
+def test_the_example_of_a_payload_learns_from_flights_and_corrects_what_is_new(tmp_path, monkeypatch):
+    pytest.importorskip("mujoco")
+    monkeypatch.setattr(sys, "argv", ["payload.py", str(tmp_path)])
+    errors = [*runpy.run_path(str(EXAMPLES / "payload.py"), run_name="__main__")["rmse"].values()]
+    assert errors[2] < 0.05
+    assert errors[2] < errors[1] / 3 < errors[0] / 3
+    assert (tmp_path / "payload.png").stat().st_size > 10_000
+    film = tmp_path / "payload.gif"  # where MuJoCo renders without a screen
+    assert not film.exists() or film.stat().st_size > 100_000
+
+
 def test_the_example_of_a_wall_keeps_the_cart_behind_it_as_often_as_it_says(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["wall.py", str(tmp_path)])
     names = runpy.run_path(str(EXAMPLES / "wall.py"), run_name="__main__")

@@ -26,7 +26,8 @@ def test_a_system_of_ones_own_is_flown_learned_swept_reported_recorded_and_calib
 def test_simulators_are_systems(page):
     pytest.importorskip("gymnasium")
     pytest.importorskip("mujoco")
-    names, (flown,) = page("docs/guide_simulator.md")
+    names, (flown, quadrotor) = page("docs/guide_simulator.md")
+    assert "100 steps of mujoco_quadrotor with convex" in quadrotor
     assert abs(names["flown"].rollout.states[-20:] - [1.0, 0.0, 0.0]).max() < 0.05
     assert "5 steps of gymnasium with convex" in flown
     assert names["cart"].state_names == ("slider", "hinge", "slider_rate", "hinge_rate", "push_activation")

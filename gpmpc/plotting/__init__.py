@@ -4,6 +4,7 @@ Every function returns a ``Figure`` made without pyplot, so nothing global is to
 """
 
 from gpmpc.plotting._animation import animate, ffmpeg_exists
+from gpmpc.plotting._film import film
 from gpmpc.plotting._logs import inspection_figure, judgement_figure
 from gpmpc.plotting._quality import quality
 from gpmpc.plotting._recorded import inputs_figure, timing_figure, tracking_figure
@@ -27,6 +28,7 @@ __all__ = [
     "calibration_figure",
     "error_over_size",
     "ffmpeg_exists",
+    "film",
     "innovations_figure",
     "inputs_figure",
     "inspection_figure",

@@ -39,8 +39,14 @@ def animate(run: "Run", path: str | Path) -> None:
     """
     if not {"x", "y", "z"} <= run.pose.keys() or not len(run.times):
         raise UnsupportedModel(f"{run.path}: an animation needs steps with positions x, y and z")
-    figure, draw = _scene(run)
-    shown = np.unique(np.linspace(0, len(run.times) - 1, min(_FRAMES, len(run.times))).astype(int))
+    save_animation(*_scene(run), len(run.times), path)
+
+
+def save_animation(
+    figure: Figure, draw: Callable[[int], list], steps: int, path: str | Path, frames: int = _FRAMES
+) -> None:
+    """Writes a figure that is drawn anew for evenly chosen steps, as ``animate``."""
+    shown = np.unique(np.linspace(0, steps - 1, min(frames, steps)).astype(int))
     animation = FuncAnimation(figure, draw, frames=shown, blit=False, cache_frame_data=False)
     writer = FFMpegWriter(fps=_RATE) if Path(path).suffix == ".mp4" else PillowWriter(fps=_RATE)
     animation.save(str(path), writer=writer, dpi=80)

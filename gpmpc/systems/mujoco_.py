@@ -106,7 +106,7 @@ class Joints(_Model):
 
 
 class Sensors(_Model, Simulator):
-    """Dynamics of a model by its sensors, from its initial pose.
+    """Dynamics of a model by its sensors, from its first keyframe, or from its initial pose.
 
     Args:
         path: Of the MJCF file.
@@ -145,9 +145,12 @@ class Sensors(_Model, Simulator):
             raise SettingError("state_names", f"must be {len(self.reset(0))} names; got {len(self.state_names)}")
 
     def _reset(self, seed: int) -> Array:
-        self.mujoco.mj_resetData(self.model, self.data)
+        if self.model.nkey:
+            self.mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+        else:
+            self.mujoco.mj_resetData(self.model, self.data)
         self.mujoco.mj_forward(self.model, self.data)
-        self._waiting = [np.zeros(len(self.controls))] * self._delay
+        self._waiting = [self.data.ctrl[self.controls].copy()] * self._delay
         return self._measure()
 
     def _step(self, input: Array) -> tuple[Array, bool]:

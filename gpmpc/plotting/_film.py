@@ -1,0 +1,131 @@
+"""Films a recorded flight of a MuJoCo model, rendered without a screen: vehicle, reference, plan and its tube."""
+
+import os
+from collections.abc import Callable
+from importlib import import_module
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+
+from gpmpc.exceptions import SettingError, UnsupportedModel
+from gpmpc.plotting._animation import PLAN, save_animation
+from gpmpc.plotting._recorded import FLOWN, REFERENCE
+
+if TYPE_CHECKING:
+    from gpmpc.recording import Run
+
+Array = np.ndarray
+_WIDTH, _HEIGHT = 640, 480  # of MuJoCo's off-screen buffer
+
+
+def film(
+    run: "Run",
+    model: str | Path,
+    positions: Callable[[Array], Array],
+    path: str | Path,
+    frames: int = 100,
+    enlarged: float = 1.0,
+) -> None:
+    """Writes a flight as MuJoCo renders it, as a GIF, or as an MP4 by the file's ending.
+
+    Args:
+        run: A recording whose ``pose`` has x, y and z.
+        model: The MJCF file.
+        positions: From a state (n,) to those of the model's joints (nq,).
+        path: The file, .gif or .mp4 (which needs ffmpeg).
+        frames: At most so many; steps are left out evenly.
+        enlarged: Factor of the tube's 2-sigma ellipsoids.
+
+    Raises:
+        SettingError: There is no off-screen rendering here.
+        UnsupportedModel: The recording has no positions.
+    """
+    if not {"x", "y", "z"} <= run.pose.keys() or not len(run.times):
+        raise UnsupportedModel(f"{run.path}: a film needs steps with positions x, y and z")
+    try:
+        mujoco = import_module("mujoco")
+        chosen = "MUJOCO_GL" in os.environ or "DISPLAY" in os.environ
+        context = import_module("mujoco.gl_context" if chosen else "mujoco.egl").GLContext(_WIDTH, _HEIGHT)
+        context.make_current()
+    except Exception as error:  # of ctypes, of PyOpenGL, of a driver
+        what = "no off-screen rendering by MuJoCo here; gpmpc.plotting.animate draws flights without it"
+        raise SettingError("film", f"{what} ({error})") from error
+    try:
+        scene = _Scene(mujoco, run, str(model), positions, enlarged)
+        figure = Figure(figsize=(_WIDTH / 80, _HEIGHT / 80))
+        FigureCanvasAgg(figure)
+        image = figure.add_axes((0, 0, 1, 1)).imshow(scene.render(0), aspect="auto")
+        image.axes.set_axis_off()
+        clock = figure.text(0.02, 0.95, "")
+        for i, (name, color) in enumerate((("reference", REFERENCE), ("flown", FLOWN), ("plan and its tube", PLAN))):
+            figure.text(0.02, 0.02 + 0.04 * i, name, color=color, weight="bold")
+
+        def draw(k: int) -> list:
+            image.set_data(scene.render(k))
+            clock.set_text(f"{run.times[k]:.2f} s")
+            return []
+
+        save_animation(figure, draw, len(run.times), path, frames)
+        scene.rendering.free()
+    finally:
+        context.free()
+
+
+class _Scene:
+    """What is rendered of one step."""
+
+    def __init__(self, mujoco: Any, run: "Run", model: str, positions: Callable[[Array], Array], enlarged: float):
+        self.mujoco, self.run, self.positions, self.enlarged = mujoco, run, positions, enlarged
+        self.model = mujoco.MjModel.from_xml_path(model)
+        self.data, self.scene = mujoco.MjData(self.model), mujoco.MjvScene(self.model, 2000)
+        self.rendering = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self.rendering)
+        self.axes = [run.pose[axis] for axis in "xyz"]
+        self.thinned = run.references[:: max(1, len(run.times) // 300)][:, self.axes]
+
+    def render(self, k: int) -> Array:
+        """The picture (height, width, 3) of step k, seen by a camera that follows the vehicle."""
+        mujoco, run = self.mujoco, self.run
+        self.data.qpos[:] = self.positions(run.states[k])
+        mujoco.mj_forward(self.model, self.data)
+        camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
+        camera.lookat[:] = run.states[k, self.axes]
+        camera.distance, camera.elevation, camera.azimuth = 2.2, -25, 120
+        every = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self.model, self.data, option, None, camera, every, self.scene)
+        self._line(self.thinned, REFERENCE)
+        self._line(run.states[max(0, k - 200) : k + 1, self.axes], FLOWN)
+        plan, covariances = run.plan_means[k][:, self.axes], run.plan_covariances[k][:, self.axes][..., self.axes]
+        finite = np.isfinite(plan).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+        self._line(plan[finite], PLAN)
+        for mean, covariance in zip(plan[finite], covariances[finite], strict=True):
+            squared, turn = np.linalg.eigh(covariance)
+            turn[:, 0] *= np.sign(np.linalg.det(turn))
+            axes = np.maximum(2 * self.enlarged * np.sqrt(np.maximum(squared, 0)), 1e-3)
+            self._add(mujoco.mjtGeom.mjGEOM_ELLIPSOID, axes, mean, turn, to_rgba(PLAN, 0.15))
+        view, pixels = mujoco.MjrRect(0, 0, _WIDTH, _HEIGHT), np.empty((_HEIGHT, _WIDTH, 3), dtype=np.uint8)
+        mujoco.mjr_render(view, self.scene, self.rendering)
+        mujoco.mjr_readPixels(pixels, None, view, self.rendering)
+        return pixels[::-1]
+
+    def _line(self, points: Array, color: str) -> None:
+        capsule = self.mujoco.mjtGeom.mjGEOM_CAPSULE
+        for begin, end in pairwise(points):
+            geom = self._add(capsule, np.zeros(3), np.zeros(3), np.eye(3), to_rgba(color))
+            if geom is not None:
+                self.mujoco.mjv_connector(geom, capsule, 0.008, begin, end)
+
+    def _add(self, kind: Any, size: Array, place: Array, turn: Array, color: Any) -> Any:
+        """A shape more; None where the scene is full."""
+        if self.scene.ngeom == self.scene.maxgeom:
+            return None
+        geom = self.scene.geoms[self.scene.ngeom]
+        self.mujoco.mjv_initGeom(geom, kind, size, place, turn.ravel(), np.array(color, dtype=np.float32))
+        geom.emission = 0.5
+        self.scene.ngeom += 1
+        return geom
