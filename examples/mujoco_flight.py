@@ -30,7 +30,7 @@ from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Rollout, closed_loop
 from gpmpc.systems import System
 from gpmpc.systems.mujoco_ import mujoco_system
-from gpmpc.systems.mujoco_quadrotor import MODEL
+from gpmpc.systems.mujoco_quadrotor import mujoco_quadrotor
 
 STEP, ROTORS = 0.02, ["u1", "u2", "u3", "u4"]
 STATES = ["px", "py", "pz", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "wx", "wy", "wz"]
@@ -52,7 +52,7 @@ SIGNS = np.array([[1, -1, -1, 1], [-1, -1, 1, 1], [-1, 1, -1, 1]])  # of each ro
 def quadrotor() -> System:
     """The package's quadrotor by its sensors, quaternions scalar last."""
     return mujoco_system(
-        MODEL,
+        mujoco_quadrotor().dynamics.path,
         actuators=ROTORS,
         sensors=["position", "quaternion", "velocity", "rate"],
         substeps=4,

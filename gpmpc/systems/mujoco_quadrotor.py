@@ -15,7 +15,7 @@ from gpmpc.systems._attitudes import GRAVITY
 from gpmpc.systems.mujoco_ import mujoco_system
 from gpmpc.systems.system import System, cos, sin
 
-MODEL = Path(__file__).with_name("quadrotor.xml")
+_MODEL = Path(__file__).with_name("quadrotor.xml")
 ROTORS = ("u1", "u2", "u3", "u4")
 _DRAG, _MASS = 0.25, 0.5  # of the model [N s/m], [kg]
 
@@ -98,7 +98,7 @@ def mujoco_quadrotor(
         "pose": {name: name for name in ("x", "y", "z", "roll", "pitch", "yaw")},
     }
     flown = mujoco_system(
-        MODEL,
+        _MODEL,
         ROTORS,
         sensors=("position", "velocity", "quaternion", "rate"),
         substeps=substeps,

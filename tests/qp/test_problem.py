@@ -36,6 +36,7 @@ INDEFINITE = np.array([[1.0, 2.0], [2.0, 1.0]])  # eigenvalues -1 and 3
             r"variable 1: lb must not exceed ub; got 1 > 0.5",
         ),
         ({"P": EYE, "q": [0, 0], "lb": [np.inf, 0.0]}, "variable 0: no number satisfies lb = inf"),
+        ({"P": EYE, "q": [0, 0], "lb": [1e20, 0.0]}, "variable 0: no number satisfies lb"),
         ({"P": EYE, "q": [0, 0], "ub": [0.0, -1e20]}, "variable 1: no number satisfies ub"),
         ({"P": EYE, "q": [0, 0], "ub": [0.0, np.nan]}, "ub must not contain NaN"),
     ],
