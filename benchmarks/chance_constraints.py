@@ -133,7 +133,7 @@ def cart_pole() -> Plant:
     return Plant(
         successor, noise, lambda: np.zeros(4), log, goal=[0.3, 0.0, 0.0, 0.0], bound=(1, 0.1), turn=25,
         weights=([10.0, 1.0, 1.0, 0.1], [1e-2]), limits=[3.0], quantile=NormalDist().inv_cdf, noise=scale,
-        share=0.2,
+        share=0.05,
     )  # fmt: skip
 
 
