@@ -86,6 +86,7 @@ def test_a_new_project_runs_at_once(tmp_path, monkeypatch):
         (["run", "--config-dir", ".", "system=short"], "derivative must give 2 entries, one for each of state_names"),
         (["run", "--config-dir", ".", "system=hollow"], "must be finite at state [0.0, 0.0]"),
         (["run", "--config-dir", ".", "system=weights"], "controller.problem: weighs 3 states and 1 inputs; nan has 2"),
+        (["run", "system=pendulum", "nominal={mass: 0.8}", "model=exact_gp"], "nominal: needs model=difference_gp"),
         (["run", "system=gymnasium"], "system.environment: this setting has no default"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

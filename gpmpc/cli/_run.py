@@ -183,6 +183,8 @@ def experiment_of(config: DictConfig) -> "Experiment":
     saved = isinstance(trained, SavedModel)
     if saved:
         trained.check(system)
+    if known and getattr(trained, "predicts", None) != "difference":
+        raise SettingError("nominal", "needs model=difference_gp, which learns what it misses")
     return Experiment(
         **parts,
         trajectory=instantiate(trajectory, _convert_="all"),

@@ -16,9 +16,27 @@ import casadi
 import numpy as np
 import torch
 
-from gpmpc.exceptions import UnsupportedModel
+from gpmpc.exceptions import DataError, UnsupportedModel
 from gpmpc.gp.posterior import AffineForm, GPPosterior
-from gpmpc.kernels.tape import CONST, INPUT, OPERATIONS, OUTPUT, Tape
+from gpmpc.kernels.tape import (
+    ADD,
+    ATAN2,
+    CONST,
+    CONSTPOW,
+    DIV,
+    FMAX,
+    FMIN,
+    INPUT,
+    MUL,
+    OPERATIONS,
+    OUTPUT,
+    POW,
+    SUB,
+    Tape,
+)
+
+Array = np.ndarray
+_BINARY = (ADD, SUB, MUL, DIV, POW, CONSTPOW, FMIN, FMAX, ATAN2)
 
 
 def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
@@ -157,3 +175,36 @@ def tape_of(function: casadi.Function) -> Tape | None:
             row[2 : 2 + len(inputs)] = inputs
             row[3] = inputs[-1]
     return Tape(code, constants, function.sz_w(), function.numel_out(0))
+
+
+def function_of_tape(code: Array, constants: Array, sizes: Sequence[int], shape: tuple[int, int]) -> casadi.Function:
+    """Writes a tape as a CasADi function again: the inverse of ``tape_of``.
+
+    Args:
+        code: Of the tape (K, 4).
+        constants: Of the tape (K,).
+        sizes: Of the arguments.
+        shape: Rows and columns of the value.
+
+    Raises:
+        DataError: The operations are no tape's.
+    """
+    arguments = [casadi.SX.sym(f"argument{i}", size) for i, size in enumerate(sizes)]
+    z, value, work = casadi.vertcat(*arguments), casadi.SX(shape[0] * shape[1], 1), {}
+    try:
+        for (operation, to, first, last), constant in zip(code.astype(int).tolist(), constants.tolist(), strict=True):
+            if operation == OUTPUT:
+                value[to] = work[first]
+            elif operation == INPUT:
+                work[to] = z[first]
+            elif operation == CONST:
+                work[to] = casadi.SX(constant)
+            elif operation in _BINARY:
+                work[to] = casadi.SX.binary(operation, work[first], work[last])
+            elif operation in OPERATIONS:
+                work[to] = casadi.SX.unary(operation, work[first])
+            else:
+                raise DataError(f"there is no operation {operation}")
+    except (KeyError, RuntimeError, ValueError) as error:
+        raise DataError(f"a function's operations do not follow from each other ({error})") from error
+    return casadi.Function("function", arguments, [casadi.reshape(value, *shape)])

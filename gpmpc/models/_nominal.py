@@ -138,34 +138,34 @@ class CasadiFunction:
         self.tape = tape_of(function)
         if self.tape is None:
             self._expansion = function.factory("expansion", names, [self._value, *jacobians])
-        self._shape = function.size1_out(0), function.size2_out(0)
-        self._sizes = [function.size1_in(i) for i in range(len(names))]
+        self.shape = function.size1_out(0), function.size2_out(0)
+        self.sizes = [function.size1_in(i) for i in range(len(names))]
         self._mapped: dict[int, Any] = {}
 
     def check_sizes(self, arguments: tuple[int, ...], value: tuple[int, int]) -> None:
         """Raises ``UnsupportedModel`` unless arguments and value have these sizes."""
-        if (tuple(self._sizes), self._shape) != (arguments, value):
+        if (tuple(self.sizes), self.shape) != (arguments, value):
             rule = f"must map vectors of {arguments} entries to a matrix of {value}"
             raise UnsupportedModel(f"a CasADi function of this model {rule}; got {self.function}")
 
     def __call__(self, *arguments: Tensor) -> Tensor:
         """The value (*batch, rows), or (*batch, rows, columns) of a matrix, at arguments (*batch, d_i)."""
         batch = arguments[0].shape[:-1]
-        flat = [to_array(a).reshape(-1, size).T for a, size in zip(arguments, self._sizes, strict=True)]
+        flat = [to_array(a).reshape(-1, size).T for a, size in zip(arguments, self.sizes, strict=True)]
         value = self.function.map(flat[0].shape[1])(*flat).full()
         value = torch.as_tensor(self._split(value, batch.numel()), dtype=arguments[0].dtype, device=arguments[0].device)
         return value.reshape(*batch, *value.shape[1:])
 
     def linearize(self, *arguments: Array) -> tuple[Array, ...]:
         """The values at K points, and their derivatives by each argument (K, rows, d_i) or (K, rows, columns, d_i)."""
-        K, (rows, columns) = len(arguments[0]), self._shape
+        K, (rows, columns) = len(arguments[0]), self.shape
         if self.tape is not None:
             from gpmpc.kernels.tape import linearize_tape  # loads numba
 
             points = np.ascontiguousarray(np.hstack(arguments))
             values, jacobians = np.empty((K, rows * columns)), np.empty((K, rows * columns, points.shape[1]))
             call_unchecked(linearize_tape, self.tape, points, values, jacobians)
-            parts = np.split(jacobians, np.cumsum(self._sizes)[:-1], axis=2)
+            parts = np.split(jacobians, np.cumsum(self.sizes)[:-1], axis=2)
             if columns == 1:
                 return values, *(np.ascontiguousarray(part) for part in parts)
             value, *parts = (p.reshape(K, columns, rows, *p.shape[2:]).swapaxes(1, 2) for p in (values, *parts))
@@ -182,7 +182,7 @@ class CasadiFunction:
         return tuple(found)
 
     def _split(self, value: Array, K: int) -> Array:
-        rows, columns = self._shape
+        rows, columns = self.shape
         split = value.reshape(rows, K, columns).transpose(1, 0, 2)
         return np.ascontiguousarray(split[..., 0] if columns == 1 else split)
 

@@ -7,8 +7,9 @@ is imported by and its parameters, which are
 * an importable dataclass, with its fields,
 * a ``CasadiFunction`` of an importable function that makes it,
 
-with parameters that JSON can hold. Reading imports the module that the file names, as Python's own ``import`` does: a
-file from someone else is read where their module is installed on purpose.
+with parameters that JSON can hold. A ``CasadiFunction`` that no function makes, such as a system's nominal model, is
+stored as its operations, which are numbers (``gpmpc.kernels.tape``). Reading imports the module that the file names, as
+Python's own ``import`` does: a file from someone else is read where their module is installed on purpose.
 """
 
 import importlib
@@ -19,6 +20,7 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -85,9 +87,9 @@ def _parts(path: Path, model: Any) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if isinstance(model.nominal, Affine):
         tensors |= {f"nominal/{part}": getattr(model.nominal, part) for part in "ABc"}
     else:
-        header["nominal"] = _import_path("nominal", model.nominal)
+        header["nominal"] = _described("nominal", model.nominal, tensors)
     if callable(model.B):
-        header["B"] = _import_path("B", model.B)
+        header["B"] = _described("B", model.B, tensors)
     else:
         tensors["B"] = model.B
     return header, tensors if model.noise is None else tensors | {"noise": model.noise}
@@ -113,7 +115,7 @@ def _inner(path: Path, name: str, header: Mapping[str, Any], tensors: Mapping[st
 
 def _build_residual(path: Path, header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> ResidualModel:
     gp, own = _inner(path, "residual", header, tensors)
-    B, nominal = _function(header, "B"), _function(header, "nominal")
+    B, nominal = (_function(header, own, key) for key in ("B", "nominal"))
     nominal = Affine(*(own[f"nominal/{part}"] for part in "ABc")) if nominal is None else nominal
     selected = header["states"], header["inputs"], header["input_dim"], header.get("angles", [])
     return ResidualModel(nominal, gp, own["B"] if B is None else B, *selected, own.get("noise"))
@@ -132,6 +134,15 @@ _BUILD: dict[str, Callable[[Path, Any, Mapping[str, Tensor]], Any]] = {
     ),
     "DisturbedModel": _build_disturbed,
 }
+
+
+def _described(key: str, function: Any, tensors: dict[str, Tensor]) -> dict[str, Any]:
+    """A function's header: its operations, which go to the tensors, or where it is imported from."""
+    tape = function.tape if isinstance(function, CasadiFunction) and function.source is None else None
+    if tape is None or not np.isfinite(tape.constants).all():
+        return _import_path(key, function)
+    tensors |= {f"{key}/{part}": torch.as_tensor(getattr(tape, part)).double() for part in ("code", "constants")}
+    return {"kind": "operations", "sizes": function.sizes, "shape": function.shape}
 
 
 def _import_path(key: str, function: Any) -> dict[str, Any]:
@@ -158,10 +169,15 @@ def _import_path(key: str, function: Any) -> dict[str, Any]:
     return {"kind": kind, "path": f"{module}:{name}", "parameters": parameters}
 
 
-def _function(header: Mapping[str, Any], key: str) -> Any:
-    """The function that a header names; None where it names none."""
+def _function(header: Mapping[str, Any], tensors: Mapping[str, Tensor], key: str) -> Any:
+    """The function that a header names or whose operations are stored; None where there is none."""
     if (entry := header.get(key)) is None:
         return None
+    if entry["kind"] == "operations":
+        from gpmpc.gp.casadi_ import function_of_tape  # loads CasADi
+
+        code, constants = (tensors[f"{key}/{part}"].numpy() for part in ("code", "constants"))
+        return CasadiFunction(function_of_tape(code, constants, entry["sizes"], entry["shape"]))
     kind, parameters = entry["kind"], entry["parameters"]
     module, _, name = entry["path"].partition(":")
     source: Any = _imported(module, name)

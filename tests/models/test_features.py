@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc import systems
 from gpmpc.dynamics import predict_with_jacobian
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, Transitions
-from gpmpc.gp.casadi_ import casadi_function
+from gpmpc.gp.casadi_ import casadi_function, successor_function
 from gpmpc.models import Affine, CasadiFunction, Lags, ResidualModel, load_model, save_model
 from gpmpc.propagation import Linearization, MomentMatching, MonteCarlo, Unscented
 from gpmpc.testing import check_model
@@ -43,6 +44,15 @@ def rotation(x):
 def rotation_in_casadi():
     x = casadi.SX.sym("x", 2)
     return casadi.Function("rotation", [x], [casadi.vertcat(casadi.sin(x[0]), 1 + 0.5 * casadi.cos(x[0]))])
+
+
+def every_operation():
+    """An effect that no path leads to, of each operation that a compiled loop knows."""
+    x, c = casadi.SX.sym("x", 2), casadi
+    a, b = 1 + x[0] ** 2, x[1]
+    first = c.sqrt(a) + c.log(a) * c.tan(b / 9) - c.atan2(b, a) + a**0.3 + a**b + c.fmin(a, b) * c.fmax(a, 1.5)
+    second = c.exp(-c.fabs(b)) + c.tanh(b) / a + c.atan(b) + 1 / a + 2 * b - c.sin(a) * c.cos(b)
+    return c.Function("all", [x], [c.vertcat(first, second)])
 
 
 def gp(n, m, k, size=25):
@@ -164,10 +174,14 @@ def test_lags_are_shifted_and_a_velocity_that_is_not_measured_is_found_in_them()
         (pendulum, rotation),
         (functools.partial(pendulum, damping=0.3), CasadiFunction(rotation_in_casadi)),
         (CasadiFunction(pendulum_in_casadi, damping=0.3), rotation),
+        (CasadiFunction(pendulum_in_casadi()), CasadiFunction(rotation_in_casadi())),
+        (CasadiFunction(successor_function(systems.pendulum())), CasadiFunction(every_operation())),
     ],
-    ids=["numbers", "function", "partial", "casadi"],
+    ids=["numbers", "function", "partial", "casadi", "operations", "system"],
 )
-def test_a_nominal_model_and_an_effect_are_saved_by_the_path_they_are_imported_from(nominal, effect, tmp_path):
+def test_a_nominal_model_and_an_effect_are_saved_by_the_path_they_are_imported_from_or_their_operations(
+    nominal, effect, tmp_path
+):
     model = with_effect(nominal, effect)
     save_model(model, tmp_path / "m.safetensors")
     loaded = load_model(tmp_path / "m.safetensors")
@@ -180,6 +194,10 @@ def test_code_without_a_path_is_refused_and_so_is_a_path_that_leads_nowhere(tmp_
     with pytest.raises(UnsupportedModel, match="nominal is code that a file cannot name"):
         save_model(with_effect(lambda x, u: x), tmp_path / "m")
     save_model(with_effect(), tmp_path / "m")
+    x, u = casadi.MX.sym("x", 2), casadi.MX.sym("u", 1)  # a table is no operation that a file holds
+    table = casadi.interpolant("table", "linear", [[0.0, 1.0]], [0.0, 2.0])
+    with pytest.raises(UnsupportedModel, match="nominal is code that a file cannot name"):
+        save_model(with_effect(CasadiFunction(casadi.Function("f", [x, u], [x * table(u)]))), tmp_path / "m")
     monkeypatch.delitem(globals(), "rotation")
     with pytest.raises(DataError, match="no function that can be imported here"):
         load_model(tmp_path / "m")
