@@ -7,6 +7,7 @@ from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.policy import ControlLoop
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
+from gpmpc.qp import CvxpySolver, PrimalActiveSet
 from gpmpc.simulation import closed_loop
 from gpmpc.status import Status
 from gpmpc.systems import double_integrator
@@ -17,8 +18,8 @@ PROBLEM = Problem(Tracking([1.0, 0.1], [0.05]), BOX, RATES)
 GOAL = np.array([1.0, 0.0])
 
 
-def controller(problem=PROBLEM):
-    return GPMPC(model(), Linearization(), problem, 10, [0.0])
+def controller(problem=PROBLEM, **settings):
+    return GPMPC(model(), Linearization(), problem, 10, [0.0], **settings)
 
 
 def moved(x, u):
@@ -57,6 +58,16 @@ def test_its_inputs_are_those_of_the_simulation():
     loop = ControlLoop(steering)
     inputs = [loop.input(x, Reference(np.tile(GOAL, (11, 1)))) for x in flown.states[:12]]
     assert np.array_equal(inputs, flown.inputs)
+
+
+@pytest.mark.parametrize("solver", [CvxpySolver(), PrimalActiveSet()], ids=lambda solver: type(solver).__name__)
+def test_another_solver_steers_alike_from_step_to_step(solver):
+    loops, x = [ControlLoop(controller()), ControlLoop(controller(solver=solver))], np.zeros(2)
+    for _ in range(8):
+        ours, theirs = (loop.input(x, GOAL) for loop in loops)
+        assert np.allclose(theirs, ours, atol=1e-6)
+        x = moved(x, ours)
+    assert [loop.failures for loop in loops] == [0, 0]
 
 
 def test_a_loop_that_may_not_go_on_says_so():
