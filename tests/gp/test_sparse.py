@@ -21,7 +21,7 @@ from gpmpc.gp import (
     standardize,
 )
 from gpmpc.gp._kernel import kernel_matrix
-from gpmpc.gp._sparse import collapsed_bound
+from gpmpc.gp._sparse import _cross, collapsed_bound
 from gpmpc.gp._sparse_training import informative_points
 from gpmpc.propagation import MomentMatching, MonteCarlo
 
@@ -79,6 +79,16 @@ def test_with_every_point_as_inducing_point_it_is_the_exact_gp(method):
     sparse = frozen.predict(query[:, :2], query[:, 2:])
     assert torch.allclose(sparse.mean, exact.mean, rtol=0, atol=1e-8)
     assert torch.allclose(sparse.variance, exact.variance, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("distance", [1e2, 1e4, 1e6])
+def test_no_covariance_exceeds_the_variance_however_far_apart_the_points_are(distance):
+    x, _, settings = problem(40)
+    far = torch.cat([x, x + distance])
+    covariances = _cross(far, far, Hyperparameters(**settings))
+    assert (covariances <= settings["signal_variance"][:, None, None]).all()
+    assert torch.allclose(covariances.diagonal(dim1=1, dim2=2), settings["signal_variance"][:, None], rtol=1e-3)
+    assert covariances[:, :40, 40:].max() == 0
 
 
 def test_points_that_are_nearly_the_same_get_the_jitter_they_need():

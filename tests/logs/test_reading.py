@@ -84,6 +84,17 @@ def test_no_transition_or_window_goes_over_a_gap(tmp_path):
     assert all(w.tobytes() in whole_windows for w in windows.states)
 
 
+def test_a_resampled_log_has_the_same_rows_whenever_its_clock_began(tmp_path):
+    table = pendulum_table(100)
+    first, later = (
+        read_log(written(tmp_path, table.assign(t=table["t"] + begin), f"{begin}.csv"), {**PENDULUM, "rate": 40})
+        for begin in (0, 4096)
+    )
+    assert len(first) == len(later) == 80  # of 1.98 s, with both ends
+    assert kinds(first) == kinds(later) == {}
+    np.testing.assert_allclose(later.runs[0].states, first.runs[0].states, rtol=0, atol=1e-9)
+
+
 def test_every_kind_of_file_gives_the_same_log(tmp_path):
     table = pendulum_table()
     log = read_log(written(tmp_path, table), PENDULUM)

@@ -5,6 +5,7 @@ import gc
 import json
 import multiprocessing
 import os
+import re
 import resource
 from dataclasses import replace
 
@@ -15,7 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from gpmpc.exceptions import RecordingError, SettingError, ShapeError
 from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
-from gpmpc.recording import RecordedSystem, read_run, replay
+from gpmpc.recording import RecordedSystem, _recorder, read_run, replay
 from gpmpc.status import Status
 from tests.recording import runs
 
@@ -367,6 +368,21 @@ def test_a_step_that_no_chunk_can_take_is_refused(tmp_path):
     with runs.recorder(tmp_path / "run.mcap") as recorder:
         with pytest.raises(RecordingError, match="is too large; at most 8388608"):
             recorder.record(replace(step, decision=decision))
+        recorder.record(step)
+    assert len(read_run(tmp_path / "run.mcap").times) == 1
+
+
+def test_the_largest_step_that_is_allowed_is_written_and_one_byte_more_is_refused(tmp_path, monkeypatch):
+    step = runs.make_step(0, np.random.default_rng(0))
+    with runs.recorder(tmp_path / "run.mcap") as recorder:
+        monkeypatch.setattr(_recorder, "LARGEST", 0)
+        with pytest.raises(RecordingError) as caught:
+            recorder.record(step)
+        size = int(re.search(r"a step of (\d+) bytes", str(caught.value))[1])
+        monkeypatch.setattr(_recorder, "LARGEST", 4 * size - 1)
+        with pytest.raises(RecordingError, match="is too large"):
+            recorder.record(step)
+        monkeypatch.setattr(_recorder, "LARGEST", 4 * size)
         recorder.record(step)
     assert len(read_run(tmp_path / "run.mcap").times) == 1
 

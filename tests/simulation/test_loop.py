@@ -118,6 +118,21 @@ def test_a_gust_acts_in_its_window_and_is_integrated():
     assert np.abs(np.delete(pushed, range(5, 10), axis=0)).max() == 0
 
 
+def test_a_gust_moves_the_next_state_of_a_plant_without_derivative():
+    class InSteps:
+        state_names, input_names = Cart.state_names, Cart.input_names
+
+        def successor(self, x, u):
+            return [x[0] + 0.1 * x[1], x[1] + 0.1 * u[0]]
+
+    plant = System(InSteps(), time_step=0.1)
+    flight = fly(plant=plant, disturbances=[Gust({"v": 2.0}, start=0.5, stop=1.0)])
+    free = [step(plant, x, u) for x, u in zip(flight.states[:-1], flight.inputs, strict=True)]
+    pushes = flight.states[1:] - np.array(free)
+    assert np.allclose(pushes[5:10], [0.0, 2.0], atol=1e-12)
+    assert np.abs(np.delete(pushes, range(5, 10), axis=0)).max() == 0
+
+
 def test_a_plant_is_replaced_from_a_time_on():
     heavy = System(HeavyCart(), time_step=0.1, substeps=1)
     flight = fly(disturbances=[Replaced(heavy, start=1.0)])
