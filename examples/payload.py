@@ -66,12 +66,11 @@ loaded, reference, recording = (
     curve(np.array([0.8, 1.6, 0.8]), 300),
     FOLDER / "payload.mcap",
 )
-system = RecordedSystem(loaded.state_names, loaded.input_names, loaded.time_step, loaded.units, pose=loaded.pose)
 flights = {
     "data sheet": fly(loaded, KnownModel(data_sheet, 12, 4), reference),
     "learned without the payload": fly(loaded, learned, reference),
 }
-with McapRecorder(recording, system) as recorder:
+with McapRecorder(recording, RecordedSystem.of(loaded)) as recorder:
     flights["and an estimate of what is new"] = fly(loaded, learned, reference, 0.3, on_step=recorder.record)
 
 above, height = (figure := Figure(figsize=(9, 4), layout="constrained")).subplots(1, 2)

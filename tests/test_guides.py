@@ -12,6 +12,9 @@ from tests.pages import BLOCK, read
 def test_a_system_of_ones_own_is_flown_learned_swept_reported_recorded_and_calibrated(page, tmp_path):
     names, (flown, *_, heavier, swept, report) = page("docs/guide_system.md")
     assert abs(names["flown"].rollout.states[-20:] - [1.0, 0.0]).max() < 0.05
+    recorded = names["run"]
+    assert (recorded.finished, recorded.metadata["units"]["state.angle"], len(recorded.states)) == (True, "rad", 60)
+    assert (recorded.metadata["frames"]["z axis"], recorded.input_bounds.tolist()) == ("up", [[-8.0], [8.0]])
     assert "100 steps of arm with convex" in flown
     assert "200 rows of random data" in flown
     assert "RMSE [rad]" in flown

@@ -134,8 +134,7 @@ def _recorder(
 
     flown = experiment.system
     bounds = [side[0] for side in controller.problem.inputs.by_stage(controller.horizon)]
-    names = flown.state_names, flown.input_names, flown.time_step, flown.units
-    system = RecordedSystem(*names, input_bounds=bounds, pose=flown.pose, z_down=flown.z_down)
+    system = RecordedSystem.of(flown, bounds)
     metadata = {
         "seed": experiment.seed,
         "command": about["provenance"]["command"],

@@ -11,7 +11,7 @@ reads and writes its messages with ``bytes`` in these places: a thousand numbers
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
@@ -20,6 +20,9 @@ from google.protobuf.message_factory import GetMessageClass
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.status import Status
+
+if TYPE_CHECKING:
+    from gpmpc.systems import System
 
 STEP, PLAN, QP = "/step", "/plan", "/qp"
 TOPICS = {STEP: "Step", PLAN: "Plan", QP: "QuadraticProgram"}
@@ -86,6 +89,13 @@ class RecordedSystem:
         ):
             if unknown := sorted({*given} - {*names}):
                 raise SettingError(key, f"must be of {', '.join(names)}; got {', '.join(unknown)}")
+
+    @classmethod
+    def of(cls, system: "System", input_bounds: Any = None) -> "RecordedSystem":
+        """Describes a system by its own names, units and pose, with its limits where no other bounds are given."""
+        bounds = [system.input_lower, system.input_upper] if input_bounds is None else input_bounds
+        names = system.state_names, system.input_names, system.time_step, system.units
+        return cls(*names, input_bounds=bounds, pose=system.pose, z_down=system.z_down)
 
     @property
     def field_units(self) -> dict[str, str]:
