@@ -119,10 +119,13 @@ def _counts_all(said: Statistics, counts: Counter[type]) -> bool:
 
 
 class _Bounded(BytesIO):
-    """A stream whose ``read`` gives all of the length, or raises ``EndOfFile``."""
+    """A stream whose ``read`` gives all of the length, or raises ``EndOfFile``; ``asked`` is the last length."""
+
+    asked = 0
 
     def read(self, size: int | None = -1, /) -> bytes:
-        if (size or 0) > len(self.getbuffer()) - self.tell():
+        self.asked = size or 0
+        if self.asked > len(self.getbuffer()) - self.tell():
             raise EndOfFile
         return super().read(size)
 
@@ -133,7 +136,7 @@ def _parsed(data: bytes) -> Iterator[McapRecord]:
     try:
         yield from StreamReader(stream, skip_magic=True, emit_chunks=True).records
     except EndOfFile:
-        if stream.tell() < len(data):
+        if stream.tell() < len(data) or stream.asked != 1:  # a record begins with one byte, its kind
             raise
 
 

@@ -97,6 +97,17 @@ def test_a_file_of_which_a_record_is_lost_or_repeated_is_not_finished(recorded, 
     assert read_run(path).finished
 
 
+@pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
+def test_a_chunk_whose_last_record_is_shorter_than_it_says_ends_an_unfinished_run(recorded, tmp_path, compression):
+    path, found = tmp_path / "cut.mcap", damage.section(recorded[0].read_bytes())
+    i = max(i for i, (kind, _) in enumerate(found) if kind == damage.CHUNK)
+    content, last = (damage.joined(part) for part in (damage.inside(found[i][1]), damage.inside(found[i][1])[-1:]))
+    for missing in (0, 1, len(last) // 2, len(last) - 9, len(last) - 1):  # of the last record: head or kind alone
+        found[i] = damage.chunk(content[: len(content) - missing], compression)
+        path.write_bytes(damage.sealed(found))
+        assert read_run(path).finished == (missing == 0), missing
+
+
 def with_messages(data, change):
     """The file with other messages, in one chunk, its checksums right."""
     found = damage.section(data)
