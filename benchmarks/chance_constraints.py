@@ -8,7 +8,7 @@ Each plant is learned from 200 of its rows and sent to a set point beyond an upp
   freedom) or an AR(1) process (correlation 0.6), of equal variance;
 - gymnasium's InvertedPendulum-v5 (angle of the pole while the cart is sent from side to side every 25 steps), its
   noise Gaussian;
-- the quadrotor of ``examples/mujoco_quadrotor.xml`` in MuJoCo and RotorPy's Hummingbird (``pip install rotorpy``):
+- the quadrotor of ``gpmpc/systems/quadrotor.xml`` in MuJoCo and RotorPy's Hummingbird (``pip install rotorpy``):
   climbing at a bounded speed by velocity commands, which an inner controller follows, in a wind that changes as an
   AR(1) process of 1 s. Attitude, rotors and wind are not among the states, which are the three velocities.
 
@@ -46,7 +46,7 @@ from gpmpc.systems.gymnasium_ import Environment
 WAYS = ("learned noise", "estimated noise", "estimated noise, adaptive", "true noise")
 ALLOWED, ROWS, SCORES = (0.9, 0.95, 0.99), 600, 399
 RATE = 0.4  # of velocity commands, from one to the next [m/s]
-QUADROTOR = Path(__file__).parents[1] / "examples" / "mujoco_quadrotor.xml"
+QUADROTOR = Path(__file__).parents[1] / "gpmpc" / "systems" / "quadrotor.xml"
 Array = np.ndarray
 
 
@@ -133,7 +133,7 @@ def cart_pole() -> Plant:
     return Plant(
         successor, noise, lambda: np.zeros(4), log, goal=[0.3, 0.0, 0.0, 0.0], bound=(1, 0.1), turn=25,
         weights=([10.0, 1.0, 1.0, 0.1], [1e-2]), limits=[3.0], quantile=NormalDist().inv_cdf, noise=scale,
-        share=0.2,
+        share=0.05,
     )  # fmt: skip
 
 

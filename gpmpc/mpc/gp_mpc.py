@@ -255,7 +255,7 @@ class GPMPC:
             if soft is not None and len(program.feedback):  # there the bounds of inputs are rows, too
                 soft = self.prediction.constraints.softness(len(program.G) - len(soft.linear) + self._rates)
             return self.solver.solve(QuadraticProgram.unchecked(*program[:5]), warm, soft)
-        fits = warm is not None and len(warm.x) == len(program.q) and warm.softness.shape[1] == len(program.lower)
+        fits = warm is not None and warm.arrays[2].shape == program.G.shape
         return self.solver.solve(QuadraticProgram.from_stacked(*program[:5]), warm if fits else None)
 
     def _proposed(

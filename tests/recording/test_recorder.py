@@ -113,12 +113,16 @@ def test_a_replayed_step_gives_the_same_answer(recorded):
 
 
 def test_soft_rows_are_replayed_soft(tmp_path):
-    rng, path = np.random.default_rng(1), tmp_path / "soft.mcap"
+    rng, path = np.random.default_rng(0), tmp_path / "soft.mcap"
     weights = np.where(np.arange(8) % 2, 5.0, np.inf)
     step = runs.make_step(0, rng, soft=SoftRows(quadratic=weights))
     with runs.recorder(path) as recorder:
         recorder.record(step)
-    np.testing.assert_allclose(replay(read_run(path), 0).x, step.decision.solution.x, rtol=0, atol=1e-9)
+    run, solution = read_run(path), step.decision.solution
+    np.testing.assert_allclose(replay(run, 0).x, solution.x, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(run.residuals[0], solution.residuals(), atol=1e-15)
+    hard = solution._replace(softness=np.array([[0.0], [np.inf]]) * np.ones(solution.softness.shape))
+    assert max(solution.residuals()) < 1e-6 < max(hard.residuals())
 
 
 def test_a_run_without_problems_has_none_to_replay_and_to_judge(tmp_path):
