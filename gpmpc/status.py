@@ -16,6 +16,7 @@ class Status(Enum):
     TIME_LIMIT = "stopped at the time limit: raise the limit, shorten the horizon, or warm-start"
     NUMERICAL_TROUBLE = "the residuals could not be brought to the tolerance: check the scaling of the problem"
     INVALID_MEASUREMENT = "the state is not finite: check the estimator; the last plan can bridge a gap"
+    FUNCTION_NOT_FINITE = "a constraint or output, or its gradient, is not finite along the plan: check it at its start"
 
     @property
     def solved(self) -> bool:

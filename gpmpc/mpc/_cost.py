@@ -124,6 +124,10 @@ def by_stage(key: str, values: Array, horizon: int, dims: int) -> Array:
     return np.ascontiguousarray(np.broadcast_to(values, (horizon, *values.shape[values.ndim - dims :])))
 
 
+class FunctionNotFinite(DataError):
+    """A constraint, an output of the cost, or its gradient is not finite along a plan."""
+
+
 def expand_function(
     name: str, function: Any, count: int, states: Array, inputs: Array, parameters: Array | None
 ) -> tuple[Array, Array, Array]:
@@ -132,7 +136,7 @@ def expand_function(
     Raises:
         SettingError: It takes parameters, and there are none.
         ShapeError: It gives another shape.
-        DataError: A value or a derivative is not finite.
+        FunctionNotFinite: A value or a derivative is not finite.
     """
     least, most = _arguments(function)
     arguments = [states, inputs] if parameters is None else [states, inputs, parameters]
@@ -145,6 +149,9 @@ def expand_function(
 
         def stacked(*at: torch.Tensor) -> torch.Tensor:
             value = function(*at, *known)
+            if not isinstance(value, torch.Tensor) or value.shape[:1] != (len(states),):
+                found = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
+                raise ShapeError(f"{name} must give a tensor ({len(states)}, {count}); got {found}")
             return value.unsqueeze(-1) if value.dim() == 1 else value
 
         values, *jacobians = linearize_function(stacked, _FLOAT64, *arguments[: min(most, 2)])
@@ -152,7 +159,7 @@ def expand_function(
         raise ShapeError(f"{name} must give ({len(states)}, {count}); got {values.shape}")
     by_state, by_input = [*jacobians, np.zeros((len(states), count, inputs.shape[1]))][:2]
     if not all(np.isfinite(part).all() for part in (values, by_state, by_input)):
-        raise DataError(f"{name} or its gradient is not finite along the plan")
+        raise FunctionNotFinite(f"{name} or its gradient is not finite along the plan")
     return values, by_state, by_input
 
 

@@ -26,6 +26,7 @@ from gpmpc.dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._condense import Condenser
+from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import CondensedProgram, expand
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc._sqp import FAILURES, Globalization
@@ -126,8 +127,8 @@ class GPMPC:
         try:
             prediction = self.prediction.linearize(self.prediction.initial_guess(request), request)
             return self._improve(prediction, request, clock)
-        except FAILURES:
-            return request.failed_decision(Status.NUMERICAL_TROUBLE, timing=clock.timing)
+        except FAILURES as error:
+            return request.failed_decision(_status_of(error), timing=clock.timing)
 
     def _improve(self, prediction: Prediction, request: Request, clock: "_Stopwatch") -> Decision:
         """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
@@ -197,8 +198,8 @@ class GPMPC:
         for t, prediction in zip(known, made, strict=True):
             try:
                 decisions[t] = self._improve(prediction, requests[t], _Stopwatch(clock.timing.model))
-            except FAILURES:
-                decisions[t] = requests[t].failed_decision(Status.NUMERICAL_TROUBLE, timing=clock.timing)
+            except FAILURES as error:
+                decisions[t] = requests[t].failed_decision(_status_of(error), timing=clock.timing)
         return decisions
 
     def gains(self, decision: Decision, parameters: Array | None = None) -> Array:
@@ -265,6 +266,10 @@ class GPMPC:
         unknowns = np.ascontiguousarray(solution.x, dtype=np.float64)
         inputs, states = call_unchecked(expand, *at, request.references.previous_input, unknowns)
         return Plan(states, inputs, prediction.covariances)
+
+
+def _status_of(error: Exception) -> Status:
+    return Status.FUNCTION_NOT_FINITE if isinstance(error, FunctionNotFinite) else Status.NUMERICAL_TROUBLE
 
 
 class NonlinearGPMPC(GPMPC):

@@ -3,12 +3,13 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.exceptions import DataError, SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.policy import ControlLoop
 from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
@@ -149,7 +150,13 @@ def test_mistakes_are_one_clear_error():
         controller(Inequality(disc)).control(at, reference, None, [np.nan, 0.0])
     with pytest.raises(ShapeError, match=r"h must give \(12, 2\); got \(12, 1\)"):
         controller(Inequality(disc, count=2)).control(at, reference, None, CENTRE)
-    assert not controller(Inequality(lambda x: x[:, 0].log())).control(at, reference).applicable
+    blind = controller(Inequality(lambda x: x[:, 0].log())).control(at, reference)
+    assert (blind.applicable, blind.status) == (False, Status.FUNCTION_NOT_FINITE)
+    with pytest.raises(SolverFailure, match="step 0: a constraint or output, or its gradient, is not finite along the"):
+        ControlLoop(controller(Inequality(lambda x: x[:, 0].log())), on_failure="raise").input(np.zeros(2), np.zeros(2))
+    for wrong, found in ((lambda x: x.sum(), r"\(\)"), (lambda x: "inside", "str")):
+        with pytest.raises(ShapeError, match=rf"h must give a tensor \(12, 1\); got {found}"):
+            controller(Inequality(wrong)).control(at, reference)
     with pytest.raises(SettingError, match="h: must be a function; got float"):
         Inequality(1.0)
     with pytest.raises(SettingError, match="NMPC takes Box and Halfspaces"):
