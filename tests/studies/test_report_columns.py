@@ -1,7 +1,9 @@
 """A measure that is zero in every run takes no column where there is little room, and one where it is not."""
 
 import pytest
+from rich.console import Console
 
+from gpmpc.studies.document import Table, terminal
 from gpmpc.studies.report import read_report as report
 from gpmpc.studies.report import terminal_table
 from tests.studies.made_up import documents, made_up_run, metrics_of
@@ -34,3 +36,12 @@ def test_a_comparison_stands_in_the_page_and_in_the_text_if_there_is_one(tmp_pat
     for name in ("report.md", "report.html"):
         with_it, without = documents(found, lines)[name], documents(found)[name]
         assert all(line in with_it and line not in without for line in [*lines, "Comparison"])
+
+
+def test_in_a_terminal_names_begin_and_numbers_end_below_each_other():
+    console = Console(width=80)
+    with console.capture() as capture:
+        console.print(terminal([Table(["system", "error"], [["cart", 0.25], ["quadrotor", 12.5]])]))
+    cart, quadrotor = (line.rstrip() for line in capture.get().splitlines() if "cart" in line or "quad" in line)
+    assert cart.index("cart") == quadrotor.index("quadrotor")
+    assert len(cart) == len(quadrotor)
