@@ -190,7 +190,8 @@ def function_of_tape(code: Array, constants: Array, sizes: Sequence[int], shape:
         DataError: The operations are no tape's.
     """
     arguments = [casadi.SX.sym(f"argument{i}", size) for i, size in enumerate(sizes)]
-    z, value, work = casadi.vertcat(*arguments), casadi.SX(shape[0] * shape[1], 1), {}
+    z, value = casadi.vertcat(*arguments), casadi.SX(shape[0] * shape[1], 1)
+    work: dict[int, Any] = {}
     try:
         for (operation, to, first, last), constant in zip(code.astype(int).tolist(), constants.tolist(), strict=True):
             if operation == OUTPUT:

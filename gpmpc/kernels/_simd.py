@@ -61,7 +61,8 @@ def _define(result: types.Type, *operands: Any) -> Callable[[Callable], Any]:
             return result(*kinds), generate
 
         typed.__name__, typed.__doc__ = write.__name__, write.__doc__
-        typed.__signature__ = inspect.signature(write)  # numba reads the names of the arguments after the first
+        signature: Any = typed  # numba reads from it the names of the arguments after the first
+        signature.__signature__ = inspect.signature(write)
         return intrinsic(typed)
 
     return make

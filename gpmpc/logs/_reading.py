@@ -141,7 +141,7 @@ def _tabulate(
         usual = max(float(np.median(np.diff(time))), 1 / mapping.rate)
         return resample(time, values, grid, rule, max_gap or 1.5 * usual)
 
-    values = {}
+    values: dict[str, Array] = {}
     for role in ROLES:
         parts = [on_grid(s.topic, samples[s.role + s.name], s.rule, mapping.max_gap) for s in mapping.of(role)]
         values[role] = np.concatenate([np.empty((len(grid), 0)), *parts], axis=1)

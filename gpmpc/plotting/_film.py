@@ -57,7 +57,8 @@ def film(
         raise SettingError("film", f"{what} ({error})") from error
     try:
         scene = _Scene(mujoco, run, str(model), positions, enlarged)
-        figure = Figure(figsize=(_WIDTH / 80, _HEIGHT / 80), layout="none")
+        figure = Figure(figsize=(_WIDTH / 80, _HEIGHT / 80))
+        figure.set_layout_engine("none")  # the picture fills it
         FigureCanvasAgg(figure)
         image = figure.add_axes((0, 0, 1, 1)).imshow(scene.render(0), aspect="auto")
         image.axes.set_axis_off()

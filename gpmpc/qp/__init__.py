@@ -5,7 +5,14 @@ recordings, loads no compiler.
 """
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gpmpc.qp.cvxpy_ import CvxpySolver
+    from gpmpc.qp.dual_active_set import DualActiveSet, Prepared
+    from gpmpc.qp.primal_active_set import PrimalActiveSet
+    from gpmpc.qp.problem import QuadraticProgram, SoftRows
+    from gpmpc.qp.solution import QPSolution, QPSolver, Residuals, make_solution
 
 _MODULES = {
     "CvxpySolver": "cvxpy_",
@@ -20,7 +27,18 @@ _MODULES = {
     "make_solution": "solution",
 }
 
-__all__ = list(_MODULES)
+__all__ = [
+    "CvxpySolver",
+    "DualActiveSet",
+    "Prepared",
+    "PrimalActiveSet",
+    "QPSolution",
+    "QPSolver",
+    "QuadraticProgram",
+    "Residuals",
+    "SoftRows",
+    "make_solution",
+]
 
 
 def __getattr__(name: str) -> Any:

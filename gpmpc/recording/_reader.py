@@ -147,14 +147,16 @@ def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
     recorded = run.problems.get(k)
     if recorded is None:
         raise RecordingError(f"{run.path}: holds no quadratic program of step {k}; it holds {len(run.problems)} others")
-    solve = DualActiveSet().solve if solver is None else solver.solve
+    chosen = DualActiveSet() if solver is None else solver
     inverse, caps = recorded.softness[:, len(recorded.q) :]
     try:
         problem = QuadraticProgram.from_stacked(*recorded[:5])
         if not inverse.any() and np.isinf(caps).all():
-            return solve(problem)
+            return chosen.solve(problem)
+        if not isinstance(chosen, DualActiveSet):
+            raise SettingError("solver", f"must be DualActiveSet for soft rows; got {type(chosen).__name__}")
         with np.errstate(divide="ignore"):
-            return solve(problem, soft=SoftRows(quadratic=1 / inverse, linear=caps))
+            return chosen.solve(problem, soft=SoftRows(quadratic=1 / inverse, linear=caps))
     except GpmpcError as error:
         raise RecordingError(f"{run.path}: step {k}: {error}") from error
 

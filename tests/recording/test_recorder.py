@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from gpmpc.exceptions import RecordingError, SettingError, ShapeError
-from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
+from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram, SoftRows
 from gpmpc.recording import RecordedSystem, _recorder, read_run, replay
 from gpmpc.status import Status
 from tests.recording import runs
@@ -123,6 +123,8 @@ def test_soft_rows_are_replayed_soft(tmp_path):
     np.testing.assert_allclose(run.residuals[0], solution.residuals(), atol=1e-15)
     hard = solution._replace(softness=np.array([[0.0], [np.inf]]) * np.ones(solution.softness.shape))
     assert max(solution.residuals()) < 1e-6 < max(hard.residuals())
+    with pytest.raises(RecordingError, match="step 0: solver: must be DualActiveSet for soft rows"):
+        replay(run, 0, PrimalActiveSet())
 
 
 def test_a_run_without_problems_has_none_to_replay_and_to_judge(tmp_path):
