@@ -28,7 +28,7 @@ def table():
         {
             "t": 0.004 * np.arange(rows),
             "a": signal,
-            "late": motion[93:-107],
+            "late": 1e-4 * motion[93:-107],
             "noisy": rng.normal(0, 0.5, rows) + 3 * np.sin(0.001 * np.arange(rows)),
             "slow": np.repeat(rng.normal(size=rows // 10), 10),
             "u": 2 * signal + 1e-3 * rng.normal(size=rows),
