@@ -9,9 +9,9 @@ flights.
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import Trainer, Transitions, standardize
@@ -73,19 +73,20 @@ flights = {
 with McapRecorder(recording, RecordedSystem.of(loaded)) as recorder:
     flights["and an estimate of what is new"] = fly(loaded, learned, reference, 0.3, on_step=recorder.record)
 
-above, height = (figure := Figure(figsize=(9, 4), layout="constrained")).subplots(1, 2)
+plt.style.use("gpmpc.plotting.gpmpc")
+figure, (above, height) = plt.subplots(1, 2, figsize=(9, 4))
 above.plot(*reference.states[:280, [0, 2]].T, "--", color="0.6", label="reference")
 height.plot(0.04 * np.arange(280), reference.states[:280, 4], "--", color="0.6")
 rmse = {}
-for (name, flight), color in zip(flights.items(), ("#d55e00", "#0072b2", "#009e73"), strict=True):
+for (name, flight), color in zip(flights.items(), ("C1", "C0", "C2"), strict=True):
     rmse[name] = float(np.sqrt(((flight.states - flight.references)[:, 0:6:2] ** 2).sum(axis=1).mean()))
     print(f"{name}: RMSE {rmse[name]:.3f} m")
     above.plot(*flight.states[:, [0, 2]].T, color=color, linewidth=1, label=f"{name}: {100 * rmse[name]:.1f} cm")
     height.plot(flight.times, flight.states[:, 4], color=color, linewidth=1)
 above.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
 height.set(xlabel="time [s]", ylabel="z [m]")
-figure.legend(loc="outside upper center", ncols=4, frameon=False, fontsize="small")
-figure.savefig(FOLDER / "payload.png", dpi=150)
+figure.legend(loc="outside upper center", ncols=4, fontsize="small")
+figure.savefig(FOLDER / "payload.png")
 try:
     film(read_run(recording), loaded.dynamics.path, joint_positions, FOLDER / "payload.gif", frames=60, enlarged=5)
 except SettingError as error:
