@@ -95,6 +95,16 @@ def test_a_tube_that_aims_lower_keeps_the_upper_limit_of_its_violations_at_what_
     assert size < 1 or misses / T > 0.3 * (1 - eta)
 
 
+def test_only_predictions_of_the_stages_that_are_told_count():
+    tube = AdaptiveTube(ConformalTube(np.ones((19, 3)), [[1.0]]), 0.9, largest=5.0)
+    for k in range(20):
+        tube.observe([100.0])  # outside of every bound
+        tube.remember(np.zeros((4, 1)), np.ones((4, 1, 1)), [k % 2 == 0, False, True])
+    assert tube.counts.tolist() == [10, 0, 17]
+    assert tube.misses.tolist() == [10, 0, 17]
+    assert tube.kappas[1] == 1.0 < tube.kappas[0] == tube.kappas[2] == 5.0
+
+
 def test_plans_are_compared_at_their_own_stage_and_those_of_failed_steps_are_left_out():
     tube = AdaptiveTube(ConformalTube(np.ones((19, 3)), [[1.0]]), 0.9, largest=5.0)
     covariances = np.ones((4, 1, 1))
