@@ -8,7 +8,6 @@ resolved configuration, units and frames, flushed to the disk. An unfinished fil
 """
 
 import contextlib
-import fcntl
 import json
 import os
 import platform
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import foxglove
+from filelock import lock_descriptor
 from foxglove.channels import LogChannel
 from foxglove.mcap import MCAPWriteOptions
 from foxglove.messages import Log, LogLevel, Timestamp
@@ -207,15 +207,13 @@ class _Sink:
         self._data, self._position, self._saved = bytearray(), 0, 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o666)
+            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            os.ftruncate(self._descriptor, 0)
-        except OSError as error:
+        if not lock_descriptor(self._descriptor, blocking=False):
             os.close(self._descriptor)
-            raise RecordingError(f"{path}: another process is recording to this file") from error
+            raise RecordingError(f"{path}: another process is recording to this file")
+        os.ftruncate(self._descriptor, 0)
 
     def write(self, data: bytes | bytearray) -> int:
         """Takes all of the data."""

@@ -9,7 +9,6 @@ Runs of a sweep share nothing but the tree of such folders, so any number of pro
 on a folder holds a lock on it, which the system takes back from a process that dies.
 """
 
-import fcntl
 import hashlib
 import json
 import os
@@ -21,12 +20,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from filelock import lock_descriptor
+
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.files import remove_partial, write_whole
 from gpmpc.provenance import flattened, provenance
 
 METRICS, ERROR, CONFIG, RECORDING = "metrics.json", "error.json", "config.yaml", "run.mcap"
 PLAN = "sweep-"  # begins the names of the files that say which runs a sweep asked for
+_LOCK = ".lock"  # locked by who works on the folder; stays, empty
 LONGEST_NAME = 150  # characters of a folder's name; file systems take 255 bytes
 
 
@@ -57,15 +59,14 @@ class RunFolder:
     def locked(self, wait: bool = True) -> Iterator[None]:
         """Makes the folder, clears it of half-written files and keeps other processes from working on it meanwhile."""
         self.path.mkdir(parents=True, exist_ok=True)
-        folder = os.open(self.path, os.O_RDONLY)
+        file = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            fcntl.flock(folder, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            if not lock_descriptor(file, blocking=wait):
+                raise Busy(f"{self.path}: another process works on this run")
             remove_partial(self.path)
             yield
-        except BlockingIOError as error:
-            raise Busy(f"{self.path}: another process works on this run") from error
         finally:
-            os.close(folder)
+            os.close(file)
 
     def begin(self, config: str) -> None:
         """Forgets an earlier failure and keeps the resolved settings."""

@@ -257,7 +257,7 @@ def test_a_folder_is_finished_when_its_metrics_are_there_and_one_process_works_o
     assert folder.result() == {"rmse": 1, "settings": {}}
     with folder.locked(wait=False):
         pass
-    assert sorted(path.name for path in folder.path.iterdir()) == ["config.yaml", "metrics.json"]
+    assert sorted(path.name for path in folder.path.iterdir()) == [".lock", "config.yaml", "metrics.json"]
 
 
 @pytest.mark.parametrize(
