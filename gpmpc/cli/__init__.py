@@ -27,8 +27,9 @@ def main() -> None:
     ignored = signal.getsignal(signal.SIGINT) is not signal.default_int_handler  # as under nohup
     if not ignored:
         signal.signal(signal.SIGINT, interrupt)
-        signal.signal(signal.SIGALRM, interrupt)
-    sys.unraisablehook = interrupt_again
+        if hasattr(signal, "setitimer"):  # not on Windows
+            signal.signal(signal.SIGALRM, interrupt)
+            sys.unraisablehook = interrupt_again
     try:
         from gpmpc.cli._terminal import usable_streams
 

@@ -59,7 +59,11 @@ COMMANDS: dict[str, Command] = {
         add_arguments=completion.add_arguments,
     ),
     "version": Command("Prints the versions of what computes, and the processor", _version),
-    "help": Command("Explains a command", _show_usage),
+    "help": Command(
+        "Explains a command",
+        _show_usage,
+        add_arguments=lambda parser: parser.add_argument("name", metavar="COMMAND", nargs="?"),
+    ),
 }
 _FLAGS = ("--json", "--quiet", "--debug")
 _USAGE = """gpmpc {version}: Gaussian process model predictive control

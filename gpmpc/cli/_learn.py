@@ -20,14 +20,15 @@ _MODEL = "model.safetensors"
 def _add_arguments(parser: Parser) -> None:
     parser.add_argument("mapping", type=Path, help="a YAML file that says what the columns mean")
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="logs: CSV, Parquet, npz, MCAP, ULog")
-    parser.add_argument("--held-out", nargs="+", metavar="RUN", default=[], help="runs to judge on (a fifth of them)")
-    parser.add_argument("--to", type=Path, metavar="DIR", default=Path("learned"), help="where all goes (learned)")
-    parser.add_argument("--points", type=int, default=300, help="rows of a GP (300)")
-    parser.add_argument("--steps", type=int, default=50, help="length of the rollouts (50)")
-    parser.add_argument("--seed", type=int, default=0, help="of every random number (0)")
-    text = "only what a controller can plan with: no feedback of the controller that flew, no late inputs"
+    parser.add_argument("--held-out", nargs="+", metavar="RUN", default=[], help="runs to judge it on (a fifth of all)")
+    text = "folder for the model, its report and its card (learned)"
+    parser.add_argument("--to", type=Path, metavar="DIR", default=Path("learned"), help=text)
+    parser.add_argument("--points", type=int, default=300, help="training rows of a GP, at most (300)")
+    parser.add_argument("--steps", type=int, default=50, help="longest prediction it is judged by (50)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random choices (0)")
+    text = "a model to plan with: without the feedback of the controller that flew, without delayed inputs"
     parser.add_argument("--for-control", action="store_true", help=text)
-    parser.add_argument("--partial", action="store_true", help="take what is whole of unfinished files")
+    parser.add_argument("--partial", action="store_true", help="read unfinished files as far as they are whole")
 
 
 def _learn(given: argparse.Namespace) -> Result:

@@ -164,5 +164,7 @@ def _write(output: Path, content: str | bytes) -> None:
 
 
 COMMAND = Command(
-    "Shows, rescues or exports a recording, or writes a Foxglove layout for it", log, add_arguments=_add_arguments
+    "Shows, rescues or exports a recording, writes its Foxglove layout, inspects logs",
+    log,
+    add_arguments=_add_arguments,
 )

@@ -96,6 +96,8 @@ def _plot(given: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]
 
 
 REPORT = Command(
-    "Puts a tree of runs into one table with figures; compares two groups", _report, add_arguments=_add_report_arguments
+    "Tabulates all runs below a folder, with figures; compares two groups of them",
+    _report,
+    add_arguments=_add_report_arguments,
 )
 PLOT = Command("Draws recorded flights as figures and an animation", _draw, add_arguments=_add_plot_arguments)
