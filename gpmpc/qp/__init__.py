@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gpmpc.qp.cvxpy_ import CvxpySolver
-    from gpmpc.qp.dual_active_set import DualActiveSet, Prepared
+    from gpmpc.qp.dual_active_set import DualActiveSet
     from gpmpc.qp.primal_active_set import PrimalActiveSet
     from gpmpc.qp.problem import QuadraticProgram, SoftRows
     from gpmpc.qp.solution import QPSolution, QPSolver, Residuals, make_solution
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 _MODULES = {
     "CvxpySolver": "cvxpy_",
     "DualActiveSet": "dual_active_set",
-    "Prepared": "dual_active_set",
     "PrimalActiveSet": "primal_active_set",
     "QPSolution": "solution",
     "QPSolver": "solution",
@@ -30,7 +29,6 @@ _MODULES = {
 __all__ = [
     "CvxpySolver",
     "DualActiveSet",
-    "Prepared",
     "PrimalActiveSet",
     "QPSolution",
     "QPSolver",

@@ -1,10 +1,9 @@
 """The memory that the dual active-set kernels work in, besides the record that a solve writes.
 
-Asking the system for memory costs as much as a small solve, so each shape (and each prepared problem) keeps its own.
-Threads may share it, since a solve keeps the interpreter's lock. It is one matrix, whose rows ``open_workspace`` names.
+Asking the system for memory costs as much as a small solve, so each shape keeps its own. Threads may share it, since a
+solve keeps the interpreter's lock. It is one matrix, whose rows ``open_workspace`` names.
 """
 
-import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +11,6 @@ from numba.core import types
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from gpmpc.compiled import inline_njit
 from gpmpc.kernels.linalg import aligned_rows
@@ -20,9 +18,9 @@ from gpmpc.qp._record import HEADER
 
 Array = NDArray[np.float64]
 
-_LIMIT, _TOLERANCE, _SOFT, _TAG, SHARE, _SETTINGS = 0, 1, 2, 3, 4, 5  # a tag of zero: not prepared
-_REALS, _INTEGERS = 5, 27  # rows of ``memory`` at which vectors begin, after settings and traits,
-_REST = 31  # then integers, the factor of the working set, L and rows
+_LIMIT, _TOLERANCE, _SOFT, SHARE, _SETTINGS = range(5)
+_REALS, _INTEGERS = 5, 26  # rows of ``memory`` at which vectors begin, after settings and traits,
+_REST = 30  # then integers, the factor of the working set, L and rows
 _END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
 
 
@@ -36,10 +34,8 @@ class Workspace(NamedTuple):
     q: Any  # (n,)
     G: Any  # (m, n)
     L: Any  # (n, n) with P = L'L
-    rows: Any  # (capacity + 1, n) the w_p of the working set, by place; all M of a prepared problem
-    gram: Any  # (M, M), padded: all K_pq of a prepared problem; empty otherwise
-    v: Any  # (n,) -L^-T q: L x = v without working constraints; of a prepared problem -q
-    seen: Any  # (M,) the multipliers that y of a prepared problem belongs to
+    rows: Any  # (capacity + 1, n) the w_p of the working set, by place
+    v: Any  # (n,) -L^-T q: L x = v without working constraints
     lower: Any  # (M,) bounds, infinite where absent
     upper: Any
     allowed_low: Any  # (M,) outside these a constraint is violated; infinite for a working one
@@ -69,8 +65,6 @@ class Workspace(NamedTuple):
     tolerance: float
     soft: bool  # whether rows are soft
     settings: Any  # of the memory; one is what cancellation left of the pivots of P, as a share of P_ii
-    tag: float  # of a prepared problem, whose L, scale, end, rows and gram are there; zero otherwise
-    prepared: bool
 
 
 class WorkingSet(NamedTuple):
@@ -86,35 +80,19 @@ class WorkingSet(NamedTuple):
     factor: Any  # L_K of K_WW + softness = L_K L_K'
 
 
-def new_memory(softness: Array, n: int, limit: int, tolerance: float, soft: bool, prepared: bool) -> Array:
-    """Returns memory for programs of n variables with these softness and caps (2, M).
-
-    ``prepared`` makes room for the rows of all constraints.
-    """
+def new_memory(softness: Array, n: int, limit: int, tolerance: float, soft: bool) -> Array:
+    """Returns memory for programs of n variables with these softness and caps (2, M)."""
     M = softness.shape[1]
     capacity = most_working(n, M, soft)
     wide = padded(max(M, capacity + 2, _SETTINGS)) + 8  # kernels write whole lanes
-    own = n * padded(n) + (M * (n + padded(M)) if prepared else n * (capacity + 1))
+    own = n * padded(n) + n * (capacity + 1)
     memory = aligned_rows(_REST + capacity + 1 - (-own // wide), wide)  # loads across cache lines take twice the time
     memory[:] = 0.0
     box = np.arange(M) < n
-    memory[0, :_SETTINGS] = limit, tolerance, soft, 0.0, 1.0
+    memory[0, :_SETTINGS] = limit, tolerance, soft, 1.0
     memory[1, :M], memory[2:4, :M] = box, softness
     memory[4, :M] = box * np.minimum(n, (np.arange(M) // _END_STEP + 1) * _END_STEP)
     return memory
-
-
-def prepare_memory(memory: Array, G: Array) -> None:
-    """Completes ``prepared`` memory, in which a solve has left the factor of P, with the rows w_p and K = C P^-1 C'."""
-    m, n = G.shape
-    rest = memory[_REST + most_working(n, n + m, memory[0, _SOFT] != 0.0) + 1 :].reshape(-1)
-    L = np.tril(rest[: n * padded(n)].reshape(n, padded(n))[:, :n])
-    np.fill_diagonal(L, 1.0 / np.diagonal(L))
-    rows = solve_triangular(L, np.vstack([np.eye(n), G]).T, lower=True, trans="T", check_finite=False).T  # L^-T c_p
-    rest[n * padded(n) :][: rows.size] = rows.ravel()
-    M = n + m
-    rest[n * padded(n) + rows.size :][: M * padded(M)].reshape(M, padded(M))[:, :M] = rows @ rows.T
-    memory[0, _TAG] = 1.0 + zlib.crc32(memory[2].tobytes(), zlib.crc32(rest.tobytes()))
 
 
 @inline_njit
@@ -156,18 +134,16 @@ def open_workspace(P, q, G, memory, out):
     """Returns the workspace and the working set in ``memory`` and the record ``out``."""
     n, M = len(q), len(q) + len(G)
     settings, real, whole = memory[0], memory[_REALS:_INTEGERS], memory[_INTEGERS:_REST].view(np.int64)
-    soft, tag = settings[_SOFT] != 0.0, settings[_TAG]
-    prepared, capacity = tag != 0.0, most_working(n, M, soft)
+    soft = settings[_SOFT] != 0.0
+    capacity = most_working(n, M, soft)
     factor, start = memory[_REST : _REST + capacity + 1], (_REST + capacity + 1) * memory.shape[1]
-    count, end = M if prepared else capacity + 1, start + n * padded(n)
-    L, rows = _matrix(memory, start, n, padded(n)), _matrix(memory, end, count, n)  # pyright: ignore[reportCallIssue]
-    gram = _matrix(memory, end + count * n, M * prepared, padded(M))  # pyright: ignore[reportCallIssue]
+    L = _matrix(memory, start, n, padded(n))  # pyright: ignore[reportCallIssue]
+    rows = _matrix(memory, start + n * padded(n), capacity + 1, n)  # pyright: ignore[reportCallIssue]
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     work = Workspace(
-        P, q, G, L, rows, gram, real[0], real[21], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2],
-        memory[3], memory[4], out, x, mu, real[6][:M], real[7], whole[0], whole[1], real[8], real[9], real[10],
-        real[11], real[12], real[13], real[14], real[15], capacity, int(settings[_LIMIT]), settings[_TOLERANCE], soft,
-        settings, tag, prepared,
+        P, q, G, L, rows, real[0], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2], memory[3],
+        memory[4], out, x, mu, real[6][:M], real[7], whole[0], whole[1], real[8], real[9], real[10], real[11],
+        real[12], real[13], real[14], real[15], capacity, int(settings[_LIMIT]), settings[_TOLERANCE], soft, settings,
     )  # fmt: skip
     active = WorkingSet(whole[2], whole[3], real[16], real[17], real[18], real[19], real[20], factor)
     return work, active

@@ -8,16 +8,8 @@ from gpmpc.status import Status
 from tests.qp.problems import feasible_problem, worst_residual
 
 
-def prepared(problem, soft, warm_start=None):
-    prepared = DualActiveSet().prepare(problem.P, problem.G, soft)
-    return prepared.solve(problem.q, problem.lower, problem.upper, warm_start)
-
-
-def changing(problem, soft, warm_start=None):
+def solve(problem, soft, warm_start=None):
     return DualActiveSet().solve(problem, warm_start, soft)
-
-
-DUAL = pytest.mark.parametrize("solve", [prepared, changing])
 
 
 def with_slacks(problem, soft, curvature=1e-6):
@@ -48,10 +40,9 @@ def conflicting_problem(rng, n, m):
     )
 
 
-@DUAL
 @pytest.mark.parametrize("kind", ["quadratic", "linear", "mixed"])
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (4, 6), (10, 25)])
-def test_soft_rows_solve_the_problem_written_out_with_slacks(solve, kind, n, m, rng):
+def test_soft_rows_solve_the_problem_written_out_with_slacks(kind, n, m, rng):
     violated = 0
     for _ in range(10):
         problem = conflicting_problem(rng, n, m)
@@ -73,10 +64,9 @@ def test_soft_rows_solve_the_problem_written_out_with_slacks(solve, kind, n, m, 
     assert violated > 0
 
 
-@DUAL
-def test_an_exact_penalty_above_the_multipliers_leaves_a_feasible_problem_as_it_is(solve, rng):
+def test_an_exact_penalty_above_the_multipliers_leaves_a_feasible_problem_as_it_is(rng):
     problem = feasible_problem(rng, 6, 9)
-    hard = changing(problem, None)
+    hard = solve(problem, None)
     assert np.abs(hard.z).max() > 0.1
     exact = solve(problem, SoftRows(linear=np.full(9, 1.01 * np.abs(hard.z).max())))
     np.testing.assert_allclose(exact.x, hard.x, atol=1e-10)
@@ -84,16 +74,14 @@ def test_an_exact_penalty_above_the_multipliers_leaves_a_feasible_problem_as_it_
     assert cheap.violation().max() > 1e-6
 
 
-@DUAL
-def test_infinite_weights_are_hard_rows(solve, rng):
+def test_infinite_weights_are_hard_rows(rng):
     problem = feasible_problem(rng, 6, 9)
     np.testing.assert_allclose(
-        solve(problem, SoftRows(quadratic=np.full(9, np.inf))).x, changing(problem, None).x, atol=1e-10
+        solve(problem, SoftRows(quadratic=np.full(9, np.inf))).x, solve(problem, None).x, atol=1e-10
     )
 
 
-@DUAL
-def test_rows_that_contradict_each_other_have_a_solution_once_they_are_soft(solve):
+def test_rows_that_contradict_each_other_have_a_solution_once_they_are_soft():
     G = np.array([[1.0, 1.0], [1.0, 1.0]])
     problem = QuadraticProgram(np.eye(2), np.zeros(2), G, [2.0, -np.inf], [np.inf, 1.0])
     assert DualActiveSet().solve(problem).status is Status.INFEASIBLE
@@ -105,8 +93,7 @@ def test_rows_that_contradict_each_other_have_a_solution_once_they_are_soft(solv
     np.testing.assert_allclose(solution.z, [-4.0, 3.0], atol=1e-12)
 
 
-@DUAL
-def test_a_hard_box_stays_hard_however_dear_the_soft_rows(solve):
+def test_a_hard_box_stays_hard_however_dear_the_soft_rows():
     problem = QuadraticProgram(np.eye(1), [0.0], [[1.0]], [5.0], [np.inf], [-1.0], [1.0])
     for soft in (SoftRows(quadratic=[1e6]), SoftRows(linear=[1e6])):
         solution = solve(problem, soft)
@@ -114,8 +101,7 @@ def test_a_hard_box_stays_hard_however_dear_the_soft_rows(solve):
         assert solution.x[0] == pytest.approx(1.0, abs=1e-12)
 
 
-@DUAL
-def test_both_prices_on_one_row_are_two_rows(solve):
+def test_both_prices_on_one_row_are_two_rows():
     # min 1/2 x^2 s.t. x >= 3 at the price w v + 1/2 rho v^2: x = (w + 3 rho) / (1 + rho) while v > 0
     w, rho = 0.5, 2.0
     problem = QuadraticProgram(np.eye(1), [0.0], [[1.0], [1.0]], [3.0, 3.0], [np.inf, np.inf])
@@ -123,9 +109,8 @@ def test_both_prices_on_one_row_are_two_rows(solve):
     assert solution.x[0] == pytest.approx((w + 3.0 * rho) / (1.0 + rho), abs=1e-12)
 
 
-@DUAL
 @pytest.mark.parametrize("kind", ["quadratic", "linear", "mixed"])
-def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(solve, kind, rng):
+def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(kind, rng):
     n, m = 8, 20
     problem = conflicting_problem(rng, n, m)
     weights = 10.0 ** rng.uniform(-1.0, 1.0, m)
@@ -146,10 +131,9 @@ def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(solve, kind,
     assert (at_caps > 0) == (kind != "quadratic")
 
 
-@DUAL
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize("price", [0.5, 40.0])
-def test_a_multiplier_beyond_what_its_row_may_pay_is_a_dual_residual(solve, side, price):
+def test_a_multiplier_beyond_what_its_row_may_pay_is_a_dual_residual(side, price):
     """min 1/2 x^2 with the row |x| >= 100 at the price w a unit: x = w. At any other x the multiplier is no price."""
     bounds = ([100.0], [np.inf]) if side > 0 else ([-np.inf], [-100.0])
     solution = solve(QuadraticProgram(np.eye(1), [0.0], [[1.0]], *bounds), SoftRows(linear=[price]))
