@@ -5,7 +5,6 @@ no command in LaTeX, no formula in a spreadsheet, no control sequence in a termi
 """
 
 import json
-import math
 import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence, Sized
@@ -159,9 +158,9 @@ def json_text(content: Any) -> str:
 
 
 def number(value: float) -> str:
-    """Returns three significant digits: 1.01e-7, 0.0123, 1.46."""
-    if value == 0 or 1e-3 <= abs(value) < 1e4 or not math.isfinite(value):
-        return f"{value:.3g}"
+    """Returns three significant digits: 1.01e-7, 0.0123, 1.46, 1.23e3."""
+    if "e" not in (text := f"{value:.3g}") and not 0 < abs(value) < 1e-3:
+        return text
     mantissa, exponent = f"{value:.2e}".split("e")
     return f"{mantissa}e{int(exponent)}"
 

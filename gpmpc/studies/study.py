@@ -145,7 +145,7 @@ def check_workers(workers: Any) -> None:
 
 
 def derived_seed(*parts: int) -> int:
-    """Returns a seed of its own for every sequence of whole numbers."""
+    """Returns a seed of its own for every sequence of whole numbers below 2^32, among those of one length."""
     return int(np.random.SeedSequence(parts).generate_state(1)[0])
 
 

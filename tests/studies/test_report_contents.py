@@ -192,3 +192,77 @@ def test_wall_times_are_not_compared(tmp_path):
     compared = compare(found, "controller=lqr", "controller=convex")
     assert not {"decision", "training"} & {each.measure for each in compared}
     assert "Times are not compared" in sentences(found, compared, "a", "b")[0]
+
+
+def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
+    tree = tmp_path / "tree"
+    for seed, error in enumerate([0.1, 0.2, 0.4]):
+        made_up_run(tree, *chosen("convex", seed, horizon=10), result=metrics_of(error, failing=2 * (seed == 2)))
+    lost = {"lost": {"step": 3, "reason": "away"}}
+    made_up_run(tree, *chosen("lqr", 0, horizon=10), result=metrics_of(0.5) | lost)
+    made_up_run(tree, *chosen("lqr", 1, horizon=10), error="no\nluck")
+    made_up_run(tree, *chosen("lqr", 2, horizon=10), result=metrics_of(0.5))
+    damaged = tree / folder_name(chosen("lqr", 2, horizon=10)[0]) / METRICS
+    damaged.write_text("{")
+    plan(tree, [chosen(controller, seed, horizon=10)[0] for controller in ("convex", "lqr") for seed in range(4)])
+    found = report(tree)
+    document = report_document(found, ["a line"], images={})
+    head, made, tail = re.split(r"## Made\n\n(.*?)(?=## To)", document.markdown(), flags=re.DOTALL)
+    assert head == (
+        "# tree\n\n4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost."
+        " All of them: horizon=10.\n\n"
+        "| controller | seeds | RMSE [m] | steps outside bounds [%] | failed solves [%] | decision, median [ms] |\n"
+        "| --- | --- | --- | --- | --- | --- |\n"
+        "| convex | 3, 1 missing | 0.2 [0.15, 0.3] | 0 | 0 [0, 5] | 3.1 |\n"
+        "| lqr | 1, 1 lost, 1 failed, 1 missing, 1 skipped | 0.5 | 0 | 0 | 3.1 |\n\n"
+        "Median [first to third quartile] over the seeds. In figures, every run is a dot.\n\n"
+        "## Comparison\n\n- a line\n\n"
+        "## Failed\n\n- controller=lqr,horizon=10,seed=1: no luck\n\n"
+        "## Lost\n\n- controller=lqr,horizon=10,seed=0: step 3, reason away\n\n"
+        f"## Skipped\n\n- {damaged}: is not what a run writes: JSONDecodeError: Expecting property name enclosed in"
+        " double quotes: line 1 column 2 (char 1)\n\n"
+    )
+    assert tail == (
+        f"## To fill the gaps\n\n```\ngpmpc run -m horizon=10 controller=convex seed=3 folder={tree}\n"
+        f"gpmpc run -m horizon=10 controller=lqr seed=1,3 folder={tree}\n```\n\n"
+        "## Settings of all runs\n\n```\ndata.size: null\nhorizon: 10\n```\n"
+    )
+    origins = [run.origin for run in found.runs]
+    dates = sorted({origin["date"] for origin in origins})
+    lines = [line.removeprefix("- ") for line in made.splitlines()]
+    assert lines[0] == "Runs made: " + " to ".join(dict.fromkeys([dates[0], dates[-1]]))
+    assert f"Machine: {origins[0]['machine']}" in lines
+    assert lines[-2] == f"Tree: {tree}"
+    assert origins[0]["machine"].endswith(" cores")
+    header, convex, lqr = document.csv().splitlines()
+    assert header.startswith(
+        "controller,finished,lost,failed,missing,skipped,rmse_q25 [m],rmse_median [m],rmse_q75 [m]"
+    )
+    assert "failed_q25 [%],failed_median [%],failed_q75 [%],decision_q25 [ms]" in header
+    assert convex.split(",")[:6] == ["convex", "3", "0", "0", "1", "0"]
+    assert lqr.split(",")[:6] == ["lqr", "1", "1", "1", "1", "1"]
+    assert [float(value) for value in convex.split(",")[6:9]] == pytest.approx([0.15, 0.2, 0.3])
+    assert "outside" not in document.tex()
+    short = terminal_table(found)
+    assert short.header == ["controller", "seeds", "RMSE\n[m]", "failed\n[%]", "decision\n[ms]"]
+    assert short.rows[0] == ["convex", "3\n1 missing", "0.2\n[0.15, 0.3]", "0\n[0, 5]", "3.1"]
+    assert short.title == "4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost"
+    assert document.links["controller=lqr,horizon=10,seed=1"] == "../controller=lqr,horizon=10,seed=1"
+    assert len(document.links) == 5
+
+
+@pytest.mark.parametrize(
+    ("provenance", "origin"),
+    [
+        (None, {}),
+        ({}, {}),
+        ({"git": {"commit": "0123456789abcdef"}, "created": "now"}, {"date": "now", "commit": "0123456789"}),
+        ({"git": {"commit": "0123456789abcdef", "dirty": True}}, {"commit": "0123456789, changed"}),
+        ({"git": None, "versions": {"gpmpc": "1.2"}}, {"commit": "1.2"}),
+        ({"machine": {"system": "Linux", "cores": 2}}, {"machine": "Linux, 2 cores"}),
+    ],
+)
+def test_where_a_run_comes_from_is_told_as_far_as_it_says_so(provenance, origin, tmp_path):
+    made_up_run(tmp_path, *chosen("lqr", 0), result=metrics_of(0.1) | {"provenance": provenance})
+    (run,) = report(tmp_path).runs
+    assert run.origin == origin

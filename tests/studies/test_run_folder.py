@@ -1,10 +1,12 @@
 """Folders of runs have names of their own, and in what two runs were asked differently is said in words."""
 
+import json
 from itertools import combinations
 
 import pytest
 
-from gpmpc.studies.run_folder import difference, folder_name
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.studies.run_folder import ERROR, LONGEST_NAME, METRICS, RunFolder, difference, folder_name, record
 
 
 def test_other_choices_have_another_folder_even_where_capitals_count_for_nothing():
@@ -43,3 +45,52 @@ def test_settings_differ_from_none_but_themselves():
     settings = [{"a": {"b": value}} for value in (None, 0, 1, "0", [0], {"c": 0})]
     assert all(difference(one, other) for one, other in combinations(settings, 2))
     assert not any(difference(one, one) for one in settings)
+
+
+def test_a_failure_is_kept_with_its_kind_and_where_it_was_raised(tmp_path):
+    folder = RunFolder(tmp_path / "runs" / "one")
+    assert folder.failed_at is None
+    folder.path.mkdir(parents=True)
+    half_written = folder.path / ".metrics.json.7.partial"
+    half_written.touch()
+    with folder.locked():
+        assert not half_written.exists()
+        try:
+            raise ZeroDivisionError("too\n  bad")
+        except ZeroDivisionError as error:
+            folder.fail(error, {"seed": 3})
+    content = json.loads((folder.path / ERROR).read_text())
+    assert (content["seed"], content["error"], content["kind"]) == (3, "too bad", "ZeroDivisionError")
+    assert content["traceback"].startswith("Traceback (most recent call last)")
+    assert content["traceback"].endswith("ZeroDivisionError: too\n  bad\n")
+    assert folder.failed_at == (folder.path / ERROR).stat().st_mtime_ns
+    folder.fail(ValueError(), {})
+    assert json.loads((folder.path / ERROR).read_text())["error"] == "ValueError"
+    folder.begin("steps: 1\n")
+    assert (folder.path / "config.yaml").read_text() == "steps: 1\n"
+    assert not (folder.path / ERROR).exists()
+
+
+def test_a_result_of_other_settings_or_none_is_refused(tmp_path):
+    folder, about = RunFolder(tmp_path), record(["b=2", "a=1"], {"seed": 7, "steps": 3}, "gpmpc run")
+    folder.finish(about)
+    assert folder.result() == folder.result({"seed": 7, "steps": 3}) == json.loads(json.dumps(about))
+    assert (about["choices"], about["seed"], about["schema"]) == (["b=2", "a=1"], 7, 1)
+    assert about["provenance"]["command"] == "gpmpc run"
+    with pytest.raises(SettingError, match=r"finished run of other settings \(steps: 3 then, 4 now\); choose another"):
+        folder.result({"seed": 7, "steps": 4})
+    for text in ("", "[]", "{}", '{"settings": '):
+        (tmp_path / METRICS).write_text(text)
+        with pytest.raises(DataError, match=r"metrics\.json: is not what a run writes: \w+: "):
+            folder.result()
+    (tmp_path / METRICS).unlink()
+    with pytest.raises(DataError, match="FileNotFoundError"):
+        folder.result()
+
+
+def test_a_name_is_the_choices_as_long_as_it_is_short_and_plain():
+    assert folder_name(["a=" + "x" * (LONGEST_NAME - 2)]) == "a=" + "x" * (LONGEST_NAME - 2)
+    longer = folder_name(["a=" + "x" * (LONGEST_NAME - 1)])
+    assert len(longer) == LONGEST_NAME + 11
+    assert longer.startswith("a=" + "x" * (LONGEST_NAME - 2) + "-")
+    assert folder_name(["a=[1]+2-3.5@b"]) == "a=[1]+2-3.5@b"

@@ -1,0 +1,184 @@
+"""A study keeps each record when it is there and runs what is missing; its seeds and names follow from settings."""
+
+import json
+import os
+from concurrent.futures.process import BrokenProcessPool
+
+import numpy as np
+import pytest
+import torch
+from threadpoolctl import threadpool_info
+
+from gpmpc.exceptions import DataError, GpmpcError, SettingError
+from gpmpc.gp import Trainer, Transitions
+from gpmpc.studies import study as studied
+from gpmpc.studies.study import (
+    Trial,
+    TrialStore,
+    check_workers,
+    derived_seed,
+    fingerprint,
+    one_thread,
+    random_rows,
+    read_model,
+    run_study,
+    trained_model,
+)
+
+
+def test_a_store_finds_what_was_kept_behind_any_line_that_was_cut_short(tmp_path):
+    path = tmp_path / "trials.jsonl"
+    store = TrialStore(path)
+    assert store.records == {}
+    assert not path.exists()
+    store.append("a", {"error": 1})
+    store.append("b", {"error": 2})
+    assert [json.loads(line)["fingerprint"] for line in path.read_text().splitlines()] == ["a", "b"]
+    for torn in ('{"fingerprint": "c", "rec', "[1, 2]\n", '{"record": {}}\n', "\n"):
+        path.write_text(path.read_text() + torn)
+    again = TrialStore(path)
+    assert again.records == store.records == {"a": {"error": 1}, "b": {"error": 2}}
+    path.write_text(path.read_text() + '{"fing')
+    torn = TrialStore(path)
+    torn.append("d", {"error": 4})
+    torn.append("e", {"error": 5})
+    assert [line[:6] for line in path.read_text().splitlines()][-3:] == ['{"fing'] * 3
+    assert [*TrialStore(path).records] == [*torn.records] == ["a", "b", "d", "e"]
+
+
+def test_a_record_is_on_the_disk_when_it_is_kept(tmp_path, monkeypatch):
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda _: synced.append((tmp_path / "trials.jsonl").read_text()))
+    TrialStore(tmp_path / "trials.jsonl").append("a", {})
+    assert synced == ['{"fingerprint": "a", "record": {}}\n']
+
+
+def fail(trial):
+    if trial.condition == "bad":
+        raise GpmpcError("no luck")
+    if trial.condition == "singular":
+        raise torch.linalg.LinAlgError("not positive definite")
+    return {"square": trial.seed**2, "threads": torch.get_num_threads()}
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """Trials in the order of their start, in this process; they finish in the opposite order."""
+    started = []
+
+    def in_processes(function, jobs, workers):
+        started.extend((job.seed, workers) for job in jobs)
+        yield from reversed([(index, function(job)) for index, job in enumerate(jobs)])
+
+    monkeypatch.setattr(studied, "in_processes", in_processes)
+    return started
+
+
+def test_what_is_missing_is_run_longest_first_and_records_stand_in_the_order_of_the_trials(tmp_path, started):
+    conditions = {3: "good", 4: "bad", 5: "singular", 6: "good"}
+    trials = [Trial({"name": c}, c, seed, f"print{seed}", float(seed % 5)) for seed, c in conditions.items()]
+    store, told = TrialStore(tmp_path / "trials.jsonl"), []
+    store.append("print6", {"name": "of an older study", "seed": 6, "square": 36})
+    records = run_study(fail, trials, store, 7, told.append)
+    assert started == [(4, 7), (3, 7), (5, 7)]
+    assert records == [
+        {"name": "good", "seed": 3, "square": 9, "threads": 1},
+        {"name": "bad", "seed": 4, "error": "no luck"},
+        {"name": "singular", "seed": 5, "error": "not positive definite"},
+        {"name": "good", "seed": 6, "square": 36},
+    ]
+    assert [record["seed"] for record in told] == [6, 5, 3, 4]  # found, then as they finish
+    assert [*TrialStore(store.path).records] == ["print6", "print5", "print3", "print4"]
+    again = []
+    assert run_study(fail, trials, TrialStore(store.path), None, again.append) == records
+    assert [record["seed"] for record in again] == [3, 4, 5, 6]
+    assert len(started) == 3
+    assert Trial({}, None, 0, "").work == 0
+
+
+def test_other_errors_end_the_study_and_a_worker_that_died_is_named(tmp_path, started, monkeypatch):
+    trials = [Trial({}, None, seed=0, fingerprint="a")]
+    with pytest.raises(ZeroDivisionError):
+        run_study(lambda _: 1 / 0, trials, TrialStore(tmp_path / "trials.jsonl"))
+
+    def die(*_):
+        raise BrokenProcessPool
+        yield
+
+    monkeypatch.setattr(studied, "in_processes", die)
+    with pytest.raises(GpmpcError, match="a worker process died"):
+        run_study(fail, trials, TrialStore(tmp_path / "trials.jsonl"))
+
+
+def test_workers_are_a_positive_whole_number_or_left_to_the_machine():
+    for workers in (None, 1, 8):
+        check_workers(workers)
+    for workers in (0, -1, 1.5, "2"):
+        with pytest.raises(SettingError, match="workers: must be a whole number, 1 or more"):
+            check_workers(workers)
+
+
+def test_rows_and_seeds_follow_from_the_seed_alone():
+    assert random_rows(6, 6, 0) == list(range(6))
+    assert random_rows(6, 0, 0) == []
+    assert random_rows(100, 3, 5) == sorted(np.random.default_rng(5).permutation(100)[:3].tolist())
+    with pytest.raises(DataError, match="size: must be at most 6, the transitions at hand; got 7"):
+        random_rows(6, 7, 0)
+    seeds = [derived_seed(*parts) for parts in ((0, 0), (0, 1), (1, 0), (1, 1), (2**32 - 1, 0))]
+    assert len({*seeds}) == len(seeds)
+    assert derived_seed(1, 2, 3) == np.random.SeedSequence([1, 2, 3]).generate_state(2)[0]
+
+
+def test_a_fingerprint_differs_with_settings_arrays_and_code_and_with_nothing_else(tmp_path):
+    array, source = np.arange(6.0), tmp_path / "own.py"
+    source.write_text("x = 1\n")
+    prints = [
+        fingerprint(*arguments, code=code)
+        for arguments in (({"a": 1, "b": 2},), ({"a": 2, "b": 1},), ([1], array), ([1], array + 1), ([1], array[:5]))
+        for code in ((), ("status.py",), ("st*.py",), ("studies/*.py",), (str(source),))
+    ]
+    assert len({*prints}) == len(prints)
+    assert {len(each) for each in prints} == {32}
+    assert fingerprint({"b": 2, "a": 1}) == prints[0]
+    assert fingerprint([1], array[::-1][::-1]) == fingerprint([1], torch.arange(6.0)) == prints[10]
+    assert fingerprint([1], None, array) == prints[10]
+    assert fingerprint(tmp_path) == fingerprint(str(tmp_path))  # what is no plain data counts by its text
+    other = tmp_path / "other.py"
+    other.write_text("x = 2\n")
+    assert fingerprint(0, code=[str(source)]) != fingerprint(0, code=[str(other)])
+
+
+def test_a_model_is_trained_once_for_its_settings_data_and_seed(tmp_path):
+    rng, calls = np.random.default_rng(0), []
+    states = torch.from_numpy(rng.normal(size=(12, 1)))
+    data = Transitions(states, torch.zeros(12, 1) + states**2, 0.5 * states)
+
+    def train(data, seed):
+        calls.append((len(data), seed, torch.get_num_threads()))
+        return Trainer(restarts=0)(data, seed=seed)
+
+    path = trained_model(train, {"a": 1}, data, 4, tmp_path)
+    assert path == trained_model(train, {"a": 1}, data, 4, tmp_path)
+    assert calls == [(12, 4, 1)]
+    others = [({"a": 2}, data, 4), ({"a": 1}, data[:9], 4), ({"a": 1}, data, 5)]
+    paths = {path, *(trained_model(train, *each, tmp_path) for each in others)}
+    assert len(paths) == len(calls) == 4
+    assert sorted(paths) == sorted((tmp_path / "models").iterdir())
+    model, query = read_model(path), torch.zeros(1, 1)
+    assert model is read_model(path)
+    assert model.state_dim == model.input_dim == 1
+    assert torch.isfinite(model.predict(query, query).mean).all()
+
+
+def test_one_thread_is_one_and_as_many_as_before_afterwards():
+    torch.set_num_threads(2)
+    try:
+        with one_thread():
+            assert torch.get_num_threads() == 1
+            assert all(library["num_threads"] == 1 for library in threadpool_info())
+        assert torch.get_num_threads() == 2
+        with pytest.raises(ZeroDivisionError), one_thread():
+            1 / 0  # noqa: B018
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(1)
