@@ -255,14 +255,6 @@ class GPPosterior:
         k, difference = self._correlations(state, input)
         return self._belief(k, state), *self._jacobian(k, difference)
 
-    def mean_hessian(self, state: Tensor, input: Tensor | None = None) -> Tensor:
-        """The mean's second derivatives by the state (*batch, k, n, n)."""
-        k, difference = self._correlations(state, input)
-        z = difference[..., : self.state_dim] / self.lengthscales[:, None, : self.state_dim]
-        weighted = k * self.weights
-        total = weighted.sum(-1)[..., None, None] * torch.diag_embed(self.lengthscales[:, : self.state_dim] ** -2)
-        return (weighted[..., None] * z).mT @ z - total
-
     def variance_reduction(self, k: Tensor, outputs: list[int] | slice = slice(None)) -> Tensor:
         """|L_a^-1 k_a|^2 (*batch, k) of correlations k (*batch, k, N): by how much the data reduce the variance.
 

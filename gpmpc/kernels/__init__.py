@@ -124,15 +124,10 @@ def linearize(
 
 
 def point_with_jacobian(packed: Packed, x: ArrayLike, u: ArrayLike) -> Expansion:
-    """Mean and variance at a certain point, with the derivatives that linearised propagation needs.
-
-    Args:
-        packed: The GPs.
-        x: State (n,) or (H, n).
-        u: Control (m,) or (H, m).
+    """Mean and variance at a certain state x and control u, with the derivatives that linearised propagation needs.
 
     Raises:
-        ShapeError: x or u do not fit the model.
+        ShapeError: x (n,) or (H, n) or u (m,) or (H, m) do not fit the model.
     """
     x, u, single = _points(packed, x, u)
     H, k, n, m = len(x), packed.output_dim, packed.state_dim, packed.input_dim

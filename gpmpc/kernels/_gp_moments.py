@@ -28,6 +28,7 @@ import numpy as np
 from numpy import ndarray
 
 from gpmpc.compiled import compiled, inline_njit, njit_inner, njit_noalloc
+from gpmpc.kernels._packed import GPArrays
 from gpmpc.kernels._rows import (
     add_products,
     largest_size,
@@ -54,8 +55,9 @@ VALUE, JACOBIAN, CROSS = 0, 1, 2  # derivatives of nothing, of M and V, of J as 
 
 
 class _Belief(NamedTuple):
-    """A belief, and the points relative to its mean and input."""
+    """A belief, and the GPs with their points relative to its mean and input."""
 
+    gp: GPArrays
     S: ndarray  # (n, n)
     x: ndarray  # x_i - mu (n, P)
     u: ndarray  # u_i - u (m, P)
@@ -116,37 +118,35 @@ def evaluate_moments(order, diagonal, gp, precision, mu, S, u, out):
     matrices = np.empty((5, n, n))
     scratch = _Scratch(matrices[0], matrices[1], matrices[2], matrices[3], matrices[4], rows[n + m], rows[n + m + 1])
     for h in range(len(mu)):
-        belief = _Belief(S[h], rows[:n], rows[n : n + m])
+        belief = _Belief(gp, S[h], rows[:n], rows[n : n + m])
         for d in range(n + m):
             at, row, point = mu[h, d] if d < n else u[h, d - n], rows[d], gp.points[d]
             for j in range(padded):
                 row[j] = point[j] - at
         for a in range(k):
-            _evaluate_output(belief, gp, a, terms, scratch)
+            _evaluate_output(belief, a, terms, scratch)
             out.M[h, a] = terms.M[a]
             multiply_transposed(terms.G[a], terms.first[a], out.J[h, a])
             if order >= JACOBIAN:
                 to, sums = (out.J[h, a], out.dM_dS[h, a], out.dM_du[h, a]), (terms.first[a], terms.second[a])
-                _differentiate_sum(terms.weighted[a], 1.0, belief, gp, a, terms, *sums, scratch, to)
+                _differentiate_sum(terms.weighted[a], 1.0, belief, a, terms, sums, scratch, to)
             if order == CROSS:
-                _differentiate_J(belief, gp, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a])
+                _differentiate_J(belief, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a])
         for a in range(k):
             reduction = reduce_variance(precision.inverse_cholesky[a], terms.q[a], scratch.row)
             out.V[h, a, a] = np.exp(gp.log_signal[a]) - reduction
             if order >= JACOBIAN:
-                to, sums = (
-                    (out.dV_dmu[h, a, a], out.dV_dS[h, a, a], out.dV_du[h, a, a]),
-                    (terms.e_first[a], terms.e_second[a]),
-                )
+                to = out.dV_dmu[h, a, a], out.dV_dS[h, a, a], out.dV_du[h, a, a]
+                sums = terms.e_first[a], terms.e_second[a]
                 multiply(scratch.row, terms.q[a], scratch.row)  # (K_a + sn2_a I)^-1 q_a becomes e
-                terms.e[a] = _differentiate_sum(scratch.row, -2.0, belief, gp, a, terms, *sums, scratch, to)
+                terms.e[a] = _differentiate_sum(scratch.row, -2.0, belief, a, terms, sums, scratch, to)
             for b in range(a, a + 1 if diagonal else k):
-                P_sum = _evaluate_pair(belief, gp, a, b, terms, pair, precision.centred[a], order >= JACOBIAN, scratch)
+                P_sum = _evaluate_pair(belief, a, b, terms, pair, precision.centred[a], order >= JACOBIAN, scratch)
                 out.V[h, a, b] += P_sum
                 out.V[h, b, a] = out.V[h, a, b]
                 if order >= JACOBIAN:
                     to = out.dV_dmu[h, a, b], out.dV_dS[h, a, b], out.dV_du[h, a, b]
-                    _differentiate_pair(belief, gp, a, b, terms, pair, P_sum, scratch, to)
+                    _differentiate_pair(belief, a, b, terms, pair, P_sum, scratch, to)
                     out.dV_dmu[h, b, a], out.dV_dS[h, b, a], out.dV_du[h, b, a] = to
 
 
@@ -162,10 +162,10 @@ def _make_terms(k, n, padded):
 
 
 @njit_inner
-def _evaluate_output(belief, gp, a, terms, scratch):
+def _evaluate_output(belief, a, terms, scratch):
     """Fills the terms of output a, but for ``second`` and the sums over e."""
     use_widest_registers()
-    n, log_q, whiten = len(belief.S), scratch.row, scratch.x
+    gp, n, log_q, whiten = belief.gp, len(belief.S), scratch.row, scratch.x
     D, D_u = gp.inverse_squares[a, :n], gp.inverse_squares[a, n:]
     # log q_i = log sf2 - 1/2 log|I + S D| - 1/2 |W (x_i - mu)|^2 - 1/2 (u_i - u)' D_u (u_i - u)
     terms.half_logdet[a] = condition(belief.S, D, whiten, terms.G[a])
@@ -188,10 +188,10 @@ def _evaluate_output(belief, gp, a, terms, scratch):
 
 
 @njit_noalloc
-def _differentiate_sum(v, factor, belief, gp, a, terms, first, second, scratch, to):
+def _differentiate_sum(v, factor, belief, a, terms, sums, scratch, to):
     """Writes ``factor`` sum_i v_i dlog q_ai; fills the sums of v_i z_i and v_i z_i z_i', and returns that of v_i."""
-    dmu, dS, du = to
-    n, total, G, D, x = len(belief.S), row_sum(v), terms.G[a], gp.inverse_squares[a], scratch.x
+    (first, second), (dmu, dS, du) = sums, to
+    n, total, G, D, x = len(belief.S), row_sum(v), terms.G[a], belief.gp.inverse_squares[a], scratch.x
     project(v, terms.z[a], first)
     project(v, belief.u, du)
     second_moments(v, terms.z[a], scratch.other, second)
@@ -208,9 +208,9 @@ def _differentiate_sum(v, factor, belief, gp, a, terms, first, second, scratch, 
 
 
 @njit_inner
-def _differentiate_J(belief, gp, a, terms, J, dJ_dS, dJ_du):
+def _differentiate_J(belief, a, terms, J, dJ_dS, dJ_du):
     """dJ/dS = 1/2 sum beta q (w w w - three times G'D with w), dJ/du = sum beta q w c'."""
-    (n, padded), G, D = belief.x.shape, terms.G[a], gp.inverse_squares[a]
+    (n, padded), G, D = belief.x.shape, terms.G[a], belief.gp.inverse_squares[a]
     w, work, sums, A = aligned_rows(n, padded), aligned_rows(2, padded), np.empty(n), np.empty((n, n))
     for c in range(n):
         for d in range(n):
@@ -231,9 +231,9 @@ def _differentiate_J(belief, gp, a, terms, J, dJ_dS, dJ_du):
 
 
 @njit_inner
-def _evaluate_pair(belief, gp, a, b, terms, pair, E, derivatives, scratch):
+def _evaluate_pair(belief, a, b, terms, pair, E, derivatives, scratch):
     """Returns sum_ij P_ij; its parts go to ``pair``, G_ab to ``scratch``."""
-    n, T_ab, whiten = len(belief.S), scratch.F, scratch.x
+    gp, n, T_ab, whiten = belief.gp, len(belief.S), scratch.F, scratch.x
     D_a, D_b = gp.inverse_squares[a, :n], gp.inverse_squares[b, :n]
     r = terms.half_logdet[a] + terms.half_logdet[b] - condition(belief.S, D_a + D_b, whiten, scratch.G_ab)
     product(scratch.G_ab, belief.S, T_ab)
@@ -250,7 +250,7 @@ def _evaluate_pair(belief, gp, a, b, terms, pair, E, derivatives, scratch):
         multiply(weights_i, terms.z[a, d], pair.weighted_z[d])
     across = math.sqrt(largest_square(pair.left) * largest_square(terms.z[b]))  # Cauchy and Schwarz
     near = largest_size(pair.rise) + largest_size(pair.fall) + across <= NEAR_ZERO
-    _sum_pairs(gp.size, a == b, near, derivatives, pair, weights_i, weights_j, terms.z[b], E)
+    _sum_pairs(gp.size, a == b, near, derivatives, pair, (weights_i, weights_j), terms.z[b], E)
     multiply(pair.p_i, weights_i, pair.p_i)
     multiply(pair.p_j, weights_j, pair.p_j)
     if derivatives:
@@ -260,10 +260,10 @@ def _evaluate_pair(belief, gp, a, b, terms, pair, E, derivatives, scratch):
 
 
 @njit_noalloc
-def _sum_pairs(size, same, near, derivatives, pair, weights_i, weights_j, z, E):
+def _sum_pairs(size, same, near, derivatives, pair, weights, z, E):
     """Writes the sums over i and j of ``pair`` before they are multiplied by the weight of their own point."""
     use_widest_registers()
-    n, padded = z.shape
+    (n, padded), (weights_i, weights_j) = z.shape, weights
     pair.p_j[:] = 0.0
     if derivatives:
         pair.p_i[:], pair.g[:] = 0.0, 0.0
@@ -327,12 +327,12 @@ def _multiply_block(values, E, at):
 
 
 @njit_inner
-def _differentiate_pair(belief, gp, a, b, terms, pair, P_sum, scratch, to):
+def _differentiate_pair(belief, a, b, terms, pair, P_sum, scratch, to):
     """Adds the derivatives of the pair's sum to those of V_ab."""
     dmu, dS, du = to
     n, same = len(belief.S), a == b
     G_ab, x, y, H = scratch.G_ab, scratch.x, scratch.y, scratch.H
-    D_a, D_b = gp.inverse_squares[a], gp.inverse_squares[b]
+    D_a, D_b = belief.gp.inverse_squares[a], belief.gp.inverse_squares[b]
     sums, controls = np.empty((2, n)), np.empty((2, len(du)))
     # y = sum_ij P_ij (z_ai + z_bj) (z_ai + z_bj)' + U_ij (z_ai z_bj' + z_bj z_ai')
     second_moments(pair.p_i, terms.z[a], scratch.row, x)
@@ -358,8 +358,8 @@ def _differentiate_pair(belief, gp, a, b, terms, pair, P_sum, scratch, to):
     # U_ij = beta_ai beta_bj q_ai q_bj, or E_ij q_ai q_aj: what F_a and F_b make of the sums of each output alone
     e_share = 1.0 if same else 0.0
     U_sum = terms.M[a] * terms.M[b] - e_share * terms.e[a]
-    _add_difference(dmu, H, terms, a, U_sum, terms.M[b], e_share, D_a, D_b, scratch)
-    _add_difference(dmu, H, terms, b, U_sum, terms.M[a], e_share, D_b, D_a, scratch)
+    _add_difference((dmu, H), terms, a, U_sum, terms.M[b], e_share, (D_a, D_b), scratch)
+    _add_difference((dmu, H), terms, b, U_sum, terms.M[a], e_share, (D_b, D_a), scratch)
     project(pair.p_i, belief.u, controls[0])
     project(pair.p_j, belief.u, controls[1])
     for c in range(len(du)):
@@ -371,11 +371,12 @@ def _differentiate_pair(belief, gp, a, b, terms, pair, P_sum, scratch, to):
 
 
 @njit_noalloc
-def _add_difference(dmu, dS, terms, a, U_sum, M, e_share, D, D_other, scratch):
+def _add_difference(to, terms, a, U_sum, M, e_share, scales, scratch):
     """Adds sum_i U_i F z_i to dmu and sum_i U_i (y_i y_i' - w_i w_i') - sum_ij U_ij F D to dS, F = G_ab' - G_a'.
 
     U_i = sum_j U_ij = M beta_i q_i - e_share e_i, y_i = G_ab' z_i, w_i = G_a' z_i.
     """
+    (dmu, dS), (D, D_other) = to, scales
     F, moment, x, G_a, G_ab = scratch.F, scratch.y, scratch.x, terms.G[a], scratch.G_ab
     n = len(F)
     for c in range(n):

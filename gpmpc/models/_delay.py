@@ -109,11 +109,6 @@ class DelayedModel(LinearWrapper):
             belief = propagator(self.model, belief, acting)
         return belief if w == 1 else DelayedModel(self.model, w).augmented(belief, queue[-1:])
 
-    def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "DelayedModel":
-        """Copies the model to another device or type."""
-        inner: Any = self.model
-        return DelayedModel(inner.to(device, dtype), self.delay)
-
     @property
     def _share(self) -> float:
         """The part of a step w in which the older of two inputs acts."""

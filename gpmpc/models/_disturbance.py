@@ -11,7 +11,6 @@ the tube. For a rigid body, columns of E of the velocities are a force over the 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -104,12 +103,6 @@ class DisturbedModel(LinearWrapper):
         covariance = padded(belief.covariance, self.state_dim)
         own = torch.as_tensor([0.0] * self.model.state_dim + list(std), dtype=self.dtype, device=self.device).square()
         return Gaussian(torch.cat([belief.mean, zero], dim=-1), covariance + torch.diag(own))
-
-    def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "DisturbedModel":
-        """Copies the model to another device or type."""
-        inner: Any = self.model
-        effect = self.effect.to(device=device, dtype=dtype)
-        return DisturbedModel(inner.to(device, dtype), effect, self.std, self.decay)
 
     @property
     def _decays(self) -> Sequence[float]:

@@ -89,19 +89,6 @@ class Features:
         ]
         return torch.stack(parts, dim=-1), input[..., list(self.inputs)]
 
-    def jacobian(self, state: Tensor) -> Tensor:
-        """The features' derivatives by the state (*batch, d, n), in torch."""
-        matrix = torch.as_tensor(self._by_column, dtype=state.dtype, device=state.device)
-        if not self.angles:
-            return matrix.expand(*state.shape[:-1], *matrix.shape)
-        one = torch.ones_like(state[..., 0])
-        slopes = [
-            part
-            for i in self.states
-            for part in ((state[..., i].cos(), -state[..., i].sin()) if i in self.angles else (one,))
-        ]
-        return torch.stack(slopes, dim=-1)[..., None] * matrix
-
     def linearize(self, states: Array, inputs: Array) -> tuple[Array, Array, Array | None]:
         """Features (K, d), selected inputs (K, m_s), each feature's derivative (K, d) by its state, None for one."""
         z, v, sines = states[:, self.columns], inputs[:, self._selected], self.sines

@@ -18,10 +18,8 @@ from torch import Tensor
 from gpmpc.dynamics import (
     Array,
     Linearized,
-    batched_jacobian,
     check_destination,
     check_query,
-    predict_by_autograd,
     tensors_for,
     to_array,
 )
@@ -224,24 +222,6 @@ class ResidualModel:
         mean = mean + (B @ d.mean[..., None])[..., 0]
         return Linearized(mean, A + B @ by_state, G + B @ by_input, V)
 
-    def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
-        """``predict`` with its mean's derivatives by x (*batch, n, n) and u (*batch, n, m), which torch can follow."""
-        input = state[..., :0] if input is None else input
-        if callable(self.B):
-            return predict_by_autograd(self, state, input)
-        belief = self.predict(state, input)
-        _, by_features, by_inputs = self.residual.predict_with_jacobian(*self.features(state, input))
-        if isinstance(self.nominal, Affine):
-            A, G = (part.expand(*state.shape[:-1], *part.shape) for part in (self.nominal.A, self.nominal.B))
-        else:
-            (_,), (A, G) = batched_jacobian(lambda x, u: (self.nominal(x, u),), (state, input))
-        places = torch.tensor(list(self.inputs), dtype=torch.long, device=self.device)
-        return (
-            belief,
-            A + self.B @ by_features @ self.features.jacobian(state),
-            G.index_add(-1, places, self.B @ by_inputs),
-        )
-
     @cached_property
     def _constant_effect(self) -> Array:
         return to_array(torch.as_tensor(self.B))
@@ -302,18 +282,10 @@ def train_residual(
     nominal: Nominal | None = None,
     seed: int = 0,
 ) -> Training:
-    """Trains a residual model of all states and inputs, as ``ResidualModel.train``; returns the whole training.
+    """Trains a residual model of all states and inputs, and returns the whole training.
 
-    Args:
-        trainer: A ``Trainer`` or ``SparseTrainer``.
-        transitions: What was observed.
-        angles: Indices of states that are seen as sine and cosine.
-        nominal: f0; None learns the difference of two states.
-        seed: Of the random starts.
-
-    Raises:
-        SettingError: An index is out of range, or there is no trainer.
-        TrainingError: An output could not be trained.
+    Arguments and errors are those of ``ResidualModel.train``; without a nominal model the difference of two states is
+    learned.
     """
     known = Affine.identity(transitions.state_dim, transitions.input_dim) if nominal is None else nominal
     model, training = _train(known, transitions, None, (None, None, angles), trainer, seed)

@@ -1,6 +1,8 @@
 """What models around another model, with further states, have in common."""
 
+from dataclasses import fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,6 +54,13 @@ class LinearWrapper(Wrapper):
     def matrices(self) -> tuple[Array, Array, Array, Array]:
         """Z (m, k), W (m, m), L (k, k) and M (k, m), for k states z."""
         raise NotImplementedError
+
+    def to(self, device: Any = None, dtype: torch.dtype | None = None) -> Any:
+        """Copies the model to another device or type."""
+        own: Any = self
+        parts = {field.name: getattr(own, field.name) for field in fields(own)}
+        moved = {name: part.to(device=device, dtype=dtype) for name, part in parts.items() if isinstance(part, Tensor)}
+        return replace(own, model=own.model.to(device, dtype), **moved)
 
     def predict(self, state: Tensor, input: Tensor) -> Gaussian:
         """The next state's distribution at z (*batch, k) and u (*batch, m), without the noise."""

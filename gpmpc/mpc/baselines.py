@@ -61,15 +61,12 @@ _STATUSES = {
 class NMPC:
     """Nonlinear MPC on the true model.
 
+    Problem, horizon and initial input are those of ``GPMPC``, and so are the errors. Soft constraints get one slack
+    variable a row and stage, with their price.
+
     Args:
         plant: The model, and what ``x_{i+1} = plant(x_i, u_i)`` means.
-        problem: Weights and constraints. Soft ones get one slack variable a row and stage, with their price.
-        horizon: H, the number of predicted states.
-        initial_input: As for ``GPMPC``: the first guess, and where rates and increments start.
         tolerance: IPOPT's, on the scaled optimality conditions.
-
-    Raises:
-        SettingError: As for ``GPMPC``.
     """
 
     def __init__(
@@ -122,11 +119,7 @@ class LQR:
     where it has them, else the last input. Every input of the plan is clipped to the input box and to the rate bounds,
     each seen from the one before; it takes no constraints of states.
 
-    Args:
-        model: What was learned; its variance is not used.
-        problem: Weights and bounds.
-        horizon: H, the number of predicted states.
-        initial_input: As for ``GPMPC``.
+    Arguments are those of ``GPMPC``; of the model the mean is used.
 
     Raises:
         SettingError: As for ``GPMPC``; or constraints of states.
@@ -179,15 +172,9 @@ class LQR:
 
 
 class StateFormMPC:
-    """GP-MPC in states and inputs, one program a step.
+    """GP-MPC in states and inputs, one program a step; arguments that are not listed are those of ``GPMPC``.
 
     Args:
-        model: What was learned.
-        propagator: How the belief moves.
-        problem: Weights and bounds.
-        horizon: H.
-        initial_input: The input before the first step (m,).
-        prediction: As for ``GPMPC``.
         constraints: Of the states s_0 .. s_H (H + 1, p), whose first n columns are the means, and the inputs (H, m),
             two CVXPY variables: a list of constraints. Called once.
         solver: A CVXPY solver.

@@ -206,10 +206,10 @@ class Request(NamedTuple):
         if plan is not None:
             first, guessed = _read_plan(plan, horizon, n, m)
         given, limits = (state, covariance, states, inputs), problem.inputs.sides
-        finite = call_unchecked(_check, *given, last, first, *limits, guess)
+        finite = call_unchecked(_check, *given, last, first, limits, guess)
         if not finite[3]:
             last = _array(initial_input)
-            call_unchecked(_check, *given, last, first, *limits, guess)
+            call_unchecked(_check, *given, last, first, limits, guess)
         kappas = None if reference.kappas is None else _array(reference.kappas)
         for name, values, known in (("states", states, finite[1]), ("inputs", inputs, finite[2])):
             if not known:
@@ -318,9 +318,9 @@ def _unwrapped(states: Array, state: Array, previous: Decision | None, angles: S
 
 
 @compiled(locked=True)
-def _check(state, covariance, states, inputs, last, plan, lower, upper, guess):
+def _check(state, covariance, states, inputs, last, plan, limits, guess):
     """Writes the initial guess; returns whether belief, reference states and inputs, and last input are finite."""
-    H, m = guess.shape
+    (H, m), (lower, upper) = guess.shape, limits
     for k in range(H):
         for j in range(m):
             u, at = plan[min(k + 1, len(plan) - 1), j] if len(plan) > 0 else last[j], min(k, len(lower) - 1)

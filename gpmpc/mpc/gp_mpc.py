@@ -220,7 +220,7 @@ class GPMPC:
         """
         model, linearizer = self.prediction.model, self.prediction.linearizer
         features = getattr(model, "features", None)
-        if features is None or getattr(linearizer.propagator, "hessian", False):
+        if features is None:
             return None
         (N, d), n, size = features.shape, model.state_dim, self.horizon * self.problem.input_dim
         p = len(self.prediction.costs.quadratic.terminal) * n

@@ -107,11 +107,6 @@ class Composition:
             moved = torch.einsum("ja,...aic->...jic", self.B, moved)
         return moved + moved.transpose(-3, -2)
 
-    def outer(self, hessian: Tensor) -> Tensor:
-        """Second derivatives of B f by the whole state (*batch, n, n, n), from those of f (*batch, k, n_s, n_s)."""
-        hessian = self._by_state(hessian, 2)
-        return hessian if self.B is None else torch.einsum("ia,...acd->...icd", self.B, hessian)
-
     def _by_state(self, derivative: Tensor, axes: int = 1) -> Tensor:
         """Extends a derivative by the states of f (its last axes) to one by the whole state."""
         if self.states is None:

@@ -1,11 +1,10 @@
 """Propagation through a model's expansion at the belief's mean, as in an extended Kalman filter.
 
-With A = dm/dx, H_a = d2m_a/dx2 at (mu, u) and the model's own variance there,
+With A = dm/dx at (mu, u) and the model's own variance there,
 
-    mu+ = m(mu, u) (+ 1/2 tr(H_a S)),   Sigma+ = A S A' + Var[f(mu, u)] (+ 1/2 tr(H_a S H_b S)),   Cov[x, x+] = S A'
+    mu+ = m(mu, u),   Sigma+ = A S A' + Var[f(mu, u)],   Cov[x, x+] = S A'
 
-The terms in brackets are those of the second-order filter (Jazwinski, 1970, section 9.3; Girard, Rasmussen, Quinonero
-Candela and Murray-Smith, 2003, for GPs). Mean equivalence leaves A S A' out (Hewing, Kabzan and Zeilinger, 2020).
+Mean equivalence leaves A S A' out (Hewing, Kabzan and Zeilinger, 2020).
 """
 
 from dataclasses import replace
@@ -18,7 +17,6 @@ from gpmpc.dynamics import predict_with_jacobian
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import GPPosterior
-from gpmpc.propagation._composition import Composition
 from gpmpc.propagation._propagator import Propagation, Propagator, checked_input, projected
 from gpmpc.propagation._sensitivity import Sensitivity
 
@@ -73,33 +71,30 @@ def _by_torch(model: GPPosterior, state: Tensor, input: Tensor) -> list[Tensor]:
 
 
 class Linearization(Propagator):
-    """First order, or with the Hessian terms second.
+    """First order.
 
     Args:
-        hessian: Adds the second-order terms.
         process_noise: Adds the model's noise covariance.
     """
 
-    def __init__(self, hessian: bool = False, process_noise: bool = False):
-        self.hessian, self.process_noise = hessian, process_noise
+    first_order = True
+    """Mean, derivatives and variance of the model at the belief's mean are all that it takes."""
 
-    @property
-    def first_order(self) -> bool:
-        """Whether mean, derivatives and variance of the model at the belief's mean are all that it takes."""
-        return not self.hessian
+    def __init__(self, process_noise: bool = False):
+        self.process_noise = process_noise
 
     def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``."""
         input = checked_input(model, belief, input)
         at_mean, A, _ = predict_with_jacobian(model, belief.mean, input)
-        return self._propagation(model, belief, input, at_mean, A)
+        return self._propagation(model, belief, at_mean, A)
 
     def differentiate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity] | None:
-        """``propagate`` with all derivatives in closed form; None where there is none (always with ``hessian``)."""
+        """``propagate`` with all derivatives in closed form; None where the model has none."""
         input = checked_input(model, belief, input)
-        expansion = None if self.hessian else expand(model, belief.mean, input)
+        expansion = expand(model, belief.mean, input)
         if expansion is None:
             return None
         A = expansion.A
@@ -115,17 +110,12 @@ class Linearization(Propagator):
             (by_covariance + by_covariance.mT) / 2,
             by_input + by_input.transpose(-3, -2) + torch.diag_embed(expansion.variance_by_input.mT).movedim(-3, -1),
         )
-        return self._propagation(model, belief, input, expansion.belief, A), sensitivity
+        return self._propagation(model, belief, expansion.belief, A), sensitivity
 
-    def _propagation(self, model: Any, belief: Gaussian, input: Tensor, at_mean: Gaussian, A: Tensor) -> Propagation:
+    def _propagation(self, model: Any, belief: Gaussian, at_mean: Gaussian, A: Tensor) -> Propagation:
         S = belief.covariance
-        mean, covariance = at_mean.mean, at_mean.covariance + A @ S @ A.mT
-        if self.hessian:
-            H = _mean_hessian(model, belief.mean, input)
-            HS = H @ S[..., None, :, :]
-            mean = mean + HS.diagonal(dim1=-2, dim2=-1).sum(-1) / 2
-            covariance = covariance + (HS[..., :, None, :, :] * HS[..., None, :, :, :].mT).sum((-2, -1)) / 2
-        return projected((mean, covariance, S @ A.mT), model.noise_covariance if self.process_noise else None)
+        moments = at_mean.mean, at_mean.covariance + A @ S @ A.mT, S @ A.mT
+        return projected(moments, model.noise_covariance if self.process_noise else None)
 
 
 class MeanEquivalence(Propagator):
@@ -154,23 +144,3 @@ class MeanEquivalence(Propagator):
             return None
         moved, d = found
         return moved, replace(d, covariance_by_covariance=torch.zeros_like(d.covariance_by_covariance))
-
-
-def _mean_hessian(model: Any, state: Tensor, input: Tensor) -> Tensor:
-    """d2m/dx2 (*batch, k, n, n): in closed form for SE-ARD GPs, else by torch autograd."""
-    composition = Composition.of(model)
-    if composition is not None:  # an affine part has no second derivative
-        seen, control = composition.seen(Gaussian.certain(state), input)
-        return composition.outer(composition.f.mean_hessian(seen.mean, control))
-    again = torch.is_grad_enabled() and (state.requires_grad or input.requires_grad)
-    with torch.inference_mode(False), torch.enable_grad():
-        x = state if state.requires_grad and again else state.detach().clone().requires_grad_()
-        _, A, _ = predict_with_jacobian(model, x, input)
-        if not A.requires_grad:  # the model is linear in the state
-            return A.new_zeros(*A.shape, A.shape[-1])
-        rows = [
-            torch.autograd.grad(A[..., a, d].sum(), x, create_graph=again, retain_graph=True, materialize_grads=True)[0]
-            for a in range(A.shape[-2])
-            for d in range(A.shape[-1])
-        ]
-    return torch.stack(rows, dim=-2).unflatten(-2, A.shape[-2:])

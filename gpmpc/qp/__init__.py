@@ -1,30 +1,19 @@
 """Quadratic programs and their solvers (NumPy float64).
 
-Names are looked up in their modules at first use: whoever needs a problem or a solution only, such as the writer of
+Solvers are looked up in their modules at first use: whoever needs a problem or a solution only, such as the writer of
 recordings, loads no compiler.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from gpmpc.qp.problem import QuadraticProgram, SoftRows
+from gpmpc.qp.solution import QPSolution, QPSolver, Residuals, make_solution
+
 if TYPE_CHECKING:
     from gpmpc.qp.cvxpy_ import CvxpySolver
     from gpmpc.qp.dual_active_set import DualActiveSet
     from gpmpc.qp.primal_active_set import PrimalActiveSet
-    from gpmpc.qp.problem import QuadraticProgram, SoftRows
-    from gpmpc.qp.solution import QPSolution, QPSolver, Residuals, make_solution
-
-_MODULES = {
-    "CvxpySolver": "cvxpy_",
-    "DualActiveSet": "dual_active_set",
-    "PrimalActiveSet": "primal_active_set",
-    "QPSolution": "solution",
-    "QPSolver": "solution",
-    "QuadraticProgram": "problem",
-    "Residuals": "solution",
-    "SoftRows": "problem",
-    "make_solution": "solution",
-}
 
 __all__ = [
     "CvxpySolver",
@@ -38,11 +27,13 @@ __all__ = [
     "make_solution",
 ]
 
+_SOLVERS = {"CvxpySolver": "cvxpy_", "DualActiveSet": "dual_active_set", "PrimalActiveSet": "primal_active_set"}
+
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
+    if name not in _SOLVERS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    value = globals()[name] = getattr(importlib.import_module(f"{__name__}.{_SOLVERS[name]}"), name)
     return value
 
 

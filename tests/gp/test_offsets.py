@@ -147,7 +147,7 @@ def query(by=0.0):
 def everything(gp, by):
     """What a model says at shifted points: a list of tensors."""
     x, u = query(by)
-    said = [*map(torch.from_numpy, gp.linearize(x.numpy(), u.numpy())), gp.mean_hessian(x, u)]
+    said = [*map(torch.from_numpy, gp.linearize(x.numpy(), u.numpy()))]
     belief, *slopes = gp.predict_with_jacobian(x, u)
     said += [belief.mean, belief.covariance, *slopes]
     module = PosteriorModule(gp)(x, u)
@@ -172,7 +172,6 @@ PROPAGATORS = [
     (MomentMatching(), 1e-10),
     (MomentMatching(diagonal=True, process_noise=True), 1e-10),
     (Linearization(), 1e-10),
-    (Linearization(hessian=True), 1e-10),
     (MeanEquivalence(), 1e-10),
     (Unscented(), 3e-7),  # its points, and the samples, are states: float64 resolves 1.5e-8 of them at 1e8
     (MonteCarlo(300), 3e-7),

@@ -120,7 +120,7 @@ def test_each_question_may_take_its_own_number_of_programs():
 @pytest.mark.parametrize("covariance", ["none", "zero_order", "diagonal", "full"])
 @pytest.mark.parametrize(
     "propagator",
-    [Linearization(), Linearization(hessian=True), MomentMatching(), MeanEquivalence(), Unscented()],
+    [Linearization(), MomentMatching(), MeanEquivalence(), Unscented()],
     ids=lambda p: f"{type(p).__name__}{sorted(vars(p).items())}",
 )
 def test_stages_stay_on_the_device_of_the_model(covariance, propagator):
@@ -183,5 +183,4 @@ def test_no_question_takes_more_memory_than_it_is_said_to(covariance, propagator
 
 
 def test_what_is_differentiated_by_autograd_takes_an_unknown_amount():
-    assert controller("trajectory", "full", Linearization(hessian=True)).bytes_per_question is None
     assert controller("trajectory", "none", Linearization(), linear_gaussian(6, 3)).bytes_per_question is None

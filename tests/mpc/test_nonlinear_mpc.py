@@ -22,7 +22,6 @@ from tests.mpc.small_models import double_integrator, pendulum_posterior
 PROPAGATORS = {
     "mean equivalence": MeanEquivalence(),
     "linearisation": Linearization(),
-    "second order": Linearization(hessian=True),
     "moment matching": MomentMatching(),
     "unscented": Unscented(),
     "monte carlo": MonteCarlo(samples=40),

@@ -7,13 +7,11 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedMod
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, differentiate
-from tests.mpc.systems import linear_gaussian
+from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented
 
 DETERMINISTIC = {
     "mean equivalence": MeanEquivalence,
     "linearization": Linearization,
-    "second order": lambda **settings: Linearization(hessian=True, **settings),
     "moment matching": MomentMatching,
     "unscented": Unscented,
     "sigma points": lambda **settings: Unscented(alpha=0.5, beta=2.0, kappa=1.0, **settings),
@@ -100,13 +98,8 @@ def test_the_order_of_accuracy_on_a_nonlinear_model_is_as_stated():
         exact, ours = MomentMatching()(model, at, u), propagator(model, at, u)
         return torch.stack([(ours.mean - exact.mean).abs().max(), (ours.covariance - exact.covariance).abs().max()])
 
-    # Error of the mean (scale^p): first order misses 1/2 tr(H S), second order and sigma points do not.
-    for propagator, power in (
-        (MeanEquivalence(), 1),
-        (Linearization(), 1),
-        (Linearization(hessian=True), 2),
-        (Unscented(), 2),
-    ):
+    # Error of the mean (scale^p): first order misses 1/2 tr(H S), sigma points do not.
+    for propagator, power in ((MeanEquivalence(), 1), (Linearization(), 1), (Unscented(), 2)):
         rate = errors(propagator, 1e-2) / errors(propagator, 1e-3)
         assert float(rate[0].log10()) == pytest.approx(power, abs=0.15)
     # Error of the covariance: Unscented sees the curvature of the model's variance, linearization does not.
@@ -115,33 +108,6 @@ def test_the_order_of_accuracy_on_a_nonlinear_model_is_as_stated():
     assert float((errors(Linearization(), 1e-2) / errors(Linearization(), 1e-3))[1].log10()) == pytest.approx(
         1, abs=0.15
     )
-    ladder = [float(errors(p, 0.3)[0]) for p in (MeanEquivalence(), Linearization(hessian=True))]
-    assert ladder[1] < ladder[0]
-
-
-def test_the_hessian_by_torch_is_the_one_in_closed_form():
-    model, at, u = gp(predicts="difference"), belief(), torch.tensor([0.2])
-
-    class Opaque:  # the same model behind another class: nothing in closed form is known of it
-        def __getattr__(self, name):
-            return getattr(model, name)
-
-    closed, by_torch = (Linearization(hessian=True)(each, at, u) for each in (model, Opaque()))
-    assert torch.allclose(closed.mean, by_torch.mean, atol=1e-12)
-    assert torch.allclose(closed.covariance, by_torch.covariance, atol=1e-12)
-
-
-def test_a_model_of_ones_own_that_is_linear_has_no_second_order_terms():
-    """Its Jacobian is a constant, through which torch cannot differentiate."""
-    model, at, u = linear_gaussian(), belief(), torch.tensor([0.7])
-    first, second = (Linearization(hessian=hessian) for hessian in (False, True))
-    assert torch.equal(first(model, at, u).covariance, second(model, at, u).covariance)
-    for ours, theirs in zip(
-        vars(differentiate(first, model, at, u)[1]).values(),
-        vars(differentiate(second, model, at, u)[1]).values(),
-        strict=True,
-    ):
-        assert torch.equal(ours, theirs)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -193,7 +159,7 @@ def test_moment_matching_says_what_it_can_do_and_who_can_do_the_rest():
     with pytest.raises(UnsupportedModel) as caught:
         MomentMatching()(other, belief(), torch.zeros(1))
     assert str(caught.value) == message
-    for name in ("mean equivalence", "linearization", "second order", "unscented", "Monte Carlo"):
+    for name in ("mean equivalence", "linearization", "unscented", "Monte Carlo"):
         assert torch.isfinite(ALL[name]()(other, belief(), torch.zeros(1)).covariance).all()
 
 

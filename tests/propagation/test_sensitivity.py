@@ -225,14 +225,6 @@ def test_inference_mode_stops_no_derivative():
     assert torch.allclose(inside.A, outside.A, atol=1e-12)
 
 
-def test_second_order_propagation_of_a_residual_model_is_mapped_by_vmap():
-    gp, at, means = MODELS["residual"], belief(3), draw(4, 3)
-    second = Linearization(hessian=True)
-    mapped = torch.func.vmap(lambda m: second(gp, Gaussian(m, at.covariance), torch.zeros(2)).covariance)(means)
-    alone = second(gp, Gaussian(means[2], at.covariance), torch.zeros(2)).covariance
-    assert torch.allclose(mapped[2], alone, atol=1e-11)
-
-
 def test_a_posterior_does_not_follow_what_becomes_of_the_tensors_it_was_made_of():
     features = draw(10, 3)
     gp = GPPosterior.from_hyperparameters(

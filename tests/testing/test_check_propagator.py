@@ -13,7 +13,6 @@ from tests.testing.test_check_model import Honest, posterior, residual
 OWN = {
     "mean equivalence": (MeanEquivalence, {}, {"linear": False}),
     "linearization": (Linearization, {}, {}),
-    "second order": (Linearization, {"hessian": True}, {}),
     "moment matching": (MomentMatching, {}, {"exact": True}),
     "diagonal": (MomentMatching, {"diagonal": True}, {"exact": True, "diagonal": True}),
     "unscented": (Unscented, {}, {}),
@@ -36,7 +35,7 @@ def test_they_pass_with_other_models(kind, settings, claims, make):
 
 
 @pytest.mark.parametrize("make", [Honest, lambda: residual(affine=False)], ids=["no GP", "nonlinear residual"])
-@pytest.mark.parametrize("name", ["mean equivalence", "linearization", "second order", "unscented", "Monte Carlo"])
+@pytest.mark.parametrize("name", ["mean equivalence", "linearization", "unscented", "Monte Carlo"])
 def test_those_for_any_model_pass_with_code(name, make):
     kind, settings, claims = OWN[name]
     check_propagator(kind(**settings), make(), **claims)
