@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from gpmpc.cli._configuration import compose, settings
 from gpmpc.cli._run import experiment_of
+from gpmpc.cli._settings import compose, settings
 from gpmpc.gp import Transitions
 from gpmpc.mpc.problem import Tracking
 from gpmpc.studies.document import Table, terminal

@@ -18,7 +18,7 @@ from hydra.utils import instantiate
 
 from benchmarks.gpytorch_likelihood import GPyTorchLikelihood
 from benchmarks.timing import write_results
-from gpmpc.cli._configuration import config_folder
+from gpmpc.cli._settings import config_folder
 from gpmpc.experiments.tables import Tables
 from gpmpc.gp import Trainer
 from gpmpc.studies.study import random_rows

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import gpmpc
-from gpmpc.cli._configuration import setting_names, settings
+from gpmpc.cli._settings import setting_names, settings
 from tests.pages import BLOCK, ROOT, read
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]

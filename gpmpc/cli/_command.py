@@ -17,10 +17,7 @@ from gpmpc.cli import _reports as reports
 from gpmpc.cli import _run as run
 from gpmpc.cli import _study as study
 from gpmpc.cli import _tune as tune
-from gpmpc.cli import _warmup as warmup
-from gpmpc.cli._arguments import Command, Result
-from gpmpc.cli._configuration import compose, help_text, model_file, settings
-from gpmpc.cli._mistakes import explain, nearest
+from gpmpc.cli._settings import Command, Result, compose, explain, help_text, model_file, nearest, settings
 from gpmpc.cli._sweep import sweep
 from gpmpc.cli._terminal import print_error, redirected_output
 from gpmpc.exceptions import GpmpcError
@@ -52,7 +49,7 @@ COMMANDS: dict[str, Command] = {
     "plot": reports.PLOT,
     "learn": learn.COMMAND,
     "log": log.COMMAND,
-    "warmup": warmup.COMMAND,
+    "warmup": study.WARMUP,
     "completion": Command(
         "Prints a script that completes commands, settings and files at TAB",
         lambda given: completion.completion(given, COMMANDS),

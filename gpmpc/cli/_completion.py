@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from gpmpc.cli._arguments import Parser, Result
-from gpmpc.cli._configuration import group_options, setting_names, settings
+from gpmpc.cli._settings import Parser, Result, group_options, setting_names, settings
 from gpmpc.exceptions import GpmpcError
 
 _SCRIPTS = {

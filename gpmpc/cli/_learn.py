@@ -3,11 +3,10 @@
 import argparse
 import json
 from contextlib import suppress
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpmpc.cli._arguments import Command, Parser, Result, write_files, writing
+from gpmpc.cli._settings import Command, Parser, Result, write_files, writing
 from gpmpc.files import write_whole
 
 if TYPE_CHECKING:
@@ -37,6 +36,7 @@ def _learn(given: argparse.Namespace) -> Result:
 
     from gpmpc.logs import judge, learn, read_log, save_learned
     from gpmpc.studies.document import terminal
+    from gpmpc.studies.study import fingerprint
 
     console, folder = Console(soft_wrap=True, highlight=False, markup=False), given.to
     log = read_log(given.files, given.mapping, given.partial)
@@ -46,7 +46,9 @@ def _learn(given: argparse.Namespace) -> Result:
     train, held_out = _split(log, given.held_out)
     with writing(folder, "to"):
         folder.mkdir(parents=True, exist_ok=True)
-        memory = _FileMemory(folder / "progress.json", _fingerprint(train, given))
+        settings = repr((train.mapping, given.points, given.steps, given.seed, given.for_control))
+        rows = (array for run in train for array in (run.states, run.inputs, run.context))
+        memory = _FileMemory(folder / "progress.json", fingerprint(settings, *rows))
         with console.status("learning") as status:
 
             def show(stage: str) -> None:
@@ -75,14 +77,6 @@ def _split(log: "Log", held_out: list[str]) -> tuple["Log", "Log"]:
     if len(names) == 1:
         return log.split_by_time(0.8)
     return log.split(names[:: max(len(names) // max(len(names) // 5, 1), 1)][: max(len(names) // 5, 1)])
-
-
-def _fingerprint(log: "Log", given: argparse.Namespace) -> str:
-    digest = sha256(repr((log.mapping, given.points, given.steps, given.seed, given.for_control)).encode())
-    for run in log:
-        for array in (run.states, run.inputs, run.context):
-            digest.update(array.tobytes())
-    return digest.hexdigest()
 
 
 class _FileMemory(dict[str, Any]):

@@ -5,7 +5,7 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpmpc.cli._arguments import Command, Parser, Result, writing
+from gpmpc.cli._settings import Command, Parser, Result, writing
 from gpmpc.exceptions import GpmpcError, SettingError
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ import keyword
 import re
 from pathlib import Path
 
-from gpmpc.cli._arguments import Command, Parser, Result, write_files
+from gpmpc.cli._settings import Command, Parser, Result, write_files
 from gpmpc.exceptions import SettingError
 
 _TEMPLATES = Path(__file__).with_name("project")  # its files, named and written for a system called NAME

@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from gpmpc.cli._arguments import Command, Parser, Result, write_files, writing
 from gpmpc.cli._log import CUT
+from gpmpc.cli._settings import Command, Parser, Result, write_files, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, RecordingError
 

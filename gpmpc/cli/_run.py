@@ -1,5 +1,8 @@
 """``gpmpc run``: one flight, from its settings to its folder; ``gpmpc run -m`` (``sweep``) flies many of them."""
 
+import math
+import os
+import re
 import shlex
 import sys
 import time
@@ -17,16 +20,17 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc.cli._arguments import Command, Result, folder_of, writing
+from gpmpc.cli._settings import Command, Result, folder_of, one_line, writing
 from gpmpc.cli._terminal import print_error
-from gpmpc.cli._tracking import log_to_mlflow
-from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, check_number
+from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
+from gpmpc.provenance import flattened
 
 if TYPE_CHECKING:
     from gpmpc.recording import McapRecorder
     from gpmpc.studies.flight import Experiment
     from gpmpc.studies.run_folder import RunFolder
     from gpmpc.systems import System
+
 
 ASIDE = ("launcher", "folder", "live", "tracker")  # settings that a result does not depend on
 _GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver", "learning")
@@ -80,7 +84,10 @@ def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
             folder.fail(error, about)
             return outcome | {"error": one_line(error), "mistake": isinstance(error, _MISTAKES)}
         if config.tracker == "mlflow":
-            _track(folder, result)
+            try:
+                log_to_mlflow(folder.path, result)
+            except Exception as error:  # the run stays finished
+                print_error(f"{folder.path} is not in MLflow: {one_line(error)}")
     return outcome | {"result": result}
 
 
@@ -89,14 +96,6 @@ def _was_interrupted(error: BaseException | None) -> bool:
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
-
-
-def _track(folder: "RunFolder", result: Mapping[str, Any]) -> None:
-    """Writes a finished run to MLflow; the run stays finished where that fails."""
-    try:
-        log_to_mlflow(folder.path, result)
-    except Exception as error:
-        print_error(f"{folder.path} is not in MLflow: {one_line(error)}")
 
 
 def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
@@ -132,9 +131,7 @@ def _recorder(
 ) -> "McapRecorder":
     from gpmpc.recording import McapRecorder, RecordedSystem
 
-    flown = experiment.system
-    bounds = [side[0] for side in controller.problem.inputs.by_stage(controller.horizon)]
-    system = RecordedSystem.of(flown, bounds)
+    flown, bounds = experiment.system, [side[0] for side in controller.problem.inputs.by_stage(controller.horizon)]
     metadata = {
         "seed": experiment.seed,
         "command": about["provenance"]["command"],
@@ -143,9 +140,8 @@ def _recorder(
         "tracked": " ".join(flown.tracked),
         "angles": " ".join(flown.angles),
     }
-    return McapRecorder(
-        path, system, config=OmegaConf.to_yaml(config, resolve=True), metadata=metadata, live=config.live
-    )
+    text = OmegaConf.to_yaml(config, resolve=True)
+    return McapRecorder(path, RecordedSystem.of(flown, bounds), config=text, metadata=metadata, live=config.live)
 
 
 def experiment_of(config: DictConfig) -> "Experiment":
@@ -265,22 +261,34 @@ def choices(overrides: Sequence[str]) -> list[str]:
     return sorted(found.values())
 
 
-def own_error(error: BaseException | None) -> GpmpcError | None:
-    """Returns the error of this package that another one was raised from, or is; None where there is none."""
-    while error is not None and not isinstance(error, GpmpcError):
-        error = error.__cause__
-    return error
-
-
-def one_line(error: BaseException) -> str:
-    """Returns the reason of an error in one line."""
-    ours = own_error(error)
-    return " ".join((str(ours) if ours else f"{type(error).__name__}: {error}").split())
-
-
 COMMAND = Command(
     "Trains a model, flies with it, records; with -m a sweep of many flights",
     _run,
     "run",
     lambda parser: parser.add_argument("--multirun", "-m", action="store_true"),
 )
+
+
+_LONGEST = 6000  # characters of a parameter that MLflow takes
+
+
+def log_to_mlflow(folder: Path, result: Mapping[str, Any]) -> None:
+    """Writes a finished run to MLflow: settings as parameters, numbers as metrics, files as artifacts.
+
+    Where it goes is said as MLflow says it, by ``MLFLOW_TRACKING_URI`` and ``MLFLOW_EXPERIMENT_NAME``; else into the
+    experiment ``gpmpc`` of the default store.
+    """
+    import mlflow  # pyright: ignore[reportMissingImports]
+
+    def name(key: str) -> str:  # in letters that MLflow takes
+        return re.sub(r"[^\w\-. /]", "_", key, flags=re.ASCII)
+
+    found = flattened({key: value for key, value in result.items() if key not in ("settings", "provenance", "choices")})
+    numbers = {key: float(value) for key, value in found.items() if isinstance(value, int | float)}
+    settings = {name(key): str(value)[:_LONGEST] for key, value in flattened(result["settings"]).items()}
+    if "MLFLOW_EXPERIMENT_NAME" not in os.environ and "MLFLOW_EXPERIMENT_ID" not in os.environ:
+        mlflow.set_experiment("gpmpc")
+    with mlflow.start_run(run_name=folder.name):
+        mlflow.log_params(settings)
+        mlflow.log_metrics({name(key): value for key, value in numbers.items() if math.isfinite(value)})
+        mlflow.log_artifacts(str(folder))

@@ -1,5 +1,7 @@
-"""``gpmpc tables``, ``gpmpc figures`` and ``gpmpc quality``: run a result's trials and write its documents."""
+"""``gpmpc tables``, ``figures`` and ``quality`` run a result's trials; ``gpmpc warmup`` compiles numerical kernels."""
 
+import argparse
+import time
 from dataclasses import replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -8,13 +10,14 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from gpmpc.cli._arguments import Command, Result, folder_of, write_files, writing
 from gpmpc.cli._run import experiment_of, plain_data, plain_settings
+from gpmpc.cli._settings import Command, Result, compose, folder_of, settings, write_files, writing
 from gpmpc.cli._terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
 
 if TYPE_CHECKING:
     from gpmpc.studies.study import Study
+
 
 _ONE, _SEVERAL = ("data", "excited", "undithered", "model", "flying"), ("trajectory", "subsystem")
 _SHOWN_ERRORS = 10
@@ -74,3 +77,29 @@ def _study(config: DictConfig, settings: dict[str, Any]) -> "Study":
 TABLES = Command("Computes Tables 1 and 2 of Cao, Lai and Alam (2017) beside the printed ones", _run, "tables")
 FIGURES = Command("Flies figures 2 to 4 and section 5.2, and the same with the plant in the loop", _run, "figures")
 QUALITY = Command("Measures closed-loop cost over the time of a decision, for every controller", _run, "quality")
+
+
+_FLOWN = ("controller=convex", "controller=paper", "controller=nonlinear", "controller=lqr")
+_SHORT = ("data.samples=12", "model.restarts=0", "steps=2", "horizon=3")
+
+
+def _warmup(given: argparse.Namespace) -> Result:
+    """Flies two steps with every controller on a learned model, and prints how long that took."""
+    from rich.console import Console
+
+    from gpmpc.compiling import report_compilation
+    from gpmpc.studies.flight import run_trial
+
+    console, began = Console(), time.perf_counter()
+    with progress_bar(console) as bar, report_compilation(), settings():
+        task = bar.add_task("", total=len(_FLOWN))
+        for words in _FLOWN:
+            bar.update(task, description=f"compiling what {words} needs")
+            run_trial(experiment_of(compose("run", [words, *_SHORT])))
+            bar.advance(task)
+    seconds = round(time.perf_counter() - began, 3)
+    console.print(f"ready after {seconds:.1f} s")
+    return Result({"seconds": seconds})
+
+
+WARMUP = Command("Compiles the numerical kernels now, instead of at the first flight", _warmup)

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import hydra
@@ -26,9 +27,8 @@ from hydra.core.plugins import Plugins
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig
 
-from gpmpc.cli._arguments import Result, folder_of, write_files
-from gpmpc.cli._configuration import without_hydra
 from gpmpc.cli._run import choices, experiment_of, plain_settings, run_one
+from gpmpc.cli._settings import Result, folder_of, without_hydra, write_files
 from gpmpc.cli._terminal import print_error, progress_bar
 from gpmpc.compiling import report_compilation
 from gpmpc.exceptions import GpmpcError, SettingError
@@ -50,14 +50,6 @@ class Job:
         return self.folder.finished or self.folder.failed_at not in (None, self.failed_before)
 
 
-class _NoCallbacks:
-    """Hydra calls these around every job; none are used here."""
-
-    def on_job_start(self, **_: Any) -> None: ...
-
-    on_job_end = on_job_start
-
-
 class Sweep:
     """Runs of one tree: their settings, which are finished, and the launcher that flies the others."""
 
@@ -67,7 +59,7 @@ class Sweep:
         self.config = hydra.compose(name, [*overrides], return_hydra_config=True)
         self.config.hydra.mode = RunMode.MULTIRUN
         self.tree, self.console = folder_of(self.config.folder), console
-        nothing: Any = _NoCallbacks()
+        nothing: Any = SimpleNamespace(on_job_start=lambda **_: None, on_job_end=lambda **_: None)  # around every job
         self._context = HydraContext(GlobalHydra.instance().config_loader(), nothing)
         self._checked: set[str] = set()
 

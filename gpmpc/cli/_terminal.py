@@ -111,9 +111,7 @@ def logging_console() -> "Console":
 def progress_bar(console: "Console", completed: Callable[[], int] | None = None) -> "Progress":
     """Returns a bar with how much is done, for how long, and how long it will still take.
 
-    Args:
-        console: Where it is drawn.
-        completed: Says how much is done, whenever the bar is drawn; by default its task is told.
+    ``completed`` says how much is done, whenever the bar is drawn; by default its task is told.
     """
     from rich import progress
 

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any, cast
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from gpmpc.cli._arguments import Command, Parser, Result, write_files
-from gpmpc.cli._configuration import group_options, without_hydra
 from gpmpc.cli._run import ASIDE, experiment_of
+from gpmpc.cli._settings import Command, Parser, Result, group_options, without_hydra, write_files
 from gpmpc.cli._sweep import Job, Sweep
 from gpmpc.exceptions import GpmpcError, RecordingError, SettingError, check_number
 

@@ -1,9 +1,24 @@
-"""Records or reads the transitions of an experiment.
+"""Records or reads flights of the quadrotor as transitions.
 
 ``NMPCData`` flies the experiment of Cao, Lai and Alam (2017), section 5, itself: unconstrained NMPC on the true plant,
 first along the trajectory with the translational subsystem, then along the attitude that those controls ask for with
-the rotational one. ``PaperData`` reads the four files that the authors published. Both give the data of one
-trajectory and one subsystem at a time.
+the rotational one. ``PaperData`` reads the four files that the authors published. ``ExcitedData`` flies with dither on
+the inputs, from which a model for control can be learned. Each gives the data of one trajectory and one subsystem at a
+time.
+
+A flight that tracks well teaches little: where the controller does its work, inputs are a function of states and
+references, and the effects of the two cannot be separated (Ljung, 1999, section 13.4: a closed loop has to be
+excited). A GP trained on such data predicts the very same flight closely and has useless derivatives by the inputs,
+which are what a controller steers by. The remedy is dither: seeded white noise on the inputs, in their own units, well
+above the process noise. Measured, 189 samples, error of the derivatives by the inputs relative to the plant's, median
+along the elliptical flight:
+
+                     dither and noise   noise alone   neither
+    translational               0.012          0.19       4.1
+    rotational                  0.003          0.11       4.0
+
+Steered by the first column's GPs, one step ahead, the plant keeps within 0.03 m of that flight (RMSE); by the last's it
+ends up a kilometre away.
 """
 
 from collections.abc import Sequence
@@ -18,8 +33,8 @@ from gpmpc.exceptions import DataError, SettingError, check_number, check_number
 from gpmpc.gp import Transitions
 from gpmpc.mpc import problem as mpc
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.simulation import Rollout, closed_loop
-from gpmpc.systems import ATTITUDES, Plant, System, attitude_for_thrust_direction
+from gpmpc.simulation import Noise, Rollout, closed_loop
+from gpmpc.systems import ATTITUDES, Plant, System, approach_attitudes, attitude_for_thrust_direction, translational
 from gpmpc.trajectories import Trajectory
 
 SUBSYSTEMS = ("translational", "rotational")
@@ -35,26 +50,25 @@ def check_quadrotor(system: System, trajectory: Trajectory | None) -> None:
 
 
 class DataSource(Protocol):
-    """Transitions of a system."""
+    """Transitions of a system that follows a trajectory, which is called ``name`` where files are filed under it.
+
+    ``note`` says what a reader has to know who compares results on these data with the paper's. ``check`` raises a
+    ``SettingError`` where there are no such data of the system. Data that are flown are flown by the system, unless
+    their settings say otherwise.
+    """
 
     @property
-    def note(self) -> str:
-        """What a reader has to know who compares results on these data with the paper's."""
-        ...
+    def note(self) -> str: ...
+    def check(self, system: System, trajectory: Trajectory | None) -> None: ...
+    def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions: ...
 
-    def check(self, system: System, trajectory: Trajectory | None) -> None:
-        """Raises a ``SettingError`` where there are no such data of the system."""
-        ...
 
-    def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions:
-        """Returns transitions.
-
-        Args:
-            system: Whose they are; data that are flown are flown by it, unless their settings say otherwise.
-            trajectory: What it follows.
-            name: What the trajectory is called, which files are filed under.
-        """
-        ...
+def check_data(data: Any, **least: int) -> None:
+    """Raises ``SettingError`` unless numbers of a data source are whole and large enough, and its attitude is known."""
+    for key, value in least.items():
+        check_number(f"data.{key}", getattr(data, key), least=value, whole=True)
+    if getattr(data, "attitude", "exact") not in ATTITUDES:
+        raise SettingError("data.attitude", f"must be one of {', '.join(ATTITUDES)}; got {data.attitude!r}")
 
 
 @dataclass(frozen=True)
@@ -99,10 +113,7 @@ class NMPCData:
     )
 
     def __post_init__(self) -> None:
-        check_number("data.samples", self.samples, least=1, whole=True)
-        check_number("data.horizon", self.horizon, least=1, whole=True)
-        if self.attitude not in ATTITUDES:
-            raise SettingError("data.attitude", f"must be one of {', '.join(ATTITUDES)}; got {self.attitude!r}")
+        check_data(self, samples=1, horizon=1)
 
     check = staticmethod(check_quadrotor)
 
@@ -116,7 +127,7 @@ class NMPCData:
         outer = self.translational.fly(references, self.horizon, steps)
         if system.name == "translational":
             return transitions_of(outer, self.samples)
-        angles = attitude_for_thrust_direction(outer.inputs[:, 1], outer.inputs[:, 2], self.attitude)
+        angles = attitude_for_thrust_direction(*outer.inputs[:, 1:].T, convention=self.attitude)
         references = np.zeros((len(angles), 6))
         references[:, [0, 2]] = angles  # phi, theta; psi and the rates are to be zero
         return transitions_of(self.rotational.fly(references, self.horizon, self.samples), self.samples)
@@ -132,7 +143,7 @@ class PaperData:
     note = "Data: the authors' own."
 
     def __post_init__(self) -> None:
-        check_number("data.samples", self.samples, least=1, whole=True)
+        check_data(self, samples=1)
         if not isinstance(self.folder, str | Path) or not Path(self.folder).is_dir():
             raise DataError(f"{self.folder}: no such folder; data.folder must hold the authors' four text files")
 
@@ -153,3 +164,81 @@ def transitions_of(flight: Rollout, samples: int) -> Transitions:
     """The first transitions of a flight."""
     states, inputs = torch.from_numpy(flight.states), torch.from_numpy(flight.inputs)
     return Transitions(states[:samples], inputs[:samples], states[1 : samples + 1])
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """How one subsystem is flown for data: NMPC on the true system, which is shaken meanwhile.
+
+    Raises:
+        SettingError: A list has another length than the quadrotor's six states or three inputs.
+    """
+
+    Q: Sequence[float]  #: state weights, the diagonal (n,)
+    R: Sequence[float]  #: weights of the inputs' increments, the diagonal (m,)
+    initial_input: Sequence[float]  #: first guess of the solver, and the input before the first (m,)
+    dither: Sequence[float]  #: standard deviation of what is added to the inputs (m,), in their units
+    noise: Sequence[float]  #: standard deviation of what is added to every next state (n,), in their units
+    horizon: int = 1  #: of the NMPC
+
+    def __post_init__(self) -> None:
+        for key, length in (("Q", 6), ("noise", 6), ("R", 3), ("initial_input", 3), ("dither", 3)):
+            check_numbers(key, getattr(self, key), length, **({} if key == "initial_input" else {"least": 0}))
+        check_number("horizon", self.horizon, least=1, whole=True)
+
+    def fly(self, system: System, references: np.ndarray, steps: int, seed: int) -> Rollout:
+        """From the first of the references (steps + horizon, n) on."""
+        problem = mpc.Problem(mpc.Tracking(self.Q, self.R))
+        controller = NMPC(system, problem, self.horizon, self.initial_input)
+        noise = Noise(process=self.noise, input=self.dither)
+        return closed_loop(
+            system, controller, references, references[0], steps, noise=noise, seed=seed, on_failure="previous_plan"
+        )
+
+
+@dataclass(frozen=True)
+class ExcitedData:
+    """Transitions of dithered flights, to train models that fly.
+
+    The translational subsystem follows the trajectory from its beginning. The rotational one is asked for attitudes of
+    that flight in random order, each held for a while and approached at first order, as a ``Cascade`` asks for them: so
+    a few seconds at its own rate cover the whole flight's attitudes.
+    """
+
+    translational: Excitation  #: how the outer subsystem is flown
+    rotational: Excitation  #: how the inner subsystem is flown
+    samples: int = 189  #: transitions of either
+    hold: int = 10  #: inner steps that an attitude is asked for
+    response_time: float = 0.1  #: of the approach to it [s]
+    attitude: str = "exact"  #: how thrust direction becomes attitude: ``"exact"`` or ``"paper"``
+    seed: int = 0  #: of dither, noise and the order of the attitudes
+
+    note = (
+        "Data: our own dithered and noisy flights of integrated plants. They are made for control; the paper's figures "
+        "belong to noise-free data of the map."
+    )
+
+    def __post_init__(self) -> None:
+        check_data(self, samples=1, hold=1, seed=0)
+        check_number("data.response_time", self.response_time, above=0, unit="[s]")
+
+    check = staticmethod(check_quadrotor)
+
+    def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions:
+        """Flies the system; the inputs are those that acted, dither included.
+
+        The attitudes that the rotational one flies are those of a flight of ``translational()``.
+        """
+        self.check(system, trajectory)
+        outer = system if system.name == "translational" else translational()
+        references = outer.reference_states(trajectory, self.samples + self.translational.horizon)
+        flight = self.translational.fly(outer, references, self.samples, self.seed)
+        if system is outer:
+            return transitions_of(flight, self.samples)
+        streams = np.random.SeedSequence([self.seed, SUBSYSTEMS.index("rotational")])
+        angles = attitude_for_thrust_direction(*flight.inputs[:, 1:].T, convention=self.attitude)
+        count = self.samples + self.rotational.horizon
+        chosen = angles[np.random.default_rng(streams).integers(len(angles), size=-(-count // self.hold))]
+        references = approach_attitudes(chosen, count, self.hold, system.time_step, self.response_time)
+        seed = int(streams.generate_state(1)[0])
+        return transitions_of(self.rotational.fly(system, references, self.samples, seed), self.samples)

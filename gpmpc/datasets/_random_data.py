@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpmpc.datasets._flights import check_data
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gp.transitions import Transitions
 from gpmpc.systems import System, step
@@ -34,8 +35,7 @@ class RandomData:
     note = "Data: our own, under random inputs."
 
     def __post_init__(self) -> None:
-        for key, least in (("samples", 1), ("episode", 1), ("hold", 1), ("seed", 0)):
-            check_number(f"data.{key}", getattr(self, key), least=least, whole=True)
+        check_data(self, samples=1, episode=1, hold=1, seed=0)
         check_number("data.amplitude", self.amplitude, above=0)
         for key, words in (("starts", ("region", "start")), ("around", ("middle", "initial_input"))):
             if getattr(self, key) not in words:

@@ -1,21 +1,17 @@
 """Logs of real systems: reading, checking, learning from them, and judging what was learned."""
 
 from gpmpc.logs._fitting import fit_nominal
-from gpmpc.logs._flying import LogDynamics, SavedModel, load_flyable
 from gpmpc.logs._inspection import Inspection, inspect_log
 from gpmpc.logs._judging import Judgement, judge
-from gpmpc.logs._kinematics import Increments, RigidBody
+from gpmpc.logs._kinematics import RigidBody
 from gpmpc.logs._learning import Learned, learn
 from gpmpc.logs._log import Log, LogRun
 from gpmpc.logs._mapping import LogMapping
-from gpmpc.logs._noise import OutputNoise
-from gpmpc.logs._nominal import MultirotorNominal
 from gpmpc.logs._reading import read_log
-from gpmpc.logs._rollouts import LogModel
-from gpmpc.logs._storage import load_learned, save_learned
+from gpmpc.logs._rollouts import LogModel, MultirotorNominal
+from gpmpc.logs._storage import LogDynamics, SavedModel, load_flyable, load_learned, save_learned
 
 __all__ = [
-    "Increments",
     "Inspection",
     "Judgement",
     "Learned",
@@ -25,7 +21,6 @@ __all__ = [
     "LogModel",
     "LogRun",
     "MultirotorNominal",
-    "OutputNoise",
     "RigidBody",
     "SavedModel",
     "fit_nominal",

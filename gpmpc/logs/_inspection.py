@@ -9,19 +9,16 @@ the share of its variance that the states explain linearly; what only follows th
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from gpmpc.exceptions import DataError
+from gpmpc.logs._kinematics import Array
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._readers import STAMP, read_streams
 from gpmpc.logs._reading import ordered_stamps, read_log
-from gpmpc.logs._state_space import Array
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 TIMES = (STAMP, "t", "time", "stamp", "Time", "seconds")  # columns that hold the time where nobody says which
 DRAWN = 3000  # points of a channel's line
@@ -154,7 +151,7 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspecti
     return Inspection(size, tuple(tables), tuple(channels), tuple(gaps), tuple(delays), follows)
 
 
-def _time(path: str | Path, table: "DataFrame", mapping: LogMapping | None) -> tuple[str, Array]:
+def _time(path: str | Path, table: pd.DataFrame, mapping: LogMapping | None) -> tuple[str, Array]:
     names = [mapping.time] if mapping and mapping.time else [name for name in TIMES if name in table]
     if not names or names[0] not in table:
         wanted = repr(names[0]) if names else "of the time, such as " + ", ".join(TIMES)

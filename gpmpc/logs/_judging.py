@@ -7,22 +7,17 @@ variance that is claimed over the root mean squared error. Coverage alone is che
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 from scipy.special import ndtri
 
-from gpmpc.logs._fitting import fit_least_squares
-from gpmpc.logs._kinematics import Kinematics
+from gpmpc.logs._fitting import error_variances, fit_least_squares, follow_errors
+from gpmpc.logs._kinematics import Array, Kinematics
 from gpmpc.logs._learning import Learned
 from gpmpc.logs._log import Log, Windows
-from gpmpc.logs._noise import error_variances, follow_errors
 from gpmpc.logs._rollouts import PAST, choose_stride, rollout_errors
-from gpmpc.logs._state_space import Array
 from gpmpc.metrics import binomial_interval
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 STEPS, LEVEL = (1, 10, 50), 0.95
 WINDOWS = 1000
@@ -59,10 +54,8 @@ class Judgement:
             for k, g in np.argwhere(own > 1.001 * errors)
         )
 
-    def to_pandas(self) -> "DataFrame":
+    def to_pandas(self) -> pd.DataFrame:
         """A row a predictor, step and group."""
-        import pandas
-
         rows = []
         for name, mean in self.mean.items():
             for (k, g), error in np.ndenumerate(mean):
@@ -73,7 +66,7 @@ class Judgement:
                     row |= {"coverage": self.coverage[k, g], "coverage_low": low, "coverage_high": high}
                     row |= {"width": self.width[k, g]}
                 rows.append(row)
-        return pandas.DataFrame(rows)
+        return pd.DataFrame(rows)
 
 
 def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = STEPS) -> Judgement:

@@ -13,16 +13,25 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
 
 from gpmpc.exceptions import DataError, check_number
 from gpmpc.gp import Trainer, standardize
-from gpmpc.logs._fitting import NominalFit, fit_least_squares, fit_nominal
-from gpmpc.logs._kinematics import Increments, Kinematics, RigidBody
+from gpmpc.logs._fitting import NominalFit, OutputNoise, fit_least_squares, fit_noise, fit_nominal
+from gpmpc.logs._kinematics import Array, Increments, Kinematics, RigidBody
 from gpmpc.logs._log import Log
-from gpmpc.logs._noise import OutputNoise, fit_noise
-from gpmpc.logs._nominal import AffineNominal, MultirotorNominal, Still
-from gpmpc.logs._rollouts import PAST, STEPS, LogModel, OutputGP, choose_stride, finite_errors
-from gpmpc.logs._state_space import Array
+from gpmpc.logs._rollouts import (
+    PAST,
+    STEPS,
+    AffineNominal,
+    LogModel,
+    MultirotorNominal,
+    OutputGP,
+    Still,
+    choose_stride,
+    finite_errors,
+)
 
 AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
 LATE = 3  # rows by which motors may act late
@@ -260,17 +269,8 @@ def _train(model: LogModel, log: Log, outputs: tuple[int, ...], average: int, po
 def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:
     """Chooses rows nearest to the centres of k-means that begins with farthest points, so that rare states count.
 
-    Args:
-        features: (N, d); standardised here.
-        count: Of rows; all where there are no more.
-        seed: Of the random starts.
-
-    Raises:
-        DataError: No row.
+    Features (N, d) are standardised here; where there are no more than ``count``, all rows are chosen.
     """
-    from scipy.cluster.vq import kmeans2
-    from scipy.spatial import cKDTree
-
     if not len(features):
         raise DataError("no row to choose from")
     if len(features) <= count:

@@ -26,14 +26,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import yaml
 
 from gpmpc.exceptions import SettingError, check_number
-from gpmpc.logs._state_space import StateGroup, StateSpace
+from gpmpc.logs._kinematics import StateGroup, StateSpace
 
 Role = Literal["states", "inputs", "context"]
 ROLES: tuple[Role, ...] = ("states", "inputs", "context")
 KINDS = ("vector", "angle", "quaternion", "euler")
-RULES = ("hold", "linear", "spherical")
 DEGREE = float(np.pi / 180)
 UNITS = {  # what one of it is in the units that states come out in
     "deg": ("rad", DEGREE),
@@ -55,11 +55,7 @@ _SIGNAL_KEYS = ("columns", "unit", "kind", "order", "frame", "scale", "resample"
 
 @dataclass(frozen=True)
 class Signal:
-    """Columns of a log that belong together.
-
-    Raises:
-        SettingError: A value is none of those.
-    """
+    """Columns of a log that belong together."""
 
     name: str  #: such as "attitude"
     role: Role  #: states, inputs or context
@@ -171,13 +167,7 @@ class LogMapping:
 
     @classmethod
     def load(cls, path: str | Path) -> "LogMapping":
-        """Reads a YAML file.
-
-        Raises:
-            SettingError: It cannot be read, or a key or value is wrong.
-        """
-        import yaml
-
+        """Reads a YAML file; ``SettingError`` where that fails, or a key or value is wrong."""
         try:
             content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -186,11 +176,7 @@ class LogMapping:
 
     @classmethod
     def from_dict(cls, content: Any) -> "LogMapping":
-        """Makes one of plain data, as a YAML file holds them.
-
-        Raises:
-            SettingError: A key or value is wrong.
-        """
+        """Makes one of plain data, as a YAML file holds them; ``SettingError`` where a key or value is wrong."""
         _check_keys("mapping", content, _KEYS)
         signals = []
         for role in ROLES:

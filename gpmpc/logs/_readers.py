@@ -7,26 +7,19 @@ the time [s]. Nothing is interpreted here.
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from gpmpc.exceptions import DataError, GpmpcError
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
 STAMP = "timestamp"  # [s], of streams with a topic
-Streams = dict[str, "DataFrame"]
+Streams = dict[str, pd.DataFrame]
 
 
 def read_streams(path: str | Path, topics: Iterable[str] = (), partial: bool = False) -> Streams:
-    """Reads the tables of a log file.
-
-    Args:
-        path: Ends in .csv, .csv.gz, .tsv, .parquet, .npz, .mcap (of this package or of ROS 2) or .ulg.
-        topics: Only these, of a file that has topics; all by default.
-        partial: Takes what is whole of an unfinished recording.
+    """Reads the tables of a log file: all topics by default, or what is whole of an unfinished recording.
 
     Raises:
         DataError: The file is missing, damaged, unfinished or of an unknown kind, or a topic is missing.
@@ -58,43 +51,37 @@ def read_streams(path: str | Path, topics: Iterable[str] = (), partial: bool = F
 def _read_csv(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     import gzip
 
-    import pandas
-
     opened = gzip.open if path.suffix.lower() == ".gz" else open
     with opened(path, "rt", encoding="utf-8-sig") as file:
         header = file.readline()
     delimiter = max(",;\t", key=header.count)
     names = [name.strip().strip('"') for name in header.strip().split(delimiter)]
-    if pandas.to_numeric(pandas.Series(names), errors="coerce").notna().any():
+    if pd.to_numeric(pd.Series(names), errors="coerce").notna().any():
         raise DataError(f"{path}: the first line holds numbers; expected a header with the names of the columns")
     twice = [name for name in names if names.count(name) > 1]
     if twice:
         raise DataError(f"{path}: column {twice[0]!r} stands there twice")
     with warnings.catch_warnings():  # of rows that are longer than the header
-        warnings.simplefilter("error", pandas.errors.ParserWarning)
-        table = pandas.read_csv(path, sep=delimiter, encoding="utf-8-sig", skipinitialspace=True, index_col=False)
+        warnings.simplefilter("error", pd.errors.ParserWarning)
+        table = pd.read_csv(path, sep=delimiter, encoding="utf-8-sig", skipinitialspace=True, index_col=False)
     return {"": table.rename(columns=str.strip)}
 
 
 def _read_parquet(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
-    import pandas
-
-    return {"": pandas.read_parquet(path)}
+    return {"": pd.read_parquet(path)}
 
 
 def _read_npz(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
-    import pandas
-
     with np.load(path, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files if archive[name].ndim in (1, 2)}
     lengths = {name: len(values) for name, values in arrays.items()}
     if len(set(lengths.values())) > 1:
         raise DataError(f"{path}: arrays must have the same number of rows; got {lengths}")
     tables = [
-        pandas.DataFrame(a, columns=[name] if a.ndim == 1 else [f"{name}[{i}]" for i in range(a.shape[1])])
+        pd.DataFrame(a, columns=[name] if a.ndim == 1 else [f"{name}[{i}]" for i in range(a.shape[1])])
         for name, a in arrays.items()
     ]
-    return {"": pandas.concat(tables, axis=1) if tables else pandas.DataFrame()}
+    return {"": pd.concat(tables, axis=1) if tables else pd.DataFrame()}
 
 
 def _read_mcap(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
@@ -116,7 +103,6 @@ def _read_mcap(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
 
 
 def _read_ros2(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
-    import pandas
     from mcap.reader import NonSeekingReader
     from mcap_ros2.decoder import DecoderFactory
 
@@ -138,7 +124,7 @@ def _read_ros2(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
             if not (partial and rows):
                 hint = "" if partial else "; partial=true takes what is whole"
                 raise DataError(f"{path}: the bag cannot be read to its end ({error}){hint}") from error
-    return {topic: pandas.DataFrame(messages) for topic, messages in rows.items()}
+    return {topic: pd.DataFrame(messages) for topic, messages in rows.items()}
 
 
 def _fields(message: Any, prefix: str) -> Iterable[tuple[str, float]]:
@@ -156,7 +142,6 @@ def _fields(message: Any, prefix: str) -> Iterable[tuple[str, float]]:
 
 
 def _read_ulog(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
-    import pandas
     from pyulog import ULog
 
     log = ULog(str(path))
@@ -164,7 +149,7 @@ def _read_ulog(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
         raise DataError(f"{path}: damaged; partial=true takes what is whole")
     streams = {}
     for data in log.data_list:
-        table = pandas.DataFrame(data.data)
+        table = pd.DataFrame(data.data)
         table[STAMP] = table["timestamp"] * 1e-6
         streams[data.name if data.multi_id == 0 else f"{data.name}[{data.multi_id}]"] = table
     return streams

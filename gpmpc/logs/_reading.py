@@ -3,16 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
+from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d
 
 from gpmpc.exceptions import DataError
-from gpmpc.logs._checks import check_plausible
-from gpmpc.logs._log import Finding, Log, LogRun
-from gpmpc.logs._mapping import ROLES, TIME_UNITS, UNITS, LogMapping, Signal
-from gpmpc.logs._readers import STAMP, read_streams
-from gpmpc.logs._state_space import (
+from gpmpc.logs._kinematics import (
     Array,
     quaternion_from_euler,
     quaternion_inverse,
@@ -21,9 +19,9 @@ from gpmpc.logs._state_space import (
     rotation_quaternion,
     rotation_vector,
 )
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from gpmpc.logs._log import Finding, Log, LogRun, check_plausible
+from gpmpc.logs._mapping import ROLES, TIME_UNITS, UNITS, LogMapping, Signal
+from gpmpc.logs._readers import STAMP, Streams, read_streams
 
 REST_TIME = 0.5  # [s] for which nothing moves at rest
 REST_SHARE = 0.1  # of a state's usual spread that counts as no movement
@@ -98,9 +96,7 @@ def _in_one_frame(run: LogRun, mapping: LogMapping) -> LogRun:
     return replace(run, states=states)
 
 
-def _split_runs(
-    file: Path, name: str, streams: dict[str, "DataFrame"], mapping: LogMapping
-) -> list[tuple[str, dict[str, "DataFrame"]]]:
+def _split_runs(file: Path, name: str, streams: Streams, mapping: LogMapping) -> list[tuple[str, Streams]]:
     if not mapping.run:
         return [(name, streams)]
     table = streams.get("")
@@ -109,9 +105,7 @@ def _split_runs(
     return [(f"{name}:{run}", {"": part}) for run, part in table.groupby(mapping.run, sort=False)]
 
 
-def _tabulate(
-    file: Path, name: str, streams: dict[str, "DataFrame"], mapping: LogMapping, findings: list[Finding]
-) -> _Table:
+def _tabulate(file: Path, name: str, streams: Streams, mapping: LogMapping, findings: list[Finding]) -> _Table:
     """Puts the signals of a run on one grid of times, in the units and conventions of ``gpmpc.logs``."""
     stamps, tables = {}, {}
     for topic in dict.fromkeys(signal.topic for signal in mapping.signals):
@@ -151,7 +145,7 @@ def _tabulate(
     return _Table(name, grid, values, left_out, breaks)
 
 
-def _time(label: str, table: "DataFrame", mapping: LogMapping) -> Array:
+def _time(label: str, table: pd.DataFrame, mapping: LogMapping) -> Array:
     column = mapping.time or STAMP
     if column not in table:
         if not mapping.time and mapping.rate:  # rows without stamps, at a rate that is declared
@@ -161,16 +155,14 @@ def _time(label: str, table: "DataFrame", mapping: LogMapping) -> Array:
     return _numbers(label, table, column) * scale
 
 
-def _some(table: "DataFrame") -> str:
+def _some(table: pd.DataFrame) -> str:
     names = [str(name) for name in table.columns]
     return ", ".join(names[:12]) + (f" and {len(names) - 12} others" if len(names) > 12 else "")
 
 
-def _numbers(label: str, table: "DataFrame", column: str) -> Array:
-    import pandas
-
+def _numbers(label: str, table: pd.DataFrame, column: str) -> Array:
     values = table[column]
-    numbers = pandas.to_numeric(values, errors="coerce").to_numpy(dtype=float)
+    numbers = pd.to_numeric(values, errors="coerce").to_numpy(dtype=float)
     wrong = np.isnan(numbers) & ~values.isna().to_numpy()
     if wrong.any():
         row = int(np.argmax(wrong))
@@ -178,7 +170,7 @@ def _numbers(label: str, table: "DataFrame", column: str) -> Array:
     return numbers
 
 
-def _values(file: Path, table: "DataFrame", signal: Signal, run: str, findings: list[Finding]) -> Array:
+def _values(file: Path, table: pd.DataFrame, signal: Signal, run: str, findings: list[Finding]) -> Array:
     """A signal (K, c) in the units and conventions of ``gpmpc.logs``; NaN where it is missing."""
     missing = [column for column in signal.columns if column not in table]
     if missing:
@@ -220,7 +212,7 @@ def _quaternions(file: Path, values: Array, signal: Signal, run: str, findings: 
     return values
 
 
-def _outside(file: Path, table: "DataFrame", mapping: LogMapping) -> np.ndarray:
+def _outside(file: Path, table: pd.DataFrame, mapping: LogMapping) -> np.ndarray:
     outside = np.zeros(len(table), dtype=bool)
     for column, (low, high) in mapping.keep.items():
         if column in table:
@@ -292,8 +284,6 @@ def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping, fi
 
 def _at_rest(states: Array, inputs: Array, spread: Array, step: float) -> np.ndarray:
     """Rows (K,) of stretches in which the inputs stay and no state moves by more than a tenth of its usual spread."""
-    from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d
-
     size = max(round(REST_TIME / step), 3)
     if len(states) < size or not inputs.shape[1]:
         return np.zeros(len(states), dtype=bool)
@@ -315,11 +305,7 @@ class Stamps(NamedTuple):
 
 
 def ordered_stamps(stamps: Array, where: str) -> Stamps:
-    """Leaves out rows whose stamp is not above all before it.
-
-    Raises:
-        DataError: A stamp is not finite, or time runs backwards for more than 5 % of the rows.
-    """
+    """Leaves out rows whose stamp is not the latest; ``DataError`` where it is not finite, or 5 % run backwards."""
     if not np.isfinite(stamps).all():
         row = int(np.argmin(np.isfinite(stamps)))
         raise DataError(f"{where}: the time in row {row + 1} is {stamps[row]}; expected a number")
@@ -339,14 +325,10 @@ def ordered_stamps(stamps: Array, where: str) -> Stamps:
 
 
 def resample(time: Array, values: Array, grid: Array, rule: str, max_gap: float) -> Array:
-    """Computes values (G, c) at the times of a grid (G,) from samples (K, c) at times (K,); NaN in and beyond gaps.
+    """Computes values (G, c) at the times of a grid (G,) [s] from samples (K, c) at increasing times (K,) [s].
 
-    Args:
-        time: Of the samples, increasing [s].
-        values: (K, c); rows with a NaN are left out, so that a gap is one there.
-        grid: [s]
-        rule: "hold" takes the last sample, "linear" interpolates, "spherical" interpolates quaternions.
-        max_gap: Longest time between two samples, and since the last one, that is bridged [s].
+    The rule "hold" takes the last sample, "linear" interpolates, "spherical" interpolates quaternions. Values are NaN
+    beyond the samples and where two of them are farther apart than ``max_gap`` [s]; samples with a NaN are left out.
     """
     present = np.isfinite(values).all(axis=1)
     time, values = time[present], values[present]

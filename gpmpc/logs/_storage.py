@@ -1,6 +1,12 @@
-"""Saves what was learned from a log to one model file (``gpmpc.gp.storage``), and loads it."""
+"""Saves what was learned from a log to one model file (``gpmpc.gp.storage``), loads it, and flies it.
 
-from dataclasses import asdict
+What was learned from a log moves states by its kinematics: x[k+1] = step(x[k], y(x[k], u[k])). As a ``DynamicsModel``
+its derivatives are central differences, all stages in one batch; the disturbance from the past is left to the
+controller's own estimate.
+"""
+
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -8,16 +14,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc.dynamics import DynamicsModel, Linearized, check_query, to_array
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.files import existing_file, new_file
-from gpmpc.gp.storage import posterior_of_parts, posterior_parts, read_model, write_model
-from gpmpc.logs._fitting import NominalFit
-from gpmpc.logs._kinematics import Increments, Kinematics, RigidBody
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp.storage import load_metadata, posterior_of_parts, posterior_parts, read_model, write_model
+from gpmpc.logs._fitting import NominalFit, OutputNoise
+from gpmpc.logs._kinematics import Array, Increments, Kinematics, RigidBody, StateGroup, StateSpace, wrap
 from gpmpc.logs._learning import Candidate, Learned
-from gpmpc.logs._noise import OutputNoise
-from gpmpc.logs._nominal import AffineNominal, MultirotorNominal, Nominal, Still
-from gpmpc.logs._rollouts import LogModel, OutputGP
-from gpmpc.logs._state_space import StateGroup, StateSpace
+from gpmpc.logs._rollouts import AffineNominal, LogModel, MultirotorNominal, Nominal, OutputGP, Still
+from gpmpc.models import load_model
+from gpmpc.systems import System
 
 KIND = "LogModel"
 _NAMES = ("state_names", "input_names", "context_names", "runs")
@@ -95,3 +102,151 @@ def _learned(path: Path, header: dict[str, Any], tensors: dict[str, Tensor]) -> 
         time_step=header["time_step"],
         **{key: tuple(names) for key, names in zip(_NAMES, header["names"], strict=True)},
     )
+
+
+DIFFERENCE = 1e-5  # of central differences, relative to entries above one
+
+
+@dataclass(frozen=True)
+class LogDynamics:
+    """A model of a log as one of the next state.
+
+    Raises:
+        SettingError: Its inputs act late, or it has a term of the controller that flew.
+    """
+
+    model: LogModel  #: without context and without late inputs
+    input_dim: int  #: number of inputs, m
+    time_step: float  #: [s]
+    noise: OutputNoise | None = None  #: of its outputs; none by default
+
+    dtype = torch.float64
+    device = torch.device("cpu")
+
+    def __post_init__(self) -> None:
+        for wrong, what in (
+            (self.model.lag, f"has inputs that act {self.model.lag} rows late"),
+            (getattr(self.model.nominal, "feedback", False), "holds the feedback of the controller that flew"),
+        ):
+            if wrong:
+                raise SettingError("model", f"{what}, which no controller can plan with: gpmpc learn --for-control")
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states, n; four of an attitude."""
+        return self.model.kinematics.space.dim
+
+    output_dim = state_dim
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """Of the next state, where all states are zero and nothing is turned (n, n)."""
+        return self._noise
+
+    @cached_property
+    def _noise(self) -> Tensor:
+        space, noise, n = self.model.kinematics.space, self.noise, self.state_dim
+        if noise is None:
+            return torch.zeros(n, n, dtype=torch.float64)
+        x = np.zeros((1, n))
+        for group, at in zip(space.groups, space.columns, strict=True):
+            x[0, at.stop - 1] = group.kind == "quaternion"
+        h = DIFFERENCE * np.eye(space.error_dim)
+        B = self._by_outputs(x, np.zeros((1, noise.outputs.shape[1])))[0]
+        D = (space.displace(x, h) - space.displace(x, -h)).T / (2 * DIFFERENCE)
+        N = B * noise.outputs.sum(axis=0) @ B.T + D * noise.measurement @ D.T
+        return torch.from_numpy((N + N.T) / 2)
+
+    def predict(self, state: Tensor, input: Tensor) -> Gaussian:
+        """The next state's distribution: mean (*batch, n), covariance (*batch, n, n)."""
+        check_query(self, state, input)
+        n, batch = self.state_dim, state.shape[:-1]
+        x, u = to_array(state).reshape(-1, n), to_array(input).reshape(-1, self.input_dim)
+        mean, covariance = self._mean(x, u), self._covariance(x, u)
+        return Gaussian(*(torch.from_numpy(a).reshape(*batch, *a.shape[1:]) for a in (mean, covariance)))
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises at K points (K, n), (K, m) by central differences, all of them at once."""
+        n, z = self.state_dim, np.concatenate([states, inputs], axis=1)
+        h = DIFFERENCE * np.maximum(np.abs(z), 1.0)
+        moved = z + np.concatenate([np.eye(z.shape[1]), -np.eye(z.shape[1])])[:, None] * h
+        values = self._mean(*np.split(moved.reshape(-1, z.shape[1]), [n], axis=1)).reshape(2, -1, *states.shape)
+        J = np.moveaxis((values[0] - values[1]) / (2 * h.T[..., None]), 0, -1)
+        A, B = (np.ascontiguousarray(part) for part in np.split(J, [n], axis=2))
+        return Linearized(self._mean(states, inputs), A, B, self._covariance(states, inputs) if covariance else None)
+
+    def _mean(self, x: Array, u: Array) -> Array:
+        model = self.model
+        after = model.kinematics.step(x, model.outputs(x, u, np.empty((len(x), 0))), self.time_step)
+        for group, at in zip(model.kinematics.space.groups, model.kinematics.space.columns, strict=True):
+            if group.kind == "angle":  # a plan counts turns
+                after[:, at] = x[:, at] + wrap(after[:, at] - x[:, at])
+        return after
+
+    def _covariance(self, x: Array, u: Array) -> Array:
+        model, nothing, K = self.model, np.empty((len(x), 0)), len(x)
+        if not model.gps:
+            return np.zeros((K, self.state_dim, self.state_dim))
+        z, y = np.ascontiguousarray(model.kinematics.features(x, u, nothing)), model.outputs(x, u, nothing)
+        V = np.zeros((K, y.shape[1], y.shape[1]))
+        for gp in model.gps:
+            V[np.ix_(range(K), gp.outputs, gp.outputs)] += np.asarray(
+                gp.posterior.linearize(z, nothing, True).covariance
+            )
+        B = self._by_outputs(x, y)
+        return B @ V @ B.mT
+
+    def _by_outputs(self, x: Array, y: Array) -> Array:
+        """Derivatives of the next states by the outputs (K, n, o)."""
+        step, dt = self.model.kinematics.step, self.time_step
+        columns = [step(x, y + h, dt) - step(x, y - h, dt) for h in DIFFERENCE * np.eye(y.shape[1])]
+        return np.stack(columns, axis=-1) / (2 * DIFFERENCE)
+
+
+@dataclass(frozen=True)
+class SavedModel:
+    """A model from a file, with what the file says of it."""
+
+    path: str  #: of the file
+    model: DynamicsModel  #: trained
+    state_names: tuple[str, ...] = ()  #: empty where the file has none
+    input_names: tuple[str, ...] = ()  #: likewise
+    time_step: float | None = None  #: [s]; None where the file has none
+
+    def check(self, system: System) -> None:
+        """Raises unless states, inputs and time step are a system's.
+
+        Raises:
+            SettingError: They are others.
+        """
+        for key, dim, names, wanted in (
+            ("states", self.model.state_dim, self.state_names, system.state_names),
+            ("inputs", self.model.input_dim, self.input_names, system.input_names),
+        ):
+            own = [name.removeprefix("state.").removeprefix("measured.").removeprefix("input.") for name in names]
+            if dim != len(wanted) or (own and own != list(wanted)):
+                found = f"the {key} {', '.join(own) or dim}; {system.name} has {', '.join(wanted)}"
+                raise SettingError("model", f"{self.path} has {found}")
+        if self.time_step is not None and abs(self.time_step / system.time_step - 1) > 1e-3:
+            steps = f"{self.time_step:g} s; {system.name} has {system.time_step:g} s"
+            raise SettingError("model", f"{self.path} has time steps of {steps}")
+
+
+def load_flyable(path: str | Path) -> SavedModel:
+    """Reads a file of ``gpmpc learn`` or of ``save_model``.
+
+    Raises:
+        DataError: The file is missing, damaged or of another kind.
+        SettingError: What is in it cannot be flown.
+    """
+    header = load_metadata(path)
+    if header.get("kind") == KIND:
+        learned = load_learned(path)
+        if learned.context_names:
+            context = ", ".join(learned.context_names)
+            raise SettingError("model", f"{path} needs a context ({context}), which is not known in flight")
+        flown = LogDynamics(learned.model, len(learned.input_names), learned.time_step, learned.noise)
+        return SavedModel(str(path), flown, learned.state_names, learned.input_names, learned.time_step)
+    said = header.get("metadata") or {}
+    states, inputs = (tuple(said.get(key) or ()) for key in ("states", "inputs"))
+    return SavedModel(str(path), load_model(path), states, inputs, said.get("time_step"))

@@ -5,9 +5,7 @@ Every function returns a ``Figure`` made without pyplot, so nothing global is to
 
 from gpmpc.plotting._animation import animate, ffmpeg_exists
 from gpmpc.plotting._film import film
-from gpmpc.plotting._logs import inspection_figure, judgement_figure
-from gpmpc.plotting._quality import quality
-from gpmpc.plotting._recorded import inputs_figure, timing_figure, tracking_figure
+from gpmpc.plotting._recorded import inputs_figure, inspection_figure, judgement_figure, timing_figure, tracking_figure
 from gpmpc.plotting._results import (
     Curve,
     Panel,
@@ -15,6 +13,7 @@ from gpmpc.plotting._results import (
     error_over_size,
     innovations_figure,
     over_settings,
+    quality,
     tracking,
 )
 from gpmpc.plotting._style import png

@@ -2,15 +2,13 @@
 
 from gpmpc.recording._layout import layout
 from gpmpc.recording._messages import RecordedSystem
-from gpmpc.recording._reader import RecordedProblem, Recovery, Run, read_run, recover, replay
+from gpmpc.recording._reader import Run, read_run, recover, replay
 from gpmpc.recording._recorder import McapRecorder
 from gpmpc.step import Step
 
 __all__ = [
     "McapRecorder",
-    "RecordedProblem",
     "RecordedSystem",
-    "Recovery",
     "Run",
     "Step",
     "layout",

@@ -24,8 +24,7 @@ from foxglove.messages import Log, LogLevel, Timestamp
 
 from gpmpc.exceptions import RecordingError, check_number
 from gpmpc.provenance import flattened, provenance
-from gpmpc.recording._encoding import Encoder, StepCopy
-from gpmpc.recording._messages import RecordedSystem
+from gpmpc.recording._messages import Encoder, RecordedSystem, StepCopy
 from gpmpc.recording._records import CONFIG, LARGEST
 from gpmpc.recording._scene import WORLD, Scene
 from gpmpc.step import Step

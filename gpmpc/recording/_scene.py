@@ -14,8 +14,7 @@ import numpy as np
 from foxglove import Context, channels
 from foxglove import messages as fg
 
-from gpmpc.recording._encoding import StepCopy
-from gpmpc.recording._messages import ATTITUDE, POSITION, RecordedSystem
+from gpmpc.recording._messages import ATTITUDE, POSITION, RecordedSystem, StepCopy
 
 Array = np.ndarray
 

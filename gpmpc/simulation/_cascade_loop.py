@@ -4,11 +4,8 @@ The outer controller, on the translational subsystem, decides the thrust U1 and 
 say; the direction, by eq. (2) of Cao, Lai and Alam (2017) inverted, is the attitude that the inner one, on the
 rotational subsystem, takes the vehicle to. (With the plant in the loop an inner loop at 1 Hz is unworkable; 20 Hz flies
 well.) The references of the angular rates are those of a first-order approach to the attitude,
-(angle_d - angle) / response time.
-
-The cascade is one controller at the inner rate. Every outer step begins with the outer controller; then, ``ratio``
-times, the inner one turns the vehicle to where the thrust is to point. Each has its own policy for failures: while the
-outer controller goes on along its last plan, the inner one keeps the vehicle upright, and the other way round.
+(angle_d - angle) / response time. Each controller has its own policy for failures: while the outer one goes on along
+its last plan, the inner one keeps the vehicle upright, and the other way round.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,11 +19,10 @@ from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Controller, Reference
 from gpmpc.mpc.policy import Command, OnFailure, check_policy, command
-from gpmpc.simulation._disturbances import Disturbance
 from gpmpc.simulation._loop import Flight, History, Moment, Rollout, check_references, fly, window
-from gpmpc.simulation._simulator import Noise, PlantSimulator
+from gpmpc.simulation._simulator import Disturbance, Noise, PlantSimulator
 from gpmpc.step import Step
-from gpmpc.systems import ATTITUDES, Coupled, Plant, attitude_at_yaw
+from gpmpc.systems import ATTITUDES, Coupled, Plant, attitude_for_thrust_direction
 
 _OUTER, _INNER = slice(0, 6), slice(6, 12)
 
@@ -35,23 +31,15 @@ _OUTER, _INNER = slice(0, 6), slice(6, 12)
 class Cascade:
     """An outer and an inner controller, and how the one's inputs are the other's references.
 
-    Attributes:
-        outer: On states x, vx, y, vy, z, vz [m, m/s] and inputs U1 [N], ux, uy [-].
-        inner: On states phi, p, theta, q, psi, r [rad, rad/s] and inputs U2, U3, U4 [N].
-        ratio: Inner steps an outer step.
-        attitude: How thrust direction becomes attitude: ``"exact"`` or ``"paper"``; see
-            ``attitude_for_thrust_direction``.
-        response_time: Of the approach to a new attitude [s].
-
     Raises:
         SettingError: A ratio below 1, an unknown attitude, or a response time that is not positive.
     """
 
-    outer: Controller
-    inner: Controller
-    ratio: int = 20
-    attitude: str = "exact"
-    response_time: float = 0.1  # [s]
+    outer: Controller  #: on states x, vx, y, vy, z, vz [m, m/s] and inputs U1 [N], ux, uy [-]
+    inner: Controller  #: on states phi, p, theta, q, psi, r [rad, rad/s] and inputs U2, U3, U4 [N]
+    ratio: int = 20  #: inner steps an outer step
+    attitude: str = "exact"  #: ``"exact"`` or ``"paper"``; see ``attitude_for_thrust_direction``
+    response_time: float = 0.1  #: of the approach to a new attitude [s]
 
     def __post_init__(self) -> None:
         check_number("ratio", self.ratio, least=1, whole=True)
@@ -60,21 +48,19 @@ class Cascade:
         check_number("response_time", self.response_time, above=0, unit="[s]")
 
     def attitude_reference(self, planned: np.ndarray, angles: np.ndarray, phase: int) -> Reference:
-        """What the inner controller is to follow.
+        """What the inner controller is to follow over its horizon, with no moments as the inputs that belong to it.
 
         Args:
             planned: The outer plan's inputs from the current outer step on (H, 3); the inner horizon looks beyond the
                 first where it reaches the next outer step, and holds the last.
             angles: Roll, pitch and yaw now (3,) [rad]; yaw is to be zero.
             phase: Inner steps since the outer step began.
-
-        Returns:
-            Over the inner horizon, with no moments as the inputs that belong to it.
         """
         ahead = phase + np.arange(self.inner.horizon + 1)
         direction = planned[np.minimum(ahead // self.ratio, len(planned) - 1)]
         states = np.zeros((len(ahead), 6))
-        states[:, [0, 2]] = attitude_at_yaw(direction[:, 1], direction[:, 2], angles[2], self.attitude)
+        ux, uy = direction[:, 1:].T
+        states[:, [0, 2]] = attitude_for_thrust_direction(ux, uy, angles[2], self.attitude)
         states[:, 1::2] = (states[:, ::2] - angles) / self.response_time
         return Reference(states, np.zeros((self.inner.horizon, 3)))
 
@@ -102,7 +88,7 @@ def cascade_loop(
     seed: int = 0,
     on_step: Callable[[Literal["outer", "inner"], Step], None] | None = None,
 ) -> CascadeRollout:
-    """Flies a cascade.
+    """Flies a cascade; what is not named here is as in ``closed_loop``.
 
     Args:
         plant: The twelve states at the inner rate, such as ``gpmpc.systems.coupled()``.
@@ -113,16 +99,14 @@ def cascade_loop(
         steps: K, outer steps.
         noise: On states, measurements and inputs, every inner step.
         disturbances: What the controllers do not know of.
-        on_failure: Of either controller; see ``closed_loop``.
+        on_failure: Of either controller.
         seed: Of all random numbers.
         on_step: Called with the loop and its step: of the outer one as it begins, of the inner one as it ends.
 
     Raises:
         ShapeError: The plant has other states, or references are too few.
-        SettingError: An unknown policy, or negative noise.
-        SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on; its step is
-            that of the controller that failed.
-        Diverged: The plant left the finite numbers; its step is an inner one.
+        SolverFailure: Its step is that of the controller that failed.
+        Diverged: Its step is an inner one.
     """
     check_policy(on_failure)
     names = (tuple(plant.dynamics.state_names), tuple(plant.dynamics.input_names))

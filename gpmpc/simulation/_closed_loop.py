@@ -15,9 +15,8 @@ from gpmpc.exceptions import Diverged, GpmpcError, SettingError, SolverFailure, 
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc.controller import Controller, Reference
 from gpmpc.mpc.policy import Command, OnFailure, check_policy, command, commands
-from gpmpc.simulation._disturbances import Disturbance
 from gpmpc.simulation._loop import Flight, History, Rollout, check_references, fly, window
-from gpmpc.simulation._simulator import ModelLoop, ModelSimulator, Noise, PlantSimulator, Simulator
+from gpmpc.simulation._simulator import Disturbance, ModelLoop, ModelSimulator, Noise, PlantSimulator, Simulator
 from gpmpc.step import Step
 from gpmpc.systems import Plant
 
@@ -106,12 +105,12 @@ def closed_loops(
     on_failure: OnFailure = "raise",
     chunk: int | None = None,
 ) -> list[Trial]:
-    """Flies a controller on a plant with many seeds at once.
+    """Flies a controller on a plant with many seeds at once; what is not named here is as in ``closed_loop``.
 
     Args:
         plant: What is steered; its right-hand side is evaluated on arrays, an entry a trial.
-        controller: Its feedback law, of all trials; a ``GPMPC`` decides for them together, any other one by one.
-        references: As for ``closed_loop``, of all trials.
+        controller: Of all trials; a ``GPMPC`` decides for them together, any other one by one.
+        references: Of all trials.
         initial: The state (n,), or the ``Gaussian`` that every trial's is drawn from.
         steps: K.
         seeds: One a trial; a number stands for 0 .. seeds - 1.
@@ -125,9 +124,8 @@ def closed_loops(
         a ``Rollout``.
 
     Raises:
-        ShapeError: As for ``closed_loop``.
-        SettingError: As for ``closed_loop``; no seeds or equal ones; a model loop, in which a seed changes nothing; or
-            no ``chunk`` where the controller cannot say how much memory a trial takes.
+        SettingError: No seeds or equal ones; a model loop, in which a seed changes nothing; or no ``chunk`` where the
+            controller cannot say how much memory a trial takes.
     """
     if isinstance(plant, ModelLoop):
         raise SettingError("plant", "a model loop draws no random numbers, all seeds are one flight; take closed_loop")

@@ -69,12 +69,7 @@ class Moment(NamedTuple):
 
 
 class Flight:
-    """One simulator under way.
-
-    Args:
-        simulator: At its initial state.
-        record: Called after every step with its ``Moment`` and what was decided.
-    """
+    """One simulator under way; ``record`` is called after every step with its ``Moment`` and what was decided."""
 
     def __init__(self, simulator: Simulator, record: Callable[[Moment, Any], None]):
         self.simulator, self.record = simulator, record
@@ -88,14 +83,10 @@ def fly(
     steps: int,
     time_step: float,
 ) -> None:
-    """Runs the loop of all flights in step; one that fails ends with its error, and the others go on.
+    """Runs the loop of all flights of one plant in step; one that fails ends with its error, and the others go on.
 
-    Args:
-        flights: Of one plant.
-        decide: From the number of the step, what is known of the states, and what was decided one step ago (None at the
-            first), to what is to be applied, its ``input`` (m,), or to a ``SolverFailure``.
-        steps: K.
-        time_step: [s].
+    ``decide`` is called with the number of the step, what is known of the states, and what was decided one step ago
+    (None at the first); it returns what is to be applied, its ``input`` (m,), or a ``SolverFailure``.
     """
     for k in range(steps):
         time, moving = round(k * time_step, 9), []
@@ -212,12 +203,7 @@ def window(references: Reference, k: int, horizon: int) -> Reference:
 
 
 def check_references(references: Reference | Array | Sequence[float], steps: int, horizon: int) -> Reference:
-    """Returns references for all steps.
-
-    Raises:
-        ShapeError: Too few, or no table.
-        SettingError: The steps are no whole number, 1 or more.
-    """
+    """Returns references for all steps, or raises ``ShapeError`` where they are too few or no table."""
     check_number("steps", steps, least=1, whole=True)
     references = references if isinstance(references, Reference) else Reference(np.asarray(references, dtype=float))
     references, needed = references.over(steps + horizon), steps + horizon

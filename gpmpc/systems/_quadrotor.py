@@ -1,26 +1,37 @@
-"""Right-hand sides of a quadrotor, split into its translational and its rotational subsystem.
+"""The quadrotor of Cao, Lai and Alam (2017), whole and split into its translational and its rotational subsystem.
 
-The model of Cao, Lai and Alam (2017), with the parameters decoded from their data. The z axis points downwards. The
-translational subsystem is driven by the total thrust U1 and by the direction (ux, uy) of the thrust, which the attitude
-has to provide; the rotational subsystem provides it, driven by the moments' forces U2, U3, U4. ``translational`` and
-``rotational`` make the systems, integrated; ``Map`` reads a right-hand side as the paper's data do.
+Parameters are decoded from the authors' data. The z axis points downwards. The translational subsystem is driven by the
+total thrust U1 and by the direction (ux, uy) of the thrust, which the attitude has to provide; the rotational subsystem
+provides it, driven by the moments' forces U2, U3, U4. Their eq. (2) joins the two: with roll phi, pitch theta and yaw
+psi the thrust points along
+
+    ux = cos(phi) sin(theta) cos(psi) + sin(phi) sin(psi)
+    uy = cos(phi) sin(theta) sin(psi) - sin(phi) cos(psi)
+
+and lifts by cos(phi) cos(theta); the three squares sum to one. The paper's x and y accelerate *along* (ux, uy), so they
+point against those of the aerospace convention. As in the paper, the angles' rates are taken for the body rates, which
+is good for small angles.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import cos, pi
+from dataclasses import dataclass, field
 from typing import Any
 
-from gpmpc.exceptions import check_number, check_numbers
-from gpmpc.systems._attitudes import GRAVITY, rotational_states_along
-from gpmpc.systems.system import System
+import numpy as np
 
-POSITION = {"x": "x", "y": "y", "z": "z"}
-ATTITUDE = {"roll": "phi", "pitch": "theta", "yaw": "psi"}
-POSITION_UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s")
-ANGLE_UNITS = dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys("pqr", "rad/s")
+from gpmpc.exceptions import SettingError, check_number, check_numbers
+from gpmpc.systems._system import GRAVITY, System, cos, sin
+from gpmpc.trajectories import Trajectory
 
-FOLLOWS_POSITIONS: dict[str, Any] = {
+ATTITUDES = ("paper", "exact")  # how thrust direction becomes attitude
+OUTER_STEP = 1.0  # [s] for which an attitude is asked for
+RESPONSE_TIME = 0.1  # [s]
+_POSITION = {"x": "x", "y": "y", "z": "z"}
+_ATTITUDE = {"roll": "phi", "pitch": "theta", "yaw": "psi"}
+_POSITION_UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s")
+_ANGLE_UNITS = dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys("pqr", "rad/s")
+_FOLLOWS_POSITIONS: dict[str, Any] = {
     "tracked": ("x", "y", "z"),
     "rates": {"vx": "x", "vy": "y", "vz": "z"},
     "lost": 10.0,  # a hundred times what a controlled one is off; twice where a fifth more mass than learned holds it
@@ -30,19 +41,15 @@ FOLLOWS_POSITIONS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Translational:
-    """Position and velocity, driven by thrust and thrust direction (Cao, Lai and Alam, 2017; ux, uy: eq. (2)).
+    """Position and velocity, driven by thrust and thrust direction.
 
     States x, vx, y, vy, z, vz [m, m/s]; inputs U1 [N], ux, uy [-].
-
-    Attributes:
-        mass: Mass of the vehicle [kg].
-        frozen_attitude: Roll and pitch [rad] whose cos(phi) cos(theta) multiplies the vertical thrust. The paper's data
-            hold both at pi/4. ``None`` takes the factor that belongs to the inputs: with psi = 0,
-            ux = cos(phi) sin(theta) and uy = -sin(phi), so cos(phi) cos(theta) = sqrt(1 - ux^2 - uy^2).
     """
 
-    mass: float = 0.74  # [kg]
-    frozen_attitude: tuple[float, float] | None = None  # roll, pitch [rad]
+    mass: float = 0.74  #: [kg]
+    #: Roll and pitch [rad] whose cos(phi) cos(theta) multiplies the vertical thrust; the paper's data hold both at
+    #: pi/4. None takes the factor of the inputs at psi = 0, cos(phi) cos(theta) = sqrt(1 - ux^2 - uy^2).
+    frozen_attitude: tuple[float, float] | None = None
 
     state_names = ("x", "vx", "y", "vy", "z", "vz")
     input_names = ("U1", "ux", "uy")
@@ -63,25 +70,21 @@ class Translational:
             vertical = ((squared + (squared * squared + 1e-24) ** 0.5) / 2 + 1e-12) ** 0.5
         else:
             roll, pitch = self.frozen_attitude
-            vertical = cos(roll) * cos(pitch)
+            vertical = math.cos(roll) * math.cos(pitch)
         return [x[1], u[1] * thrust, x[3], u[2] * thrust, x[5], GRAVITY - vertical * thrust]
 
 
 @dataclass(frozen=True)
 class Rotational:
-    """Attitude and body rates, driven by the moments' forces (Cao, Lai and Alam, 2017).
+    """Attitude and body rates, driven by the moments' forces.
 
     States phi, p, theta, q, psi, r [rad, rad/s]; inputs U2, U3, U4 [N].
-
-    Attributes:
-        arm: Distance l from the centre of mass to a rotor [m].
-        inertia: Principal moments of inertia Ixx, Iyy, Izz [kg m^2].
-        gyroscopic: The rotors' gyroscopic terms Jr W / Ixx and Jr W / Iyy, at their constant speed W [1/s].
     """
 
-    arm: float = 0.21  # [m]
-    inertia: tuple[float, float, float] = (0.005, 0.005, 0.0089)  # [kg m^2]
-    gyroscopic: tuple[float, float] = (0.01102, 0.01102)  # [1/s]
+    arm: float = 0.21  #: distance l from the centre of mass to a rotor [m]
+    inertia: tuple[float, float, float] = (0.005, 0.005, 0.0089)  #: principal moments Ixx, Iyy, Izz [kg m^2]
+    #: the rotors' gyroscopic terms Jr W / Ixx and Jr W / Iyy, at their constant speed W [1/s]
+    gyroscopic: tuple[float, float] = (0.01102, 0.01102)
 
     state_names = ("phi", "p", "theta", "q", "psi", "r")
     input_names = ("U2", "U3", "U4")
@@ -103,14 +106,34 @@ class Rotational:
 
 
 @dataclass(frozen=True)
-class Map:
-    """Reads a right-hand side as the next state, x[k+1] = f(x[k], u[k]): the data of Cao, Lai and Alam (2017) do.
+class Coupled:
+    """Position, velocity, attitude and body rates, driven by the thrust and the moments' forces.
 
-    Attributes:
-        dynamics: The right-hand side f.
+    States x, vx, y, vy, z, vz [m, m/s], phi, p, theta, q, psi, r [rad, rad/s]; inputs U1, U2, U3, U4 [N].
     """
 
-    dynamics: Any
+    mass: float = 0.74  #: of the vehicle [kg]
+    rotational: Rotational = field(default_factory=Rotational)  #: the rotational subsystem
+
+    state_names = Translational.state_names + Rotational.state_names
+    input_names = ("U1", *Rotational.input_names)
+
+    def __post_init__(self) -> None:
+        check_number("mass", self.mass, above=0, unit="[kg]")
+
+    def derivative(self, x: Any, u: Any) -> list[Any]:
+        """d/dt of the twelve states [m/s, m/s^2, rad/s, rad/s^2]."""
+        ux, uy, vertical = thrust_direction(x[6], x[8], x[10])
+        thrust = u[0] / self.mass  # U1 / m [m/s^2]
+        turning = self.rotational.derivative([x[i] for i in range(6, 12)], [u[1], u[2], u[3]])
+        return [x[1], ux * thrust, x[3], uy * thrust, x[5], GRAVITY - vertical * thrust, *turning]
+
+
+@dataclass(frozen=True)
+class Map:
+    """Reads a right-hand side as the next state, x[k+1] = f(x[k], u[k]): the data of Cao, Lai and Alam (2017) do."""
+
+    dynamics: Any  #: the right-hand side f
 
     def __post_init__(self) -> None:
         for key in ("state_names", "input_names"):
@@ -122,49 +145,138 @@ class Map:
 
 
 def translational(time_step: float = 1.0, substeps: int = 1, **parameters: Any) -> System:
-    """Makes the translational subsystem; one substep is exact, since its acceleration depends on the input alone.
+    """Makes the translational subsystem with ``parameters`` of ``Translational``; time step [s].
 
-    Args:
-        time_step: [s].
-        substeps: Runge-Kutta steps per time step.
-        parameters: Attributes of ``Translational``.
+    One Runge-Kutta substep is exact, since its acceleration depends on the input alone.
     """
     return System(
         Translational(**parameters),
         time_step,
         substeps,
         name="translational",
-        units=POSITION_UNITS | {"U1": "N", "ux": "1", "uy": "1"},
+        units=_POSITION_UNITS | {"U1": "N", "ux": "1", "uy": "1"},
         input_lower=(0.0, -0.7, -0.7),
         input_upper=(100.0, 0.7, 0.7),
         initial_input=(7.26, 0.0, 0.0),  # the weight m g
         region=((-20.0, -2.0) * 3, (20.0, 2.0) * 3),
-        pose=POSITION,
-        **FOLLOWS_POSITIONS,
+        pose=_POSITION,
+        **_FOLLOWS_POSITIONS,
     )
 
 
 def rotational(time_step: float = 0.05, substeps: int = 10, **parameters: Any) -> System:
-    """Makes the rotational subsystem at 20 Hz; a trajectory prescribes the attitudes that a flight along it needs.
+    """Makes the rotational subsystem at 20 Hz with ``parameters`` of ``Rotational``; time step [s].
 
-    Args:
-        time_step: [s].
-        substeps: Runge-Kutta steps per time step.
-        parameters: Attributes of ``Rotational``.
+    A trajectory prescribes the attitudes that a flight along it needs.
     """
     return System(
         Rotational(**parameters),
         time_step,
         substeps,
         name="rotational",
-        units=ANGLE_UNITS | dict.fromkeys(("U2", "U3", "U4"), "N"),
+        units=_ANGLE_UNITS | dict.fromkeys(("U2", "U3", "U4"), "N"),
         input_lower=(-2.0,) * 3,
         input_upper=(2.0,) * 3,
         tracked=("phi", "theta", "psi"),
         rates={"p": "phi", "q": "theta", "r": "psi"},
         region=((-0.5, -1.0) * 3, (0.5, 1.0) * 3),
-        lost=pi / 2,  # a vehicle on its side carries itself no more
+        lost=math.pi / 2,  # a vehicle on its side carries itself no more
         references=rotational_states_along,
-        pose=ATTITUDE,
+        pose=_ATTITUDE,
         z_down=True,
     )
+
+
+def coupled(mass: float = 0.74, time_step: float = 0.05, substeps: int = 2, **parameters: Any) -> System:
+    """Makes the whole quadrotor at the rate of its inner loop; ``gpmpc.simulation.cascade_loop`` flies it.
+
+    Mass [kg], time step [s], Runge-Kutta substeps, and ``parameters`` of ``Rotational``.
+    """
+    return System(
+        Coupled(mass, Rotational(**parameters)),
+        time_step,
+        substeps,
+        name="coupled",
+        units=_POSITION_UNITS | _ANGLE_UNITS | dict.fromkeys(("U1", "U2", "U3", "U4"), "N"),
+        input_lower=(0.0, -2.0, -2.0, -2.0),
+        input_upper=(20.0, 2.0, 2.0, 2.0),
+        initial_input=(7.26, 0.0, 0.0, 0.0),  # the weight m g
+        region=((-2.0, -1.0) * 3 + (-0.3, -0.5) * 3, (2.0, 1.0) * 3 + (0.3, 0.5) * 3),
+        pose=_POSITION | _ATTITUDE,
+        **_FOLLOWS_POSITIONS,
+    )
+
+
+def thrust_direction(phi: Any, theta: Any, psi: Any) -> tuple[Any, Any, Any]:
+    """(ux, uy) and cos(phi) cos(theta) [-] of an attitude [rad]; Cao, Lai and Alam (2017), eq. (2)."""
+    ux = cos(phi) * sin(theta) * cos(psi) + sin(phi) * sin(psi)
+    uy = cos(phi) * sin(theta) * sin(psi) - sin(phi) * cos(psi)
+    return ux, uy, cos(phi) * cos(theta)
+
+
+def attitude_for_thrust_direction(
+    ux: np.ndarray, uy: np.ndarray, psi: np.ndarray | float = 0.0, convention: str = "exact"
+) -> np.ndarray:
+    """Roll and pitch that point the thrust along (ux, uy) at a yaw psi; Cao, Lai and Alam (2017), eq. (2) inverted.
+
+    Turned by -psi, eq. (2) is that of psi = 0, where ux = cos(phi) sin(theta) and uy = -sin(phi) give phi = -asin(uy)
+    and theta = asin(ux / cos(phi)). The authors' data hold theta = sign(phi) asin(ux) instead. Arguments outside
+    [-1, 1] saturate.
+
+    Args:
+        ux: Thrust direction along x, any shape [-].
+        uy: Thrust direction along y, same shape [-].
+        psi: [rad]
+        convention: ``"exact"``, or ``"paper"`` for the authors' formula.
+
+    Returns:
+        Roll and pitch [rad], stacked along a new last axis of length 2.
+
+    Raises:
+        SettingError: The convention is neither of the two.
+    """
+    if convention not in ATTITUDES:
+        raise SettingError("attitude", f"must be 'paper' or 'exact'; got {convention!r}")
+    ux, uy = ux * np.cos(psi) + uy * np.sin(psi), uy * np.cos(psi) - ux * np.sin(psi)
+    phi = -np.arcsin(np.clip(uy, -1, 1))
+    if convention == "paper":
+        theta = np.sign(phi) * np.arcsin(np.clip(ux, -1, 1))
+    else:
+        horizontal = np.cos(phi)
+        ratio = np.divide(ux, horizontal, out=np.zeros_like(horizontal), where=horizontal > 1e-12)
+        theta = np.arcsin(np.clip(ratio, -1, 1))
+    return np.stack([phi, theta], axis=-1)
+
+
+def attitudes_along(trajectory: Trajectory, count: int, outer_step: float = OUTER_STEP) -> np.ndarray:
+    """Roll and pitch (count, 2) [rad], one an outer step, that point the thrust where the trajectory needs it.
+
+    Between two outer steps the velocity has to change by v[k+1] - v[k], so the thrust has to give the mean acceleration
+    a = (v[k+1] - v[k]) / T beside the weight: U1 / m = |a - g e_z|, ux = a_x / (U1 / m), uy = a_y / (U1 / m).
+    """
+    velocities = trajectory.velocity(outer_step * np.arange(count + 1))
+    force = np.diff(velocities, axis=0) / outer_step - [0.0, 0.0, GRAVITY]  # over the mass [m/s^2]
+    direction = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)  # of a free fall: none
+    return attitude_for_thrust_direction(direction[:, 0], direction[:, 1])
+
+
+def approach_attitudes(angles: np.ndarray, count: int, hold: int, time_step: float, response_time: float) -> np.ndarray:
+    """Rotational states (count, 6) that approach attitudes one after another at first order, as ``Cascade`` asks it to.
+
+    Roll and pitch (K, 2) [rad], of which the first is where it begins, are asked for ``hold`` inner steps each; times
+    [s].
+    """
+    left = np.exp(-time_step / response_time)  # of the way, after one step
+    states, at = np.zeros((count, 6)), angles[0]
+    for j in range(count):
+        wanted = angles[j // hold]
+        states[j, [0, 2]], states[j, [1, 3]] = at, (wanted - at) / response_time
+        at = wanted + left * (at - wanted)
+    return states
+
+
+def rotational_states_along(trajectory: Trajectory, count: int, time_step: float) -> np.ndarray:
+    """Rotational states phi, p, theta, q, psi, r (count, 6) [rad, rad/s], one an inner step, of a flight along it."""
+    hold = max(1, round(OUTER_STEP / time_step))
+    angles = attitudes_along(trajectory, -(-count // hold))
+    return approach_attitudes(angles, count, hold, time_step, RESPONSE_TIME)

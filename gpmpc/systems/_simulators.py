@@ -11,27 +11,27 @@ Array = np.ndarray
 
 
 def library(name: str) -> Any:
-    """Imports a library of the extra ``sim``.
-
-    Raises:
-        SettingError: It is not installed.
-    """
+    """Imports a library of the extra ``sim``; ``SettingError`` where it is not installed."""
     try:
         return import_module(name)
     except ImportError as error:
         raise SettingError("system", f"needs {name}, which is not installed: pip install 'gpmpc[sim]'") from error
 
 
+def numbers(x: Any, u: Any) -> tuple[Array, Array]:
+    """Returns states and inputs as arrays; ``SettingError`` where they are no numbers."""
+    try:
+        return np.array(x, dtype=float), np.array(u, dtype=float)
+    except (TypeError, ValueError, NotImplementedError) as error:
+        what = "a simulator has no equations: take a controller on a learned model"
+        raise SettingError("controller", what) from error
+
+
 class Simulator:
-    """Dynamics that a simulator steps: a subclass has ``_reset``, ``_step`` and, where it can be set, ``_set``.
+    """Dynamics that a simulator steps: a subclass has ``_reset``, ``_step`` and, where it can be set, ``_set``."""
 
-    Attributes:
-        stateful: A step moves the simulator.
-        ended: Whether the simulator has ended its episode.
-    """
-
-    stateful = True
-    ended = False
+    stateful = True  #: a step moves the simulator
+    ended = False  #: whether the simulator has ended its episode
     state_names: tuple[str, ...] = ()
     input_names: tuple[str, ...] = ()
     _now: Array | None = None
@@ -44,14 +44,9 @@ class Simulator:
     def successor(self, x: Any, u: Any) -> Array:
         """Steps the simulator from a state (n,) with an input (m,); returns the next state.
 
-        Raises:
-            SettingError: It does not stand in that state and cannot be set to it, or x and u are no numbers.
+        ``SettingError`` where it does not stand in that state and cannot be set to it, or x and u are no numbers.
         """
-        try:
-            state, input = np.array(x, dtype=float), np.array(u, dtype=float)
-        except (TypeError, ValueError, NotImplementedError) as error:
-            what = "a simulator has no equations: take a controller on a learned model"
-            raise SettingError("controller", what) from error
+        state, input = numbers(x, u)
         if state.ndim != 1:
             raise SettingError("plant", "a simulator takes one step at a time; take closed_loop for each seed")
         moved = self._now is None or not np.array_equal(state, self._now)

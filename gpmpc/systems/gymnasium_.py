@@ -12,43 +12,17 @@ import numpy as np
 from gpmpc import systems
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.systems._simulators import Simulator, library
-from gpmpc.systems.system import System, step
+from gpmpc.systems._system import System, step
 
 Array = np.ndarray
-OURS = (
-    "acrobot",
-    "cart_pole",
-    "double_integrator",
-    "double_pendulum",
-    "pendulum",
-    "planar_quadrotor",
-    "stirred_tank",
-    "translational",
-)
+OURS = ("acrobot", "cart_pole", "double_integrator", "double_pendulum", "pendulum", "planar_quadrotor")
+OURS += ("stirred_tank", "translational")
 
 
-class Environment(Simulator):
-    """The dynamics of a gymnasium environment.
+class _Environment(Simulator):
+    """The dynamics of a gymnasium environment; see ``gymnasium_system``."""
 
-    Args:
-        name: Of the environment, such as ``"InvertedPendulum-v5"``, or one that was made.
-        observe: From an observation to the state (n,); the observation itself by default.
-        state_names: Of the state; x1, x2, ... by default.
-        input_names: Of the action; u1, u2, ... by default.
-        settings: Further arguments of ``gymnasium.make``.
-
-    Raises:
-        SettingError: There is no such environment, or its spaces are not boxes of one dimension.
-    """
-
-    def __init__(
-        self,
-        name: Any,
-        observe: Callable[[Any], Array] | None = None,
-        state_names: Sequence[str] = (),
-        input_names: Sequence[str] = (),
-        **settings: Any,
-    ):
+    def __init__(self, name: Any, observe: Any, state_names: Sequence[str], input_names: Sequence[str], settings: Any):
         gymnasium = library("gymnasium")
         self.environment = name
         if isinstance(name, str):
@@ -114,19 +88,19 @@ def gymnasium_system(
     """Makes a system of a gymnasium environment.
 
     Args:
-        environment: Its name, or one that was made.
-        observe: From an observation to the state (n,).
-        state_names: Of the state.
-        input_names: Of the action.
+        environment: Its name, such as ``"InvertedPendulum-v5"``, or one that was made.
+        observe: From an observation to the state (n,); the observation itself by default.
+        state_names: Of the state; x1, x2, ... by default.
+        input_names: Of the action; u1, u2, ... by default.
         time_step: [s]; by default the environment's ``dt``.
         make: Further arguments of ``gymnasium.make``.
         settings: Of ``System``, such as ``units``, ``tracked`` and ``goal``; the environment limits the inputs.
 
     Raises:
-        SettingError: The environment cannot be taken, or gives no time step.
+        SettingError: There is no such environment, its spaces are not boxes of one dimension, or it gives no time step.
         ShapeError: Names do not fit it.
     """
-    dynamics = Environment(environment, observe, state_names, input_names, **(make or {}))
+    dynamics = _Environment(environment, observe, state_names, input_names, make or {})
     time_step = getattr(dynamics.environment.unwrapped, "dt", None) if time_step is None else time_step
     if time_step is None:
         raise SettingError("time_step", "is not known of this environment; say it [s]")

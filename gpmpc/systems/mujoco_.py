@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.systems._simulators import Simulator, library
-from gpmpc.systems.system import System
+from gpmpc.systems._simulators import Simulator, library, numbers
+from gpmpc.systems._system import System
 
 Array = np.ndarray
 
@@ -34,11 +34,7 @@ class _Model:
         self.limits = np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
 
     def indices(self, key: str, kind: Any, count: int, names: Sequence[str]) -> list[int]:
-        """Finds named parts of the model.
-
-        Raises:
-            SettingError: There is none, or one is not there.
-        """
+        """Finds named parts of the model; ``SettingError`` where none is named, or one is not there."""
         known = [self.mujoco.mj_id2name(self.model, kind, i) for i in range(count)]
         if not names:
             raise SettingError(key, f"name at least one of {', '.join(map(str, known)) or 'none'} of {self.path}")
@@ -48,19 +44,8 @@ class _Model:
         return [known.index(name) for name in names]
 
 
-class Joints(_Model):
-    """Dynamics of a model by its joints.
-
-    Args:
-        path: Of the MJCF file.
-        joints: Names of all joints, hinges and slides.
-        actuators: Names of those that are steered; others stay at zero.
-        substeps: Steps of the model per step.
-
-    Raises:
-        DataError: The file is no MJCF model.
-        SettingError: A joint or an actuator is not there, is no hinge or slide, or a joint is left out.
-    """
+class _Joints(_Model):
+    """Dynamics of a model by its joints, all of them hinges and slides; actuators that are not named stay at zero."""
 
     def __init__(self, path: str | Path, joints: Sequence[str], actuators: Sequence[str], substeps: int = 1):
         super().__init__(path, actuators)
@@ -81,16 +66,8 @@ class Joints(_Model):
         self.input_names = tuple(actuators)
 
     def successor(self, x: Any, u: Any) -> Array:
-        """The next state (n,) or states (n, T) from a state and an input, or T of each.
-
-        Raises:
-            SettingError: They are no numbers.
-        """
-        try:
-            states, inputs = np.array(x, dtype=float), np.array(u, dtype=float)
-        except (TypeError, ValueError, NotImplementedError) as error:
-            what = "a simulator has no equations: take a controller on a learned model"
-            raise SettingError("controller", what) from error
+        """The next state (n,) or states (n, T) from a state and an input, or T of each."""
+        states, inputs = numbers(x, u)
         single = states.ndim == 1
         states, inputs = states.reshape(len(states), -1), inputs.reshape(len(inputs), -1)
         count, model = states.shape[1], self.model
@@ -98,29 +75,15 @@ class Joints(_Model):
         initial[:, self._order] = states.T
         control = np.zeros((count, self.substeps, model.nu))
         control[:, :, self.controls] = inputs.T[:, None]
-        if not np.isfinite(initial).all() or not np.isfinite(control).all():
-            return np.full(states.shape, np.nan)[:, 0] if single else np.full(states.shape, np.nan)
-        moved, _ = library("mujoco.rollout").rollout(model, self.data, initial, control)
-        after = moved[:, -1, self._order].T
+        after = np.full(states.shape, np.nan)
+        if np.isfinite(initial).all() and np.isfinite(control).all():
+            moved, _ = library("mujoco.rollout").rollout(model, self.data, initial, control)
+            after = moved[:, -1, self._order].T
         return after[:, 0] if single else after
 
 
-class Sensors(_Model, Simulator):
-    """Dynamics of a model by its sensors, from its first keyframe, or from its initial pose.
-
-    Args:
-        path: Of the MJCF file.
-        sensors: Names, in the order of the state.
-        actuators: Names of those that are steered; others stay at zero.
-        state_names: Of what the sensors measure; by default a sensor's own, numbered where it has several values.
-        observe: From what the sensors measure to the state (n,).
-        substeps: Steps of the model per step.
-        input_delay: Steps after which an input acts.
-
-    Raises:
-        DataError: The file is no MJCF model.
-        SettingError: A sensor or an actuator is not there.
-    """
+class _Sensors(_Model, Simulator):
+    """Dynamics of a model by its sensors, from its first keyframe, or from its initial pose."""
 
     def __init__(
         self,
@@ -177,24 +140,26 @@ def mujoco_system(
 
     Args:
         path: Of the MJCF file.
-        actuators: Names of those that are steered.
-        joints: Names of all joints.
+        actuators: Names of those that are steered; others stay at zero.
+        joints: Names of all joints, hinges and slides.
         sensors: Names, in the order of the state; without joints.
         substeps: Steps of the model per time step.
-        observation: Further arguments of ``Sensors``.
+        observation: Of sensors: ``observe``, from what they measure to the state (n,); ``state_names``, by default a
+            sensor's own, numbered where it has several values; ``input_delay``, steps after which an input acts.
         settings: Of ``System``, such as ``units``, ``tracked`` and ``goal``; limits of the inputs are the actuators'.
 
     Raises:
         DataError: The file is no MJCF model.
-        SettingError: A name is not there, or both joints and sensors are named, or neither.
+        SettingError: A name is not there, a joint is no hinge or slide or is left out, or both joints and sensors are
+            named, or neither.
     """
     if bool(joints) == bool(sensors):
         raise SettingError("joints, sensors", "name either the joints or the sensors that are the state")
     if joints:
-        dynamics: Joints | Sensors = Joints(path, joints, actuators, substeps)
+        dynamics: _Joints | _Sensors = _Joints(path, joints, actuators, substeps)
         settings = {"rates": {f"{name}_rate": name for name in settings.get("tracked") or ()}} | settings
     else:
-        dynamics = Sensors(path, sensors, actuators, substeps=substeps, **(observation or {}))
+        dynamics = _Sensors(path, sensors, actuators, substeps=substeps, **(observation or {}))
     lower, upper = dynamics.limits
     given = {"name": Path(path).stem, "input_lower": lower, "input_upper": upper} | settings
     return System(dynamics, substeps * float(dynamics.model.opt.timestep), 1, **given)

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from gpmpc.exceptions import check_number, check_numbers
-from gpmpc.systems._attitudes import GRAVITY
+from gpmpc.systems._system import GRAVITY, System, cos, sin
 from gpmpc.systems.mujoco_ import mujoco_system
-from gpmpc.systems.system import System, cos, sin
 
 _MODEL = Path(__file__).with_name("quadrotor.xml")
 ROTORS = ("u1", "u2", "u3", "u4")
@@ -22,19 +21,12 @@ _DRAG, _MASS = 0.25, 0.5  # of the model [N s/m], [kg]
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A rigid body that four rotors lift and turn; it knows neither drag nor that the rotors lag.
+    """A rigid body that four rotors lift and turn; it knows neither drag nor that the rotors lag."""
 
-    Attributes:
-        mass: [kg].
-        inertia: Principal moments of inertia [kg m^2].
-        arm: From the centre to a rotor, along x and along y [m].
-        yaw: Torque about z that a rotor's thrust brings [m].
-    """
-
-    mass: float = 0.4  # [kg]
-    inertia: tuple[float, float, float] = (0.0025, 0.0025, 0.0045)  # [kg m^2]
-    arm: float = 0.12  # [m]
-    yaw: float = 0.016  # [m]
+    mass: float = 0.4  #: [kg]
+    inertia: tuple[float, float, float] = (0.0025, 0.0025, 0.0045)  #: principal moments of inertia [kg m^2]
+    arm: float = 0.12  #: from the centre to a rotor, along x and along y [m]
+    yaw: float = 0.016  #: torque about z that a rotor's thrust brings [m]
 
     state_names = ("x", "vx", "y", "vy", "z", "vz", "roll", "p", "pitch", "q", "yaw", "r")
     input_names = ROTORS
@@ -87,16 +79,6 @@ def mujoco_quadrotor(
     names, hover = RigidBody.state_names, [_MASS * GRAVITY / 4] * 4
     units = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s")
     units |= dict.fromkeys(("roll", "pitch", "yaw"), "rad") | dict.fromkeys("pqr", "rad/s") | dict.fromkeys(ROTORS, "N")
-    settings: dict[str, Any] = {
-        "units": units,
-        "initial_input": hover,
-        "goal": [0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0],
-        "tracked": ("x", "y", "z"),
-        "rates": {"vx": "x", "vy": "y", "vz": "z"},
-        "angles": ("roll", "pitch", "yaw"),
-        "lost": 10.0,
-        "pose": {name: name for name in ("x", "y", "z", "roll", "pitch", "yaw")},
-    }
     flown = mujoco_system(
         _MODEL,
         ROTORS,
@@ -104,7 +86,14 @@ def mujoco_quadrotor(
         substeps=substeps,
         observation={"state_names": names, "observe": _state, "input_delay": input_delay},
         nominal=System(RigidBody(**(known or {})), 0.005 * substeps, 2, initial_input=hover),
-        **settings,
+        units=units,
+        initial_input=hover,
+        goal=[0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0],
+        tracked=("x", "y", "z"),
+        rates={"vx": "x", "vy": "y", "vz": "z"},
+        angles=("roll", "pitch", "yaw"),
+        lost=10.0,
+        pose={name: name for name in ("x", "y", "z", "roll", "pitch", "yaw")},
     )
     model, vehicle = flown.dynamics.model, flown.dynamics.model.body("vehicle").id
     model.body_mass[vehicle] = mass

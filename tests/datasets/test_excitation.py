@@ -5,7 +5,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from gpmpc.cli._configuration import config_folder
+from gpmpc.cli._settings import config_folder
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import SettingError
 from gpmpc.systems import pendulum, rotational, step, translational

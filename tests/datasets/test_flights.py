@@ -45,7 +45,7 @@ def test_the_velocity_reaches_the_reference_two_samples_ahead(elliptical):
 
 def test_the_rotational_data_steer_to_the_attitude_of_the_controls_two_samples_ahead(elliptical):
     u = elliptical["translational"].inputs[2:, 1:].numpy()
-    asked = attitude_for_thrust_direction(u[:, 0], u[:, 1], "paper")
+    asked = attitude_for_thrust_direction(u[:, 0], u[:, 1], convention="paper")
     assert np.abs(elliptical["rotational"].next_states[:-2, [1, 3]].numpy() - asked).max() < 5e-5
     assert np.abs(elliptical["rotational"].next_states[:, [4, 5]].numpy()).max() < 1e-9  # yaw stays at rest
 

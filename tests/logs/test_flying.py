@@ -11,10 +11,10 @@ import torch
 
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
-from gpmpc.logs import Increments, LogDynamics, LogModel, MultirotorNominal, OutputNoise, RigidBody
-from gpmpc.logs._nominal import Still
-from gpmpc.logs._rollouts import OutputGP
-from gpmpc.logs._state_space import StateGroup, StateSpace, rotation_quaternion
+from gpmpc.logs import LogDynamics, LogModel, MultirotorNominal, RigidBody
+from gpmpc.logs._fitting import OutputNoise
+from gpmpc.logs._kinematics import Increments, StateGroup, StateSpace, rotation_quaternion
+from gpmpc.logs._rollouts import OutputGP, Still
 from gpmpc.testing import check_model
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))

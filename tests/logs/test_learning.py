@@ -22,10 +22,10 @@ from gpmpc.logs import (
     read_log,
     save_learned,
 )
+from gpmpc.logs._fitting import error_variances, follow_errors
+from gpmpc.logs._kinematics import rotation_quaternion
 from gpmpc.logs._learning import choose_rows
 from gpmpc.logs._log import Log, LogRun
-from gpmpc.logs._noise import error_variances, follow_errors
-from gpmpc.logs._state_space import rotation_quaternion
 
 EXAMPLE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "own_log.py"))
 MAPPING = LogMapping.from_dict(EXAMPLE["MAPPING"])

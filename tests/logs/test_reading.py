@@ -8,7 +8,7 @@ import pytest
 
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs import read_log
-from gpmpc.logs._state_space import StateGroup, StateSpace, quaternion_from_euler, rotate, rotation_quaternion
+from gpmpc.logs._kinematics import StateGroup, StateSpace, quaternion_from_euler, rotate, rotation_quaternion
 
 PENDULUM = {
     "time": {"column": "t"},

@@ -9,7 +9,8 @@ from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.simulation import Cascade, Dropout, Gust, Noise, Replaced, cascade_loop
 from gpmpc.status import Status
-from gpmpc.systems import Coupled, Map, Rotational, System, Translational, step, thrust_direction
+from gpmpc.systems import Coupled, Map, Rotational, System, Translational, step
+from gpmpc.systems._quadrotor import thrust_direction
 from gpmpc.trajectories import Elliptical, Lorenz, states_along
 
 PLANT = System(Coupled(), time_step=0.05, substeps=1)

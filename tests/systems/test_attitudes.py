@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 
-from gpmpc.systems import System, Translational, step, thrust_direction
-from gpmpc.systems._attitudes import approach_attitudes, attitudes_along, rotational_states_along
-from gpmpc.systems._quadrotor import GRAVITY
+from gpmpc.systems import System, Translational, step
+from gpmpc.systems._quadrotor import (
+    GRAVITY,
+    approach_attitudes,
+    attitudes_along,
+    rotational_states_along,
+    thrust_direction,
+)
 from gpmpc.trajectories import Elliptical, Hover, Lorenz, states_along
 
 

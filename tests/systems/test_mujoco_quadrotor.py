@@ -7,8 +7,8 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from gpmpc.cli._configuration import compose, settings
 from gpmpc.cli._run import experiment_of
+from gpmpc.cli._settings import compose, settings
 from gpmpc.exceptions import SettingError
 from gpmpc.studies.flight import metrics, run_trial
 from gpmpc.systems import step

@@ -84,11 +84,11 @@ def test_the_derivative_exists_at_and_beyond_a_horizontal_thrust(u):
 def test_the_exact_attitude_points_the_thrust_where_it_is_asked(rng):
     phi, theta = rng.uniform(-1.4, 1.4, size=(2, 100))
     ux, uy = np.cos(phi) * np.sin(theta), -np.sin(phi)
-    assert np.allclose(attitude_for_thrust_direction(ux, uy, "exact"), np.column_stack([phi, theta]), atol=1e-12)
+    assert np.allclose(attitude_for_thrust_direction(ux, uy), np.column_stack([phi, theta]), atol=1e-12)
 
 
 def test_the_papers_attitude_has_its_slip_and_saturates():
-    angles = attitude_for_thrust_direction(np.array([0.3, 0.3, 5.0]), np.array([0.2, -0.2, -4.0]), "paper")
+    angles = attitude_for_thrust_direction(np.array([0.3, 0.3, 5.0]), np.array([0.2, -0.2, -4.0]), convention="paper")
     assert np.allclose(angles[:, 0], [-np.arcsin(0.2), np.arcsin(0.2), np.pi / 2])
     assert np.allclose(angles[:, 1], [-np.arcsin(0.3), np.arcsin(0.3), np.pi / 2])
 
@@ -103,7 +103,10 @@ def test_the_papers_attitude_has_its_slip_and_saturates():
         (lambda: Rotational(gyroscopic=(1,)), "gyroscopic: must be a list of 2 numbers"),
         (lambda: System(Rotational(), time_step=0), "time_step: must be a number above 0"),
         (lambda: System(Rotational(), substeps=0), "substeps: must be a whole number, 1 or more; got 0"),
-        (lambda: attitude_for_thrust_direction(np.zeros(1), np.zeros(1), "papper"), "'paper' or 'exact'; got 'papper'"),
+        (
+            lambda: attitude_for_thrust_direction(np.zeros(1), np.zeros(1), convention="papper"),
+            "'paper' or 'exact'; got 'papper'",
+        ),
     ],
 )
 def test_misuse_is_refused_with_the_rule(build, message):

@@ -9,6 +9,7 @@ import pytest
 from gpmpc.datasets import RandomData
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.systems import (
+    GRAVITY,
     System,
     acrobot,
     cart_pole,
@@ -24,7 +25,6 @@ from gpmpc.systems import (
     stirred_tank,
     translational,
 )
-from gpmpc.systems._attitudes import GRAVITY
 from gpmpc.trajectories import Hover, Step, Waypoints
 
 ALL = [

@@ -18,43 +18,34 @@ from gpmpc.exceptions import GpmpcError, SettingError, ShapeError, check_number,
 from gpmpc.trajectories import Trajectory
 
 Array = np.ndarray
+GRAVITY = 9.81  # [m/s^2]
 UNKNOWN = "?"  # the unit of a state or an input that has none given
 
 
 class Dynamics(Protocol):
-    """How a system moves, with named states and inputs.
+    """How a system moves, with the names of its n states and m inputs, in order.
 
     Besides the names it has one method of two: ``derivative(x, u)``, the n entries of dx/dt, or ``successor(x, u)``,
     the n entries of the next state. x and u are indexed from 0 and know arithmetic.
     """
 
     @property
-    def state_names(self) -> Sequence[str]:
-        """Names of the n states, in order."""
-        ...
-
+    def state_names(self) -> Sequence[str]: ...
     @property
-    def input_names(self) -> Sequence[str]:
-        """Names of the m inputs, in order."""
-        ...
+    def input_names(self) -> Sequence[str]: ...
 
 
 class Plant(Protocol):
-    """A discrete-time system; a ``System`` is one."""
+    """A discrete-time system; a ``System`` is one.
+
+    Names and motion, the time of one step [s], and the n entries of x[k+1], symbolic or numeric.
+    """
 
     @property
-    def dynamics(self) -> Dynamics:
-        """The names of states and inputs, and how it moves."""
-        ...
-
+    def dynamics(self) -> Dynamics: ...
     @property
-    def time_step(self) -> float:
-        """Time of one step [s]."""
-        ...
-
-    def successor(self, x: Any, u: Any) -> Sequence[Any]:
-        """The n entries of x[k+1], symbolic or numeric."""
-        ...
+    def time_step(self) -> float: ...
+    def successor(self, x: Any, u: Any) -> Sequence[Any]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,56 +54,39 @@ class System:
 
     A right-hand side is integrated by the classical Runge-Kutta method of order four on equal substeps.
 
-    Attributes:
-        dynamics: Names of states and inputs, and ``derivative(x, u)`` or ``successor(x, u)``; see ``Dynamics``.
-        time_step: Sampling time [s].
-        substeps: Runge-Kutta steps per sampling time.
-        name: What it is called; by default as the class of its dynamics.
-        units: By name of state or input, such as ``{"x": "m"}``.
-        input_lower: Smallest inputs (m,); None where there is no limit.
-        input_upper: Largest inputs (m,).
-        initial_input: The input before the first step (m,), such as the one at rest; zero by default.
-        start: Where a flight begins (n,); on its reference by default.
-        goal: The state that is held where no trajectory is followed (n,); zero by default.
-        region: Smallest and largest states that random data start from (2, n).
-        angles: States whose errors are taken within half a turn [rad].
-        tracked: States that a trajectory prescribes and errors are reported of, in one unit; by default all states in
-            the unit of the first.
-        rates: For a state, the tracked one that it is the time derivative of, such as ``{"vx": "x"}``.
-        lost: A flight is not lost while its tracked states are nearer than this to their reference, in their unit; with
-            infinity only one that leaves the finite numbers is.
-        references: From a trajectory, a count K and the time step to reference states (K, n), where a trajectory
-            prescribes something other than tracked states.
-        pose: States that say where it is in space and how it is turned, by x, y, z, roll, pitch, yaw; pictures show it
-            there.
-        z_down: Whether the z axis of that space points downwards.
-        nominal: What is known of it before anything is learned, as a system with its states, inputs and time step; a
-            model of differences learns what it misses.
-
     Raises:
         SettingError: A number out of range, an unknown name, tracked states of several units, or dynamics without a
             finite value where the system starts.
         ShapeError: A list has another length than there are states or inputs, or the dynamics have.
     """
 
-    dynamics: Any
-    time_step: float = 1.0  # [s]
-    substeps: int = 10
-    name: str = ""
-    units: Mapping[str, str] = field(default_factory=dict)
-    input_lower: Any = None
-    input_upper: Any = None
-    initial_input: Any = None
-    start: Any = None
-    goal: Any = None
-    region: Any = None
-    angles: Sequence[str] = ()
+    dynamics: Any  #: names of states and inputs, and ``derivative(x, u)`` or ``successor(x, u)``; see ``Dynamics``
+    time_step: float = 1.0  #: sampling time [s]
+    substeps: int = 10  #: Runge-Kutta steps per sampling time
+    name: str = ""  #: what it is called; by default as the class of its dynamics
+    units: Mapping[str, str] = field(default_factory=dict)  #: by name of state or input, such as ``{"x": "m"}``
+    input_lower: Any = None  #: smallest inputs (m,); None where there is no limit
+    input_upper: Any = None  #: largest inputs (m,)
+    initial_input: Any = None  #: the input before the first step (m,), such as the one at rest; zero by default
+    start: Any = None  #: where a flight begins (n,); on its reference by default
+    goal: Any = None  #: the state that is held where no trajectory is followed (n,); zero by default
+    region: Any = None  #: smallest and largest states that random data start from (2, n)
+    angles: Sequence[str] = ()  #: states whose errors are taken within half a turn [rad]
+    #: states that a trajectory prescribes and errors are reported of, in one unit; by default all in that of the first
     tracked: Sequence[str] = ()
+    #: for a state, the tracked one that it is the time derivative of, such as ``{"vx": "x"}``
     rates: Mapping[str, str] = field(default_factory=dict)
+    #: a flight is not lost while its tracked states are nearer than this to their reference, in their unit; with
+    #: infinity only one that leaves the finite numbers is
     lost: float = inf
+    #: from a trajectory, a count K and the time step to reference states (K, n), where a trajectory prescribes
+    #: something other than tracked states
     references: Callable[[Trajectory, int, float], Array] | None = None
+    #: states that say where it is in space and how it is turned, by x, y, z, roll, pitch, yaw; pictures show it there
     pose: Mapping[str, str] = field(default_factory=dict)
-    z_down: bool = False
+    z_down: bool = False  #: whether the z axis of that space points downwards
+    #: what is known of it before anything is learned, as a system with its states, inputs and time step; a model of
+    #: differences learns what it misses
     nominal: "System | None" = None
 
     def __post_init__(self) -> None:

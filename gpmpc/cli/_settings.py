@@ -1,0 +1,257 @@
+"""Arguments and settings of commands: how they are composed, and a user's mistake in them as one line."""
+
+import argparse
+import difflib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException, OverrideParseException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+import gpmpc
+from gpmpc.exceptions import GpmpcError, SettingError
+
+
+class Result(NamedTuple):
+    """What a command returns."""
+
+    data: Any = None  # plain data, which ``--json`` prints
+    code: int = 0  # the exit code
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that raises an error of this package instead of printing the usage and exiting."""
+
+    def __init__(self, *arguments: Any, **settings: Any):
+        self.values: dict[str, list[str] | None] = {}  # by option or name: choices, empty for any; None for a flag
+        super().__init__(*arguments, **settings)
+
+    def add_argument(self, *names: Any, **settings: Any) -> Any:
+        flag = settings.get("action") in ("store_true", "help")
+        self.values |= dict.fromkeys(names, None if flag else [*settings.get("choices", ())])
+        return super().add_argument(*names, **settings)
+
+    def error(self, message: str) -> NoReturn:
+        raise GpmpcError(f"{message}; {self.prog} --help shows how")
+
+
+class Command(NamedTuple):
+    """One command."""
+
+    summary: str  # for the list of all
+    task: Callable[[Any], Result]  # from the composed settings, or from the parsed arguments, to the result
+    settings: str = ""  # name of its file in ``conf/``; empty where it has arguments only
+    add_arguments: Callable[[Parser], None] = lambda parser: None  # to its parser
+
+    def parser(self, name: str) -> Parser:
+        """Returns the parser of what follows the command's name."""
+        description = f"gpmpc {name}: {self.summary[0].lower()}{self.summary[1:]}."
+        parser = Parser(prog=f"gpmpc {name}", description=description, add_help=not self.settings)
+        self.add_arguments(parser)
+        if self.settings:
+            parser.add_argument("-h", "--help", action="store_true")
+            parser.add_argument("--cfg", action="store_true")
+            for name in ("--config-name", "--config-dir"):
+                parser.add_argument(name)
+            parser.add_argument("overrides", nargs="*")
+        return parser
+
+
+def folder_of(folder: Any) -> Path:
+    """Returns the folder that the setting ``folder`` names."""
+    if not isinstance(folder, str) or not folder.strip():
+        raise SettingError("folder", f"must be the path of a folder; got {folder!r}")
+    return Path(folder)
+
+
+@contextmanager
+def writing(folder: Path, key: str = "folder") -> Iterator[None]:
+    """Turns errors of writing to ``folder`` into one of the setting ``key``, which named it."""
+    try:
+        yield
+    except OSError as error:
+        raise SettingError(key, f"cannot write to {folder}: {error.strerror or error}") from error
+
+
+def write_files(folder: Path, files: Mapping[str, str | bytes], key: str = "folder") -> str:
+    """Writes files, each in one piece, and makes the folder; returns the line that says so."""
+    from gpmpc.files import write_whole
+
+    with writing(folder, key):
+        for name, content in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            write_whole(folder / name, content)
+    return f"written to {folder}: {', '.join(sorted(files))}"
+
+
+ENDINGS = (".safetensors", ".safetensors'", '.safetensors"')  # of files of models, quoted or not
+
+
+def config_folder() -> Path:
+    """Returns the settings' folder: beside the package's modules in a wheel, beside the package in a checkout."""
+    package = Path(gpmpc.__file__).resolve().parent
+    installed = package / "conf"
+    return installed if installed.is_dir() else package.parent / "conf"
+
+
+@contextmanager
+def settings(own: str | None = None) -> Iterator[None]:
+    """Lets Hydra find the package's settings, and those in a folder ``own`` behind them.
+
+    What stands in the working folder can be named by ``_target_`` inside, behind everything that is installed.
+    """
+    try:
+        here = os.getcwd()
+    except OSError as error:
+        raise GpmpcError("the working folder is gone; change to one that exists") from error
+    if here not in sys.path:
+        sys.path.append(here)
+    if own is not None:
+        _search_also(Path(own))
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder())):
+        yield
+
+
+def _search_also(folder: Path) -> None:
+    if not folder.is_dir():
+        raise SettingError("--config-dir", f"{folder}: no such folder")
+
+    class OwnFolder(SearchPathPlugin):
+        def manipulate_search_path(self, search_path: Any) -> None:
+            search_path.append("command-line", f"file://{folder.absolute()}")
+
+    Plugins.instance().register(OwnFolder)
+
+
+def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
+    """Returns the settings of ``conf/NAME.yaml`` with overrides; Hydra's own are ``HydraConfig.get()`` from then on."""
+    config = hydra.compose(name, [*overrides], return_hydra_config=True)
+    HydraConfig.instance().set_config(config)
+    return without_hydra(config)
+
+
+def model_file(override: str) -> list[str]:
+    """Returns an override; in the place of ``model=FILE``, of a file or several, the option that reads it."""
+    key, _, value = override.partition("=")
+    return ["model=saved", f"model.path={value}"] if key == "model" and value.endswith(ENDINGS) else [override]
+
+
+def without_hydra(config: DictConfig) -> DictConfig:
+    config = config.copy()
+    with open_dict(config):
+        del config["hydra"]
+    return config
+
+
+def setting_names(name: str, overrides: Sequence[str] = ()) -> list[str]:
+    """Returns every setting of ``conf/NAME.yaml``, dotted; each after the node that holds it."""
+
+    def keys(node: object, prefix: str = "") -> list[str]:
+        if not isinstance(node, dict):
+            return []
+        return [key for k, value in node.items() for key in (f"{prefix}{k}", *keys(value, f"{prefix}{k}."))]
+
+    return keys(OmegaConf.to_container(hydra.compose(name, [*overrides]), resolve=False))
+
+
+def group_options(name: str) -> dict[str, list[str]]:
+    """Returns the options of every group that ``conf/NAME.yaml`` chooses from; not every command has every group."""
+    defaults = OmegaConf.load(config_folder() / f"{name}.yaml").defaults
+    keys = [key for entry in defaults if OmegaConf.is_dict(entry) for key in entry if not key.startswith("override ")]
+    options = GlobalHydra.instance().config_loader().get_group_options
+    found = {key: options(key.partition("@")[0]) for key in sorted(keys)}
+    for other in (entry for entry in defaults if isinstance(entry, str) and entry != "_self_"):
+        found |= group_options(other)
+    return found
+
+
+def help_text(name: str) -> str:
+    """Returns what ``gpmpc COMMAND --help`` prints: how it is used, its choices, every setting with its value."""
+    choices = "\n".join(f"{key}: {', '.join(options)}" for key, options in group_options(name).items())
+    every, header = OmegaConf.to_yaml(compose(name)), HydraConfig.get().help.header
+    return f"{header}\n\nChoices:\n\n{choices}\n\nEvery setting, with its default:\n\n{every}"
+
+
+_EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher
+
+
+def explain(error: Exception, name: str) -> str | None:
+    """Returns a user's mistake in one line; None where the error is not the user's."""
+    if isinstance(error, GpmpcError | HydraException | OmegaConfBaseException):
+        return _of_settings(error, name)
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    if name and isinstance(error, TypeError | ValueError | ArithmeticError):  # a value that no check foresaw
+        reason = " ".join(str(error).split()) or type(error).__name__
+        return f"{reason}; is a setting of the wrong kind? --debug shows where"
+    return None
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Returns the name that a misspelt one stands for, as a question; by its last part where only that was typed."""
+    known, leaf = sorted(known, key=lambda key: key.count(".")), lambda key: key.rpartition(".")[2]
+    alone = "." not in name or leaf(name).lower() in {leaf(key).lower() for key in known}
+    for part in (leaf,) if alone else (str, leaf):
+        parts = {part(key).lower() for key in known}
+        if close := difflib.get_close_matches(part(name).lower(), parts, n=1):
+            meant = [key for key in known if part(key).lower() == close[0]]
+            if "." in name:
+                meant = difflib.get_close_matches(name, meant, n=1, cutoff=0.0)
+            meant = [key for key in meant if "." not in key] or meant
+            return f" (did you mean {' or '.join(map(repr, meant[:3]))}?)"
+    return ""
+
+
+def _of_settings(error: Exception, name: str) -> str:
+    if own_error(error):
+        return one_line(error)
+    text = str(error)
+    if unknown := re.match(r"Could not override '([^']+)'", text):
+        with settings():
+            known = setting_names(name)
+        return f"unknown setting {unknown[1]!r}{nearest(unknown[1], known)}"
+    option = re.search(r"Could not find '([^'/]+)/([^']+)'\s+Available options in '[^']+':\n((?:\t.*\n)+)", text)
+    if option and (extra := _EXTRAS.get(option[2].removeprefix("launcher/"))):
+        return f"launcher: this one is not installed: pip install 'gpmpc[{extra}]'"
+    if option:
+        known = option[3].split()
+        available = f"available are {', '.join(known)}{nearest(option[2], known)}"
+        return f"{option[1]}: no such option {option[2]!r}; {available}"
+    if isinstance(error, OverrideParseException):
+        if "=" not in error.override:
+            return f"{error.override!r}: a setting is written SETTING=VALUE"
+        quoted = "in single quotes where the value holds brackets, braces, commas or spaces"
+        return f"{error.override!r}: cannot be read; a setting is written SETTING=VALUE, {quoted}"
+    if unlocated := re.match(r"Error locating target '([^']+)'", text):
+        return f"_target_: no such class or function {unlocated[1]!r}"
+    if isinstance(error, MissingMandatoryValue):
+        return f"{error.full_key}: this setting has no default; give it as {error.full_key}=VALUE"
+    if ambiguous := re.match(r"Ambiguous value for argument '([^=]+)=([^']+)'", text):
+        listed = f"{ambiguous[1]}: a list is written in brackets, {ambiguous[1]}=[{ambiguous[2]}]"
+        return f"{listed}; a sweep takes -m" if name == "run" else listed
+    lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc" not in line]
+    return "; ".join(line.rstrip(".:;") for line in lines) or type(error).__name__
+
+
+def own_error(error: BaseException | None) -> GpmpcError | None:
+    """Returns the error of this package that another one was raised from, or is; None where there is none."""
+    while error is not None and not isinstance(error, GpmpcError):
+        error = error.__cause__
+    return error
+
+
+def one_line(error: BaseException) -> str:
+    """Returns the reason of an error in one line."""
+    ours = own_error(error)
+    return " ".join((str(ours) if ours else f"{type(error).__name__}: {error}").split())
