@@ -137,6 +137,19 @@ def test_a_start_that_is_known_is_searched_from_over_all_points():
     assert np.allclose(again.explored[:, 0], first.objective, rtol=1e-6)
 
 
+def test_a_subset_is_searched_first_where_there_are_more_points_and_other_starts_than_a_known_one():
+    data = pendulum(40, noise=1e-2)
+    whole, same, fewer = (Trainer(restarts=0, subset=subset)(data) for subset in (None, 40, 39))
+    assert np.array_equal(same.theta, whole.theta)
+    assert same.evaluations == whole.evaluations
+    assert not np.array_equal(fewer.explored, whole.explored)
+    start, again = whole.posterior, {}
+    for restarts in (0, 1):
+        again[restarts] = [Trainer(restarts=restarts, subset=subset)(data, start=start) for subset in (None, 20)]
+    assert np.array_equal(again[0][0].explored, again[0][1].explored)
+    assert not np.array_equal(again[1][0].explored, again[1][1].explored)
+
+
 def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(monkeypatch):
     monkeypatch.setattr("gpmpc.gp._training.available_memory", lambda: 2 * 2**20)
     with pytest.raises(DataError) as refused:

@@ -1,5 +1,7 @@
 """Many starts find plans that one misses, over any full turn, within their time; feedback holds between decisions."""
 
+from itertools import product
+
 import casadi
 import numpy as np
 import pytest
@@ -115,11 +117,71 @@ def test_a_measurement_that_is_not_finite_is_said_so_and_misuse_is_refused():
         one.control(Gaussian.certain(np.zeros(2)), Reference(np.zeros(2)), plan=(np.zeros((2, 1)), np.zeros((3, 2))))
 
 
+def test_goals_are_the_nearest_turns_of_each_angle_seen_from_the_end_of_the_reference():
+    many = ManyStarts(controller(double_pendulum("elbow"), [10.0, 0.1, 10.0, 0.1], [0.01], 3), turns=(2, 3))
+    angle = np.array([[0.0, 3.0, 7.0, 10.0], [5.0, 4.0, 2.0, -9.0]])
+    reference = Reference(np.stack([angle[0], np.full(4, 0.5), angle[1], np.full(4, -0.5)], axis=1))
+    state = np.array([3.0, 8.0, 1.0, -8.0])
+    off = state[[0, 2]] - angle[:, -1]
+    around = [sorted(range(-9, 9), key=lambda k, a=a: abs(off[a] - 2 * np.pi * k))[: (2, 3)[a]] for a in range(2)]
+    expected = sorted(product(*around), key=lambda turns: np.abs(off - 2 * np.pi * np.array(turns)).sum())
+    goals = list(many._goals(state, reference))
+    assert len(goals) == 6
+    for goal, turns in zip(goals, expected, strict=True):
+        moved = 2 * np.pi * np.array([turns[0], 0, turns[1], 0])
+        assert np.allclose(goal.states, reference.states + moved, atol=1e-12)
+
+
+def test_a_guess_is_a_line_to_the_goal_or_what_its_inputs_lead_to():
+    system, H = pendulum(), 4
+    inputs = np.array([[0.5], [-0.5], [1.0], [0.0]])
+    many = ManyStarts(controller(system, [1.0, 0.01], [0.01], H), guesses=[None, inputs, 1e308 * inputs], turns=2)
+    state, targets = np.array([0.3, -0.2]), np.stack([np.linspace(0.0, 1.0, 5), np.ones(5)], axis=1)
+    found = list(many._candidates(state, Reference(targets)))
+    assert len(found) == 6  # guess by guess, two goals each
+    for goal, (states, given) in found[:2]:
+        assert np.allclose(states[0], state)
+        assert np.allclose(states[-1], goal.states[-1])
+        for k in range(H + 1):
+            assert np.allclose(states[k], goal.states[k] + (1 - k / H) * (state - goal.states[0]))
+        assert np.array_equal(given, np.tile(system.initial_input, (H, 1)))
+    for _, (states, given) in found[2:4]:
+        assert given is inputs
+        for k in range(H):
+            assert np.allclose(states[k + 1], step(system, states[k], given[k]), rtol=1e-7, atol=1e-9)
+        assert np.array_equal(states[0], state)
+    for _, (states, _) in found[4:]:  # which leads nowhere
+        assert np.array_equal(states, np.tile(state, (H + 1, 1)))
+
+
+def test_what_cannot_be_searched_is_refused():
+    one = controller(pendulum(), [1.0, 0.01], [0.01], 30)
+    for settings, message in (
+        ({"turns": 0}, "turns: must be whole numbers from 1 on, one for each of 1 angles"),
+        ({"turns": [1, 0]}, "turns: must be whole numbers"),
+        ({"budget": 0.0}, "budget: must be a number above 0"),
+    ):
+        with pytest.raises(SettingError, match=message):
+            ManyStarts(one, **settings)
+    settings = PredictionSettings("velocity", "none")
+    paper = GPMPC(one.prediction.model, Linearization(), one.problem, 30, one.initial_input, settings)
+    for parts in ((paper,), (one, paper)):
+        with pytest.raises(SettingError, match="controller: must be of form 'trajectory'"):
+            ManyStarts(*parts)
+    bare = ManyStarts(one)
+    assert (bare.planner, bare.limit, bare.budget, bare.turns) == (one, np.inf, None, [2])
+    assert (bare.horizon, bare.problem) == (30, one.problem)
+
+
 def test_kicks_push_every_input_to_both_sides_within_its_bounds():
     problem = Problem(Tracking([1.0], [1.0, 1.0], penalized="inputs"), inputs=Box([0.0, -1.0], [2.0, np.inf]))
     found = kicks(problem, 12, np.array([0.5, 0.0]))
     assert [inputs[0, 0] for inputs in found] == [0.5, 1.25, 0.25]
     assert all((inputs[:, 0] >= 0).all() and not inputs[:, 1].any() for inputs in found)
+    assert [inputs[:6, 0].tolist() for inputs in found[1:]] == [
+        [1.25, 1.25, 0.25, 0.25, 0.5, 0.5], [0.25, 0.25, 1.25, 1.25, 0.5, 0.5],
+    ]  # fmt: skip
+    assert kicks(problem, 3, np.array([0.5, 0.0]), share=1.0)[1][:, 0].tolist() == [2.0, 0.0, 0.5]
 
 
 @pytest.mark.parametrize("starts", [3, pytest.param(20, marks=pytest.mark.slow)])
