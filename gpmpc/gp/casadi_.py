@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from gpmpc.exceptions import DataError, UnsupportedModel
-from gpmpc.gp.posterior import AffineForm, GPPosterior
+from gpmpc.gp.posterior import GPPosterior
 from gpmpc.kernels.tape import (
     ADD,
     ATAN2,
@@ -59,7 +59,11 @@ def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
     """
     form = getattr(model, "affine_form", None)
     x, u = casadi.MX.sym("state", model.state_dim), casadi.MX.sym("input", model.input_dim)
-    mean, variance = _residual(model, x, u) if form is None or form.tape is not None else _affine(form, x, u)
+    if form is None or form.B is not None:
+        mean, variance = _residual(model, x, u)
+    else:  # GPs alone, of next states or of differences
+        mean, variance = _moments(form.f, x, u)
+        mean = mean if form.A is None else mean + x
     return casadi.Function(name, [x, u], [mean, variance], ["state", "input"], ["mean", "variance"])
 
 
@@ -69,23 +73,8 @@ def successor_function(plant: Any) -> casadi.Function:
     return casadi.Function("successor", [x, u], [casadi.vertcat(*plant.successor(x, u))])
 
 
-def _affine(form: AffineForm, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:
-    """Mean and variance (k,) of a model with an affine form."""
-    seen = (x, u)
-    if form.states is not None:
-        seen = _features(x, form.states, form.angles), _selected(u, form.inputs or [])
-    mean, variance = _moments(form.f, *seen)
-    if form.B is not None:
-        B = _numbers(form.B)
-        mean, variance = B @ mean, B**2 @ variance
-    for factor, vector in ((form.A, x), (form.G, u)):
-        if factor is not None:
-            mean = mean + _numbers(factor) @ vector
-    return mean if form.c is None else mean + _numbers(form.c), variance
-
-
 def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:
-    """Mean and variance (n,) of a residual model with functions that are written in CasADi."""
+    """Mean and variance (n,) of a residual model whose functions are numbers or written in CasADi."""
     nominal: Any = getattr(model, "nominal", None)
     B: Any = getattr(model, "B", None)
     known: Any = getattr(nominal, "function", None)

@@ -33,7 +33,6 @@ from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, Stages
 from gpmpc.mpc.problem import Inequality, Problem
 from gpmpc.propagation import Propagator, differentiate, square_roots
 from gpmpc.propagation import linearize as linearize_belief
-from gpmpc.qp import SoftRows
 
 Array = np.ndarray
 
@@ -263,11 +262,9 @@ class ConstraintRows:
         E = self._rows(F, covariances[1 : stages + 1]) if self._constant is None else self._constant
         return StageRows(np.ascontiguousarray(E), D, lower, upper)
 
-    def softness(self, hard_rows: int) -> SoftRows | None:
+    def all_prices(self, hard_rows: int) -> Array | None:
         """The prices of all rows of a program's G, after ``hard_rows`` that have none; None where all are hard."""
-        if not self.soft:
-            return None
-        return SoftRows(linear=np.concatenate([np.full(hard_rows, np.inf), np.tile(self.prices, self._horizon)]))
+        return np.concatenate([np.full(hard_rows, np.inf), np.tile(self.prices, self._horizon)]) if self.soft else None
 
     def _rows(self, F: Array, covariances: Array) -> Array:
         """E (K, r, p) of gradients F (K, r, n) at covariances of the states (K, n, n); one of either stands for all."""

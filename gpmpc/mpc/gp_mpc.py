@@ -88,8 +88,8 @@ class GPMPC:
         self._prior = self.prediction.linearizer.prior_variances()
         self._rates = self._condenser.bounds.rate_lower.size
         self._hard = np.where(np.isinf(self.prediction.constraints.prices), np.inf, 0.0)  # prices: of hard rows alone
-        self._soft = self.prediction.constraints.softness(self._rates)
-        if self._soft is not None and not isinstance(self.solver, DualActiveSet):
+        self._prices = self.prediction.constraints.all_prices(self._rates)
+        if self._prices is not None and not isinstance(self.solver, DualActiveSet):
             got = (
                 f"soft constraints need DualActiveSet (penalty=None makes them hard); got {type(self.solver).__name__}"
             )
@@ -251,10 +251,10 @@ class GPMPC:
 
     def _solve(self, program: CondensedProgram, warm: QPSolution | None) -> QPSolution:
         if isinstance(self.solver, DualActiveSet):
-            soft = self._soft
-            if soft is not None and len(program.feedback):  # there the bounds of inputs are rows, too
-                soft = self.prediction.constraints.softness(len(program.G) - len(soft.linear) + self._rates)
-            return self.solver.solve(QuadraticProgram.unchecked(*program[:5]), warm, soft)
+            prices = self._prices
+            if prices is not None and len(program.feedback):  # there the bounds of inputs are rows, too
+                prices = np.concatenate([np.full(len(program.G) - len(prices), np.inf), prices])
+            return self.solver.solve(QuadraticProgram.unchecked(*program[:5]), warm, prices)
         fits = warm is not None and warm.arrays[2].shape == program.G.shape
         return self.solver.solve(QuadraticProgram.from_stacked(*program[:5]), warm if fits else None)
 
@@ -307,8 +307,7 @@ def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> b
 
 def _violation(solution: QPSolution) -> float:
     """The largest violation of a hard row."""
-    softness, caps = solution.softness
-    return float(solution.violation()[(softness == 0.0) & np.isinf(caps)].max(initial=0.0))
+    return float(solution.violation()[np.isinf(solution.caps)].max(initial=0.0))
 
 
 class _Stopwatch:

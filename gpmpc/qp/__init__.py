@@ -7,7 +7,7 @@ recordings, loads no compiler.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from gpmpc.qp.problem import QuadraticProgram, SoftRows
+from gpmpc.qp.problem import QuadraticProgram
 from gpmpc.qp.solution import QPSolution, QPSolver, Residuals, make_solution
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ __all__ = [
     "QPSolver",
     "QuadraticProgram",
     "Residuals",
-    "SoftRows",
     "make_solution",
 ]
 

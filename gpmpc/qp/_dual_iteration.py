@@ -3,8 +3,8 @@
 For a working set W the minimiser over ``c_p'x = b_p, p in W`` is x = x_u - P^-1 C_W' mu with K_WW mu = y_W - b_W, where
 x_u is the unconstrained minimiser, y = C x_u and K = C P^-1 C'. The method of Goldfarb and Idnani (Math. Programming
 27, 1983, algorithm 1) keeps every multiplier in its range and moves to the most violated constraint p until none is
-violated. Where rows are soft, 1/rho is added to K_pp, and a multiplier at its cap leaves with a constraint that stays
-violated; then mu_p is not zero outside the working set.
+violated. A multiplier at its cap, the price of a soft row, leaves with a constraint that stays violated; then mu_p is
+not zero outside the working set.
 
 The functions take a ``Workspace``, a ``WorkingSet`` and the number k of its constraints; those that change k return it.
 """
@@ -114,7 +114,7 @@ def _satisfy_constraint(work, active, k, p):
     violation = (work.y[p] - (work.upper[p] if above else work.lower[p])) * sense
     place = _make_row(work, active, k, p)
     row, size = work.rows[place], int(work.end[p])
-    free_value, K_pp = _measure_row(work, p, row, size)
+    free_value, K_pp = dot(row, work.v, len(work.x)), dot(row, row, size)
     _multiply_working_rows(work, active, k, p, row)
     solve_lower(active.factor, k, solved)
     while True:
@@ -126,7 +126,7 @@ def _satisfy_constraint(work, active, k, p):
         solve_transposed(active.factor, k, r)
         d = K_pp - dot(solved, solved, k)
         if d < _DOUBTFUL * K_pp:
-            d = _distance_to_span(work, active, k, p, row)
+            d = _distance_to_span(work, active, k, row)
         # ratio test:  t = min(t1, t2);  t2 = violation / d makes p hold,  t1 takes a multiplier to the end of its range
         step = max(0.0, violation) / d if d > _DEPENDENT * K_pp and k < work.capacity else np.inf
         room = active.most[k] - mu[p] if sense > 0.0 else mu[p] - active.least[k]
@@ -176,16 +176,13 @@ def _first_blocking(work, active, k, sense, step):
 
 
 @inline_njit
-def _distance_to_span(work, active, k, p, row):
-    """Returns ``d = |w_p - sum r_i w_i|^2``, softness included, as a sum of squares, which cannot cancel."""
+def _distance_to_span(work, active, k, row):
+    """Returns ``d = |w_p - sum r_i w_i|^2`` as a sum of squares, which cannot cancel."""
     rest, n = work.scratch, len(work.x)
     for j in range(n):
         rest[j] = row[j]
     subtract_rows(rest, work.rows, active.place, work.r, k, n)
-    d = dot(rest, rest, n) + work.softness[p]
-    for i in range(k):
-        d += work.softness[abs(active.name[i]) - 1] * work.r[i] * work.r[i]
-    return d
+    return dot(rest, rest, n)
 
 
 @inline_njit
@@ -212,7 +209,7 @@ def add_constraints(work, active, k, count):
         row, size = work.rows[place], int(work.end[p])
         _multiply_working_rows(work, active, k, p, row)
         solve_lower(active.factor, k, solved)
-        free_value, K_pp = _measure_row(work, p, row, size)
+        free_value, K_pp = dot(row, work.v, len(work.x)), dot(row, row, size)
         pivot = K_pp - dot(solved, solved, k)
         if pivot > _GUESSED_PIVOT * K_pp:
             active.place[first + i] = active.place[k]
@@ -240,12 +237,6 @@ def _make_row(work, active, slot, p):
         row[p] = 1.0
     solve_transposed(work.L, int(work.end[p]), row)
     return place
-
-
-@inline_njit
-def _measure_row(work, p, row, size):
-    """Returns c_p'x at the unconstrained minimiser, and K_pp with softness; ``row`` is w_p."""
-    return dot(row, work.v, len(work.x)), dot(row, row, size) + work.softness[p]
 
 
 @inline_njit

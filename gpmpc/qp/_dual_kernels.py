@@ -231,7 +231,7 @@ def _measure_residuals(work, active, k, least):
     row by its bound or its own terms. ``_UNDEFINED`` where a number that it is made of is not finite: comparisons alone
     would pass over NaN.
 
-    Fills ``gradient = P x + slope`` and ``rest = y_W - softness mu_W - b``, where slope = q + C'mu.
+    Fills ``gradient = P x + slope`` and ``rest = y_W - b``, where slope = q + C'mu.
     """
     P, y, slope, gradient, n = work.P, work.y, work.slope, work.gradient, len(work.x)
     multiply(P, n, y, n, gradient)
@@ -247,7 +247,7 @@ def _measure_residuals(work, active, k, least):
     worst = max(worst, 0.01 * largest(shifts) / max(largest(entries), _TINY))
     for i in range(k):
         p, b = abs(active.name[i]) - 1, active.bound[i]
-        work.rest[i] = y[p] - work.softness[p] * work.mu[p] - b
+        work.rest[i] = y[p] - b
         rest, length = abs(work.rest[i]), size * work.scale[p]
         undefined += 0.0 * rest
         if rest > 1e-15 * length:  # then by the row's own terms too
@@ -292,8 +292,8 @@ def _worst_violation(work, least):
     size = math.sqrt(max(abs(dot(work.slope, y, len(work.x))), least * least))
     for p in range(len(y)):
         if abs(mu[p]) < work.cap[p]:
-            above, below, paid = y[p] - work.upper[p], work.lower[p] - y[p], work.softness[p] * abs(mu[p])
+            above, below = y[p] - work.upper[p], work.lower[p] - y[p]
             bound = work.upper[p] if above > below else work.lower[p]
-            rest = max(above, below) - paid - work.negligible[p]
+            rest = max(above, below) - work.negligible[p]
             worst = max(worst, rest / max(1e-3 * size * work.scale[p], abs(bound)))
     return worst

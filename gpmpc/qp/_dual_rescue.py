@@ -5,7 +5,7 @@ iteration of ``gpmpc.qp._dual_iteration`` is written for accuracy: variables and
 working set has a QR factor computed anew at each change, and x and the multipliers are sums of two floats that Newton's
 method corrects by residuals without rounding error (iterative refinement, Higham, Accuracy and Stability of Numerical
 
-    a = -A_W dmu - [L^-1 r1; 0],   A_W' a = -r2,   L' dx = a
+    a = -A_W dmu - L^-1 r1,   A_W' a = -r2,   L' dx = a
 
 for the residuals r1 of stationarity and r2 of the working set.
 """
@@ -33,13 +33,13 @@ _CORRECTIONS = 12
 
 @np.errstate(all="ignore")  # what is not finite does not convince
 def rescue(
-    problem: tuple, softness: Array, record: Array, limit: int = 20, late: Callable[[], bool] = lambda: False
+    problem: tuple, caps: Array, record: Array, limit: int = 20, late: Callable[[], bool] = lambda: False
 ) -> Array:
     """The record of a solve that starts from the working set of another, ``record``.
 
     Args:
         problem: P, q, G, lower and upper; bounds of 1e20 or more are absent.
-        softness: (2, M), see ``gpmpc.qp.problem.stack_softness``.
+        caps: (M,), see ``gpmpc.qp.problem.multiplier_caps``.
         record: What the kernel wrote.
         limit: Changes of the working set before ``ITERATION_LIMIT``.
         late: Whether it is time for ``TIME_LIMIT``.
@@ -49,7 +49,7 @@ def rescue(
     try:
         lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
         for dependent in _DEPENDENT:
-            solve = _Solve((P, q, G, lower, upper), softness, dependent, late)
+            solve = _Solve((P, q, G, lower, upper), caps, dependent, late)
             result[layout.STATUS] = solve.run(layout.working_names(record, len(q), len(lower)), limit)
             if result[layout.STATUS] != layout.NUMERICAL_TROUBLE:
                 break
@@ -64,7 +64,7 @@ def rescue(
 class _Solve:
     """One program, scaled, and the state of the iteration: the working set, x, and the multipliers."""
 
-    def __init__(self, problem: tuple, softness: Array, dependent: float, late: Callable):
+    def __init__(self, problem: tuple, caps: Array, dependent: float, late: Callable):
         P, q, G, lower, upper = problem
         n, M = len(q), len(lower)
         D = _power_of_two(np.sqrt(np.diagonal(P)))
@@ -72,11 +72,10 @@ class _Solve:
         self.D, self.E, self.n = D, E, n
         self.P, self.q, self.C = P * np.outer(D, D), q * D, np.vstack([np.eye(n), G * D * E[n:, None]])
         self.lower, self.upper = lower * E, upper * E
-        self.softness, self.caps = softness[0] * E * E, softness[1] / E
-        self.G, self.bounds, self.late = G, (lower, upper), late
+        self.caps, self.G, self.bounds, self.late = caps / E, G, (lower, upper), late
         self.L = np.linalg.cholesky(self.P)
         self.columns = solve_triangular(self.L, self.C.T, lower=True)  # L^-1 C'
-        self.norms = np.sqrt((self.columns**2).sum(axis=0) + self.softness)
+        self.norms = np.sqrt((self.columns**2).sum(axis=0))
         self.dependent = dependent / np.diagonal(self.L).min()
         self.members: list[int] = []
         self.sides: list[int] = []
@@ -129,8 +128,7 @@ class _Solve:
         guess = {int(abs(name)) - 1: int(np.sign(name)) for name in names}
         some = [p for p, side in guess.items() if np.isfinite(self._bound(p, side)) and self.norms[p] > 0.0]
         if some:
-            A = np.vstack([self.columns[:, some], np.diag(np.sqrt(self.softness[some]))]) / self.norms[some]
-            R, order = qr(A, mode="r", pivoting=True)
+            R, order = qr(self.columns[:, some] / self.norms[some], mode="r", pivoting=True)
             good = np.abs(np.diagonal(R)) > 1e6 * self.dependent
             self.members = [some[i] for i in order[: len(good)][good]]
             self.sides = [guess[p] for p in self.members]
@@ -138,16 +136,15 @@ class _Solve:
     def _factorise(self) -> None:
         if self.late():
             raise TimeoutError
-        A = np.vstack([self.columns[:, self.members], np.diag(np.sqrt(self.softness[self.members]))])
-        self.Q, self.R = qr(A, mode="economic")
+        self.Q, self.R = qr(self.columns[:, self.members], mode="economic")
 
     def _distance(self, p: int) -> tuple[Array, float]:
         """The combination r of the working columns nearest to that of constraint p, and its distance."""
-        rest, r = np.append(self.columns[:, p], np.zeros(len(self.members))), np.zeros(len(self.members))
+        rest, r = self.columns[:, p], np.zeros(len(self.members))
         for _ in range(2):  # twice is enough
             part = self.Q.T @ rest
             rest, r = rest - self.Q @ part, r + solve_triangular(self.R, part)
-        return r, float(np.sqrt(rest @ rest + self.softness[p]))
+        return r, float(np.sqrt(rest @ rest))
 
     def _settle(self) -> bool:
         """Finds x and the multipliers of the working set; drops the most wrong one until all are in range."""
@@ -177,7 +174,6 @@ class _Solve:
         """Newton's method on the working set with residuals free of rounding; False if it does not converge."""
         W, n = self.members, self.n
         C, b = self.C[W], np.array([self._bound(p, side) for p, side in zip(W, self.sides, strict=True)])
-        S = np.diag(self.softness[W])
         pulling = np.flatnonzero(self.mu[0])
         others = np.setdiff1d(pulling, W)  # soft rows at their caps
         for _ in range(_CORRECTIONS):
@@ -186,12 +182,11 @@ class _Solve:
                 [(self.P, x[0]), (self.P, x[1]), (C.T, mu[0, W]), (C.T, mu[1, W]), (self.C[others].T, mu[0, others])],
                 self.q,
             )
-            r2 = _sum_products([(C, x[0]), (C, x[1]), (S, -mu[0, W]), (S, -mu[1, W])], -b)
-            slope = np.append(solve_triangular(self.L, r1, lower=True), np.zeros(len(W)))
+            r2, slope = _sum_products([(C, x[0]), (C, x[1])], -b), solve_triangular(self.L, r1, lower=True)
             along = solve_triangular(self.R, r2, trans="T")
             part = self.Q.T @ slope
             a = self.Q @ (part - along) - slope
-            dx = solve_triangular(self.L, a[:n], trans="T", lower=True)
+            dx = solve_triangular(self.L, a, trans="T", lower=True)
             dmu = solve_triangular(self.R, along - part)
             _add(x, slice(None), dx)
             _add(mu, W, dmu)

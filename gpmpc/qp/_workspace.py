@@ -19,8 +19,8 @@ from gpmpc.qp._record import HEADER
 Array = NDArray[np.float64]
 
 _LIMIT, _TOLERANCE, _SOFT, SHARE, _SETTINGS = range(5)
-_REALS, _INTEGERS = 5, 26  # rows of ``memory`` at which vectors begin, after settings and traits,
-_REST = 30  # then integers, the factor of the working set, L and rows
+_REALS, _INTEGERS = 4, 25  # rows of ``memory`` at which vectors begin, after settings and traits,
+_REST = 29  # then integers, the factor of the working set, L and rows
 _END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
 
 
@@ -42,8 +42,7 @@ class Workspace(NamedTuple):
     allowed_high: Any
     negligible: Any  # (M,) violation of a bound of zero that is none
     scale: Any  # (M,) length of c_p in the metric of the inverse of P's diagonal
-    softness: Any  # (M,) 1/rho of a quadratic price: added to K_pp
-    cap: Any  # (M,) linear price: the largest size of a multiplier
+    cap: Any  # (M,) price of a violation: the largest size of a multiplier
     end: Any  # (M,) leading entries of c_p that may not be zero
     record: Any  # what the solve returns, see ``gpmpc.qp._record``; in it
     x: Any  # (n,) the point and
@@ -76,29 +75,23 @@ class WorkingSet(NamedTuple):
     free_value: Any  # c_p'x at the unconstrained minimiser
     least: Any  # range of the multiplier: [0, cap] at an upper bound,
     most: Any  # [-cap, 0] at a lower one, [-cap, cap] for an equality
-    diagonal: Any  # K_pp + softness
-    factor: Any  # L_K of K_WW + softness = L_K L_K'
+    diagonal: Any  # K_pp
+    factor: Any  # L_K of K_WW = L_K L_K'
 
 
-def new_memory(softness: Array, n: int, limit: int, tolerance: float, soft: bool) -> Array:
-    """Returns memory for programs of n variables with these softness and caps (2, M)."""
-    M = softness.shape[1]
-    capacity = most_working(n, M, soft)
+def new_memory(caps: Array, n: int, limit: int, tolerance: float, soft: bool) -> Array:
+    """Returns memory for programs of n variables with these caps (M,)."""
+    M = len(caps)
+    capacity = min(n, M)
     wide = padded(max(M, capacity + 2, _SETTINGS)) + 8  # kernels write whole lanes
     own = n * padded(n) + n * (capacity + 1)
     memory = aligned_rows(_REST + capacity + 1 - (-own // wide), wide)  # loads across cache lines take twice the time
     memory[:] = 0.0
     box = np.arange(M) < n
     memory[0, :_SETTINGS] = limit, tolerance, soft, 1.0
-    memory[1, :M], memory[2:4, :M] = box, softness
-    memory[4, :M] = box * np.minimum(n, (np.arange(M) // _END_STEP + 1) * _END_STEP)
+    memory[1, :M], memory[2, :M] = box, caps
+    memory[3, :M] = box * np.minimum(n, (np.arange(M) // _END_STEP + 1) * _END_STEP)
     return memory
-
-
-@inline_njit
-def most_working(n, M, soft):
-    """Returns how many constraints can work at once."""
-    return M if soft else min(n, M)
 
 
 @inline_njit
@@ -134,16 +127,15 @@ def open_workspace(P, q, G, memory, out):
     """Returns the workspace and the working set in ``memory`` and the record ``out``."""
     n, M = len(q), len(q) + len(G)
     settings, real, whole = memory[0], memory[_REALS:_INTEGERS], memory[_INTEGERS:_REST].view(np.int64)
-    soft = settings[_SOFT] != 0.0
-    capacity = most_working(n, M, soft)
+    soft, capacity = settings[_SOFT] != 0.0, min(n, M)
     factor, start = memory[_REST : _REST + capacity + 1], (_REST + capacity + 1) * memory.shape[1]
     L = _matrix(memory, start, n, padded(n))  # pyright: ignore[reportCallIssue]
     rows = _matrix(memory, start + n * padded(n), capacity + 1, n)  # pyright: ignore[reportCallIssue]
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     work = Workspace(
         P, q, G, L, rows, real[0], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2], memory[3],
-        memory[4], out, x, mu, real[6][:M], real[7], whole[0], whole[1], real[8], real[9], real[10], real[11],
-        real[12], real[13], real[14], real[15], capacity, int(settings[_LIMIT]), settings[_TOLERANCE], soft, settings,
+        out, x, mu, real[6][:M], real[7], whole[0], whole[1], real[8], real[9], real[10], real[11], real[12], real[13],
+        real[14], real[15], capacity, int(settings[_LIMIT]), settings[_TOLERANCE], soft, settings,
     )  # fmt: skip
     active = WorkingSet(whole[2], whole[3], real[16], real[17], real[18], real[19], real[20], factor)
     return work, active

@@ -127,7 +127,7 @@ class CvxpySolver:
         if best.status is Status.SOLVED:
             best.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
             if self.options is None:  # its working set may be right all the same
-                best.record[:] = rescue(problem, best.softness, best.record)
+                best.record[:] = rescue(problem, best.caps, best.record)
         return best
 
     def _form(self, n: int, lower: Array, upper: Array) -> tuple[Any, Any, list]:

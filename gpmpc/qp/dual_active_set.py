@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gpmpc.compiled import compile_for, unchecked_entry_point
 from gpmpc.exceptions import ProblemError
@@ -21,7 +21,7 @@ from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_kernels import SIGNATURE, solve
 from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp._workspace import new_memory
-from gpmpc.qp.problem import QuadraticProgram, SoftRows, stack_softness
+from gpmpc.qp.problem import QuadraticProgram, multiplier_caps
 from gpmpc.qp.solution import QPSolution, WarmStart, as_record, proves_infeasibility
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ class DualActiveSet:
         _run = unchecked_entry_point(solve)
 
     def solve(
-        self, problem: QuadraticProgram, warm_start: WarmStart = None, soft: SoftRows | None = None
+        self, problem: QuadraticProgram, warm_start: WarmStart = None, prices: ArrayLike | None = None
     ) -> QPSolution:
         """Solves one problem.
 
@@ -70,42 +70,42 @@ class DualActiveSet:
             problem: The QP. ``QuadraticProgram.unchecked`` builds it in a fraction of a microsecond; its arrays are
                 checked here.
             warm_start: The solution of a similar problem, or an active set; any guess is safe.
-            soft: Weights of the rows that may be violated.
+            prices: Of a violation of each row of G, per unit (m,); infinite where it is hard, as all are by default.
 
         Returns:
             The minimiser with status ``SOLVED``, or ``INFEASIBLE`` (the multipliers are then Farkas' proof),
             ``ITERATION_LIMIT``, ``TIME_LIMIT`` (the best dual iterate) or ``NUMERICAL_TROUBLE``.
 
         Raises:
-            ProblemError: The problem was not checked and breaks a rule of ``QuadraticProgram``.
+            ProblemError: The problem was not checked and breaks a rule of ``QuadraticProgram``, or the prices do.
         """
         began = perf_counter()
         try:
-            plan = self._plans[problem.G.shape] if soft is None else self._plan(problem.G.shape, soft)
+            plan = self._plans[problem.G.shape] if prices is None else self._plan(problem.G.shape, prices)
         except (AttributeError, KeyError, TypeError):  # the first of its shape, or an unchecked one without a shape
             problem = QuadraticProgram.from_stacked(*problem)
-            plan = self._plan(problem.G.shape, soft)
-        (P, q, G, lower, upper), (softness, memory, size, where) = problem, plan
+            plan = self._plan(problem.G.shape, prices)
+        (P, q, G, lower, upper), (caps, memory, size, where) = problem, plan
         record, status = _empty(size), _MISUSE
         try:
             guess = _NO_RECORD if warm_start is None else warm_start.record  # type: ignore[union-attr]
             if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
                 status = _run(P, q, G, lower, upper, guess, memory, record)
                 if not status:
-                    return _new(QPSolution, (record[where], problem, softness, record, 0.0, perf_counter() - began))
+                    return _new(QPSolution, (record[where], problem, caps, record, 0.0, perf_counter() - began))
         except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
             pass
         return _solve_again(problem, warm_start, plan, self, status, record, began)
 
-    def _plan(self, shape: tuple, soft: SoftRows | None) -> tuple[Array, Array, int, slice]:
-        """Returns softness, memory, the record's length, and where x is in it, for a shape of G."""
+    def _plan(self, shape: tuple, prices: ArrayLike | None) -> tuple[Array, Array, int, slice]:
+        """Returns caps, memory, the record's length, and where x is in it, for a shape of G."""
         m, n = shape
-        softness, M, limit = stack_softness(soft, n, m), n + m, self._limit(n + m)
+        caps, M, limit = multiplier_caps(prices, n, m), n + m, self._limit(n + m)
         if self.time_limit is not None:
             limit = min(limit, _ITERATIONS_PER_LOOK)
-        memory = new_memory(softness, n, limit, self.tolerance, soft is not None)
-        plan = softness, memory, layout.record_size(n, M), slice(layout.HEADER, layout.HEADER + n)
-        if soft is None:
+        memory = new_memory(caps, n, limit, self.tolerance, prices is not None)
+        plan = caps, memory, layout.record_size(n, M), slice(layout.HEADER, layout.HEADER + n)
+        if prices is None:
             self._plans[m, n] = plan
         return plan
 
@@ -119,14 +119,14 @@ def _solve_again(problem: _Arrays, warm_start, plan, solver, status, record, beg
     Raises:
         ProblemError: The problem breaks a rule of ``QuadraticProgram``.
     """
-    softness, memory, _, where = plan
+    caps, memory, _, where = plan
     if status == layout.MISUSE:
         problem = QuadraticProgram.from_stacked(*problem)  # raises if it is misuse indeed
     P, q, G, lower, upper = problem
     n, M = len(q), len(lower)
 
     def solution(record: Array) -> QPSolution:
-        return QPSolution(record[where], problem, softness, record, 0.0, perf_counter() - began)
+        return QPSolution(record[where], problem, caps, record, 0.0, perf_counter() - began)
 
     def late() -> bool:
         return solver.time_limit is not None and perf_counter() - began > solver.time_limit
@@ -155,7 +155,7 @@ def _solve_again(problem: _Arrays, warm_start, plan, solver, status, record, beg
         record = guess
     record[layout.ITERATIONS] += done
     if not _is_certain(record, G, lower, upper):
-        record = rescue(problem, softness, record, limit, late)
+        record = rescue(problem, caps, record, limit, late)
     return solution(record)
 
 

@@ -86,7 +86,7 @@ class PrimalActiveSet:
         def finish(status, x, multipliers, active, iterations):
             solution = make_solution(problem, status, x, multipliers, active_set=active, iterations=iterations)
             if status in (Status.SOLVED, Status.NUMERICAL_TROUBLE):  # it is checked, and its last digits are found
-                solution.record[:] = rescue(problem, solution.softness, solution.record)
+                solution.record[:] = rescue(problem, solution.caps, solution.record)
                 if solution.status is not Status.INFEASIBLE and not solution.is_optimal(self.tolerance):
                     solution.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
             return solution._replace(solve_seconds=perf_counter() - began)

@@ -5,12 +5,12 @@
 
 with P symmetric and positive definite, so that the minimiser is unique whenever the constraints can be met. The rows
 of G may depend on each other, repeat, or be zero. A bound of size 1e20 or more is none, equal bounds make an
-equality.
+equality. A row with a price w may be violated by v for w v: its multiplier then reaches w, and no more. So the penalty
+is exact: a row whose multiplier stays below its price is kept (Fletcher, 1987, section 14.3).
 
 Solvers see the constraints *stacked*, box first: ``lower <= C x <= upper`` with C = [I; G], M = n + m rows.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -193,52 +193,16 @@ def _check_matrices(P: ArrayLike, q: ArrayLike, G: ArrayLike | None) -> tuple[tu
     return (n, rows[0]), P, q, G
 
 
-@dataclass(frozen=True, eq=False, init=False)
-class SoftRows:
-    """Prices of violated rows of G; infinity keeps a row hard.
+def multiplier_caps(prices: ArrayLike | None, variables: int, rows: int) -> Array:
+    """Returns the largest sizes (M,) of the stacked constraints' multipliers: the prices of rows, infinity elsewhere.
 
-    A row with a *quadratic* weight rho pays 1/2 rho v^2 for a violation v (its multiplier is rho v); one with a
-    *linear* weight w pays w |v|, the exact L1 penalty (Fletcher, Practical Methods of Optimization, 1987, section
-    14.3): it is met exactly as long as its multiplier stays below w. In the dual both are simple: a quadratic weight
-    adds 1/rho to the diagonal of K, a linear one caps the multiplier. A row that is to pay both is written twice.
-
-    Attributes:
-        quadratic: (m,) rho > 0.
-        linear: (m,) w > 0.
+    Raises:
+        ProblemError: Another number of prices than of rows, NaN, or a price that is not positive.
     """
-
-    quadratic: Array
-    linear: Array
-
-    def __init__(self, quadratic: ArrayLike | None = None, linear: ArrayLike | None = None):
-        """Checks the weights; those of a kind that is omitted are infinite.
-
-        Raises:
-            ProblemError: A weight that is not positive, or two finite weights on one row.
-        """
-        given = quadratic if quadratic is not None else linear
-        if given is None:
-            raise ProblemError("soft rows need quadratic weights, linear weights, or both; got neither")
-        for name, value in (("quadratic", quadratic), ("linear", linear)):
-            array = np.full(np.shape(given), np.inf) if value is None else value
-            array = _as_float_array(f"{name} weights", array, (np.size(given),))
-            if not (array > 0.0).all():
-                i = int(np.argmin(array > 0.0))
-                raise ProblemError(f"{name} weight of row {i} must be positive; got {array[i]:.6g}")
-            object.__setattr__(self, name, array)
-        both = np.isfinite(self.quadratic) & np.isfinite(self.linear)
-        if both.any():
-            i = int(np.argmax(both))
-            raise ProblemError(f"row {i} has a quadratic and a linear weight: write the row twice, once with each")
-
-
-def stack_softness(soft: SoftRows | None, variables: int, rows: int) -> Array:
-    """Returns (2, M): 1/rho and the cap of the multiplier for the stacked constraints; 0 and infinity where hard."""
-    softness = np.vstack([np.zeros(variables + rows), np.full(variables + rows, np.inf)])
-    if soft is not None:
-        if len(soft.quadratic) != rows:
-            raise ProblemError(
-                f"soft weights must be given for every row of G; got {len(soft.quadratic)} for {rows} rows"
-            )
-        softness[:, variables:] = 1.0 / soft.quadratic, soft.linear
-    return softness
+    caps = np.full(variables + rows, np.inf)
+    if prices is not None:
+        caps[variables:] = _as_float_array("prices of rows", prices, (rows,))
+        if not (caps > 0.0).all():
+            i = int(np.argmin(caps > 0.0))
+            raise ProblemError(f"price of row {i - variables} must be positive; got {caps[i]:.6g}")
+    return caps

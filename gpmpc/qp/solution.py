@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
-from gpmpc.qp.problem import ABSENT, QuadraticProgram, stack_softness
+from gpmpc.qp.problem import ABSENT, QuadraticProgram
 from gpmpc.status import Status
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ class QPSolution(NamedTuple):
     Attributes:
         x: (n,) the minimiser; the best iterate if the status is not ``SOLVED``. A view of the record.
         arrays: P, q, G, and the bounds (M,) of the stacked constraints ``[x; Gx]``, as in ``QuadraticProgram``.
-        softness: (2, M), see ``gpmpc.qp.problem.stack_softness``.
+        caps: Largest sizes (M,) of the multipliers: the prices of soft rows, infinity elsewhere.
         record: The solver's whole result in one array, and a warm start for the next solve; see ``gpmpc.qp._record``.
         build_seconds: Time spent on building or compiling the problem in this call [s].
         solve_seconds: Time spent on solving it [s].
@@ -55,7 +55,7 @@ class QPSolution(NamedTuple):
 
     x: Array
     arrays: tuple[Array, Array, Array, Array, Array]
-    softness: Array
+    caps: Array
     record: Array
     build_seconds: float = 0.0
     solve_seconds: float = 0.0
@@ -64,7 +64,7 @@ class QPSolution(NamedTuple):
     def multipliers(self) -> Array:
         """(M,) multipliers of the stacked constraints; Farkas' proof if the status is ``INFEASIBLE``."""
         start = layout.HEADER + len(self.x)
-        return self.record[start : start + self.softness.shape[1]]
+        return self.record[start : start + len(self.caps)]
 
     @property
     def z(self) -> Array:
@@ -89,7 +89,7 @@ class QPSolution(NamedTuple):
     @property
     def active_set(self) -> NDArray[np.int8]:
         """(M,) -1 where a stacked constraint works at its lower bound, +1 at its upper bound, 0 elsewhere."""
-        M = self.softness.shape[1]
+        M = len(self.caps)
         active, start = np.zeros(M, dtype=np.int8), layout.HEADER + len(self.x) + M
         codes = self.record[start : start + int(self.record[layout.WORKING])]
         active[np.abs(codes).astype(int) - 1] = np.sign(codes)
@@ -98,11 +98,8 @@ class QPSolution(NamedTuple):
     @property
     def objective(self) -> float:
         """1/2 x'Px + q'x, with the price of violated soft rows [the unit of the cost]."""
-        x, (P, q, *_) = self.x, self.arrays
-        (softness, caps), violation = self.softness, self.violation()
-        soft, linear = softness > 0, np.isfinite(caps)
-        price = 0.5 * np.sum(violation[soft] ** 2 / softness[soft]) + np.sum(caps[linear] * violation[linear])
-        return float(0.5 * x @ P @ x + q @ x + price)
+        x, (P, q, *_), soft = self.x, self.arrays, np.isfinite(self.caps)
+        return float(0.5 * x @ P @ x + q @ x + self.caps[soft] @ self.violation()[soft])
 
     def violation(self) -> Array:
         """(M,) how far each stacked constraint lies outside its bounds, in the constraint's own unit; soft ones too."""
@@ -118,7 +115,7 @@ class QPSolution(NamedTuple):
         Args:
             zero: What counts as no x at all, as a share of the free minimiser.
         """
-        (P, q, G, lower, upper), (softness, caps) = self.arrays, self.softness
+        (P, q, G, lower, upper), caps = self.arrays, self.caps
         x, multipliers = self.x, self.multipliers
         sizes, up, down = np.abs(multipliers), multipliers > 0, multipliers < 0
         rows, slope, n = G @ x, P @ x, len(x)
@@ -127,7 +124,7 @@ class QPSolution(NamedTuple):
         zero = max(1e-4 * (units * np.abs(x)).max(), zero * free)
 
         violation = self.violation()
-        beyond = np.maximum(0.0, violation - np.where(sizes >= caps, np.inf, softness * sizes))
+        beyond = np.where(sizes >= caps, 0.0, violation)
         bound = np.abs(np.where(np.concatenate([x, rows]) > upper, upper, lower))
         own = np.concatenate([np.maximum(np.abs(x), zero / units), np.abs(G) @ np.maximum(np.abs(x), zero / units)])
         own[n:][~G.any(axis=1)] = zero_row_size(G, lower, upper)
@@ -141,10 +138,9 @@ class QPSolution(NamedTuple):
         dual = _largest_ratio(rest, np.maximum(own, zero * units))
 
         support = multipliers[up] * upper[up], multipliers[down] * lower[down]
-        paying, capped = softness > 0.0, (sizes >= caps) & np.isfinite(caps)  # the squares of others may overflow
-        soft = softness[paying] @ multipliers[paying] ** 2 + caps[capped] @ violation[capped]
+        capped = (sizes >= caps) & np.isfinite(caps)
         curvature, gain = x @ slope, q @ x
-        gap = abs(curvature + gain + sum(map(np.sum, support)) + soft)
+        gap = abs(curvature + gain + sum(map(np.sum, support)) + caps[capped] @ violation[capped])
         own = sum(np.abs(part).sum() for part in support)
         gap = _largest_ratio(gap, max(abs(curvature), abs(gain), own, zero * free))
         return Residuals(primal, dual, gap)
@@ -205,7 +201,7 @@ def make_solution(
     record[layout.STATUS] = layout.STATUSES.index(status)
     record[layout.ITERATIONS] = iterations
     record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
-    hard = stack_softness(None, n, M - n)
+    hard = np.full(M, np.inf)
     return QPSolution(record[layout.HEADER : layout.HEADER + n], problem, hard, record, build_seconds, solve_seconds)
 
 

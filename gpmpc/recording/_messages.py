@@ -185,10 +185,10 @@ class StepCopy:
             expected += [(H, m), (H + 1, n), (H + 1, n, n)]
             if solution is not None:
                 arrays += [solution.x, solution.record]
-                problem = (*solution.arrays, solution.softness)
+                problem = (*solution.arrays, _softness(solution.caps))
             elif program is not None:
-                hard = np.vstack([np.zeros(len(program.lower)), np.full(len(program.lower), np.inf)])
-                problem = (program.P, program.q, program.G, program.lower, program.upper, hard)
+                hard = np.full(len(program.lower), np.inf)
+                problem = (program.P, program.q, program.G, program.lower, program.upper, _softness(hard))
             if record_problem:
                 arrays += problem
         for i, array in enumerate(arrays):
@@ -285,3 +285,10 @@ class Encoder:
 
 def _deviations(covariances: Array) -> Array:
     return np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0))
+
+
+def _softness(caps: Array) -> Array:
+    """Zeros and the largest sizes of the multipliers (2, M), as recordings hold them."""
+    rows = np.zeros((2, len(caps)))
+    rows[1] = caps
+    return rows

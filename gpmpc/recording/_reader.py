@@ -46,7 +46,7 @@ class RecordedProblem(NamedTuple):
     G: Array  # (m, n)
     lower: Array  # (M,) bounds of the stacked constraints [x; Gx]
     upper: Array  # (M,)
-    softness: Array  # (2, M) 1/rho and the cap of the multiplier of every stacked constraint
+    softness: Array  # (2, M) zeros (older recordings: 1/rho of quadratic prices), and the multipliers' largest sizes
     x: Array  # (n,) the solution found then; empty where there was none
     multipliers: Array  # (M,) its multipliers; empty where there was none
 
@@ -142,7 +142,7 @@ def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
     Raises:
         RecordingError: The step or its problem is not in the recording, or it is no convex program.
     """
-    from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
+    from gpmpc.qp import DualActiveSet, QuadraticProgram
 
     recorded = run.problems.get(k)
     if recorded is None:
@@ -151,12 +151,13 @@ def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
     inverse, caps = recorded.softness[:, len(recorded.q) :]
     try:
         problem = QuadraticProgram.from_stacked(*recorded[:5])
-        if not inverse.any() and np.isinf(caps).all():
+        if inverse.any():
+            raise SettingError("solver", "takes no quadratic prices of rows")
+        if np.isinf(caps).all():
             return chosen.solve(problem)
         if not isinstance(chosen, DualActiveSet):
             raise SettingError("solver", f"must be DualActiveSet for soft rows; got {type(chosen).__name__}")
-        with np.errstate(divide="ignore"):
-            return chosen.solve(problem, soft=SoftRows(quadratic=1 / inverse, linear=caps))
+        return chosen.solve(problem, prices=caps)
     except GpmpcError as error:
         raise RecordingError(f"{run.path}: step {k}: {error}") from error
 
@@ -309,7 +310,7 @@ def _residuals(problem: RecordedProblem) -> tuple[float, float, float]:
         return np.nan, np.nan, np.nan
     P, q, G, lower, upper, softness, x, multipliers = problem
     solution = make_solution(QuadraticProgram.unchecked(P, q, G, lower, upper), Status.SOLVED, x, multipliers)
-    return solution._replace(softness=softness).residuals()
+    return solution._replace(caps=softness[1]).residuals()
 
 
 class Recovery(NamedTuple):

@@ -10,7 +10,7 @@ from gpmpc.mpc._condense import Condenser, condense_with_feedback
 from gpmpc.mpc._cost import PENALIZED
 from gpmpc.mpc._linear_quadratic import QuadraticCost, References, StageRows, Stages, evaluate_cost, expand
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.qp import DualActiveSet, QuadraticProgram, SoftRows
+from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
 from tests.mpc.double_pendulum import ACROBOT, PENDUBOT, UPRIGHT, DoublePendulum
 
@@ -186,8 +186,8 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
     assert len(plain.feedback) == 0
     other = condense_with_feedback(condenser.cost, condenser.bounds, stages, start, references, rows)
     for program in (plain, other):
-        soft = SoftRows(np.concatenate([np.full(len(program.G) - H * r, np.inf), price]))
-        solution = solver.solve(QuadraticProgram.unchecked(*program[:5]), soft=soft)
+        prices = np.concatenate([np.full(len(program.G) - H * r, np.inf), price])
+        solution = solver.solve(QuadraticProgram.unchecked(*program[:5]), prices=prices)
         assert solution.status is Status.SOLVED
         inputs, states = expand(stages, start, program.feedback, references.previous_input, solution.x)
         z = solution.multipliers[-(len(problem.inputs.lower) * H * (2 if rated else 1) + H * r) :]
@@ -239,14 +239,14 @@ def test_weights_by_stage_outputs_and_rows_of_inputs_make_the_stacked_problem_in
         assert gained == pytest.approx(total - cost_and_rows(origin)[0], rel=1e-9)
         left = program.upper[-H * r :] - program.G[-H * r :] @ x
         assert np.allclose(left.reshape(H, r), 1.0 - values, atol=1e-10)
-        solution = DualActiveSet().solve(QuadraticProgram.unchecked(*program[:5]), soft=priced(program, H * r))
+        solution = DualActiveSet().solve(QuadraticProgram.unchecked(*program[:5]), prices=priced(program, H * r))
         plans.append(expand(stages, start, program.feedback, references.previous_input, solution.x)[0])
         assert cost_and_rows(plans[-1])[0] < rest[0]
     assert np.allclose(*plans, atol=1e-8)
 
 
 def priced(program, rows):
-    return SoftRows(np.concatenate([np.full(len(program.G) - rows, np.inf), np.full(rows, 2.0)]))
+    return np.concatenate([np.full(len(program.G) - rows, np.inf), np.full(rows, 2.0)])
 
 
 def test_an_unstable_plant_is_condensed_in_feedback_coordinates_and_the_plan_is_found(rng):

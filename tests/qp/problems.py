@@ -64,6 +64,6 @@ def primal(problem, warm_start=None):
     return PrimalActiveSet().solve(problem, warm_start)
 
 
-def solve_stacked(P, q, G, lower, upper, warm_start=None, soft=None):
+def solve_stacked(P, q, G, lower, upper, warm_start=None, prices=None):
     """The solution of arrays that nobody has checked."""
-    return DualActiveSet().solve(QuadraticProgram.unchecked(P, q, G, lower, upper), warm_start, soft)
+    return DualActiveSet().solve(QuadraticProgram.unchecked(P, q, G, lower, upper), warm_start, prices)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gpmpc.qp import PrimalActiveSet, QuadraticProgram, SoftRows
+from gpmpc.qp import PrimalActiveSet, QuadraticProgram
 from gpmpc.status import Status
 from tests.qp.problems import solve_stacked
 
@@ -69,8 +69,7 @@ def test_a_row_whose_norm_overflows_is_not_taken_for_one_that_is_kept():
 def test_soft_rows_do_not_hide_it():
     P, q = PROBLEMS["in one variable"]
     free = np.append(FREE, 1.0)
-    soft = SoftRows(quadratic=np.array([1.0]))
-    solution = solve_stacked(P, q, np.array([[0.0, 1.0, 0.0]]), -free, free, soft=soft)
+    solution = solve_stacked(P, q, np.array([[0.0, 1.0, 0.0]]), -free, free, prices=[1.0])
     assert solution.status is Status.NUMERICAL_TROUBLE
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import ProblemError
-from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram, SoftRows
+from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
 from tests.qp.problems import solve_stacked
 
 EYE = np.eye(2)
@@ -104,24 +104,17 @@ def test_unstacking_and_stacking_bounds_are_inverse(rng):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("prices", "message"),
     [
-        ({}, "neither"),
-        ({"quadratic": [1.0, 0.0]}, "quadratic weight of row 1 must be positive"),
-        ({"linear": [-1.0, 1.0]}, "linear weight of row 0 must be positive"),
-        ({"linear": [1.0, np.nan]}, "NaN"),
-        ({"quadratic": [np.inf, 1.0], "linear": [1.0, 1.0]}, "row 1 has a quadratic and a linear weight"),
-        ({"quadratic": [1.0, 1.0], "linear": [1.0]}, "shape"),
+        ([1.0, 0.0], "price of row 1 must be positive; got 0"),
+        ([-1.0, 1.0], "price of row 0 must be positive"),
+        ([1.0, np.nan], "prices of rows must not contain NaN"),
+        ([1.0], r"prices of rows must have shape \(2,\); got \(1,\)"),
     ],
 )
-def test_malformed_soft_weights_are_refused(arguments, message):
+def test_prices_are_positive_numbers_one_for_each_row(prices, message):
     with pytest.raises(ProblemError, match=message):
-        SoftRows(**arguments)
-
-
-def test_soft_weights_must_cover_every_row():
-    with pytest.raises(ProblemError, match="got 1 for 2 rows"):
-        DualActiveSet().solve(QuadraticProgram(EYE, [0.0, 0.0], EYE), soft=SoftRows(linear=[1.0]))
+        DualActiveSet().solve(QuadraticProgram(EYE, [0.0, 0.0], EYE), prices=prices)
 
 
 @pytest.mark.parametrize("solver", [DualActiveSet, PrimalActiveSet])

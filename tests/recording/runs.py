@@ -22,11 +22,11 @@ def problem(rng, variables=6, rows=8):
     return QuadraticProgram(A @ A.T + np.eye(variables), 3 * rng.standard_normal(variables), G, **bounds, **box)
 
 
-def make_step(k, rng, horizon=5, status=Status.SOLVED, failed=False, qp=True, soft=None, variables=6):
+def make_step(k, rng, horizon=5, status=Status.SOLVED, failed=False, qp=True, prices=None, variables=6):
     n, m = len(STATES), len(INPUTS)
     roots = rng.standard_normal((horizon + 1, n, n))
     program = problem(rng, variables) if qp else None
-    solution = DualActiveSet().solve(program, soft=soft) if qp else None
+    solution = DualActiveSet().solve(program, prices=prices) if qp else None
     inputs = rng.standard_normal((horizon, m))
     decision = Decision(
         input=inputs[0],

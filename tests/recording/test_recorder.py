@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from gpmpc.exceptions import RecordingError, SettingError, ShapeError
-from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram, SoftRows
+from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
 from gpmpc.recording import RecordedSystem, _recorder, read_run, replay
 from gpmpc.status import Status
 from tests.recording import runs
@@ -114,14 +114,14 @@ def test_a_replayed_step_gives_the_same_answer(recorded):
 
 def test_soft_rows_are_replayed_soft(tmp_path):
     rng, path = np.random.default_rng(0), tmp_path / "soft.mcap"
-    weights = np.where(np.arange(8) % 2, 5.0, np.inf)
-    step = runs.make_step(0, rng, soft=SoftRows(quadratic=weights))
+    prices = np.where(np.arange(8) % 2, 0.05, np.inf)
+    step = runs.make_step(0, rng, prices=prices)
     with runs.recorder(path) as recorder:
         recorder.record(step)
     run, solution = read_run(path), step.decision.solution
     np.testing.assert_allclose(replay(run, 0).x, solution.x, rtol=0, atol=1e-9)
     np.testing.assert_allclose(run.residuals[0], solution.residuals(), atol=1e-15)
-    hard = solution._replace(softness=np.array([[0.0], [np.inf]]) * np.ones(solution.softness.shape))
+    hard = solution._replace(caps=np.full_like(solution.caps, np.inf))
     assert max(solution.residuals()) < 1e-6 < max(hard.residuals())
     with pytest.raises(RecordingError, match="step 0: solver: must be DualActiveSet for soft rows"):
         replay(run, 0, PrimalActiveSet())
