@@ -32,7 +32,7 @@ from gpmpc.experiments.subsystems import SCALINGS, SYSTEMS, check_subsystems
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Scaling, Training, Transitions
 from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
-from gpmpc.plotting import Panel, error_over_size, png
+from gpmpc.plotting import error_over_size, png
 from gpmpc.propagation import MomentMatching
 from gpmpc.studies.document import MISSING, Document, Table, number, with_range
 from gpmpc.studies.study import Trial, check_workers, derived_seed, fingerprint, random_rows
@@ -386,15 +386,15 @@ def _numbers(row: Row) -> dict[str, Any]:
 
 def _figure(records: Sequence[dict]) -> bytes:
     """Draws the test MSE over the training size, one panel a trajectory and subsystem (PNG)."""
-    panels: dict[tuple[str, str], Panel] = {}
+    panels: dict[str, tuple[dict, dict]] = {}  # our errors and the paper's, by size
     for record in records:
         name = record["trajectory"], record["subsystem"]
-        panel = panels.setdefault(name, Panel(", ".join(name), {}, {}))
+        ours, paper = panels.setdefault(", ".join(name), ({}, {}))
         if "error" not in record:
-            panel.draws.setdefault(record["size"], []).append(record["test_mse"])
+            ours.setdefault(record["size"], []).append(record["test_mse"])
         if printed := paper_figures().get((*name, record["size"])):
-            panel.paper[record["size"]] = float(printed["test_mse"])
-    return png(error_over_size(list(panels.values()), "test MSE", "Tables 1 and 2: error of held-out predictions"))
+            paper[record["size"]] = float(printed["test_mse"])
+    return png(error_over_size(panels, "test MSE", "Tables 1 and 2: error of held-out predictions"))
 
 
 def _digits(value: Decimal) -> str:

@@ -1,9 +1,9 @@
 """gpmpc: Gaussian process model predictive control.
 
-The rooms of the house, from the ground up: ``gp`` (exact Gaussian processes), ``qp`` (quadratic programs), ``plants``
-and ``trajectories`` (the systems and what they follow), ``propagation`` (beliefs through a model), ``control``,
-``simulation``, ``datasets``, ``metrics``, ``recording`` (runs in MCAP files), ``plotting``, ``experiments`` (the
-paper's results), ``cli``.
+The packages, from the ground up: ``gp`` (Gaussian processes), ``qp`` (quadratic programs), ``systems`` and
+``trajectories`` (what is controlled and what it follows), ``models``, ``propagation`` (beliefs through a model),
+``estimation``, ``mpc`` (controllers), ``simulation``, ``datasets``, ``learning``, ``recording`` (runs in MCAP files),
+``logs``, ``plotting``, ``studies``, ``experiments`` (the published results), ``cli``.
 """
 
 __version__ = "0.1.0"

@@ -85,11 +85,6 @@ class Sweep:
             for job in finished:
                 job.folder.result(plain_settings(*self.settings(job)))
 
-    def keep_plan(self, jobs: Sequence[Job]) -> None:
-        """Writes what was asked for, so that a report knows what is missing; equal sweeps write the same file."""
-        text = json.dumps({"runs": [choices(job.overrides) for job in jobs]}, indent=1) + "\n"
-        write_files(self.tree, {f"{PLAN}{hashlib.sha256(text.encode()).hexdigest()[:10]}.json": text})
-
     def fly(self, jobs: Sequence[Job]) -> list[dict[str, Any]]:
         """Flies the runs that are not finished; returns the outcome of each of those."""
         waiting = [job for job in jobs if not job.folder.finished]
@@ -142,7 +137,9 @@ def sweep(given: Namespace, name: str) -> Result:
     jobs = list({job.folder.path: job for job in map(runs.job, combinations)}.values())
     finished = sum(job.folder.finished for job in jobs)
     runs.check(jobs)
-    runs.keep_plan(jobs)
+    # What was asked for, so that a report knows what is missing; equal sweeps write the same file.
+    plan = json.dumps({"runs": [choices(job.overrides) for job in jobs]}, indent=1) + "\n"
+    write_files(runs.tree, {f"{PLAN}{hashlib.sha256(plan.encode()).hexdigest()[:10]}.json": plan})
     with runs.progress(jobs, len(jobs)):
         outcomes = runs.fly(jobs)
     failed = [outcome for outcome in outcomes if "error" in outcome]

@@ -116,7 +116,7 @@ def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = ST
     ]
     return Judgement(
         groups=tuple(group.name for group in space.groups),
-        units=tuple(group.error_unit for group in space.groups),
+        units=tuple("rad" if group.kind == "quaternion" else group.unit for group in space.groups),
         steps=tuple(steps),
         mean={name: d.mean(axis=0) for name, d in distances.items()},
         rmse={name: np.sqrt(np.square(d).mean(axis=0)) for name, d in distances.items()},

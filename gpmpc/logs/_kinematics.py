@@ -34,10 +34,6 @@ class StateGroup:
         """Number of entries of a difference: three of a quaternion."""
         return 3 if self.kind == "quaternion" else len(self.entries)
 
-    @property
-    def error_unit(self) -> str:
-        return "rad" if self.kind == "quaternion" else self.unit
-
 
 @dataclass(frozen=True)
 class StateSpace:

@@ -141,7 +141,8 @@ def learn(
         base = models
         for average in AVERAGES:
             grown = partial(_with_gp, outputs=outputs, average=average, points=points, seed=seed)
-            words = f"{name}, GP on {_words({**choice, group: average})}"
+            averages = {**choice, group: average}.items()
+            words = f"{name}, GP on {' and '.join(f'{of} (averaged over {rows})' for of, rows in averages)}"
             progress(words)
             trained: list[LogModel] = []
             if words not in memory:
@@ -179,10 +180,6 @@ def _is_better(candidate: Candidate, incumbent: Candidate) -> bool:
     """Whether a candidate's errors are smaller on the whole, and in no group at no step much larger."""
     ratio = np.log(np.maximum(candidate.errors, 1e-12) / np.maximum(incumbent.errors, 1e-12))
     return bool(ratio.mean() < -GAIN and ratio.max() < LOSS)
-
-
-def _words(choice: dict[str, int]) -> str:
-    return " and ".join(f"{group} (averaged over {average})" for group, average in choice.items())
 
 
 def _structures(kinematics: Kinematics, log: Log) -> tuple[str, LogModel, dict[str, Grow]]:

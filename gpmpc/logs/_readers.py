@@ -67,10 +67,6 @@ def _read_csv(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     return {"": table.rename(columns=str.strip)}
 
 
-def _read_parquet(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
-    return {"": pd.read_parquet(path)}
-
-
 def _read_npz(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     with np.load(path, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files if archive[name].ndim in (1, 2)}
@@ -158,7 +154,7 @@ def _read_ulog(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
 _READERS: dict[str, Callable[[Path, tuple[str, ...], bool], Streams]] = {
     ".csv": _read_csv,
     ".tsv": _read_csv,
-    ".parquet": _read_parquet,
+    ".parquet": lambda path, *_: {"": pd.read_parquet(path)},
     ".npz": _read_npz,
     ".mcap": _read_mcap,
     ".ulg": _read_ulog,

@@ -8,7 +8,6 @@ from gpmpc.plotting._film import film
 from gpmpc.plotting._recorded import inputs_figure, inspection_figure, judgement_figure, timing_figure, tracking_figure
 from gpmpc.plotting._results import (
     Curve,
-    Panel,
     calibration_figure,
     error_over_size,
     innovations_figure,
@@ -21,7 +20,6 @@ from gpmpc.plotting._sweeps import Series, over_variable, search_figure
 
 __all__ = [
     "Curve",
-    "Panel",
     "Series",
     "animate",
     "calibration_figure",

@@ -19,28 +19,27 @@ if TYPE_CHECKING:
     from gpmpc.estimation import FilterRun
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One panel of ``error_over_size``."""
-
-    title: str  # above the panel
-    draws: dict[int, list[float]]  # errors of all draws by training size
-    paper: dict[int, float]  # the paper's figure by training size
-
-
 @styled
-def error_over_size(panels: Sequence[Panel], label: str, title: str = "") -> Figure:
-    """Draws of an error over the training size with their quartiles, and the paper's points; logarithmic."""
+def error_over_size(
+    panels: Mapping[str, tuple[dict[int, list[float]], dict[int, float]]], label: str, title: str = ""
+) -> Figure:
+    """Draws of an error over the training size with their quartiles, and the paper's points; logarithmic.
+
+    Args:
+        panels: By title, the errors of all draws and the paper's figure, both by training size.
+        label: Of the error.
+        title: Of the figure.
+    """
     figure, axes = _panels(len(panels), 4.6, 3.4, title)
-    for axis, panel in zip(axes, panels, strict=False):
-        sizes = sorted(panel.draws)
-        axis.set(title=panel.title, xlabel="training points N")
+    for axis, (heading, (errors, paper)) in zip(axes, panels.items(), strict=False):
+        sizes = sorted(errors)
+        axis.set(title=heading, xlabel="training points N")
         if not sizes:  # every fit failed
             axis.set_axis_off()
             continue
-        draws = Series("our draws, with their quartiles", [panel.draws[size] for size in sizes])
+        draws = Series("our draws, with their quartiles", [errors[size] for size in sizes])
         draw_quartiles(axis, [draws], [str(size) for size in sizes])
-        if known := {size: panel.paper[size] for size in sizes if size in panel.paper}:
+        if known := {size: paper[size] for size in sizes if size in paper}:
             axis.plot([*known], [*known.values()], "o", color=VERMILION, markersize=6, zorder=3, label="paper")
         axis.set_yscale("log")
         axis.yaxis.set_minor_locator(NullLocator())

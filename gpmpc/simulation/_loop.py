@@ -108,17 +108,6 @@ def fly(
                 flight.record(Moment(k, time, state, covariance, measured, input), decided)
 
 
-class _Row(NamedTuple):
-    """What a ``Rollout`` holds of a step: nothing of its quadratic program, and one row of its plan."""
-
-    step: Step  # without its decision
-    expected: Array  # mean of the next state; NaN where no plan was applied
-    expected_covariance: Array
-    iterations: int
-    timing: Timing
-    far_from_data: bool
-
-
 class History:
     """Collects the steps of one loop for its ``Rollout``.
 
@@ -138,7 +127,9 @@ class History:
         states: slice = slice(None),
         on_step: Callable[[Step], None] | None = None,
     ):
-        self.rows: list[_Row] = []
+        # Of every step, without its decision and its quadratic program: mean and covariance expected of the next state,
+        # NaN where no plan was applied; iterations, timing, and whether the plan left the data.
+        self.rows: list[tuple[Step, Array, Array, int, Timing, bool]] = []
         self._simulator, self._references, self._time_step = simulator, references, time_step
         self._states, self._on_step = states, on_step
 
@@ -156,7 +147,7 @@ class History:
             measured=measured,
             input=np.asarray(moment.input, dtype=float),
             decision=decision,
-            innovation=measured - (self.rows[-1].expected if self.rows else np.nan),
+            innovation=measured - (self.rows[-1][1] if self.rows else np.nan),
             belief_covariance=moment.covariance[part, part],
             gp_size=0 if learned is None else learned.size,
             gp_version=0 if learned is None else learned.version,
@@ -172,27 +163,28 @@ class History:
         spent: Any = (0, Timing(0.0, 0.0, 0.0), False)
         if decision is not None:
             spent = decision.iterations, decision.timing, decision.far_from_data
-        self.rows.append(_Row(replace(step, decision=None), *expected, *spent))
+        self.rows.append((replace(step, decision=None), *expected, *spent))
 
     def rollout(self, last: Array | None = None) -> Rollout:
         """Makes the arrays of all steps; ``last`` is the reference state of the end, by default that of its number."""
-        rows, steps, part, end = self.rows, [row.step for row in self.rows], self._states, self._simulator
+        steps, means, covariances, iterations, timings, far = zip(*self.rows, strict=True)
+        part, end = self._states, self._simulator
         if last is None:
-            last = self._references.states[: len(rows) + 1][-1]
+            last = self._references.states[: len(steps) + 1][-1]
         return Rollout(
             states=np.array([*(step.state for step in steps), end.mean[part]]),
             covariances=np.array([*(step.belief_covariance for step in steps), end.covariance[part, part]]),
             measured=np.array([step.measured for step in steps]),
             inputs=np.array([step.input for step in steps]),
             references=np.array([*(step.reference for step in steps), last], dtype=float),
-            predicted_means=np.array([row.expected for row in rows]),
-            predicted_covariances=np.array([row.expected_covariance for row in rows]),
+            predicted_means=np.array(means),
+            predicted_covariances=np.array(covariances),
             statuses=tuple(step.status for step in steps if step.status is not None),
-            iterations=np.array([row.iterations for row in rows]),
-            timings=tuple(row.timing for row in rows),
+            iterations=np.array(iterations),
+            timings=timings,
             time_step=self._time_step,
             suboptimal=tuple(s.k for s in steps if not (s.failed or s.status is None or s.status.solved)),
-            far_from_data=tuple(row.step.k for row in rows if row.far_from_data),
+            far_from_data=tuple(s.k for s, left in zip(steps, far, strict=True) if left),
         )
 
 
