@@ -18,15 +18,11 @@ class ShapeError(GpmpcError, ValueError):
 
 
 class SettingError(GpmpcError, ValueError):
-    """A setting is unknown, of the wrong type, or outside its range.
-
-    Attributes:
-        key: The name of the setting, as the user writes it.
-    """
+    """A setting is unknown, of the wrong type, or outside its range."""
 
     def __init__(self, key: str, message: str):
         super().__init__(key, message)
-        self.key = key
+        self.key = key  #: the name of the setting, as the user writes it
 
     def __str__(self) -> str:
         return f"{self.args[0]}: {self.args[1]}"
@@ -37,15 +33,11 @@ class DataError(GpmpcError, ValueError):
 
 
 class TrainingError(GpmpcError, RuntimeError):
-    """For at least one output every start of the search failed, or sparse GPs learned nothing where exact ones do.
-
-    Attributes:
-        outputs: Indices of the outputs (from 0) that could not be trained.
-    """
+    """For at least one output every start of the search failed, or sparse GPs learned nothing where exact ones do."""
 
     def __init__(self, outputs: list[int], message: str):
         super().__init__(outputs, message)
-        self.outputs = outputs
+        self.outputs = outputs  #: indices of the outputs (from 0) that could not be trained
 
     def __str__(self) -> str:
         return self.args[1]
@@ -60,33 +52,24 @@ class ProblemError(GpmpcError, ValueError):
 
 
 class SolverFailure(GpmpcError, RuntimeError):
-    """A controller's solver did not succeed where its caller had declared no other policy.
-
-    Attributes:
-        step: The time step (from 0).
-    """
+    """A controller's solver did not succeed where its caller had declared no other policy."""
 
     def __init__(self, step: int, advice: str):
         super().__init__(step, advice)
-        self.step = step
+        self.step = step  #: the time step (from 0)
 
     def __str__(self) -> str:
         return f"the controller's solver failed at step {self.args[0]}: {self.args[1]}"
 
 
 class Diverged(GpmpcError, ArithmeticError):
-    """A simulated system left the finite numbers, or its simulator ended the episode.
+    """A simulated system left the finite numbers, or its simulator ended the episode."""
 
-    Attributes:
-        step: The time step (from 0) that it did so in.
-        flown: The ``Rollout`` of a closed loop up to there; None where that was its first step.
-    """
-
-    flown: Any = None
+    flown: Any = None  #: the ``Rollout`` of a closed loop up to there; None where that was its first step
 
     def __init__(self, step: int, message: str):
         super().__init__(step, message)
-        self.step = step
+        self.step = step  #: the time step (from 0) that it did so in
 
     def __str__(self) -> str:
         return f"step {self.args[0]}: {self.args[1]}"

@@ -40,9 +40,9 @@ def environment() -> dict[str, str | None]:
 
     configuration: Any = np.show_config(mode="dicts")
     blas = configuration["Build Dependencies"]["blas"]
-    own = {"gpmpc": version("gpmpc"), "python": platform.python_version()}
     return {
-        **own,
+        "gpmpc": version("gpmpc"),
+        "python": platform.python_version(),
         **versions(("torch", "gpytorch", "numba", "numpy", "scipy", "casadi")),
         "BLAS": f"{blas['name']} {blas['version']}",
         "CPU": f"{processor()}, {os.cpu_count()} cores",

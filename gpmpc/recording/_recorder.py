@@ -46,9 +46,6 @@ class McapRecorder:
         chunk_size: Numbers [bytes] that wait in memory at most, if more than one step does; what a killed run loses.
         live: Serve every step to viewers as well, at ``address``.
 
-    Attributes:
-        address: Where a viewer finds the live view, such as ``ws://127.0.0.1:8765``; None without one.
-
     Raises:
         RecordingError: The file cannot be written, or another process is writing it.
     """
@@ -74,7 +71,7 @@ class McapRecorder:
         config = config if isinstance(config, str) else json.dumps(config, indent=2, default=str)
 
         self.path = Path(path)
-        self.address: str | None = None
+        self.address: str | None = None  #: where a viewer finds the live view, such as ``ws://127.0.0.1:8765``
         self._n, self._m = len(system.state_names), len(system.input_names)
         self._start, self._record_problems, self._chunk_size = start_time_ns, record_problems, chunk_size
         self._encoder = Encoder(system)
@@ -110,11 +107,7 @@ class McapRecorder:
             self.address = f"ws://127.0.0.1:{self._server.port}"
 
     def record(self, step: Step, gp_size: int | None = None) -> None:
-        """Takes a copy of a step.
-
-        Args:
-            step: As a closed loop makes it.
-            gp_size: Transitions that the model holds, where the step does not say.
+        """Takes a copy of a step; ``gp_size`` transitions are in the model, where the step does not say.
 
         Raises:
             ShapeError: An array does not fit the names of states and inputs.
@@ -134,10 +127,7 @@ class McapRecorder:
             self._end_chunk()
 
     def close(self, outcome: str = "complete") -> None:
-        """Writes what waits and finishes the file.
-
-        Args:
-            outcome: How the run ended; kept as metadata.
+        """Writes what waits and finishes the file; how the run ended is kept as metadata.
 
         Raises:
             RecordingError: It could not be written; the file is left unfinished.
