@@ -37,6 +37,7 @@ _GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation",
 _MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
 _CHOICES = {"recorder": ("mcap", "none"), "tracker": ("mlflow", "none"), "live": (True, False)}
 _LOST = 3  # exit code of a run that is finished, and whose flight was lost
+_LONGEST = 6000  # characters of a parameter that MLflow takes
 
 
 def _run(config: DictConfig) -> Result:
@@ -267,9 +268,6 @@ COMMAND = Command(
     "run",
     lambda parser: parser.add_argument("--multirun", "-m", action="store_true"),
 )
-
-
-_LONGEST = 6000  # characters of a parameter that MLflow takes
 
 
 def log_to_mlflow(folder: Path, result: Mapping[str, Any]) -> None:

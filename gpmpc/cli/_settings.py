@@ -22,6 +22,9 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 import gpmpc
 from gpmpc.exceptions import GpmpcError, SettingError
 
+ENDINGS = (".safetensors", ".safetensors'", '.safetensors"')  # of files of models, quoted or not
+_EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher
+
 
 class Result(NamedTuple):
     """What a command returns."""
@@ -93,9 +96,6 @@ def write_files(folder: Path, files: Mapping[str, str | bytes], key: str = "fold
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             write_whole(folder / name, content)
     return f"written to {folder}: {', '.join(sorted(files))}"
-
-
-ENDINGS = (".safetensors", ".safetensors'", '.safetensors"')  # of files of models, quoted or not
 
 
 def config_folder() -> Path:
@@ -181,9 +181,6 @@ def help_text(name: str) -> str:
     choices = "\n".join(f"{key}: {', '.join(options)}" for key, options in group_options(name).items())
     every, header = OmegaConf.to_yaml(compose(name)), HydraConfig.get().help.header
     return f"{header}\n\nChoices:\n\n{choices}\n\nEvery setting, with its default:\n\n{every}"
-
-
-_EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher
 
 
 def explain(error: Exception, name: str) -> str | None:

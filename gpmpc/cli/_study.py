@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 _ONE, _SEVERAL = ("data", "excited", "undithered", "model", "flying"), ("trajectory", "subsystem")
 _SHOWN_ERRORS = 10
+_FLOWN = ("controller=convex", "controller=paper", "controller=nonlinear", "controller=lqr")
+_SHORT = ("data.samples=12", "model.restarts=0", "steps=2", "horizon=3")
 
 
 def _run(config: DictConfig) -> Result:
@@ -77,10 +79,6 @@ def _study(config: DictConfig, settings: dict[str, Any]) -> "Study":
 TABLES = Command("Computes Tables 1 and 2 of Cao, Lai and Alam (2017) beside the printed ones", _run, "tables")
 FIGURES = Command("Flies figures 2 to 4 and section 5.2, and the same with the plant in the loop", _run, "figures")
 QUALITY = Command("Measures closed-loop cost over the time of a decision, for every controller", _run, "quality")
-
-
-_FLOWN = ("controller=convex", "controller=paper", "controller=nonlinear", "controller=lqr")
-_SHORT = ("data.samples=12", "model.restarts=0", "steps=2", "horizon=3")
 
 
 def _warmup(given: argparse.Namespace) -> Result:

@@ -5,7 +5,7 @@ from gpmpc.logs._inspection import Inspection, inspect_log
 from gpmpc.logs._judging import Judgement, judge
 from gpmpc.logs._kinematics import RigidBody
 from gpmpc.logs._learning import Learned, learn
-from gpmpc.logs._log import Log, LogRun
+from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._reading import read_log
 from gpmpc.logs._rollouts import LogModel, MultirotorNominal
@@ -19,7 +19,6 @@ __all__ = [
     "LogDynamics",
     "LogMapping",
     "LogModel",
-    "LogRun",
     "MultirotorNominal",
     "RigidBody",
     "SavedModel",

@@ -29,6 +29,11 @@ WINDOWS = 300
 EVALUATIONS = 15
 MEMORY_ROWS = 40_000  # states of one batch of rollouts: parameter vectors times windows
 BLOCK = 4  # consecutive windows whose errors are correlated
+TIME_CONSTANTS = (0.0, 0.05, 0.25, 1.0)  # [s]; zero is white
+FITTED = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps
+DIFFERENCE = 1e-6
+FOLLOWED, PRIOR = 6.0, 1.0  # times of the longest prediction: after which an error is forgotten, that a one weighs
+NOISE_WINDOWS, LINEARIZED = 2000, 200  # of a fold: whose errors count, and along which rollouts are linearised
 
 
 @dataclass(frozen=True)
@@ -133,13 +138,6 @@ def fit_least_squares(kinematics: Kinematics, log: Log) -> LogModel:
     solution: Any = np.linalg.lstsq(np.column_stack([z, np.ones(len(z))]), y, rcond=1e-8)[0]
     nominal = AffineNominal(kinematics, y.shape[1], z.shape[1])
     return LogModel(kinematics, nominal, solution.T.ravel(), (0,) * y.shape[1])
-
-
-TIME_CONSTANTS = (0.0, 0.05, 0.25, 1.0)  # [s]; zero is white
-FITTED = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps
-DIFFERENCE = 1e-6
-FOLLOWED, PRIOR = 6.0, 1.0  # times of the longest prediction: after which an error is forgotten, that a one weighs
-NOISE_WINDOWS, LINEARIZED = 2000, 200  # of a fold: whose errors count, and along which rollouts are linearised
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Kind = Literal["vector", "angle", "quaternion"]
+GRAVITY = np.array([0.0, 0.0, -9.80665])  # [m/s2], world
 
 
 @dataclass(frozen=True)
@@ -156,9 +157,6 @@ def quaternion_from_euler(angles: Array) -> Array:
     (sx, sy, sz), (cx, cy, cz) = np.moveaxis(np.sin(angles / 2), -1, 0), np.moveaxis(np.cos(angles / 2), -1, 0)
     x, y = sx * cy * cz - cx * sy * sz, cx * sy * cz + sx * cy * sz
     return np.stack([x, y, cx * cy * sz - sx * sy * cz, cx * cy * cz + sx * sy * sz], axis=-1)
-
-
-GRAVITY = np.array([0.0, 0.0, -9.80665])  # [m/s2], world
 
 
 class Kinematics(Protocol):

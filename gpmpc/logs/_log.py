@@ -20,6 +20,12 @@ from gpmpc.gp import Transitions
 from gpmpc.logs._kinematics import Array, StateSpace, quaternion_inverse, quaternion_product, rotate, rotation_vector
 from gpmpc.logs._mapping import LogMapping, Signal
 
+SPAN = 4  # rows on each side of a finite difference: above the noise of one row
+SLOPES = (0.5, 2.0)  # of a signal over the derivative that it should be
+FIT = 0.7  # correlation from which a slope says something
+MOST_ROWS = 20_000
+_HINTS = ((180 / np.pi, "degrees instead of radians"), (np.pi / 180, "radians instead of degrees"))
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -191,13 +197,6 @@ class Log:
 
     def __iter__(self) -> Iterator[LogRun]:
         return iter(self.runs)
-
-
-SPAN = 4  # rows on each side of a finite difference: above the noise of one row
-SLOPES = (0.5, 2.0)  # of a signal over the derivative that it should be
-FIT = 0.7  # correlation from which a slope says something
-MOST_ROWS = 20_000
-_HINTS = ((180 / np.pi, "degrees instead of radians"), (np.pi / 180, "radians instead of degrees"))
 
 
 def check_plausible(runs: Sequence[LogRun], step: float, mapping: LogMapping) -> None:

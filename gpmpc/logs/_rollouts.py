@@ -21,6 +21,9 @@ from gpmpc.gp import GPPosterior
 from gpmpc.logs._kinematics import Array, Kinematics, quaternion_inverse, rotate
 from gpmpc.logs._log import Log, Windows
 
+STEPS = 50  # of the rollouts that models are judged by
+PAST = 20  # rows before them
+
 
 class Nominal(Protocol):
     """Outputs (..., o) as a function of P named parameters, with the point (P,) at which a fit begins."""
@@ -126,10 +129,6 @@ class AffineNominal:
         z = self.kinematics.features(states, inputs, context)
         A = np.asarray(theta, dtype=float).reshape(self.output_dim, self.feature_dim + 1)
         return z @ A[:, :-1].T + A[:, -1]
-
-
-STEPS = 50  # of the rollouts that models are judged by
-PAST = 20  # rows before them
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from gpmpc.systems import System
 KIND = "LogModel"
 _NAMES = ("state_names", "input_names", "context_names", "runs")
 _NOISE = ("outputs", "measurement")
+DIFFERENCE = 1e-5  # of central differences, relative to entries above one
 
 
 def save_learned(learned: Learned, path: str | Path) -> None:
@@ -102,9 +103,6 @@ def _learned(path: Path, header: dict[str, Any], tensors: dict[str, Tensor]) -> 
         time_step=header["time_step"],
         **{key: tuple(names) for key, names in zip(_NAMES, header["names"], strict=True)},
     )
-
-
-DIFFERENCE = 1e-5  # of central differences, relative to entries above one
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,10 @@ if TYPE_CHECKING:
 
 FLOWN, REFERENCE, TUBE, _BOUND, _FAILED = BLUE, VERMILION, SKY, GREY, ORANGE
 _STAGES = {"model": BLUE, "build": SKY, "solve": VERMILION}
+_MODEL, _GAP = BLUE, ORANGE
+_OTHERS = (GREY, *COLOURS[1:5])  # told apart without colour by their markers
+_MARKERS = ("s", "^", "v", "D", "P")
+_PER_PAGE = 24  # channels drawn
 
 
 def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -178,12 +182,6 @@ def _failures(run: "Run", axes: tuple[Axes, ...]) -> None:
     for axis in axes:
         for time in run.times[run.failed]:
             axis.axvline(time, color=_FAILED, linewidth=1, alpha=0.6, label="failed solve", zorder=0)
-
-
-_MODEL, _GAP = BLUE, ORANGE
-_OTHERS = (GREY, *COLOURS[1:5])  # told apart without colour by their markers
-_MARKERS = ("s", "^", "v", "D", "P")
-_PER_PAGE = 24  # channels drawn
 
 
 @styled

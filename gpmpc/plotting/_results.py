@@ -18,6 +18,14 @@ if TYPE_CHECKING:
     from gpmpc.calibration import Calibration
     from gpmpc.estimation import FilterRun
 
+_SIZE = (9.0, 6.2)  # [in]: at 100 dots an inch as wide as a README
+_CURVES = 5
+_MARKERS = ("o", "^", "s", "D", "v", "P", "X")
+_OTHERS = "0.75"
+_FRONT = "0.35"
+_TICKS = (-1, 0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # [%]
+_LINEAR = 1.0  # [%] of cost up to which the axis is linear
+
 
 @styled
 def error_over_size(
@@ -195,15 +203,6 @@ def over_settings(
             axis.set_ylim(bottom=0)
     legend_below(figure, axes)
     return figure
-
-
-_SIZE = (9.0, 6.2)  # [in]: at 100 dots an inch as wide as a README
-_CURVES = 5
-_MARKERS = ("o", "^", "s", "D", "v", "P", "X")
-_OTHERS = "0.75"
-_FRONT = "0.35"
-_TICKS = (-1, 0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # [%]
-_LINEAR = 1.0  # [%] of cost up to which the axis is linear
 
 
 @styled

@@ -66,6 +66,8 @@ _FIELDS = {
 }
 _LARGEST = 1000  # states or inputs
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_NAMES = ("reference", "state", "measured", "innovation", "input", "belief_covariance")
+_NAMES += ("inputs", "means", "covariances")
 
 
 @dataclass(frozen=True)
@@ -161,8 +163,6 @@ def message_classes(file: FileDescriptorProto) -> dict[str, Any]:
 
 Array = np.ndarray
 _ndarray, _float64 = np.ndarray, np.dtype(np.float64)
-_NAMES = ("reference", "state", "measured", "innovation", "input", "belief_covariance")
-_NAMES += ("inputs", "means", "covariances")
 _NUMBERS = {status: number for number, status in enumerate(Status)}
 
 

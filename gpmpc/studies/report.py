@@ -44,6 +44,8 @@ _SHORT = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": 
 _PARTS = ("q25", "median", "q75")
 _MOST_LINES = 8  # in a figure; what is varied besides is pooled
 _LEGEND = "Median [first to third quartile] over the seeds. In figures, every run is a dot."
+_LEVEL = 0.05
+_FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
 
 
 def report_document(
@@ -186,10 +188,6 @@ def _lines(report: Report, index: int) -> dict[str, list[Cell]]:
         label = ", ".join(f"{report.variables[i]}={cell.values[i]}" for i in others)
         lines.setdefault(label or "all", []).append(cell)
     return lines
-
-
-_LEVEL = 0.05
-_FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
 
 
 @dataclass(frozen=True)
