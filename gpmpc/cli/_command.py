@@ -16,9 +16,8 @@ from gpmpc.cli import _new as new
 from gpmpc.cli import _reports as reports
 from gpmpc.cli import _run as run
 from gpmpc.cli import _study as study
-from gpmpc.cli import _tune as tune
 from gpmpc.cli._settings import Command, Result, compose, explain, help_text, model_file, nearest, settings
-from gpmpc.cli._sweep import sweep
+from gpmpc.cli._sweep import TUNE, sweep, tune
 from gpmpc.cli._terminal import print_error, redirected_output
 from gpmpc.exceptions import GpmpcError
 
@@ -40,7 +39,7 @@ def _show_usage(given: argparse.Namespace) -> Result:
 
 COMMANDS: dict[str, Command] = {
     "run": run.COMMAND,
-    "tune": tune.COMMAND,
+    "tune": TUNE,
     "tables": study.TABLES,
     "figures": study.FIGURES,
     "quality": study.QUALITY,
@@ -131,7 +130,7 @@ def _with_settings(name: str, command: Command, given: argparse.Namespace) -> Re
         if swept and given.cfg:
             raise GpmpcError("--cfg: shows the settings of one run; leave out -m, and give each setting one value")
         if swept:
-            return tune.tune(given, config_name) if name == "tune" else sweep(given, config_name)
+            return tune(given, config_name) if name == "tune" else sweep(given, config_name)
         config = compose(config_name, given.overrides)
         if given.cfg:
             print(OmegaConf.to_yaml(config), end="")
