@@ -127,41 +127,18 @@ def delete_row(L, k, gone, solved, cosines, sines):
     and ``sines`` (k,) are scratch.
     """
     left = solved[gone]
-    for top in range(gone + 1, k, _BLOCK):
-        rests = (L[top, gone], 0.0, 0.0, 0.0)
-        if top + _BLOCK <= k:
-            rests = L[top, gone], L[top + 1, gone], L[top + 2, gone], L[top + 3, gone]
-            rests = _rotate_four(L, top, gone, rests, cosines, sines)
-        for i in range(top, min(top + _BLOCK, k)):
-            row, above, rest = L[i], L[i - 1], rests[i - top]
-            first = top
-            if top + _BLOCK > k:
-                first, rest = gone + 1, row[gone]
-            for j in range(gone):
-                above[j] = row[j]
-            for j in range(first, i):
-                entry = row[j]
-                above[j - 1], rest = cosines[j] * rest + sines[j] * entry, cosines[j] * entry - sines[j] * rest
-            diagonal = 1.0 / row[i]
-            reciprocal = 1.0 / math.sqrt(rest * rest + diagonal * diagonal)
-            cosines[i], sines[i] = rest * reciprocal, diagonal * reciprocal
-            above[i - 1] = reciprocal
-            below = solved[i]
-            solved[i - 1], left = cosines[i] * left + sines[i] * below, cosines[i] * below - sines[i] * left
-
-
-@inline_njit
-def _rotate_four(L, top, gone, rests, cosines, sines):
-    """Applies the rotations before ``top`` to four rows, whose chains hide each other's latency; returns the rests."""
-    a, b, c, d = rests
-    row0, row1, row2, row3, above = L[top], L[top + 1], L[top + 2], L[top + 3], L[top - 1]
-    for j in range(gone + 1, top):
-        cosine, sine, e0, e1, e2, e3 = cosines[j], sines[j], row0[j], row1[j], row2[j], row3[j]
-        above[j - 1], row0[j - 1] = cosine * a + sine * e0, cosine * b + sine * e1
-        row1[j - 1], row2[j - 1] = cosine * c + sine * e2, cosine * d + sine * e3
-        a, b = cosine * e0 - sine * a, cosine * e1 - sine * b
-        c, d = cosine * e2 - sine * c, cosine * e3 - sine * d
-    return a, b, c, d
+    for i in range(gone + 1, k):
+        row, above, rest, below = L[i], L[i - 1], L[i, gone], solved[i]
+        for j in range(gone):
+            above[j] = row[j]
+        for j in range(gone + 1, i):
+            entry = row[j]
+            above[j - 1], rest = cosines[j] * rest + sines[j] * entry, cosines[j] * entry - sines[j] * rest
+        diagonal = 1.0 / row[i]
+        reciprocal = 1.0 / math.sqrt(rest * rest + diagonal * diagonal)
+        cosines[i], sines[i] = rest * reciprocal, diagonal * reciprocal
+        above[i - 1] = reciprocal
+        solved[i - 1], left = cosines[i] * left + sines[i] * below, cosines[i] * below - sines[i] * left
 
 
 @njit_noalloc
@@ -262,21 +239,6 @@ def _subtract_below(P, L, top, j):
 
 
 @inline_njit
-def _subtract_below_two(P, L, top, j):
-    """Returns columns ``j`` to ``j + 7``, then the eight after these: eight sums hide the latency of one."""
-    a0, a1, a2, a3 = load(P[top], j), load(P[top + 1], j), load(P[top + 2], j), load(P[top + 3], j)
-    j += _LANES
-    b0, b1, b2, b3 = load(P[top], j), load(P[top + 1], j), load(P[top + 2], j), load(P[top + 3], j)
-    for s in range(top + _BLOCK, len(P)):
-        row = L[s]
-        x, y = load(row, j - _LANES), load(row, j)
-        f0, f1, f2, f3 = row[top], row[top + 1], row[top + 2], row[top + 3]
-        a0, a1, a2, a3 = a0 - f0 * x, a1 - f1 * x, a2 - f2 * x, a3 - f3 * x
-        b0, b1, b2, b3 = b0 - f0 * y, b1 - f1 * y, b2 - f2 * y, b3 - f3 * y
-    return (a0, a1, a2, a3), (b0, b1, b2, b3)
-
-
-@inline_njit
 def _eliminate(targets, j, sums, multipliers, factors):
     """Writes eight columns of four rows, given what the rows below have left of them."""
     (t0, t1, t2, t3), (a0, a1, a2, a3) = targets, sums
@@ -320,12 +282,8 @@ def _finish_four_rows(P, L, top):
     g3, g2, g1, g0 = math.sqrt(r3), math.sqrt(r2), math.sqrt(r1), 1.0 / math.sqrt(d0)
     targets, multipliers, factors = (t0, t1, t2, t3), (m01, m02, m03, m12, m13, m23), (g0, g1, g2, g3)
     _eliminate(targets, j, (a0, a1, a2, a3), multipliers, factors)
-    while j >= 2 * _LANES:
-        j -= 2 * _LANES
-        left, right = _subtract_below_two(P, L, top, j)
-        _eliminate(targets, j, left, multipliers, factors)
-        _eliminate(targets, j + _LANES, right, multipliers, factors)
-    if j > 0:
-        _eliminate(targets, 0, _subtract_below(P, L, top, 0), multipliers, factors)
+    while j > 0:
+        j -= _LANES
+        _eliminate(targets, j, _subtract_below(P, L, top, j), multipliers, factors)
     t0[top], t1[top + 1], t2[top + 2], t3[top + 3] = g0, g1, g2, g3
     return True
