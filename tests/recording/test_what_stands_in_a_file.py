@@ -133,6 +133,16 @@ def test_steps_are_written_when_enough_wait_or_enough_time_has_passed(tmp_path, 
         assert found == [0, 2, 2]
 
 
+def test_the_beginning_and_the_end_of_a_file_are_flushed_to_the_disk(tmp_path, monkeypatch):
+    path, sizes = tmp_path / "run.mcap", []
+    monkeypatch.setattr(_recorder.os, "fsync", lambda _: sizes.append(path.stat().st_size))
+    with runs.recorder(path, chunk_size=1) as recorder:
+        assert sizes == [path.stat().st_size]
+        recorder.record(runs.make_step(0, np.random.default_rng(0), qp=False))
+        assert len(sizes) == 1
+    assert sizes[1:] == [path.stat().st_size]
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -35,3 +35,38 @@ def test_a_summary_has_a_line_for_each_thing_that_is_measured(failing):
         )
     assert lines["decision [ms]"].startswith("median 3.1  (model 1, build 0.1, solve 2), 99 % below 3.1")
     assert said(result, trajectory="goal", system="pendulum")["flight"] == "20 steps of pendulum with convex"
+
+
+def test_everything_that_a_result_may_hold_has_its_line():
+    result = metrics_of(0.125, steps=20)
+    result |= {
+        "settings": {
+            "options": OPTIONS,
+            "system": {"mass": 1.0, "arm": 0.2},
+            "plant": {"mass": 1.5, "arm": 0.2},
+            "model": {"path": "model.safetensors"},
+            "nominal": {"mass": 0.9},
+        },
+        "training": {"size": 40},
+        "times": result["times"] | {"training": 1.234},
+        "lost": {"step": 3, "time": 0.3, "reason": "away"},
+        "error_at_end": 0.5,
+        "episodes": [0.25, None],
+        "suboptimal": {"ITERATION_LIMIT": 2, "TIME_LIMIT": 1},
+        "far_from_data": 7,
+    }
+    lines = dict(summary(result).rows)
+    assert lines["flown with"] == "mass 1.5 (learned: 1.0)"
+    assert lines["model"] == "model.safetensors"
+    assert lines["learned from"] == "40 rows of excited data, in 1.23 s"
+    assert lines["known before"] == "mass 0.9"
+    assert lines["lost"] == "from step 3 (0.3 s) on: away"
+    assert lines["at the end [m]"] == "0.5"
+    assert lines["episodes before"] == "0.25, diverged"
+    assert lines["stopped early"].startswith("ITERATION_LIMIT 2, TIME_LIMIT 1: ")
+    assert lines["far from the data"].startswith("the plans of 7 steps: ")
+    assert dict(summary(result | {"rmse": dict.fromkeys(result["rmse"])}).rows)["RMSE [m]"] == "none: it diverged"
+    bare = result | {"settings": {"options": OPTIONS}, "training": None, "lost": None, "error_at_end": None}
+    bare |= {"episodes": [], "suboptimal": {}, "far_from_data": 0}
+    names = ["flight", "RMSE [m]", "bounds of inputs", "failed solves", "decision [ms]"]
+    assert [name for name, _ in summary(bare).rows] == names
