@@ -127,7 +127,8 @@ class NMPCData:
         outer = self.translational.fly(references, self.horizon, steps)
         if system.name == "translational":
             return transitions_of(outer, self.samples)
-        angles = attitude_for_thrust_direction(*outer.inputs[:, 1:].T, convention=self.attitude)
+        ux, uy = outer.inputs[:, 1:].T
+        angles = attitude_for_thrust_direction(ux, uy, convention=self.attitude)
         references = np.zeros((len(angles), 6))
         references[:, [0, 2]] = angles  # phi, theta; psi and the rates are to be zero
         return transitions_of(self.rotational.fly(references, self.horizon, self.samples), self.samples)
@@ -236,7 +237,8 @@ class ExcitedData:
         if system is outer:
             return transitions_of(flight, self.samples)
         streams = np.random.SeedSequence([self.seed, SUBSYSTEMS.index("rotational")])
-        angles = attitude_for_thrust_direction(*flight.inputs[:, 1:].T, convention=self.attitude)
+        ux, uy = flight.inputs[:, 1:].T
+        angles = attitude_for_thrust_direction(ux, uy, convention=self.attitude)
         count = self.samples + self.rotational.horizon
         chosen = angles[np.random.default_rng(streams).integers(len(angles), size=-(-count // self.hold))]
         references = approach_attitudes(chosen, count, self.hold, system.time_step, self.response_time)
