@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from benchmarks.timing import write_results
+from gpmpc.dynamics import Linearized
 from gpmpc.estimation import (
     KalmanFilter,
     Measurement,
@@ -34,6 +35,7 @@ from gpmpc.estimation import (
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.models import Affine, DelayedModel, DisturbedModel, ResidualModel
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
@@ -53,6 +55,37 @@ def pendulum(x: Array, u: Array, substeps: int = 5) -> Array:
         rate = rate + STEP / substeps * (-9.81 * math.sin(angle) - 0.1 * rate + u[0])
         angle = angle + STEP / substeps * rate
     return np.array([angle, rate])
+
+
+class Exact:
+    """The pendulum itself as a model: what a controller could know at most."""
+
+    state_dim, input_dim, output_dim, dtype, device = 2, 1, 2, torch.float64, torch.device("cpu")
+    noise_covariance = torch.diag(torch.from_numpy(NOISE**2))
+
+    def predict(self, state: torch.Tensor, input: torch.Tensor) -> Gaussian:
+        """The next state, which is certain."""
+        moved = pendulum_many(state.numpy(), input.numpy())[0]
+        return Gaussian(torch.from_numpy(moved), torch.zeros(*state.shape, 2, dtype=torch.float64))
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Next states and their derivatives."""
+        mean, A, B = pendulum_many(states, inputs)
+        return Linearized(mean, A, B, np.zeros((len(states), 2, 2)) if covariance else None)
+
+
+def pendulum_many(states: Array, inputs: Array, substeps: int = 5) -> tuple[Array, Array, Array]:
+    """``pendulum`` for states (*batch, 2), with derivatives by state and input."""
+    h = STEP / substeps
+    slope = np.zeros((*states.shape[:-1], 2, 3))  # of angle and rate by both and the torque
+    slope[..., 0, 0] = slope[..., 1, 1] = 1.0
+    angle, rate = states[..., 0], states[..., 1]
+    for _ in range(substeps):
+        pull = -9.81 * np.cos(angle)[..., None] * slope[..., 0, :] - 0.1 * slope[..., 1, :] + np.array([0.0, 0.0, 1.0])
+        rate = rate + h * (-9.81 * np.sin(angle) - 0.1 * rate + inputs[..., 0])
+        slope[..., 1, :] += h * pull
+        angle, slope[..., 0, :] = angle + h * rate, slope[..., 0, :] + h * slope[..., 1, :]
+    return np.stack([angle, rate], axis=-1), slope[..., :2].copy(), slope[..., 2:].copy()
 
 
 def random_motion(steps: int, delay: int, seed: int = 0) -> tuple[Array, Array]:
@@ -89,6 +122,8 @@ class Loop(NamedTuple):
         noise: Factor of the noise of the plant.
         task: The reference, ``"swing"`` or ``"steps"``.
         against: The loop that the error is compared with.
+        gain: Of the controller's own disturbance estimate.
+        known: Whether the controller has the true model in place of the learned one.
         drift: Standard deviation by which an angular acceleration, estimated beside the state, may change in a step
             [rad/s per step]; 0 for none.
     """
@@ -102,6 +137,8 @@ class Loop(NamedTuple):
     task: str = "swing"
     against: str = "state measured"
     drift: float = 0.0
+    gain: float = 0.0
+    known: bool = False
 
 
 def all_states(rng: np.random.Generator) -> Array:
@@ -125,6 +162,9 @@ LOOPS = {
     f"{LATE}, ignored": Loop(DELAY),
     f"{LATE}, compensated": Loop(DELAY, DELAY),
     f"{LATE}, planned with": Loop(DELAY, DELAY, augmented=True),
+    f"{LATE}, planned, estimate": Loop(DELAY, DELAY, augmented=True, gain=0.2),
+    f"{LATE}, true model": Loop(DELAY, DELAY, augmented=True, known=True),
+    "state measured, true model": Loop(known=True),
     f"{LATE}, believed {DELAY - 1}": Loop(DELAY, DELAY - 1, augmented=True),
     f"{LATE}, believed {DELAY + 1}": Loop(DELAY, DELAY + 1, augmented=True),
     "no noise": Loop(noise=0.0),
@@ -166,16 +206,17 @@ class Flown(NamedTuple):
     filters: Array
 
 
-def fly(model: ResidualModel, loop: Loop, steps: int, seed: int) -> Flown:
+def fly(model: Any, loop: Loop, steps: int, seed: int) -> Flown:
     """One flight."""
     rng = np.random.default_rng(seed)
+    model = Exact() if loop.known else model
     delayed = DelayedModel(model, loop.assumed) if loop.assumed else None
     planned: Any = delayed if delayed is not None and loop.augmented else model
     extra = planned.state_dim - 2
     cost = Tracking([10.0, 0.1] + [0.0] * extra, [1e-2])
     problem = Problem(cost, Box([-LIMIT], [LIMIT]))
     propagator = Linearization(process_noise=True)
-    controller = GPMPC(planned, propagator, problem, HORIZON, [0.0])
+    controller = GPMPC(planned, propagator, problem, HORIZON, [0.0], PredictionSettings(disturbance_gain=loop.gain))
     estimated: Any = model
     if loop.drift:
         effect = torch.tensor([[STEP], [1.0]], dtype=torch.float64)

@@ -1,15 +1,8 @@
 r"""Points that come and go while a controller runs, without factorising K + sn2 I anew, which is cubic in them.
 
-Adding points extends the Cholesky factor by rows, removing one changes only the block below it, by a rank-one term
-(Gill, Golub, Murray and Saunders, 1974; Osborne, 2010, appendix B, for GPs). With K + sn2 I = L L' and p new points X*,
-
-    L+ = [ L    0 ]        L22 L22' = K(X*, X*) + sn2 I - L21 L21',      L21' = L^-1 K(X, X*)
-         [ L21 L22]
-
-    removing i:  L33+ L33+' = L33 L33' + l32 l32',     l32 = L[i+1:, i]
-
-which is O(N^2) a point. The second is an update by a positive term, which is stable; and the weights are solved for
-from the factor each time, two triangular systems, so that no error is carried along with them.
+Adding points extends the Cholesky factor by rows, L21' = L^-1 K(X, X*), L22 L22' = K(X*, X*) + sn2 I - L21 L21';
+removing one changes only the block below it (``gpmpc.kernels._window``): both O(N^2) a point. The weights are solved
+for from the factor each time, two triangular systems, so that no error is carried along with them.
 
 The least informative point is the one whose removal changes the posterior over functions least, in Kullback-Leibler
 divergence. With and without y_i the two posteriors differ by one factor of the likelihood, which depends on f(x~_i)
@@ -32,13 +25,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.compiled import compiled
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel, check_number
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._kernel import check_positive_definite, kernel_matrix
-from gpmpc.gp.backend import host_arrays
 from gpmpc.gp.posterior import GPPosterior
 from gpmpc.gp.transitions import Transitions, check_transitions
+from gpmpc.kernels._window import drop_point
 
 _log = logging.getLogger(__name__)
 _MANY = 0.2  # where more than this part of the points is removed, one factorisation costs less than the updates
@@ -101,10 +93,11 @@ def remove_points(posterior: GPPosterior, indices: Sequence[int] | Tensor) -> GP
         cholesky = rows[:, :, kept]
         cholesky[:, first:, first:] = torch.linalg.cholesky(rows[:, first:, first:] @ rows[:, first:, first:].mT)
     else:
-        cholesky = posterior.cholesky.new_zeros(posterior.output_dim, len(kept), len(kept))
-        before = posterior.cholesky.detach().numpy()
-        for factor, smaller in zip(before, cholesky.numpy(), strict=True):
-            _remove(factor, smaller, kept.numpy(), np.array(removed))
+        columns = np.ascontiguousarray(posterior.cholesky.mT.detach().numpy())
+        for index in reversed(removed):
+            before, columns = columns, np.empty_like(columns[:, 1:, 1:], order="C")
+            drop_point(before, index, columns)
+        cholesky = torch.from_numpy(columns).mT
     targets = posterior.targets[kept]
     right = (targets - posterior.offset).mT[..., None]
     half = torch.linalg.solve_triangular(cholesky, right, upper=False)
@@ -162,9 +155,6 @@ class SlidingWindow:
 
     def append(self, posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
         """The posterior with points x~ (p, n + m) and their targets (p, k), held to ``points`` points."""
-        oldest = self.remove == "oldest" and len(posterior) == self.points and len(features) == 1
-        if oldest and self.points > 1 and host_arrays(posterior.weights) is not None:
-            return _slide(posterior, *_checked_points(posterior, features, targets))
         larger = append_points(posterior, features, targets)
         excess, removable = len(larger) - self.points, len(posterior)
         if excess <= 0:
@@ -210,93 +200,6 @@ def _noise_variances(posterior: GPPosterior) -> Tensor:
         return nominal
     diagonal = posterior.cholesky.square().sum(-1) - posterior.signal_variance[:, None]
     return diagonal.clamp_min(torch.finfo(posterior.dtype).eps)
-
-
-def _slide(posterior: GPPosterior, feature: Tensor, target: Tensor) -> GPPosterior:
-    """``append_points`` and ``remove_points`` of the first point, in one pass over the factor and its memory."""
-    features, targets = torch.cat([posterior.features[1:], feature]), torch.cat([posterior.targets[1:], target])
-    upper = np.empty(posterior.cholesky.shape)
-    hyperparameters = posterior.lengthscales, posterior.signal_variance, posterior.noise_variance
-    scales, sf2, sn2 = (part.numpy() for part in hyperparameters)
-    weights = np.ascontiguousarray((targets - posterior.offset).mT.numpy())
-    before = np.ascontiguousarray(posterior.cholesky.numpy().transpose(0, 2, 1))  # no copy after the first time
-    failed = torch.tensor(_slide_factors(before, upper, features.numpy(), scales, sf2, sn2, weights))
-    check_positive_definite(failed, posterior.signal_variance, posterior.noise_variance)
-    factor = torch.from_numpy(upper.transpose(0, 2, 1))
-    return replace(posterior, features=features, targets=targets, cholesky=factor, weights=torch.from_numpy(weights))
-
-
-@compiled
-def _slide_factors(before, upper, features, scales, sf2, sn2, right):
-    """Writes the transposed factors (k, N, N) without the first and with a new last point; ``right`` becomes weights.
-
-    Column by column of the factor, which is row by row here, so that every loop runs over contiguous memory. Returns
-    which outputs have failed: their matrix is not positive definite.
-    """
-    outputs, N, d = len(before), before.shape[1], features.shape[1]
-    v, new, failed = np.empty(N), np.empty(N), np.zeros(outputs, dtype=np.bool_)
-    for a in range(outputs):
-        U, b = upper[a], right[a]
-        for i in range(N - 1):
-            square = 0.0
-            for c in range(d):
-                square += ((features[i, c] - features[N - 1, c]) / scales[a, c]) ** 2
-            new[i], v[i] = sf2[a] * np.exp(-0.5 * square), before[a, 0, i + 1]
-        rest = sf2[a] + sn2[a]
-        for j in range(N - 1):
-            old, row = before[a, j + 1], U[j]
-            radius = np.hypot(old[j + 1], v[j])
-            c, s = old[j + 1] / radius, v[j] / radius
-            row[:j], row[j] = 0.0, radius
-            w, b[j] = new[j] / radius, b[j] / radius
-            row[N - 1] = w
-            rest -= w * w
-            y = b[j]
-            for i in range(j + 1, N - 1):
-                entry = old[i + 1]
-                mixed = c * entry + s * v[i]
-                v[i] = c * v[i] - s * entry
-                row[i] = mixed
-                new[i] -= w * mixed
-                b[i] -= y * mixed
-            b[N - 1] -= y * w
-        if not rest > 0.0:
-            failed[a] = True
-            return failed
-        U[N - 1, : N - 1], U[N - 1, N - 1] = 0.0, np.sqrt(rest)
-        b[N - 1] /= U[N - 1, N - 1]
-        for j in range(N - 1, -1, -1):
-            total = b[j]
-            for i in range(j + 1, N):
-                total -= U[j, i] * b[i]
-            b[j] = total / U[j, j]
-    return failed
-
-
-@compiled
-def _remove(factor: np.ndarray, smaller: np.ndarray, kept: np.ndarray, removed: np.ndarray) -> None:
-    """Writes the lower factor of the rows that are kept, from that of all (N, N), into ``smaller`` (N - r, N - r).
-
-    Every removed column v is absorbed by the block below it, L L' + v v', through plane rotations; the last one first,
-    so that each meets only columns that stay. Row by row: row i needs the rotations of the columns before it, which
-    are known once their own rows were reached.
-    """
-    size = len(kept)
-    for i in range(size):
-        for j in range(i + 1):
-            smaller[i, j] = factor[kept[i], kept[j]]
-    c, s = np.empty(size), np.empty(size)
-    for which in range(len(removed) - 1, -1, -1):
-        start = removed[which] - which
-        for i in range(start, size):
-            row, v = smaller[i], factor[kept[i], removed[which]]
-            for j in range(start, i):
-                entry = row[j]
-                row[j] = c[j] * entry + s[j] * v
-                v = c[j] * v - s[j] * entry
-            radius = np.hypot(row[i], v)
-            c[i], s[i] = row[i] / radius, v / radius
-            row[i] = radius
 
 
 def _checked_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:

@@ -17,6 +17,7 @@ from gpmpc.exceptions import ShapeError
 from gpmpc.kernels._gp_moments import CROSS, JACOBIAN, VALUE, evaluate_moments
 from gpmpc.kernels._gp_point import expand_points, linearize_points
 from gpmpc.kernels._packed import Array, GPArrays, Packed, pack
+from gpmpc.kernels._window import replace_point
 
 __all__ = [
     "Expansion",
@@ -28,6 +29,7 @@ __all__ = [
     "moments_with_jacobian",
     "pack",
     "point_with_jacobian",
+    "replace_point",
 ]
 
 

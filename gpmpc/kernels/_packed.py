@@ -94,7 +94,9 @@ class Packed:
                 row = square[i : i + ROWS, : i // COLUMNS * COLUMNS + COLUMNS]
                 blocks.append(row.reshape(ROWS, -1, COLUMNS).swapaxes(0, 1).ravel())
             centred.append(np.concatenate(blocks))
-        return Precision(_aligned(np.stack(inverse)), _aligned(np.stack(centred)))
+        found = Precision(aligned((len(inverse), len(inverse[0]))), aligned((len(centred), len(centred[0]))))
+        found.inverse_cholesky[:], found.centred[:] = inverse, centred
+        return found
 
     def _centred_square(self, a: int) -> Array:
         padded, size = self.arrays.points.shape[1], self.arrays.size
@@ -147,17 +149,17 @@ def pack(
         if not (value > 0).all():
             raise SettingError(name, f"must be positive; got {value.tolist()}")
 
-    padding = (0, -size % COLUMNS)
-    points = _aligned(np.pad(features.T, ((0, 0), padding), mode="edge"))
-    padded_weights = _aligned(np.pad(weights, ((0, 0), padding)))
+    padded = -(-size // COLUMNS) * COLUMNS
+    points, padded_weights = aligned((d, padded)), aligned((outputs, padded))
+    points[:, :size], points[:, size:] = features.T, features[-1:].T
+    padded_weights[:, :size] = weights
     arrays = GPArrays(points, lengthscales**-2.0, np.log(signal_variance), padded_weights, size)
     return Packed(arrays, cholesky, state_dim, d - state_dim)
 
 
-def _aligned(rows: Array) -> Array:
-    """A copy whose rows start on cache lines where they are multiples of 8."""
-    memory = np.empty(rows.size + 8)
+def aligned(shape: tuple[int, int]) -> Array:
+    """Zeros whose rows start on cache lines where they are multiples of 8."""
+    size = shape[0] * shape[1]
+    memory = np.zeros(size + 8)
     skip = -(memory.ctypes.data // memory.itemsize) % 8
-    aligned = memory[skip : skip + rows.size].reshape(rows.shape)
-    aligned[:] = rows
-    return aligned
+    return memory[skip : skip + size].reshape(shape)

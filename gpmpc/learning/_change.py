@@ -11,7 +11,8 @@ Length-scales and signal variances are the model's: the plant may differ by a sh
 was seen lately d is zero, and with one point it is the estimate of a constant disturbance.
 """
 
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
 
@@ -22,7 +23,9 @@ from torch import Tensor
 from gpmpc.dynamics import Array, DynamicsModel, Linearized, linearize, to_array
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import GPPosterior, SlidingWindow
+from gpmpc.gp import GPPosterior
+from gpmpc.kernels import GPArrays, Packed, replace_point
+from gpmpc.kernels import linearize as linearize_gps
 from gpmpc.models import Features, Wrapper
 
 
@@ -32,7 +35,8 @@ class ChangedModel(Wrapper):
 
     Attributes:
         model: f: a ``GPPosterior`` of next states, or a ``ResidualModel``.
-        change: d, over (phi, t), with ``predicts="value"``; None for none.
+        share: By how much the plant may differ, as a share of what was learned.
+        memory: Length-scale of time in the kernel [steps].
         time: t of all predictions [steps].
 
     Raises:
@@ -40,7 +44,8 @@ class ChangedModel(Wrapper):
     """
 
     model: DynamicsModel
-    change: GPPosterior | None = None
+    share: float = 0.1
+    memory: float = 5000.0
     time: float = 0.0
 
     def __post_init__(self) -> None:
@@ -67,59 +72,61 @@ class ChangedModel(Wrapper):
         return torch.eye(self.gp.output_dim, dtype=self.gp.dtype) if self.gp is model else model.B
 
     @cached_property
-    def reach(self) -> Array:
-        """The pseudo-inverse of B (k, n): the part of an error of f that d can explain."""
-        return np.ascontiguousarray(np.linalg.pinv(to_array(self.B)), dtype=np.float64)
+    def arrays(self) -> tuple[Array, Array, Array]:
+        """B (n, k), its pseudo-inverse, the part of an error of f that d can explain, and the noise of the GP (k,)."""
+        B = to_array(self.B)
+        return B, np.linalg.pinv(B), to_array(self.gp.noise_variance)
+
+    @cached_property
+    def change(self) -> tuple[Packed, Array]:
+        """d: GPs over (phi, u, t) for the compiled kernels, and their targets (k, N); without points at first."""
+        gp, nothing = self.gp, np.zeros((self.gp.output_dim, 0))
+        scales = np.column_stack([to_array(gp.lengthscales), np.full(gp.output_dim, self.memory)])
+        signal = np.log(self.share**2 * to_array(gp.signal_variance))
+        arrays = GPArrays(np.zeros((scales.shape[1], 0)), scales**-2.0, signal, nothing, 0)
+        return Packed(arrays, nothing[:, None, :0].repeat(0, axis=1), gp.state_dim, gp.input_dim + 1), nothing
+
+    def __len__(self) -> int:
+        return self.change[0].arrays.size
 
     def later(self, steps: float) -> "ChangedModel":
         """The model some steps later."""
         return self._replaced(time=self.time + steps)
 
     def _replaced(self, **changes: Any) -> "ChangedModel":
-        other = replace(self, **changes)
-        for name in ("gp", "features", "B", "reach"):  # these do not change with time
-            other.__dict__[name] = getattr(self, name)
+        other = copy(self)
+        other.__dict__.update(changes)
         return other
 
-    def errors(self, states: Array, inputs: Array, next_states: Array) -> tuple[Array, Array, Array]:
-        """Points (phi, u) (N, d) of d, what it was there (N, k), and variances of f there (N, k), of N transitions."""
+    def error(self, state: Array, input: Array, next_state: Array) -> tuple[Array, Array, Array]:
+        """The point (phi, u, t) (d,) of a transition, what d was there (k,), and the variance of f there (k,)."""
+        states, inputs, reach = state[None], input[None], self.arrays[1]
         alone = linearize(self.model, states, inputs)
-        variances = np.einsum("ai,nij,aj->na", self.reach, cast(Array, alone.covariance), self.reach)
-        points = np.column_stack(self.features.linearize(states, inputs)[:2])
-        return points, (next_states - alone.mean) @ self.reach.T, variances
+        z, v, _ = self.features.linearize(states, inputs)
+        variance = ((reach @ cast(Array, alone.covariance)[0]) * reach).sum(1)
+        return np.concatenate([z[0], v[0], [self.time]]), reach @ (next_state - alone.mean[0]), variance
 
-    def with_points(
-        self, points: Array, targets: Array, noise: Array, share: float, memory: float, window: SlidingWindow
-    ) -> "ChangedModel":
-        """The model with further points (phi, u) (N, d) of the change, observed now with noise of variances (k,).
-
-        Share and memory are those of the kernel, for the first points; the window says which points go.
-
-        Raises:
-            SettingError: The kernel matrix is not positive definite.
-            DataError: A number is not finite.
-        """
-        gp, variances = self.gp, torch.from_numpy(noise)
-        features = torch.from_numpy(np.column_stack([points, np.full(len(points), self.time)]))
-        if self.change is None:
-            scales = torch.cat([gp.lengthscales, torch.full_like(gp.lengthscales[:, :1], memory)], dim=1)
-            kernel = scales, share**2 * gp.signal_variance, variances
-            one = features[:1], torch.from_numpy(targets[:1])
-            first = self._replaced(change=GPPosterior.from_hyperparameters(*one, *kernel, gp.input_dim + 1, "value"))
-            if len(points) == 1:
-                return first
-            return first.with_points(points[1:], targets[1:], noise, share, memory, window)
-        before = replace(self.change, noise_variance=variances)  # of these points; the others' is in the factor
-        return self._replaced(change=window.append(before, features, torch.from_numpy(targets)))
+    def with_point(self, point: Array, target: Array, noise: Array, drop: int = -1) -> "ChangedModel":
+        """The model with a further point (phi, u, t) of the change; see ``gpmpc.kernels.replace_point``."""
+        return self._replaced(change=replace_point(*self.change, point, target, noise, drop))
 
     def last_innovation(self) -> tuple[Array, Array]:
         """Error and variance (k,) of the prediction of the last point of the change by those before, with its noise.
 
         With L the factor and beta the weights, L_NN^2 is the variance, and beta_N L_NN^2 the error.
         """
-        change: Any = self.change
-        variance = to_array(change.cholesky[:, -1, -1] ** 2)
-        return to_array(change.weights[:, -1]) * variance, variance
+        change, last = self.change[0], len(self) - 1
+        variance = change.cholesky[:, last, last] ** 2
+        return change.arrays.weights[:, last] * variance, variance
+
+    @property
+    def posterior(self) -> GPPosterior:
+        """The GPs of d as tensors."""
+        (packed, targets), gp = self.change, self.gp
+        arrays, size = packed.arrays, len(self)
+        parts = arrays.points[:, :size].T, targets.T, arrays.inverse_squares**-0.5, np.exp(arrays.log_signal)
+        rest = self.arrays[2], np.zeros(len(targets)), packed.cholesky, arrays.weights[:, :size]
+        return GPPosterior(*map(torch.from_numpy, parts + rest), gp.input_dim + 1, "value")
 
     @property
     def state_dim(self) -> int:
@@ -134,20 +141,22 @@ class ChangedModel(Wrapper):
     def predict(self, state: Tensor, input: Tensor) -> Gaussian:
         """The next state's distribution at x (*batch, n) and u (*batch, m), without the noise."""
         belief = self.model.predict(state, input)
-        if self.change is None:
+        if not len(self):
             return belief
         z, v = self.features(state, input)
-        d = self.change.predict(z, torch.cat([v, torch.full_like(state[..., :1], self.time)], dim=-1))
+        d = self.posterior.predict(z, torch.cat([v, torch.full_like(state[..., :1], self.time)], dim=-1))
         return Gaussian(belief.mean + d.mean @ self.B.mT, belief.covariance + self.B @ d.covariance @ self.B.mT)
 
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
         """Linearises at K points (K, n), (K, m), the model and its change each by a method of their own."""
-        found = linearize(self.model, states, inputs, covariance)
-        if self.change is None:
+        found, (change, targets) = linearize(self.model, states, inputs, covariance), self.change
+        if not len(self):
             return found
         z, v, slope = self.features.linearize(states, inputs)
-        d = self.change.linearize(z, np.column_stack([v, np.full(len(v), self.time)]), covariance)
-        by_state, by_input = self.features.chain(d.A, d.B[..., :-1], slope)
-        B, V = to_array(self.B), found.covariance
-        V = None if V is None or d.covariance is None else V + B @ d.covariance @ B.T
-        return Linearized(found.mean + d.mean @ B.T, found.A + B @ by_state, found.B + B @ by_input, V)
+        at = np.empty((len(v), v.shape[1] + 1))
+        at[:, :-1], at[:, -1] = v, self.time
+        mean, by_state, by_input, variance = linearize_gps(change, z, at, covariance, np.zeros(len(targets)), False)
+        by_state, by_input = self.features.chain(by_state, by_input[..., :-1], slope)
+        B, V = self.arrays[0], found.covariance
+        V = None if V is None or variance is None else V + B @ variance @ B.T
+        return Linearized(found.mean + mean @ B.T, found.A + B @ by_state, found.B + B @ by_input, V)

@@ -7,9 +7,8 @@ explains least, makes room. Both predict the step before they see it, and
 * the change is **used** once its predictions have won: their log densities, summed over a window of steps, exceed those
   of the model alone by a margin;
 * it is **no longer used** once they have lost, or where a decision could not be applied;
-* a step that neither chance nor the noise of late explains is a **surprise**: the plant is another one. Time jumps
-  ahead, so that what was seen before counts little, and the change is used at once: a GP with one point is an estimate
-  of a constant disturbance.
+* a step that neither chance nor the noise of late explains is a **surprise**: the plant is another one. What was seen
+  before is forgotten, and the change is used at once: a GP with one point is an estimate of a constant disturbance.
 
 Noise may be larger than the model believes: it is scaled by what successive errors differ by, in the median.
 """
@@ -26,11 +25,12 @@ from gpmpc.dynamics import Array, to_array
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import SlidingWindow
+from gpmpc.gp._online import least_informative
 from gpmpc.learning._change import ChangedModel
 from gpmpc.mpc.controller import Decision, Reference, check_method
 from gpmpc.mpc.gp_mpc import GPMPC
 
-_FEW = 3  # differences of errors that say how large the noise is
+_FEW, _MANY = 3, 100  # differences of errors that say how large the noise is
 _LARGEST = 10.0  # difference of log densities that one step counts for: no outlier decides alone
 
 
@@ -40,8 +40,8 @@ class Learned:
 
     model: ChangedModel  #: with the change
     state: Array  #: measured at the last step (n,)
-    error: Array  #: of the model alone in the last step, as far as a change reaches it (k,)
-    spread: Array  #: squared differences of successive errors over those expected of the model's noise
+    error: Array  #: of the model alone in the last step, as far as a change reaches it (k,); NaN for unknown
+    spread: Array  #: squared differences of successive errors over those expected of the model's noise (w,)
     leads: Array  #: by how much the log density with the change exceeds that without, of the last steps
     active: bool = False  #: whether the change is part of the model that plans
     version: int = 0  #: how often that model has changed
@@ -49,7 +49,7 @@ class Learned:
     @property
     def size(self) -> int:
         """Points of the model that plans."""
-        return len(self.model.gp) + (0 if self.model.change is None or not self.active else len(self.model.change))
+        return len(self.model.gp) + (len(self.model) if self.active else 0)
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ class OnlineLearning:
 
     points: int = 40
     remove: Literal["oldest", "least_informative"] = "oldest"
-    share: float = 0.3
-    memory: float = 200.0  # [steps]
+    share: float = 0.1
+    memory: float = 5000.0  # [steps]
     window: int = 20
     margin: float = 20.0
     surprise: float = 30.0
@@ -86,28 +86,30 @@ class OnlineLearning:
 
     def learn(self, learned: Learned, input: Array, state: Array) -> Learned:
         """Learns from one step: the input that was applied (m,), and the state measured after it (n,)."""
-        model = learned.model
-        points, errors, latent = model.errors(learned.state[None], np.array(input, dtype=float)[None], state[None])
-        error, noise = errors[0], model.gp.noise_variance.numpy()
-        moved = float(np.mean((error - learned.error) ** 2 / noise)) / 2.0
-        spread = np.append(learned.spread, moved)[-self.window :] if np.isfinite(moved) else learned.spread
+        model, spread = learned.model, learned.spread
+        point, error, latent = model.error(learned.state, np.asarray(input, dtype=float), state)
+        moved = float(((error - learned.error) ** 2 / model.arrays[2]).mean()) / 2.0
+        if np.isfinite(moved):
+            spread = np.append(spread, moved)[-_MANY:]
+        found = replace(learned, model=model.later(1.0), state=state, error=error, spread=spread)
         if len(spread) < _FEW:
-            return replace(learned, model=model.later(1.0), state=state, error=error, spread=spread)
-        noise = noise * noise_ratio(spread, len(error))
-        kernel = noise, self.share, self.memory, SlidingWindow(self.points, self.remove)
-        larger = model.with_points(points, errors, *kernel)
+            return found
+        noise, drop = model.arrays[2] * noise_ratio(spread, len(error)), -1
+        if len(model) == self.points:
+            drop = 0 if self.remove == "oldest" else least_informative(model.posterior, 1)[0]
+        larger, alone = model.with_point(point, error, noise, drop), noise + latent
         missed, variance = larger.last_innovation()
-        alone = noise + latent[0]
-        lead = log_density(missed, variance + latent[0]) - log_density(error, alone)
+        variance = variance + latent
+        lead = log_density(missed, variance) - log_density(error, alone)
         leads = np.append(learned.leads, np.clip(lead, -_LARGEST, _LARGEST))[-self.window :]
         total = float(leads.sum())
         active = total >= 0 if learned.active else total > self.margin
-        squares = missed**2 / (variance + latent[0]) if learned.active else error**2 / alone
+        squares = missed**2 / variance if learned.active else error**2 / alone
         if float(squares.mean()) > self.surprise:
             active, leads = True, leads[:0]
-            larger = model.later(2.0 * self.memory).with_points(points, errors, *kernel)
+            larger = replace(model).with_point(point, error, noise)
         version = learned.version + (active or learned.active)
-        return Learned(larger.later(1.0), state, error, spread, leads, active, version)
+        return replace(found, model=larger.later(1.0), leads=leads, active=active, version=version)
 
 
 class LearningController:
@@ -130,7 +132,7 @@ class LearningController:
         self.controller, self.learning = controller, OnlineLearning() if learning is None else learning
         self.problem, self.horizon = controller.problem, controller.horizon
         self.initial_input = controller.initial_input
-        self._model = ChangedModel(controller.prediction.model)
+        self._model = ChangedModel(controller.prediction.model, self.learning.share, self.learning.memory)
 
     def control(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
@@ -158,7 +160,7 @@ class LearningController:
             return self._begin(state, before.version + 1)
 
     def _begin(self, state: Array, version: int = 0) -> Learned:
-        unknown = np.full(len(self._model.reach), np.nan)
+        unknown = np.full(len(self._model.arrays[2]), np.nan)
         return Learned(self._model, state, unknown, np.empty(0), np.empty(0), version=version)
 
 
@@ -168,12 +170,12 @@ def noise_ratio(spread: Array, outputs: int) -> float:
     ``spread`` has half the squared differences of successive errors over the model's noise, mean over the outputs (w,):
     what changes slowly has no part in them, and a jump no weight in their median.
     """
-    return max(1.0, float(np.median(spread)) * outputs / _median(outputs))
+    return max(1.0, float(np.sort(spread)[len(spread) // 2]) * outputs / _median(outputs))
 
 
 def log_density(error: Array, variance: Array) -> float:
     """Of independent Gaussians, but for a constant."""
-    return -0.5 * float(np.sum(error**2 / variance + np.log(variance)))
+    return -0.5 * float((error**2 / variance + np.log(variance)).sum())
 
 
 @cache

@@ -8,7 +8,8 @@ import torch
 
 from gpmpc.exceptions import SettingError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import SlidingWindow, Trainer, Transitions, append_points, remove_points
+from gpmpc.gp import Trainer, Transitions, append_points, remove_points
+from gpmpc.kernels import replace_point
 from gpmpc.learning import ChangedModel, Learned, LearningController, OnlineLearning
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc.controller import Reference
@@ -85,7 +86,7 @@ def test_learning_is_switched_off_where_the_old_plant_comes_back_and_no_measurem
     assert not any(steps[:40])
     assert all(steps[45:80])
     assert not any(steps[-30:])
-    assert len(learned.model.change) == learning.points
+    assert len(learned.model) == learning.points
 
 
 def test_equal_seeds_give_equal_bits_and_one_controller_flies_many_flights():
@@ -129,33 +130,34 @@ def test_a_changed_model_keeps_the_promises_of_a_model_and_its_last_innovation_i
     rng = np.random.default_rng(2)
     x, u = rng.uniform(-1, 1, (12, 2)), rng.uniform(-1, 1, (12, 1))
     after = np.array([cart(a, b, gain=0.8) for a, b in zip(x, u, strict=True)])
-    points, errors, _ = changed.errors(x, u, after)
-    kernel = np.full(errors.shape[1], 1e-6), 0.3, 50.0, SlidingWindow(20)
-    model = changed.with_points(points[:-1], errors[:-1], *kernel).later(1.0)
+    seen = [changed.error(*row) for row in zip(x, u, after, strict=True)]
+    noise, model = np.full(len(seen[0][1]), 1e-6), changed
+    for point, error, _ in seen[:-1]:
+        model = model.with_point(point, error, noise)
+    model = model.later(1.0)
     check_model(model, torch.from_numpy(x), torch.from_numpy(u))
-    larger = model.with_points(points[-1:], errors[-1:], *kernel)
-    found = larger.last_innovation()
-    d = model.change.predict(
-        torch.from_numpy(points[-1:, : -model.gp.input_dim]),
-        torch.from_numpy(np.append(points[-1:, -model.gp.input_dim :], [[model.time]], axis=1)),
-    )
-    np.testing.assert_allclose(found[0], errors[-1] - d.mean.numpy()[0], atol=1e-8)
+    point, error, _ = model.error(x[-1], u[-1], after[-1])
+    larger = model.with_point(point, error, noise)
+    found, at = larger.last_innovation(), torch.from_numpy(point[None])
+    d = model.posterior.predict(at[:, : -model.gp.input_dim - 1], at[:, -model.gp.input_dim - 1 :])
+    np.testing.assert_allclose(found[0], error - d.mean.numpy()[0], atol=1e-8)
     np.testing.assert_allclose(found[1], d.variance.numpy()[0] + 1e-6, rtol=1e-6)
-    alone, later = (abs((after - one.linearize(x, u).mean) @ changed.reach.T).max() for one in (changed, larger))
+    alone, later = (abs((after - one.linearize(x, u).mean) @ changed.arrays[1].T).max() for one in (changed, larger))
     assert later < 0.2 * alone
 
 
-def test_a_window_that_is_full_slides_to_what_appending_and_removing_give():
-    rng = np.random.default_rng(3)
-    window = remove_points(MODEL, range(30, len(MODEL)))
-    slid = plain = window
-    for _ in range(20):
-        x, y = (torch.from_numpy(rng.normal(size=(1, size))) for size in (3, 2))
-        slid = SlidingWindow(30).append(slid, x, y)
-        plain = remove_points(append_points(plain, x, y), [0])
-    torch.testing.assert_close(slid.cholesky, plain.cholesky, rtol=1e-8, atol=1e-10)
-    torch.testing.assert_close(slid.weights, plain.weights, rtol=1e-6, atol=1e-8)
-    assert torch.equal(slid.features, plain.features)
+@pytest.mark.parametrize("drop", [-1, 0, 7, 29])
+def test_a_point_that_is_replaced_leaves_the_gps_that_training_on_the_others_gives(drop):
+    rng, gp = np.random.default_rng(3), remove_points(MODEL, range(30, len(MODEL)))
+    packed, targets = gp.packed, gp.targets.numpy().T.copy() - gp.offset.numpy()[:, None]
+    for _ in range(3):
+        x, y = rng.normal(size=3), rng.normal(size=2)
+        packed, targets = replace_point(packed, targets, x, y, gp.noise_variance.numpy(), drop)
+        gp = append_points(gp, torch.from_numpy(x[None]), torch.from_numpy(y[None]) + gp.offset)
+        gp = remove_points(gp, [] if drop < 0 else [drop])
+    np.testing.assert_allclose(packed.cholesky, gp.cholesky, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(packed.arrays.weights[:, : len(gp)], gp.weights, rtol=1e-6, atol=1e-8)
+    np.testing.assert_array_equal(packed.arrays.points[:, : len(gp)].T, gp.features)
 
 
 def test_what_cannot_be_learned_is_refused():
