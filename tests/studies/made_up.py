@@ -1,6 +1,7 @@
 """Runs that were never flown, in the folders and with the content that real ones have."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -17,16 +18,9 @@ SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"contr
 PLANT = translational()
 
 
-class Bounds:
-    inputs, constraints = Box(np.zeros(3), np.full(3, 10.0)), ()
-
-
-class Steering:
-    problem, horizon = Bounds, 1
-
-
-def metrics_of(error, steps=20, failing=0):
+def metrics_of(error, steps=20, failing=0, constraints=()):
     """The metrics of a flight that is everywhere ``error`` [m] from its reference in x."""
+    problem = SimpleNamespace(inputs=Box(np.zeros(3), np.full(3, 10.0)), constraints=constraints)
     references = np.zeros((steps + 1, 6))
     states = references.copy()
     states[:, 0] = error
@@ -37,7 +31,7 @@ def metrics_of(error, steps=20, failing=0):
         np.full((steps, 6, 6), np.nan), statuses, np.ones(steps, int), (timing,) * steps, 1.0,
     )  # fmt: skip
     experiment = Experiment(None, None, PLANT, None, lambda plant: None, steps=steps)
-    return metrics(experiment, Flown(rollout, Steering, None))
+    return metrics(experiment, Flown(rollout, SimpleNamespace(problem=problem, horizon=2), None))
 
 
 def made_up_run(tree, choices, settings, result=None, error=None):

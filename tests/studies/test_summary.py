@@ -2,9 +2,11 @@
 
 import io
 
+import numpy as np
 import pytest
 from rich.console import Console
 
+from gpmpc.mpc.problem import Box
 from gpmpc.studies.document import terminal
 from gpmpc.studies.flight import summary
 from gpmpc.studies.run_folder import record
@@ -70,3 +72,14 @@ def test_everything_that_a_result_may_hold_has_its_line():
     bare |= {"episodes": [], "suboptimal": {}, "far_from_data": 0}
     names = ["flight", "RMSE [m]", "bounds of inputs", "failed solves", "decision [ms]"]
     assert [name for name, _ in summary(bare).rows] == names
+
+
+@pytest.mark.parametrize(("error", "outside"), [(0.04, 0), (0.06, 20), (-1.5, 20), (-0.5, 0)])
+def test_states_are_counted_outside_the_tightest_bounds_that_all_boxes_have_now(error, outside):
+    narrow = np.full((2, 6), 9.0)
+    narrow[:, 0] = 0.05, 0.01  # of the first stage, and of one later on
+    boxes = Box(np.full(6, -1.0), np.full(6, 1.0)), Box(np.full((2, 6), -9.0), narrow)
+    found = metrics_of(error, constraints=boxes)["violations"]
+    assert (found["states"]["violations"], found["states"]["steps"]) == (outside, 20)
+    assert found["states"]["rate"] == outside / 20
+    assert "states" not in metrics_of(error)["violations"]
