@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gpmpc.exceptions import ShapeError
+from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.propagation import MomentMatching, linearize, rollout
 from tests.propagation.test_propagators import ALL, DETERMINISTIC, belief, gp, linear
@@ -106,6 +106,8 @@ def test_inputs_without_a_horizon_are_refused():
     for inputs in (torch.zeros(1), torch.zeros(0, 1)):
         with pytest.raises(ShapeError, match=r"inputs must be \(\*batch, H, m\) with H of 1 or more; got"):
             rollout(MomentMatching(), gp(), belief(), inputs)
+    with pytest.raises(SettingError, match="inputs: must be a torch tensor; got list"):
+        rollout(MomentMatching(), gp(), belief(), [[0.1]])
 
 
 def test_the_symmetric_root_squares_to_the_covariance_and_is_semidefinite():

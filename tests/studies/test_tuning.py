@@ -54,3 +54,13 @@ def test_flights_that_were_lost_count_as_the_worst_and_stop_nothing():
         [c for c in search.costs if math.isfinite(c)]
     ) >= len(document.tables[0].rows)
     assert document.images["tuning.png"]
+
+
+@pytest.mark.parametrize(("finite", "told"), [(7, False), (8, True)])
+def test_importances_are_told_from_eight_finite_costs_on(finite, told):
+    search = Search(SPACE, 0)
+    costs = [cost(candidate) for candidate in search.ask(10)]
+    search.tell([*costs[:finite], *[math.inf] * (10 - finite)])
+    assert bool(search.importances()) == told
+    titles = [table.title for table in search.document(None, "gpmpc run").tables]
+    assert titles == ["Best candidates", "What mattered"][: 1 + told]
