@@ -69,7 +69,7 @@ class Scene:
         tube = [
             fg.SpherePrimitive(pose=fg.Pose(position=p, orientation=q), size=fg.Vector3(x=a, y=b, z=c), color=_TUBE)
             for p, q, (a, b, c) in zip(places[2:], turned, diameters, strict=True)
-            if a or b or c
+            if c  # the largest
         ]
         line = fg.LinePrimitive(
             type=fg.LinePrimitiveLineType.LineStrip,

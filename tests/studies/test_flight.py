@@ -156,6 +156,18 @@ def test_an_offset_and_a_short_flight_are_no_loss(trajectory):
         assert numbers(experiment(trajectory=trajectory, steps=steps))["lost"] is None
 
 
+def test_a_plan_leaves_out_the_process_noise_of_the_plant_unless_its_covariances_hold_it():
+    noisy, holding = Noise(process=[1e-3] * 6), Linearization(process_noise=True)
+    for settings, expected in (
+        ({"noise": noisy}, 1e-3),
+        ({"noise": noisy, "propagator": Linearization()}, 1e-3),
+        ({"noise": noisy, "propagator": holding}, 0.0),
+        ({"noise": Noise(measurement=[1e-3] * 6)}, 0.0),
+        ({}, 0.0),
+    ):
+        assert blind(lambda x: HOVER, **settings).unplanned_noise(None).tolist() == [expected] * 6
+
+
 def growing(rate):
     """Thrust that is never quite infinite."""
     return lambda x: [min(rate * float(abs(x[4])), 1.7e308), 0, 0]
