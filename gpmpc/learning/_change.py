@@ -75,7 +75,7 @@ class ChangedModel(Wrapper):
     def arrays(self) -> tuple[Array, Array, Array]:
         """B (n, k), its pseudo-inverse, the part of an error of f that d can explain, and the noise of the GP (k,)."""
         B = to_array(self.B)
-        return B, np.linalg.pinv(B), to_array(self.gp.noise_variance)
+        return B, np.asarray(np.linalg.pinv(B), dtype=np.float64), to_array(self.gp.noise_variance)
 
     @cached_property
     def change(self) -> tuple[Packed, Array]:
@@ -126,7 +126,8 @@ class ChangedModel(Wrapper):
         arrays, size = packed.arrays, len(self)
         parts = arrays.points[:, :size].T, targets.T, arrays.inverse_squares**-0.5, np.exp(arrays.log_signal)
         rest = self.arrays[2], np.zeros(len(targets)), packed.cholesky, arrays.weights[:, :size]
-        return GPPosterior(*map(torch.from_numpy, parts + rest), gp.input_dim + 1, "value")
+        tensors: list[Any] = [torch.from_numpy(part) for part in parts + rest]
+        return GPPosterior(*tensors, gp.input_dim + 1, "value")
 
     @property
     def state_dim(self) -> int:
