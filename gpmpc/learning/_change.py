@@ -12,7 +12,7 @@ was seen lately d is zero, and with one point it is the estimate of a constant d
 """
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, cast
 
@@ -126,8 +126,9 @@ class ChangedModel(Wrapper):
         arrays, size = packed.arrays, len(self)
         parts = arrays.points[:, :size].T, targets.T, arrays.inverse_squares**-0.5, np.exp(arrays.log_signal)
         rest = self.arrays[2], np.zeros(len(targets)), packed.cholesky, arrays.weights[:, :size]
-        tensors: list[Any] = [torch.from_numpy(part) for part in parts + rest]
-        return GPPosterior(*tensors, gp.input_dim + 1, "value")
+        names = [field.name for field in fields(GPPosterior)]
+        given: dict[str, Any] = dict(zip(names, map(torch.from_numpy, parts + rest), strict=False))
+        return GPPosterior(**given, input_dim=gp.input_dim + 1, predicts="value")
 
     @property
     def state_dim(self) -> int:
