@@ -195,8 +195,8 @@ class AdaptiveTube:
         Args:
             means: As a decision has them (H + 1, n).
             covariances: Likewise (H + 1, n, n).
-            stages: Whether each stage's prediction counts (H,), such as where the plan touches a bound: how often
-                bounds are violated there is what alpha follows then. By default all count.
+            stages: Whether each stage's prediction counts (H,), or each of its directions (H, r), such as where the
+                plan touches a bound: how often bounds are violated there is what alpha follows then. By default all do.
         """
         means, covariances = (np.ascontiguousarray(part, dtype=np.float64) for part in (means, covariances))
         expected = self.tube.horizon + 1, self.tube.rows.shape[1]
@@ -231,16 +231,17 @@ def _observe(state, rows, bounds, step, numbers, scores, parts):
     """Updates alpha and kappa of each stage (H,) by a state (n,); ``bounds`` (H, H, r) hold the last plans."""
     (N, H), (rate, allowed, largest), (kappas, alphas, counts, misses) = scores.shape, numbers, parts
     for k in range(H):  # the plan of k + 1 steps ago said where the state would be at its stage k
-        known, outside = True, False
+        counted, known, outside = False, True, False  # a bound that does not count is NaN
         plan = (step - k - 1) % H
         for r in range(len(rows)):
             value = 0.0
             for i in range(len(state)):
                 value += rows[r, i] * state[i]
             bound = bounds[plan, k, r]
-            known = known and bound == bound and value == value
+            counted = counted or bound == bound
+            known = known and (bound != bound or value == value)
             outside = outside or value > bound
-        if known:
+        if counted and known:
             counts[k] += 1.0
             misses[k] += 1.0 if outside else 0.0
             alphas[k] = min(alphas[k] + rate * (allowed[k] - (1.0 if outside else 0.0)), 1.0)

@@ -105,6 +105,20 @@ def test_only_predictions_of_the_stages_that_are_told_count():
     assert tube.kappas[1] == 1.0 < tube.kappas[0] == tube.kappas[2] == 5.0
 
 
+def test_only_the_directions_count_in_which_a_plan_touches_a_bound():
+    tube = AdaptiveTube(ConformalTube(np.ones((19, 1)), [[1.0], [-1.0]]), 0.9, largest=5.0)
+    touched = {"above": [[True, False]], "below": [[False, True]], "both": [[True, True]], "none": [[False, False]]}
+    counted = []
+    for stages in touched.values():
+        tube.remember(np.zeros((2, 1)), np.ones((2, 1, 1)), stages)
+        tube.observe([100.0])  # far above
+        counted.append((int(tube.counts[0]), int(tube.misses[0])))
+        tube.remember(np.zeros((2, 1)), np.ones((2, 1, 1)), stages)
+        tube.observe([np.nan])  # not measured
+    assert counted == [(1, 1), (2, 1), (3, 2), (3, 2)]
+    assert tube.counts.tolist() == [3]
+
+
 def test_plans_are_compared_at_their_own_stage_and_those_of_failed_steps_are_left_out():
     tube = AdaptiveTube(ConformalTube(np.ones((19, 3)), [[1.0]]), 0.9, largest=5.0)
     covariances = np.ones((4, 1, 1))
