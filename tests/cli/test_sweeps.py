@@ -40,7 +40,7 @@ def test_a_run_leaves_a_folder_that_says_everything(single):
     for text in ("4 steps of translational along elliptical", "RMSE [m]", "INVALID_MEASUREMENT 1", "25 rows"):
         assert text in done.stdout
     (folder,) = (cwd / "tree").iterdir()
-    assert sorted(path.name for path in folder.iterdir()) == ["config.yaml", "metrics.json", "run.mcap"]
+    assert sorted(path.name for path in folder.iterdir()) == [".lock", "config.yaml", "metrics.json", "run.mcap"]
     found = json.loads((folder / "metrics.json").read_text())
     assert set(found["rmse"]) == {"x", "y", "z", "total"}
     assert found["rmse"]["total"] < 1
