@@ -22,7 +22,7 @@ from gpmpc.plotting import film
 from gpmpc.propagation import Linearization
 from gpmpc.recording import McapRecorder, RecordedSystem, read_run
 from gpmpc.simulation import Noise, closed_loop
-from gpmpc.systems.mujoco_quadrotor import joint_positions, mujoco_quadrotor
+from gpmpc.systems.mujoco_quadrotor import mujoco_quadrotor
 
 FOLDER = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 MEASURED = [0.003, 0.01] * 3 + [0.002, 0.02] * 3  # standard deviations [m, m/s], [rad, rad/s]
@@ -88,6 +88,6 @@ height.set(xlabel="time [s]", ylabel="z [m]")
 figure.legend(loc="outside upper center", ncols=4, fontsize="small")
 figure.savefig(FOLDER / "payload.png")
 try:
-    film(read_run(recording), loaded.dynamics.path, joint_positions, FOLDER / "payload.gif", frames=60, enlarged=5)
+    film(read_run(recording), loaded, FOLDER / "payload.gif", frames=60, enlarged=5)
 except SettingError as error:
     print(error)

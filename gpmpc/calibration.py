@@ -2,11 +2,11 @@
 
 Held-out recordings are predicted from every one of their states k = 1 to H steps ahead, with the inputs that were
 applied, and compared with what was measured, per step and state: root mean squared error, negative log predictive
-density (Quinonero-Candela et al., 2006), and how often central intervals hold the measurement (Gneiting, Balabdaoui and
-Raftery, 2007). k = 1 from a certain state is the usual check of the model alone.
+density (Quinonero-Candela et al., 2006), how often central intervals hold the measurement (Gneiting, Balabdaoui and
+Raftery, 2007), and their width. k = 1 from a certain state is the usual check of the model alone.
 
 Predictions from neighbouring states overlap, so their errors are correlated: the effective number of samples is smaller
-than the count, the more so the larger k.
+than the count, the more so the larger k. Intervals of a coverage count those that do not overlap.
 """
 
 import math
@@ -21,7 +21,7 @@ from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.transitions import Transitions
-from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
+from gpmpc.metrics import binomial_interval, interval_coverage, mean_squared_error, negative_log_predictive_density
 from gpmpc.propagation import Propagator, best_propagator
 
 if TYPE_CHECKING:
@@ -79,6 +79,13 @@ class Calibration:
     rmse: Tensor  # (H, n) root mean squared error, in the units of each state
     nlpd: Tensor  # (H, n) negative log predictive density; lower is better
     coverage: Tensor  # (H, n, L) part of the measurements inside the central interval of each level
+    width: Tensor  # (H, n) root mean predicted variance over the RMSE: one is honest, less claims too much
+    independent: Tensor  # (H,) predictions that do not overlap, at most
+
+    def coverage_interval(self, step: int, state: int, level: int) -> tuple[float, float]:
+        """Computes the exact 95 % interval of a coverage (Clopper and Pearson, 1934), from its three indices."""
+        trials = int(self.independent[step])
+        return binomial_interval(round(float(self.coverage[step, state, level]) * trials), trials)
 
     @property
     def horizon(self) -> int:
@@ -86,7 +93,7 @@ class Calibration:
         return len(self.samples)
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """Returns a row a step and state: step, state, samples, rmse, nlpd, and coverage_<level> for each level."""
+        """Returns a row a step and state: step, state, samples, rmse, nlpd, width, and coverage_<level> for each."""
         import pandas
 
         n = len(self.names)
@@ -95,6 +102,7 @@ class Calibration:
             "state": self.names * self.horizon,
         }
         table |= {"samples": self.samples.repeat_interleave(n), "rmse": self.rmse.ravel(), "nlpd": self.nlpd.ravel()}
+        table["width"] = self.width.ravel()
         table |= {f"coverage_{level:g}": self.coverage[..., j].ravel() for j, level in enumerate(self.levels)}
         return pandas.DataFrame(table)
 
@@ -162,13 +170,16 @@ def calibrate(
     def table(measure: Callable[[Tensor, Tensor, Tensor], Any]) -> Tensor:
         return torch.tensor([[measure(*column) for column in step] for step in columns], dtype=torch.float64)
 
+    rmse = table(lambda m, v, y: math.sqrt(mean_squared_error(m, y)))
     return Calibration(
         names,
         tuple(levels),
         torch.tensor([len(mean) for mean, _, _ in steps]),
-        table(lambda m, v, y: math.sqrt(mean_squared_error(m, y))),
+        rmse,
         table(negative_log_predictive_density),
         table(lambda m, v, y: [interval_coverage(m, v, y, level) for level in levels]),
+        table(lambda m, v, y: math.sqrt(v.mean())) / rmse,
+        torch.tensor([sum(len(recording) // k for recording in recordings) for k in range(1, horizon + 1)]),
     )
 
 

@@ -11,6 +11,7 @@ from gpmpc.calibration import CHUNK, Calibration, Recording, calibrate
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Transitions
+from gpmpc.metrics import binomial_interval
 from gpmpc.plotting import calibration_figure
 from gpmpc.propagation import Linearization, MeanEquivalence
 
@@ -138,23 +139,39 @@ def example():
         torch.tensor([[0.1, 0.2], [0.3, 0.4]]),
         torch.tensor([[1.0, 2.0], [3.0, math.inf]]),
         torch.tensor([[[0.5, 0.9], [0.6, 1.0]], [[0.4, 0.8], [0.3, 0.7]]]),
+        torch.tensor([[1.0, 1.1], [1.2, 1.3]]),
+        torch.tensor([20, 5]),
     )
 
 
 def test_the_report_is_a_data_frame():
     frame = example().to_pandas()
-    assert list(frame.columns) == ["step", "state", "samples", "rmse", "nlpd", "coverage_0.5", "coverage_0.95"]
-    assert frame.iloc[1].tolist() == [1, "rate", 20, pytest.approx(0.2), 2.0, pytest.approx(0.6), 1.0]
+    assert list(frame.columns) == ["step", "state", "samples", "rmse", "nlpd", "width", "coverage_0.5", "coverage_0.95"]
+    assert frame.iloc[1].tolist() == [1, "rate", 20, pytest.approx(0.2), 2.0, 1.1, pytest.approx(0.6), 1.0]
     assert frame.iloc[3].tolist() == [
         2,
         "rate",
         10,
         pytest.approx(0.4),
         math.inf,
+        1.3,
         pytest.approx(0.3),
         pytest.approx(0.7),
     ]
     assert frame["state"].tolist() == ["angle", "rate"] * 2
+
+
+def test_a_coverages_interval_is_exact_and_counts_what_does_not_overlap():
+    assert example().coverage_interval(0, 0, 1) == binomial_interval(18, 20)
+    assert example().coverage_interval(1, 0, 1) == binomial_interval(4, 5)
+    found = calibrate(LinearGaussian(), [*runs(3, 7), *runs(2, 3)], Linearization(), 4)
+    assert found.independent.tolist() == [27, 11, 8, 3]
+    same = runs(300, 5, noisy=False)
+    honest, narrow = (
+        calibrate(LinearGaussian(Q=noise), same, Linearization(), 5, observation_noise=False) for noise in (Q, Q / 9)
+    )
+    assert honest.width.numpy() == pytest.approx(1.0, abs=0.2)
+    assert (narrow.width / honest.width).numpy() == pytest.approx(1 / 3)
 
 
 def test_the_figure_has_a_column_for_each_state_and_a_row_for_each_measure():

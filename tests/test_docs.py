@@ -40,11 +40,11 @@ references = states_along(Elliptical(), np.arange(60.0))
 """  # what the pages speak of: a plant, transitions, a model, a controller
 
 
-def test_ten_tasks_of_a_newcomer_are_done_from_an_empty_folder(page, tmp_path):
+def test_eleven_tasks_of_a_newcomer_are_done_from_an_empty_folder(page, tmp_path):
     names, printed = page("docs/how_to.md")
-    assert read("docs/how_to.md").count("\n## ") == 10
+    assert read("docs/how_to.md").count("\n## ") == 11
     assert "(docs/how_to.md)" in read("README.md")
-    weights, waypoints, own_path, _, own_system, _, _, bounded, swept, report, compared = printed
+    weights, waypoints, own_path, _, own_system, _, _, bounded, swept, report, compared, calibrated = printed
     assert "20 steps of translational along elliptical with convex" in weights
     assert "along waypoints" in waypoints
     assert "along figure_eight" in own_path
@@ -53,6 +53,7 @@ def test_ten_tasks_of_a_newcomer_are_done_from_an_empty_folder(page, tmp_path):
     assert "12 runs: 12 flown" in swept
     assert "12 finished in 2 cells, 0 failed, 0 missing" in report
     assert "n = 6" in compared
+    assert "50 ahead" in calibrated
     from gpmpc.recording import read_run
 
     (recording,) = tmp_path.glob("bounded/*/run.mcap")

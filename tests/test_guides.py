@@ -3,6 +3,7 @@
 import shlex
 
 import numpy as np
+import pandas
 import pytest
 
 from tests.cli.command import forked
@@ -10,7 +11,7 @@ from tests.pages import BLOCK, read
 
 
 def test_a_system_of_ones_own_is_flown_learned_swept_reported_recorded_and_calibrated(page, tmp_path):
-    names, (flown, *_, heavier, swept, report) = page("docs/guide_system.md")
+    names, (flown, *_, calibrated, heavier, swept, report) = page("docs/guide_system.md")
     assert abs(names["flown"].rollout.states[-20:] - [1.0, 0.0]).max() < 0.05
     recorded = names["run"]
     assert (recorded.finished, recorded.metadata["units"]["state.angle"], len(recorded.states)) == (True, "rad", 60)
@@ -18,6 +19,11 @@ def test_a_system_of_ones_own_is_flown_learned_swept_reported_recorded_and_calib
     assert "100 steps of arm with convex" in flown
     assert "200 rows of random data" in flown
     assert "RMSE [rad]" in flown
+    assert "10 ahead" in calibrated
+    assert "rate [rad/s]" in calibrated
+    frame = pandas.read_csv(tmp_path / "outputs/run/system=arm/calibration/calibration.csv")
+    assert frame["samples"].tolist()[:2] == [99, 99]
+    assert frame["rmse"].max() < 0.01
     assert "mass 1.2 (learned: 1.0)" in heavier
     assert "4 flown" in swept
     assert "RMSE" in report
@@ -29,8 +35,9 @@ def test_a_system_of_ones_own_is_flown_learned_swept_reported_recorded_and_calib
 def test_simulators_are_systems(page):
     pytest.importorskip("gymnasium")
     pytest.importorskip("mujoco")
-    names, (flown, quadrotor) = page("docs/guide_simulator.md")
+    names, (flown, quadrotor, filmed) = page("docs/guide_simulator.md")
     assert "100 steps of mujoco_quadrotor with convex" in quadrotor
+    assert "flight.gif" in filmed
     assert abs(names["flown"].rollout.states[-20:] - [1.0, 0.0, 0.0]).max() < 0.05
     assert "5 steps of gymnasium with convex" in flown
     assert names["cart"].state_names == ("slider", "hinge", "slider_rate", "hinge_rate", "push_activation")

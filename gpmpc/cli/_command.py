@@ -46,6 +46,7 @@ COMMANDS: dict[str, Command] = {
     "new": new.COMMAND,
     "report": reports.REPORT,
     "plot": reports.PLOT,
+    "calibrate": reports.CALIBRATE,
     "learn": learn.COMMAND,
     "log": log.COMMAND,
     "warmup": study.WARMUP,

@@ -1,15 +1,25 @@
-"""``gpmpc report`` and ``gpmpc plot``: what is in a tree of runs, and in a recorded flight."""
+"""``gpmpc report``, ``plot`` and ``calibrate``: a tree of runs, recorded flights, how well a model predicts them."""
 
 import argparse
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import OmegaConf
 
 from gpmpc.cli._log import CUT
-from gpmpc.cli._settings import Command, Parser, Result, write_files, writing
+from gpmpc.cli._run import experiment_of
+from gpmpc.cli._settings import Command, Parser, Result, settings, write_files, writing
 from gpmpc.cli._terminal import print_error
-from gpmpc.exceptions import DataError, RecordingError
+from gpmpc.exceptions import DataError, RecordingError, check_number
+
+if TYPE_CHECKING:
+    from gpmpc.recording import Run
+    from gpmpc.studies.flight import Experiment
 
 _FORMATS = ("png", "pdf", "svg")
+_LEVELS = 0.5, 0.9, 0.95  # of the intervals that are drawn; the last is printed
+_RUN = "a run's folder, one with runs below it, or a recording (.mcap)"
 
 
 def _add_report_arguments(parser: Parser) -> None:
@@ -41,23 +51,28 @@ def _report(given: argparse.Namespace) -> Result:
 
 
 def _add_plot_arguments(parser: Parser) -> None:
-    parser.add_argument(
-        "run", type=Path, metavar="RUN", help="a run's folder, one with runs below it, or a recording (.mcap)"
-    )
+    parser.add_argument("run", type=Path, metavar="RUN", help=_RUN)
     parser.add_argument("--to", type=Path, metavar="DIR", help="where the figures go (RUN/figures)")
     parser.add_argument("--format", choices=_FORMATS, default="png", help="of the figures (png)")
     parser.add_argument("--no-animation", action="store_true", help="figures only: they take a second")
+    parser.add_argument("--film", action="store_true", help="a system of MuJoCo: the animation as MuJoCo renders it")
+
+
+def _recordings(run: Path) -> list[Path]:
+    """Returns the recordings that are meant by a run's folder, by one above it, or by a file."""
+    from gpmpc.studies.run_folder import RECORDING
+
+    paths = [run / RECORDING if run.is_dir() else run]
+    if run.is_dir() and not paths[0].exists():
+        paths = sorted(run.rglob(RECORDING))
+    if not paths:
+        raise DataError(f"{run}: holds no {RECORDING}, nor does a folder below it")
+    return paths
 
 
 def _draw(given: argparse.Namespace) -> Result:
     """Draws figures and an animation of a recorded flight, or of every one below a folder."""
-    from gpmpc.studies.run_folder import RECORDING
-
-    paths = [given.run / RECORDING if given.run.is_dir() else given.run]
-    if given.run.is_dir() and not paths[0].exists():
-        paths = sorted(given.run.rglob(RECORDING))
-    if not paths:
-        raise DataError(f"{given.run}: holds no {RECORDING}, nor does a folder below it")
+    paths = _recordings(given.run)
     if len(paths) == 1:
         return Result(_plot(given, paths[0], given.to or paths[0].parent / "figures"))
     plotted, code = [], 0
@@ -74,30 +89,101 @@ def _draw(given: argparse.Namespace) -> Result:
 def _plot(given: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]:
     from rich.console import Console
 
-    from gpmpc.plotting import animate, ffmpeg_exists, inputs_figure, timing_figure, tracking_figure
+    from gpmpc.plotting import animate, ffmpeg_exists, film, inputs_figure, timing_figure, tracking_figure
     from gpmpc.recording import read_run
 
     run, written = read_run(path), []
     if not len(run.times):
         raise DataError(f"{path}: holds no step")
+    animated = given.film or (not given.no_animation and {"x", "y", "z"} <= run.pose.keys())
+    draw = partial(film, system=_experiment(run).flown) if given.film else animate
     with writing(folder, "to"), Console().status("drawing"):
         folder.mkdir(parents=True, exist_ok=True)
         figures = {"tracking": tracking_figure(run), "inputs": inputs_figure(run), "timing": timing_figure(run)}
         for name, figure in figures.items():
             figure.savefig(folder / f"{name}.{given.format}", dpi=150)
             written.append(f"{name}.{given.format}")
-        if not given.no_animation and {"x", "y", "z"} <= run.pose.keys():
-            for ending in ("gif", "mp4") if ffmpeg_exists() else ("gif",):
-                animate(run, folder / f"flight.{ending}")
-                written.append(f"flight.{ending}")
+        for ending in ("gif", *["mp4"] * ffmpeg_exists()) if animated else ():
+            draw(run, path=folder / f"flight.{ending}")
+            written.append(f"flight.{ending}")
     note = "" if run.finished else f"; {len(run.times)} steps: the recording is {CUT}"
     print(f"written to {folder}: {', '.join(written)}{note}")
     return {"folder": str(folder), "written": written, "finished": run.finished}
+
+
+def _experiment(run: "Run") -> "Experiment":
+    """Makes what the settings in a recording describe."""
+    config: Any = OmegaConf.create(run.config)
+    if not {"system", "controller", "folder"} <= config.keys():
+        raise DataError(f"{run.path}: holds no settings, which gpmpc run puts into its recordings")
+    with settings():
+        return experiment_of(config)
+
+
+def _add_calibrate_arguments(parser: Parser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder or recording; its model is learned again")
+    parser.add_argument("flights", type=Path, nargs="*", metavar="FLIGHT", help=f"what is predicted (RUN): {_RUN}")
+    parser.add_argument("--steps", type=int, default=50, help="length of the longest prediction (50)")
+    parser.add_argument("--to", type=Path, metavar="DIR", help="where all goes (RUN/calibration)")
+
+
+def _calibrate(given: argparse.Namespace) -> Result:
+    """Predicts flights from each of their steps with a run's model: errors, and how often 95 % intervals hold."""
+    import torch
+    from rich.console import Console
+
+    from gpmpc.calibration import Recording, calibrate
+    from gpmpc.plotting import calibration_figure, png
+    from gpmpc.recording import read_run
+    from gpmpc.studies.document import Document, Table, terminal
+    from gpmpc.studies.study import one_thread
+
+    check_number("--steps", given.steps, least=1, whole=True)
+    console, (first, *others) = Console(), _recordings(given.run)
+    if others:
+        raise DataError(f"{given.run}: holds {1 + len(others)} runs; name the one whose model it is")
+    experiment, folder = _experiment(read_run(first)), given.to or first.parent / "calibration"
+    system, model = experiment.system, experiment.model
+    flights = [read_run(path) for tree in given.flights or [first] for path in _recordings(tree)]
+    for run in flights:
+        if (run.state_names, run.input_names) != (system.state_names, system.input_names):
+            raise DataError(f"{run.path}: has other states or inputs than {first}")
+        if len(run.times) < 2 or (run.steps[1:] != run.steps[:-1] + 1).any():
+            raise DataError(f"{run.path}: has fewer than two steps, or one is missing")
+    if not experiment.learns or hasattr(experiment.learning, "episodes"):
+        raise DataError(f"{first}: its controller learned no model, or learned it from whole flights")
+    if model is None:
+        with one_thread(), console.status("learning"):
+            model = experiment.learn(experiment.training_rows(), experiment.seed).posterior
+    recordings = [Recording(torch.tensor(run.states), torch.tensor(run.inputs[:-1])) for run in flights]
+    horizon = min(given.steps, max(map(len, recordings)))
+    names = [f"{name} [{system.units.get(name, '?')}]" for name in system.state_names]
+    with console.status("predicting"):
+        found = calibrate(model, recordings, horizon=horizon, levels=_LEVELS, names=names)
+    rows = []
+    for k in sorted({step for step in (1, 10, 50) if step <= horizon} | {horizon}):
+        for i, name in enumerate(names):
+            low, high = found.coverage_interval(k - 1, i, -1)
+            held = f"{found.coverage[k - 1, i, -1]:.1%}", f"{low:.1%} to {high:.1%}"
+            rows.append([f"{k} ahead", name, float(found.rmse[k - 1, i]), *held, float(found.width[k - 1, i])])
+    table = Table(["steps", "state", "RMSE", "in 95 %", "exact interval", "width"], rows, sections=True)
+    lead = f"{found.samples[0]} predictions of {', '.join(str(run.path) for run in flights)}"
+    images = {"calibration.png": png(calibration_figure(found))}
+    document = Document(f"How well the model of {first} predicts", [table], found.to_pandas(), lead, images=images)
+    where = write_files(folder, document.files("calibration"), "to")
+    console.print(terminal([table]))
+    console.out(where, highlight=False)
+    return Result({"folder": str(folder), "rows": document.data.to_dict("records")})
 
 
 REPORT = Command(
     "Tabulates all runs below a folder, with figures; compares two groups of them",
     _report,
     add_arguments=_add_report_arguments,
+)
+CALIBRATE = Command(
+    "Predicts recorded flights with a run's model: its errors, and whether its intervals hold",
+    _calibrate,
+    add_arguments=_add_calibrate_arguments,
 )
 PLOT = Command("Draws recorded flights as figures and an animation", _draw, add_arguments=_add_plot_arguments)

@@ -1,7 +1,6 @@
 """Films a recorded flight of a MuJoCo model, rendered without a screen: vehicle, reference, plan and its tube."""
 
 import os
-from collections.abc import Callable
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
@@ -18,35 +17,31 @@ from gpmpc.plotting._recorded import FLOWN, REFERENCE
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
+    from gpmpc.systems import System
 
 Array = np.ndarray
 _WIDTH, _HEIGHT = 640, 480  # of MuJoCo's off-screen buffer
 
 
-def film(
-    run: "Run",
-    model: str | Path,
-    positions: Callable[[Array], Array],
-    path: str | Path,
-    frames: int = 100,
-    enlarged: float = 1.0,
-) -> None:
+def film(run: "Run", system: "System", path: str | Path, frames: int = 100, enlarged: float = 1.0) -> None:
     """Writes a flight as MuJoCo renders it, as a GIF, or as an MP4 by the file's ending.
 
+    Reference, plan and tube are drawn where the recording's ``pose`` has x, y and z.
+
     Args:
-        run: A recording whose ``pose`` has x, y and z.
-        model: The MJCF file.
-        positions: From a state (n,) to those of the model's joints (nq,).
+        run: A recording.
+        system: What flew: its ``dynamics`` have a MuJoCo ``model``, and ``positions`` from a state (n,) to those of the
+            model's joints (nq,), as a system of joints has.
         path: The file, .gif or .mp4 (which needs ffmpeg).
         frames: At most so many; steps are left out evenly.
         enlarged: Factor of the tube's 2-sigma ellipsoids.
 
     Raises:
         SettingError: There is no off-screen rendering here.
-        UnsupportedModel: The recording has no positions.
+        UnsupportedModel: The system is none of MuJoCo whose state says where its joints are, or no step was recorded.
     """
-    if not {"x", "y", "z"} <= run.pose.keys() or not len(run.times):
-        raise UnsupportedModel(f"{run.path}: a film needs steps with positions x, y and z")
+    if not len(run.times) or not (hasattr(system.dynamics, "model") and hasattr(system.dynamics, "positions")):
+        raise UnsupportedModel(f"{run.path}: a film needs steps of a MuJoCo model, and its joints' positions")
     try:
         mujoco = import_module("mujoco")
         chosen = "MUJOCO_GL" in os.environ or "DISPLAY" in os.environ
@@ -56,14 +51,15 @@ def film(
         what = "no off-screen rendering by MuJoCo here; gpmpc.plotting.animate draws flights without it"
         raise SettingError("film", f"{what} ({error})") from error
     try:
-        scene = _Scene(mujoco, run, str(model), positions, enlarged)
+        scene = _Scene(mujoco, run, system.dynamics, enlarged)
         figure = Figure(figsize=(_WIDTH / 80, _HEIGHT / 80))
         figure.set_layout_engine("none")  # the picture fills it
         FigureCanvasAgg(figure)
         image = figure.add_axes((0, 0, 1, 1)).imshow(scene.render(0), aspect="auto")
         image.axes.set_axis_off()
         clock = figure.text(0.02, 0.95, "")
-        for i, (name, color) in enumerate((("reference", REFERENCE), ("flown", FLOWN), ("plan and its tube", PLAN))):
+        legend = (("reference", REFERENCE), ("flown", FLOWN), ("plan and its tube", PLAN)) if scene.axes else ()
+        for i, (name, color) in enumerate(legend):
             figure.text(0.02, 0.02 + 0.04 * i, name, color=color, weight="bold")
 
         def draw(k: int) -> list:
@@ -80,25 +76,37 @@ def film(
 class _Scene:
     """What is rendered of one step."""
 
-    def __init__(self, mujoco: Any, run: "Run", model: str, positions: Callable[[Array], Array], enlarged: float):
-        self.mujoco, self.run, self.positions, self.enlarged = mujoco, run, positions, enlarged
-        self.model = mujoco.MjModel.from_xml_path(model)
+    def __init__(self, mujoco: Any, run: "Run", dynamics: Any, enlarged: float):
+        self.mujoco, self.run, self.positions, self.enlarged = mujoco, run, dynamics.positions, enlarged
+        self.model = dynamics.model
         self.data, self.scene = mujoco.MjData(self.model), mujoco.MjvScene(self.model, 2000)
         self.rendering = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self.rendering)
-        self.axes = [run.pose[axis] for axis in "xyz"]
+        self.axes = [run.pose[axis] for axis in "xyz"] if {"x", "y", "z"} <= run.pose.keys() else []
         self.thinned = run.references[:: max(1, len(run.times) // 300)][:, self.axes]
 
     def render(self, k: int) -> Array:
-        """The picture (height, width, 3) of step k, seen by a camera that follows the vehicle."""
+        """The picture (height, width, 3) of step k; a camera follows what has a position."""
         mujoco, run = self.mujoco, self.run
         self.data.qpos[:] = self.positions(run.states[k])
         mujoco.mj_forward(self.model, self.data)
         camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
-        camera.lookat[:] = run.states[k, self.axes]
-        camera.distance, camera.elevation, camera.azimuth = 2.2, -25, 120
+        mujoco.mjv_defaultFreeCamera(self.model, camera)
+        if self.axes:
+            camera.lookat[:] = run.states[k, self.axes]
+            camera.distance, camera.elevation, camera.azimuth = 2.2, -25, 120
         every = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self.model, self.data, option, None, camera, every, self.scene)
+        if self.axes:
+            self._draw_paths(k)
+        view, pixels = mujoco.MjrRect(0, 0, _WIDTH, _HEIGHT), np.empty((_HEIGHT, _WIDTH, 3), dtype=np.uint8)
+        mujoco.mjr_render(view, self.scene, self.rendering)
+        mujoco.mjr_readPixels(pixels, None, view, self.rendering)
+        return pixels[::-1]
+
+    def _draw_paths(self, k: int) -> None:
+        """Adds the reference, what was flown before step k, and the plan with its tube."""
+        run = self.run
         self._line(self.thinned, REFERENCE)
         self._line(run.states[max(0, k - 200) : k + 1, self.axes], FLOWN)
         plan, covariances = run.plan_means[k][:, self.axes], run.plan_covariances[k][:, self.axes][..., self.axes]
@@ -108,11 +116,7 @@ class _Scene:
             squared, turn = np.linalg.eigh(covariance)
             turn[:, 0] *= np.sign(np.linalg.det(turn))
             axes = np.maximum(2 * self.enlarged * np.sqrt(np.maximum(squared, 0)), 1e-3)
-            self._add(mujoco.mjtGeom.mjGEOM_ELLIPSOID, axes, mean, turn, to_rgba(PLAN, 0.15))
-        view, pixels = mujoco.MjrRect(0, 0, _WIDTH, _HEIGHT), np.empty((_HEIGHT, _WIDTH, 3), dtype=np.uint8)
-        mujoco.mjr_render(view, self.scene, self.rendering)
-        mujoco.mjr_readPixels(pixels, None, view, self.rendering)
-        return pixels[::-1]
+            self._add(self.mujoco.mjtGeom.mjGEOM_ELLIPSOID, axes, mean, turn, to_rgba(PLAN, 0.15))
 
     def _line(self, points: Array, color: str) -> None:
         capsule = self.mujoco.mjtGeom.mjGEOM_CAPSULE

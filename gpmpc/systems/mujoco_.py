@@ -65,6 +65,12 @@ class _Joints(_Model):
         self.state_names = (*joints, *rates, *(f"{name}_activation" for name in activated))
         self.input_names = tuple(actuators)
 
+    def positions(self, state: Array) -> Array:
+        """The positions of the model's joints (nq,), in MuJoCo's order, in a state (n,)."""
+        found, count = np.empty(self.model.nq), self.model.nq
+        found[self._order[:count] - 1] = state[:count]
+        return found
+
     def successor(self, x: Any, u: Any) -> Array:
         """The next state (n,) or states (n, T) from a state and an input, or T of each."""
         states, inputs = numbers(x, u)
@@ -83,7 +89,10 @@ class _Joints(_Model):
 
 
 class _Sensors(_Model, Simulator):
-    """Dynamics of a model by its sensors, from its first keyframe, or from its initial pose."""
+    """Dynamics of a model by its sensors, from its first keyframe, or from its initial pose.
+
+    Films need an attribute ``positions`` besides: from a state (n,) to the positions of the model's joints (nq,).
+    """
 
     def __init__(
         self,

@@ -95,6 +95,7 @@ def mujoco_quadrotor(
         lost=10.0,
         pose={name: name for name in ("x", "y", "z", "roll", "pitch", "yaw")},
     )
+    flown.dynamics.positions = _joint_positions
     model, vehicle = flown.dynamics.model, flown.dynamics.model.body("vehicle").id
     model.body_mass[vehicle] = mass
     flown.dynamics.mujoco.mj_setConst(model, flown.dynamics.data)  # what follows from the mass
@@ -103,7 +104,7 @@ def mujoco_quadrotor(
     return flown
 
 
-def joint_positions(state: np.ndarray) -> np.ndarray:
+def _joint_positions(state: np.ndarray) -> np.ndarray:
     """The positions of the model's joints (7,) in a state (12,)."""
     (s1, s2, s3), (c1, c2, c3) = (f(np.asarray(state)[6::2] / 2) for f in (np.sin, np.cos))
     turn = [c1 * c2 * c3 + s1 * s2 * s3, s1 * c2 * c3 - c1 * s2 * s3, c1 * s2 * c3 + s1 * c2 * s3]

@@ -8,6 +8,7 @@ import pytest
 from gpmpc.plotting._recorded import expected
 from gpmpc.recording import read_run
 from tests.cli.command import forked, gpmpc
+from tests.recording import runs
 
 TINY = ["data.samples=25", "model.restarts=0", "horizon=2", "folder=tree"]
 NOISY = f"noise.process={[0.01] * 6}".replace(" ", "")
@@ -39,6 +40,31 @@ def test_a_lost_flight_is_finished_and_readable_and_has_an_exit_code_of_its_own(
     assert "finished before" in again.stdout
     assert forked("plot", str(folder), cwd=tmp_path).returncode == 0
     assert forked("report", "tree", cwd=tmp_path).returncode == 0
+
+
+def test_a_flight_is_predicted_and_what_cannot_be_predicted_or_filmed_is_said_in_one_line(tmp_path):
+    assert forked("run", *TINY, "steps=9", cwd=tmp_path).returncode == 0
+    done = forked("calibrate", "tree", "--steps", "12", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout)["rows"]
+    assert [(row["step"], row["samples"]) for row in rows if row["state"] == "x [m]"] == [
+        (k, 9 - k) for k in range(1, 9)
+    ]
+    assert all(0 <= row["coverage_0.5"] <= row["coverage_0.95"] <= 1 and row["width"] > 0 for row in rows)
+    (folder,) = (tmp_path / "tree").glob("*/calibration")
+    assert {path.suffix for path in folder.iterdir()} == {".csv", ".md", ".png", ".tex"}
+    assert forked("run", *TINY, "steps=3", cwd=tmp_path).returncode == 0
+    runs.record_run(tmp_path / "foreign.mcap", steps=3)
+    for words, said in (
+        (["calibrate", "nowhere"], "nowhere: cannot be read"),
+        (["calibrate", "tree"], "tree: holds 2 runs"),
+        (["calibrate", "tree", "--steps", "0"], "--steps: must be a whole number, 1 or more; got 0"),
+        (["calibrate", "foreign.mcap"], "foreign.mcap: holds no settings"),
+        (["plot", "--film", str(folder.parent)], "a film needs steps of a MuJoCo model"),
+    ):
+        wrong = forked(*words, cwd=tmp_path)
+        assert (wrong.returncode, wrong.stderr.count("\n")) == (2, 1), wrong.stderr
+        assert said in wrong.stderr
 
 
 def test_who_is_not_lost_is_not_called_so(tmp_path):

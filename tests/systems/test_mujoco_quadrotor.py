@@ -12,7 +12,7 @@ from gpmpc.cli._settings import compose, settings
 from gpmpc.exceptions import SettingError
 from gpmpc.studies.flight import metrics, run_trial
 from gpmpc.systems import step
-from gpmpc.systems.mujoco_quadrotor import RigidBody, joint_positions, mujoco_quadrotor
+from gpmpc.systems.mujoco_quadrotor import RigidBody, mujoco_quadrotor
 
 
 def test_states_and_positions_of_joints_are_those_of_one_attitude(rng):
@@ -20,7 +20,7 @@ def test_states_and_positions_of_joints_are_those_of_one_attitude(rng):
     for _ in range(5):
         state = np.zeros(12)
         state[0:6:2], state[6::2] = rng.normal(size=3), rng.uniform([-3, -1.5, -3], [3, 1.5, 3])
-        vehicle.data.qpos[:], vehicle.data.qvel[:] = joint_positions(state), 0
+        vehicle.data.qpos[:], vehicle.data.qvel[:] = vehicle.positions(state), 0
         vehicle.mujoco.mj_forward(vehicle.model, vehicle.data)
         assert vehicle._measure() == pytest.approx(state, abs=1e-9)
 
