@@ -12,12 +12,13 @@ from gpmpc.qp.solution import QPSolution, QPSolver, Residuals, make_solution
 
 if TYPE_CHECKING:
     from gpmpc.qp.cvxpy_ import CvxpySolver
-    from gpmpc.qp.dual_active_set import DualActiveSet
+    from gpmpc.qp.dual_active_set import DualActiveSet, Prepared
     from gpmpc.qp.primal_active_set import PrimalActiveSet
 
 __all__ = [
     "CvxpySolver",
     "DualActiveSet",
+    "Prepared",
     "PrimalActiveSet",
     "QPSolution",
     "QPSolver",
@@ -26,7 +27,12 @@ __all__ = [
     "make_solution",
 ]
 
-_SOLVERS = {"CvxpySolver": "cvxpy_", "DualActiveSet": "dual_active_set", "PrimalActiveSet": "primal_active_set"}
+_SOLVERS = {
+    "CvxpySolver": "cvxpy_",
+    "DualActiveSet": "dual_active_set",
+    "Prepared": "dual_active_set",
+    "PrimalActiveSet": "primal_active_set",
+}
 
 
 def __getattr__(name: str) -> Any:

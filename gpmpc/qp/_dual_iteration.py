@@ -12,7 +12,7 @@ The functions take a ``Workspace``, a ``WorkingSet`` and the number k of its con
 import numpy as np
 
 from gpmpc.compiled import inline_njit
-from gpmpc.kernels.linalg import dot
+from gpmpc.kernels.linalg import combine_rows, dot
 from gpmpc.qp._record import INFEASIBLE, ITERATION_LIMIT, SOLVED
 from gpmpc.qp._triangular import (
     append_row,
@@ -85,19 +85,27 @@ def iterate(work, active, k, count, margin, iterations, batches):
                 batches = _BATCHES  # caps may have changed x_u
         if unsettled:
             k = drop_wrong_multipliers(work, active, k)
-        _minimise(work, active, k)
-        complete = several or work.soft or count == 1 or iterations >= work.limit
-        if not complete:  # first satisfy those that were seen to be violated, then look at all
-            count = keep_violated(work, margin, count)
-            complete = count == 0
+        if work.prepared and not begins:
+            _follow_multipliers(work)
+        else:
+            _minimise(work, active, k)
+            complete = several or work.soft or work.prepared or count == 1 or iterations >= work.limit
+            if not complete:  # first satisfy those that were seen to be violated, then look at all
+                count = keep_violated(work, margin, count)
+                complete = count == 0
+            if complete:
+                multiply_constraints(work)
+            for i in range(len(work.mu) if work.prepared else 0):
+                work.seen[i] = work.mu[i]
         if complete:
-            multiply_constraints(work)
             count = list_violated(work, margin)
         begins = False
     if violated:
         for i in range(k):  # rounding can take multipliers out of their ranges
             p = abs(active.name[i]) - 1
             work.mu[p] = min(max(work.mu[p], active.least[i]), active.most[i])
+        if work.prepared:
+            multiply_constraints(work)  # which x has, but for rounding
     return SOLVED, k, iterations, batches, passed, violated
 
 
@@ -114,7 +122,7 @@ def _satisfy_constraint(work, active, k, p):
     violation = (work.y[p] - (work.upper[p] if above else work.lower[p])) * sense
     place = _make_row(work, active, k, p)
     row, size = work.rows[place], int(work.end[p])
-    free_value, K_pp = dot(row, work.v, len(work.x)), dot(row, row, size)
+    free_value, K_pp = _measure_row(work, p, row, size)
     _multiply_working_rows(work, active, k, p, row)
     solve_lower(active.factor, k, solved)
     while True:
@@ -209,7 +217,7 @@ def add_constraints(work, active, k, count):
         row, size = work.rows[place], int(work.end[p])
         _multiply_working_rows(work, active, k, p, row)
         solve_lower(active.factor, k, solved)
-        free_value, K_pp = dot(row, work.v, len(work.x)), dot(row, row, size)
+        free_value, K_pp = _measure_row(work, p, row, size)
         pivot = K_pp - dot(solved, solved, k)
         if pivot > _GUESSED_PIVOT * K_pp:
             active.place[first + i] = active.place[k]
@@ -223,8 +231,26 @@ def add_constraints(work, active, k, count):
 
 
 @inline_njit
+def restore_constraints(work, active, names, factor):
+    """Makes the named constraints of a prepared problem the working set, whose factor is known; returns its size."""
+    k, at = len(names), 0
+    for i in range(k):
+        p, row = int(abs(names[i])) - 1, active.factor[i]
+        active.place[i] = p
+        active.free_value[i], active.diagonal[i] = _measure_row(work, p, work.rows[p], 0)
+        _write_slot(work, active, i, p, names[i] > 0.0)
+        ignore_violations(work, p)
+        for j in range(i + 1):
+            row[j] = factor[at + j]
+        at += i + 1
+    return k
+
+
+@inline_njit
 def _make_row(work, active, slot, p):
     """Returns the place of ``w_p = L^-T c_p``, computed in the place that the slot has free if it is not known."""
+    if work.prepared:
+        return p
     place, n = active.place[slot], len(work.x)
     row = work.rows[place]
     if p >= n:
@@ -240,9 +266,22 @@ def _make_row(work, active, slot, p):
 
 
 @inline_njit
+def _measure_row(work, p, row, size):
+    """Returns c_p'x at the unconstrained minimiser, and K_pp; ``row`` is w_p."""
+    n = len(work.x)
+    if work.prepared:
+        return dot(work.gram[p], work.v, n), work.gram[p, p]
+    return dot(row, work.v, n), dot(row, row, size)
+
+
+@inline_njit
 def _multiply_working_rows(work, active, k, p, row):
     """Writes K_Wp to ``solved``, where ``row`` is w_p."""
-    multiply_rows(work.rows, active.place, k, row, int(work.end[p]), work.solved)
+    if work.prepared:
+        for i in range(k):
+            work.solved[i] = work.gram[p, active.place[i]]
+    else:
+        multiply_rows(work.rows, active.place, k, row, int(work.end[p]), work.solved)
 
 
 @inline_njit
@@ -302,10 +341,14 @@ def drop_wrong_multipliers(work, active, k):
 def _minimise(work, active, k):
     """Writes the minimiser of the Lagrangian, ``P x = -(q + C'mu)``, to the first n entries of y."""
     n, y = len(work.x), work.y
-    if work.soft:  # constraints at their caps have multipliers, too
+    if work.prepared or work.soft:  # constraints at their caps have multipliers, too
         add_multipliers(work, active, k)
+        if work.prepared:
+            combine_rows(work.gram, n, work.slope, 0, n, y)
         for i in range(n):
-            y[i] = -work.slope[i]
+            y[i] = -y[i] if work.prepared else -work.slope[i]
+        if work.prepared:
+            return
         solve_transposed(work.L, n, y)
     else:  # L x = v - sum mu_i w_i
         for i in range(n):
@@ -314,6 +357,18 @@ def _minimise(work, active, k):
             work.scratch[i] = work.mu[abs(active.name[i]) - 1]
         subtract_rows(y, work.rows, active.place, work.scratch, k, n)
     solve_lower(work.L, n, y)
+
+
+@inline_njit
+def _follow_multipliers(work):
+    """Moves y of a prepared program by the rows of K whose multipliers have changed."""
+    mu, seen, amounts, count, M = work.mu, work.seen, work.excess, 0, len(work.mu)
+    for p in range(M):
+        work.candidates[count] = p
+        amounts[count] = mu[p] - seen[p]
+        count += amounts[count] != 0.0
+        seen[p] = mu[p]
+    subtract_rows(work.y, work.gram, work.candidates, amounts, count, M)
 
 
 @inline_njit

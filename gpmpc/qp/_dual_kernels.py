@@ -14,8 +14,15 @@ import numpy as np
 from gpmpc.compiled import compiled, inline_njit
 from gpmpc.kernels._simd import any_nonzero, clip, larger, largest, load, load_some, store, total, zeros
 from gpmpc.kernels.linalg import dot, multiply
-from gpmpc.qp._dual_iteration import NEGLIGIBLE, add_multipliers, iterate, multiply_constraints
+from gpmpc.qp._dual_iteration import (
+    NEGLIGIBLE,
+    add_multipliers,
+    iterate,
+    multiply_constraints,
+    restore_constraints,
+)
 from gpmpc.qp._record import (
+    AGE,
     CONSTRAINTS,
     HEADER,
     ITERATION_LIMIT,
@@ -24,11 +31,12 @@ from gpmpc.qp._record import (
     NUMERICAL_TROUBLE,
     SOLVED,
     STATUS,
+    TAG,
     VARIABLES,
     WORKING,
 )
 from gpmpc.qp._triangular import factorise, multiply_rows, solve_lower, solve_transposed, subtract_rows
-from gpmpc.qp._violations import TOLERATED, choose_guess, list_violated, restore_limits
+from gpmpc.qp._violations import TOLERATED, are_present, choose_guess, list_violated, restore_limits
 from gpmpc.qp._workspace import SHARE, all_finite, is_dense, is_dense_matrix, open_workspace, round_end
 
 SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
@@ -41,6 +49,7 @@ _REFINEMENTS = 3
 _FINE, _FINEST = 2e-10, 1e-15  # residuals at which refinement stops
 _DOUBT = 3e-7  # times the shares that cancellation left of the pivots: the largest residual of a solution
 _ILL = 5e-4  # such a share: what else x violates is seen of the best x only
+_OLD = 1000  # changes after which a factor is computed anew
 _BATCHES = 4  # see ``iterate``
 _TINY = 1e-300
 _UNDEFINED = 1e300  # a residual that overflowed; less than infinity, so that refinement is tried
@@ -55,7 +64,7 @@ def solve(P, q, G, lower, upper, guess, memory, out):
     if not (shaped and dense and is_dense_matrix(P) and is_dense_matrix(G) and all_finite(q)):
         return MISUSE
     work, active = open_workspace(P, q, G, memory, out)
-    if not (factorise(P, work.L) and _measure_rows(work)):
+    if not work.prepared and not (factorise(P, work.L) and _measure_rows(work)):
         return MISUSE
     longest = zeros()
     for i in range(0, n, 8):
@@ -71,7 +80,7 @@ def _solve_opened(work, active, guess, least):
     """Solves the program in the workspace."""
     n, M = len(work.x), len(work.mu)
     known = len(guess) > HEADER and guess[VARIABLES] == n and guess[CONSTRAINTS] == M and 0 <= guess[WORKING] <= M
-    k, guessed = np.int64(0), _start(work, active, guess if known else guess[:0])
+    k, guessed = _start(work, active, guess if known else guess[:0])
     pivots, margin, fine = work.settings[SHARE], _LATER / NEGLIGIBLE * least, _FINE
     iterations, rounds = np.int64(0), 0  # for a literal numba compiles callees anew
     status, passed, moved = NUMERICAL_TROUBLE, False, False
@@ -115,19 +124,33 @@ def _solve_opened(work, active, guess, least):
         status = NUMERICAL_TROUBLE
     out = work.record
     out[STATUS], out[ITERATIONS], out[WORKING], out[VARIABLES], out[CONSTRAINTS] = status, iterations, k, n, M
+    out[TAG], out[AGE] = work.tag if status == SOLVED else 0.0, out[AGE] + iterations
     for i in range(n):
         work.x[i] = work.y[i]
     for i in range(k):
         out[HEADER + n + M + i] = active.name[i]
+    if work.prepared:
+        at = HEADER + n + 2 * M
+        for i in range(k):
+            row = active.factor[i]
+            for j in range(i + 1):
+                out[at + j] = row[j]
+            at += i + 1
     return status
 
 
 @inline_njit
 def _start(work, active, guess):
-    """Starts from a guess: x_u, soft rows that stay violated, and the candidates; returns how many these are."""
+    """Starts from a guess: x_u, soft rows that stay violated, and the working set.
+
+    Returns:
+        How many constraints work already, and how many are guessed to, and are candidates.
+    """
     n, M = len(work.x), len(work.mu)
-    for i in range(work.capacity + 2):
-        active.place[i] = i
+    work.record[AGE] = 0.0
+    if not work.prepared:
+        for i in range(work.capacity + 2):
+            active.place[i] = i
     if work.soft and len(guess) > 0:
         for p in range(n, M):
             value, cap = guess[HEADER + n + p], work.cap[p]
@@ -137,11 +160,16 @@ def _start(work, active, guess):
     add_multipliers(work, active, np.int64(0))
     for i in range(n):
         work.v[i] = -work.slope[i]
-    solve_transposed(work.L, n, work.v)
+    if not work.prepared:
+        solve_transposed(work.L, n, work.v)
     if len(guess) == 0:
-        return np.int64(0)
+        return np.int64(0), np.int64(0)
     first = HEADER + n + M
-    return choose_guess(work, guess[first : first + int(guess[WORKING])])
+    names, known = guess[first : first + int(guess[WORKING])], work.prepared and guess[TAG] == work.tag
+    if known and len(guess) == len(work.record) and guess[AGE] < _OLD and are_present(work, names):
+        work.record[AGE] = guess[AGE]
+        return restore_constraints(work, active, names, guess[first + M :]), np.int64(0)
+    return np.int64(0), choose_guess(work, names)
 
 
 @inline_njit

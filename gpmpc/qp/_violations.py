@@ -106,3 +106,15 @@ def choose_guess(work, names):
                 chosen += 1
                 ignore_violations(work, p)
     return chosen
+
+
+@inline_njit
+def are_present(work, names):
+    """Returns whether every one of the named bounds is there (it may have become absent), its multiplier at no cap."""
+    for name in names:
+        if not 1.0 <= abs(name) <= len(work.mu):
+            return False
+        p = int(abs(name)) - 1
+        if work.mu[p] != 0.0 or abs(work.upper[p] if name > 0.0 else work.lower[p]) == np.inf:
+            return False
+    return True

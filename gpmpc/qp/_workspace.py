@@ -1,9 +1,10 @@
 """The memory that the dual active-set kernels work in, besides the record that a solve writes.
 
-Asking the system for memory costs as much as a small solve, so each shape keeps its own. Threads may share it, since a
-solve keeps the interpreter's lock. It is one matrix, whose rows ``open_workspace`` names.
+Asking the system for memory costs as much as a small solve, so each shape (and each prepared problem) keeps its own.
+Threads may share it, since a solve keeps the interpreter's lock. It is one matrix, whose rows ``open_workspace`` names.
 """
 
+import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from numba.core import types
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from gpmpc.compiled import inline_njit
 from gpmpc.kernels.linalg import aligned_rows
@@ -18,9 +20,9 @@ from gpmpc.qp._record import HEADER
 
 Array = NDArray[np.float64]
 
-_LIMIT, _TOLERANCE, _SOFT, SHARE, _SETTINGS = range(5)
-_REALS, _INTEGERS = 4, 25  # rows of ``memory`` at which vectors begin, after settings and traits,
-_REST = 29  # then integers, the factor of the working set, L and rows
+_LIMIT, _TOLERANCE, _SOFT, _TAG, SHARE, _SETTINGS = range(6)  # a tag of zero: not prepared
+_REALS, _INTEGERS = 4, 26  # rows of ``memory`` at which vectors begin, after settings and traits,
+_REST = 30  # then integers, the factor of the working set, L and rows
 _END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
 
 
@@ -34,8 +36,10 @@ class Workspace(NamedTuple):
     q: Any  # (n,)
     G: Any  # (m, n)
     L: Any  # (n, n) with P = L'L
-    rows: Any  # (capacity + 1, n) the w_p of the working set, by place
-    v: Any  # (n,) -L^-T q: L x = v without working constraints
+    rows: Any  # (capacity + 1, n) the w_p of the working set, by place; all M of a prepared problem
+    gram: Any  # (M, M), padded: all K_pq of a prepared problem; empty otherwise
+    v: Any  # (n,) -L^-T q: L x = v without working constraints; of a prepared problem -q
+    seen: Any  # (M,) the multipliers that y of a prepared problem belongs to
     lower: Any  # (M,) bounds, infinite where absent
     upper: Any
     allowed_low: Any  # (M,) outside these a constraint is violated; infinite for a working one
@@ -64,6 +68,8 @@ class Workspace(NamedTuple):
     tolerance: float
     soft: bool  # whether rows are soft
     settings: Any  # of the memory; one is what cancellation left of the pivots of P, as a share of P_ii
+    tag: float  # of a prepared problem, whose L, scale, end, rows and gram are there; zero otherwise
+    prepared: bool
 
 
 class WorkingSet(NamedTuple):
@@ -79,19 +85,32 @@ class WorkingSet(NamedTuple):
     factor: Any  # L_K of K_WW = L_K L_K'
 
 
-def new_memory(caps: Array, n: int, limit: int, tolerance: float, soft: bool) -> Array:
-    """Returns memory for programs of n variables with these caps (M,)."""
+def new_memory(caps: Array, n: int, limit: int, tolerance: float, soft: bool, prepared: bool) -> Array:
+    """Returns memory for programs of n variables with these caps (M,); ``prepared`` has room for all M rows."""
     M = len(caps)
     capacity = min(n, M)
     wide = padded(max(M, capacity + 2, _SETTINGS)) + 8  # kernels write whole lanes
-    own = n * padded(n) + n * (capacity + 1)
+    own = n * padded(n) + (M * (n + padded(M)) if prepared else n * (capacity + 1))
     memory = aligned_rows(_REST + capacity + 1 - (-own // wide), wide)  # loads across cache lines take twice the time
     memory[:] = 0.0
     box = np.arange(M) < n
-    memory[0, :_SETTINGS] = limit, tolerance, soft, 1.0
+    memory[0, :_SETTINGS] = limit, tolerance, soft, 0.0, 1.0
     memory[1, :M], memory[2, :M] = box, caps
     memory[3, :M] = box * np.minimum(n, (np.arange(M) // _END_STEP + 1) * _END_STEP)
     return memory
+
+
+def prepare_memory(memory: Array, G: Array) -> None:
+    """Completes ``prepared`` memory, in which a solve has left the factor of P, with the rows w_p and K = C P^-1 C'."""
+    m, n = G.shape
+    rest = memory[_REST + n + 1 :].reshape(-1)
+    L = np.tril(rest[: n * padded(n)].reshape(n, padded(n))[:, :n])
+    np.fill_diagonal(L, 1.0 / np.diagonal(L))
+    rows = solve_triangular(L, np.vstack([np.eye(n), G]).T, lower=True, trans="T", check_finite=False).T  # L^-T c_p
+    rest[n * padded(n) :][: rows.size] = rows.ravel()
+    M = n + m
+    rest[n * padded(n) + rows.size :][: M * padded(M)].reshape(M, padded(M))[:, :M] = rows @ rows.T
+    memory[0, _TAG] = 1.0 + zlib.crc32(rest.tobytes())
 
 
 @inline_njit
@@ -127,15 +146,18 @@ def open_workspace(P, q, G, memory, out):
     """Returns the workspace and the working set in ``memory`` and the record ``out``."""
     n, M = len(q), len(q) + len(G)
     settings, real, whole = memory[0], memory[_REALS:_INTEGERS], memory[_INTEGERS:_REST].view(np.int64)
-    soft, capacity = settings[_SOFT] != 0.0, min(n, M)
+    soft, tag, capacity = settings[_SOFT] != 0.0, settings[_TAG], min(n, M)
+    prepared = tag != 0.0
     factor, start = memory[_REST : _REST + capacity + 1], (_REST + capacity + 1) * memory.shape[1]
-    L = _matrix(memory, start, n, padded(n))  # pyright: ignore[reportCallIssue]
-    rows = _matrix(memory, start + n * padded(n), capacity + 1, n)  # pyright: ignore[reportCallIssue]
+    count, end = M if prepared else capacity + 1, start + n * padded(n)
+    L, rows = _matrix(memory, start, n, padded(n)), _matrix(memory, end, count, n)  # pyright: ignore[reportCallIssue]
+    gram = _matrix(memory, end + count * n, M * prepared, padded(M))  # pyright: ignore[reportCallIssue]
     x, mu = out[HEADER : HEADER + n], out[HEADER + n : HEADER + n + M]
     work = Workspace(
-        P, q, G, L, rows, real[0], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2], memory[3],
-        out, x, mu, real[6][:M], real[7], whole[0], whole[1], real[8], real[9], real[10], real[11], real[12], real[13],
-        real[14], real[15], capacity, int(settings[_LIMIT]), settings[_TOLERANCE], soft, settings,
+        P, q, G, L, rows, gram, real[0], real[21], real[1], real[2], real[3], real[4], real[5], memory[1], memory[2],
+        memory[3], out, x, mu, real[6][:M], real[7], whole[0], whole[1], real[8], real[9], real[10], real[11], real[12],
+        real[13], real[14], real[15], capacity, int(settings[_LIMIT]), settings[_TOLERANCE], soft, settings, tag,
+        prepared,
     )  # fmt: skip
     active = WorkingSet(whole[2], whole[3], real[16], real[17], real[18], real[19], real[20], factor)
     return work, active
