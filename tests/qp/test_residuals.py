@@ -17,7 +17,7 @@ def excess(value, lower, upper):
 @np.errstate(invalid="ignore")  # the gap at an absent bound
 def by_definition(solution):
     """Primal and dual residual, duality gap."""
-    (P, q, G, lower, upper), (softness, caps) = solution.arrays, solution.softness
+    (P, q, G, lower, upper), caps = solution.arrays, solution.caps
     x, y, n = solution.x, solution.multipliers, len(q)
     C, M = np.vstack([np.eye(n), G]), len(lower)
     units = [np.sqrt(P[i, i]) for i in range(n)]
@@ -28,14 +28,14 @@ def by_definition(solution):
     for p in range(M):
         value = C[p] @ x
         missed = excess(value, lower[p], upper[p])
-        beyond = 0.0 if abs(y[p]) >= caps[p] else max(0.0, missed - softness[p] * abs(y[p]))
+        beyond = 0.0 if abs(y[p]) >= caps[p] else missed
         own = sum(abs(C[p, i]) * max(abs(x[i]), zero / units[i]) for i in range(n))
         if beyond:
             primal = max(primal, beyond / max(own, abs(upper[p] if value > upper[p] else lower[p])))
         bound = upper[p] if y[p] > 0 else lower[p]
         stray[p] = abs(y[p]) if y[p] and abs(bound) >= ABSENT else max(0.0, abs(y[p]) - caps[p])
         bounds += abs(y[p] * bound) if y[p] else 0.0
-        price += softness[p] * y[p] ** 2 + (caps[p] * missed if abs(y[p]) >= caps[p] else 0.0)
+        price += caps[p] * missed if abs(y[p]) >= caps[p] else 0.0
         price += y[p] * bound if y[p] else 0.0
     for i in range(n):
         rest = abs(P[i] @ x + q[i] + C[:, i] @ y) + np.abs(C[:, i]) @ stray
@@ -57,10 +57,8 @@ def random_claim(rng, soft=False, absent=False, scale=1.0):
         y[0], y[-1] = -abs(y[0]), abs(y[-1])
     claim = make_solution(QuadraticProgram.from_stacked(P, q, G, lower, upper), Status.SOLVED, x, y)
     if soft:
-        softness = claim.softness.copy()
-        softness[0, n:] = np.where(rng.random(m) < 0.5, rng.uniform(0, 2, m), 0.0)
-        softness[1, n:] = np.where(softness[0, n:] > 0, np.inf, rng.uniform(0.1, 1.5, m))
-        claim = claim._replace(softness=softness)
+        prices = np.where(rng.random(m) < 0.5, rng.uniform(0.1, 1.5, m), np.inf)
+        claim = claim._replace(caps=np.append(claim.caps[:n], prices))
     return claim
 
 
@@ -91,11 +89,10 @@ def test_what_counts_as_zero_is_a_share_of_the_free_minimiser():
 def test_objective_and_violations_are_those_of_their_definition(soft, rng):
     for _ in range(20):
         claim = random_claim(rng, soft)
-        (P, q, G, lower, upper), (softness, caps) = claim.arrays, claim.softness
+        (P, q, G, lower, upper), caps = claim.arrays, claim.caps
         missed = [excess(v, a, b) for v, a, b in zip([*claim.x, *(G @ claim.x)], lower, upper, strict=True)]
         np.testing.assert_allclose(claim.violation(), missed, atol=1e-15)
-        price = sum(0.5 * v**2 / s for v, s in zip(missed, softness, strict=True) if s > 0)
-        price += sum(v * c for v, c in zip(missed, caps, strict=True) if np.isfinite(c))
+        price = sum(v * c for v, c in zip(missed, caps, strict=True) if np.isfinite(c))
         assert claim.objective == pytest.approx(0.5 * claim.x @ P @ claim.x + q @ claim.x + price)
 
 
