@@ -9,6 +9,7 @@ from gpmpc.experiments.realaigym import (
     ACTUATED,
     Play,
     casadi_model,
+    fit_body,
     heights,
     league_controller,
     learn,
@@ -22,7 +23,7 @@ from gpmpc.experiments.realaigym import (
     wrong_system,
 )
 from gpmpc.models import KnownModel
-from gpmpc.systems import double_pendulum
+from gpmpc.systems import double_pendulum, step_many
 
 
 class Interface:
@@ -78,6 +79,18 @@ def test_learned_from_are_calm_transitions_without_a_torque_on_the_passive_joint
     # of 18 windows of 10 samples, every 5: 4 begin wild, 1 spans the jump, 3 have a torque on the passive joint
     assert len(found.states) == 10
     assert set(found.inputs[:, 0].tolist()) == {1.0, 2.5}
+
+
+@pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
+def test_a_body_fitted_to_five_seconds_of_random_torques_predicts_others_as_the_true_one_does(robot):
+    wrong = wrong_system(robot, 0.15, 2)
+    found = fit_body(robot, wrong, transitions(random_record(robot, 5.0, 0), robot))
+    test = transitions(random_record(robot, 5.0, 1), robot)
+    wrong_error, error, least = (
+        np.sqrt(np.square(step_many(body, test.states.numpy(), test.inputs.numpy()) - test.next_states.numpy()).mean())
+        for body in (wrong, found, double_pendulum(ACTUATED[robot]))
+    )
+    assert error < 2 * least < 0.01 * wrong_error
 
 
 def test_a_residual_learned_from_random_torques_predicts_better_than_the_wrong_body():
