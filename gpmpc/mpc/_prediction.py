@@ -277,7 +277,7 @@ class PredictionModel:
     def evaluate(self, plan: Plan, at: Prediction, request: Request) -> Prediction:
         """The prediction at a plan with the derivatives of another one, ``at``."""
         after = self._roll_out.open_loop(plan.states[:-1], plan.inputs[:, None], request.disturbance)[:, 1]
-        return self._without(plan, after, at, request)
+        return self._without(plan, np.ascontiguousarray(after), at, request)  # kernels do not look at strides
 
     def _without(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
         rows = self.constraints.at(plan, plan.covariances, self.points, request.parameters, request.kappas)
