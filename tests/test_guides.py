@@ -96,6 +96,7 @@ def test_a_new_project_runs_at_once(tmp_path, monkeypatch):
         (["run", "--config-dir", ".", "system=short"], "derivative must give 2 entries, one for each of state_names"),
         (["run", "--config-dir", ".", "system=hollow"], "must be finite at state [0.0, 0.0]"),
         (["run", "--config-dir", ".", "system=weights"], "controller.problem: weighs 3 states and 1 inputs; nan has 2"),
+        (["run", "--config-dir", ".", "system=root"], "h or its gradient is not finite at x = [0. 0.], u = [0.]"),
         (["run", "system=pendulum", "nominal={mass: 0.8}", "model=exact_gp"], "nominal: needs model=difference_gp"),
         (["run", "system=gymnasium"], "system.environment: this setting has no default"),
     ],
@@ -103,17 +104,22 @@ def test_a_new_project_runs_at_once(tmp_path, monkeypatch):
 )
 def test_a_mistake_is_one_clear_line(arguments, message, tmp_path):
     (tmp_path / "system").mkdir()
-    for name, rates in (("short", "[x[1]]"), ("hollow", "[x[1], 0 * float('nan')]"), ("weights", "[x[1], u[0]]")):
+    rows = {"short": "[x[1]]", "hollow": "[x[1], 0 * float('nan')]", "weights": "[x[1], u[0]]", "root": "[x[1], u[0]]"}
+    for name, rates in rows.items():
         text = f"state_names, input_names = ('a', 'b'), ('u',)\n    def derivative(self, x, u): return {rates}\n"
         limits = "name='nan', input_lower=[-1], input_upper=[1], region=[[-1, -1], [1, 1]]"
         made = (
             f"from gpmpc.systems import System\nclass D:\n    {text}\ndef make(): return System(D(), 0.1, {limits})\n"
+            "def h(x): return (x[:, 0] - 1).sqrt()\n"
         )
         (tmp_path / f"{name}_module.py").write_text(made)
+        h = "{_target_: hydra.utils.get_method, path: root_module.h}"
+        kept = f"[{{_target_: gpmpc.mpc.Inequality, h: {h}}}]" if name == "root" else "[]"
         weights = "[1, 1, 1]" if name == "weights" else "[1, 1]"
+        problem = f"{{cost: {{Q: {weights}, R: [1]}}, constraints: {kept}}}"
         (tmp_path / "system" / f"{name}.yaml").write_text(
             "# @package _global_\ndefaults: [override /trajectory: goal, override /data: random, _self_]\n"
-            f"system: {{_target_: {name}_module.make}}\ncontroller: {{problem: {{cost: {{Q: {weights}, R: [1]}}}}}}\n"
+            f"system: {{_target_: {name}_module.make}}\ncontroller: {{problem: {problem}}}\n"
         )
     before = sorted(tmp_path.rglob("*.*"))
     done = forked(*arguments, cwd=tmp_path)

@@ -158,8 +158,11 @@ def expand_function(
     if values.shape != (len(states), count):
         raise ShapeError(f"{name} must give ({len(states)}, {count}); got {values.shape}")
     by_state, by_input = [*jacobians, np.zeros((len(states), count, inputs.shape[1]))][:2]
-    if not all(np.isfinite(part).all() for part in (values, by_state, by_input)):
-        raise FunctionNotFinite(f"{name} or its gradient is not finite along the plan")
+    found = values, by_state, by_input
+    if not all(np.isfinite(part).all() for part in found):
+        k = next(k for k in range(len(states)) if not all(np.isfinite(part[k]).all() for part in found))
+        x, u = (np.array2string(row[k], precision=4, max_line_width=10**6) for row in (states, inputs))
+        raise FunctionNotFinite(f"{name} or its gradient is not finite at x = {x}, u = {u}")
     return values, by_state, by_input
 
 

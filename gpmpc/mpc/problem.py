@@ -23,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gpmpc.exceptions import SettingError, check_number
-from gpmpc.mpc._cost import LeastSquares, Tracking, by_stage, expand_function, read_numbers
+from gpmpc.mpc._cost import FunctionNotFinite, LeastSquares, Tracking, by_stage, expand_function, read_numbers
 from gpmpc.qp.problem import ABSENT
 
 Array = np.ndarray
@@ -288,6 +288,17 @@ class Problem:
         """Raises ``SettingError`` where there are functions to linearise, which a controller of this name does not."""
         if self.outputs or any(isinstance(constraint, Inequality) for constraint in self.constraints):
             raise SettingError("problem", f"{name} takes Box and Halfspaces; Inequality and LeastSquares are for GPMPC")
+
+    def check_start(self, state: Array, input: Array) -> None:
+        """Raises ``SettingError`` where a function, or its gradient, is not finite at a first state and input."""
+        for part in (*self.outputs, *self.constraints):
+            try:
+                if isinstance(part, LeastSquares):
+                    part.squares(state[None], input[None], None)
+                elif isinstance(part, Inequality):
+                    part.expand(state[None], input[None], None)
+            except FunctionNotFinite as error:
+                raise SettingError("controller.problem", f"{error}, where the flight starts") from None
 
     def price(self, constraint: Constraint) -> float:
         """Returns the price of violating a constraint, infinite for a hard one."""

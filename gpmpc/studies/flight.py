@@ -98,6 +98,9 @@ class Experiment:
         if problem is not None and (problem.state_dim, problem.input_dim) != shape:
             weighed = f"weighs {problem.state_dim} states and {problem.input_dim} inputs"
             raise SettingError("controller.problem", f"{weighed}; {system.name} has {shape[0]} and {shape[1]}")
+        if problem is not None:
+            start = self.references(1)[0] if plant.start is None else plant.start
+            problem.check_start(np.asarray(start, dtype=float), np.asarray(plant.initial_input, dtype=float))
         if self.learns and self.model is None and hasattr(self.data, "check"):
             self.data.check(system, self.trajectory)
 
