@@ -21,21 +21,15 @@ from gpmpc.models import linearize_function
 class Measurement:
     """A measurement model that is a function of the state.
 
-    Attributes:
-        state_dim: n, of the state.
-        noise_covariance: R (p, p).
-        function: h, from x (*batch, n) to y (*batch, p), in torch.
-        angles: Entries of y that are angles [rad]: their differences are wrapped to (-pi, pi].
-
     Raises:
         ShapeError: R is not square.
         SettingError: R is no tensor, or an angle is no entry of y.
     """
 
-    state_dim: int
-    noise_covariance: Tensor
-    function: Callable[[Tensor], Tensor]
-    angles: Sequence[int] = ()
+    state_dim: int  #: n, of the state
+    noise_covariance: Tensor  #: R (p, p)
+    function: Callable[[Tensor], Tensor]  #: h, from x (*batch, n) to y (*batch, p), in torch
+    angles: Sequence[int] = ()  #: entries of y that are angles [rad]: their differences are wrapped to (-pi, pi]
 
     def __post_init__(self) -> None:
         check_number("state_dim", self.state_dim, least=1, whole=True)

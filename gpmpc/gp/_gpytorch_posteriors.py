@@ -98,16 +98,11 @@ class KernelPosterior:
     """Exact GPs with any kernels of GPyTorch, frozen; build it with ``from_gpytorch``.
 
     It works with every propagation but ``MomentMatching``, which has a closed form for the SE-ARD kernel only.
-
-    Attributes:
-        parts: One a GPyTorch model, each with one output or a batch of them.
-        input_dim: m, how many of the last features are controls.
-        predicts: What the targets mean.
     """
 
-    parts: tuple["_Part", ...]
-    input_dim: int
-    predicts: Predicts
+    parts: tuple["_Part", ...]  #: one a GPyTorch model, each with one output or a batch of them
+    input_dim: int  #: m, how many of the last features are controls
+    predicts: Predicts  #: what the targets mean
 
     @classmethod
     def from_gpytorch(

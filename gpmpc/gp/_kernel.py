@@ -130,17 +130,11 @@ def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> 
 
 
 class Hyperparameters(NamedTuple):
-    """Of k SE-ARD GPs over d features.
+    """Of k SE-ARD GPs over d features."""
 
-    Attributes:
-        lengthscales: (k, d).
-        signal_variance: sf2 (k,).
-        noise_variance: sn2 (k,).
-    """
-
-    lengthscales: Tensor
-    signal_variance: Tensor
-    noise_variance: Tensor
+    lengthscales: Tensor  #: (k, d)
+    signal_variance: Tensor  #: sf2 (k,)
+    noise_variance: Tensor  #: sn2 (k,)
 
     @classmethod
     def from_theta(cls, theta: Tensor) -> "Hyperparameters":

@@ -128,16 +128,13 @@ class SlidingWindow:
 
     New points stay under either rule, unless they alone are more than that (which is logged).
 
-    Attributes:
-        points: How many points the posterior may hold.
-        remove: Which go first. ``"oldest"`` costs O(N^2) a point; ``"least_informative"`` needs the inverse of the
-            kernel matrix, O(N^3) a call.
-
     Raises:
         SettingError: Fewer than one point, or an unknown rule.
     """
 
-    points: int
+    points: int  #: how many points the posterior may hold
+    #: which go first. ``"oldest"`` costs O(N^2) a point; ``"least_informative"`` needs the inverse of the kernel
+    #: matrix, O(N^3) a call
     remove: Literal["oldest", "least_informative"] = "oldest"
 
     def __post_init__(self) -> None:

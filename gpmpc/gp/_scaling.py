@@ -19,15 +19,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Scaling:
-    """One affine map a column.
+    """One affine map a column."""
 
-    Attributes:
-        offset: (d,), in the units of the data.
-        factor: (d,), in the units of the data; positive.
-    """
-
-    offset: Tensor
-    factor: Tensor
+    offset: Tensor  #: (d,), in the units of the data
+    factor: Tensor  #: (d,), in the units of the data; positive
 
     def __post_init__(self) -> None:
         check_tensors(offset=self.offset, factor=self.factor)

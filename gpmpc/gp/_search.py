@@ -43,16 +43,11 @@ class SoftLimits:
 
     ((log l_d - log std(x~_d)) / log r)^p summed over d, and (log(sf / sn) / log s)^p; the penalties of PILCO
     (Deisenroth, 2010) and of the experiment of Cao, Lai and Alam (2017). Nearly flat inside, steep outside.
-
-    Attributes:
-        lengthscale_factor: r, how far a length-scale may be from its input's standard deviation.
-        signal_to_noise: s, how large sf / sn may be.
-        power: p, even.
     """
 
-    lengthscale_factor: float = 100.0
-    signal_to_noise: float = 1000.0
-    power: int = 30
+    lengthscale_factor: float = 100.0  #: r, how far a length-scale may be from its input's standard deviation
+    signal_to_noise: float = 1000.0  #: s, how large sf / sn may be
+    power: int = 30  #: p, even
 
     def __post_init__(self) -> None:
         for key in ("lengthscale_factor", "signal_to_noise"):

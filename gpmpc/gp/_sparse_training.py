@@ -46,34 +46,23 @@ class SparseTrainer:
     Six outputs of nine features, 5000 transitions and 100 inducing points take 0.3 s an iteration on one
     core; progress is logged.
 
-    Attributes:
-        inducing: M; no more than there are distinct points.
-        method: ``"sgpr"`` (Titsias, 2009) never overfits and may overestimate the noise; ``"fitc"`` (Snelson and
-            Ghahramani, 2006) has a noise of its own at every point and may underestimate it (Bauer, van der Wilk and
-            Rasmussen, 2016).
-        predicts: What the GPs learn, as in ``Trainer``.
-        scaling: How features and targets are scaled for training, as in ``Trainer``.
-        iterations: Of L-BFGS, at most.
-        subset: Number of random transitions in the first, exact, training.
-        restarts: Random starts of that one.
-        tolerance: Relative decrease of the objective at which L-BFGS stops.
-        signal_to_noise_limit: The box holds sf / sn within this factor of one.
-        jitter: Added to the diagonal of Kzz, in units of sf2.
-
     Raises:
         SettingError: A setting is out of range.
     """
 
-    inducing: int = 100
+    inducing: int = 100  #: M; no more than there are distinct points
+    #: ``"sgpr"`` (Titsias, 2009) never overfits and may overestimate the noise; ``"fitc"`` (Snelson and Ghahramani,
+    #: 2006) has a noise of its own at every point and may underestimate it (Bauer, van der Wilk and Rasmussen, 2016)
     method: Method = "sgpr"
-    predicts: Predicts = "next_state"
+    predicts: Predicts = "next_state"  #: what the GPs learn, as in ``Trainer``
+    #: how features and targets are scaled for training, as in ``Trainer``
     scaling: Callable[[Tensor, Sequence[str]], Scaling] = centre
-    iterations: int = 100
-    subset: int = 200
-    restarts: int = 1
-    tolerance: float = 1e-7
-    signal_to_noise_limit: float = 1e4
-    jitter: float = JITTER
+    iterations: int = 100  #: of L-BFGS, at most
+    subset: int = 200  #: number of random transitions in the first, exact, training
+    restarts: int = 1  #: random starts of that one
+    tolerance: float = 1e-7  #: relative decrease of the objective at which L-BFGS stops
+    signal_to_noise_limit: float = 1e4  #: the box holds sf / sn within this factor of one
+    jitter: float = JITTER  #: added to the diagonal of Kzz, in units of sf2
 
     def __post_init__(self) -> None:
         for key in ("inducing", "subset"):

@@ -41,54 +41,43 @@ _MANY = 1000  # points: from here on the log has a line an output
 
 @dataclass(frozen=True)
 class Training:
-    """The result of a training.
+    """The result of a training."""
 
-    Attributes:
-        posterior: The trained GPs, frozen; of a sparse training, to M pseudo-observations at the inducing points.
-        theta: Rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), in the units of the data.
-        objective: Negative log marginal likelihood plus penalty where the search ended (k,); of a sparse training
-            minus the bound on the log marginal likelihood, in scaled units.
-        explored: Of an exact training, the objective where the exploration from every start ended (k, restarts + 1),
-            over the subset if there is one; of a sparse training, where the search over the bound began (k, 1).
-        evaluations: Of the likelihood or of the bound, all starts and outputs together.
-        seconds: Wall time [s].
-    """
-
+    #: the trained GPs, frozen; of a sparse training, to M pseudo-observations at the inducing points
     posterior: GPPosterior
-    theta: np.ndarray
+    theta: np.ndarray  #: rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), in the units of the data
+    #: negative log marginal likelihood plus penalty where the search ended (k,); of a sparse training minus the bound
+    #: on the log marginal likelihood, in scaled units
     objective: np.ndarray
+    #: of an exact training, the objective where the exploration from every start ended (k, restarts + 1), over the
+    #: subset if there is one; of a sparse training, where the search over the bound began (k, 1)
     explored: np.ndarray
-    evaluations: int
-    seconds: float  # [s]
+    evaluations: int  #: of the likelihood or of the bound, all starts and outputs together
+    seconds: float  #: wall time [s]
 
 
 @dataclass(frozen=True)
 class Trainer:
     """Fits one SE-ARD GP per output to observed transitions.
 
-    Attributes:
-        predicts: What the GPs learn: the next state, the difference to it, or any values, which ``fit`` takes.
-        scaling: How features and targets are scaled for training; what comes out is in the units of the data all the
-            same. The prior mean is what it maps to zero: the targets' mean by default and with ``standardize``, zero
-            with ``identity``.
-        penalty: Added to every output's negative log marginal likelihood, such as ``SoftLimits()``; none by default.
-        restarts: Random starts besides the first, which has l = std(x~), sf = std(y), sn = std(y) / 10.
-        subset: Of more points than this a random subset of as many is searched first, from all starts; the search over
-            all points goes on from its best. None searches over all of them from every start.
-        tolerance: Relative decrease of the objective at which L-BFGS stops.
-        signal_to_noise_limit: The box holds sf / sn within this factor of one. Moment matching needs sf2 / sn2 below
-            about 1e10 in double precision.
-
     Raises:
         SettingError: A setting is out of range.
     """
 
+    #: what the GPs learn: the next state, the difference to it, or any values, which ``fit`` takes
     predicts: Predicts = "next_state"
+    #: how features and targets are scaled for training; what comes out is in the units of the data all the same. The
+    #: prior mean is what it maps to zero: the targets' mean by default and with ``standardize``, zero with ``identity``
     scaling: Callable[[Tensor, Sequence[str]], Scaling] = centre
+    #: added to every output's negative log marginal likelihood, such as ``SoftLimits()``; none by default
     penalty: Callable[[np.ndarray, np.ndarray], tuple[float, np.ndarray]] | None = None
-    restarts: int = 3
+    restarts: int = 3  #: random starts besides the first, which has l = std(x~), sf = std(y), sn = std(y) / 10
+    #: of more points than this a random subset of as many is searched first, from all starts; the search over all
+    #: points goes on from its best. None searches over all of them from every start
     subset: int | None = 1000
-    tolerance: float = 1e-8
+    tolerance: float = 1e-8  #: relative decrease of the objective at which L-BFGS stops
+    #: the box holds sf / sn within this factor of one. Moment matching needs sf2 / sn2 below about 1e10 in double
+    #: precision
     signal_to_noise_limit: float = 1e4
 
     def __post_init__(self) -> None:

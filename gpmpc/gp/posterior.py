@@ -30,57 +30,33 @@ class AffineForm(NamedTuple):
     """A model x+ = A x + G u + c + f0(x, u) + B f(x_s, u_s); without f0 and angles moments go through it exactly.
 
     None stands for A = 0, G = 0, c = 0, B = I, or a selection of everything.
-
-    Attributes:
-        f: The latent functions.
-        A: (n, n).
-        G: (n, m).
-        c: (n,).
-        B: (n, k).
-        states: The states that f depends on.
-        inputs: The inputs that f depends on.
-        angles: Those of ``states`` that f sees as (sine, cosine), at their place.
-        tape: f0 as a ``gpmpc.kernels.tape.Tape``; None for zero.
     """
 
-    f: "GPPosterior"
-    A: Tensor | None = None
-    G: Tensor | None = None
-    c: Tensor | None = None
-    B: Tensor | None = None
-    states: list[int] | None = None
-    inputs: list[int] | None = None
-    angles: tuple[int, ...] = ()
-    tape: Any = None
+    f: "GPPosterior"  #: the latent functions
+    A: Tensor | None = None  #: (n, n)
+    G: Tensor | None = None  #: (n, m)
+    c: Tensor | None = None  #: (n,)
+    B: Tensor | None = None  #: (n, k)
+    states: list[int] | None = None  #: the states that f depends on
+    inputs: list[int] | None = None  #: the inputs that f depends on
+    angles: tuple[int, ...] = ()  #: those of ``states`` that f sees as (sine, cosine), at their place
+    tape: Any = None  #: f0 as a ``gpmpc.kernels.tape.Tape``; None for zero
 
 
 @dataclass(frozen=True, eq=False)
 class GPPosterior:
-    """Exact GPs, one per output, over the same N points; a training, ``from_hyperparameters`` or a file makes them.
+    """Exact GPs, one per output, over the same N points; a training, ``from_hyperparameters`` or a file makes them."""
 
-    Attributes:
-        features: x~ = (x, u) of the training points (N, n + m).
-        targets: Of the GPs (N, k): next states, differences x[k+1] - x[k] (k = n), or any values.
-        lengthscales: l (k, n + m), one row an output.
-        signal_variance: sf2 (k,).
-        noise_variance: sn2 (k,).
-        offset: The prior mean, one constant an output (k,).
-        cholesky: Lower factor L of K + sn2 I (k, N, N).
-        weights: beta = (K + sn2 I)^-1 (y - offset) (k, N).
-        input_dim: m, how many of the last features are certain inputs (controls).
-        predicts: What the targets mean.
-    """
-
-    features: Tensor
-    targets: Tensor
-    lengthscales: Tensor
-    signal_variance: Tensor
-    noise_variance: Tensor
-    offset: Tensor
-    cholesky: Tensor
-    weights: Tensor
-    input_dim: int
-    predicts: Predicts
+    features: Tensor  #: x~ = (x, u) of the training points (N, n + m)
+    targets: Tensor  #: of the GPs (N, k): next states, differences x[k+1] - x[k] (k = n), or any values
+    lengthscales: Tensor  #: l (k, n + m), one row an output
+    signal_variance: Tensor  #: sf2 (k,)
+    noise_variance: Tensor  #: sn2 (k,)
+    offset: Tensor  #: the prior mean, one constant an output (k,)
+    cholesky: Tensor  #: lower factor L of K + sn2 I (k, N, N)
+    weights: Tensor  #: beta = (K + sn2 I)^-1 (y - offset) (k, N)
+    input_dim: int  #: m, how many of the last features are certain inputs (controls)
+    predicts: Predicts  #: what the targets mean
 
     @classmethod
     def from_hyperparameters(

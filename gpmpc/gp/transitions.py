@@ -27,11 +27,6 @@ _EXPECTED = "a file of transitions"
 class Transitions:
     """N observed transitions of a system with n states and m inputs, as float64.
 
-    Attributes:
-        states: x[k], (N, n).
-        inputs: u[k], (N, m); m may be zero.
-        next_states: x[k+1], (N, n).
-
     Raises:
         ShapeError: The three do not belong together.
         DataError: There is no row, or an entry is not finite (its row and column are named, from 1).
@@ -41,9 +36,9 @@ class Transitions:
     (2, [[1.0]])
     """
 
-    states: Tensor
-    inputs: Tensor
-    next_states: Tensor
+    states: Tensor  #: x[k], (N, n)
+    inputs: Tensor  #: u[k], (N, m); m may be zero
+    next_states: Tensor  #: x[k+1], (N, n)
 
     if TYPE_CHECKING:  # anything that is an array of numbers
 

@@ -34,57 +34,34 @@ __all__ = [
 
 
 class Expansion(NamedTuple):
-    """f at a certain point (x, u).
+    """f at a certain point (x, u)."""
 
-    Attributes:
-        M: The mean (k,).
-        variance: Of the latent functions, not below zero (k,).
-        J: dM/dx (k, n).
-        dM_du: (k, m).
-        dvariance_dx: (k, n).
-        dvariance_du: (k, m).
-        d2M_dx2: (k, n, n).
-        d2M_dxdu: (k, n, m).
-    """
-
-    M: Array
-    variance: Array
-    J: Array
-    dM_du: Array
-    dvariance_dx: Array
-    dvariance_du: Array
-    d2M_dx2: Array
-    d2M_dxdu: Array
+    M: Array  #: the mean (k,)
+    variance: Array  #: of the latent functions, not below zero (k,)
+    J: Array  #: dM/dx (k, n)
+    dM_du: Array  #: (k, m)
+    dvariance_dx: Array  #: (k, n)
+    dvariance_du: Array  #: (k, m)
+    d2M_dx2: Array  #: (k, n, n)
+    d2M_dxdu: Array  #: (k, n, m)
 
 
 class Moments(NamedTuple):
     """Moments of f, x ~ N(mu, S), and their derivatives; those of J are None where they were not asked for.
 
     For symmetric dS: dV_ab = dV_dmu[a, b] . dmu + sum_cd dV_dS[a, b, c, d] dS[c, d] + dV_du[a, b] . du; so dM, dJ.
-
-    Attributes:
-        M: E[f] (k,).
-        V: Cov[f] (k, k).
-        J: E[df/dx] = dM/dmu (k, n); Cov[x, f] = S J'.
-        dM_dS: (k, n, n).
-        dM_du: (k, m).
-        dV_dmu: (k, k, n).
-        dV_dS: (k, k, n, n).
-        dV_du: (k, k, m).
-        dJ_dS: (k, n, n, n).
-        dJ_du: (k, n, m).
     """
 
-    M: Array
-    V: Array
-    J: Array
-    dM_dS: Array
-    dM_du: Array
-    dV_dmu: Array
-    dV_dS: Array
-    dV_du: Array
-    dJ_dS: Array | None
-    dJ_du: Array | None
+    M: Array  #: E[f] (k,)
+    V: Array  #: cov[f] (k, k)
+    J: Array  #: E[df/dx] = dM/dmu (k, n); Cov[x, f] = S J'
+    dM_dS: Array  #: (k, n, n)
+    dM_du: Array  #: (k, m)
+    dV_dmu: Array  #: (k, k, n)
+    dV_dS: Array  #: (k, k, n, n)
+    dV_du: Array  #: (k, k, m)
+    dJ_dS: Array | None  #: (k, n, n, n)
+    dJ_du: Array | None  #: (k, n, m)
 
     @property
     def dJ_dmu(self) -> Array:

@@ -21,52 +21,34 @@ ROWS, COLUMNS = 4, 16  # of a block of pairs of points
 
 
 class GPArrays(NamedTuple):
-    """k GPs over the same points, for compiled code.
+    """k GPs over the same points, for compiled code."""
 
-    Attributes:
-        points: x~ of the training points (n + m, P).
-        inverse_squares: D = 1 / l^2 (k, n + m).
-        log_signal: log sf2 (k,).
-        weights: beta (k, P).
-        size: N.
-    """
-
-    points: Array
-    inverse_squares: Array
-    log_signal: Array
-    weights: Array
-    size: int
+    points: Array  #: x~ of the training points (n + m, P)
+    inverse_squares: Array  #: D = 1 / l^2 (k, n + m)
+    log_signal: Array  #: log sf2 (k,)
+    weights: Array  #: beta (k, P)
+    size: int  #: N
 
 
 class Precision(NamedTuple):
-    """(K + sn2 I)^-1 of k GPs in two forms, as lower triangles.
+    """(K + sn2 I)^-1 of k GPs in two forms, as lower triangles."""
 
-    Attributes:
-        inverse_cholesky: L_a^-1, four rows after four rows: of rows i to i + 3 the columns before i + 4, rounded up to
-            a multiple of 8, with zeros above the diagonal (k, size).
-        centred: E_a = beta_a beta_a' - (K_a + sn2_a I)^-1, doubled below the diagonal, so that sums over i >= j
-            suffice; block of 4 x 16 after block, rows of blocks one after the other (k, size).
-    """
-
+    #: L_a^-1, four rows after four rows: of rows i to i + 3 the columns before i + 4, rounded up to a multiple of 8,
+    #: with zeros above the diagonal (k, size)
     inverse_cholesky: Array
+    #: E_a = beta_a beta_a' - (K_a + sn2_a I)^-1, doubled below the diagonal, so that sums over i >= j suffice; block of
+    #: 4 x 16 after block, rows of blocks one after the other (k, size)
     centred: Array
 
 
 @dataclass(frozen=True)
 class Packed:
-    """k GPs over the same N points; build it with ``pack``.
+    """k GPs over the same N points; build it with ``pack``."""
 
-    Attributes:
-        arrays: What predictions of the mean read.
-        cholesky: Lower factor L of K + sn2 I (k, N, N).
-        state_dim: n.
-        input_dim: m.
-    """
-
-    arrays: GPArrays
-    cholesky: Array
-    state_dim: int
-    input_dim: int
+    arrays: GPArrays  #: what predictions of the mean read
+    cholesky: Array  #: lower factor L of K + sn2 I (k, N, N)
+    state_dim: int  #: n
+    input_dim: int  #: m
 
     @property
     def output_dim(self) -> int:

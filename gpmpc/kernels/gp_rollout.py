@@ -23,55 +23,31 @@ PLAIN, SINE, COSINE = range(3)
 
 
 class AffineGPs(NamedTuple):
-    """GPs f inside an affine model, for compiled code.
+    """GPs f inside an affine model, for compiled code."""
 
-    Attributes:
-        f: The GPs.
-        offset: Their prior means (k,).
-        A: (n, n).
-        G: (n, m).
-        c: (n,).
-        B: (n, k).
-        states: The state that each feature of f is a function of (d,).
-        kinds: Which function: ``PLAIN``, ``SINE`` or ``COSINE`` (d,).
-        inputs: The inputs that f depends on (m_s,).
-        tape: f0; ``NO_TAPE`` for zero.
-    """
-
-    f: GPArrays
-    offset: Array
-    A: Array
-    G: Array
-    c: Array
-    B: Array
-    states: Indices
-    kinds: Indices
-    inputs: Indices
-    tape: Tape
+    f: GPArrays  #: the GPs
+    offset: Array  #: their prior means (k,)
+    A: Array  #: (n, n)
+    G: Array  #: (n, m)
+    c: Array  #: (n,)
+    B: Array  #: (n, k)
+    states: Indices  #: the state that each feature of f is a function of (d,)
+    kinds: Indices  #: which function: ``PLAIN``, ``SINE`` or ``COSINE`` (d,)
+    inputs: Indices  #: the inputs that f depends on (m_s,)
+    tape: Tape  #: f0; ``NO_TAPE`` for zero
 
 
 class Feedback(NamedTuple):
-    """A feedback u_k = u'_k + K_k (x_k - x'_k) towards T plans of H stages, within bounds.
+    """A feedback u_k = u'_k + K_k (x_k - x'_k) towards T plans of H stages, within bounds."""
 
-    Attributes:
-        states: x'_0 .. x'_{H-1}, and more that are not read (T, H or more, n).
-        inputs: u' (T, H, m).
-        gains: K of each plan, or of all (T or 1, H, m, n).
-        lower: Bounds of the inputs (m,).
-        upper: (m,).
-        rate_lower: Bounds of their changes in a step (m,).
-        rate_upper: (m,).
-        previous_input: The input before the first (m,).
-    """
-
-    states: Array
-    inputs: Array
-    gains: Array
-    lower: Array
-    upper: Array
-    rate_lower: Array
-    rate_upper: Array
-    previous_input: Array
+    states: Array  #: x'_0 .. x'_{H-1}, and more that are not read (T, H or more, n)
+    inputs: Array  #: u' (T, H, m)
+    gains: Array  #: K of each plan, or of all (T or 1, H, m, n)
+    lower: Array  #: bounds of the inputs (m,)
+    upper: Array  #: (m,)
+    rate_lower: Array  #: bounds of their changes in a step (m,)
+    rate_upper: Array  #: (m,)
+    previous_input: Array  #: the input before the first (m,)
 
 
 @njit_noalloc

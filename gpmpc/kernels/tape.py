@@ -22,20 +22,14 @@ OPERATIONS = frozenset({*range(16), ATAN, FABS, FMIN, FMAX, INV, TANH, ATAN2, CO
 
 
 class Tape(NamedTuple):
-    """A function of a vector z (d,).
+    """A function of a vector z (d,)."""
 
-    Attributes:
-        code: Operation, place of the result and places of up to two operands (K, 4). Of an ``INPUT`` the operand is an
-            index into z, of an ``OUTPUT`` the result is an index into the value.
-        constants: Of the operations ``CONST``, by row (K,).
-        work: Number of places.
-        size: Entries of the value.
-    """
-
+    #: operation, place of the result and places of up to two operands (K, 4). Of an ``INPUT`` the operand is an index
+    #: into z, of an ``OUTPUT`` the result is an index into the value
     code: NDArray[np.int64]
-    constants: Array
-    work: int
-    size: int
+    constants: Array  #: of the operations ``CONST``, by row (K,)
+    work: int  #: number of places
+    size: int  #: entries of the value
 
 
 NO_TAPE = Tape(np.empty((0, 4), dtype=np.int64), np.empty(0), 0, 0)

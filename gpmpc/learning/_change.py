@@ -33,20 +33,14 @@ from gpmpc.models import Features, Wrapper
 class ChangedModel(Wrapper):
     """A model and its change.
 
-    Attributes:
-        model: f: a ``GPPosterior`` of next states, or a ``ResidualModel``.
-        share: By how much the plant may differ, as a share of what was learned.
-        memory: Length-scale of time in the kernel [steps].
-        time: t of all predictions [steps].
-
     Raises:
         UnsupportedModel: Another model, or a ``ResidualModel`` whose B is a function of the state.
     """
 
-    model: DynamicsModel
-    share: float = 0.1
-    memory: float = 5000.0
-    time: float = 0.0
+    model: DynamicsModel  #: f: a ``GPPosterior`` of next states, or a ``ResidualModel``
+    share: float = 0.1  #: by how much the plant may differ, as a share of what was learned
+    memory: float = 5000.0  #: length-scale of time in the kernel [steps]
+    time: float = 0.0  #: t of all predictions [steps]
 
     def __post_init__(self) -> None:
         if not isinstance(self.gp, GPPosterior) or self.gp.device.type != "cpu" or callable(self.B):

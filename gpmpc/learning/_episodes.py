@@ -20,14 +20,11 @@ from gpmpc.simulation import Rollout
 class EpisodicLearning:
     """How a model is learned over episodes.
 
-    Attributes:
-        episodes: Flights before the one that counts: the first with the model of the data, two at least.
-
     Raises:
         SettingError: Fewer than two.
     """
 
-    episodes: int = 2
+    episodes: int = 2  #: flights before the one that counts: the first with the model of the data, two at least
 
     def __post_init__(self) -> None:
         check_number("learning.episodes", self.episodes, least=2, whole=True)

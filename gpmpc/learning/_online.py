@@ -56,26 +56,18 @@ class Learned:
 class OnlineLearning:
     """How a change is learned while flying.
 
-    Attributes:
-        points: Of the change, at most.
-        remove: Which goes where there are more: ``"oldest"`` or ``"least_informative"``; see ``SlidingWindow``.
-        share: By how much the plant may differ, as a share of what was learned.
-        memory: Length-scale of time in the kernel [steps].
-        window: Steps over which predictions are compared.
-        margin: Lead of the summed log densities from which on the change is used.
-        surprise: Squared error over its expectation, from which on a plant is another one.
-
     Raises:
         SettingError: A number out of range, or an unknown rule.
     """
 
-    points: int = 40
+    points: int = 40  #: of the change, at most
+    #: which goes where there are more: ``"oldest"`` or ``"least_informative"``; see ``SlidingWindow``
     remove: Literal["oldest", "least_informative"] = "oldest"
-    share: float = 0.1
-    memory: float = 5000.0  # [steps]
-    window: int = 20
-    margin: float = 20.0
-    surprise: float = 30.0
+    share: float = 0.1  #: by how much the plant may differ, as a share of what was learned
+    memory: float = 5000.0  #: length-scale of time in the kernel [steps]
+    window: int = 20  #: steps over which predictions are compared
+    margin: float = 20.0  #: lead of the summed log densities from which on the change is used
+    surprise: float = 30.0  #: squared error over its expectation, from which on a plant is another one
 
     def __post_init__(self) -> None:
         SlidingWindow(self.points, self.remove)

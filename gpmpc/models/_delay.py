@@ -30,16 +30,12 @@ from gpmpc.models._wrapper import LinearWrapper, padded
 class DelayedModel(LinearWrapper):
     """A model whose input acts late.
 
-    Attributes:
-        model: Without the delay, of n states and m inputs.
-        delay: In steps, more than zero; a fraction is allowed.
-
     Raises:
         SettingError: The delay is no positive number, or the model does not predict next states.
     """
 
-    model: DynamicsModel
-    delay: float
+    model: DynamicsModel  #: without the delay, of n states and m inputs
+    delay: float  #: in steps, more than zero; a fraction is allowed
 
     def __post_init__(self) -> None:
         check_number("delay", self.delay, above=0, unit="[steps]")

@@ -26,21 +26,16 @@ from gpmpc.models._wrapper import LinearWrapper, padded
 class DisturbedModel(LinearWrapper):
     """A model with disturbances as further states, (x, d).
 
-    Attributes:
-        model: Without them, of n states.
-        effect: E, by how much each moves the states within a step (n, q), in the model's type.
-        std: Standard deviations of w, by how much each changes from step to step (q,).
-        decay: Diagonal of Phi (q,): 1 for a constant, less than 1 in size for an AR(1) process.
-
     Raises:
         ShapeError: E has another number of rows than the model has states.
         SettingError: A standard deviation is negative, a decay not between -1 and 1, or the model does not predict next
             states.
     """
 
-    model: DynamicsModel
-    effect: Tensor
-    std: Sequence[float]
+    model: DynamicsModel  #: without them, of n states
+    effect: Tensor  #: E, by how much each moves the states within a step (n, q), in the model's type
+    std: Sequence[float]  #: standard deviations of w, by how much each changes from step to step (q,)
+    #: diagonal of Phi (q,): 1 for a constant, less than 1 in size for an AR(1) process
     decay: Sequence[float] | None = None
 
     def __post_init__(self) -> None:

@@ -23,22 +23,15 @@ from gpmpc.models._nominal import Affine
 class Features:
     """Maps a state and an input to what a GP sees of them.
 
-    Attributes:
-        states: Selected states, in the order of the features.
-        inputs: Selected inputs.
-        angles: Those of the selected states that are seen as (sine, cosine), at their place.
-        state_dim: n, of the state they are selected from.
-        input_dim: m.
-
     Raises:
         SettingError: An index is out of range or stands there twice, or an angle is not selected.
     """
 
-    states: Sequence[int]
-    inputs: Sequence[int]
-    angles: Sequence[int]
-    state_dim: int
-    input_dim: int
+    states: Sequence[int]  #: selected states, in the order of the features
+    inputs: Sequence[int]  #: selected inputs
+    angles: Sequence[int]  #: those of the selected states that are seen as (sine, cosine), at their place
+    state_dim: int  #: n, of the state they are selected from
+    input_dim: int  #: m
 
     def __post_init__(self) -> None:
         chosen = {"states": self.state_dim, "inputs": self.input_dim, "angles": self.state_dim}
@@ -115,20 +108,14 @@ class Lags:
 
     For systems of which one measurement does not say where they go: a velocity that is not measured, an actuator's lag.
 
-    Attributes:
-        state_dim: n, of what is measured.
-        input_dim: m.
-        states: p, how many earlier states are part of the state.
-        inputs: q, how many earlier inputs are.
-
     Raises:
         SettingError: One of them is no whole number of zero or more.
     """
 
-    state_dim: int
-    input_dim: int
-    states: int = 1
-    inputs: int = 0
+    state_dim: int  #: n, of what is measured
+    input_dim: int  #: m
+    states: int = 1  #: p, how many earlier states are part of the state
+    inputs: int = 0  #: q, how many earlier inputs are
 
     def __post_init__(self) -> None:
         for key, least in (("state_dim", 1), ("input_dim", 0), ("states", 0), ("inputs", 0)):

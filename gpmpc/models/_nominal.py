@@ -19,19 +19,14 @@ from gpmpc.gaussian import Gaussian, check_tensors
 class Affine:
     """A nominal model x+ = A x + B u + c, through which uncertainty goes exactly.
 
-    Attributes:
-        A: (n, n).
-        B: (n, m).
-        c: (n,).
-
     Raises:
         ShapeError: The shapes do not belong together.
         SettingError: One of the three is no tensor.
     """
 
-    A: Tensor
-    B: Tensor
-    c: Tensor
+    A: Tensor  #: (n, n)
+    B: Tensor  #: (n, m)
+    c: Tensor  #: (n,)
 
     def __post_init__(self) -> None:
         check_tensors(A=self.A, B=self.B, c=self.c)
@@ -63,17 +58,12 @@ class Affine:
 
 @dataclass(frozen=True)
 class KnownModel:
-    """A known function x+ = f0(x, u) as a model without uncertainty.
+    """A known function x+ = f0(x, u) as a model without uncertainty."""
 
-    Attributes:
-        function: f0, from x (*batch, n) and u (*batch, m) to (*batch, n), such as ``CasadiFunction``.
-        state_dim: n.
-        input_dim: m.
-    """
-
+    #: f0, from x (*batch, n) and u (*batch, m) to (*batch, n), such as ``CasadiFunction``
     function: Callable[[Tensor, Tensor], Tensor]
-    state_dim: int
-    input_dim: int
+    state_dim: int  #: n
+    input_dim: int  #: m
 
     dtype, device = torch.float64, torch.device("cpu")
 

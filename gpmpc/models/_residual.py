@@ -39,30 +39,22 @@ Effect = Tensor | Callable[[Tensor], Tensor]
 class ResidualModel:
     """A nominal model and a GP on its residual.
 
-    Attributes:
-        nominal: f0, from x (*batch, n) and u (*batch, m) to (*batch, n), in torch; an ``Affine`` one allows exact
-            moment matching.
-        residual: d, with ``predicts="value"``.
-        B: Where it acts (n, k), or a function of the state (*batch, n) that gives it (*batch, n, k), in torch or by
-            ``CasadiFunction``; (*batch, n) will do where k = 1.
-        states: The states that d depends on, in its order.
-        inputs: The inputs that d depends on, in its order.
-        input_dim: m, all of them.
-        angles: Those of ``states`` that d sees as (sine, cosine), at their place.
-        noise: Covariance of the observations (n, n); by default that of d's, B diag(sn2) B', which needs a constant B.
-
     Raises:
         ShapeError: The parts do not belong together.
         SettingError: The residual predicts something else, an index is out of range, or the noise is missing.
     """
 
+    #: f0, from x (*batch, n) and u (*batch, m) to (*batch, n), in torch; an ``Affine`` one allows exact moment matching
     nominal: Nominal
-    residual: GPPosterior
+    residual: GPPosterior  #: d, with ``predicts="value"``
+    #: where it acts (n, k), or a function of the state (*batch, n) that gives it (*batch, n, k), in torch or by
+    #: ``CasadiFunction``; (*batch, n) will do where k = 1
     B: Effect
-    states: Sequence[int]
-    inputs: Sequence[int]
-    input_dim: int
-    angles: Sequence[int] = ()
+    states: Sequence[int]  #: the states that d depends on, in its order
+    inputs: Sequence[int]  #: the inputs that d depends on, in its order
+    input_dim: int  #: m, all of them
+    angles: Sequence[int] = ()  #: those of ``states`` that d sees as (sine, cosine), at their place
+    #: covariance of the observations (n, n); by default that of d's, B diag(sn2) B', which needs a constant B
     noise: Tensor | None = None
 
     def __post_init__(self) -> None:

@@ -13,13 +13,9 @@ from gpmpc.gaussian import Gaussian
 
 
 class Wrapper:
-    """A model with the inputs, the type and the device of the model that it holds, and with further states.
+    """A model with the inputs, the type and the device of the model that it holds, and with further states."""
 
-    Attributes:
-        model: The model that is wrapped.
-    """
-
-    model: DynamicsModel
+    model: DynamicsModel  #: the model that is wrapped
 
     @property
     def state_dim(self) -> int:

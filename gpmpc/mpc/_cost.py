@@ -26,22 +26,16 @@ PENALIZED = ("inputs", "deviations", "increments")
 class Tracking:
     """Costs of the distance to a reference and of the inputs.
 
-    Attributes:
-        Q: State weights, the diagonal (n,) or the matrix (n, n); matrices (H, n, n) by stage.
-        R: Input weights, likewise (m,), (m, m) or (H, m, m), positive definite.
-        terminal: Weight of the last predicted state, one like Q; Q itself (its last one) by default.
-        penalized: What R weighs: ``"inputs"``, ``"deviations"`` from the reference inputs, or ``"increments"``.
-        angles: Indices of states whose error is modulo 2 pi: their references move by full turns towards the plan;
-            None for none.
-
     Raises:
         SettingError: A weight is not symmetric positive semidefinite, R is zero in a direction, or a length is wrong.
     """
 
-    Q: Any
-    R: Any
-    terminal: Any = None
+    Q: Any  #: state weights, the diagonal (n,) or the matrix (n, n); matrices (H, n, n) by stage
+    R: Any  #: input weights, likewise (m,), (m, m) or (H, m, m), positive definite
+    terminal: Any = None  #: weight of the last predicted state, one like Q; Q itself (its last one) by default
+    #: what R weighs: ``"inputs"``, ``"deviations"`` from the reference inputs, or ``"increments"``
     penalized: Penalized = "increments"
+    #: indices of states whose error is modulo 2 pi: their references move by full turns towards the plan; None for none
     angles: Sequence[int] = ()
 
     def __post_init__(self) -> None:
@@ -79,20 +73,16 @@ class Tracking:
 class LeastSquares:
     """Costs of outputs y(x, u, p), weighed squares of how far they are from their references.
 
-    Attributes:
-        y: A function of tensors, states (H, n), inputs (H, m) and, where the controller is handed ``parameters``, these
-            (H, q), that gives (H, d), each row of its own stage; or a CasADi function of vectors. It may take fewer:
-            the states, or states and inputs.
-        weight: W, the diagonal (d,) or the matrix (d, d); matrices (H, d, d) by stage, zero where y costs nothing.
-        reference: c (d,), or (H, d) by stage; zero by default.
-
     Raises:
         SettingError: y is no function, the weight is not symmetric positive semidefinite, or a length is wrong.
     """
 
+    #: a function of tensors, states (H, n), inputs (H, m) and, where the controller is handed ``parameters``, these (H,
+    #: q), that gives (H, d), each row of its own stage; or a CasADi function of vectors. It may take fewer: the states,
+    #: or states and inputs
     y: Any
-    weight: Any
-    reference: Any = None
+    weight: Any  #: W, the diagonal (d,) or the matrix (d, d); matrices (H, d, d) by stage, zero where y costs nothing
+    reference: Any = None  #: c (d,), or (H, d) by stage; zero by default
 
     def __post_init__(self) -> None:
         if not callable(self.y):

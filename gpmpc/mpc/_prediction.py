@@ -80,26 +80,23 @@ class Prediction(NamedTuple):
 class PredictionSettings:
     """How beliefs are predicted.
 
-    Attributes:
-        form: Where the dynamics are linearised: ``"trajectory"``, at every stage of the last plan; ``"velocity"``, at
-            the current belief, held over the horizon (Cao, Lai and Alam, 2017, section 4).
-        covariance: What the program holds: ``"full"``, means and roots of the covariances; ``"diagonal"``, means and
-            standard deviations; ``"zero_order"``, means, with covariances predicted beside it; ``"none"``, means alone.
-        feedback: Predicts the covariances of ``"zero_order"`` under a feedback, without which no long horizon with
-            state constraints is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"``
-            and ``"diagonal"`` are those without feedback.
-        disturbance_gain: L in [0, 1], the observer gain of the constant-disturbance estimate; 0 disables it.
-        rolled_out: Ends a decision with a roll-out under the feedback, so that its plan obeys the model's dynamics
-            however few programs it took; for ``"trajectory"``.
-
     Raises:
         SettingError: An unknown form or covariance mode, a gain out of range, or one with ``"velocity"``.
     """
 
+    #: where the dynamics are linearised: ``"trajectory"``, at every stage of the last plan; ``"velocity"``, at the
+    #: current belief, held over the horizon (Cao, Lai and Alam, 2017, section 4)
     form: Form = "trajectory"
+    #: what the program holds: ``"full"``, means and roots of the covariances; ``"diagonal"``, means and standard
+    #: deviations; ``"zero_order"``, means, with covariances predicted beside it; ``"none"``, means alone
     covariance: Covariance = "zero_order"
+    #: predicts the covariances of ``"zero_order"`` under a feedback, without which no long horizon with state
+    #: constraints is feasible, and lets the iteration roll plans out under it. The covariances of ``"full"`` and
+    #: ``"diagonal"`` are those without feedback
     feedback: bool = True
-    disturbance_gain: float = 0.0
+    disturbance_gain: float = 0.0  #: L in [0, 1], the observer gain of the constant-disturbance estimate; 0 disables it
+    #: ends a decision with a roll-out under the feedback, so that its plan obeys the model's dynamics however few
+    #: programs it took; for ``"trajectory"``
     rolled_out: bool = False
 
     def __post_init__(self) -> None:

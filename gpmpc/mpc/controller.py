@@ -30,18 +30,15 @@ _NO_PLAN = np.empty((0, 0))
 class Reference:
     """What a controller is to follow over its horizon H, from the current time on.
 
-    Attributes:
-        states: r_0 .. r_H (H + 1, n); r_0 belongs to the current time. Or a set point (n,), for any horizon.
-        inputs: u*_0 .. u*_{H-1} (H, m), the inputs that belong to it where they are known; (m,) for a set point.
-        kappas: Standard deviations (H,) between the means and the sides of chance constraints, by stage, in the place
-            of the problem's, such as those of an ``AdaptiveTube``; for covariances of ``zero_order``.
-
     Raises:
         ShapeError: They do not belong together.
     """
 
-    states: Array
+    states: Array  #: r_0 .. r_H (H + 1, n); r_0 belongs to the current time. Or a set point (n,), for any horizon
+    #: u*_0 .. u*_{H-1} (H, m), the inputs that belong to it where they are known; (m,) for a set point
     inputs: Array | None = None
+    #: standard deviations (H,) between the means and the sides of chance constraints, by stage, in the place of the
+    #: problem's, such as those of an ``AdaptiveTube``; for covariances of ``zero_order``
     kappas: Array | None = None
 
     def __post_init__(self) -> None:

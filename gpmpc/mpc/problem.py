@@ -35,22 +35,19 @@ _EXACT = 1e6  # the exact price, in the cost's largest weight: more than any mul
 class Constraint:
     """What every constraint of the states has beside its sides.
 
-    Attributes:
-        probability: eta in (0.5, 1), with which each side is to hold at each stage; None: the mean keeps it.
-        kappa: Standard deviations between the mean and a side; Phi^-1(eta) unless given (the paper takes 2 for 0.95).
-        penalty: Price of a violation per unit and stage; ``"exact"``: one that no plan pays which can keep the
-            constraint; None: hard.
-        stages: Those of 1 .. H that it holds at, such as ``range(5, 11)``; all by default.
-        joint: Whether eta is for all sides and stages together, by Boole's inequality: each gets its part of 1 - eta.
-
     Raises:
         SettingError: A probability outside (0.5, 1), a negative kappa, a price that is not positive, or stages below 1.
     """
 
+    #: eta in (0.5, 1), with which each side is to hold at each stage; None: the mean keeps it
     probability: float | None = None
+    #: standard deviations between the mean and a side; Phi^-1(eta) unless given (the paper takes 2 for 0.95)
     kappa: float | None = None
+    #: price of a violation per unit and stage; ``"exact"``: one that no plan pays which can keep the constraint; None:
+    #: hard
     penalty: float | Literal["exact"] | None = "exact"
-    stages: Iterable[int] | None = None
+    stages: Iterable[int] | None = None  #: those of 1 .. H that it holds at, such as ``range(5, 11)``; all by default
+    #: whether eta is for all sides and stages together, by Boole's inequality: each gets its part of 1 - eta
     joint: bool = False
 
     def __post_init__(self) -> None:
@@ -90,10 +87,6 @@ class Constraint:
 class Box(Constraint):
     """Bounds lower <= x <= upper: of the states, and (without the keywords) of inputs or their increments.
 
-    Attributes:
-        lower: List or array (d,), or (H, d) by stage, kept as an array; -inf where there is none; None: none at all.
-        upper: Likewise; inf where there is none.
-
     Raises:
         SettingError: Crossed bounds, or as for ``Constraint``.
 
@@ -104,8 +97,9 @@ class Box(Constraint):
     gpmpc.exceptions.SettingError
     """
 
+    #: list or array (d,), or (H, d) by stage, kept as an array; -inf where there is none; None: none at all
     lower: Any = None
-    upper: Any = None
+    upper: Any = None  #: likewise; inf where there is none
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -160,17 +154,13 @@ class Box(Constraint):
 class Halfspaces(Constraint):
     """Linear constraints F x <= f of the states.
 
-    Attributes:
-        F: (r, n).
-        f: (r,), or (H, r) by stage.
-
     Raises:
         SettingError: Shapes that do not belong together, numbers that are not finite, a zero row, or as for
             ``Constraint``.
     """
 
-    F: Any
-    f: Any
+    F: Any  #: (r, n)
+    f: Any  #: (r,), or (H, r) by stage
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -200,16 +190,12 @@ class Inequality(Constraint):
     Its standard deviation is the one along the gradient, sqrt(dh Sigma dh'). A gradient that vanishes says nothing of
     where to go: prefer ``radius - distance`` to ``radius**2 - distance**2``.
 
-    Attributes:
-        h: A function of tensors or in CasADi, like y of ``LeastSquares``, that gives (H, count).
-        count: Number of values of h at a stage.
-
     Raises:
         SettingError: h is no function, or as for ``Constraint``.
     """
 
-    h: Any
-    count: int = 1
+    h: Any  #: a function of tensors or in CasADi, like y of ``LeastSquares``, that gives (H, count)
+    count: int = 1  #: number of values of h at a stage
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -231,22 +217,15 @@ class Inequality(Constraint):
 class Problem:
     """A cost, bounds of the inputs, and constraints of the states; see the module's text.
 
-    Attributes:
-        cost: Of states and inputs; its Q may be zero.
-        inputs: Bounds of the inputs; none by default.
-        input_rates: Bounds of u_i - u_{i-1} per step; none by default.
-        constraints: Of the states, ``Box``, ``Halfspaces`` or ``Inequality``; none by default.
-        outputs: Costs of outputs, ``LeastSquares``, beside ``cost``; none by default.
-
     Raises:
         SettingError: A part is of another kind or length than the cost asks for.
     """
 
-    cost: Tracking
-    inputs: Box = field(default_factory=Box)
-    input_rates: Box = field(default_factory=Box)
-    constraints: Sequence[Constraint] = ()
-    outputs: Sequence[LeastSquares] = ()
+    cost: Tracking  #: of states and inputs; its Q may be zero
+    inputs: Box = field(default_factory=Box)  #: bounds of the inputs; none by default
+    input_rates: Box = field(default_factory=Box)  #: bounds of u_i - u_{i-1} per step; none by default
+    constraints: Sequence[Constraint] = ()  #: of the states, ``Box``, ``Halfspaces`` or ``Inequality``; none by default
+    outputs: Sequence[LeastSquares] = ()  #: costs of outputs, ``LeastSquares``, beside ``cost``; none by default
 
     def __post_init__(self) -> None:
         if not isinstance(self.cost, Tracking):

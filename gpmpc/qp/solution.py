@@ -26,39 +26,30 @@ class Residuals(NamedTuple):
     Each is relative to the numbers that it is a sum of, so that neither units nor data of another size hide it. Where
     these cancel, zero is what is small beside x, or very small beside the free minimiser, in the metric of P's diagonal
     (1e-4 and 1e-12 of them).
-
-    Attributes:
-        primal: The largest violation of a hard constraint, or of a soft one beyond what its multiplier pays for;
-            relative to the violated bound or the constraint's own terms |c|'|x|.
-        dual: The largest entry of P x + q + G'z + z_box, multipliers of absent bounds or beyond their weights counted
-            as wrong; relative to the entry's own terms.
-        gap: |primal - dual objective|, what ``primal`` counts as violated left out; relative to x'Px, |q'x|, or the sum
-            of |multiplier times bound|.
     """
 
+    #: the largest violation of a hard constraint, or of a soft one beyond what its multiplier pays for; relative to the
+    #: violated bound or the constraint's own terms |c|'|x|
     primal: float
+    #: the largest entry of P x + q + G'z + z_box, multipliers of absent bounds or beyond their weights counted as
+    #: wrong; relative to the entry's own terms
     dual: float
+    #: |primal - dual objective|, what ``primal`` counts as violated left out; relative to x'Px, |q'x|, or the sum of
+    #: |multiplier times bound|
     gap: float
 
 
 class QPSolution(NamedTuple):
-    """The minimiser with its multipliers, status and residuals. Holds references to the problem's arrays, not copies.
+    """The minimiser with multipliers, status and residuals. Holds references to the problem's arrays, not copies."""
 
-    Attributes:
-        x: (n,) the minimiser; the best iterate if the status is not ``SOLVED``. A view of the record.
-        arrays: P, q, G, and the bounds (M,) of the stacked constraints ``[x; Gx]``, as in ``QuadraticProgram``.
-        caps: Largest sizes (M,) of the multipliers: the prices of soft rows, infinity elsewhere.
-        record: The solver's whole result in one array, and a warm start for the next solve; see ``gpmpc.qp._record``.
-        build_seconds: Time spent on building or compiling the problem in this call [s].
-        solve_seconds: Time spent on solving it [s].
-    """
-
-    x: Array
+    x: Array  #: (n,) the minimiser; the best iterate if the status is not ``SOLVED``. A view of the record
+    #: P, q, G, and the bounds (M,) of the stacked constraints ``[x; Gx]``, as in ``QuadraticProgram``
     arrays: tuple[Array, Array, Array, Array, Array]
-    caps: Array
+    caps: Array  #: largest sizes (M,) of the multipliers: the prices of soft rows, infinity elsewhere
+    #: the solver's whole result in one array, and a warm start for the next solve; see ``gpmpc.qp._record``
     record: Array
-    build_seconds: float = 0.0
-    solve_seconds: float = 0.0
+    build_seconds: float = 0.0  #: time spent on building or compiling the problem in this call [s]
+    solve_seconds: float = 0.0  #: time spent on solving it [s]
 
     @property
     def multipliers(self) -> Array:
