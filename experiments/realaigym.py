@@ -4,26 +4,33 @@
 league's own classes disturb and simulate, and prints the board with a row of ours. Models: ``true`` (the published
 equations and parameters), ``residual`` (a rigid body, each of whose parameters is 15 % wrong at first, is fitted by
 least squares, and a GP learns what is left) and ``gp`` (a GP alone). They are learned from 60 s: 20 s of random torque,
-then four times 10 s of the league's own test under the model learned so far.
+then four times 10 s of the league's own test under the model learned so far. They are kept in ``folder=``, with a file
+``con_gpmpc_*.py`` that flies them in the league's own scripts; ``board=script`` runs the league's unmodified one.
 
 The league's simulator: github.com/dfki-ric-underactuated-lab/double_pendulum, its ``src/python`` on PYTHONPATH.
 """
 
+import json
+import os
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import casadi
 import numpy as np
+import pandas
 import torch
 from scipy.optimize import least_squares
 
 from gpmpc.exceptions import GpmpcError, SettingError
+from gpmpc.files import write_whole
 from gpmpc.gp import GPPosterior, Trainer, Transitions, informative_points, standardize
-from gpmpc.models import Affine, CasadiFunction, Features, KnownModel, ResidualModel
+from gpmpc.models import Affine, CasadiFunction, Features, KnownModel, ResidualModel, load_model, save_model
 from gpmpc.mpc import (
     GPMPC,
     Box,
@@ -126,7 +133,7 @@ class Pilot:
 
     def torques(self, x: Any, t: float) -> Array:
         """The torques of both joints (2,) at a state in the league's order and a time [s]."""
-        lost, state = self._loop is None or t - self._last > 1.5 * INPUT, state_of(x)
+        lost, state = self._loop is None or abs(t - self._last) > 1.5 * INPUT, state_of(x)
         if lost:
             self._loop, self._count = ControlLoop(self.controller), 0
         share, self._last = self._count * INPUT / PLAN, t
@@ -154,6 +161,68 @@ def league_controller(base: type, pilot: Pilot) -> Any:
             return pilot.torques(x, 0.0 if t is None else t)
 
     return GPMPCController()
+
+
+ENTRY = '''\
+"""GP-MPC in the league's interface: this file and the model beside it stand in leaderboard/{robot}/simulation_v3."""
+
+from pathlib import Path
+
+from double_pendulum.controller.abstract_controller import AbstractController
+from gpmpc.experiments.realaigym import league_controller, pilot, read_model
+
+leaderboard_config = {{
+    "csv_path": "{name}/sim_swingup.csv",
+    "name": "{name}",
+    "simple_name": "GP-MPC ({kind})",
+    "short_description": "MPC from many starts on {described}.",
+    "readme_path": "readmes/{name}.md",
+    "username": "gpmpc",
+}}
+model = read_model("{robot}", "{kind}", Path(__file__).with_name("{name}.safetensors"))
+controller = league_controller(AbstractController, pilot(model, "{robot}"))
+controller.init()
+'''
+DESCRIBED = {
+    "true": "the true model",
+    "residual": "a fitted rigid body and a GP of its error from 60 s of interaction",
+    "gp": "a GP from 60 s of interaction",
+}
+
+
+def read_model(robot: str, kind: str, path: Path) -> Any:
+    """The model of a file, or the true one."""
+    return KnownModel(casadi_model(double_pendulum(ACTUATED[robot])), 4, 1) if kind == "true" else load_model(path)
+
+
+def write_entry(robot: str, kind: str, seed: int, folder: Path) -> Path:
+    """Writes a controller file for the league's scripts, and beside it the model, learned first where it is not there.
+
+    Returns the path of the controller file, ``con_gpmpc_*.py``.
+    """
+    name = f"gpmpc_{kind}_{seed}"
+    model, entry = folder / robot / f"{name}.safetensors", folder / robot / f"con_{name}.py"
+    entry.parent.mkdir(parents=True, exist_ok=True)
+    if kind != "true" and not model.exists():
+        begin = perf_counter()
+        save_model(learned_model(robot, kind, seed), model, {"robot": robot, "seed": seed})
+        _say(f"  learned in {perf_counter() - begin:.0f} s: {model}")
+    write_whole(entry, ENTRY.format(robot=robot, kind=kind, name=name, described=DESCRIBED[kind]))
+    return entry
+
+
+def play_script(entry: Path, robot: str) -> float:
+    """The score by the league's unmodified script, which draws its disturbances without a seed."""
+    found = find_spec("double_pendulum")
+    where = Path(str(found and found.origin)).resolve().parents[3] / "leaderboard" / robot / "simulation_v3"
+    if not where.is_dir():
+        raise SettingError("simulator", f"board=script needs the repository, not only its package: {INSTALL}")
+    results = where / "data" / entry.stem.removeprefix("con_")
+    (results / "sim_swingup.csv").unlink(missing_ok=True)  # the script would score it again
+    paths = [str(entry.parent.resolve()), *filter(None, [os.environ.get("PYTHONPATH")])]
+    command = [sys.executable, "calculate_leaderboard_score.py", entry.name]
+    subprocess.run(command, cwd=where, env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)}, check=True)
+    return float(pandas.read_csv(results / "leaderboard_entry.csv")["RealAI Score"].iloc[0])
 
 
 def pilot(model: Any, robot: str, horizon: int = 40, programs: int = 10, wild: bool = True, gain: float = 1.0) -> Pilot:
@@ -354,24 +423,29 @@ def learned_model(robot: str, kind: str, seed: int, error: float = 0.15) -> Any:
     return model
 
 
-def board(robot: str, kind: str, seeds: list[int], draws: list[int], **settings: Any) -> list[dict[str, Any]]:
-    """Plays a number of draws with the model of each seed; prints and returns one row for each play."""
+def board(robot: str, kind: str, seeds: list[int], draws: list[int], folder: Path) -> list[dict[str, Any]]:
+    """Plays a number of draws with the model of each seed; prints and returns one row for each play.
+
+    Rows that the folder holds already are read, not played again.
+    """
     rows = []
     for seed in seeds:
-        begin = perf_counter()
-        model = KnownModel(casadi_model(double_pendulum(ACTUATED[robot])), 4, 1)
-        if kind != "true":
-            model = learned_model(robot, kind, seed)
-        learning = perf_counter() - begin
+        entry = write_entry(robot, kind, seed, folder)
+        store = entry.with_name(f"{entry.stem.removeprefix('con_')}.json")
+        played = json.loads(store.read_text()) if store.exists() else []
+        model = read_model(robot, kind, entry.with_name(f"{store.stem}.safetensors"))
         for draw in draws:
-            who = pilot(model, robot, **settings)
-            found, ms = play(who, robot, draw), 1e3 * np.array(who.seconds)
-            search = np.array(who.searched)
-            rows.append(
-                {"robot": robot, "model": kind, "seed": seed, "draw": draw, "score": found.score}
-                | {"learning": learning, "searches": int(search.sum()), "search": float(np.median(ms[search]))}
-                | {"median": float(np.median(ms[~search])), "p99": float(np.quantile(ms[~search], 0.99))}
-            )
+            if not any(row["draw"] == draw for row in played):
+                who = pilot(model, robot)
+                found, ms = play(who, robot, draw), 1e3 * np.array(who.seconds)
+                search = np.array(who.searched)
+                played.append(
+                    {"robot": robot, "model": kind, "seed": seed, "draw": draw, "score": found.score}
+                    | {"searches": int(search.sum()), "search": float(np.median(ms[search]))}
+                    | {"median": float(np.median(ms[~search])), "p99": float(np.quantile(ms[~search], 0.99))}
+                )
+                write_whole(store, json.dumps(played, indent=1))
+            rows += [row for row in played if row["draw"] == draw]
             _say("  " + "  ".join(f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()))
     return rows
 
@@ -402,28 +476,34 @@ def table(robot: str, rows: list[dict[str, Any]]) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Reads ``robot=``, ``model=``, ``seeds=`` and ``draws=``, plays, and prints the board."""
+    """Reads ``robot=``, ``model=``, ``seeds=``, ``draws=``, ``board=`` and ``folder=``, plays, and prints the board."""
     given = {"robot": "acrobot", "model": "true", "seeds": "0", "draws": "3"}
+    given |= {"board": "simulation", "folder": "outputs/realaigym"}
+    choices = {"robot": tuple(ACTUATED), "model": tuple(DESCRIBED), "board": ("simulation", "script")}
     try:
         for argument in arguments:
             key, _, value = argument.partition("=")
             if key not in given:
                 raise SettingError(key, f"must be one of {', '.join(given)}")
             given[key] = value
-        if given["robot"] not in ACTUATED:
-            raise SettingError("robot", f"must be one of {', '.join(ACTUATED)}; got {given['robot']!r}")
-        if given["model"] not in ("true", "residual", "gp"):
-            raise SettingError("model", f"must be true, residual or gp; got {given['model']!r}")
+        for key, names in choices.items():
+            if given[key] not in names:
+                raise SettingError(key, f"must be one of {', '.join(names)}; got {given[key]!r}")
         if not (given["seeds"].replace(",", "").isdigit() and given["draws"].isdigit()):
             raise SettingError("seeds, draws", "must be numbers such as 0,1 and a number of draws such as 3")
         if find_spec("double_pendulum") is None:
             raise SettingError("simulator", INSTALL)
-        seeds = [int(seed) for seed in given["seeds"].split(",")]
-        rows = board(given["robot"], given["model"], seeds, [100 + i for i in range(int(given["draws"]))])
-    except GpmpcError as error:
+        robot, kind, folder = given["robot"], given["model"], Path(given["folder"])
+        seeds, draws = [int(seed) for seed in given["seeds"].split(",")], int(given["draws"])
+        if given["board"] == "script":
+            for seed in seeds:
+                for _ in range(draws):
+                    _say(f"  seed {seed}  score {play_script(write_entry(robot, kind, seed, folder), robot):.3f}")
+            return 0
+        _say(table(robot, board(robot, kind, seeds, [100 + i for i in range(draws)], folder)))
+    except (GpmpcError, subprocess.CalledProcessError) as error:
         print(f"realaigym: {error}", file=sys.stderr)
         return 2
-    _say(table(given["robot"], rows))
     return 0
 
 

@@ -1,13 +1,19 @@
 """The league's experiment: interface, equations, what is learned from, what is said without the simulator."""
 
+import shutil
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
+from gpmpc.exceptions import SettingError
 from gpmpc.experiments import realaigym
 from gpmpc.experiments.realaigym import (
     ACTUATED,
     Play,
+    board,
     casadi_model,
     fit_body,
     heights,
@@ -15,11 +21,14 @@ from gpmpc.experiments.realaigym import (
     learn,
     main,
     pilot,
+    play_script,
     random_record,
+    read_model,
     right_hand_side,
     state_of,
     table,
     transitions,
+    write_entry,
     wrong_system,
 )
 from gpmpc.models import KnownModel
@@ -119,13 +128,80 @@ def test_the_board_is_sorted_and_says_what_share_of_draws_is_above_the_best():
     assert [line.split("|")[1].strip() for line in lines[2:5]] == ["AR-EAPO", "gpmpc, gp model", "VIMPPI"]
 
 
+def test_what_was_learned_is_kept_in_a_file_and_not_learned_again(monkeypatch, tmp_path):
+    data, learned = transitions(random_record("acrobot", 5.0, 0), "acrobot"), []
+
+    def learned_model(robot, kind, seed):
+        learned.append(learn(data, casadi_model(wrong_system(robot, 0.15, seed)), points=40))
+        return learned[-1]
+
+    monkeypatch.setattr(realaigym, "learned_model", learned_model)
+    write_entry("acrobot", "residual", 3, tmp_path)
+    entry = write_entry("acrobot", "residual", 3, tmp_path)
+    found = read_model("acrobot", "residual", entry.with_name("gpmpc_residual_3.safetensors"))
+    expected = learned[0].predict(data.states[:5], data.inputs[:5])
+    assert len(learned) == 1
+    assert torch.equal(found.predict(data.states[:5], data.inputs[:5]).mean, expected.mean)
+
+
+SCRIPT = """
+import importlib, pathlib, sys
+import numpy as np
+name = sys.argv[1].removesuffix(".py")
+module = importlib.import_module(name)
+torques = [module.controller.get_control_output(np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), 0.002 * k) for k in range(3)]
+folder = pathlib.Path("data", module.leaderboard_config["csv_path"]).parent
+folder.mkdir(parents=True)
+(folder / "leaderboard_entry.csv").write_text(f"Controller,RealAI Score\\nGP-MPC,{abs(torques[-1][0])}\\n")
+"""
+
+
+def test_the_leagues_script_flies_the_file_that_was_written(monkeypatch, tmp_path):
+    source, script = tmp_path / "src" / "python", tmp_path / "leaderboard" / "pendubot" / "simulation_v3"
+    (source / "double_pendulum" / "controller").mkdir(parents=True)
+    (source / "double_pendulum" / "__init__.py").write_text("")
+    (source / "double_pendulum" / "controller" / "abstract_controller.py").write_text(
+        "class AbstractController:\n"
+        "    def init(self):\n        pass\n"
+        "    def get_control_output(self, x, t):\n        return self.get_control_output_(x, t)\n"
+    )
+    script.mkdir(parents=True)
+    (script / "calculate_leaderboard_score.py").write_text(SCRIPT)
+    root = Path(realaigym.__file__).parents[1]
+    monkeypatch.setenv("PYTHONPATH", f"{source}:{root}")
+    monkeypatch.setattr(sys, "path", [str(source), *sys.path])
+    torque = play_script(write_entry("pendubot", "true", 0, tmp_path / "kept"), "pendubot")
+    assert 0 < torque <= 6.0  # the shoulder is driven back upright
+    shutil.rmtree(script)
+    with pytest.raises(SettingError, match="board=script needs the repository, not only its package: the league's"):
+        play_script(tmp_path / "kept" / "con_gpmpc_true_0.py", "pendubot")
+
+
+def test_draws_that_were_played_are_read_and_not_played_again(monkeypatch, tmp_path):
+    played = []
+
+    def play(who, robot, seed):
+        played.append(seed)
+        who.seconds, who.searched = [0.5, 0.002], [True, False]
+        return Play(seed / 1000, np.zeros((1, 4)), np.zeros((0, 2)))
+
+    monkeypatch.setattr(realaigym, "play", play)
+    first = board("acrobot", "true", [0], [100, 101], tmp_path)
+    again = board("acrobot", "true", [0], [100, 101, 102], tmp_path)
+    assert played == [100, 101, 102]
+    assert again[:2] == first
+    assert [row["score"] for row in again] == [0.1, 0.101, 0.102]
+    assert again[0]["search"] == 500.0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ([], "realaigym: simulator: the league's simulator is not installed: git clone https://github.com/dfki-ric"),
         (["robot=arm"], "realaigym: robot: must be one of acrobot, pendubot; got 'arm'"),
-        (["model=best"], "realaigym: model: must be true, residual or gp; got 'best'"),
-        (["speed=2"], "realaigym: speed: must be one of robot, model, seeds, draws"),
+        (["model=best"], "realaigym: model: must be one of true, residual, gp; got 'best'"),
+        (["board=chess"], "realaigym: board: must be one of simulation, script; got 'chess'"),
+        (["speed=2"], "realaigym: speed: must be one of robot, model, seeds, draws, board, folder"),
         (["draws=many"], "realaigym: seeds, draws: must be numbers such as"),
     ],
 )
