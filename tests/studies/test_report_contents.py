@@ -4,10 +4,13 @@ import csv
 import io
 import json
 import re
+from itertools import product
 
+import numpy as np
 import pytest
 from rich.console import Console
 
+from gpmpc.studies import report as reporting
 from gpmpc.studies.document import terminal
 from gpmpc.studies.report import compare, report_document, sentences, terminal_table
 from gpmpc.studies.report import read_report as report
@@ -266,3 +269,80 @@ def test_where_a_run_comes_from_is_told_as_far_as_it_says_so(provenance, origin,
     made_up_run(tmp_path, *chosen("lqr", 0), result=metrics_of(0.1) | {"provenance": provenance})
     (run,) = report(tmp_path).runs
     assert run.origin == origin
+
+
+def test_a_figure_has_a_curve_for_what_else_was_varied_or_for_less_of_it_where_that_were_too_many(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(reporting, "over_variable", lambda *arguments: arguments)
+    monkeypatch.setattr(reporting, "png", lambda drawn: drawn)
+    errors = {}
+    for i, (horizon, size, gain) in enumerate(product((1, 5, 10, 20), (50, 100, 200), ("high", "low"))):
+        errors[horizon, size, gain] = 0.25 * (i + 1)
+        choices = [f"gain={gain}", f"horizon={horizon}", "seed=0", f"size={size}"]
+        made_up_run(tmp_path, choices, SETTINGS, result=metrics_of(errors[horizon, size, gain], failing=i == 3))
+    drawn = reporting.report_document(report(tmp_path)).images
+    measures = {"rmse": "RMSE [m]", "failed": "failed solves [%]", "decision": "decision, median [ms]"}
+    assert {*drawn} == {f"{name}-over-{key}.png" for name in measures for key in ("horizon", "size", "gain")}
+    for name, label in measures.items():
+        for key, ticks in (("horizon", ["1", "5", "10", "20"]), ("size", ["50", "100", "200"])):
+            title, found, axis, _, logarithmic = drawn[f"{name}-over-{key}.png"]
+            assert (title, found, axis, logarithmic) == (key, ticks, label, name != "failed")
+    series = drawn["rmse-over-horizon.png"][3]  # 6 curves
+    assert [line.label for line in series] == [f"gain={g}, size={s}" for g in ("high", "low") for s in (50, 100, 200)]
+    for line, (gain, size) in zip(series, product(("high", "low"), (50, 100, 200)), strict=True):
+        assert line.values == [[pytest.approx(errors[horizon, size, gain])] for horizon in (1, 5, 10, 20)]
+    series = drawn["rmse-over-size.png"][3]  # 8 curves: as many as there may be
+    assert [line.label for line in series] == [
+        f"gain={g}, horizon={h}" for g in ("high", "low") for h in (1, 5, 10, 20)
+    ]
+    series = drawn["rmse-over-gain.png"][3]  # 12 were too many: without the horizon, of which there are most
+    assert [line.label for line in series] == ["size=50", "size=100", "size=200"]
+    for line, size in zip(series, (50, 100, 200), strict=True):
+        pooled = [[errors[horizon, size, gain] for horizon in (1, 5, 10, 20)] for gain in ("high", "low")]
+        assert line.values == [pytest.approx(values) for values in pooled]
+    failed = drawn["failed-over-horizon.png"][3]
+    assert sorted(value for line in failed for values in line.values for value in values) == [0] * 23 + [5]
+
+
+def test_a_single_varied_setting_has_one_curve_and_names_that_would_be_files_already_get_a_number(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(reporting, "over_variable", lambda *arguments: arguments)
+    monkeypatch.setattr(reporting, "png", lambda drawn: drawn)
+    for value in (1, 2):
+        made_up_run(tmp_path / "one", [f"a/b={value}", "seed=0"], SETTINGS, result=metrics_of(0.1 * value))
+        for other in (1, 2):
+            choices = [f"a/b={value}", f"a:b={other}", "seed=0"]
+            made_up_run(tmp_path / "two", choices, SETTINGS, result=metrics_of(0.1 * value))
+    one, two = (reporting.report_document(report(tmp_path / tree)).images for tree in ("one", "two"))
+    assert [*one] == ["rmse-over-a-b.png", "decision-over-a-b.png"]
+    (line,) = one["rmse-over-a-b.png"][3]
+    assert (line.label, line.values) == ("all", [[pytest.approx(0.1)], [pytest.approx(0.2)]])
+    assert [*two] == [
+        "rmse-over-a-b.png", "decision-over-a-b.png", "rmse-over-a-b-1.png", "decision-over-a-b-1.png"
+    ]  # fmt: skip
+
+
+def test_a_comparison_is_told_with_every_number(tmp_path):
+    for seed, (first, second) in enumerate(zip([3, 5, 7, 8, 9, 6, 5], [2, 3, 4, 4, 4, 7.5, 4.5], strict=True)):
+        add(tmp_path, "lqr", seed, float(first))
+        add(tmp_path, "convex", seed, float(second), failing=2)
+    found = report(tmp_path)
+    compared = compare(found, "controller=lqr", "controller=convex")
+    rmse, outside, failed = compared
+    assert [each.measure for each in compared] == ["rmse", "outside", "failed"]
+    assert (rmse.medians, rmse.quartiles, rmse.means) == ((6.0, 4.0), (0.75, 2.0, 3.5), (43 / 7, 29 / 7))
+    assert rmse.rank_biserial == pytest.approx((28 - 2 * 3) / 28)  # -1.5 has the third rank of 1 to 7
+    assert (outside.difference, outside.standardised, outside.rank_biserial, outside.interval) == (0, 0, 0, (0, 0))
+    assert (failed.difference, failed.interval, failed.standardised) == (-10, (-10, -10), -np.inf)
+    assert failed.rank_biserial == -1
+    assert np.isnan([failed.wilcoxon, failed.t_test]).all()
+    assert sentences(found, compared, "a", "b") == [
+        "A: a; B: b; pairs are seeds, what else was varied is averaged within a seed. Times are not compared.",
+        "RMSE [m]: no difference shown. Medians 6 and 4; differences 2 [0.75, 3.5]; Wilcoxon signed-rank p = 0.0781, "
+        "rank-biserial 0.79; mean difference 2 (95 %: -0.0507 to 4.05), paired t-test p = 0.0543, d_z 0.90; n = 7",
+        "steps outside bounds [%]: no difference shown. Medians 0 and 0; differences 0 [0, 0]; n = 7",
+        "failed solves [%]: undecided: every seed gave the same, so all are one; vary what the seed draws (data.size, "
+        "noise). Medians 0 and 10; differences -10 [-10, -10]; n = 7",
+    ]

@@ -1,16 +1,21 @@
 """What a run says at its end are the numbers of its metrics."""
 
 import io
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from gpmpc.exceptions import Diverged
+from gpmpc.mpc.controller import Timing
 from gpmpc.mpc.problem import Box
+from gpmpc.simulation import Rollout
+from gpmpc.status import Status
 from gpmpc.studies.document import terminal
-from gpmpc.studies.flight import summary
+from gpmpc.studies.flight import Experiment, Flown, metrics, summary
 from gpmpc.studies.run_folder import record
-from tests.studies.made_up import metrics_of
+from tests.studies.made_up import PLANT, metrics_of
 
 OPTIONS = {"trajectory": "lorenz", "system": "translational", "data": "excited", "controller": "convex"}
 
@@ -83,3 +88,73 @@ def test_states_are_counted_outside_the_tightest_bounds_that_all_boxes_have_now(
     assert (found["states"]["violations"], found["states"]["steps"]) == (outside, 20)
     assert found["states"]["rate"] == outside / 20
     assert "states" not in metrics_of(error)["violations"]
+
+
+def rollout_of(errors, **changes):
+    """A flight of ``PLANT`` so far from its reference along x, y and z [m], each row a state."""
+    errors, n = np.array(errors, dtype=float), 6
+    steps, references = len(errors) - 1, np.zeros((len(errors), n))
+    references[:, 0] = 0.5 * np.arange(len(errors))
+    states = references.copy()
+    states[:, ::2] += errors
+    timings = tuple(Timing(0.001 * (k + 1), 0.01, 0.1) for k in range(steps))
+    nothing = np.full((steps, n, n), np.nan)
+    return Rollout(**{
+        "states": states, "covariances": np.zeros((steps + 1, n, n)), "measured": states[:-1],
+        "inputs": np.linspace([1, 2, 3], [10, 11, 12], steps), "references": references,
+        "predicted_means": nothing[..., 0], "predicted_covariances": nothing, "statuses": (Status.SOLVED,) * steps,
+        "iterations": np.ones(steps, int), "timings": timings, "time_step": 0.2,
+    } | changes)  # fmt: skip
+
+
+def measured(rollout, training=None, diverged=None, before=(), system=PLANT):
+    problem = SimpleNamespace(inputs=Box(np.zeros(3), np.full(3, 10.0)), constraints=())
+    controller = SimpleNamespace(problem=problem, horizon=2)
+    experiment = Experiment(None, None, system, None, lambda plant: None, steps=len(rollout.inputs))
+    flown = Flown(rollout, controller, training, diverged, tuple(Flown(each, controller, None) for each in before))
+    return metrics(experiment, flown)
+
+
+def test_the_metrics_of_a_flight_are_written_out_in_full():
+    statuses = Status.SOLVED, Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.INFEASIBLE
+    solves = {"statuses": statuses, "suboptimal": (2,), "far_from_data": (0, 3), "iterations": np.array([1, 2, 3, 10])}
+    training = SimpleNamespace(posterior=range(7), evaluations=5, objective=np.array([1.5, 2.5]), seconds=0.25)
+    errors = [[9, 9, 9], [3, 0, 0], [0, 0, 4], [0, 0, 0], [0, 6, 0]]
+    episodes = rollout_of([[0, 0, 0], [0, 3, 0], [4, 0, 0]]), rollout_of([[0, 0, 0], [np.inf, 0, 0]])
+    found = measured(rollout_of(errors, **solves), training, before=episodes)
+    quantiles = {name: found["times"].pop(name) for name in ("model", "build", "solve", "total")}
+    violations = found.pop("violations")
+    assert found == {
+        "steps": 4,
+        "unit": "m",
+        "rmse": pytest.approx({"x": 1.5, "y": 3.0, "z": 2.0, "total": np.sqrt(61 / 4)}),
+        "error_at_end": pytest.approx(6.0),
+        "lost": None,
+        "failures": {"INFEASIBLE": 2},
+        "far_from_data": 2,
+        "suboptimal": {"ITERATION_LIMIT": 1},
+        "iterations": {"mean": 4.0, "largest": 10},
+        "training": {"size": 7, "evaluations": 5, "objective": [1.5, 2.5]},
+        "episodes": [pytest.approx(np.sqrt(12.5)), None],
+        "times": {"training": 0.25},
+    }
+    assert quantiles["model"] == pytest.approx({"median": 0.0025, "p95": 0.00385, "p99": 0.00397, "largest": 0.004})
+    assert {quantiles["build"]["median"], quantiles["solve"]["median"]} == {0.01, 0.1}
+    assert quantiles["total"]["largest"] == pytest.approx(0.114)
+    rate = violations["inputs"]
+    assert (rate["violations"], rate["steps"], rate["rate"], rate["worst"]) == (1, 4, 0.25, 2.0)
+    assert measured(rollout_of(errors))["training"] is None
+    assert measured(rollout_of(errors))["times"]["training"] is None
+
+
+def test_a_loss_is_told_from_the_first_step_beyond_and_a_divergence_besides():
+    errors = [[0, 0, 0], [0, 0, 9], [0, 0, 12], [0, 40, 0]]
+    far = "12 m from its reference, more than 10 m"
+    assert measured(rollout_of(errors))["lost"] == {"step": 2, "time": 0.4, "reason": far}
+    assert measured(rollout_of(errors[:2]))["lost"] is None
+    over = Diverged(7, "the plant's\n state is lost")
+    both = {"step": 2, "time": 0.4, "reason": f"{far}; step 7: the plant's state is lost"}
+    assert measured(rollout_of(errors), diverged=over)["lost"] == both
+    alone = measured(rollout_of(errors[:2]), diverged=over)
+    assert alone["lost"] == {"step": 7, "time": 1.4, "reason": "step 7: the plant's state is lost"}
+    assert (alone["rmse"], alone["error_at_end"]) == (dict.fromkeys(["x", "y", "z", "total"]), None)

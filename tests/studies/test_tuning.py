@@ -6,6 +6,8 @@ import pytest
 
 pytest.importorskip("optuna")
 
+from gpmpc.studies import tuning
+from gpmpc.studies.document import number
 from gpmpc.studies.tuning import Interval, Search
 
 SPACE = {"weight": Interval(1e-3, 1e3, logarithmic=True), "horizon": Interval(1, 30, whole=True), "kind": ["a", "b"]}
@@ -64,3 +66,60 @@ def test_importances_are_told_from_eight_finite_costs_on(finite, told):
     assert bool(search.importances()) == told
     titles = [table.title for table in search.document(None, "gpmpc run").tables]
     assert titles == ["Best candidates", "What mattered"][: 1 + told]
+
+
+@pytest.mark.parametrize(
+    ("space", "costs"),
+    [({"weight": Interval(0.0, 1.0)}, range(10)), (SPACE, [2.0] * 10)],
+    ids=["one setting", "equal costs"],
+)
+def test_nothing_matters_where_there_is_nothing_to_tell_apart(space, costs):
+    search = Search(space, 0)
+    search.ask(10)
+    search.tell([float(cost) for cost in costs])
+    assert search.importances() == {}
+
+
+def test_numbers_are_drawn_evenly_or_evenly_in_their_logarithm_and_whole_where_asked_for():
+    ranges = {
+        "even": Interval(1.0, 1e4), "log": Interval(1.0, 1e4, logarithmic=True),
+        "whole": Interval(1, 10**4, whole=True), "whole log": Interval(1, 10**4, logarithmic=True, whole=True),
+    }  # fmt: skip
+    search = Search(ranges, 0)
+    for _ in range(40):
+        search.ask(1)
+    for name, interval in ranges.items():
+        values = [candidate[name] for candidate in search.candidates]
+        below = sum(value < 100 for value in values)
+        assert 10 <= below <= 30 if interval.logarithmic else below < 5
+        assert {type(value) for value in values} == {int if interval.whole else float}
+
+
+def test_a_document_holds_the_ten_best_with_ties_in_their_order_and_everything_in_the_data(monkeypatch):
+    monkeypatch.setattr(tuning, "search_figure", lambda *arguments: arguments)
+    monkeypatch.setattr(tuning, "png", lambda drawn: drawn)
+    search = Search({"w.$x": Interval(0.0, 1.0), "n": Interval(1, 3, whole=True), "kind": ["a\n", "a\n"]}, 0)
+    search.ask(5)
+    search.tell([5.0, 2.0, math.inf, 2.0, 1234.5])
+    assert len(search.ask(7)) == 7
+    search.tell([6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0])
+    assert search.best == 1
+    monkeypatch.setattr(search, "importances", lambda: {"w.$x": 0.756, "n": 0.244})
+    document = search.document(0.01234, "gpmpc run a=1")
+    best, matter = document.tables
+    assert (best.title, [*best.header]) == ("Best candidates", ["candidate", "cost", "w.$x", "n", "kind"])
+    shown = [(1, "2"), (3, "2"), (0, "5"), *((i, str(i + 1)) for i in range(5, 12))]
+    of = search.candidates
+    assert best.rows == [[str(i), cost, number(of[i]["w.$x"]), str(of[i]["n"]), "a\\n"] for i, cost in shown]
+    assert (matter.title, matter.header) == ("What mattered", ["setting", "importance"])
+    assert matter.rows == [["w.$x", "76 %"], ["n", "24 %"]]
+    assert document.data.to_dict("records") == [{"candidate": i, "cost": search.costs[i], **of[i]} for i in range(12)]
+    assert document.lead == "12 candidates; cost of the best 2, of the settings as they are 0.0123."
+    assert document.code == {"To fly the best one": ["gpmpc run a=1"]}
+    assert document.images == {"tuning.png": (search.costs, {r"w.\$x": 0.756, "n": 0.244}, 0.01234)}
+    monkeypatch.setattr(search, "importances", dict)
+    search.costs[:] = [math.inf] * 12
+    nothing = search.document(None, "")
+    assert nothing.lead == "12 candidates; cost of the best lost or failed, of the settings as they are —."
+    assert [table.title for table in nothing.tables] == ["Best candidates"]
+    assert [row[:2] for row in nothing.tables[0].rows] == [[str(i), "lost or failed"] for i in range(10)]
