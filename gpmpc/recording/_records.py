@@ -103,6 +103,8 @@ def _sound_records(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
                         whole = False
                     else:
                         yield record
+        except RecordingError:
+            raise
         except _BROKEN:
             if kind not in (Opcode.ATTACHMENT, Opcode.METADATA):
                 return

@@ -103,6 +103,16 @@ def test_the_vehicle_is_seen_in_space_where_the_states_tell_about_it(shown):
         assert scene["topics"]["/plan/tube"]["visible"] == (flown != "rotational")
         assert scene["topics"]["/plan/path"]["visible"] == (flown != "translational")
         assert scene["followTf"] == ("display" if flown == "rotational" else "vehicle")
+        assert scene["followMode"] == ("follow-none" if flown == "rotational" else "follow-position")
+        assert scene["foxglovePanelTitle"] == ("attitude" if flown == "rotational" else "plan and 2-sigma tube")
+        grid = scene["layers"]["grid"]
+        assert grid["size"] == grid["divisions"] == (4 if flown == "rotational" else 40)
+        assert scene["cameraState"]["distance"] == (3 if flown == "rotational" else 25)
+        assert (made["layout"]["splitPercentage"], made["layout"]["first"]["splitPercentage"]) == (50, 78)
+    else:
+        assert made["layout"] == {
+            "direction": "row", "first": "RosOut!log", "second": "Tab!plots", "splitPercentage": 25
+        }  # fmt: skip
 
 
 def test_the_shipped_layout_is_that_of_the_translational_quadrotor(tmp_path):
@@ -116,3 +126,24 @@ def test_titles_have_units_and_bounds_are_drawn_only_where_there_are_any(tmp_pat
     assert panels["Plot!state-vx"]["foxglovePanelTitle"] == "vx [m/s]"
     assert panels["Plot!input-F"]["foxglovePanelTitle"] == "F"
     assert len(panels["Plot!input-F"]["paths"]) == 1
+
+
+def test_states_stand_below_each_other_in_tabs_by_what_they_are(shown):
+    flown, _, made = shown
+    tabs = {tab["title"]: tab["layout"] for tab in made["configById"]["Tab!plots"]["tabs"]}
+    grouped = {
+        "translational": ["Position", "Rates"], "rotational": ["Attitude", "Rates"],
+        "whole": ["Position", "Attitude", "Rates"], "pendulum": ["States"],
+    }[flown]  # fmt: skip
+    assert [*tabs] == [*grouped, "Inputs", "Uncertainty", "Solver"]
+    uncertain = [panel for panel in made["configById"] if re.match("Plot!(expected|innovation)-", panel)]
+    kinds = [f"Plot!{kind}-{title.lower()}" for title in grouped[:2] for kind in ("expected", "innovation")]
+    assert uncertain == kinds
+    first, rest, shares = tabs["Solver"]["first"], tabs["Solver"]["second"], []
+    for node in (tabs["Solver"], rest):
+        assert node["direction"] == "column"
+        shares.append(node["splitPercentage"])
+    assert (first, shares, rest["first"]) == ("Plot!timing", [33.33, 50.0], "Plot!iterations")
+    dashed = {line["value"].split(".")[1] for panel in made["configById"].values() for line in panel.get("paths", ())
+              if line.get("lineStyle") == "dashed"}  # fmt: skip
+    assert dashed == {"reference", "input_lower", "input_upper"}

@@ -7,8 +7,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from gpmpc.exceptions import SettingError, ShapeError
-from gpmpc.recording import RecordedSystem, _recorder, layout, read_run, recover
+from gpmpc.exceptions import RecordingError, SettingError, ShapeError
+from gpmpc.recording import RecordedSystem, _reader, _recorder, _records, layout, read_run, recover
 from gpmpc.status import Status
 from gpmpc.systems import rotational, translational
 from tests.recording import runs
@@ -205,3 +205,26 @@ def test_a_layout_of_one_state_has_no_tab_for_what_is_not_there(tmp_path):
     assert '"title": "States"' in text
     for title in ("Position", "Attitude", "Rates"):
         assert f'"title": "{title}"' not in text
+
+
+def test_what_a_file_may_unfold_to_is_counted_to_the_byte(path, monkeypatch):
+    assert _records.room(path) == 64 * 2**20 + 300 * path.stat().st_size
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        data = [message.data for *_, message in reader.iter_messages()]
+        summary = reader.get_summary()
+    data += [schema.data for schema in summary.schemas.values()] + [b""] * len(summary.channels)
+    room = sum(2000 + len(each) for each in data)
+    monkeypatch.setattr(_records, "room", lambda _: room)
+    assert len([*_records.whole_records(path)]) > len(data)
+    monkeypatch.setattr(_records, "room", lambda _: room - 1)
+    with pytest.raises(RecordingError, match=r"run\.mcap: its chunks unfold to more than 0 MB"):
+        list(_records.whole_records(path))
+    rows, (H, n, m) = 2, (5, 6, 3)
+    needed = 8 * rows * (H + 1) * (n + n + n * n + m)  # of means, deviations, covariances and inputs
+    monkeypatch.undo()
+    monkeypatch.setattr(_reader, "room", lambda _: needed)
+    assert read_run(path).plan_means.shape == (rows, H + 1, n)
+    monkeypatch.setattr(_reader, "room", lambda _: needed - 1)
+    with pytest.raises(RecordingError, match="a plan of 5 stages would make arrays of 0 MB with the others"):
+        read_run(path)
