@@ -23,8 +23,7 @@ from benchmarks.quadrotor import HOVER, TRAJECTORIES, Asked, problem, recorded, 
 from benchmarks.timing import write_results
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.controller import Decision, Request, Timing
+from gpmpc.mpc import Decision, PredictionSettings, Request, Timing
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.status import Status

@@ -24,8 +24,7 @@ from gpmpc.estimation import KalmanFilter, Measurement
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.models import DisturbedModel
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.controller import Decision, Reference
+from gpmpc.mpc import Decision, PredictionSettings, Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Tracking
 from gpmpc.propagation import Linearization

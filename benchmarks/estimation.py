@@ -23,7 +23,6 @@ import numpy as np
 import torch
 
 from benchmarks.timing import write_results
-from gpmpc.dynamics import Linearized
 from gpmpc.estimation import (
     KalmanFilter,
     Measurement,
@@ -34,9 +33,8 @@ from gpmpc.estimation import (
 )
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
-from gpmpc.models import Affine, DelayedModel, DisturbedModel, ResidualModel
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.controller import Reference
+from gpmpc.models import Affine, DelayedModel, DisturbedModel, Linearized, ResidualModel
+from gpmpc.mpc import PredictionSettings, Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization

@@ -2,7 +2,7 @@
 
     .venv/bin/python -m benchmarks.floor [--sizes 100 189 500 1000 2000]
 
-One process, one thread, process CPU time. The floor counts the arithmetic that ``gpmpc.kernels`` has to issue for a
+One process, one thread, process CPU time. The floor counts the arithmetic that ``gpmpc._kernels`` has to issue for a
 pair of points and of outputs, in registers of eight numbers, and divides it by the rate at which this machine, in the
 same process, issues independent multiply-adds from registers. Loads, stores, loops and everything that grows slower
 than N^2 are not in it: this is the arithmetic floor, to which ``ratio`` refers. ``streamed`` is what reading the two
@@ -23,10 +23,10 @@ import numpy as np
 import torch
 
 from benchmarks.timing import write_results
-from gpmpc import kernels
-from gpmpc.compiled import compiled
+from gpmpc import _kernels as kernels
+from gpmpc._compiled import compiled
+from gpmpc._kernels._simd import load, store
 from gpmpc.gp import GPPosterior
-from gpmpc.kernels._simd import load, store
 
 STATES, INPUTS, LANES = 6, 3, 8
 # Vector instructions for eight pairs of points, R states:

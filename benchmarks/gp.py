@@ -17,10 +17,9 @@ import numpy as np
 import torch
 
 from benchmarks.timing import describe, machine, markdown_table, time_interleaved, write_results
-from gpmpc import kernels
+from gpmpc import _kernels as kernels
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import GPPosterior
-from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
+from gpmpc.gp import GPPosterior, exact_inference, to_gpytorch
 from gpmpc.propagation._moments import moments
 
 STATES, INPUTS = 6, 3

@@ -4,8 +4,9 @@ import gpytorch
 import numpy as np
 import torch
 
+from gpmpc.gp import exact_inference
+from gpmpc.gp._gpytorch import BatchExactGP
 from gpmpc.gp._kernel import centred
-from gpmpc.gp.gpytorch_ import BatchExactGP, exact_inference
 
 
 class GPyTorchLikelihood:

@@ -20,10 +20,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gpmpc.dynamics import DynamicsModel, predict_with_jacobian
+from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Reference
+from gpmpc.models import DynamicsModel
+from gpmpc.mpc import Reference
 from gpmpc.mpc.problem import Problem
 
 Array = np.ndarray

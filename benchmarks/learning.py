@@ -23,11 +23,10 @@ from matplotlib.figure import Figure
 
 from benchmarks.quadrotor import DATA, HOVER, NOISE, OUTER, TRAINER, TRAJECTORIES, problem, trained
 from benchmarks.timing import write_results
-from gpmpc.files import write_whole
+from gpmpc._files import write_whole
 from gpmpc.gp import GPPosterior
 from gpmpc.learning import LearningController, OnlineLearning
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.controller import Controller
+from gpmpc.mpc import Controller, PredictionSettings
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization

@@ -71,8 +71,7 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
 
     from gpmpc.gaussian import Gaussian
     from gpmpc.gp import load_posterior
-    from gpmpc.mpc import PredictionSettings
-    from gpmpc.mpc.controller import Reference
+    from gpmpc.mpc import PredictionSettings, Reference
     from gpmpc.mpc.gp_mpc import GPMPC
     from gpmpc.mpc.problem import Box, Problem, Tracking
     from gpmpc.propagation import Linearization

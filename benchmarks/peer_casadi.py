@@ -15,10 +15,10 @@ import casadi
 import numpy as np
 
 from benchmarks.kkt import Instance
+from gpmpc._interrupts import interrupts_after
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.casadi_ import casadi_function
-from gpmpc.interrupts import interrupts_after
 from gpmpc.mpc.problem import Problem
 
 Array = np.ndarray

@@ -10,9 +10,8 @@ import numpy as np
 
 from benchmarks.peer_do_mpc import MISSING
 from gpmpc.exceptions import SettingError
-from gpmpc.qp import QPSolution, QuadraticProgram
-from gpmpc.qp.problem import ABSENT
-from gpmpc.qp.solution import make_solution
+from gpmpc.qp import QPSolution, QuadraticProgram, make_solution
+from gpmpc.qp._problem import ABSENT
 from gpmpc.status import Status
 
 STATUSES = {1: Status.SOLVED, 2: Status.SOLVED, -1: Status.INFEASIBLE, -4: Status.ITERATION_LIMIT}  # of its exit flags

@@ -14,9 +14,9 @@ import numpy as np
 
 from benchmarks.kkt import Instance
 from benchmarks.peer_casadi import IPOPT_WARM, MAX_ITERATIONS, check_problem, mean_function
+from gpmpc._interrupts import interrupts_after
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
-from gpmpc.interrupts import interrupts_after
 from gpmpc.mpc.problem import Problem
 
 MISSING = "not installed: pip install 'gpmpc[bench]'"

@@ -14,8 +14,7 @@ from scipy.optimize import minimize
 
 from benchmarks.kkt import Instance
 from benchmarks.peer_casadi import check_problem
-from gpmpc.gp import GPPosterior
-from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
+from gpmpc.gp import GPPosterior, exact_inference, to_gpytorch
 from gpmpc.mpc.problem import Problem
 
 

@@ -40,8 +40,7 @@ from benchmarks.timing import (
     write_results,
 )
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.controller import Controller, Decision, Timing
+from gpmpc.mpc import Controller, Decision, PredictionSettings, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization

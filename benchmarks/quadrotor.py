@@ -9,7 +9,7 @@ import torch
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, standardize
-from gpmpc.mpc.controller import Controller, Decision, Reference
+from gpmpc.mpc import Controller, Decision, Reference
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.simulation import Noise, closed_loop
 from gpmpc.systems import rotational, translational

@@ -26,7 +26,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.timing import write_results
-from gpmpc.mpc.controller import Decision, Timing
+from gpmpc.mpc import Decision, Timing
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.recording import McapRecorder, RecordedSystem, Step
 from gpmpc.status import Status

@@ -20,9 +20,8 @@ import numpy as np
 import torch
 
 from benchmarks.quadrotor import HOVER, INNER, NOISE, OUTER, STATE_BOUNDS, TRAJECTORIES, problem, trained
-from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc import Controller, PredictionSettings
 from gpmpc.mpc.baselines import LQR, NMPC, StateFormMPC
-from gpmpc.mpc.controller import Controller
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching

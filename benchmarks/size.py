@@ -115,7 +115,7 @@ class House:
         for module, tree in self.trees.items():
             if not _is_private(module):
                 exported = {node.value for part in tree.body if _assigns_all(part) for node in _strings(part)}
-                for part in (part for part in tree.body if isinstance(part, ast.ImportFrom)):
+                for part in _import_statements(tree.body):
                     source = self.trees.get(part.module or "") if _is_private(part.module or "") else None
                     defined = {*_functions_and_classes(source.body)} if source else set()
                     found += [f"{module}.{alias.name}" for alias in part.names if alias.name in defined & exported]
@@ -186,6 +186,14 @@ def _assigns_all(part: ast.stmt) -> bool:
 
 def _strings(part: ast.stmt) -> Iterator[ast.Constant]:
     return (node for node in ast.walk(part) if isinstance(node, ast.Constant) and isinstance(node.value, str))
+
+
+def _import_statements(body: list[ast.stmt]) -> Iterator[ast.ImportFrom]:
+    for part in body:
+        if isinstance(part, ast.ImportFrom):
+            yield part
+        elif isinstance(part, ast.If):  # for type checkers alone: what a package loads at its first use
+            yield from _import_statements(part.body)
 
 
 def _functions_and_classes(body: list[ast.stmt]) -> Iterator[str]:

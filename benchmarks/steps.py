@@ -22,8 +22,7 @@ from benchmarks.pendulums import pendulum_gp, pendulum_plant, pendulum_reference
 from benchmarks.timing import RESULTS, describe, machine, markdown_table, time_interleaved, write_results
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.controller import Controller, Decision, Reference
+from gpmpc.mpc import Controller, Decision, PredictionSettings, Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.plotting import png

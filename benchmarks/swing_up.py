@@ -24,7 +24,7 @@ from gpmpc.cli._run import experiment_of
 from gpmpc.cli._settings import compose, settings
 from gpmpc.gp import Transitions
 from gpmpc.mpc.problem import Tracking
-from gpmpc.studies.document import Table, terminal
+from gpmpc.studies._document import Table, terminal
 from gpmpc.studies.flight import Experiment, run_trial
 from gpmpc.studies.study import one_thread
 from gpmpc.systems import System

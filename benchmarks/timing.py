@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from gpmpc._provenance import processor, provenance
 from gpmpc.exceptions import check_number
-from gpmpc.provenance import processor, provenance
 
 FLUSH_BYTES = 64 * 2**20  # walked through before a flushed call: more than any core's own caches
 WARM_UP_CALLS = 2  # not counted: what is compiled, loaded or allocated once

@@ -52,7 +52,7 @@ def main() -> None:
         finished = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
         results.append(case | json.loads(finished.stdout.splitlines()[-1]))
         print(described(results[-1]), flush=True)
-    from gpmpc.provenance import provenance
+    from gpmpc._provenance import provenance
 
     settings.out.mkdir(parents=True, exist_ok=True)
     meta = provenance() | {"threads": settings.threads, "load": os.getloadavg()[0], "left out": left_out}

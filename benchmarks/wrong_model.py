@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
 from benchmarks.timing import write_results
-from gpmpc.files import write_whole
+from gpmpc._files import write_whole
 from gpmpc.metrics import tracking_error
 from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.gp_mpc import GPMPC

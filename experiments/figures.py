@@ -29,14 +29,13 @@ from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.experiments.subsystems import SCALINGS, SYSTEMS, check_subsystems
 from gpmpc.gp import Scaling, Transitions
 from gpmpc.metrics import tracking_error, violation_rate
-from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc import Controller, PredictionSettings, Reference
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.controller import Controller, Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.problem import Box, Constraint, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import ModelLoop, Noise, Rollout, closed_loop, rehearse
-from gpmpc.studies.document import Document, Table
+from gpmpc.studies._document import Document, Table
 from gpmpc.studies.study import (
     Trial,
     check_workers,

@@ -11,7 +11,7 @@ import pandas as pd
 
 from gpmpc.metrics import binomial_interval, time_quantiles
 from gpmpc.plotting import Curve, over_settings, png, tracking
-from gpmpc.studies.document import MISSING, Document, Table, number
+from gpmpc.studies._document import MISSING, Document, Table, number
 
 ERRORS = ("x - reference [m]", "y - reference [m]", "z - reference [m], downwards")
 POSITIONS, ANGLES = ("x [m]", "y [m]", "z, downwards [m]"), ("roll [rad]", "pitch [rad]", "yaw [rad]")

@@ -25,9 +25,9 @@ import pandas as pd
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.metrics import tracking_cost, tracking_error
-from gpmpc.mpc.controller import Controller, Decision, Reference
+from gpmpc.mpc import Controller, Decision, Reference
 from gpmpc.plotting import png, quality
-from gpmpc.studies.document import MISSING, Document, Table, number
+from gpmpc.studies._document import MISSING, Document, Table, number
 from gpmpc.studies.flight import Experiment, run_trial
 from gpmpc.studies.study import Trial, check_workers, fingerprint, read_model, trained_model
 from gpmpc.trajectories import Trajectory

@@ -27,8 +27,8 @@ import pandas
 import torch
 from scipy.optimize import least_squares
 
+from gpmpc._files import write_whole
 from gpmpc.exceptions import GpmpcError, SettingError
-from gpmpc.files import write_whole
 from gpmpc.gp import GPPosterior, Trainer, Transitions, informative_points, standardize
 from gpmpc.models import Affine, CasadiFunction, Features, KnownModel, ResidualModel, load_model, save_model
 from gpmpc.mpc import (

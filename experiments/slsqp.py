@@ -18,10 +18,12 @@ import torch
 from scipy.linalg import block_diag, solve_triangular
 from scipy.optimize import minimize
 
-from gpmpc.dynamics import DynamicsModel, check_next_states, tensors_for, to_array
+from gpmpc._dynamics import check_next_states, tensors_for, to_array
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Decision, Reference, Request, Timing, check_controller
+from gpmpc.models import DynamicsModel
+from gpmpc.mpc import Decision, Reference, Request, Timing
+from gpmpc.mpc._controller import check_controller
 from gpmpc.mpc.problem import Box, Problem
 from gpmpc.propagation import Propagator, differentiate
 from gpmpc.status import Status

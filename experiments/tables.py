@@ -34,7 +34,7 @@ from gpmpc.gp import GPPosterior, Scaling, Training, Transitions
 from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
 from gpmpc.plotting import error_over_size, png
 from gpmpc.propagation import MomentMatching
-from gpmpc.studies.document import MISSING, Document, Table, number, with_range
+from gpmpc.studies._document import MISSING, Document, Table, number, with_range
 from gpmpc.studies.study import Trial, check_workers, derived_seed, fingerprint, random_rows
 from gpmpc.trajectories import Trajectory
 

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import DynamicsModel
+from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.transitions import Transitions
+from gpmpc.gp import Transitions
 from gpmpc.metrics import binomial_interval, interval_coverage, mean_squared_error, negative_log_predictive_density
 from gpmpc.propagation import Propagator, best_propagator
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:  # recordings are read without torch
-    from gpmpc.mpc.controller import Decision
+    from gpmpc.mpc import Decision
     from gpmpc.status import Status
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numba
 import pytest
 
-import gpmpc.compiled
+import gpmpc._compiled
 
 ROOT = Path(__file__).resolve().parents[1]
 KERNEL = """
-from gpmpc.compiled import compiled
+from gpmpc._compiled import compiled
 from tiny.callee import double
 @compiled
 def kernel(x):
@@ -20,7 +20,7 @@ def kernel(x):
 print(kernel(1.0), sum(kernel.stats.cache_hits.values()))
 """
 CALLEE = """
-from gpmpc.compiled import inline_njit
+from gpmpc._compiled import inline_njit
 from tiny import (
     constants,  # a module
 )
@@ -66,7 +66,7 @@ def test_machine_code_is_used_again_until_a_file_that_went_into_it_changes(packa
 
 MOVED = """
 from typing import NamedTuple
-from gpmpc.compiled import compiled
+from gpmpc._compiled import compiled
 from {module} import Pair
 @compiled
 def kernel(pair):
@@ -87,7 +87,7 @@ def test_machine_code_for_a_class_that_has_moved_is_compiled_anew(package):
 OWN = """
 import math
 import os
-from gpmpc.compiled import compiled
+from gpmpc._compiled import compiled
 FACTOR = float(os.environ["FACTOR"])
 @compiled
 def callee(x):  # too long to be put into its caller
@@ -131,12 +131,12 @@ def test_where_nothing_can_be_kept_kernels_are_compiled_all_the_same(package):
 
 
 def test_the_stamp_of_a_kernel_covers_constants_and_callees_and_spares_the_rest():
-    import gpmpc.qp.dual_active_set
-    import gpmpc.qp.primal_active_set
+    import gpmpc.qp._dual_active_set
+    import gpmpc.qp._primal_active_set
 
     def covered(module):
-        before = gpmpc.compiled.sources_stamp(module)
-        read, changed = gpmpc.compiled._read_source, set()
+        before = gpmpc._compiled.sources_stamp(module)
+        read, changed = gpmpc._compiled._read_source, set()
         for name in [name for name in sys.modules if name.startswith("gpmpc.")]:
             file = getattr(sys.modules[name], "__file__", None)
 
@@ -144,22 +144,22 @@ def test_the_stamp_of_a_kernel_covers_constants_and_callees_and_spares_the_rest(
                 digest, imported = read(path)
                 return (digest[::-1] if path == file else digest), imported
 
-            gpmpc.compiled._read_source = edited
+            gpmpc._compiled._read_source = edited
             try:
-                if gpmpc.compiled.sources_stamp(module) != before:
+                if gpmpc._compiled.sources_stamp(module) != before:
                     changed.add(name)
             finally:
-                gpmpc.compiled._read_source = read
+                gpmpc._compiled._read_source = read
         return changed
 
     kernels = covered("gpmpc.qp._dual_kernels")
     assert {f"gpmpc.qp._{name}" for name in ("dual_iteration", "triangular", "workspace", "record")} <= kernels
-    assert {"gpmpc.compiled", "gpmpc.kernels._simd"} <= kernels
-    assert not {"gpmpc.qp", "gpmpc.qp.dual_active_set", "gpmpc.qp.primal_active_set"} & kernels
+    assert {"gpmpc._compiled", "gpmpc._kernels._simd"} <= kernels
+    assert not {"gpmpc.qp", "gpmpc.qp._dual_active_set", "gpmpc.qp._primal_active_set"} & kernels
 
 
 def test_numba_still_has_the_private_parts_that_are_used_here():
-    """Where one has moved, see ``gpmpc.compiled``: kernels compile for longer, and edits of other files go unseen."""
+    """Where one has moved, see ``gpmpc._compiled``: kernels compile for longer, and edits of other files go unseen."""
     from numba.core.codegen import JITCodeLibrary
     from numba.core.compiler import Compiler
     from numba.core.cpu import CPUTargetOptions
@@ -170,38 +170,38 @@ def test_numba_still_has_the_private_parts_that_are_used_here():
     assert callable(Compiler.define_pipelines)
     assert all(hasattr(CPUTargetOptions, option) for option in ("_nrt", "no_cfunc_wrapper", "no_cpython_wrapper"))
 
-    @gpmpc.compiled.njit_noalloc
+    @gpmpc._compiled.njit_noalloc
     def inner(x):
         return 2.0 * x
 
-    @gpmpc.compiled.compiled
+    @gpmpc._compiled.compiled
     def kernel(x):
         return inner(x) + 1.0
 
     assert kernel._cache._cache_file._version.startswith(f"{numba.__version__} ")
     assert (kernel(1.0), inner(1.0)) == (3.0, 2.0)  # as a part of the kernel, and in Python
-    anew = numba.njit(**gpmpc.compiled._PRIVATE_OPTIONS[True])(kernel.py_func)  # ``kernel`` may have been loaded
+    anew = numba.njit(**gpmpc._compiled._PRIVATE_OPTIONS[True])(kernel.py_func)  # ``kernel`` may have been loaded
     anew(1.0)
     library = anew.overloads[anew.signatures[0]].library
-    assert type(library) is gpmpc.compiled._KernelLibrary
-    assert gpmpc.compiled._InnerLibrary in {type(part) for part in library._linking_libraries}
-    assert gpmpc.compiled.unchecked_entry_point(kernel) is kernel.overloads[kernel.signatures[0]].entry_point
+    assert type(library) is gpmpc._compiled._KernelLibrary
+    assert gpmpc._compiled._InnerLibrary in {type(part) for part in library._linking_libraries}
+    assert gpmpc._compiled.unchecked_entry_point(kernel) is kernel.overloads[kernel.signatures[0]].entry_point
 
 
 def test_without_numbas_private_parts_kernels_compile_in_its_own_way(monkeypatch):
-    monkeypatch.setattr(gpmpc.compiled, "_PRIVATE_OPTIONS", {True: {}, False: {}})
-    monkeypatch.setattr(gpmpc.compiled, "_NRT_OPTION", False)
+    monkeypatch.setattr(gpmpc._compiled, "_PRIVATE_OPTIONS", {True: {}, False: {}})
+    monkeypatch.setattr(gpmpc._compiled, "_NRT_OPTION", False)
 
-    @gpmpc.compiled.njit_noalloc
+    @gpmpc._compiled.njit_noalloc
     def inner(x):
         return 2.0 * x
 
-    @gpmpc.compiled.compiled(allocates=False)
+    @gpmpc._compiled.compiled(allocates=False)
     def kernel(x):
         return inner(x) + 1.0
 
     assert kernel(1.0) == 3.0
-    assert gpmpc.compiled.unchecked_entry_point(print) is print
+    assert gpmpc._compiled.unchecked_entry_point(print) is print
 
 
 def test_another_numba_caches_in_its_own_way(monkeypatch):
@@ -209,4 +209,4 @@ def test_another_numba_caches_in_its_own_way(monkeypatch):
         """Without the private parts."""
 
     monkeypatch.setattr(numba, "njit", lambda **options: lambda function: Kernel())
-    assert isinstance(gpmpc.compiled.compiled(len), Kernel)
+    assert isinstance(gpmpc._compiled.compiled(len), Kernel)

@@ -6,7 +6,7 @@ import time
 import numba
 import pytest
 
-from gpmpc.compiling import report_compilation
+from gpmpc._compiling import report_compilation
 
 
 def test_compiling_is_told_once_with_its_time_and_a_call_of_what_is_compiled_is_not(capsys):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc._interrupts import interrupts_after
 from gpmpc.gaussian import Gaussian
-from gpmpc.interrupts import interrupts_after
+from gpmpc.mpc import Reference
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.systems import System, Translational
 

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from gpmpc import metrics
-from gpmpc.dynamics import predict_with_jacobian
+from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, Transitions, append_points, train
 from gpmpc.models import Affine, ResidualModel
+from gpmpc.mpc import Reference
 from gpmpc.mpc.baselines import StateFormMPC
-from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching, rollout

@@ -24,7 +24,7 @@ from gpmpc.exceptions import GpmpcError
 
 def _version(given: argparse.Namespace) -> Result:
     """Prints what a report of a bug needs: versions, the BLAS library, the processor."""
-    from gpmpc.provenance import environment
+    from gpmpc._provenance import environment
 
     data = environment()
     print("\n".join(f"{name:10}{value}" for name, value in data.items()))
@@ -84,7 +84,7 @@ def main() -> None:
     with redirected_output("error" if "--json" in flags else "nowhere" if "--quiet" in flags else "output"):
         result = _run(arguments, debug="--debug" in flags)
     if "--json" in flags:
-        from gpmpc.studies.document import json_text
+        from gpmpc.studies._document import json_text
 
         print(json_text(result.data), end="")
     if result.code:

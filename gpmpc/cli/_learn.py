@@ -6,12 +6,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gpmpc._files import write_whole
 from gpmpc.cli._settings import Command, Parser, Result, write_files, writing
-from gpmpc.files import write_whole
 
 if TYPE_CHECKING:
     from gpmpc.logs import Judgement, Learned, Log
-    from gpmpc.studies.document import Document
+    from gpmpc.studies._document import Document
 
 _MODEL = "model.safetensors"
 
@@ -35,7 +35,7 @@ def _learn(given: argparse.Namespace) -> Result:
     from rich.console import Console
 
     from gpmpc.logs import judge, learn, read_log, save_learned
-    from gpmpc.studies.document import terminal
+    from gpmpc.studies._document import terminal
     from gpmpc.studies.study import fingerprint
 
     console, folder = Console(soft_wrap=True, highlight=False, markup=False), given.to
@@ -96,7 +96,7 @@ class _FileMemory(dict[str, Any]):
 def _report(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Log") -> "Document":
     """Makes the report: errors beside the baselines, coverage and width, and every candidate."""
     from gpmpc.plotting import judgement_figure, png
-    from gpmpc.studies.document import Document, Table, number
+    from gpmpc.studies._document import Document, Table, number
 
     groups = [f"{group} [{unit}]" for group, unit in zip(judgement.groups, judgement.units, strict=True)]
     errors, intervals = [], []
@@ -137,8 +137,8 @@ def _card(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "L
     """Makes the model card: data, ranges, what was left out, what is learned and why, and what must not be trusted."""
     import pandas as pd
 
-    from gpmpc.provenance import provenance
-    from gpmpc.studies.document import Document, Table
+    from gpmpc._provenance import provenance
+    from gpmpc.studies._document import Document, Table
 
     names, outputs = [*train.space.names, *train.input_names], learned.model.kinematics.output_names
     # An affine map has many parameters, and no standard errors.

@@ -61,7 +61,7 @@ def _info(file: Path) -> Result:
     from rich.console import Console
 
     from gpmpc.recording import read_run
-    from gpmpc.studies.document import Table, plain_text, terminal
+    from gpmpc.studies._document import Table, plain_text, terminal
 
     run, console = read_run(file), Console()
     facts = _facts(run)
@@ -125,7 +125,7 @@ def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:
 
     from gpmpc.logs import LogMapping, inspect_log
     from gpmpc.plotting import inspection_figure, png
-    from gpmpc.studies.document import Document, Table, terminal
+    from gpmpc.studies._document import Document, Table, terminal
 
     mapping = LogMapping.load(mapping_file) if mapping_file else None
     found = inspect_log(file, mapping)
@@ -157,7 +157,7 @@ def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:
 
 
 def _write(output: Path, content: str | bytes) -> None:
-    from gpmpc.files import write_whole
+    from gpmpc._files import write_whole
 
     with writing(output, "output"):
         write_whole(output, content)

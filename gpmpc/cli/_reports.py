@@ -33,7 +33,7 @@ def _report(given: argparse.Namespace) -> Result:
     """Writes a tree of runs as one table with figures, and whether two groups of them differ."""
     from rich.console import Console
 
-    from gpmpc.studies.document import terminal
+    from gpmpc.studies._document import terminal
     from gpmpc.studies.report import compare, notes, read_report, report_document, sentences, terminal_table
 
     console, folder = Console(), given.to or given.tree / "report"
@@ -60,7 +60,7 @@ def _add_plot_arguments(parser: Parser) -> None:
 
 def _recordings(run: Path) -> list[Path]:
     """Returns the recordings that are meant by a run's folder, by one above it, or by a file."""
-    from gpmpc.studies.run_folder import RECORDING
+    from gpmpc.studies._run_folder import RECORDING
 
     paths = [run / RECORDING if run.is_dir() else run]
     if run.is_dir() and not paths[0].exists():
@@ -135,7 +135,7 @@ def _calibrate(given: argparse.Namespace) -> Result:
     from gpmpc.calibration import Recording, calibrate
     from gpmpc.plotting import calibration_figure, png
     from gpmpc.recording import read_run
-    from gpmpc.studies.document import Document, Table, terminal
+    from gpmpc.studies._document import Document, Table, terminal
     from gpmpc.studies.study import one_thread
 
     check_number("--steps", given.steps, least=1, whole=True)

@@ -20,15 +20,15 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+from gpmpc._provenance import flattened
 from gpmpc.cli._settings import Command, Result, folder_of, one_line, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
-from gpmpc.provenance import flattened
 
 if TYPE_CHECKING:
     from gpmpc.recording import McapRecorder
+    from gpmpc.studies._run_folder import RunFolder
     from gpmpc.studies.flight import Experiment
-    from gpmpc.studies.run_folder import RunFolder
     from gpmpc.systems import System
 
 
@@ -44,8 +44,8 @@ def _run(config: DictConfig) -> Result:
     """Flies, prints the results and where they are kept; the task behind ``conf/run.yaml``."""
     from rich.console import Console
 
-    from gpmpc.compiling import report_compilation
-    from gpmpc.studies.document import terminal
+    from gpmpc._compiling import report_compilation
+    from gpmpc.studies._document import terminal
     from gpmpc.studies.flight import summary
 
     console = Console()
@@ -63,7 +63,7 @@ def _run(config: DictConfig) -> Result:
 
 def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
     """Flies one run; an error is kept in its folder and returned as ``error``."""
-    from gpmpc.studies.run_folder import RunFolder, folder_name, record
+    from gpmpc.studies._run_folder import RunFolder, folder_name, record
     from gpmpc.studies.study import one_thread
 
     overrides = choices(HydraConfig.get().overrides.task)
@@ -101,8 +101,8 @@ def _was_interrupted(error: BaseException | None) -> bool:
 
 def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
     """Trains, flies and records; returns the metrics."""
+    from gpmpc.studies._run_folder import RECORDING
     from gpmpc.studies.flight import metrics, run_trial
-    from gpmpc.studies.run_folder import RECORDING
 
     if config.recorder != "mcap":
         return metrics(experiment, run_trial(experiment))

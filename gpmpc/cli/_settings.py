@@ -89,7 +89,7 @@ def writing(folder: Path, key: str = "folder") -> Iterator[None]:
 
 def write_files(folder: Path, files: Mapping[str, str | bytes], key: str = "folder") -> str:
     """Writes files, each in one piece, and makes the folder; returns the line that says so."""
-    from gpmpc.files import write_whole
+    from gpmpc._files import write_whole
 
     with writing(folder, key):
         for name, content in files.items():

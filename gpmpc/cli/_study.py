@@ -27,8 +27,8 @@ _SHORT = ("data.samples=12", "model.restarts=0", "steps=2", "horizon=3")
 
 def _run(config: DictConfig) -> Result:
     """Runs what is missing of a study, writes its documents and prints its tables."""
-    from gpmpc.provenance import provenance
-    from gpmpc.studies.document import json_text, terminal
+    from gpmpc._provenance import provenance
+    from gpmpc.studies._document import json_text, terminal
     from gpmpc.studies.study import TrialStore, run_study
 
     settings, console = plain_data(config), logging_console()
@@ -85,7 +85,7 @@ def _warmup(given: argparse.Namespace) -> Result:
     """Flies two steps with every controller on a learned model, and prints how long that took."""
     from rich.console import Console
 
-    from gpmpc.compiling import report_compilation
+    from gpmpc._compiling import report_compilation
     from gpmpc.studies.flight import run_trial
 
     console, began = Console(), time.perf_counter()

@@ -34,13 +34,13 @@ from hydra.core.plugins import Plugins
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from gpmpc._compiling import report_compilation
 from gpmpc.cli._run import ASIDE, choices, experiment_of, plain_settings, run_one
 from gpmpc.cli._settings import Command, Parser, Result, folder_of, group_options, without_hydra, write_files
 from gpmpc.cli._terminal import print_error, progress_bar
-from gpmpc.compiling import report_compilation
 from gpmpc.exceptions import GpmpcError, RecordingError, SettingError, check_number
 from gpmpc.parallel import THREADS, children_ignore_interrupts, end_with
-from gpmpc.studies.run_folder import PLAN, Busy, RunFolder, folder_name
+from gpmpc.studies._run_folder import PLAN, Busy, RunFolder, folder_name
 
 if TYPE_CHECKING:
     from gpmpc.studies.tuning import Interval
@@ -199,7 +199,7 @@ def tune(given: Namespace, name: str) -> Result:
     """Searches, and writes the candidates, a figure of what mattered and the best settings."""
     from rich.console import Console
 
-    from gpmpc.studies.document import terminal
+    from gpmpc.studies._document import terminal
     from gpmpc.studies.tuning import Search
 
     for key in ("trials", "batch", "seeds"):
@@ -298,7 +298,7 @@ def _cost(job: Job, controller: Mapping[str, Any]) -> float:
     """Returns the cost of a run with the weights of a controller; infinite where it was lost or failed."""
     from gpmpc.metrics import tracking_cost
     from gpmpc.recording import read_run
-    from gpmpc.studies.run_folder import RECORDING
+    from gpmpc.studies._run_folder import RECORDING
 
     if not job.folder.finished or job.folder.result().get("lost"):
         return math.inf

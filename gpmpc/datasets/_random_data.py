@@ -7,7 +7,7 @@ import numpy as np
 
 from gpmpc.datasets._flights import check_data
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
-from gpmpc.gp.transitions import Transitions
+from gpmpc.gp import Transitions
 from gpmpc.systems import System, step
 from gpmpc.trajectories import Trajectory
 

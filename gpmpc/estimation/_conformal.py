@@ -32,8 +32,8 @@ import numpy as np
 import torch
 from scipy.stats import beta
 
-from gpmpc.compiled import call_unchecked, compiled
-from gpmpc.dynamics import Array, DynamicsModel
+from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._dynamics import Array, DynamicsModel
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Propagator, rollout

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.dynamics import Array
+from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError, ShapeError, check_number
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import DynamicsModel
+from gpmpc._dynamics import DynamicsModel
 from gpmpc.estimation._consistency import wrapped
 from gpmpc.estimation._measurement import Measurement
 from gpmpc.exceptions import SettingError, ShapeError, check_number

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, Linearized, check_query
+from gpmpc._dynamics import Array, Linearized, check_query
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.models import linearize_function

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import DataError, ShapeError, UnsupportedModel, check_number
-from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.transitions import Transitions, check_transitions
+from gpmpc.gp import GPPosterior, Transitions
+from gpmpc.gp._transitions import check_transitions
 
 
 @dataclass(frozen=True)

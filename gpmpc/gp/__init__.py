@@ -1,18 +1,18 @@
 """Gaussian process models of dynamics: data, training, and the frozen posterior that predicts."""
 
+from gpmpc.gp._backend import backend
+from gpmpc.gp._gpytorch import exact_inference, to_gpytorch
 from gpmpc.gp._gpytorch_posteriors import KernelPosterior, from_gpytorch
 from gpmpc.gp._kernel import Hyperparameters
 from gpmpc.gp._online import SlidingWindow, append_points, append_transitions, remove_points
+from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._scaling import Scaling, centre, identity, min_max, standardize
 from gpmpc.gp._search import SoftLimits
 from gpmpc.gp._sparse import sparse_posterior
 from gpmpc.gp._sparse_training import SparseTrainer, informative_points
+from gpmpc.gp._storage import load_metadata, load_posterior, save_posterior
 from gpmpc.gp._training import Trainer, Training, train
-from gpmpc.gp.backend import backend
-from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
-from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.storage import load_metadata, load_posterior, save_posterior
-from gpmpc.gp.transitions import Transitions
+from gpmpc.gp._transitions import Transitions
 
 __all__ = [
     "GPPosterior",

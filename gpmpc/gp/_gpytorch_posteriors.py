@@ -17,19 +17,13 @@ import gpytorch
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import (
-    Array,
-    Linearized,
-    check_destination,
-    check_query,
-    linearize_by_autograd,
-)
+from gpmpc._dynamics import Array, Linearized, check_destination, check_query, linearize_by_autograd
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp._gpytorch import exact_inference, members
 from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
+from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._sparse import Method, sparse_posterior
-from gpmpc.gp.gpytorch_ import exact_inference, members
-from gpmpc.gp.posterior import GPPosterior
 
 
 def from_gpytorch(

@@ -1,7 +1,7 @@
 r"""Points that come and go while a controller runs, without factorising K + sn2 I anew, which is cubic in them.
 
 Adding points extends the Cholesky factor by rows, L21' = L^-1 K(X, X*), L22 L22' = K(X*, X*) + sn2 I - L21 L21';
-removing one changes only the block below it (``gpmpc.kernels._window``): both O(N^2) a point. The weights are solved
+removing one changes only the block below it (``gpmpc._kernels._window``): both O(N^2) a point. The weights are solved
 for from the factor each time, two triangular systems, so that no error is carried along with them.
 
 The least informative point is the one whose removal changes the posterior over functions least, in Kullback-Leibler
@@ -25,12 +25,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._kernels._window import drop_point
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel, check_number
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._kernel import check_positive_definite, kernel_matrix
-from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.transitions import Transitions, check_transitions
-from gpmpc.kernels._window import drop_point
+from gpmpc.gp._posterior import GPPosterior
+from gpmpc.gp._transitions import Transitions, check_transitions
 
 _log = logging.getLogger(__name__)
 _MANY = 0.2  # where more than this part of the points is removed, one factorisation costs less than the updates

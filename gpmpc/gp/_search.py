@@ -24,8 +24,8 @@ from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._kernel import IGNORED, check_posterior
 from gpmpc.gp._likelihood import FAILED, NegativeLogMarginalLikelihood
+from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._scaling import Scaling
-from gpmpc.gp.posterior import GPPosterior
 
 _log = logging.getLogger(__name__)
 _EXPLORATION = 16  # L-BFGS iterations from every start, before ...

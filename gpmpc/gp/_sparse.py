@@ -34,7 +34,7 @@ from torch.utils.checkpoint import checkpoint
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp._posterior import GPPosterior
 
 Method = Literal["sgpr", "fitc"]
 JITTER = 1e-8  # of Kzz, in units of sf2

@@ -33,7 +33,7 @@ from gpmpc.gp._sparse import (
     sparse_posterior,
 )
 from gpmpc.gp._training import Trainer, Training
-from gpmpc.gp.transitions import Transitions, check_transitions
+from gpmpc.gp._transitions import Transitions, check_transitions
 
 _log = logging.getLogger(__name__)
 _EVERY = 10  # iterations between two lines of the log

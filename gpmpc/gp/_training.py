@@ -21,6 +21,7 @@ from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
 from gpmpc.gp._likelihood import FAILED
 from gpmpc.gp._memory import GIB, available_memory
 from gpmpc.gp._online import targets_of
+from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._scaling import Scaling, centre
 from gpmpc.gp._search import (
     SearchProblem,
@@ -31,8 +32,7 @@ from gpmpc.gp._search import (
     restored_theta,
     training_data,
 )
-from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.transitions import Transitions, check_transitions
+from gpmpc.gp._transitions import Transitions, check_transitions
 
 _log = logging.getLogger(__name__)
 _ONE_THREAD = 1000  # points below which LAPACK's threads wait for each other longer than they work

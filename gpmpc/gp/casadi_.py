@@ -16,9 +16,7 @@ import casadi
 import numpy as np
 import torch
 
-from gpmpc.exceptions import DataError, UnsupportedModel
-from gpmpc.gp.posterior import GPPosterior
-from gpmpc.kernels.tape import (
+from gpmpc._kernels.tape import (
     ADD,
     ATAN2,
     CONST,
@@ -34,6 +32,8 @@ from gpmpc.kernels.tape import (
     SUB,
     Tape,
 )
+from gpmpc.exceptions import DataError, UnsupportedModel
+from gpmpc.gp._posterior import GPPosterior
 
 Array = np.ndarray
 _BINARY = (ADD, SUB, MUL, DIV, POW, CONSTPOW, FMIN, FMAX, ATAN2)

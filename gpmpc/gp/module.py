@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import UnsupportedModel
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp._posterior import GPPosterior
 
 
 class PosteriorModule(torch.nn.Module):

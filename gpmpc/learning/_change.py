@@ -20,12 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, DynamicsModel, Linearized, linearize, to_array
+from gpmpc._dynamics import Array, DynamicsModel, Linearized, linearize, to_array
+from gpmpc._kernels import GPArrays, Packed, replace_point
+from gpmpc._kernels import linearize as linearize_gps
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.kernels import GPArrays, Packed, replace_point
-from gpmpc.kernels import linearize as linearize_gps
 from gpmpc.models import Features, Wrapper
 
 
@@ -101,7 +101,7 @@ class ChangedModel(Wrapper):
         return np.concatenate([z[0], v[0], [self.time]]), reach @ (next_state - alone.mean[0]), variance
 
     def with_point(self, point: Array, target: Array, noise: Array, drop: int = -1) -> "ChangedModel":
-        """The model with a further point (phi, u, t) of the change; see ``gpmpc.kernels.replace_point``."""
+        """The model with a further point (phi, u, t) of the change; see ``gpmpc._kernels.replace_point``."""
         return self._replaced(change=replace_point(*self.change, point, target, noise, drop))
 
     def last_innovation(self) -> tuple[Array, Array]:

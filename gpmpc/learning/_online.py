@@ -21,13 +21,14 @@ from typing import Any, Literal
 import numpy as np
 from scipy.stats import chi2
 
-from gpmpc.dynamics import Array, to_array
+from gpmpc._dynamics import Array, to_array
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import SlidingWindow
 from gpmpc.gp._online import least_informative
 from gpmpc.learning._change import ChangedModel
-from gpmpc.mpc.controller import Decision, Reference, check_method
+from gpmpc.mpc import Decision, Reference
+from gpmpc.mpc._controller import check_method
 from gpmpc.mpc.gp_mpc import GPMPC
 
 _FEW, _MANY = 3, 100  # differences of errors that say how large the noise is

@@ -1,4 +1,4 @@
-"""Saves what was learned from a log to one model file (``gpmpc.gp.storage``), loads it, and flies it.
+"""Saves what was learned from a log to one model file (``gpmpc.gp._storage``), loads it, and flies it.
 
 What was learned from a log moves states by its kinematics: x[k+1] = step(x[k], y(x[k], u[k])). As a ``DynamicsModel``
 its derivatives are central differences, all stages in one batch; the disturbance from the past is left to the
@@ -14,11 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import DynamicsModel, Linearized, check_query, to_array
+from gpmpc._dynamics import DynamicsModel, Linearized, check_query, to_array
+from gpmpc._files import existing_file, new_file
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.files import existing_file, new_file
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.storage import load_metadata, posterior_of_parts, posterior_parts, read_model, write_model
+from gpmpc.gp import load_metadata
+from gpmpc.gp._storage import posterior_of_parts, posterior_parts, read_model, write_model
 from gpmpc.logs._fitting import NominalFit, OutputNoise
 from gpmpc.logs._kinematics import Array, Increments, Kinematics, RigidBody, StateGroup, StateSpace, wrap
 from gpmpc.logs._learning import Candidate, Learned

@@ -1,6 +1,6 @@
 """Dynamics models: the protocol, and models made of a known part and a learned one."""
 
-from gpmpc.dynamics import DynamicsModel, Linearized, linearize, linearize_by_autograd
+from gpmpc._dynamics import DynamicsModel, Linearized, linearize, linearize_by_autograd
 from gpmpc.models._delay import DelayedModel
 from gpmpc.models._disturbance import DisturbedModel
 from gpmpc.models._features import Features, Lags

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, DynamicsModel, check_next_states
+from gpmpc._dynamics import Array, DynamicsModel, check_next_states
 from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.models._wrapper import LinearWrapper, padded

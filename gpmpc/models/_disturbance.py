@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, DynamicsModel, check_next_states, to_array
+from gpmpc._dynamics import Array, DynamicsModel, check_next_states, to_array
 from gpmpc.exceptions import SettingError, ShapeError, check_numbers
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.models._wrapper import LinearWrapper, padded

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpmpc.dynamics import Array
+from gpmpc._dynamics import Array
 from gpmpc.exceptions import SettingError, ShapeError, check_number
-from gpmpc.gp.transitions import Transitions
+from gpmpc.gp import Transitions
 from gpmpc.models._nominal import Affine
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.compiled import call_unchecked
-from gpmpc.dynamics import Array, Linearized, batched_jacobian, check_query, tensors_for, to_array
+from gpmpc._compiled import call_unchecked
+from gpmpc._dynamics import Array, Linearized, batched_jacobian, check_query, tensors_for, to_array
 from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian, check_tensors
 
@@ -97,8 +97,8 @@ class KnownModel:
 class CasadiFunction:
     """A function that is written in CasADi, linearised at all points in one call.
 
-    Its operations are read once and run by compiled loops (``gpmpc.kernels.tape``), or by CasADi where it calls what is
-    no expression.
+    Its operations are read once and run by compiled loops (``gpmpc._kernels.tape``), or by CasADi where it calls what
+    is no expression.
 
     It serves as nominal model, (state (n,), input (m,)) to the next state (n,), and as effect B(x), state (n,) to
     (n, k). It is evaluated in double precision on the CPU, and torch cannot differentiate it.
@@ -150,7 +150,7 @@ class CasadiFunction:
         """The values at K points, and their derivatives by each argument (K, rows, d_i) or (K, rows, columns, d_i)."""
         K, (rows, columns) = len(arguments[0]), self.shape
         if self.tape is not None:
-            from gpmpc.kernels.tape import linearize_tape  # loads numba
+            from gpmpc._kernels.tape import linearize_tape  # loads numba
 
             points = np.ascontiguousarray(np.hstack(arguments))
             values, jacobians = np.empty((K, rows * columns)), np.empty((K, rows * columns, points.shape[1]))

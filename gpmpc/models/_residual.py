@@ -15,19 +15,12 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import (
-    Array,
-    Linearized,
-    check_destination,
-    check_query,
-    tensors_for,
-    to_array,
-)
+from gpmpc._dynamics import Array, Linearized, check_destination, check_query, tensors_for, to_array
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp import GPPosterior, SlidingWindow, Trainer, Training, Transitions, append_points
-from gpmpc.gp.posterior import AffineForm
-from gpmpc.gp.transitions import check_transitions
+from gpmpc.gp._posterior import AffineForm
+from gpmpc.gp._transitions import check_transitions
 from gpmpc.models._features import Features
 from gpmpc.models._nominal import Affine, CasadiFunction, linearize_function
 

@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from gpmpc.compiled import call_unchecked
-from gpmpc.dynamics import Array, DynamicsModel, linearize, to_array
-from gpmpc.gp.backend import host_arrays
-from gpmpc.gp.posterior import AffineForm
-from gpmpc.kernels import GPArrays
-from gpmpc.kernels.gp_rollout import COSINE, PLAIN, SINE, AffineGPs, Feedback, roll_out_gps
-from gpmpc.kernels.tape import NO_TAPE
+from gpmpc._compiled import call_unchecked
+from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
+from gpmpc._kernels import GPArrays
+from gpmpc._kernels.gp_rollout import COSINE, PLAIN, SINE, AffineGPs, Feedback, roll_out_gps
+from gpmpc._kernels.tape import NO_TAPE
+from gpmpc.gp._backend import host_arrays
+from gpmpc.gp._posterior import AffineForm
 from gpmpc.models._features import Features
 
 

@@ -1,4 +1,4 @@
-"""Files of models that are made of a known part and a learned one, in the format of ``gpmpc.gp.storage``.
+"""Files of models that are made of a known part and a learned one, in the format of ``gpmpc.gp._storage``.
 
 Numbers are stored as arrays. Code cannot be: a nominal model or an effect that is a function is stored as the path it
 is imported by and its parameters, which are
@@ -8,8 +8,8 @@ is imported by and its parameters, which are
 * a ``CasadiFunction`` of an importable function that makes it,
 
 with parameters that JSON can hold. A ``CasadiFunction`` that no function makes, such as a system's nominal model, is
-stored as its operations, which are numbers (``gpmpc.kernels.tape``). Reading imports the module that the file names, as
-Python's own ``import`` does: a file from someone else is read where their module is installed on purpose.
+stored as its operations, which are numbers (``gpmpc._kernels.tape``). Reading imports the module that the file names,
+as Python's own ``import`` does: a file from someone else is read where their module is installed on purpose.
 """
 
 import importlib
@@ -24,10 +24,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._files import existing_file, new_file
 from gpmpc.exceptions import DataError, GpmpcError, UnsupportedModel
-from gpmpc.files import existing_file, new_file
-from gpmpc.gp.posterior import GPPosterior
-from gpmpc.gp.storage import load_metadata, posterior_of_parts, posterior_parts, read_model, write_model
+from gpmpc.gp import GPPosterior, load_metadata
+from gpmpc.gp._storage import posterior_of_parts, posterior_parts, read_model, write_model
 from gpmpc.models._delay import DelayedModel
 from gpmpc.models._disturbance import DisturbedModel
 from gpmpc.models._nominal import Affine, CasadiFunction

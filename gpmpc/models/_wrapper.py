@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, DynamicsModel, Linearized, check_query, linearize, tensors_for
+from gpmpc._dynamics import Array, DynamicsModel, Linearized, check_query, linearize, tensors_for
 from gpmpc.gaussian import Gaussian
 
 

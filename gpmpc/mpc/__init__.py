@@ -1,12 +1,12 @@
 """Controllers: from a state and a reference to an input."""
 
+from gpmpc.mpc._controller import Controller, Decision, Reference, Request, Timing
 from gpmpc.mpc._cost import LeastSquares, Tracking
 from gpmpc.mpc._linear_quadratic import dlqr
+from gpmpc.mpc._policy import ControlLoop
 from gpmpc.mpc._prediction import PredictionSettings
 from gpmpc.mpc._starts import ManyStarts, kicks
-from gpmpc.mpc.controller import Controller, Decision, Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.policy import ControlLoop
 from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem
 
 __all__ = [
@@ -23,6 +23,8 @@ __all__ = [
     "PredictionSettings",
     "Problem",
     "Reference",
+    "Request",
+    "Timing",
     "Tracking",
     "dlqr",
     "kicks",

@@ -23,9 +23,9 @@ coordinates are used where the diagonal of P exceeds that of the last stage, whi
 
 import numpy as np
 
-from gpmpc.compiled import call_unchecked, compiled, njit_inner, njit_noalloc
+from gpmpc._compiled import call_unchecked, compiled, njit_inner, njit_noalloc
+from gpmpc._kernels.linalg import aligned_rows, combine_rows, copy, copy_matrix, dot
 from gpmpc.exceptions import ShapeError
-from gpmpc.kernels.linalg import aligned_rows, combine_rows, copy, copy_matrix, dot
 from gpmpc.mpc._linear_quadratic import (
     DEVIATIONS,
     INCREMENTS,

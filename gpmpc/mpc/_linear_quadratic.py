@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpmpc.compiled import compiled, njit_inner, njit_noalloc
+from gpmpc._compiled import compiled, njit_inner, njit_noalloc
+from gpmpc._kernels.linalg import add_transposed_product, copy, copy_matrix, dot, product, solve_positive
 from gpmpc.exceptions import SettingError
-from gpmpc.kernels.linalg import add_transposed_product, copy, copy_matrix, dot, product, solve_positive
 
 Array = np.ndarray
 

@@ -31,13 +31,22 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from gpmpc.compiled import call_unchecked, compiled
-from gpmpc.dynamics import DynamicsModel, check_next_states, linearize
+from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._dynamics import DynamicsModel, check_next_states, linearize
+from gpmpc._kernels.gp_rollout import Feedback
+from gpmpc._kernels.linalg import copy_matrix, product
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.kernels.gp_rollout import Feedback
-from gpmpc.kernels.linalg import copy_matrix, product
 from gpmpc.models import RollOut
+from gpmpc.mpc._controller import (
+    Decision,
+    Reference,
+    Request,
+    check_controller,
+    check_method,
+    full_turns,
+    read_parameters,
+)
 from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, Stages, finite_horizon_lqr
 from gpmpc.mpc._stages import (
     COVARIANCES,
@@ -47,15 +56,6 @@ from gpmpc.mpc._stages import (
     StageCosts,
     StageLinearizer,
     keep_rates,
-)
-from gpmpc.mpc.controller import (
-    Decision,
-    Reference,
-    Request,
-    check_controller,
-    check_method,
-    full_turns,
-    read_parameters,
 )
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator

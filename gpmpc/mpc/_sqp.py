@@ -22,13 +22,13 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from gpmpc.compiled import call_unchecked, compiled
+from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._kernels.linalg import dot
 from gpmpc.exceptions import DataError, ProblemError
-from gpmpc.kernels.linalg import dot
+from gpmpc.mpc._controller import Request
 from gpmpc.mpc._linear_quadratic import CondensedProgram, References, evaluate_cost, weight_of_stage
 from gpmpc.mpc._prediction import Prediction, PredictionModel
 from gpmpc.mpc._stages import Plan, price_violations
-from gpmpc.mpc.controller import Request
 from gpmpc.qp import QPSolution
 from gpmpc.status import Status
 

@@ -23,11 +23,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
-from gpmpc.compiled import call_unchecked, compiled
-from gpmpc.dynamics import DynamicsModel, linearize, tensors_for, to_array
+from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._dynamics import DynamicsModel, linearize, tensors_for, to_array
+from gpmpc._kernels.linalg import dot
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
-from gpmpc.kernels.linalg import dot
 from gpmpc.mpc._cost import PENALIZED, by_stage
 from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, Stages
 from gpmpc.mpc.problem import Inequality, Problem

@@ -18,9 +18,9 @@ import torch
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import RollOut
+from gpmpc.mpc._controller import Array, Decision, Reference, full_turns
 from gpmpc.mpc._linear_quadratic import References, evaluate_cost
 from gpmpc.mpc._stages import StageCosts, StageLinearizer
-from gpmpc.mpc.controller import Array, Decision, Reference, full_turns
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization

@@ -31,18 +31,18 @@ from typing import Any
 import casadi
 import numpy as np
 
-from gpmpc.dynamics import DynamicsModel, check_next_states
+from gpmpc._dynamics import DynamicsModel, check_next_states
+from gpmpc._interrupts import interrupts_after
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.interrupts import interrupts_after
+from gpmpc.mpc._controller import FEASIBLE, Decision, Reference, Request, Timing, check_controller
 from gpmpc.mpc._linear_quadratic import optimal_feedback
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc._sqp import FAILURES
 from gpmpc.mpc._stages import ConstraintRows, Plan, StageCosts, StageLinearizer
-from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_controller
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator
-from gpmpc.qp.cvxpy_ import STATUSES, TIGHT
+from gpmpc.qp._cvxpy import STATUSES, TIGHT
 from gpmpc.status import Status
 from gpmpc.systems import Plant
 

@@ -21,17 +21,17 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.compiled import call_unchecked, compiled
-from gpmpc.dynamics import DynamicsModel, linearize
+from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._condense import Condenser
+from gpmpc.mpc._controller import FEASIBLE, Decision, Reference, Request, Timing, check_method
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import CondensedProgram, expand
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc._sqp import FAILURES, Globalization
 from gpmpc.mpc._stages import Covariance, Plan, price_violations
-from gpmpc.mpc.controller import FEASIBLE, Decision, Reference, Request, Timing, check_method
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Propagator
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram

@@ -24,7 +24,7 @@ import numpy as np
 
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.mpc._cost import FunctionNotFinite, LeastSquares, Tracking, by_stage, expand_function, read_numbers
-from gpmpc.qp.problem import ABSENT
+from gpmpc.qp._problem import ABSENT
 
 Array = np.ndarray
 

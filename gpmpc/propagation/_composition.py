@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.posterior import AffineForm
+from gpmpc.gp._posterior import AffineForm
 from gpmpc.propagation._sensitivity import Sensitivity
 
 _NOT_WANTED: Any = None
@@ -38,7 +38,7 @@ class Latent(NamedTuple):
 
 
 class Composition:
-    """The affine part of a model around its latent functions ``f``; see ``gpmpc.gp.posterior.AffineForm``."""
+    """The affine part of a model around its latent functions ``f``; see ``gpmpc.gp._posterior.AffineForm``."""
 
     B: Any
     G: Any

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import predict_with_jacobian
+from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.backend import host_arrays
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp import GPPosterior
+from gpmpc.gp._backend import host_arrays
 from gpmpc.propagation._propagator import Propagation, Propagator, checked_input, projected
 from gpmpc.propagation._sensitivity import Sensitivity
 
@@ -42,7 +42,7 @@ def expand(model: Any, state: Tensor, input: Tensor) -> _Expansion | None:
     if (arrays := host_arrays(gp.weights, state, input)) is None:
         parts = _by_torch(gp, state, input)
     else:
-        from gpmpc import kernels  # loads numba
+        from gpmpc import _kernels as kernels  # loads numba
 
         batch = state.shape[:-1]
         flat = arrays[1].reshape(-1, gp.state_dim)

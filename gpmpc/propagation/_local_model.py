@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, tensors_for, to_array
+from gpmpc._dynamics import Array, tensors_for, to_array
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.propagation._propagator import Propagator

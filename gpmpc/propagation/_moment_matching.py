@@ -8,8 +8,8 @@ from torch import Tensor
 
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.backend import host_arrays
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp import GPPosterior
+from gpmpc.gp._backend import host_arrays
 from gpmpc.propagation._composition import Composition, Latent
 from gpmpc.propagation._moments import moments, moments_with_jacobian
 from gpmpc.propagation._propagator import Propagation, Propagator, checked_input, projected
@@ -80,8 +80,8 @@ class MomentMatching(Propagator):
         return self._compiled(f, belief.mean.shape[:-1], arrays[1:])
 
     def _compiled(self, f: GPPosterior, batch: torch.Size, arrays: Sequence[Any], cross: bool | None = None) -> Latent:
-        """The moments of f by ``gpmpc.kernels``; ``cross`` adds derivatives, with those of J or without."""
-        from gpmpc import kernels  # loads numba
+        """The moments of f by ``gpmpc._kernels``; ``cross`` adds derivatives, with those of J or without."""
+        from gpmpc import _kernels as kernels  # loads numba
 
         mean, S, u = arrays
         n, m = f.state_dim, f.input_dim

@@ -23,7 +23,7 @@ exponent may stay where exp does not overflow.
 
 The mean and J have their derivatives in closed form, with dM/dS = 1/2 d2M/dmu2 (Price, 1958). Those of V come from
 reverse mode: every pair of outputs has a copy of the belief of its own, so that one pass over the sum of all entries
-gives each entry's. ``gpmpc.kernels`` computes all of this in compiled loops.
+gives each entry's. ``gpmpc._kernels`` computes all of this in compiled loops.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp import GPPosterior
 from gpmpc.propagation._composition import Latent
 
 _ENTRIES = 2**18  # of what is made at once of each kind, for one pair of outputs at least

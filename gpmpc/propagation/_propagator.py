@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import check_query
+from gpmpc._dynamics import check_query
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian, check_tensors, nearest_positive_semidefinite
 

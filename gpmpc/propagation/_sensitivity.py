@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import batched_jacobian
+from gpmpc._dynamics import batched_jacobian
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation._propagator import Propagation, Propagator, checked_input
 

@@ -7,13 +7,13 @@ recordings, loads no compiler.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from gpmpc.qp.problem import QuadraticProgram
-from gpmpc.qp.solution import QPSolution, QPSolver, Residuals, make_solution
+from gpmpc.qp._problem import QuadraticProgram
+from gpmpc.qp._solution import QPSolution, QPSolver, Residuals, make_solution
 
 if TYPE_CHECKING:
-    from gpmpc.qp.cvxpy_ import CvxpySolver
-    from gpmpc.qp.dual_active_set import DualActiveSet, Prepared
-    from gpmpc.qp.primal_active_set import PrimalActiveSet
+    from gpmpc.qp._cvxpy import CvxpySolver
+    from gpmpc.qp._dual_active_set import DualActiveSet, Prepared
+    from gpmpc.qp._primal_active_set import PrimalActiveSet
 
 __all__ = [
     "CvxpySolver",
@@ -28,10 +28,10 @@ __all__ = [
 ]
 
 _SOLVERS = {
-    "CvxpySolver": "cvxpy_",
-    "DualActiveSet": "dual_active_set",
-    "Prepared": "dual_active_set",
-    "PrimalActiveSet": "primal_active_set",
+    "CvxpySolver": "_cvxpy",
+    "DualActiveSet": "_dual_active_set",
+    "Prepared": "_dual_active_set",
+    "PrimalActiveSet": "_primal_active_set",
 }
 
 

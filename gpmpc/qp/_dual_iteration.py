@@ -11,8 +11,8 @@ The functions take a ``Workspace``, a ``WorkingSet`` and the number k of its con
 
 import numpy as np
 
-from gpmpc.compiled import inline_njit
-from gpmpc.kernels.linalg import combine_rows, dot
+from gpmpc._compiled import inline_njit
+from gpmpc._kernels.linalg import combine_rows, dot
 from gpmpc.qp._record import INFEASIBLE, ITERATION_LIMIT, SOLVED
 from gpmpc.qp._triangular import (
     append_row,

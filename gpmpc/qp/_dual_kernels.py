@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 
-from gpmpc.compiled import compiled, inline_njit
-from gpmpc.kernels._simd import any_nonzero, clip, larger, largest, load, load_some, store, total, zeros
-from gpmpc.kernels.linalg import dot, multiply
+from gpmpc._compiled import compiled, inline_njit
+from gpmpc._kernels._simd import any_nonzero, clip, larger, largest, load, load_some, store, total, zeros
+from gpmpc._kernels.linalg import dot, multiply
 from gpmpc.qp._dual_iteration import (
     NEGLIGIBLE,
     add_multipliers,

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
 from gpmpc.qp import _record as layout
-from gpmpc.qp.problem import ABSENT
-from gpmpc.qp.solution import proves_infeasibility, zero_row_size
+from gpmpc.qp._problem import ABSENT
+from gpmpc.qp._solution import proves_infeasibility, zero_row_size
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ def rescue(
 
     Args:
         problem: P, q, G, lower and upper; bounds of 1e20 or more are absent.
-        caps: (M,), see ``gpmpc.qp.problem.multiplier_caps``.
+        caps: (M,), see ``gpmpc.qp._problem.multiplier_caps``.
         record: What the kernel wrote.
         limit: Changes of the working set before ``ITERATION_LIMIT``.
         late: Whether it is time for ``TIME_LIMIT``.

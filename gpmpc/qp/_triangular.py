@@ -7,9 +7,9 @@ few arrays is called, not inlined: a solve is then compiled in two thirds of the
 
 import math
 
-from gpmpc.compiled import inline_njit, njit_noalloc
-from gpmpc.kernels._simd import load, load_some, store, total, zeros
-from gpmpc.kernels.linalg import dot, four_dots
+from gpmpc._compiled import inline_njit, njit_noalloc
+from gpmpc._kernels._simd import load, load_some, store, total, zeros
+from gpmpc._kernels.linalg import dot, four_dots
 
 _LANES, _BLOCK = 8, 4
 _ROUNDING = 2.3e-16  # times n: share of P_ii below which a pivot is rounding

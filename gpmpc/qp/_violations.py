@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from gpmpc.compiled import inline_njit
-from gpmpc.kernels.linalg import dot
+from gpmpc._compiled import inline_njit
+from gpmpc._kernels.linalg import dot
 
 TOLERATED = 2e-14  # a violation below this share of the bound is none, whatever the constraint's other bound is
 

@@ -14,8 +14,8 @@ from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from gpmpc.compiled import inline_njit
-from gpmpc.kernels.linalg import aligned_rows
+from gpmpc._compiled import inline_njit
+from gpmpc._kernels.linalg import aligned_rows
 from gpmpc.qp._record import HEADER
 
 Array = NDArray[np.float64]

@@ -17,8 +17,8 @@ from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Channel, Footer, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
+from gpmpc._files import whole_file
 from gpmpc.exceptions import GpmpcError, RecordingError, SettingError
-from gpmpc.files import whole_file
 from gpmpc.recording import _messages
 from gpmpc.recording._messages import PLAN, QP, QP_ARRAYS, STEP, TIMING, TOPICS
 from gpmpc.recording._records import CONFIG, RECOVERED, room, whole_records

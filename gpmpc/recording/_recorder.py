@@ -22,8 +22,8 @@ from foxglove.channels import LogChannel
 from foxglove.mcap import MCAPWriteOptions
 from foxglove.messages import Log, LogLevel, Timestamp
 
+from gpmpc._provenance import flattened, provenance
 from gpmpc.exceptions import RecordingError, check_number
-from gpmpc.provenance import flattened, provenance
 from gpmpc.recording._messages import Encoder, RecordedSystem, StepCopy
 from gpmpc.recording._records import CONFIG, LARGEST
 from gpmpc.recording._scene import WORLD, Scene

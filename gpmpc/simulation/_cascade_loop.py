@@ -17,8 +17,8 @@ import numpy as np
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Controller, Reference
-from gpmpc.mpc.policy import Command, OnFailure, check_policy, command
+from gpmpc.mpc import Controller, Reference
+from gpmpc.mpc._policy import Command, OnFailure, check_policy, command
 from gpmpc.simulation._loop import Flight, History, Moment, Rollout, check_references, fly, window
 from gpmpc.simulation._simulator import Disturbance, Noise, PlantSimulator
 from gpmpc.step import Step

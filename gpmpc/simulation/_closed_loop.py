@@ -13,8 +13,8 @@ import numpy as np
 
 from gpmpc.exceptions import Diverged, GpmpcError, SettingError, SolverFailure, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Controller, Reference
-from gpmpc.mpc.policy import Command, OnFailure, check_policy, command, commands
+from gpmpc.mpc import Controller, Reference
+from gpmpc.mpc._policy import Command, OnFailure, check_policy, command, commands
 from gpmpc.simulation._loop import Flight, History, Rollout, check_references, fly, window
 from gpmpc.simulation._simulator import Disturbance, ModelLoop, ModelSimulator, Noise, PlantSimulator, Simulator
 from gpmpc.step import Step
@@ -50,7 +50,7 @@ def closed_loop(
         noise: On a plant's states, measurements and inputs.
         disturbances: Gusts, other plants, dropouts: what the controller does not know of.
         on_failure: What is applied where a solve fails: ``"previous_plan"``, ``"hold"`` or ``"raise"``; see
-            ``gpmpc.mpc.policy``.
+            ``gpmpc.mpc._policy``.
         seed: Of all random numbers; equal seeds give equal numbers.
         on_step: Called after every step and outside of everything that is timed, such as a recorder's ``record``.
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from gpmpc.exceptions import Diverged, ShapeError, SolverFailure, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Reference, Timing
-from gpmpc.mpc.policy import Command
+from gpmpc.mpc import Reference, Timing
+from gpmpc.mpc._policy import Command
 from gpmpc.simulation._simulator import Simulator, step_together
 from gpmpc.status import Status
 from gpmpc.step import Step

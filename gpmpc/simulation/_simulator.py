@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from gpmpc.dynamics import DynamicsModel
+from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, UnsupportedModel, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Propagator

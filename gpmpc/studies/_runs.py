@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from gpmpc._provenance import flattened
 from gpmpc.exceptions import DataError
-from gpmpc.provenance import flattened
-from gpmpc.studies.document import plain_text
-from gpmpc.studies.run_folder import ERROR, METRICS, PLAN, folder_name
+from gpmpc.studies._document import plain_text
+from gpmpc.studies._run_folder import ERROR, METRICS, PLAN, folder_name
 
 SEED = "seed"
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError)  # of a file

@@ -16,20 +16,20 @@ from typing import Any, Literal
 
 import numpy as np
 
+from gpmpc._dynamics import DynamicsModel
 from gpmpc.datasets import DataSource
-from gpmpc.dynamics import DynamicsModel
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number
 from gpmpc.gp import Training, Transitions
 from gpmpc.gp.casadi_ import successor_function
 from gpmpc.learning import EpisodicLearning, LearningController, OnlineLearning
 from gpmpc.metrics import find_loss, time_quantiles, tracking_error, violation_rate
 from gpmpc.models import CasadiFunction, train_residual
-from gpmpc.mpc.controller import Reference
-from gpmpc.mpc.policy import OnFailure, check_policy
+from gpmpc.mpc import Reference
+from gpmpc.mpc._policy import OnFailure, check_policy
 from gpmpc.mpc.problem import Box
 from gpmpc.propagation import Propagator, best_propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
-from gpmpc.studies.document import Table
+from gpmpc.studies._document import Table
 from gpmpc.studies.study import random_rows
 from gpmpc.systems import System
 from gpmpc.trajectories import Trajectory

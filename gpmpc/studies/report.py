@@ -21,12 +21,12 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from gpmpc._provenance import now
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable, png
-from gpmpc.provenance import now
+from gpmpc.studies._document import MISSING, Document, Table, figure_label, plain_text, with_range
+from gpmpc.studies._run_folder import LONGEST_NAME
 from gpmpc.studies._runs import MEASURES, SEED, Cell, Report, in_order, read_report
-from gpmpc.studies.document import MISSING, Document, Table, figure_label, plain_text, with_range
-from gpmpc.studies.run_folder import LONGEST_NAME
 
 __all__ = [
     "Comparison",

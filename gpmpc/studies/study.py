@@ -21,12 +21,12 @@ import torch
 from threadpoolctl import threadpool_limits
 
 import gpmpc
-from gpmpc.compiling import report_compilation
+from gpmpc._compiling import report_compilation
 from gpmpc.exceptions import DataError, GpmpcError, check_number
 from gpmpc.gp import Training, Transitions
 from gpmpc.models import DynamicsModel, load_model, save_model
 from gpmpc.parallel import in_processes
-from gpmpc.studies.document import Document, Table
+from gpmpc.studies._document import Document, Table
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import pandas as pd
 
 from gpmpc.exceptions import GpmpcError
 from gpmpc.plotting import png, search_figure
-from gpmpc.studies.document import MISSING, Document, Table, figure_label, number, plain_text
+from gpmpc.studies._document import MISSING, Document, Table, figure_label, number, plain_text
 from gpmpc.studies.study import derived_seed
 
 _FEWEST = 8  # candidates of which an importance is told

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import DynamicsModel
+from gpmpc._dynamics import DynamicsModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.testing._promise import require, require_close, require_covariance
 
@@ -14,7 +14,7 @@ from gpmpc.testing._promise import require, require_close, require_covariance
 def check_model(
     model: DynamicsModel, states: Tensor | None = None, inputs: Tensor | None = None, seed: int = 0
 ) -> None:
-    """Checks a model against the protocol ``gpmpc.dynamics.DynamicsModel``.
+    """Checks a model against the protocol ``gpmpc._dynamics.DynamicsModel``.
 
     ``predict`` is called alone and in batches, twice, with arrays in awkward layouts; ``linearize`` is compared with it
     and with its finite differences.

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import linearize
+from gpmpc._dynamics import linearize
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian, square_root
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.propagation import Propagation, Propagator, differentiate
 from gpmpc.testing._promise import require, require_close, require_covariance

@@ -15,7 +15,7 @@ from benchmarks.peers import EVICTED, LOOP, Run, converged, measure, one_program
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc.controller import Reference
+from gpmpc.mpc import Reference
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status

@@ -17,7 +17,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.experiments.figures import Figures, Row
 from gpmpc.experiments.figures_tables import LOOPS, paper_seconds, summarise
 from gpmpc.gp import SoftLimits, identity, train
-from gpmpc.mpc.controller import Reference
+from gpmpc.mpc import Reference
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.propagation import MomentMatching
 from gpmpc.trajectories import Elliptical, Lorenz

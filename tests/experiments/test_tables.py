@@ -21,7 +21,7 @@ from gpmpc.experiments.tables import (
     summarise,
 )
 from gpmpc.gp import SoftLimits, Transitions, identity, train
-from gpmpc.studies.document import number
+from gpmpc.studies._document import number
 from gpmpc.studies.study import TrialStore, run_study
 from gpmpc.trajectories import Hover
 

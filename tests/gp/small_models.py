@@ -2,7 +2,7 @@
 
 import torch
 
-from gpmpc.gp import GPPosterior, _archive, load_posterior, save_posterior, storage
+from gpmpc.gp import GPPosterior, _archive, _storage, load_posterior, save_posterior
 from gpmpc.models import Affine, ResidualModel, load_model, save_model
 
 SAVE = {GPPosterior: save_posterior, ResidualModel: save_model}
@@ -37,6 +37,6 @@ def as_before(model, path):
     """Writes a model as gpmpc 1 did: arrays in an .npz archive."""
     new = path.with_suffix(".new")
     SAVE[type(model)](model, new)
-    header, arrays = storage._content(new, "model")
+    header, arrays = _storage._content(new, "model")
     header = {key: value for key, value in header.items() if key not in ("checksum", "metadata")}
     path.write_bytes(_archive.write_npz(header | {"format_version": 1}, arrays))

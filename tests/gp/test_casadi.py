@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.dynamics import predict_with_jacobian
+from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.casadi_ import casadi_function

@@ -15,12 +15,11 @@ from gpytorch.kernels import (
 from gpytorch.likelihoods import FixedNoiseGaussianLikelihood, GaussianLikelihood
 from gpytorch.means import ConstantMean, LinearMean, ZeroMean
 
-from gpmpc.dynamics import predict_with_jacobian
+from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import Hyperparameters, KernelPosterior, from_gpytorch
+from gpmpc.gp import Hyperparameters, KernelPosterior, exact_inference, from_gpytorch
 from gpmpc.gp._sparse import collapsed_bound
-from gpmpc.gp.gpytorch_ import exact_inference
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, differentiate
 
 

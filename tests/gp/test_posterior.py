@@ -3,8 +3,7 @@ import pytest
 import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
-from gpmpc.gp import GPPosterior, Scaling
-from gpmpc.gp.gpytorch_ import exact_inference, to_gpytorch
+from gpmpc.gp import GPPosterior, Scaling, exact_inference, to_gpytorch
 
 
 def posterior(size=30, n=2, m=1, predicts="next_state", seed=0):

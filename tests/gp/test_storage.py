@@ -11,9 +11,9 @@ import safetensors
 import safetensors.numpy
 import torch
 
-from gpmpc.dynamics import predict_with_jacobian
+from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
-from gpmpc.gp import GPPosterior, Trainer, Transitions, load_metadata, load_posterior, save_posterior, storage
+from gpmpc.gp import GPPosterior, Trainer, Transitions, _storage, load_metadata, load_posterior, save_posterior
 from gpmpc.models import ResidualModel, save_model
 from tests.gp.small_models import LOAD, SAVE, as_before, posterior, residual_model
 
@@ -153,10 +153,10 @@ def test_a_flipped_bit_in_the_data_is_refused(tmp_path):
 
 def rewritten(path, header=None, **arrays):
     """The file with other header entries and arrays (None drops one), and a valid checksum."""
-    said, parts = storage._content(path, "model")
+    said, parts = _storage._content(path, "model")
     said = said | (header or {})
     parts = {name: value for name, value in (parts | arrays).items() if value is not None}
-    said["checksum"] = storage._checksum(said, parts)
+    said["checksum"] = _storage._checksum(said, parts)
     safetensors.numpy.save_file(parts, path, {"gpmpc": json.dumps(said)})
 
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc import kernels
+from gpmpc import _kernels as kernels
+from gpmpc._kernels import _gp_point, _simd
+from gpmpc._kernels._packed import pack
+from gpmpc._kernels._rows import largest_size, largest_square, reduce_variance, reduce_variances
+from gpmpc._kernels._simd import NEAR_ZERO, load, store
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.kernels import _gp_point, _simd
-from gpmpc.kernels._packed import pack
-from gpmpc.kernels._rows import largest_size, largest_square, reduce_variance, reduce_variances
-from gpmpc.kernels._simd import NEAR_ZERO, load, store
 from gpmpc.propagation._moments import moments, moments_with_jacobian
 from tests.propagation.test_moment_matching import belief, by_mpmath, model
 

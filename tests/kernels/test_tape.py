@@ -4,8 +4,8 @@ import casadi
 import numpy as np
 import pytest
 
+from gpmpc._kernels.gp_rollout import Feedback
 from gpmpc.gp.casadi_ import tape_of
-from gpmpc.kernels.gp_rollout import Feedback
 from gpmpc.models import CasadiFunction, KnownModel, RollOut
 from gpmpc.systems import double_pendulum, step
 

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc._kernels import replace_point
 from gpmpc.exceptions import SettingError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions, append_points, remove_points
-from gpmpc.kernels import replace_point
 from gpmpc.learning import ChangedModel, Learned, LearningController, OnlineLearning
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc.controller import Reference
+from gpmpc.mpc import ControlLoop, Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.policy import ControlLoop
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.testing import check_model

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gpmpc import systems
-from gpmpc.dynamics import predict_with_jacobian
+from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, Transitions

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.dynamics import Linearized, linearize, linearize_by_autograd
 from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.models import Affine, CasadiFunction, ResidualModel
+from gpmpc.models import Affine, CasadiFunction, Linearized, ResidualModel, linearize, linearize_by_autograd
 
 N, M = 3, 2
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gpmpc.dynamics import predict_with_jacobian
+from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, SlidingWindow, SparseTrainer, Trainer, Transitions

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.dynamics import linearize
+from gpmpc._kernels.gp_rollout import Feedback
 from gpmpc.gp import GPPosterior
-from gpmpc.kernels.gp_rollout import Feedback
-from gpmpc.models import Affine, DisturbedModel, ResidualModel, RollOut
+from gpmpc.models import Affine, DisturbedModel, ResidualModel, RollOut, linearize
 
 GENERATOR = torch.Generator().manual_seed(3)
 

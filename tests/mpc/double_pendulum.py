@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from numba import njit
 
-from gpmpc.dynamics import Linearized
 from gpmpc.gaussian import Gaussian
+from gpmpc.models import Linearized
 
 MASS, LENGTH, CENTRE, GRAVITY = (0.523, 0.626), 0.2, (0.2, 0.256), 9.81  # [kg], [m], [m], [m/s^2]
 INERTIA = (0.0319, 0.0509)  # about the joints [kg m^2]

@@ -8,9 +8,8 @@ import torch
 
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc import PredictionSettings, Reference, Request
 from gpmpc.mpc.baselines import StateFormMPC
-from gpmpc.mpc.controller import Reference, Request
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching

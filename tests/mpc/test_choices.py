@@ -7,7 +7,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Reference
+from gpmpc.mpc import Reference
 from gpmpc.status import Status
 from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import SettingError, SolverFailure
-from gpmpc.mpc.controller import Reference
+from gpmpc.mpc import ControlLoop, Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.policy import ControlLoop
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.qp import CvxpySolver, PrimalActiveSet

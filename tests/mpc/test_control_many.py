@@ -10,9 +10,8 @@ from torch.utils._pytree import tree_leaves
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
-from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc import PredictionSettings, Reference
 from gpmpc.mpc._stages import StageLinearizer
-from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented

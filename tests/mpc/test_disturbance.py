@@ -9,11 +9,10 @@ import torch
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
-from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc import PredictionSettings, Reference
+from gpmpc.mpc._policy import command
 from gpmpc.mpc.baselines import StateFormMPC
-from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.policy import command
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.status import Status

@@ -9,10 +9,10 @@ import torch
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
+from gpmpc.mpc import Reference
 from gpmpc.mpc._prediction import FORMS, PredictionSettings
 from gpmpc.mpc._stages import COVARIANCES
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, rollout

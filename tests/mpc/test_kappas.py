@@ -9,8 +9,7 @@ import torch
 from gpmpc.estimation import AdaptiveTube, ConformalTube
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.controller import Reference
+from gpmpc.mpc import PredictionSettings, Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization

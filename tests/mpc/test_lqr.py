@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.dynamics import linearize_by_autograd
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
+from gpmpc.models import linearize_by_autograd
+from gpmpc.mpc import Reference
 from gpmpc.mpc._linear_quadratic import dlqr, finite_horizon_lqr
 from gpmpc.mpc.baselines import LQR
-from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import MeanEquivalence

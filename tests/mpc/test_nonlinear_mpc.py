@@ -9,8 +9,8 @@ import torch
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc import Reference, Request
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.controller import Reference, Request
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, rollout

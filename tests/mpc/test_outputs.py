@@ -9,13 +9,11 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Transitions, train
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc import LeastSquares
+from gpmpc.mpc import ControlLoop, LeastSquares, Reference
 from gpmpc.mpc._prediction import FORMS, PredictionSettings
 from gpmpc.mpc._stages import COVARIANCES
 from gpmpc.mpc.baselines import LQR, NMPC, StateFormMPC
-from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.policy import ControlLoop
 from gpmpc.mpc.problem import Box, Inequality, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status

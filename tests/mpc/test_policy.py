@@ -3,8 +3,8 @@ import pytest
 
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Decision, Reference, Timing
-from gpmpc.mpc.policy import command
+from gpmpc.mpc import Decision, Reference, Timing
+from gpmpc.mpc._policy import command
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.status import Status
 

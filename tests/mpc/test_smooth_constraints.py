@@ -5,11 +5,9 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc import ControlLoop, PredictionSettings, Reference
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.policy import ControlLoop
 from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status

@@ -9,8 +9,7 @@ from benchmarks.kkt import Instance, kkt_residual
 from benchmarks.pendulums import pendulum_gp
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc import Decision, PredictionSettings, Reference, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.dynamics import Linearized
 from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.gp import GPPosterior
-from gpmpc.models import Affine, ResidualModel
+from gpmpc.models import Affine, Linearized, ResidualModel
 from gpmpc.mpc._linear_quadratic import Stages
 from gpmpc.mpc._stages import StageLinearizer
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented

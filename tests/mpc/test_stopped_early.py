@@ -9,9 +9,8 @@ import torch
 
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc import PredictionSettings, Reference
 from gpmpc.mpc.baselines import NMPC, StateFormMPC
-from gpmpc.mpc.controller import Reference
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization

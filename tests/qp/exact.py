@@ -9,7 +9,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from gpmpc.qp.problem import ABSENT
+from gpmpc.qp._problem import ABSENT
 
 
 def exact_solution(problem, lower=None, upper=None):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram, make_solution
-from gpmpc.qp.solution import zero_row_size
+from gpmpc.qp._solution import zero_row_size
 from gpmpc.status import Status
 from tests.qp.exact import exact_solution, rational
 from tests.qp.families import FAMILIES

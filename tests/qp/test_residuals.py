@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gpmpc.qp import DualActiveSet, QuadraticProgram, make_solution
-from gpmpc.qp.solution import proves_infeasibility
+from gpmpc.qp._solution import proves_infeasibility
 from gpmpc.status import Status
 
 ABSENT = 1e20

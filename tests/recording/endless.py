@@ -9,7 +9,7 @@ import sys
 
 import numpy as np
 
-from gpmpc.mpc.controller import Decision, Timing
+from gpmpc.mpc import Decision, Timing
 from gpmpc.recording import McapRecorder, RecordedSystem, Step
 from gpmpc.status import Status
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gpmpc.mpc.controller import Decision, Timing
+from gpmpc.mpc import Decision, Timing
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.recording import McapRecorder, RecordedSystem, Step
 from gpmpc.status import Status

@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from gpmpc.mpc.controller import Decision, Timing
+from gpmpc.mpc import Decision, Timing
 from gpmpc.recording import McapRecorder, RecordedSystem, Step, layout, read_run
 from gpmpc.status import Status
 from gpmpc.systems import coupled, pendulum, rotational, translational

@@ -6,7 +6,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
-from gpmpc.mpc.controller import Decision, Timing
+from gpmpc.mpc import Decision, Timing
 from gpmpc.recording import McapRecorder, RecordedSystem, Step
 from gpmpc.status import Status
 from gpmpc.systems import Coupled, coupled

@@ -7,8 +7,7 @@ import torch
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc import Decision, PredictionSettings, Reference, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching

@@ -7,7 +7,7 @@ import torch
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc.controller import Decision, Reference, Timing
+from gpmpc.mpc import Decision, Reference, Timing
 from gpmpc.propagation import MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, Replaced, closed_loop
 from gpmpc.status import Status

@@ -5,8 +5,8 @@ import pytest
 
 from gpmpc.exceptions import ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Decision, Reference, Timing
-from gpmpc.mpc.policy import command, commands
+from gpmpc.mpc import Decision, Reference, Timing
+from gpmpc.mpc._policy import command, commands
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Cascade, ModelLoop, cascade_loop, closed_loop, closed_loops

@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from gpmpc.mpc.controller import Timing
+from gpmpc.mpc import Timing
 from gpmpc.mpc.problem import Box
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
+from gpmpc.studies._run_folder import PLAN, RunFolder, folder_name, record
 from gpmpc.studies.flight import Experiment, Flown, metrics
 from gpmpc.studies.report import report_document
-from gpmpc.studies.run_folder import PLAN, RunFolder, folder_name, record
 from gpmpc.systems import translational
 
 SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}

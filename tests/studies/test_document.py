@@ -6,16 +6,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from gpmpc.studies.document import (
-    Document,
-    Table,
-    figure_label,
-    json_text,
-    number,
-    plain_text,
-    terminal,
-    with_range,
-)
+from gpmpc.studies._document import Document, Table, figure_label, json_text, number, plain_text, terminal, with_range
 
 RUNS = Table(
     ["kind", "n, all", "RMSE [m]"],

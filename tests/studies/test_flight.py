@@ -13,16 +13,16 @@ from gpmpc.cli._run import experiment_of
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import Diverged, SettingError
 from gpmpc.gp import Trainer
+from gpmpc.mpc import Decision, Timing
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.controller import Decision, Timing
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise
 from gpmpc.status import Status
 from gpmpc.studies import flight as studied
+from gpmpc.studies._run_folder import Busy, RunFolder, folder_name
 from gpmpc.studies.flight import Experiment, metrics, run_trial
-from gpmpc.studies.run_folder import Busy, RunFolder, folder_name
 from gpmpc.systems import coupled, rotational, translational
 from gpmpc.trajectories import Elliptical, Hover, Lorenz, Step
 

@@ -14,12 +14,12 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from gpmpc._provenance import provenance
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable
-from gpmpc.provenance import provenance
+from gpmpc.studies._run_folder import METRICS, folder_name, record
 from gpmpc.studies.report import compare, sentences, terminal_table
 from gpmpc.studies.report import read_report as report
-from gpmpc.studies.run_folder import METRICS, folder_name, record
 from tests.studies.made_up import SETTINGS, add, chosen, documents, made_up_run, metrics_of, plan
 
 CONF = Path(__file__).resolve().parents[2] / "conf"

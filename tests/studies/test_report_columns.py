@@ -3,7 +3,7 @@
 import pytest
 from rich.console import Console
 
-from gpmpc.studies.document import Table, terminal
+from gpmpc.studies._document import Table, terminal
 from gpmpc.studies.report import read_report as report
 from gpmpc.studies.report import terminal_table
 from tests.studies.made_up import documents, made_up_run, metrics_of

@@ -11,10 +11,10 @@ import pytest
 from rich.console import Console
 
 from gpmpc.studies import report as reporting
-from gpmpc.studies.document import terminal
+from gpmpc.studies._document import terminal
+from gpmpc.studies._run_folder import ERROR, METRICS, folder_name
 from gpmpc.studies.report import compare, report_document, sentences, terminal_table
 from gpmpc.studies.report import read_report as report
-from gpmpc.studies.run_folder import ERROR, METRICS, folder_name
 from tests.studies.made_up import SETTINGS, add, chosen, documents, made_up_run, metrics_of, plan
 
 RESULT = ("rmse", "steps", "failures", "violations", "times", "unit")  # what a failed run need not have

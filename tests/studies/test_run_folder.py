@@ -6,7 +6,7 @@ from itertools import combinations
 import pytest
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.studies.run_folder import ERROR, LONGEST_NAME, METRICS, RunFolder, difference, folder_name, record
+from gpmpc.studies._run_folder import ERROR, LONGEST_NAME, METRICS, RunFolder, difference, folder_name, record
 
 
 def test_other_choices_have_another_folder_even_where_capitals_count_for_nothing():

@@ -8,13 +8,13 @@ import pytest
 from rich.console import Console
 
 from gpmpc.exceptions import Diverged
-from gpmpc.mpc.controller import Timing
+from gpmpc.mpc import Timing
 from gpmpc.mpc.problem import Box
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
-from gpmpc.studies.document import terminal
+from gpmpc.studies._document import terminal
+from gpmpc.studies._run_folder import record
 from gpmpc.studies.flight import Experiment, Flown, metrics, summary
-from gpmpc.studies.run_folder import record
 from tests.studies.made_up import PLANT, metrics_of
 
 OPTIONS = {"trajectory": "lorenz", "system": "translational", "data": "excited", "controller": "convex"}

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("optuna")
 
 from gpmpc.studies import tuning
-from gpmpc.studies.document import number
+from gpmpc.studies._document import number
 from gpmpc.studies.tuning import Interval, Search
 
 SPACE = {"weight": Interval(1e-3, 1e3, logarithmic=True), "horizon": Interval(1, 30, whole=True), "kind": ["a", "b"]}

@@ -113,7 +113,7 @@ class Pushing:
     horizon, initial_input = 1, [1.0]
 
     def control(self, belief, reference, previous=None):
-        from gpmpc.mpc.controller import Decision, Timing
+        from gpmpc.mpc import Decision, Timing
         from gpmpc.status import Status
 
         n = len(belief.mean)

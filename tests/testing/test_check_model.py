@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.dynamics import linearize_by_autograd
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.models import Affine, ResidualModel
+from gpmpc.models import Affine, ResidualModel, linearize_by_autograd
 from gpmpc.testing import check_model
 
 

@@ -24,12 +24,12 @@ import safetensors.numpy
 import torch
 from torch import Tensor
 
+from gpmpc._files import existing_file, new_file, write_whole
+from gpmpc._provenance import now, versions
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, UnsupportedModel
-from gpmpc.files import existing_file, new_file, write_whole
 from gpmpc.gp._archive import read_npz
 from gpmpc.gp._kernel import check_posterior
-from gpmpc.gp.posterior import GPPosterior
-from gpmpc.provenance import now, versions
+from gpmpc.gp._posterior import GPPosterior
 
 _FORMAT, _VERSION = "gpmpc model", 2
 _DTYPES = {torch.float64: "float64", torch.float32: "float32"}

@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
-from gpmpc.compiled import inline_njit, njit_inner, njit_noalloc
-from gpmpc.kernels._simd import load, store, zeros
+from gpmpc._compiled import inline_njit, njit_inner, njit_noalloc
+from gpmpc._kernels._simd import load, store, zeros
 
 
 @njit_inner

@@ -13,10 +13,10 @@ The moments are summed over x~_i - x~, which all outputs share, and scaled by D_
 
 import numpy as np
 
-from gpmpc.compiled import compiled, njit_noalloc
-from gpmpc.kernels._rows import multiply, project, reduce_variance, reduce_variances
-from gpmpc.kernels._simd import exp, load, store, total, use_widest_registers, zeros
-from gpmpc.kernels.linalg import aligned_rows
+from gpmpc._compiled import compiled, njit_noalloc
+from gpmpc._kernels._rows import multiply, project, reduce_variance, reduce_variances
+from gpmpc._kernels._simd import exp, load, store, total, use_widest_registers, zeros
+from gpmpc._kernels.linalg import aligned_rows
 
 
 @njit_noalloc
@@ -100,7 +100,7 @@ def linearize_points(gp, columns, outer, x, u, memory, out):
 
 @compiled
 def expand_points(gp, inverse_cholesky, x, u, out):
-    """Writes the arrays of ``gpmpc.kernels.Expansion`` at K points."""
+    """Writes the arrays of ``gpmpc._kernels.Expansion`` at K points."""
     use_widest_registers()
     d, (K, n) = len(gp.points), x.shape
     padded = gp.points.shape[1]

@@ -22,9 +22,9 @@ from typing import Any
 
 from filelock import lock_descriptor
 
+from gpmpc._files import remove_partial, write_whole
+from gpmpc._provenance import flattened, provenance
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
-from gpmpc.files import remove_partial, write_whole
-from gpmpc.provenance import flattened, provenance
 
 METRICS, ERROR, CONFIG, RECORDING = "metrics.json", "error.json", "config.yaml", "run.mcap"
 PLAN = "sweep-"  # begins the names of the files that say which runs a sweep asked for

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._files import existing_file, new_file, write_whole
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, UnsupportedModel, check_number
-from gpmpc.files import existing_file, new_file, write_whole
 from gpmpc.gp._archive import read_npz, write_npz
 
 _NAMES = ("states", "inputs", "next_states")

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpmpc.dynamics import Array, Linearized, check_destination, check_query, tensors_for, to_array
+from gpmpc._dynamics import Array, Linearized, check_destination, check_query, tensors_for, to_array
 from gpmpc.gaussian import Gaussian, check_tensors
+from gpmpc.gp._backend import host_arrays
 from gpmpc.gp._kernel import Predicts, check_posterior, factorize
 from gpmpc.gp._scaling import Scaling
-from gpmpc.gp.backend import host_arrays
 
 if TYPE_CHECKING:
-    from gpmpc.kernels import Packed
+    from gpmpc._kernels import Packed
 
 
 class AffineForm(NamedTuple):
@@ -40,7 +40,7 @@ class AffineForm(NamedTuple):
     states: list[int] | None = None  #: the states that f depends on
     inputs: list[int] | None = None  #: the inputs that f depends on
     angles: tuple[int, ...] = ()  #: those of ``states`` that f sees as (sine, cosine), at their place
-    tape: Any = None  #: f0 as a ``gpmpc.kernels.tape.Tape``; None for zero
+    tape: Any = None  #: f0 as a ``gpmpc._kernels.tape.Tape``; None for zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ class GPPosterior:
     @cached_property
     def packed(self) -> "Packed":
         """The arrays of the compiled loops, for a float64 model in host memory."""
-        from gpmpc.kernels import pack  # loads numba
+        from gpmpc._kernels import pack  # loads numba
 
         parts = (self.features, self.lengthscales, self.signal_variance, self.cholesky, self.weights)
         features, lengthscales, signal_variance, cholesky, weights = (part.numpy() for part in parts)
@@ -217,7 +217,7 @@ class GPPosterior:
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
         """Linearises the mean at K points (K, n), (K, m): by the compiled kernels where they can, else by torch."""
         if host_arrays(self.weights) is not None:
-            from gpmpc import kernels  # loads numba
+            from gpmpc import _kernels as kernels  # loads numba
 
             return Linearized(*kernels.linearize(self.packed, states, inputs, covariance, *self._prior))
         x, u = tensors_for(self, states, inputs)

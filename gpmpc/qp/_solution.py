@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
-from gpmpc.qp.problem import ABSENT, QuadraticProgram
+from gpmpc.qp._problem import ABSENT, QuadraticProgram
 from gpmpc.status import Status
 
 Array = NDArray[np.float64]

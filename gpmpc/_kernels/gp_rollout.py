@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gpmpc.compiled import compiled, njit_noalloc
-from gpmpc.kernels._packed import Array, GPArrays
-from gpmpc.kernels._simd import exp, load, total, use_widest_registers, zeros
-from gpmpc.kernels.linalg import aligned_rows, copy, dot
-from gpmpc.kernels.tape import Tape, run_tape
+from gpmpc._compiled import compiled, njit_noalloc
+from gpmpc._kernels._packed import Array, GPArrays
+from gpmpc._kernels._simd import exp, load, total, use_widest_registers, zeros
+from gpmpc._kernels.linalg import aligned_rows, copy, dot
+from gpmpc._kernels.tape import Tape, run_tape
 
 Indices = NDArray[np.intp]
 

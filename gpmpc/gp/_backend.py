@@ -1,8 +1,8 @@
 """The choice between compiled loops and torch, in which the closed forms of a posterior both exist.
 
-The loops of ``gpmpc.kernels`` are many times faster, on one thread, for float64 numbers in host memory. Torch evaluates
-everything else: other devices and types, and whatever autograd or a function transform follows. The two give the same
-numbers; ``backend`` forces one of them.
+The loops of ``gpmpc._kernels`` are many times faster, on one thread, for float64 numbers in host memory. Torch
+evaluates everything else: other devices and types, and whatever autograd or a function transform follows. The two give
+the same numbers; ``backend`` forces one of them.
 """
 
 from collections.abc import Iterator

@@ -10,10 +10,10 @@ n is the variance of the new point's noise. Factors are read by columns, so that
 
 import numpy as np
 
-from gpmpc.compiled import call_unchecked, compiled, njit_inner
+from gpmpc._compiled import call_unchecked, compiled, njit_inner
+from gpmpc._kernels._gp_point import _write_kernel, _write_offsets
+from gpmpc._kernels._packed import COLUMNS, Array, Packed, aligned
 from gpmpc.exceptions import SettingError
-from gpmpc.kernels._gp_point import _write_kernel, _write_offsets
-from gpmpc.kernels._packed import COLUMNS, Array, Packed, aligned
 
 
 def replace_point(

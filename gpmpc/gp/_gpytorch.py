@@ -14,7 +14,7 @@ from gpytorch.constraints import Positive
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
-from gpmpc.gp.posterior import GPPosterior
+from gpmpc.gp._posterior import GPPosterior
 
 
 @contextmanager

@@ -16,14 +16,14 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpmpc.compiled import compile_for, unchecked_entry_point
+from gpmpc._compiled import compile_for, unchecked_entry_point
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_kernels import SIGNATURE, solve
 from gpmpc.qp._dual_rescue import rescue
+from gpmpc.qp._problem import QuadraticProgram, multiplier_caps
+from gpmpc.qp._solution import QPSolution, WarmStart, as_record, proves_infeasibility
 from gpmpc.qp._workspace import new_memory, prepare_memory
-from gpmpc.qp.problem import QuadraticProgram, multiplier_caps
-from gpmpc.qp.solution import QPSolution, WarmStart, as_record, proves_infeasibility
 
 Array = NDArray[np.float64]
 _Arrays = tuple[Array, Array, Array, Array, Array]  # P, q, G, lower, upper

@@ -1,8 +1,8 @@
 """Sums and products of vectors over the training points: rows of P numbers, P a multiple of 16."""
 
-from gpmpc.compiled import inline_njit, njit_noalloc
-from gpmpc.kernels._simd import larger, largest, load, store, use_widest_registers, zeros
-from gpmpc.kernels.linalg import dot
+from gpmpc._compiled import inline_njit, njit_noalloc
+from gpmpc._kernels._simd import larger, largest, load, store, use_widest_registers, zeros
+from gpmpc._kernels.linalg import dot
 
 
 @inline_njit

@@ -16,7 +16,7 @@ from scipy.interpolate import krogh_interpolate
 
 from gpmpc.exceptions import SettingError, ShapeError, SolverFailure, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc.controller import Controller, Decision, Reference, Timing, full_turns
+from gpmpc.mpc._controller import Controller, Decision, Reference, Timing, full_turns
 from gpmpc.mpc.problem import Problem
 from gpmpc.status import Status
 

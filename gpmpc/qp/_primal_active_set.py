@@ -31,8 +31,8 @@ from scipy.optimize import linprog
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import rescue
-from gpmpc.qp.problem import ABSENT, QuadraticProgram
-from gpmpc.qp.solution import QPSolution, WarmStart, as_record, make_solution, proves_infeasibility
+from gpmpc.qp._problem import ABSENT, QuadraticProgram
+from gpmpc.qp._solution import QPSolution, WarmStart, as_record, make_solution, proves_infeasibility
 from gpmpc.status import Status
 
 Array = NDArray[np.float64]
@@ -77,7 +77,7 @@ class PrimalActiveSet:
 
     @np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen below
     def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
-        """The minimiser, from a warm start of any kind; see ``gpmpc.qp.solution.QPSolver``."""
+        """The minimiser, from a warm start of any kind; see ``gpmpc.qp._solution.QPSolver``."""
         began = perf_counter()
         n, M = len(problem.q), len(problem.lower)
         rows = _one_sided(problem)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from gpmpc.compiled import call_unchecked, compiled, njit_inner
+from gpmpc._compiled import call_unchecked, compiled, njit_inner
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._linear_quadratic import References

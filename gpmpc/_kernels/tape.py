@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gpmpc.compiled import compiled, njit_noalloc
+from gpmpc._compiled import compiled, njit_noalloc
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
-from gpmpc.compiled import inline_njit
+from gpmpc._compiled import inline_njit
 
 _WIDTH = 8
 

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gpmpc.compiled import call_unchecked
+from gpmpc._compiled import call_unchecked
+from gpmpc._kernels._gp_moments import CROSS, JACOBIAN, VALUE, evaluate_moments
+from gpmpc._kernels._gp_point import expand_points, linearize_points
+from gpmpc._kernels._packed import Array, GPArrays, Packed, pack
+from gpmpc._kernels._window import replace_point
 from gpmpc.exceptions import ShapeError
-from gpmpc.kernels._gp_moments import CROSS, JACOBIAN, VALUE, evaluate_moments
-from gpmpc.kernels._gp_point import expand_points, linearize_points
-from gpmpc.kernels._packed import Array, GPArrays, Packed, pack
-from gpmpc.kernels._window import replace_point
 
 __all__ = [
     "Expansion",

@@ -27,9 +27,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy import ndarray
 
-from gpmpc.compiled import compiled, inline_njit, njit_inner, njit_noalloc
-from gpmpc.kernels._packed import GPArrays
-from gpmpc.kernels._rows import (
+from gpmpc._compiled import compiled, inline_njit, njit_inner, njit_noalloc
+from gpmpc._kernels._packed import GPArrays
+from gpmpc._kernels._rows import (
     add_products,
     largest_size,
     largest_square,
@@ -40,8 +40,8 @@ from gpmpc.kernels._rows import (
     second_moments,
     transform,
 )
-from gpmpc.kernels._simd import NEAR_ZERO, exp, expm1, expm1_near_zero, load, store, total, use_widest_registers, zeros
-from gpmpc.kernels.linalg import (
+from gpmpc._kernels._simd import NEAR_ZERO, exp, expm1, expm1_near_zero, load, store, total, use_widest_registers, zeros
+from gpmpc._kernels.linalg import (
     add_product,
     aligned_rows,
     condition,
@@ -107,7 +107,7 @@ class _Scratch(NamedTuple):
 
 @compiled
 def evaluate_moments(order, diagonal, gp, precision, mu, S, u, out):
-    """Writes the arrays of ``gpmpc.kernels.Moments`` at mu (H, n), S (H, n, n) and u (H, m).
+    """Writes the arrays of ``gpmpc._kernels.Moments`` at mu (H, n), S (H, n, n) and u (H, m).
 
     ``order`` is ``VALUE``, ``JACOBIAN`` or ``CROSS``; the arrays of ``out`` are full of zeros, or empty beyond that.
     """

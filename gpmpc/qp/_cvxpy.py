@@ -29,9 +29,9 @@ from scipy.linalg import cho_solve, solve_triangular
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import rescue
-from gpmpc.qp.primal_active_set import farkas_ray
-from gpmpc.qp.problem import ABSENT, QuadraticProgram
-from gpmpc.qp.solution import QPSolution, WarmStart, make_solution
+from gpmpc.qp._primal_active_set import farkas_ray
+from gpmpc.qp._problem import ABSENT, QuadraticProgram
+from gpmpc.qp._solution import QPSolution, WarmStart, make_solution
 from gpmpc.status import Status
 
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ class CvxpySolver:
             raise ProblemError(f"CVXPY finds no solver named {self.name!r}; it finds {', '.join(installed)}")
 
     def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
-        """The minimiser; a warm start's x is offered to solvers that take one. See ``gpmpc.qp.solution.QPSolver``."""
+        """The minimiser; a warm start's x is offered to solvers that take one. See ``gpmpc.qp._solution.QPSolver``."""
         import cvxpy
 
         began = perf_counter()
