@@ -217,7 +217,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--horizons", default="1,5,10,20,50", help="comma-separated")
     parser.add_argument("--modes", default="constant,changing,elliptical,lorenz", help="comma-separated")
-    parser.add_argument("--length", type=int, default=440, help="QPs per cell")
+    parser.add_argument("--length", type=int, default=340, help="QPs per cell")
     parser.add_argument("--passes", type=int, default=3, help="turns of each solver")
     parser.add_argument("--slow-solvers", type=int, default=30, help="QPs for Algorithm 1 and CVXPY; 0 leaves them out")
     settings = parser.parse_args()

@@ -11,8 +11,8 @@ proposes. It has no defects, and exists where inputs alone would lead an unstabl
 
 A plan is judged by its relative offset (Bates and Watts, 1981): the Gauss-Newton step in the metric of the cost,
 relative to the root of the cost, which is the cosine between the residuals and what a plan can change of them; and by
-its defects, relative to the states. Gauss-Newton misses the curvature of the dynamics. Where that makes it creep, as in
-the covariances of ``full``, damped BFGS updates put it into the program (Nocedal and Wright, 2006, procedure 18.2).
+its defects, relative to the states. Gauss-Newton misses the curvature of the dynamics. Where that makes it creep, with
+matched beliefs, damped BFGS updates put it into the program (Nocedal and Wright, 2006, procedure 18.2).
 """
 
 import math
@@ -62,7 +62,7 @@ class Globalization:
 
     def correct(self, program: CondensedProgram, plan: Plan) -> CondensedProgram:
         """A program made at a plan, with the curvature that the last steps showed, where the iteration creeps."""
-        if len(program.feedback):  # its unknowns are not the inputs
+        if not self._updatable(program):
             return program
         inputs = plan.inputs.ravel()
         self._gradient = gradient = program.P @ inputs + program.q
@@ -86,7 +86,7 @@ class Globalization:
         """
         plan, last_rate, prices = at.plan, self._rate, self._model.constraints.prices
         z = solution.z
-        if not len(program.feedback):
+        if self._updatable(program):
             gradient = self._gradient + program.G.T @ z if len(z) else self._gradient
             self._last = plan.inputs.ravel(), gradient, z
         z = z[len(z) - at.rows.lower.size :].reshape(at.rows.lower.shape)
@@ -116,12 +116,16 @@ class Globalization:
             return at._replace(plan=proposed), Status.SOLVED
         return at, Status.NUMERICAL_TROUBLE
 
-    def _candidates(self, at: Prediction, towards: Plan, feedback: Array) -> Iterator[Prediction]:
-        """Predictions at a plan, and at the plan that obeys the dynamics under the feedback towards it.
+    def _updatable(self, program: CondensedProgram) -> bool:
+        """Whether steps are remembered: where covariances make it creep; plans of means come from too far away."""
+        return not (len(program.feedback) or self._model.linearizer.at_points)
 
-        Linearised moments overshoot, so where they are part of the state the second comes first.
+    def _candidates(self, at: Prediction, towards: Plan, feedback: Array) -> Iterator[Prediction]:
+        """Predictions at the plan that obeys the dynamics under the feedback towards another one, and at that one.
+
+        The first leads further from a wild start, and linearised moments, which overshoot, are then right.
         """
-        for rolled_out in (False, True) if self._model.linearizer.at_points else (True, False):
+        for rolled_out in (True, False):
             try:
                 if rolled_out:
                     yield self._model.roll_out(towards, at, feedback, self._request, not self._model.evaluates)
