@@ -1,4 +1,8 @@
+import pytest
+
+from gpmpc.exceptions import DataError
 from gpmpc.gp import _memory as memory
+from gpmpc.gp import _training
 
 
 def test_a_running_process_has_some_memory_left():
@@ -25,3 +29,40 @@ def test_the_kernels_word_is_read_and_may_be_missing(tmp_path):
     (tmp_path / "meminfo").write_text("MemTotal: 9 kB\nMemAvailable:     3 kB\n")
     assert memory._by_kernel(tmp_path / "meminfo") == 3 * 1024
     assert memory._by_kernel(tmp_path / "nothing") is None
+
+
+@pytest.mark.parametrize(
+    ("by_kernel", "by_group", "free"),
+    [(700, 500, 500), (500, 700, 500), (None, 300, 300), (900, None, 900), (9, -9, 0)],
+)
+def test_what_is_left_is_the_least_that_anybody_leaves(by_kernel, by_group, free, monkeypatch):
+    monkeypatch.setattr(memory, "_by_kernel", lambda: by_kernel)
+    monkeypatch.setattr(memory, "_by_control_group", lambda: by_group)
+    assert memory.available_memory() == free
+
+
+def test_where_the_kernel_says_nothing_all_physical_memory_counts_or_nothing_is_known(monkeypatch):
+    monkeypatch.setattr(memory, "_by_kernel", lambda: None)
+    monkeypatch.setattr(memory, "_by_control_group", lambda: None)
+    monkeypatch.setattr(memory.os, "sysconf", {"SC_PHYS_PAGES": 30, "SC_PAGE_SIZE": 4096}.__getitem__, raising=False)
+    assert memory.available_memory() == 30 * 4096
+
+    def unknown(_):
+        raise ValueError
+
+    monkeypatch.setattr(memory.os, "sysconf", unknown)
+    assert memory.available_memory() is None
+
+
+def test_a_training_that_does_not_fit_is_refused_with_the_points_that_would(monkeypatch):
+    needed = 8 * 1000**2 * (2 + 2)  # [bytes]
+    for free in (needed, None):
+        monkeypatch.setattr(_training, "available_memory", lambda free=free: free)
+        _training._check_memory(1000, 2)
+    monkeypatch.setattr(_training, "available_memory", lambda: needed - 1)
+    with pytest.raises(DataError, match="train on 999 points or fewer"):
+        _training._check_memory(1000, 2)
+    monkeypatch.setattr(_training, "available_memory", lambda: 2**30)
+    message = "exact GPs of 20000 points and 3 outputs need 14.9 GiB, 2.98 GiB a kernel matrix; 1 GiB are available: "
+    with pytest.raises(DataError, match=f"{message}train on 5181 points or fewer"):
+        _training._check_memory(20_000, 3)
