@@ -6,6 +6,8 @@ equations and parameters), ``residual`` (a rigid body, each of whose parameters 
 least squares, and a GP learns what is left) and ``gp`` (a GP alone). They are learned from 60 s: 20 s of random torque,
 then four times 10 s of the league's own test under the model learned so far. They are kept in ``folder=``, with a file
 ``con_gpmpc_*.py`` that flies them in the league's own scripts; ``board=script`` runs the league's unmodified one.
+``board=robustness`` flies as many values of each quantity of the robustness board as ``draws=`` says (league: 21).
+With ``time=real`` what is computed takes effect as much later as it took (``realaigym_real_time``).
 
 The league's simulator: github.com/dfki-ric-underactuated-lab/double_pendulum, its ``src/python`` on PYTHONPATH.
 """
@@ -19,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import casadi
 import numpy as np
@@ -29,8 +31,8 @@ from scipy.optimize import least_squares
 
 from gpmpc._files import write_whole
 from gpmpc.exceptions import GpmpcError, SettingError
-from gpmpc.gp import GPPosterior, Trainer, Transitions, informative_points, standardize
-from gpmpc.models import Affine, CasadiFunction, Features, KnownModel, ResidualModel, load_model, save_model
+from gpmpc.gp import GPPosterior, Trainer, Transitions, informative_points, load_metadata, standardize
+from gpmpc.models import Affine, CasadiFunction, Features, KnownModel, ResidualModel, RollOut, load_model, save_model
 from gpmpc.mpc import (
     GPMPC,
     Box,
@@ -48,7 +50,7 @@ from gpmpc.systems import System, double_pendulum, step, step_many
 
 Array = np.ndarray
 
-ACTUATED = {"acrobot": "elbow", "pendubot": "shoulder"}
+ACTUATED, JOINTS = {"acrobot": "elbow", "pendubot": "shoulder"}, {"acrobot": 1, "pendubot": 0}
 PUBLISHED = {  # simulation board of 2025: mean score of the best entries, acados with the true model, and MC-PILCO (GP)
     "acrobot": {"AR-EAPO": 0.658, "VIMPPI": 0.648, "acados MPC": 0.630, "MC-PILCO": 0.307},
     "pendubot": {"VIMPPI": 0.799, "AR-EAPO": 0.759, "acados MPC": 0.726, "MC-PILCO": 0.509},
@@ -78,6 +80,12 @@ def casadi_model(system: System) -> CasadiFunction:
     """The step of a system as a function that can be linearised."""
     x, u = casadi.SX.sym("x", len(system.state_names)), casadi.SX.sym("u", len(system.input_names))
     return CasadiFunction(casadi.Function("successor", [x, u], [casadi.vertcat(*system.successor(x, u))]))
+
+
+def fine_model(robot: str, body: list[float] | None = None) -> KnownModel:
+    """A rigid body over 2 ms; by default the true one."""
+    system = double_pendulum(ACTUATED[robot]) if body is None else _with_parameters(robot, np.array(body))
+    return KnownModel(casadi_model(replace(system, time_step=INPUT, substeps=1)), 4, 1)
 
 
 def wrong_system(robot: str, error: float, seed: int) -> System:
@@ -153,7 +161,15 @@ class Pilot:
         return out
 
 
-def league_controller(base: type, pilot: Pilot) -> Any:
+class Flies(Protocol):
+    """What flies the pendulum."""
+
+    def torques(self, x: Any, t: float) -> Array:
+        """The torques of both joints (2,) at a state in the league's order and a time [s]."""
+        ...
+
+
+def league_controller(base: type, pilot: Flies) -> Any:
     """A controller in the league's interface (``AbstractController`` or what stands for it) that a pilot flies."""
 
     class GPMPCController(base):
@@ -205,10 +221,31 @@ def write_entry(robot: str, kind: str, seed: int, folder: Path) -> Path:
     entry.parent.mkdir(parents=True, exist_ok=True)
     if kind != "true" and not model.exists():
         begin = perf_counter()
-        save_model(learned_model(robot, kind, seed), model, {"robot": robot, "seed": seed})
+        learned, body = learned_model(robot, kind, seed)
+        save_model(learned, model, {"robot": robot, "seed": seed, "body": body})
         _say(f"  learned in {perf_counter() - begin:.0f} s: {model}")
     write_whole(entry, ENTRY.format(robot=robot, kind=kind, name=name, described=DESCRIBED[kind]))
     return entry
+
+
+def play_robustness(entry: Path, robot: str, kind: str, size: int) -> str:
+    """The parts of the league's robustness board, with a number of values of each quantity, as a table."""
+    from double_pendulum.controller.abstract_controller import AbstractController
+
+    from gpmpc.experiments.realaigym_real_time import real_time_pilot
+    from gpmpc.experiments.realaigym_robustness import Watchful, robustness
+
+    path = entry.with_name(f"{entry.stem.removeprefix('con_')}.safetensors")
+    model = read_model(robot, kind, path)
+    fine = fine_model(robot, None if kind == "true" else load_metadata(path)["metadata"]["body"])
+    quick = KnownModel(model.nominal, 4, 1) if kind == "residual" else model
+    who = Watchful(real_time_pilot(make_parts(model), JOINTS[robot], quick), RollOut(fine), JOINTS[robot])
+    store = path.with_name(f"{path.stem}_robustness_{size}.json")
+    found = robustness(league_controller(AbstractController, who), robot, size, store)
+    shares = {part: float(np.mean(successes)) for part, successes in found.items()}
+    lines = [f"| {robot}, robustness 2, {kind} model | flights | up after 10 s |", "|---|---|---|"]
+    lines += [f"| {part} | {len(found[part])} | {share:.3f} |" for part, share in shares.items()]
+    return "\n".join([*lines, f"| mean | | {np.mean(list(shares.values())):.3f} |"])
 
 
 def play_script(entry: Path, robot: str) -> float:
@@ -225,16 +262,26 @@ def play_script(entry: Path, robot: str) -> float:
     return float(pandas.read_csv(results / "leaderboard_entry.csv")["RealAI Score"].iloc[0])
 
 
-def pilot(model: Any, robot: str, horizon: int = 40, programs: int = 10, wild: bool = True, gain: float = 1.0) -> Pilot:
-    """Makes the controller of a model.
+class Parts(NamedTuple):
+    """What a pilot is made of."""
+
+    controller: GPMPC  #: takes one program a decision, from a plan
+    planner: GPMPC  #: takes several
+    guesses: list[Array | None]  #: to start from: the straight line, the drift, kicks
+    criterion: Callable[[Decision, Reference], float]  #: predicted time below the line, more where the end is off [s]
+
+
+def make_parts(
+    model: Any, horizon: int = 40, programs: int = 10, wild: bool = True, disturbance_gain: float = 0.0
+) -> Parts:
+    """Makes the parts of a pilot.
 
     Args:
         model: Predicts the state 20 ms later.
-        robot: ``"acrobot"`` or ``"pendubot"``.
         horizon: Stages of 20 ms.
         programs: Of each start.
         wild: Whether starts with kicks are taken besides the straight line and the drift.
-        gain: Share of the feedback between plans.
+        disturbance_gain: Of the controller's estimate of what the model mispredicts.
     """
     Q, R = np.diag([10.0, 0.1, 10.0, 0.1]), np.array([[0.01]])
     upright = model.linearize(np.zeros((1, 4)), np.zeros((1, 1)), False)
@@ -242,13 +289,12 @@ def pilot(model: Any, robot: str, horizon: int = 40, programs: int = 10, wild: b
     problem = Problem(Tracking(Q, R, 10.0 * P, penalized="inputs", angles=(0, 2)), inputs=Box([-TORQUE], [TORQUE]))
 
     def time_below(decision: Decision, reference: Reference) -> float:
-        """Predicted time below the line, and more where the plan ends away from upright [s]."""
         off = decision.means[-1] - reference.states[-1]
         below = PLAN * float(np.sum(heights(decision.means[1:]) < LINE))
         return below + min(10.0, float(off @ P @ off) / 15.0)
 
     def make(iterations: int) -> GPMPC:
-        settings = PredictionSettings(covariance="none", rolled_out=True)
+        settings = PredictionSettings(covariance="none", rolled_out=True, disturbance_gain=disturbance_gain)
         return GPMPC(model, Linearization(), problem, horizon, [0.0], settings, iterations=iterations, tolerance=1e-2)
 
     guesses: list[Array | None] = [None, np.zeros((horizon, 1))]
@@ -257,8 +303,13 @@ def pilot(model: Any, robot: str, horizon: int = 40, programs: int = 10, wild: b
             kick = np.zeros((horizon, 1))
             kick[: horizon // 6], kick[horizon // 6 : horizon // 3] = sign * TORQUE, -sign * TORQUE
             guesses.append(kick)
-    controller = ManyStarts(make(1), make(programs), guesses, (2, 3), time_below, REPLAN)
-    return Pilot(controller, 1 if robot == "acrobot" else 0, gain)
+    return Parts(make(1), make(programs), guesses, time_below)
+
+
+def pilot(model: Any, robot: str, gain: float = 1.0, **settings: Any) -> Pilot:
+    """Makes the pilot of a model that takes all the time it likes; settings are those of ``make_parts``."""
+    controller, planner, guesses, criterion = make_parts(model, **settings)
+    return Pilot(ManyStarts(controller, planner, guesses, (2, 3), criterion, REPLAN), JOINTS[robot], gain)
 
 
 def _cost_to_go(A: Array, B: Array, Q: Array, R: Array) -> Array:
@@ -284,7 +335,7 @@ class Play:
     torques: Array
 
 
-def play(who: Pilot, robot: str, seed: int, seconds: float = DURATION, unmodified: bool = False) -> Play:
+def play(who: Flies, robot: str, seed: int, seconds: float = DURATION, unmodified: bool = False) -> Play:
     """Runs the league's simulation and disturbances, drawn from a seed.
 
     Args:
@@ -356,7 +407,7 @@ def right_hand_side() -> Callable[[float, Array, Array], Array]:
 def random_record(robot: str, seconds: float, seed: int) -> list[Play]:
     """Records of 2 s each, hanging at first, under torques that are drawn anew every 0.1 s."""
     system = replace(double_pendulum(ACTUATED[robot], time_step=INPUT), substeps=1)
-    rng, joint, records = np.random.default_rng(seed), 1 if robot == "acrobot" else 0, []
+    rng, joint, records = np.random.default_rng(seed), JOINTS[robot], []
     for _ in range(round(seconds / 2)):
         state, states, torques = np.array([np.pi, 0.0, 0.0, 0.0]), [], []
         for k in range(1000):
@@ -371,7 +422,7 @@ def random_record(robot: str, seconds: float, seed: int) -> list[Play]:
 
 def transitions(records: list[Play], robot: str, spread: float = 0.05) -> Transitions:
     """Transitions over 20 ms with a torque that changed by at most ``spread`` [N m], and none on the passive joint."""
-    joint, count = 1 if robot == "acrobot" else 0, round(PLAN / INPUT)
+    joint, count = JOINTS[robot], round(PLAN / INPUT)
     states, inputs, after = [], [], []
     for record in records:
         for i in range(0, len(record.torques) - count, count // 2):
@@ -405,8 +456,8 @@ def learn(data: Transitions, nominal: Any, before: Any = None, points: int = 700
     return ResidualModel(nominal, posterior, torch.eye(4, dtype=torch.float64), range(4), [0], 1, (0, 2))
 
 
-def learned_model(robot: str, kind: str, seed: int, error: float = 0.15) -> Any:
-    """The model of 60 s of interaction: 20 s of random torque, and four times 10 s of the league's test."""
+def learned_model(robot: str, kind: str, seed: int, error: float = 0.15) -> tuple[Any, list[float]]:
+    """The model, and its body, of 20 s of random torque and four times 10 s of the league's test."""
     nominal: Any = Affine.identity(4, 1)
     nominal.A[[0, 2], [1, 3]] = PLAN  # an angle moves by its rate
     body, model, records = wrong_system(robot, error, seed), None, random_record(robot, 20.0, seed)
@@ -420,10 +471,12 @@ def learned_model(robot: str, kind: str, seed: int, error: float = 0.15) -> Any:
             who = pilot(model, robot, wild=False, gain=0.0)
             records.append(play(who, robot, 5000 + 100 * seed + round_, 10.0))
             _say(f"  round {round_ + 1}: {30 + 10 * round_} s of interaction, score {records[-1].score:.3f}")
-    return model
+    return model, _parameters(body).tolist()
 
 
-def board(robot: str, kind: str, seeds: list[int], draws: list[int], folder: Path) -> list[dict[str, Any]]:
+def board(
+    robot: str, kind: str, seeds: list[int], draws: list[int], folder: Path, real_time: bool = False
+) -> list[dict[str, Any]]:
     """Plays a number of draws with the model of each seed; prints and returns one row for each play.
 
     Rows that the folder holds already are read, not played again.
@@ -431,23 +484,46 @@ def board(robot: str, kind: str, seeds: list[int], draws: list[int], folder: Pat
     rows = []
     for seed in seeds:
         entry = write_entry(robot, kind, seed, folder)
-        store = entry.with_name(f"{entry.stem.removeprefix('con_')}.json")
+        store = entry.with_name(f"{entry.stem.removeprefix('con_')}{'_real_time' if real_time else ''}.json")
         played = json.loads(store.read_text()) if store.exists() else []
-        model = read_model(robot, kind, entry.with_name(f"{store.stem}.safetensors"))
+        model = read_model(robot, kind, entry.with_name(f"{entry.stem.removeprefix('con_')}.safetensors"))
         for draw in draws:
             if not any(row["draw"] == draw for row in played):
-                who = pilot(model, robot)
-                found, ms = play(who, robot, draw), 1e3 * np.array(who.seconds)
-                search = np.array(who.searched)
-                played.append(
-                    {"robot": robot, "model": kind, "seed": seed, "draw": draw, "score": found.score}
-                    | {"searches": int(search.sum()), "search": float(np.median(ms[search]))}
-                    | {"median": float(np.median(ms[~search])), "p99": float(np.quantile(ms[~search], 0.99))}
-                )
+                played.append({"robot": robot, "model": kind, "seed": seed, "draw": draw})
+                played[-1] |= _play_in_real_time(model, robot, kind, draw) if real_time else _play(model, robot, draw)
                 write_whole(store, json.dumps(played, indent=1))
             rows += [row for row in played if row["draw"] == draw]
             _say("  " + "  ".join(f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()))
     return rows
+
+
+def _play(model: Any, robot: str, draw: int) -> dict[str, Any]:
+    who = pilot(model, robot)
+    found, ms, search = play(who, robot, draw), 1e3 * np.array(who.seconds), np.array(who.searched)
+    return {
+        "score": found.score,
+        "searches": int(search.sum()),
+        "search": float(np.median(ms[search])),
+        "median": float(np.median(ms[~search])),
+        "p99": float(np.quantile(ms[~search], 0.99)),
+    }
+
+
+def _play_in_real_time(model: Any, robot: str, kind: str, draw: int) -> dict[str, Any]:
+    from gpmpc.experiments.realaigym_real_time import real_time_pilot
+
+    quick = KnownModel(model.nominal, 4, 1) if kind == "residual" else model
+    who = real_time_pilot(make_parts(model), JOINTS[robot], quick)
+    found, ms, between = play(who, robot, draw), 1e3 * np.array(who.seconds), 1e3 * np.array(who.between)
+    return {
+        "score": found.score,
+        "searches": len(who.searched),
+        "search": 1e3 * float(np.median(who.searched)),
+        "median": float(np.median(ms)),
+        "p99": float(np.quantile(ms, 0.99)),
+        "late decisions": float(np.mean(ms > 1e3 * PLAN)),
+        "late inputs": float(np.mean(between > 1e3 * INPUT)),
+    }
 
 
 def table(robot: str, rows: list[dict[str, Any]]) -> str:
@@ -476,10 +552,11 @@ def table(robot: str, rows: list[dict[str, Any]]) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Reads ``robot=``, ``model=``, ``seeds=``, ``draws=``, ``board=`` and ``folder=``, plays, and prints the board."""
+    """Reads settings such as ``robot=acrobot``, plays, and prints the board."""
     given = {"robot": "acrobot", "model": "true", "seeds": "0", "draws": "3"}
-    given |= {"board": "simulation", "folder": "outputs/realaigym"}
-    choices = {"robot": tuple(ACTUATED), "model": tuple(DESCRIBED), "board": ("simulation", "script")}
+    given |= {"board": "simulation", "time": "free", "folder": "outputs/realaigym"}
+    choices = {"robot": tuple(ACTUATED), "model": tuple(DESCRIBED), "board": ("simulation", "script", "robustness")}
+    choices |= {"time": ("free", "real")}
     try:
         for argument in arguments:
             key, _, value = argument.partition("=")
@@ -500,7 +577,14 @@ def main(arguments: list[str]) -> int:
                 for _ in range(draws):
                     _say(f"  seed {seed}  score {play_script(write_entry(robot, kind, seed, folder), robot):.3f}")
             return 0
-        _say(table(robot, board(robot, kind, seeds, [100 + i for i in range(draws)], folder)))
+        if given["board"] == "robustness":
+            if kind == "gp":
+                raise SettingError("model", "must be true or residual for board=robustness, which predicts over 2 ms")
+            for seed in seeds:
+                _say(play_robustness(write_entry(robot, kind, seed, folder), robot, kind, draws))
+            return 0
+        rows = board(robot, kind, seeds, [100 + i for i in range(draws)], folder, given["time"] == "real")
+        _say(table(robot, rows))
     except (GpmpcError, subprocess.CalledProcessError) as error:
         print(f"realaigym: {error}", file=sys.stderr)
         return 2

@@ -133,7 +133,7 @@ def test_what_was_learned_is_kept_in_a_file_and_not_learned_again(monkeypatch, t
 
     def learned_model(robot, kind, seed):
         learned.append(learn(data, casadi_model(wrong_system(robot, 0.15, seed)), points=40))
-        return learned[-1]
+        return learned[-1], [1.0]
 
     monkeypatch.setattr(realaigym, "learned_model", learned_model)
     write_entry("acrobot", "residual", 3, tmp_path)
@@ -200,8 +200,8 @@ def test_draws_that_were_played_are_read_and_not_played_again(monkeypatch, tmp_p
         ([], "realaigym: simulator: the league's simulator is not installed: git clone https://github.com/dfki-ric"),
         (["robot=arm"], "realaigym: robot: must be one of acrobot, pendubot; got 'arm'"),
         (["model=best"], "realaigym: model: must be one of true, residual, gp; got 'best'"),
-        (["board=chess"], "realaigym: board: must be one of simulation, script; got 'chess'"),
-        (["speed=2"], "realaigym: speed: must be one of robot, model, seeds, draws, board, folder"),
+        (["board=chess"], "realaigym: board: must be one of simulation, script, robustness; got 'chess'"),
+        (["speed=2"], "realaigym: speed: must be one of robot, model, seeds, draws, board, time, folder"),
         (["draws=many"], "realaigym: seeds, draws: must be numbers such as"),
     ],
 )

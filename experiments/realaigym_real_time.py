@@ -1,0 +1,146 @@
+"""Plays the league's double pendulum as if computing took its time, which the simulation does not ask for.
+
+Every decision and every search is timed (processor time, all threads), and acts as much simulated time later. One core
+gives torques every 2 ms and decides every 20 ms; a second one searches from where the pendulum is expected at the
+search's end, while the best plan so far flies, or no torque where there is none yet.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from math import ceil
+from time import process_time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpmpc.experiments.realaigym import INPUT, PLAN, TORQUE, Array, Parts, state_of
+from gpmpc.gaussian import Gaussian
+from gpmpc.models import RollOut
+from gpmpc.mpc import GPMPC, ControlLoop, Decision, ManyStarts, Reference
+from gpmpc.mpc._policy import Command
+
+TICKS = round(PLAN / INPUT)  # inputs in a plan's time step
+GOOD = 0.1  # predicted time below the line up to which no better plan is searched for [s]
+
+
+class Flight(NamedTuple):
+    """A plan and the times, in inputs of 2 ms, that it begins at and is known from."""
+
+    loop: ControlLoop
+    plan: Decision
+    value: float  #: of the criterion
+    start: int
+    known: int
+
+
+@dataclass
+class RealTimePilot:
+    """Flies the best plan that is known, and knows a plan only after the time that it took.
+
+    Attributes:
+        step: Takes one program a decision.
+        searches: One after the other, again and again, while the plan is not good.
+        criterion: Of plans: predicted time below the line [s].
+        model: Predicts where a search begins.
+        joint: With the motor: 0, 1.
+        lead: Time from a search's call to its first state, in time steps of the plan.
+    """
+
+    step: GPMPC
+    searches: Sequence[ManyStarts]
+    criterion: Callable[[Decision, Reference], float]
+    model: Any
+    joint: int
+    lead: int = 8
+    seconds: list[float] = field(default_factory=list)  #: of each decision [s]
+    searched: list[float] = field(default_factory=list)  #: of each search [s]
+    between: list[float] = field(default_factory=list)  #: of each torque [s]
+    _flight: Flight | None = None
+    _decided: Flight | None = None
+    _found: Flight | None = None
+    _last: float = -1.0
+    _count: int = 0
+    _turn: int = 0
+
+    def __post_init__(self) -> None:
+        self._passive = RollOut(self.model)
+
+    def torques(self, x: Any, t: float) -> Array:
+        """The torques of both joints (2,) at a state in the league's order and a time [s]."""
+        state = state_of(x)
+        if abs(t - self._last) > 1.5 * INPUT:
+            self._flight = self._decided = self._found = None
+            self._count = self._turn = 0
+        self._last, now = t, self._count
+        if self._found is not None and now >= self._found.known:
+            if self._flight is None or self._found.value < self._flight.value - PLAN:
+                self._flight, self._decided = self._found, None
+            self._found = None
+        if self._decided is not None and now >= self._decided.known:
+            self._flight, self._decided = self._decided, None
+        begin, torque = process_time(), 0.0
+        if self._flight is not None:
+            torque = self._flight.loop.input_between(state, (now - self._flight.start) / TICKS)[0]
+        self.between.append(process_time() - begin)
+        if now % TICKS == 0:
+            if self._found is None and (self._flight is None or self._flight.value > GOOD):
+                self._found = self._search(state, now)
+            if self._decided is None and self._flight is not None and now > self._flight.start:
+                self._decided = self._decide(state, now, self._flight)
+        self._count += 1
+        out = np.zeros(2)
+        out[self.joint] = np.clip(torque, -TORQUE, TORQUE)
+        return out
+
+    def _search(self, state: Array, now: int) -> Flight | None:
+        begin, flight = process_time(), self._flight
+        if flight is None:
+            expected = self._passive.open_loop(state[None], np.zeros((1, self.lead, 1)))[0, -1]
+        else:
+            means = flight.plan.means
+            expected = means[min((now - flight.start) // TICKS + self.lead, len(means) - 1)]
+        search = self.searches[self._turn % len(self.searches)]
+        self._turn += 1
+        plan = search.control(Gaussian.certain(expected), Reference(np.zeros(4)))
+        return self._timed(plan, begin, now, now + self.lead * TICKS, self.searched)
+
+    def _decide(self, state: Array, now: int, flight: Flight) -> Flight | None:
+        begin, passed = process_time(), (now - flight.start) // TICKS
+        inputs, states = (_later(part, passed) for part in (flight.plan.inputs, flight.plan.means))
+        previous = flight.plan if passed == 1 else None
+        plan = self.step.control(Gaussian.certain(state), _goal(states), previous, None, (inputs, states))
+        return self._timed(plan, begin, now, now, self.seconds)
+
+    def _timed(self, plan: Decision, begin: float, now: int, start: int, times: list[float]) -> Flight | None:
+        """The flight of a plan whose making began at a processor time; None where it is not applicable."""
+        loop, value = ControlLoop(self.step), 0.0
+        if plan.applicable:
+            loop.last = Command(plan.input, plan.status, plan, plan)
+            loop.input_between(plan.means[0], 0.0)  # its gains
+            value = self.criterion(plan, _goal(plan.means))
+        times.append(process_time() - begin)
+        known = max(start, now + max(1, ceil(times[-1] / INPUT)))
+        return Flight(loop, plan, value, start, known) if plan.applicable else None
+
+
+def real_time_pilot(parts: Parts, joint: int, quick: Any) -> RealTimePilot:
+    """Makes a real-time pilot that searches with a model that is quick, and decides with that of its parts."""
+    planner = parts.planner.with_model(quick)
+    searches = [ManyStarts(planner, planner, [guess], (2, 3), parts.criterion) for guess in parts.guesses]
+    made = RealTimePilot(parts.controller, searches, parts.criterion, quick, joint)
+    for k in range((made.lead + 4) * TICKS):  # compiles everything before the clock counts
+        made.torques(np.array([np.pi, 0.2, 0.0, 0.0]), INPUT * k)
+    return RealTimePilot(parts.controller, searches, parts.criterion, quick, joint)
+
+
+def _later(part: Array, stages: int) -> Array:
+    """Inputs or states from a later stage on, the last one repeated."""
+    stages = min(stages, len(part) - 1)
+    return np.concatenate([part[stages:], np.repeat(part[-1:], stages, axis=0)])
+
+
+def _goal(states: Array) -> Reference:
+    """Upright over the horizon of a plan (H + 1, n), in the turns that are nearest to its end."""
+    upright = np.zeros_like(states)
+    upright[:, [0, 2]] = 2 * np.pi * np.round(states[-1, [0, 2]] / (2 * np.pi))
+    return Reference(upright)
