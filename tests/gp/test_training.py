@@ -1,3 +1,6 @@
+import logging
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +13,7 @@ from gpmpc.gp import (
     SparseTrainer,
     Trainer,
     Transitions,
+    _training,
     identity,
     standardize,
     to_gpytorch,
@@ -261,3 +265,22 @@ def test_a_refit_and_a_start_need_a_posterior_and_transitions_that_fit_it():
     assert trainer.refit(values).posterior.predicts == "value"
     with pytest.raises(SettingError, match=r"transitions: must be Transitions\(...\); got int"):
         SparseTrainer()(1)
+
+
+def test_a_training_of_many_points_tells_of_every_output_what_it_took(caplog, monkeypatch):
+    data = pendulum(12)
+    train(data, restarts=0)
+    assert not caplog.records
+    monkeypatch.setattr(_training, "_MANY", 11)
+    with caplog.at_level(logging.INFO, "gpmpc"):
+        found = train(data, restarts=0)
+    told = [
+        re.fullmatch(r"training: output (\d) of 2: (\d+) evaluations, \d+\.\d s", r.message) for r in caplog.records
+    ]
+    assert [one[1] for one in told] == ["1", "2"]
+    assert sum(int(one[2]) for one in told) == found.evaluations
+    caplog.clear()
+    monkeypatch.setattr(_training, "_MANY", 12)
+    with caplog.at_level(logging.INFO, "gpmpc"):
+        train(data, restarts=0)
+    assert not caplog.records
