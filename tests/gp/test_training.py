@@ -99,6 +99,10 @@ def test_the_spread_of_a_constant_column_is_its_magnitude_or_one():
     columns = np.column_stack([[1.0, 2.0, 3.0], [-4.0] * 3, [0.0] * 3, [0.5, 0.5 + 1e-12, 0.5]])
     assert np.allclose(column_std(columns), [1, 4, 1, 0.5])
     assert np.allclose(column_std(np.array([[2.0, 0.0]])), [2, 1])
+    assert np.allclose(column_std(np.array([[1e9, 1.0], [3e9, 1.002]])), np.sqrt(2) * np.array([1e9, 1e-3]))
+    assert np.allclose(
+        column_std(np.array([[1e9, 1.0, 1.0], [1e9 + 1e-2, 1.0, 1.0 + 1e-5]])), [1e9, 1, 1e-5 / np.sqrt(2)]
+    )
 
 
 def test_the_prior_mean_is_what_the_scaling_maps_to_zero():
