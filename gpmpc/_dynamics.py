@@ -198,11 +198,7 @@ def _constant_arrays(*tensors: Tensor) -> list[Array] | None:
 
 
 def check_next_states(model: Any) -> tuple[int, int]:
-    """Returns the numbers of states and inputs of a model that predicts next states.
-
-    Raises:
-        SettingError: It is no model, or predicts something else.
-    """
+    """The numbers of states and inputs of a model that predicts next states; of others a ``SettingError``."""
     if not hasattr(model, "predict"):
         raise SettingError("model", f"must be a DynamicsModel, such as GPPosterior; got {type(model).__name__}")
     if model.output_dim != model.state_dim:
@@ -213,12 +209,7 @@ def check_next_states(model: Any) -> tuple[int, int]:
 
 
 def check_query(model: Any, state: Tensor, input: Tensor) -> None:
-    """Raises unless a state (*batch, n) and an input (*batch, m) fit a model in shape, type and device.
-
-    Raises:
-        ShapeError: Another number of states or inputs.
-        SettingError: No tensor, or another dtype or device.
-    """
+    """Raises unless a state (*batch, n) and an input (*batch, m) are tensors of a model's shape, type and device."""
     check_tensors(state=state, input=input)
     if state.shape[-1:] != (model.state_dim,) or input.shape[-1:] != (model.input_dim,):
         got = [tensor.shape[-1] if tensor.dim() else "a scalar" for tensor in (state, input)]
@@ -238,11 +229,7 @@ def check_query(model: Any, state: Tensor, input: Tensor) -> None:
 
 
 def check_destination(device: Any, dtype: Any) -> None:
-    """Raises unless a model can go to a device and a type; None stays where it is.
-
-    Raises:
-        SettingError: torch finds no such device here, or the type is neither float32 nor float64.
-    """
+    """Raises unless torch finds the device, and the type is float32 or float64; None stays where it is."""
     if device is not None:
         try:
             torch.empty(0, device=device)

@@ -46,12 +46,7 @@ def remove_partial(folder: Path) -> None:
 
 
 def existing_file(path: str | Path, expected: str) -> Path:
-    """The path of a file that is there.
-
-    Raises:
-        SettingError: It is no path.
-        DataError: There is no file, or it cannot be looked at.
-    """
+    """The path of a file that is there; ``DataError`` where none is, ``SettingError`` of what is no path."""
     try:
         found = _path(path).is_file()
     except OSError as error:
@@ -62,12 +57,7 @@ def existing_file(path: str | Path, expected: str) -> Path:
 
 
 def new_file(path: str | Path) -> Path:
-    """The path of a file that can be written.
-
-    Raises:
-        SettingError: It is no path.
-        DataError: The folder does not exist.
-    """
+    """The path of a file to be written; ``DataError`` without its folder, ``SettingError`` of what is no path."""
     path = _path(path)
     if not path.parent.is_dir():
         raise DataError(f"{path}: the folder {path.parent} does not exist")

@@ -110,11 +110,7 @@ def check_number(
 
 
 def check_numbers(key: str, values: Any, length: int, **limits: Any) -> None:
-    """Raises unless a setting is a list of ``length`` numbers, each as ``check_number`` asks for.
-
-    Raises:
-        SettingError: It is not.
-    """
+    """Raises unless a setting is a list of ``length`` numbers, each as ``check_number`` asks for."""
     if isinstance(values, str) or not hasattr(values, "__len__") or len(values) != length:
         raise SettingError(key, f"must be a list of {length} numbers; got {values!r}")
     for value in values:

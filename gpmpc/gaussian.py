@@ -10,11 +10,7 @@ from gpmpc.exceptions import SettingError, ShapeError
 
 
 def check_tensors(**given: Any) -> None:
-    """Raises unless everything given is a tensor.
-
-    Raises:
-        SettingError: Something else was given: an array, a list, a number.
-    """
+    """Raises ``SettingError`` unless everything given is a tensor: of an array, a list, a number."""
     for key, value in given.items():
         if not isinstance(value, Tensor):
             got = type(value).__name__

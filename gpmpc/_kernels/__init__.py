@@ -103,11 +103,7 @@ def linearize(
 
 
 def point_with_jacobian(packed: Packed, x: ArrayLike, u: ArrayLike) -> Expansion:
-    """Mean and variance at a certain state x and control u, with the derivatives that linearised propagation needs.
-
-    Raises:
-        ShapeError: x (n,) or (H, n) or u (m,) or (H, m) do not fit the model.
-    """
+    """Mean and variance at a state x (n,) or (H, n) and control u, with the derivatives that linearisation needs."""
     x, u, single = _points(packed, x, u)
     H, k, n, m = len(x), packed.output_dim, packed.state_dim, packed.input_dim
     shapes = [(k,), (k,), (k, n), (k, m), (k, n), (k, m), (k, n, n), (k, n, m)]

@@ -89,7 +89,8 @@ def _draw(given: argparse.Namespace) -> Result:
 def _plot(given: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]:
     from rich.console import Console
 
-    from gpmpc.plotting import animate, ffmpeg_exists, film, inputs_figure, timing_figure, tracking_figure
+    from gpmpc.plotting import animate, film, inputs_figure, timing_figure, tracking_figure
+    from gpmpc.plotting._animation import ffmpeg_exists
     from gpmpc.recording import read_run
 
     run, written = read_run(path), []

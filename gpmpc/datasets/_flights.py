@@ -34,7 +34,8 @@ from gpmpc.gp import Transitions
 from gpmpc.mpc import problem as mpc
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.simulation import Noise, Rollout, closed_loop
-from gpmpc.systems import ATTITUDES, Plant, System, approach_attitudes, attitude_for_thrust_direction, translational
+from gpmpc.systems import ATTITUDES, Plant, System, attitude_for_thrust_direction, translational
+from gpmpc.systems._quadrotor import approach_attitudes
 from gpmpc.trajectories import Trajectory
 
 SUBSYSTEMS = ("translational", "rotational")

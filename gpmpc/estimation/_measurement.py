@@ -14,7 +14,7 @@ from torch import Tensor
 from gpmpc._dynamics import Array, Linearized, check_query
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.models import linearize_function
+from gpmpc.models._nominal import linearize_function
 
 
 @dataclass(frozen=True)

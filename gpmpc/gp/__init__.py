@@ -8,7 +8,6 @@ from gpmpc.gp._online import SlidingWindow, append_points, append_transitions, r
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._scaling import Scaling, centre, identity, min_max, standardize
 from gpmpc.gp._search import SoftLimits
-from gpmpc.gp._sparse import sparse_posterior
 from gpmpc.gp._sparse_training import SparseTrainer, informative_points
 from gpmpc.gp._storage import load_metadata, load_posterior, save_posterior
 from gpmpc.gp._training import Trainer, Training, train
@@ -38,7 +37,6 @@ __all__ = [
     "min_max",
     "remove_points",
     "save_posterior",
-    "sparse_posterior",
     "standardize",
     "to_gpytorch",
     "train",

@@ -42,11 +42,7 @@ def centred(points: Any) -> Any:
 
 
 def factorize(inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor) -> Tensor:
-    """The lower Cholesky factors of K + sn2 I (k, N, N).
-
-    Raises:
-        SettingError: The matrix of an output is not positive definite in double precision.
-    """
+    """The lower Cholesky factors of K + sn2 I (k, N, N); ``SettingError`` where one is not positive definite."""
     if len(inputs) > _MANY and not any(
         t.requires_grad for t in (inputs, lengthscales, signal_variance, noise_variance)
     ):

@@ -194,11 +194,7 @@ def restored_theta(theta: np.ndarray, features: Scaling, targets: Scaling) -> np
 
 
 def log_hyperparameters(posterior: GPPosterior, features: Scaling, targets: Scaling) -> np.ndarray:
-    """Rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), of a posterior, in scaled units.
-
-    Raises:
-        ShapeError: The scalings belong to other dimensions.
-    """
+    """Rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), of a posterior, in scaled units."""
     k, d = len(targets.factor), len(features.factor)
     if posterior.lengthscales.shape != (k, d):
         got = tuple(posterior.lengthscales.shape[::-1])

@@ -189,11 +189,7 @@ class Transitions:
 
 
 def check_transitions(transitions: Any) -> None:
-    """Raises unless these are transitions.
-
-    Raises:
-        SettingError: Something else was given.
-    """
+    """Raises ``SettingError`` unless these are transitions."""
     if not isinstance(transitions, Transitions):
         raise SettingError("transitions", f"must be Transitions(...); got {type(transitions).__name__}")
 

@@ -26,7 +26,8 @@ from gpmpc._kernels import linearize as linearize_gps
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.models import Features, Wrapper
+from gpmpc.models import Features
+from gpmpc.models._wrapper import Wrapper
 
 
 @dataclass(frozen=True)

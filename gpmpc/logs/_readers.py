@@ -19,11 +19,7 @@ Streams = dict[str, pd.DataFrame]
 
 
 def read_streams(path: str | Path, topics: Iterable[str] = (), partial: bool = False) -> Streams:
-    """Reads the tables of a log file: all topics by default, or what is whole of an unfinished recording.
-
-    Raises:
-        DataError: The file is missing, damaged, unfinished or of an unknown kind, or a topic is missing.
-    """
+    """Reads the tables of a log file: all topics by default, or what is whole of an unfinished recording."""
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: no such file")

@@ -4,11 +4,10 @@ from gpmpc._dynamics import DynamicsModel, Linearized, linearize, linearize_by_a
 from gpmpc.models._delay import DelayedModel
 from gpmpc.models._disturbance import DisturbedModel
 from gpmpc.models._features import Features, Lags
-from gpmpc.models._nominal import Affine, CasadiFunction, KnownModel, linearize_function
-from gpmpc.models._residual import ResidualModel, train_residual
+from gpmpc.models._nominal import Affine, CasadiFunction, KnownModel
+from gpmpc.models._residual import ResidualModel
 from gpmpc.models._roll_out import RollOut
 from gpmpc.models._storage import load_model, save_model
-from gpmpc.models._wrapper import Wrapper
 
 __all__ = [
     "Affine",
@@ -22,11 +21,8 @@ __all__ = [
     "Linearized",
     "ResidualModel",
     "RollOut",
-    "Wrapper",
     "linearize",
     "linearize_by_autograd",
-    "linearize_function",
     "load_model",
     "save_model",
-    "train_residual",
 ]

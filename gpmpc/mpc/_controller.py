@@ -268,12 +268,7 @@ def _array(value: Any) -> Array:
 
 
 def read_parameters(parameters: Any, horizon: int) -> Array:
-    """Returns parameters of every stage (H, q).
-
-    Raises:
-        ShapeError: They are neither (q,) nor (H, q).
-        DataError: They are not finite.
-    """
+    """Returns finite parameters of every stage (H, q), given as these or as (q,)."""
     values = np.atleast_1d(_array(parameters))
     if values.ndim == 1:
         values = np.tile(values, (horizon, 1))

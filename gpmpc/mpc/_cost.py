@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
-from gpmpc.models import CasadiFunction, linearize_function
+from gpmpc.models._nominal import CasadiFunction, linearize_function
 
 Array = np.ndarray
 
@@ -104,11 +104,7 @@ class LeastSquares:
 
 
 def by_stage(key: str, values: Array, horizon: int, dims: int) -> Array:
-    """Returns values of every stage, given of every stage or of one (whose array has ``dims`` axes).
-
-    Raises:
-        SettingError: Of another number of stages.
-    """
+    """Returns values of every stage, given of every stage (H of them) or of one (whose array has ``dims`` axes)."""
     if values.ndim > dims and len(values) != horizon:
         raise SettingError(key, f"must be given for one stage or all {horizon}; got {len(values)}")
     return np.ascontiguousarray(np.broadcast_to(values, (horizon, *values.shape[values.ndim - dims :])))

@@ -119,7 +119,7 @@ class ControlLoop:
 
     Args:
         controller: With a problem and an initial input.
-        on_failure: ``"previous_plan"`` or ``"hold"``; see ``command``. ``"raise"`` stops instead.
+        on_failure: ``"previous_plan"`` goes on along the last plan, ``"hold"`` keeps the last input, ``"raise"`` stops.
 
     Attributes:
         last: Command of the last step: its input, decision and status; None before the first.

@@ -117,11 +117,7 @@ class PredictionSettings:
 
 
 class PredictionModel:
-    """Predicts beliefs for one problem.
-
-    Raises:
-        SettingError: No propagator, or settings that do not belong to the model.
-    """
+    """Predicts beliefs for one problem; checks that the settings belong to the model."""
 
     def __init__(
         self,
@@ -161,11 +157,7 @@ class PredictionModel:
         parameters: Any = None,
         plan: Any = None,
     ) -> Request:
-        """The checked arguments of a controller's ``control``, with the disturbance estimate.
-
-        Raises:
-            ShapeError: Belief, reference or plan have other dimensions, or reference inputs are missing.
-        """
+        """The arguments of a controller's ``control``, whose dimensions are checked, with the disturbance estimate."""
         problem, H = self.problem, self.horizon
         request = Request.read(problem, H, self.initial_input, belief, reference, previous, plan)
         if parameters is not None:

@@ -31,8 +31,9 @@ from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
 from gpmpc.mpc._cost import PENALIZED, by_stage
 from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, Stages
 from gpmpc.mpc.problem import Inequality, Problem
-from gpmpc.propagation import Propagator, differentiate, square_roots
+from gpmpc.propagation import Propagator, differentiate
 from gpmpc.propagation import linearize as linearize_belief
+from gpmpc.propagation._local_model import square_roots
 
 Array = np.ndarray
 
@@ -155,11 +156,7 @@ def _constants(A, B, after, states, inputs):
 
 
 class StageCosts:
-    """The cost of a problem's stages: the weights alone, ``quadratic``, and the squares of outputs along a plan.
-
-    Raises:
-        SettingError: Weights or references of another number of stages.
-    """
+    """The cost of a problem's stages: the weights alone, ``quadratic``, and the squares of outputs along a plan."""
 
     def __init__(self, problem: Problem, horizon: int, linearizer: StageLinearizer):
         n, m, cost, self._linearizer = problem.state_dim, problem.input_dim, problem.cost, linearizer

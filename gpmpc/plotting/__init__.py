@@ -3,7 +3,7 @@
 Every function returns a ``Figure`` made without pyplot, so nothing global is touched and no window opens.
 """
 
-from gpmpc.plotting._animation import animate, ffmpeg_exists
+from gpmpc.plotting._animation import animate
 from gpmpc.plotting._film import film
 from gpmpc.plotting._recorded import inputs_figure, inspection_figure, judgement_figure, timing_figure, tracking_figure
 from gpmpc.plotting._results import (
@@ -24,7 +24,6 @@ __all__ = [
     "animate",
     "calibration_figure",
     "error_over_size",
-    "ffmpeg_exists",
     "film",
     "innovations_figure",
     "inputs_figure",

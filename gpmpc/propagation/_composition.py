@@ -38,7 +38,7 @@ class Latent(NamedTuple):
 
 
 class Composition:
-    """The affine part of a model around its latent functions ``f``; see ``gpmpc.gp._posterior.AffineForm``."""
+    """The affine part of a model around its latent functions ``f``, an ``AffineForm``."""
 
     B: Any
     G: Any

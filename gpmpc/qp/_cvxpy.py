@@ -74,7 +74,7 @@ class CvxpySolver:
             raise ProblemError(f"CVXPY finds no solver named {self.name!r}; it finds {', '.join(installed)}")
 
     def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
-        """The minimiser; a warm start's x is offered to solvers that take one. See ``gpmpc.qp._solution.QPSolver``."""
+        """The minimiser; a warm start's x is offered to solvers that take one. See ``QPSolver``."""
         import cvxpy
 
         began = perf_counter()

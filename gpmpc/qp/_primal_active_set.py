@@ -77,7 +77,7 @@ class PrimalActiveSet:
 
     @np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen below
     def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
-        """The minimiser, from a warm start of any kind; see ``gpmpc.qp._solution.QPSolver``."""
+        """The minimiser, from a warm start of any kind; see ``QPSolver``."""
         began = perf_counter()
         n, M = len(problem.q), len(problem.lower)
         rows = _one_sided(problem)

@@ -197,11 +197,7 @@ def make_solution(
 
 
 def as_record(warm_start: WarmStart, n: int, M: int) -> Array:
-    """Returns whatever can be used of a warm start.
-
-    Raises:
-        ProblemError: It is neither a solution nor an active set of this size.
-    """
+    """Whatever can be used of a warm start; ``ProblemError`` of what is no solution or active set of this size."""
     if warm_start is None:
         return layout.NO_RECORD
     if isinstance(warm_start, QPSolution):

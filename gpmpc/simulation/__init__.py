@@ -3,7 +3,7 @@
 from gpmpc.simulation._cascade_loop import Cascade, cascade_loop
 from gpmpc.simulation._closed_loop import Trial, closed_loop, closed_loops, rehearse
 from gpmpc.simulation._loop import Rollout
-from gpmpc.simulation._simulator import Disturbance, Dropout, Gust, ModelLoop, Noise, PlantSimulator, Replaced
+from gpmpc.simulation._simulator import Disturbance, Dropout, Gust, ModelLoop, Noise, Replaced
 from gpmpc.step import Step
 
 __all__ = [
@@ -13,7 +13,6 @@ __all__ = [
     "Gust",
     "ModelLoop",
     "Noise",
-    "PlantSimulator",
     "Replaced",
     "Rollout",
     "Step",

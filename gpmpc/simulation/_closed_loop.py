@@ -50,7 +50,7 @@ def closed_loop(
         noise: On a plant's states, measurements and inputs.
         disturbances: Gusts, other plants, dropouts: what the controller does not know of.
         on_failure: What is applied where a solve fails: ``"previous_plan"``, ``"hold"`` or ``"raise"``; see
-            ``gpmpc.mpc._policy``.
+            ``ControlLoop``.
         seed: Of all random numbers; equal seeds give equal numbers.
         on_step: Called after every step and outside of everything that is timed, such as a recorder's ``record``.
 

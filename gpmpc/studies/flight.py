@@ -23,12 +23,14 @@ from gpmpc.gp import Training, Transitions
 from gpmpc.gp.casadi_ import successor_function
 from gpmpc.learning import EpisodicLearning, LearningController, OnlineLearning
 from gpmpc.metrics import find_loss, time_quantiles, tracking_error, violation_rate
-from gpmpc.models import CasadiFunction, train_residual
+from gpmpc.models import CasadiFunction
+from gpmpc.models._residual import train_residual
 from gpmpc.mpc import Reference
 from gpmpc.mpc._policy import OnFailure, check_policy
 from gpmpc.mpc.problem import Box
 from gpmpc.propagation import Propagator, best_propagator
-from gpmpc.simulation import Disturbance, ModelLoop, Noise, PlantSimulator, Rollout, Step, closed_loop, rehearse
+from gpmpc.simulation import Disturbance, ModelLoop, Noise, Rollout, Step, closed_loop, rehearse
+from gpmpc.simulation._simulator import PlantSimulator
 from gpmpc.studies._document import Table
 from gpmpc.studies.study import random_rows
 from gpmpc.systems import System

@@ -14,7 +14,7 @@ from gpmpc.testing._promise import require, require_close, require_covariance
 def check_model(
     model: DynamicsModel, states: Tensor | None = None, inputs: Tensor | None = None, seed: int = 0
 ) -> None:
-    """Checks a model against the protocol ``gpmpc._dynamics.DynamicsModel``.
+    """Checks a model against the protocol ``gpmpc.models.DynamicsModel``.
 
     ``predict`` is called alone and in batches, twice, with arrays in awkward layouts; ``linearize`` is compared with it
     and with its finite differences.

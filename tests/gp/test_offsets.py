@@ -20,12 +20,11 @@ from gpmpc.gp import (
     identity,
     min_max,
     remove_points,
-    sparse_posterior,
     standardize,
 )
 from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
 from gpmpc.gp._search import column_std, constant_columns
-from gpmpc.gp._sparse import collapsed_bound
+from gpmpc.gp._sparse import collapsed_bound, sparse_posterior
 from gpmpc.gp.casadi_ import casadi_function
 from gpmpc.gp.module import PosteriorModule
 from gpmpc.propagation import (

@@ -17,11 +17,10 @@ from gpmpc.gp import (
     Transitions,
     append_transitions,
     remove_points,
-    sparse_posterior,
     standardize,
 )
 from gpmpc.gp._kernel import kernel_matrix
-from gpmpc.gp._sparse import _cross, collapsed_bound
+from gpmpc.gp._sparse import _cross, collapsed_bound, sparse_posterior
 from gpmpc.gp._sparse_training import informative_points
 from gpmpc.propagation import MomentMatching, MonteCarlo
 
