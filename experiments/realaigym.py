@@ -272,7 +272,7 @@ class Parts(NamedTuple):
 
 
 def make_parts(
-    model: Any, horizon: int = 40, programs: int = 10, wild: bool = True, disturbance_gain: float = 0.0
+    model: Any, horizon: int = 40, programs: int = 20, wild: bool = True, disturbance_gain: float = 0.0
 ) -> Parts:
     """Makes the parts of a pilot.
 
