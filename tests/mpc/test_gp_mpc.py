@@ -9,7 +9,8 @@ import torch
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
-from gpmpc.mpc import Reference
+from gpmpc.mpc import Reference, gp_mpc
+from gpmpc.mpc._controller import Timing
 from gpmpc.mpc._prediction import FORMS, PredictionSettings
 from gpmpc.mpc._stages import COVARIANCES
 from gpmpc.mpc.baselines import NMPC
@@ -497,3 +498,20 @@ def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_reque
         with backend(evaluated):
             found.append(controller.control(state, at_origin(3)).covariances[1])
     assert np.allclose(found[1] - found[0], gp().noise_covariance, atol=1e-6)  # of 1e-4; the plans differ a little
+
+
+def test_each_part_of_a_decision_takes_its_own_time_and_questions_share_the_model(monkeypatch):
+    model, H = linear_gaussian(2, 1), 3
+    problem, reference = Problem(Tracking([1.0, 1.0], [0.1])), Reference(np.zeros((H + 1, 2)), np.zeros((H, 1)))
+    controller = GPMPC(model, Linearization(), problem, H, [0.0])
+    at = Gaussian.certain(np.ones(2))
+    looks = iter([0.0, 1.0, 11.0, 111.0, 1111.0])
+    monkeypatch.setattr(gp_mpc, "perf_counter", lambda: next(looks))
+    assert controller.control(at, reference).timing == Timing(1.0 + 1000.0, 10.0, 100.0)
+    looks = iter([0.0, 4.0, *(100.0 + k for k in (0, 1, 3, 7, 15)), *(200.0 + k for k in (0, 10, 30, 70, 150))])
+    first, second = controller.control_many([at, at], [reference] * 2, [None] * 2)
+    assert first.timing == Timing(4.0 / 2 + 1.0 + 8.0, 2.0, 4.0)
+    assert second.timing == Timing(4.0 / 2 + 10.0 + 80.0, 20.0, 40.0)
+    looks = iter(range(20))
+    again = GPMPC(model, Linearization(), problem, H, [0.0], iterations=5).control(at, reference)
+    assert again.timing == Timing(again.iterations + 1.0, float(again.iterations), float(again.iterations))
