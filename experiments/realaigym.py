@@ -7,6 +7,7 @@ least squares, and a GP learns what is left) and ``gp`` (a GP alone). They are l
 then four times 10 s of the league's own test under the model learned so far. They are kept in ``folder=``, with a file
 ``con_gpmpc_*.py`` that flies them in the league's own scripts; ``board=script`` runs the league's unmodified one.
 ``board=robustness`` flies as many values of each quantity of the robustness board as ``draws=`` says (league: 21).
+``board=film`` draws 8 s as a GIF.
 With ``time=real`` what is computed takes effect as much later as it took (``realaigym_real_time``).
 
 The league's simulator: github.com/dfki-ric-underactuated-lab/double_pendulum, its ``src/python`` on PYTHONPATH.
@@ -246,6 +247,16 @@ def play_robustness(entry: Path, robot: str, kind: str, size: int) -> str:
     lines = [f"| {robot}, robustness 2, {kind} model | flights | up after 10 s |", "|---|---|---|"]
     lines += [f"| {part} | {len(found[part])} | {share:.3f} |" for part, share in shares.items()]
     return "\n".join([*lines, f"| mean | | {np.mean(list(shares.values())):.3f} |"])
+
+
+def play_film(entry: Path, robot: str, kind: str) -> Path:
+    """Writes the first 8 s of draw 100 as a GIF beside an entry."""
+    from gpmpc.experiments.realaigym_film import film
+
+    path = entry.with_name(f"{entry.stem.removeprefix('con_')}.gif")
+    model = read_model(robot, kind, path.with_suffix(".safetensors"))
+    film(play(pilot(model, robot), robot, 100, 8.0), JOINTS[robot], path)
+    return path
 
 
 def play_script(entry: Path, robot: str) -> float:
@@ -555,7 +566,11 @@ def main(arguments: list[str]) -> int:
     """Reads settings such as ``robot=acrobot``, plays, and prints the board."""
     given = {"robot": "acrobot", "model": "true", "seeds": "0", "draws": "3"}
     given |= {"board": "simulation", "time": "free", "folder": "outputs/realaigym"}
-    choices = {"robot": tuple(ACTUATED), "model": tuple(DESCRIBED), "board": ("simulation", "script", "robustness")}
+    choices = {
+        "robot": tuple(ACTUATED),
+        "model": tuple(DESCRIBED),
+        "board": ("simulation", "script", "robustness", "film"),
+    }
     choices |= {"time": ("free", "real")}
     try:
         for argument in arguments:
@@ -582,6 +597,10 @@ def main(arguments: list[str]) -> int:
                 raise SettingError("model", "must be true or residual for board=robustness, which predicts over 2 ms")
             for seed in seeds:
                 _say(play_robustness(write_entry(robot, kind, seed, folder), robot, kind, draws))
+            return 0
+        if given["board"] == "film":
+            for seed in seeds:
+                _say(f"  {play_film(write_entry(robot, kind, seed, folder), robot, kind)}")
             return 0
         rows = board(robot, kind, seeds, [100 + i for i in range(draws)], folder, given["time"] == "real")
         _say(table(robot, rows))

@@ -2,29 +2,31 @@
 
 Every decision and every search is timed (processor time, all threads), and acts as much simulated time later. One core
 gives torques every 2 ms and decides every 20 ms; a second one searches from where the pendulum is expected at the
-search's end, while the best plan so far flies, or no torque where there is none yet.
+search's end. Until a plan is known there is no torque; then the remaining searches look for a better one that starts
+from that plan, which meanwhile flies by its feedback alone, and from then on it is improved every 20 ms.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from math import ceil
+from dataclasses import dataclass, field, replace
+from math import ceil, inf
 from time import process_time
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpmpc.experiments.realaigym import INPUT, PLAN, TORQUE, Array, Parts, state_of
+from gpmpc.experiments.realaigym import INPUT, PLAN, REPLAN, TORQUE, Array, Parts, state_of
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import RollOut
 from gpmpc.mpc import GPMPC, ControlLoop, Decision, ManyStarts, Reference
 from gpmpc.mpc._policy import Command
 
+CALM = 3.0  # rates up to which a plan that leads nowhere is flown, for the motion's sake [rad/s]
 TICKS = round(PLAN / INPUT)  # inputs in a plan's time step
-GOOD = 0.1  # predicted time below the line up to which no better plan is searched for [s]
+GOOD = 0.4  # predicted time below the line up to which a plan is not compared with those of other searches [s]
 
 
 class Flight(NamedTuple):
-    """A plan and the times, in inputs of 2 ms, that it begins at and is known from."""
+    """A plan and the times, in inputs of 2 ms, that it begins at and is known from, when its core is free again."""
 
     loop: ControlLoop
     plan: Decision
@@ -39,7 +41,7 @@ class RealTimePilot:
 
     Attributes:
         step: Takes one program a decision.
-        searches: One after the other, again and again, while the plan is not good.
+        searches: Taken one after the other, again and again while there is no plan.
         criterion: Of plans: predicted time below the line [s].
         model: Predicts where a search begins.
         joint: With the motor: 0, 1.
@@ -51,7 +53,7 @@ class RealTimePilot:
     criterion: Callable[[Decision, Reference], float]
     model: Any
     joint: int
-    lead: int = 8
+    lead: int = 6
     seconds: list[float] = field(default_factory=list)  #: of each decision [s]
     searched: list[float] = field(default_factory=list)  #: of each search [s]
     between: list[float] = field(default_factory=list)  #: of each torque [s]
@@ -73,27 +75,41 @@ class RealTimePilot:
             self._count = self._turn = 0
         self._last, now = t, self._count
         if self._found is not None and now >= self._found.known:
-            if self._flight is None or self._found.value < self._flight.value - PLAN:
-                self._flight, self._decided = self._found, None
+            better = self._flight is None or self._found.value < self._value(self._flight, self._found.start) - PLAN
+            if better and self._found.value < inf:
+                self._flight = self._found
             self._found = None
         if self._decided is not None and now >= self._decided.known:
-            self._flight, self._decided = self._decided, None
+            if self._decided.value < inf:
+                self._flight = self._decided
+                self._turn = 0 if self._flight.value > REPLAN else self._turn
+            self._decided = None
         begin, torque = process_time(), 0.0
         if self._flight is not None:
             torque = self._flight.loop.input_between(state, (now - self._flight.start) / TICKS)[0]
         self.between.append(process_time() - begin)
-        if now % TICKS == 0:
-            if self._found is None and (self._flight is None or self._flight.value > GOOD):
-                self._found = self._search(state, now)
-            if self._decided is None and self._flight is not None and now > self._flight.start:
-                self._decided = self._decide(state, now, self._flight)
+        if now % TICKS == 0 and self._found is None and self._decided is None:
+            flight = self._flight
+            lost = flight is None or flight.value > REPLAN
+            if flight is not None and lost and (now - flight.start) // TICKS + self.lead >= len(flight.plan.inputs):
+                self._flight = flight = None  # a search needs to know where the flight will be
+            compared = self._turn >= len(self.searches) or (flight is not None and flight.value <= GOOD)
+            if flight is None or lost or not (compared or now < flight.known + TICKS):
+                self._found = self._search(state, now, flight)
+            elif now > flight.start:
+                self._decided = self._decide(state, now, flight)
         self._count += 1
         out = np.zeros(2)
         out[self.joint] = np.clip(torque, -TORQUE, TORQUE)
         return out
 
-    def _search(self, state: Array, now: int) -> Flight | None:
-        begin, flight = process_time(), self._flight
+    def _value(self, flight: Flight, start: int) -> float:
+        """The criterion of what is left of a flight from a time on."""
+        means = flight.plan.means[min((start - flight.start) // TICKS, len(flight.plan.means) - 2) :]
+        return self.criterion(replace(flight.plan, means=means), _goal(means))
+
+    def _search(self, state: Array, now: int, flight: Flight | None) -> Flight:
+        begin = process_time()
         if flight is None:
             expected = self._passive.open_loop(state[None], np.zeros((1, self.lead, 1)))[0, -1]
         else:
@@ -104,23 +120,25 @@ class RealTimePilot:
         plan = search.control(Gaussian.certain(expected), Reference(np.zeros(4)))
         return self._timed(plan, begin, now, now + self.lead * TICKS, self.searched)
 
-    def _decide(self, state: Array, now: int, flight: Flight) -> Flight | None:
+    def _decide(self, state: Array, now: int, flight: Flight) -> Flight:
         begin, passed = process_time(), (now - flight.start) // TICKS
         inputs, states = (_later(part, passed) for part in (flight.plan.inputs, flight.plan.means))
         previous = flight.plan if passed == 1 else None
         plan = self.step.control(Gaussian.certain(state), _goal(states), previous, None, (inputs, states))
         return self._timed(plan, begin, now, now, self.seconds)
 
-    def _timed(self, plan: Decision, begin: float, now: int, start: int, times: list[float]) -> Flight | None:
-        """The flight of a plan whose making began at a processor time; None where it is not applicable."""
-        loop, value = ControlLoop(self.step), 0.0
+    def _timed(self, plan: Decision, begin: float, now: int, start: int, times: list[float]) -> Flight:
+        """The flight of a plan whose making began at a processor time; its value is infinite where it is of no use."""
+        loop, value = ControlLoop(self.step), inf
         if plan.applicable:
             loop.last = Command(plan.input, plan.status, plan, plan)
             loop.input_between(plan.means[0], 0.0)  # its gains
             value = self.criterion(plan, _goal(plan.means))
+            if value > REPLAN and np.abs(plan.means[0, [1, 3]]).max() > CALM:
+                value = inf
         times.append(process_time() - begin)
-        known = max(start, now + max(1, ceil(times[-1] / INPUT)))
-        return Flight(loop, plan, value, start, known) if plan.applicable else None
+        done = now + max(1, ceil(times[-1] / INPUT))
+        return Flight(loop, plan, value, start, max(start, done) if value < inf else done)
 
 
 def real_time_pilot(parts: Parts, joint: int, quick: Any) -> RealTimePilot:

@@ -200,7 +200,7 @@ def test_draws_that_were_played_are_read_and_not_played_again(monkeypatch, tmp_p
         ([], "realaigym: simulator: the league's simulator is not installed: git clone https://github.com/dfki-ric"),
         (["robot=arm"], "realaigym: robot: must be one of acrobot, pendubot; got 'arm'"),
         (["model=best"], "realaigym: model: must be one of true, residual, gp; got 'best'"),
-        (["board=chess"], "realaigym: board: must be one of simulation, script, robustness; got 'chess'"),
+        (["board=chess"], "realaigym: board: must be one of simulation, script, robustness, film; got 'chess'"),
         (["speed=2"], "realaigym: speed: must be one of robot, model, seeds, draws, board, time, folder"),
         (["draws=many"], "realaigym: seeds, draws: must be numbers such as"),
     ],

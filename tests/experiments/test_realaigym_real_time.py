@@ -40,7 +40,7 @@ def leagues(robot, torque_of, count, delay=0, response=1.0, noise=0.0):
     return np.array(states), np.array(asked)
 
 
-@pytest.mark.parametrize(("cost", "begins"), [(0.01, 80), (0.3, 150)])
+@pytest.mark.parametrize(("cost", "begins"), [(0.01, 60), (0.3, 150)])
 def test_a_plan_acts_after_the_time_that_its_search_took(cost, begins, monkeypatch):
     clock = iter(cost * np.arange(1_000_000))
     model = KnownModel(casadi_model(double_pendulum("shoulder")), 4, 1)
@@ -52,6 +52,7 @@ def test_a_plan_acts_after_the_time_that_its_search_took(cost, begins, monkeypat
     assert np.flatnonzero(torques)[0] == begins
     assert np.allclose(who.searched, cost)
     assert np.allclose(who.seconds, cost)
+    assert len(who.seconds) > 0
     who.torques(x, 5.0)  # the league had taken it away: no plan, no torque
     assert who.torques(x, 5.0 + INPUT)[0] == 0
 
@@ -65,7 +66,22 @@ def test_a_late_decision_leaves_the_last_plan_flying_until_it_is_known(monkeypat
     for k in range(200):
         who.torques(np.array([np.pi + 0.01, 0.0, 0.0, 0.0]), INPUT * k)
         decided.append(len(who.seconds))
-    assert np.flatnonzero(np.diff(decided)).tolist() == [89, 109, 129, 149, 169, 189]  # every second period of 10
+    assert np.flatnonzero(np.diff(decided)).tolist() == [69, 89, 109, 129, 149, 169, 189]  # every second period of 10
+
+
+@pytest.mark.parametrize(("value", "rate", "searches"), [(0.1, 0.0, 1), (1.0, 0.0, 2), (9.0, 10.0, 5)])
+def test_other_searches_are_for_plans_that_are_not_good_and_no_plan_flies_that_leads_nowhere(
+    value, rate, searches, monkeypatch
+):
+    model = KnownModel(casadi_model(double_pendulum("shoulder")), 4, 1)
+    parts = make_parts(model, horizon=20, programs=3, wild=False)._replace(criterion=lambda plan, goal: value)
+    who = real_time_pilot(parts, 0, model)
+    clock = iter(0.119 * np.arange(1_000_000))
+    monkeypatch.setattr(realaigym_real_time, "process_time", lambda: next(clock))
+    x = np.array([np.pi + 0.1, 0.0, rate, 0.0])
+    torques = [who.torques(x, INPUT * k)[0] for k in range(300)]
+    assert len(who.searched) == searches  # there are two
+    assert (len(who.seconds) > 0) == np.any(torques) == (value < 5)
 
 
 def test_rates_are_found_from_angles_whatever_the_noise_of_the_rates():
