@@ -42,7 +42,7 @@ _ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: po
 _NOISE = 1e-10  # the square of an offset that a model with that round-off need not get below
 _SMALL = 1e-3  # share of an input's size whose cost counts where the cost itself vanishes
 _MEMORY = 10  # updates of a Hessian
-_NEAR = 0.2  # relative offset from which steps are remembered: those from far away mislead
+_NEAR = 0.2  # relative offset of plans near a solution: steps from further away mislead updates
 _CREEP = 0.25  # ratio of two offsets above which the Hessian is updated
 
 
@@ -102,15 +102,16 @@ class Globalization:
         if settled or size <= self._tolerance or size * slower <= self._tolerance * (1.0 - slower):
             return at._replace(plan=proposed), Status.SOLVED
         slope = promised - curvature - merit
+        far = size > _NEAR
         length = 1.0
         while length >= _SHORTEST_STEP:
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
-            for trial in self._candidates(at, _between(plan, proposed, length), program.feedback):
+            for trial in self._candidates(at, _between(plan, proposed, length), program.feedback, far):
                 rows = trial.rows if self._model.constraints.smooth else at.rows._replace(E=trial.rows.E)
                 points = trial.stages.next, rows, trial.plan
                 if call_unchecked(_merit, trial.cost, terms, self._defect_prices, *points) <= bound:
-                    trial = self._model.linearize(trial.plan, self._request) if self._model.evaluates else trial
-                    return trial, None
+                    bare = far and self._model.evaluates
+                    return self._model.linearize(trial.plan, self._request) if bare else trial, None
             length /= 2.0
         if size**2 <= _ROUND_OFF:  # size^2 of the cost is what could still be gained
             return at._replace(plan=proposed), Status.SOLVED
@@ -120,16 +121,19 @@ class Globalization:
         """Whether steps are remembered: where covariances make it creep; plans of means come from too far away."""
         return not (len(program.feedback) or self._model.linearizer.at_points)
 
-    def _candidates(self, at: Prediction, towards: Plan, feedback: Array) -> Iterator[Prediction]:
-        """Predictions at the plan that obeys the dynamics under the feedback towards another one, and at that one.
+    def _candidates(self, at: Prediction, towards: Plan, feedback: Array, far: bool) -> Iterator[Prediction]:
+        """Predictions at a plan, and at the plan that obeys the dynamics under the feedback towards it.
 
-        The first leads further from a wild start, and linearised moments, which overshoot, are then right.
+        Far from a solution the second comes first, since it leads further; and where moments are linearised, since they
+        overshoot. Near one, a plan is linearised at once: it will be taken.
         """
-        for rolled_out in (True, False):
+        for rolled_out in (True, False) if far or not self._model.linearizer.at_points else (False, True):
             try:
                 if rolled_out:
-                    yield self._model.roll_out(towards, at, feedback, self._request, not self._model.evaluates)
-                elif self._model.evaluates:
+                    yield self._model.roll_out(
+                        towards, at, feedback, self._request, not (far and self._model.evaluates)
+                    )
+                elif far and self._model.evaluates:
                     yield self._model.evaluate(towards, at, self._request)
                 else:
                     yield self._model.linearize(self._model.canonical(towards), self._request)
