@@ -90,12 +90,7 @@ class Packed:
 
 
 def pack(
-    features: Array,
-    lengthscales: Array,
-    signal_variance: Array,
-    cholesky: Array,
-    weights: Array,
-    state_dim: int,
+    features: Array, lengthscales: Array, signal_variance: Array, cholesky: Array, weights: Array, state_dim: int
 ) -> Packed:
     """Lays out exact SE-ARD GPs for the compiled kernels.
 

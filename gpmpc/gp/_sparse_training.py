@@ -23,15 +23,7 @@ from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
 from gpmpc.gp._likelihood import FAILED
 from gpmpc.gp._scaling import Scaling, centre, identity
 from gpmpc.gp._search import column_std, log_hyperparameters, restored_theta, search_box, training_data
-from gpmpc.gp._sparse import (
-    JITTER,
-    Method,
-    check_method,
-    collapsed_bound,
-    data_sums,
-    inducing_factor,
-    sparse_posterior,
-)
+from gpmpc.gp._sparse import JITTER, Method, check_method, collapsed_bound, data_sums, inducing_factor, sparse_posterior
 from gpmpc.gp._training import Trainer, Training
 from gpmpc.gp._transitions import Transitions, check_transitions
 

@@ -261,11 +261,7 @@ def _effect(B: Effect, state: Tensor) -> Tensor:
 
 
 def train_residual(
-    trainer: Any,
-    transitions: Transitions,
-    angles: Sequence[int] = (),
-    nominal: Nominal | None = None,
-    seed: int = 0,
+    trainer: Any, transitions: Transitions, angles: Sequence[int] = (), nominal: Nominal | None = None, seed: int = 0
 ) -> Training:
     """Trains a residual model of all states and inputs, and returns the whole training.
 

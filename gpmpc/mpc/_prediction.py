@@ -48,15 +48,7 @@ from gpmpc.mpc._controller import (
     read_parameters,
 )
 from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, Stages, finite_horizon_lqr
-from gpmpc.mpc._stages import (
-    COVARIANCES,
-    ConstraintRows,
-    Covariance,
-    Plan,
-    StageCosts,
-    StageLinearizer,
-    keep_rates,
-)
+from gpmpc.mpc._stages import COVARIANCES, ConstraintRows, Covariance, Plan, StageCosts, StageLinearizer, keep_rates
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator
 

@@ -14,13 +14,7 @@ import numpy as np
 from gpmpc._compiled import compiled, inline_njit
 from gpmpc._kernels._simd import any_nonzero, clip, larger, largest, load, load_some, store, total, zeros
 from gpmpc._kernels.linalg import dot, multiply
-from gpmpc.qp._dual_iteration import (
-    NEGLIGIBLE,
-    add_multipliers,
-    iterate,
-    multiply_constraints,
-    restore_constraints,
-)
+from gpmpc.qp._dual_iteration import NEGLIGIBLE, add_multipliers, iterate, multiply_constraints, restore_constraints
 from gpmpc.qp._record import (
     AGE,
     CONSTRAINTS,

@@ -85,12 +85,22 @@ class _Arrays(NamedTuple):
 class QuadraticProgram(_Arrays):
     """``min 1/2 x'Px + q'x`` subject to ``h_lower <= Gx <= h_upper`` and ``lb <= x <= ub``, checked at construction.
 
-    Attributes:
+    Args:
         P: (n, n) symmetric positive definite.
         q: (n,).
-        G: (m, n) rows.
+        G: (m, n) rows; none if omitted.
+        h_lower: (m,) lower bounds of the rows; absent if omitted.
+        h_upper: (m,) upper bounds of the rows; absent if omitted.
+        lb: (n,) lower bounds of x; absent if omitted.
+        ub: (n,) upper bounds of x; absent if omitted.
+
+    Attributes:
         lower: (M,) lower bounds of the stacked constraints ``[x; Gx]``.
         upper: (M,) upper bounds likewise.
+
+    Raises:
+        ProblemError: Shapes that do not match, NaN, P not symmetric (which entries) or not positive definite
+            (which eigenvalue), crossed bounds (which index).
 
     >>> from gpmpc.qp import DualActiveSet
     >>> solution = DualActiveSet().solve(QuadraticProgram(P=[[2, 0], [0, 2]], q=[-2, -4], ub=[0.5, 1]))
@@ -110,21 +120,6 @@ class QuadraticProgram(_Arrays):
         lb: ArrayLike | None = None,
         ub: ArrayLike | None = None,
     ):
-        """Checks a program.
-
-        Args:
-            P: (n, n) symmetric positive definite.
-            q: (n,).
-            G: (m, n) rows; none if omitted.
-            h_lower: (m,) lower bounds of the rows; absent if omitted.
-            h_upper: (m,) upper bounds of the rows; absent if omitted.
-            lb: (n,) lower bounds of x; absent if omitted.
-            ub: (n,) upper bounds of x; absent if omitted.
-
-        Raises:
-            ProblemError: Shapes that do not match, NaN, P not symmetric (which entries) or not positive definite
-                (which eigenvalue), crossed bounds (which index).
-        """
         if G is None and (h_lower is not None or h_upper is not None):
             raise ProblemError("h_lower and h_upper bound the rows of G; got bounds without G")
         (n, m), P, q, G = _check_matrices(P, q, G)

@@ -172,10 +172,7 @@ class Flown:
     before: tuple["Flown", ...] = ()  #: the episodes
 
 
-def run_trial(
-    experiment: Experiment,
-    prepare: Prepare | None = None,
-) -> Flown:
+def run_trial(experiment: Experiment, prepare: Prepare | None = None) -> Flown:
     """Trains and flies.
 
     Args:
@@ -221,10 +218,7 @@ def _tracking_error(experiment: Experiment, flown: Flown, last: int = 0) -> Any:
 
 
 def _fly(
-    experiment: Experiment,
-    prepare: Prepare | None,
-    model: DynamicsModel | None,
-    training: Training | None,
+    experiment: Experiment, prepare: Prepare | None, model: DynamicsModel | None, training: Training | None
 ) -> Flown:
     """Flies with a model, or on the plant's own where it is None."""
     plant = experiment.flown

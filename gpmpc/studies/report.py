@@ -28,16 +28,7 @@ from gpmpc.studies._document import MISSING, Document, Table, figure_label, plai
 from gpmpc.studies._run_folder import LONGEST_NAME
 from gpmpc.studies._runs import MEASURES, SEED, Cell, Report, in_order, read_report
 
-__all__ = [
-    "Comparison",
-    "Report",
-    "compare",
-    "notes",
-    "read_report",
-    "report_document",
-    "sentences",
-    "terminal_table",
-]
+__all__ = ["Comparison", "Report", "compare", "notes", "read_report", "report_document", "sentences", "terminal_table"]
 
 _DRAWN = ("rmse", "failed", "decision")  # a figure each
 _SHORT = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
