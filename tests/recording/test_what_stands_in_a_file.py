@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from gpmpc.exceptions import RecordingError, SettingError, ShapeError
@@ -228,3 +229,24 @@ def test_what_a_file_may_unfold_to_is_counted_to_the_byte(path, monkeypatch):
     monkeypatch.setattr(_reader, "room", lambda _: needed - 1)
     with pytest.raises(RecordingError, match="a plan of 5 stages would make arrays of 0 MB with the others"):
         read_run(path)
+
+
+def test_a_file_that_says_no_more_than_the_names_is_a_run_without_steps(tmp_path):
+    path = tmp_path / "bare.mcap"
+    for about, message in (
+        ({"state_names": "x y", "input_names": "u"}, None),
+        ({"state_names": "x y"}, "is not the recording of a run"),
+        ({"state_names": "x x", "input_names": "u"}, "its metadata are damaged; state_names: a name must be unique"),
+    ):
+        with path.open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            writer.add_metadata("run", about)
+            writer.finish()
+        if message is None:
+            run = read_run(path)
+            assert (run.state_names, run.input_names, run.finished) == (("x", "y"), ("u",), True)
+            assert (run.states.shape, run.plan_means.shape, run.residuals.shape) == ((0, 2), (0, 1, 2), (0,))
+        else:
+            with pytest.raises(RecordingError, match=message):
+                read_run(path)
