@@ -240,7 +240,8 @@ def play_robustness(entry: Path, robot: str, kind: str, size: int) -> str:
     model = read_model(robot, kind, path)
     fine = fine_model(robot, None if kind == "true" else load_metadata(path)["metadata"]["body"])
     quick = KnownModel(model.nominal, 4, 1) if kind == "residual" else model
-    who = Watchful(real_time_pilot(make_parts(model), JOINTS[robot], quick), RollOut(fine), JOINTS[robot])
+    inner = real_time_pilot(make_parts(model, programs=10), JOINTS[robot], quick)
+    who = Watchful(inner, RollOut(fine), JOINTS[robot])
     store = path.with_name(f"{path.stem}_robustness_{size}.json")
     found = robustness(league_controller(AbstractController, who), robot, size, store)
     shares = {part: float(np.mean(successes)) for part, successes in found.items()}
@@ -524,7 +525,7 @@ def _play_in_real_time(model: Any, robot: str, kind: str, draw: int) -> dict[str
     from gpmpc.experiments.realaigym_real_time import real_time_pilot
 
     quick = KnownModel(model.nominal, 4, 1) if kind == "residual" else model
-    who = real_time_pilot(make_parts(model), JOINTS[robot], quick)
+    who = real_time_pilot(make_parts(model, programs=10), JOINTS[robot], quick)
     found, ms, between = play(who, robot, draw), 1e3 * np.array(who.seconds), 1e3 * np.array(who.between)
     return {
         "score": found.score,
