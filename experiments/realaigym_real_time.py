@@ -20,7 +20,6 @@ from gpmpc.models import RollOut
 from gpmpc.mpc import GPMPC, ControlLoop, Decision, ManyStarts, Reference
 from gpmpc.mpc._policy import Command
 
-CALM = 3.0  # rates up to which a plan that leads nowhere is flown, for the motion's sake [rad/s]
 TICKS = round(PLAN / INPUT)  # inputs in a plan's time step
 GOOD = 0.4  # predicted time below the line up to which a plan is not compared with those of other searches [s]
 
@@ -134,8 +133,6 @@ class RealTimePilot:
             loop.last = Command(plan.input, plan.status, plan, plan)
             loop.input_between(plan.means[0], 0.0)  # its gains
             value = self.criterion(plan, _goal(plan.means))
-            if value > REPLAN and np.abs(plan.means[0, [1, 3]]).max() > CALM:
-                value = inf
         times.append(process_time() - begin)
         done = now + max(1, ceil(times[-1] / INPUT))
         return Flight(loop, plan, value, start, max(start, done) if value < inf else done)
