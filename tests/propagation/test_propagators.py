@@ -1,10 +1,11 @@
 """What the five propagators promise, each where its answer is known, and what they say to bad input."""
 
+import numpy as np
 import pytest
 import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
-from gpmpc.gaussian import Gaussian
+from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented
@@ -224,3 +225,15 @@ def test_settings_out_of_range_are_refused():
     ):
         with pytest.raises(SettingError, match=message):
             make()
+
+
+@pytest.mark.parametrize("samples", [3, 2500])  # 2500 are predicted in three parts
+def test_monte_carlo_gives_the_sample_moments_of_its_draws(samples):
+    model, at, u = gp(), belief(), torch.tensor([0.3])
+    found = MonteCarlo(samples, seed=4).propagate(model, at, u)
+    steps = torch.from_numpy(np.random.default_rng(4).standard_normal((samples, 2))) @ square_root(at.covariance)
+    moved = model.predict(at.mean + steps, u.expand(samples, 1))
+    both = torch.cov(torch.cat([steps, moved.mean], dim=1).mT)
+    assert torch.allclose(found.belief.mean, moved.mean.mean(0), rtol=1e-12)
+    assert torch.allclose(found.belief.covariance, both[2:, 2:] + moved.covariance.mean(0), rtol=1e-10, atol=1e-14)
+    assert torch.allclose(found.cross_covariance, both[:2, 2:], rtol=1e-10, atol=1e-14)
