@@ -48,7 +48,7 @@ from gpmpc.gp import Trainer, Transitions
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc import GPMPC, Box, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
-from gpmpc.systems.gymnasium_ import Environment
+from gpmpc.systems.gymnasium_ import gymnasium_system
 
 WAYS = ("learned noise", "estimated noise", "estimated noise, adaptive", "true noise")
 ALLOWED, ROWS, SCORES = (10.0, 5.0, 1.0), 600, 399
@@ -127,7 +127,7 @@ def pendulum_plant(kind: str) -> Plant:
 
 def cart_pole() -> Plant:
     """Gymnasium's cart with a pole, learned from single steps all over its region."""
-    environment, scale = Environment("InvertedPendulum-v5"), np.array([1e-3, 1e-3, 0.01, 0.01])
+    environment, scale = gymnasium_system("InvertedPendulum-v5").dynamics, np.array([1e-3, 1e-3, 0.01, 0.01])
     environment.reset(0)
 
     def successor(x: Array, u: Array, w: Array) -> Array:

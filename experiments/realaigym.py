@@ -151,11 +151,10 @@ class Pilot:
             torque = self._loop.input(state, Reference(np.zeros(4)))
             self.seconds.append(perf_counter() - begin)
             self.searched.append(lost)
-        elif self.gain > 0:
-            torque = self._loop.last.input
-            torque = torque + self.gain * (self._loop.input_between(state, share) - torque)
         else:
             torque = self._loop.last.input
+            if self.gain > 0:
+                torque = torque + self.gain * (self._loop.input_between(state, share) - torque)
         self._count = (self._count + 1) % round(PLAN / INPUT)
         out = np.zeros(2)
         out[self.joint] = np.clip(torque[0], -TORQUE, TORQUE)
@@ -229,20 +228,22 @@ def write_entry(robot: str, kind: str, seed: int, folder: Path) -> Path:
     return entry
 
 
+def beside(entry: Path, ending: str) -> Path:
+    """The file that an entry shares its name with, such as its model."""
+    return entry.with_name(entry.stem.removeprefix("con_") + ending)
+
+
 def play_robustness(entry: Path, robot: str, kind: str, size: int) -> str:
     """The parts of the league's robustness board, with a number of values of each quantity, as a table."""
     from double_pendulum.controller.abstract_controller import AbstractController
 
-    from gpmpc.experiments.realaigym_real_time import real_time_pilot
     from gpmpc.experiments.realaigym_robustness import Watchful, robustness
 
-    path = entry.with_name(f"{entry.stem.removeprefix('con_')}.safetensors")
+    path = beside(entry, ".safetensors")
     model = read_model(robot, kind, path)
     fine = fine_model(robot, None if kind == "true" else load_metadata(path)["metadata"]["body"])
-    quick = KnownModel(model.nominal, 4, 1) if kind == "residual" else model
-    inner = real_time_pilot(make_parts(model, programs=10), JOINTS[robot], quick)
-    who = Watchful(inner, RollOut(fine), JOINTS[robot])
-    store = path.with_name(f"{path.stem}_robustness_{size}.json")
+    who = Watchful(_real_time_pilot(model, robot, kind), RollOut(fine), JOINTS[robot])
+    store = beside(entry, f"_robustness_{size}.json")
     found = robustness(league_controller(AbstractController, who), robot, size, store)
     shares = {part: float(np.mean(successes)) for part, successes in found.items()}
     lines = [f"| {robot}, robustness 2, {kind} model | flights | up after 10 s |", "|---|---|---|"]
@@ -254,8 +255,7 @@ def play_film(entry: Path, robot: str, kind: str) -> Path:
     """Writes the first 8 s of draw 100 as a GIF beside an entry."""
     from gpmpc.experiments.realaigym_film import film
 
-    path = entry.with_name(f"{entry.stem.removeprefix('con_')}.gif")
-    model = read_model(robot, kind, path.with_suffix(".safetensors"))
+    path, model = beside(entry, ".gif"), read_model(robot, kind, beside(entry, ".safetensors"))
     film(play(pilot(model, robot), robot, 100, 8.0), JOINTS[robot], path)
     return path
 
@@ -266,7 +266,7 @@ def play_script(entry: Path, robot: str) -> float:
     where = Path(str(found and found.origin)).resolve().parents[3] / "leaderboard" / robot / "simulation_v3"
     if not where.is_dir():
         raise SettingError("simulator", f"board=script needs the repository, not only its package: {INSTALL}")
-    results = where / "data" / entry.stem.removeprefix("con_")
+    results = where / "data" / beside(entry, "").name
     (results / "sim_swingup.csv").unlink(missing_ok=True)  # the script would score it again
     paths = [str(entry.parent.resolve()), *filter(None, [os.environ.get("PYTHONPATH")])]
     command = [sys.executable, "calculate_leaderboard_score.py", entry.name]
@@ -283,9 +283,7 @@ class Parts(NamedTuple):
     criterion: Callable[[Decision, Reference], float]  #: predicted time below the line, more where the end is off [s]
 
 
-def make_parts(
-    model: Any, horizon: int = 40, programs: int = 20, wild: bool = True, disturbance_gain: float = 0.0
-) -> Parts:
+def make_parts(model: Any, horizon: int = 40, programs: int = 20, wild: bool = True) -> Parts:
     """Makes the parts of a pilot.
 
     Args:
@@ -293,7 +291,6 @@ def make_parts(
         horizon: Stages of 20 ms.
         programs: Of each start.
         wild: Whether starts with kicks are taken besides the straight line and the drift.
-        disturbance_gain: Of the controller's estimate of what the model mispredicts.
     """
     Q, R = np.diag([10.0, 0.1, 10.0, 0.1]), np.array([[0.01]])
     upright = model.linearize(np.zeros((1, 4)), np.zeros((1, 1)), False)
@@ -306,7 +303,7 @@ def make_parts(
         return below + min(10.0, float(off @ P @ off) / 15.0)
 
     def make(iterations: int) -> GPMPC:
-        settings = PredictionSettings(covariance="none", rolled_out=True, disturbance_gain=disturbance_gain)
+        settings = PredictionSettings(covariance="none", rolled_out=True)
         return GPMPC(model, Linearization(), problem, horizon, [0.0], settings, iterations=iterations, tolerance=1e-2)
 
     guesses: list[Array | None] = [None, np.zeros((horizon, 1))]
@@ -496,9 +493,9 @@ def board(
     rows = []
     for seed in seeds:
         entry = write_entry(robot, kind, seed, folder)
-        store = entry.with_name(f"{entry.stem.removeprefix('con_')}{'_real_time' if real_time else ''}.json")
+        store = beside(entry, "_real_time.json" if real_time else ".json")
         played = json.loads(store.read_text()) if store.exists() else []
-        model = read_model(robot, kind, entry.with_name(f"{entry.stem.removeprefix('con_')}.safetensors"))
+        model = read_model(robot, kind, beside(entry, ".safetensors"))
         for draw in draws:
             if not any(row["draw"] == draw for row in played):
                 played.append({"robot": robot, "model": kind, "seed": seed, "draw": draw})
@@ -522,10 +519,7 @@ def _play(model: Any, robot: str, draw: int) -> dict[str, Any]:
 
 
 def _play_in_real_time(model: Any, robot: str, kind: str, draw: int) -> dict[str, Any]:
-    from gpmpc.experiments.realaigym_real_time import real_time_pilot
-
-    quick = KnownModel(model.nominal, 4, 1) if kind == "residual" else model
-    who = real_time_pilot(make_parts(model, programs=10), JOINTS[robot], quick)
+    who = _real_time_pilot(model, robot, kind)
     found, ms, between = play(who, robot, draw), 1e3 * np.array(who.seconds), 1e3 * np.array(who.between)
     return {
         "score": found.score,
@@ -536,6 +530,14 @@ def _play_in_real_time(model: Any, robot: str, kind: str, draw: int) -> dict[str
         "late decisions": float(np.mean(ms > 1e3 * PLAN)),
         "late inputs": float(np.mean(between > 1e3 * INPUT)),
     }
+
+
+def _real_time_pilot(model: Any, robot: str, kind: str) -> Any:
+    """The real-time pilot of a model; that of a residual model searches with its fitted body."""
+    from gpmpc.experiments.realaigym_real_time import real_time_pilot
+
+    quick = KnownModel(model.nominal, 4, 1) if kind == "residual" else model
+    return real_time_pilot(make_parts(model, programs=10), JOINTS[robot], quick)
 
 
 def table(robot: str, rows: list[dict[str, Any]]) -> str:
@@ -567,12 +569,8 @@ def main(arguments: list[str]) -> int:
     """Reads settings such as ``robot=acrobot``, plays, and prints the board."""
     given = {"robot": "acrobot", "model": "true", "seeds": "0", "draws": "3"}
     given |= {"board": "simulation", "time": "free", "folder": "outputs/realaigym"}
-    choices = {
-        "robot": tuple(ACTUATED),
-        "model": tuple(DESCRIBED),
-        "board": ("simulation", "script", "robustness", "film"),
-    }
-    choices |= {"time": ("free", "real")}
+    choices = {"robot": tuple(ACTUATED), "model": tuple(DESCRIBED)}
+    choices |= {"board": ("simulation", "script", "robustness", "film"), "time": ("free", "real")}
     try:
         for argument in arguments:
             key, _, value = argument.partition("=")
@@ -582,29 +580,29 @@ def main(arguments: list[str]) -> int:
         for key, names in choices.items():
             if given[key] not in names:
                 raise SettingError(key, f"must be one of {', '.join(names)}; got {given[key]!r}")
-        if not (given["seeds"].replace(",", "").isdigit() and given["draws"].isdigit()):
+        if not all(number.isdigit() for number in (*given["seeds"].split(","), given["draws"])):
             raise SettingError("seeds, draws", "must be numbers such as 0,1 and a number of draws such as 3")
+        robot, kind, folder = given["robot"], given["model"], Path(given["folder"])
+        if given["board"] == "robustness" and kind == "gp":
+            raise SettingError("model", "must be true or residual for board=robustness, which predicts over 2 ms")
+        if given["board"] in ("script", "film") and given["time"] == "real":
+            raise SettingError("time", "must be free for board=script and board=film")
         if find_spec("double_pendulum") is None:
             raise SettingError("simulator", INSTALL)
-        robot, kind, folder = given["robot"], given["model"], Path(given["folder"])
         seeds, draws = [int(seed) for seed in given["seeds"].split(",")], int(given["draws"])
-        if given["board"] == "script":
-            for seed in seeds:
+        if given["board"] == "simulation":
+            rows = board(robot, kind, seeds, [100 + i for i in range(draws)], folder, given["time"] == "real")
+            _say(table(robot, rows))
+            return 0
+        for seed in seeds:
+            entry = write_entry(robot, kind, seed, folder)
+            if given["board"] == "robustness":
+                _say(play_robustness(entry, robot, kind, draws))
+            elif given["board"] == "film":
+                _say(f"  {play_film(entry, robot, kind)}")
+            else:
                 for _ in range(draws):
-                    _say(f"  seed {seed}  score {play_script(write_entry(robot, kind, seed, folder), robot):.3f}")
-            return 0
-        if given["board"] == "robustness":
-            if kind == "gp":
-                raise SettingError("model", "must be true or residual for board=robustness, which predicts over 2 ms")
-            for seed in seeds:
-                _say(play_robustness(write_entry(robot, kind, seed, folder), robot, kind, draws))
-            return 0
-        if given["board"] == "film":
-            for seed in seeds:
-                _say(f"  {play_film(write_entry(robot, kind, seed, folder), robot, kind)}")
-            return 0
-        rows = board(robot, kind, seeds, [100 + i for i in range(draws)], folder, given["time"] == "real")
-        _say(table(robot, rows))
+                    _say(f"  seed {seed}  score {play_script(entry, robot):.3f}")
     except (GpmpcError, subprocess.CalledProcessError) as error:
         print(f"realaigym: {error}", file=sys.stderr)
         return 2

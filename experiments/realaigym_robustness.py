@@ -3,8 +3,8 @@
 Six parts, each a share of flights: other masses, inertias and frictions; noise on the rates; noise on the torque; a
 motor that follows slowly or overshoots; late measurements; torque pulses on both joints. The league's own class
 disturbs, simulates (its plant, too) and judges. The pilot is told nothing: a Kalman filter makes rates of the angles,
-delay and responsiveness are estimated from 0.3 s of random torques and made up for, and the controller's disturbance
-estimate takes up what its model mispredicts.
+delay and responsiveness are estimated from 0.3 s of random torques and made up for. Nothing adapts to other masses and
+frictions.
 """
 
 import json

@@ -53,7 +53,7 @@ class Moments(NamedTuple):
     """
 
     M: Array  #: E[f] (k,)
-    V: Array  #: cov[f] (k, k)
+    V: Array  #: Cov[f] (k, k)
     J: Array  #: E[df/dx] = dM/dmu (k, n); Cov[x, f] = S J'
     dM_dS: Array  #: (k, n, n)
     dM_du: Array  #: (k, m)

@@ -1,7 +1,7 @@
 """Learns from one flight to the next: fly, learn, fly.
 
 After each flight its transitions join the data, and a model is trained anew. Flights alone teach little of the
-derivatives that a controller needs (``gpmpc.datasets.excitation``), so the earlier data stay. A model that predicts
+derivatives that a controller needs (``gpmpc.datasets.Excitation``), so the earlier data stay. A model that predicts
 better may control worse, so the one whose flight had the smallest error flies the flight that counts. Where the plant
 is another one than that of the data, these contradict the flights: there ``OnlineLearning`` helps.
 """

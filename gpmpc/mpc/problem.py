@@ -273,7 +273,7 @@ class Problem:
         for part in (*self.outputs, *self.constraints):
             try:
                 if isinstance(part, LeastSquares):
-                    part.squares(state[None], input[None], None)
+                    expand_function("y", part.y, part.weight.shape[-1], state[None], input[None], None)
                 elif isinstance(part, Inequality):
                     part.expand(state[None], input[None], None)
             except FunctionNotFinite as error:

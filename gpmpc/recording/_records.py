@@ -104,7 +104,7 @@ def _sound_records(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
                     else:
                         yield record
         except RecordingError:
-            raise
+            raise  # it is a RuntimeError, as broken records raise
         except _BROKEN:
             if kind not in (Opcode.ATTACHMENT, Opcode.METADATA):
                 return

@@ -23,7 +23,7 @@ class _Known(NamedTuple):
 
 
 def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
-    """Checks a solver against the protocol ``gpmpc.qp.solver.QPSolver``.
+    """Checks a solver against the protocol ``gpmpc.qp.QPSolver``.
 
     It solves problems whose minimisers and multipliers are known and problems without a solution, from warm starts that
     are right, wrong and absurd, and from arrays in awkward layouts.

@@ -202,6 +202,8 @@ def test_draws_that_were_played_are_read_and_not_played_again(monkeypatch, tmp_p
         (["model=best"], "realaigym: model: must be one of true, residual, gp; got 'best'"),
         (["board=chess"], "realaigym: board: must be one of simulation, script, robustness, film; got 'chess'"),
         (["speed=2"], "realaigym: speed: must be one of robot, model, seeds, draws, board, time, folder"),
+        (["board=film", "time=real"], "realaigym: time: must be free for board=script and board=film"),
+        (["seeds=0,,1"], "realaigym: seeds, draws: must be numbers such as"),
         (["draws=many"], "realaigym: seeds, draws: must be numbers such as"),
     ],
 )

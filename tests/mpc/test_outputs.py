@@ -196,3 +196,13 @@ def test_mistakes_are_one_clear_error():
         controller.control(at, GOAL, plan=np.zeros((3, 2)))
     with pytest.raises(DataError, match="a plan to start from must be finite"):
         controller.control(at, GOAL, plan=np.full((7, 2), np.nan))
+
+
+def test_functions_are_looked_at_where_a_flight_starts_also_with_references_and_weights_by_stage():
+    cost, start, weight = Tracking([1.0] * 3, [1.0] * 2), (STATE, np.zeros(2)), np.stack([np.eye(3)] * H)
+    Problem(cost, outputs=[LeastSquares(lambda x: x, weight, np.zeros((H, 3)))]).check_start(*start)
+    with pytest.raises(SettingError, match=r"y or its gradient is not finite at x = \[ 0\.4 -0\.3  0\.2\], u"):
+        Problem(cost, outputs=[LeastSquares(torch.log, weight, np.zeros((H, 3)))]).check_start(*start)
+    kept = Inequality(lambda x, u: u.log().sum(dim=1))
+    with pytest.raises(SettingError, match=r"h or its gradient is not finite at x = .* where the flight starts"):
+        Problem(cost, constraints=[kept]).check_start(*start)
