@@ -132,3 +132,15 @@ def test_settings_that_make_no_sense_are_refused(solver, settings):
 def test_a_warm_start_of_another_shape_is_misuse(solver):
     with pytest.raises(ProblemError, match="warm start"):
         solver.solve(QuadraticProgram(EYE, [0.0, 0.0]), np.ones(5))
+
+
+@pytest.mark.parametrize("size", [1.0, 1e6])
+@pytest.mark.parametrize(("skew", "accepted"), [(5e-11, True), (2e-10, False)])
+def test_what_is_skew_by_rounding_is_taken_for_symmetric(size, skew, accepted):
+    P = size * np.array([[1.0, 0.3, 0.1], [0.3, 0.5, 0.0], [0.1 + skew, 0.0, 0.6]])
+    program = QuadraticProgram.unchecked(P, np.ones(3), np.zeros((0, 3)), np.full(3, -np.inf), np.full(3, np.inf))
+    if accepted:
+        assert DualActiveSet().solve(program).x == pytest.approx(np.linalg.solve(P, -np.ones(3)), rel=1e-9)
+    else:
+        with pytest.raises(ProblemError, match="symmetric"):
+            DualActiveSet().solve(program)
