@@ -127,13 +127,12 @@ class Globalization:
         Far from a solution the second comes first, since it leads further; and where moments are linearised, since they
         overshoot. Near one, a plan is linearised at once: it will be taken.
         """
+        bare = far and self._model.evaluates  # without derivatives
         for rolled_out in (True, False) if far or not self._model.linearizer.at_points else (False, True):
             try:
                 if rolled_out:
-                    yield self._model.roll_out(
-                        towards, at, feedback, self._request, not (far and self._model.evaluates)
-                    )
-                elif far and self._model.evaluates:
+                    yield self._model.roll_out(towards, at, feedback, self._request, not bare)
+                elif bare:
                     yield self._model.evaluate(towards, at, self._request)
                 else:
                     yield self._model.linearize(self._model.canonical(towards), self._request)
