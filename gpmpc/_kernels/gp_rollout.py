@@ -43,10 +43,10 @@ class Feedback(NamedTuple):
     states: Array  #: x'_0 .. x'_{H-1}, and more that are not read (T, H or more, n)
     inputs: Array  #: u' (T, H, m)
     gains: Array  #: K of each plan, or of all (T or 1, H, m, n)
-    lower: Array  #: bounds of the inputs (m,)
-    upper: Array  #: (m,)
-    rate_lower: Array  #: bounds of their changes in a step (m,)
-    rate_upper: Array  #: (m,)
+    lower: Array  #: bounds of the inputs (H, m)
+    upper: Array  #: (H, m)
+    rate_lower: Array  #: bounds of their changes in a step (H, m)
+    rate_upper: Array  #: (H, m)
     previous_input: Array  #: the input before the first (m,)
 
 
@@ -80,31 +80,38 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
     f, offset, A, G, c, B, columns, kinds, chosen, tape = model
     (T, H, m), n, d, k_dim = inputs.shape, start.shape[1], len(columns), len(offset)
     work = aligned_rows(2, 8 + d + len(chosen) + k_dim)
-    at, value, point, places, known = work[0], work[1], np.empty(n + m), np.empty(tape.work), np.zeros(n)
+    memory = aligned_rows(2 * n + m + tape.work + 5, 8)  # eight roll-outs side by side, for the tape
+    at, value, point, known, places = work[0], work[1], memory[: n + m], memory[n + m : -tape.work - 5], memory[2 * n + m :]
+    memory[: 2 * n + m] = 0.0
     for t in range(T):
-        gains = feedback.gains[min(t, len(feedback.gains) - 1)]
         copy(start[t], states[t, 0])
+    for first in range(0, T, 8):
+        together = range(first, min(first + 8, T))
         for k in range(H):
-            x, u, after, planned = states[t, k], inputs[t, k], states[t, k + 1], feedback.states[t, k]
-            for i in range(m):
-                wanted = feedback.inputs[t, k, i]
-                for j in range(n):
-                    wanted += gains[k, i, j] * (x[j] - planned[j])
-                last = inputs[t, k - 1, i] if k > 0 else feedback.previous_input[i]
-                wanted = min(max(wanted, last + feedback.rate_lower[i]), last + feedback.rate_upper[i])
-                u[i] = min(max(wanted, feedback.lower[i]), feedback.upper[i])
-            for i in range(d):
-                z = x[columns[i]]
-                at[i] = math.sin(z) if kinds[i] == SINE else math.cos(z) if kinds[i] == COSINE else z
-            for i in range(len(chosen)):
-                at[d + i] = u[chosen[i]]
-            for a in range(k_dim):
-                value[a] = offset[a] + _mean(f.points, f.log_signal[a], f.inverse_squares[a], f.weights[a], at)
+            for t in together:
+                x, u, planned = states[t, k], inputs[t, k], feedback.states[t, k]
+                gains = feedback.gains[min(t, len(feedback.gains) - 1), k]
+                for i in range(m):
+                    wanted = feedback.inputs[t, k, i]
+                    for j in range(n):
+                        wanted += gains[i, j] * (x[j] - planned[j])
+                    last = inputs[t, k - 1, i] if k > 0 else feedback.previous_input[i]
+                    wanted = min(max(wanted, last + feedback.rate_lower[k, i]), last + feedback.rate_upper[k, i])
+                    u[i] = min(max(wanted, feedback.lower[k, i]), feedback.upper[k, i])
+                    point[n + i, t - first] = u[i]
+                for i in range(n):
+                    point[i, t - first] = x[i]
             if tape.size > 0:
-                copy(x, point[:n])
-                copy(u, point[n:])
                 run_tape(tape, point, places, known)
-            for i in range(n):
-                after[i] = (
-                    known[i] + c[i] + disturbance[i] + dot(A[i], x, n) + dot(G[i], u, m) + dot(B[i], value, k_dim)
-                )
+            for t in together:
+                x, u, after = states[t, k], inputs[t, k], states[t, k + 1]
+                for i in range(d):
+                    z = x[columns[i]]
+                    at[i] = math.sin(z) if kinds[i] == SINE else math.cos(z) if kinds[i] == COSINE else z
+                for i in range(len(chosen)):
+                    at[d + i] = u[chosen[i]]
+                for a in range(k_dim):
+                    value[a] = offset[a] + _mean(f.points, f.log_signal[a], f.inverse_squares[a], f.weights[a], at)
+                for i in range(n):
+                    added = known[i, t - first] + c[i] + disturbance[i]
+                    after[i] = added + dot(A[i], x, n) + dot(G[i], u, m) + dot(B[i], value, k_dim)

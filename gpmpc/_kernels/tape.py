@@ -1,8 +1,8 @@
-"""Evaluates functions that are lists of scalar operations, with derivatives by forward differentiation.
+"""Evaluates functions that are lists of scalar operations, at eight points at once, with derivatives.
 
 A tape is what is left of an expression of sums, products and elementary functions: one operation after the other on a
 few places of work. Compiled loops run it beside GPs, and no function of a user is compiled. Derivatives are carried
-along, a row of tangents for every place (Griewank and Walther, 2008, section 3.1).
+along forwards, tangents for every place (Griewank and Walther, 2008, section 3.1).
 """
 
 import math
@@ -11,13 +11,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gpmpc._compiled import compiled, njit_noalloc
+from gpmpc._compiled import compiled, inline_njit, njit_noalloc
+from gpmpc._kernels._simd import cosine, load, sine, store, use_widest_registers, zeros
+from gpmpc._kernels.linalg import aligned_rows
 
 Array = NDArray[np.float64]
 
 # The operations, by CasADi's numbers for them.
 ASSIGN, ADD, SUB, MUL, DIV, NEG, EXP, LOG, POW, CONSTPOW, SQRT, SQ, TWICE, SIN, COS, TAN = range(16)
 ATAN, FABS, FMIN, FMAX, INV, TANH, ATAN2, CONST, INPUT, OUTPUT = 18, 29, 34, 35, 36, 39, 43, 44, 45, 46
+TWO_OPERANDS = (ADD, SUB, MUL, DIV, POW, CONSTPOW, FMIN, FMAX, ATAN2)
 OPERATIONS = frozenset({*range(16), ATAN, FABS, FMIN, FMAX, INV, TANH, ATAN2, CONST, INPUT, OUTPUT})
 
 
@@ -37,73 +40,93 @@ NO_TAPE = Tape(np.empty((0, 4), dtype=np.int64), np.empty(0), 0, 0)
 
 @njit_noalloc
 def run_tape(tape, z, work, value):
-    """Writes the value at z (d,); ``work`` is a vector of as many places as the tape has, or more."""
-    value[: tape.size] = 0.0
+    """Writes the values (size, 8) at eight points z (d, 8); ``work`` (places + 5, 8) is lent to work in."""
+    use_widest_registers()
+    z, work, value = z.reshape(-1), work.reshape(-1), value.reshape(-1)
+    for i in range(tape.size):
+        store(value, 8 * i, zeros())
     for k in range(len(tape.code)):
-        code = tape.code[k]
-        operation, i = code[0], code[1]
+        operation, i, j, last = tape.code[k, 0], 8 * tape.code[k, 1], 8 * tape.code[k, 2], 8 * tape.code[k, 3]
         if operation == OUTPUT:
-            value[i] = work[code[2]]
+            store(value, i, load(work, j))
         elif operation == INPUT:
-            work[i] = z[code[2]]
+            store(work, i, load(z, j))
         elif operation == CONST:
-            work[i] = tape.constants[k]
+            store(work, i, zeros() + tape.constants[k])
         else:
-            work[i] = _operate(operation, work[code[2]], work[code[3]])[0]
+            store(work, i, _operate(operation, load(work, j), load(work, last), work, 8 * tape.work)[0])
 
 
 @compiled
 def linearize_tape(tape, points, values, jacobians):
     """Writes the values (K, size) at K points z (K, d), and their derivatives (K, size, d)."""
-    d = points.shape[1]
-    work, tangents = np.empty(tape.work), np.empty((tape.work, d))
-    values[:], jacobians[:] = 0.0, 0.0
-    for p in range(len(points)):
+    use_widest_registers()
+    K, d = points.shape
+    sizes = 8 * np.array([d, tape.work + 5, tape.work * d, tape.size, tape.size * d])
+    memory, ends = aligned_rows(1, sizes.sum())[0], np.cumsum(sizes)
+    z, work, tangents = memory[: ends[0]], memory[ends[0] : ends[1]], memory[ends[1] : ends[2]]
+    value, derivative = memory[ends[2] : ends[3]], memory[ends[3] :]
+    memory[:] = 0.0
+    for first in range(0, K, 8):
+        for lane in range(8):
+            for c in range(d):
+                z[8 * c + lane] = points[min(first + lane, K - 1), c]
         for k in range(len(tape.code)):
-            code = tape.code[k]
-            operation, i, j, last = code[0], code[1], code[2], code[3]
+            operation, i, j, last = tape.code[k, 0], 8 * tape.code[k, 1], 8 * tape.code[k, 2], 8 * tape.code[k, 3]
             if operation == OUTPUT:
-                values[p, i] = work[j]
-                for c in range(d):
-                    jacobians[p, i, c] = tangents[j, c]
+                store(value, i, load(work, j))
+                for c in range(0, 8 * d, 8):
+                    store(derivative, i * d + c, load(tangents, j * d + c))
             elif operation in (INPUT, CONST):
-                work[i] = points[p, j] if operation == INPUT else tape.constants[k]
-                for c in range(d):
-                    tangents[i, c] = 0.0
-                if operation == INPUT:
-                    tangents[i, j] = 1.0
+                store(work, i, load(z, j) if operation == INPUT else zeros() + tape.constants[k])
+                for c in range(0, 8 * d, 8):
+                    store(tangents, i * d + c, zeros() + (1.0 if operation == INPUT and c == j else 0.0))
             else:
-                work[i], by_first, by_second = _operate(operation, work[j], work[last])
-                if by_second == 0.0:
-                    for c in range(d):
-                        tangents[i, c] = by_first * tangents[j, c]
-                else:
-                    for c in range(d):
-                        tangents[i, c] = by_first * tangents[j, c] + by_second * tangents[last, c]
+                found, by_first, by_second = _operate(operation, load(work, j), load(work, last), work, 8 * tape.work)
+                store(work, i, found)
+                both = operation in TWO_OPERANDS
+                for c in range(0, 8 * d, 8):
+                    tangent = by_first * load(tangents, j * d + c)
+                    if both:
+                        tangent = tangent + by_second * load(tangents, last * d + c)
+                    store(tangents, i * d + c, tangent)
+        for lane in range(min(8, K - first)):
+            for i in range(tape.size):
+                values[first + lane, i] = value[8 * i + lane]
+                for c in range(d):
+                    jacobians[first + lane, i, c] = derivative[8 * (i * d + c) + lane]
 
 
-@njit_noalloc
-def _operate(operation, a, b):
-    """The value of an operation on a and b, and its derivatives by them; b is not read where it has one operand."""
+@inline_njit
+def _operate(operation, a, b, work, free):
+    """The values of an operation on a and b, and its derivatives by them; b is not read where it has one operand.
+
+    40 entries of ``work`` from ``free`` on are written to.
+    """
     if operation == ADD:
-        return a + b, 1.0, 1.0
+        return a + b, zeros() + 1.0, zeros() + 1.0
     if operation == SUB:
-        return a - b, 1.0, -1.0
+        return a - b, zeros() + 1.0, zeros() - 1.0
     if operation == MUL:
         return a * b, b, a
     if operation == DIV:
-        return a / b, 1.0 / b, -a / (b * b)
+        return a / b, 1.0 / b, a / b * (-1.0 / b)
     if operation == SQ:
-        return a * a, 2.0 * a, 0.0
+        return a * a, a * 2.0, zeros()
     if operation == TWICE:
-        return 2.0 * a, 2.0, 0.0
+        return a * 2.0, zeros() + 2.0, zeros()
     if operation == NEG:
-        return -a, -1.0, 0.0
+        return a * -1.0, zeros() - 1.0, zeros()
     if operation == SIN:
-        return math.sin(a), math.cos(a), 0.0
+        return sine(a), cosine(a), zeros()
     if operation == COS:
-        return math.cos(a), -math.sin(a), 0.0
-    return _operate_rarely(operation, a, b)
+        return cosine(a), sine(a) * -1.0, zeros()
+    store(work, free, a)
+    store(work, free + 8, b)
+    for lane in range(free, free + 8):
+        found = _operate_rarely(operation, work[lane], work[lane + 8])
+        work[lane + 16], work[lane + 24], work[lane + 32] = found
+    return load(work, free + 16), load(work, free + 24), load(work, free + 32)
 
 
 @njit_noalloc

@@ -45,15 +45,15 @@ class RollOut:
         states[:, 0], last = start, feedback.previous_input
         for k in range(H):
             u = feedback.inputs[:, k] + (gains[:, k] @ (states[:, k] - feedback.states[:, k])[..., None])[..., 0]
-            u = np.minimum(np.maximum(u, last + feedback.rate_lower), last + feedback.rate_upper)
-            last = inputs[:, k] = np.minimum(np.maximum(u, feedback.lower), feedback.upper)
+            u = np.minimum(np.maximum(u, last + feedback.rate_lower[k]), last + feedback.rate_upper[k])
+            last = inputs[:, k] = np.minimum(np.maximum(u, feedback.lower[k]), feedback.upper[k])
             states[:, k + 1] = _mean(self._model, np.ascontiguousarray(states[:, k]), last) + added
         return states, inputs
 
     def open_loop(self, start: Array, inputs: Array, disturbance: Array | None = None) -> Array:
         """Returns the states (T, H + 1, n) that inputs (T, H, m) lead to from x_0 (T, n), without bounds."""
         (T, H, m), n = inputs.shape, start.shape[1]
-        gains, free = np.zeros((1, H, m, n)), np.full(m, np.inf)
+        gains, free = np.zeros((1, H, m, n)), np.full((H, m), np.inf)
         law = Feedback(np.zeros((T, H, n)), np.ascontiguousarray(inputs), gains, -free, free, -free, free, np.zeros(m))
         return self(start, law, disturbance)[0]
 

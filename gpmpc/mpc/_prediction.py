@@ -24,7 +24,7 @@ will see the next states and correct what went wrong (Hewing, Kabzan and Zeiling
 finite-horizon LQR at the first stage. It is part of the covariances only: the bounds of the inputs hold for u_k.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -127,6 +127,8 @@ class PredictionModel:
         self.propagator, self.problem, self.horizon = propagator, problem, horizon
         self.settings, self.points = settings, horizon if settings.form == "trajectory" else 1
         self._set_model(model)
+        limits = *problem.inputs.by_stage(horizon), *problem.input_rates.by_stage(horizon)
+        self._limits = [np.ascontiguousarray(limit) for limit in limits]
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         self.costs = StageCosts(problem, horizon, self.linearizer)
 
@@ -255,38 +257,44 @@ class PredictionModel:
         """Whether plans are compared without derivatives: where the means are all that is predicted."""
         return self.linearizer.covariance == "none"
 
-    def evaluate(self, plan: Plan, at: Prediction, request: Request) -> Prediction:
-        """The prediction at a plan with the derivatives of another one, ``at``."""
-        after = self._roll_out.open_loop(plan.states[:-1], plan.inputs[:, None], request.disturbance)[:, 1]
-        return self._without(plan, np.ascontiguousarray(after), at, request)  # kernels do not look at strides
+    def trials(
+        self, towards: Sequence[Plan], at: Prediction, feedback: Array, request: Request
+    ) -> Iterator[tuple[Plan, Array]]:
+        """For each plan the one that obeys the dynamics under a feedback towards it, see ``roll_out``, and then itself.
 
-    def _without(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
+        With where the dynamics lead from their points (H, n). All plans are rolled out in one call.
+        """
+        (T, H), gains = (len(towards), self.horizon), self._towards(at, feedback)[None]
+        states, inputs = (np.stack(parts) for parts in list(zip(*towards, strict=True))[:2])
+        law = Feedback(states, inputs, gains, *self._limits, request.references.previous_input)
+        rolled, after = self._roll_out(states[:, 0], law, request.disturbance), None
+        for t, plan in enumerate(towards):
+            yield Plan(rolled[0][t], rolled[1][t], plan.covariances), rolled[0][t, 1:]
+            if after is None:
+                points = states[:, :-1].reshape(T * H, -1), inputs.reshape(T * H, 1, -1), request.disturbance
+                after = np.ascontiguousarray(self._roll_out.open_loop(*points)[:, 1]).reshape(T, H, -1)
+            yield plan, after[t]
+
+    def without_derivatives(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
+        """The prediction at a plan whose points lead to ``after`` (H, n), with the derivatives of another one, ``at``."""
         rows = self.constraints.at(plan, plan.covariances, self.points, request.parameters, request.kappas)
         stages, cost = at.stages._replace(next=after), self.costs.at(plan, request.parameters)
         return Prediction(plan, stages, plan.covariances, rows, cost)
 
-    def roll_out(
-        self, towards: Plan, prediction: Prediction, feedback: Array, request: Request, derivatives: bool = True
-    ) -> Prediction:
+    def roll_out(self, towards: Plan, prediction: Prediction, feedback: Array, request: Request) -> Prediction:
         """The prediction at the plan that obeys the dynamics under a feedback towards another one, within its bounds.
 
         The feedback is a program's, F_k (H, m, p + m + 1), or that of the stages of ``prediction`` where there is none
-        (0, m, p + m + 1). Without ``derivatives`` the stages are linearised only where the plan needs it.
+        (0, m, p + m + 1).
         """
-        problem, n, linearizer = self.problem, self.problem.state_dim, self.linearizer
-        own = -self.gains(*prediction.stages[:2], prediction.cost) if not len(feedback) else feedback
-        gains = np.ascontiguousarray(own[:, :, :n])
+        n, linearizer, gains = self.problem.state_dim, self.linearizer, self._towards(prediction, feedback)
         last, disturbance = request.references.previous_input, request.disturbance
-        limits = problem.inputs.lower, problem.inputs.upper, problem.input_rates.lower, problem.input_rates.upper
-        if linearizer.at_points and all(limit.ndim == 1 for limit in limits):
-            law = Feedback(towards.states[None], towards.inputs[None], gains[None], *limits, last)
+        if linearizer.at_points:
+            law = Feedback(towards.states[None], towards.inputs[None], gains[None], *self._limits, last)
             states, inputs = self._roll_out(towards.states[:1], law, disturbance)
-            plan = Plan(states[0], inputs[0], towards.covariances)
-            if not derivatives:
-                return self._without(plan, plan.states[1:], prediction, request)
-            return self.linearize(plan, request)
+            return self.linearize(Plan(states[0], inputs[0], towards.covariances), request)
+        low, high, down, up = self._limits
         states, inputs, covariances = (part.copy() for part in towards)
-        (low, high), (down, up) = (box.by_stage(self.horizon) for box in (problem.inputs, problem.input_rates))
         parts = []
         for k in range(self.horizon):  # of a belief, whose means depend on its covariances
             input = towards.inputs[k] + gains[k] @ (states[k, :n] - towards.states[k, :n])
@@ -298,6 +306,11 @@ class PredictionModel:
             parts.append(stage)
         stages = Stages(*map(np.concatenate, zip(*parts, strict=True)))
         return self.predict(Plan(states, inputs, covariances), stages, request)
+
+    def _towards(self, prediction: Prediction, feedback: Array) -> Array:
+        """The gains (H, m, n) of ``roll_out``."""
+        gains = feedback if len(feedback) else -self.gains(*prediction.stages[:2], prediction.cost)
+        return np.ascontiguousarray(gains[:, :, : self.problem.state_dim])
 
     def gain(self, stages: Stages, cost: QuadraticCost) -> Array:
         """K (m, n) of the feedback u = u_k - K (x - mu_k) at the first stage; zero without feedback."""

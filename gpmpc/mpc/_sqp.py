@@ -18,6 +18,7 @@ matched beliefs, damped BFGS updates put it into the program (Nocedal and Wright
 import math
 from collections import deque
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 import torch
@@ -37,7 +38,8 @@ Array = np.ndarray
 _TORCH_FAILURE = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
 FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, _TORCH_FAILURE)  # no finite numbers
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
-_SHORTEST_STEP = 2.0**-10
+_HALVINGS = 10  # of a step at most
+_TOGETHER = 8  # shares of a step that are compared in one call
 _ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
 _NOISE = 1e-10  # the square of an offset that a model with that round-off need not get below
 _SMALL = 1e-3  # share of an input's size whose cost counts where the cost itself vanishes
@@ -103,16 +105,13 @@ class Globalization:
             return at._replace(plan=proposed), Status.SOLVED
         slope = promised - curvature - merit
         far = size > _NEAR
-        length = 1.0
-        while length >= _SHORTEST_STEP:
+        for length, trial in self._trials(at, plan, proposed, program.feedback, far):
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
-            for trial in self._candidates(at, _between(plan, proposed, length), program.feedback, far):
-                rows = trial.rows if self._model.constraints.smooth else at.rows._replace(E=trial.rows.E)
-                points = trial.stages.next, rows, trial.plan
-                if call_unchecked(_merit, trial.cost, terms, self._defect_prices, *points) <= bound:
-                    bare = far and self._model.evaluates
-                    return self._model.linearize(trial.plan, self._request) if bare else trial, None
-            length /= 2.0
+            rows = trial.rows if self._model.constraints.smooth else at.rows._replace(E=trial.rows.E)
+            points = trial.stages.next, rows, trial.plan
+            if call_unchecked(_merit, trial.cost, terms, self._defect_prices, *points) <= bound:
+                bare = far and self._model.evaluates
+                return self._model.linearize(trial.plan, self._request) if bare else trial, None
         if size**2 <= _ROUND_OFF:  # size^2 of the cost is what could still be gained
             return at._replace(plan=proposed), Status.SOLVED
         return at, Status.NUMERICAL_TROUBLE
@@ -121,22 +120,33 @@ class Globalization:
         """Whether steps are remembered: where covariances make it creep; plans of means come from too far away."""
         return not (len(program.feedback) or self._model.linearizer.at_points)
 
-    def _candidates(self, at: Prediction, towards: Plan, feedback: Array, far: bool) -> Iterator[Prediction]:
-        """Predictions at a plan, and at the plan that obeys the dynamics under the feedback towards it.
+    def _trials(
+        self, at: Prediction, plan: Plan, proposed: Plan, feedback: Array, far: bool
+    ) -> Iterator[tuple[float, Prediction]]:
+        """Shares of the step to a proposed plan, and the predictions at the plan that obeys the dynamics and at its own.
 
-        Far from a solution the second comes first, since it leads further; and where moments are linearised, since they
-        overshoot. Near one, a plan is linearised at once: it will be taken.
+        Far from a solution the first of these leads further; and it comes first where moments are linearised, since
+        they overshoot. Near one, a plan is linearised at once: it will be taken.
         """
-        bare = far and self._model.evaluates  # without derivatives
-        for rolled_out in (True, False) if far or not self._model.linearizer.at_points else (False, True):
+        model, request, shares = self._model, self._request, 2.0 ** -np.arange(_HALVINGS + 1)
+        if far and model.evaluates:  # without derivatives
+            for together in np.split(shares, [_TOGETHER]):
+                towards = [_between(plan, proposed, share) for share in together]
+                found = model.trials(towards, at, feedback, request)
+                for share, trial in zip(np.repeat(together, 2), found, strict=True):
+                    try:
+                        yield share, model.without_derivatives(*trial, at, request)
+                    except FAILURES:  # it may lead the model out of its numbers
+                        continue
+            return
+        for share, first in product(shares, (True, False)):
+            towards = _between(plan, proposed, share)
             try:
-                if rolled_out:
-                    yield self._model.roll_out(towards, at, feedback, self._request, not bare)
-                elif bare:
-                    yield self._model.evaluate(towards, at, self._request)
+                if first is (far or not model.linearizer.at_points):
+                    yield share, model.roll_out(towards, at, feedback, request)
                 else:
-                    yield self._model.linearize(self._model.canonical(towards), self._request)
-            except FAILURES:  # a trial plan may lead the model out of its numbers
+                    yield share, model.linearize(model.canonical(towards), request)
+            except FAILURES:
                 continue
 
 

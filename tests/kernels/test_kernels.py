@@ -408,3 +408,15 @@ def test_what_does_not_fit_is_refused():
 
 def test_the_kernels_load_no_torch_of_their_own():
     assert not [path for path in Path(kernels.__file__).parent.glob("*.py") if "import torch" in path.read_text()]
+
+
+def test_the_sine_and_cosine_of_lanes_are_exact_to_round_off_and_stay_within_one(rng):
+    sine, cosine = by_lanes(_simd.sine), by_lanes(_simd.cosine)
+    for scale in (1.0, 100.0, 1e6):
+        x = rng.uniform(-scale, scale, 8000)
+        assert np.abs(sine(x) - np.sin(x)).max() < 4e-16
+        assert np.abs(cosine(x) - np.cos(x)).max() < 4e-16
+    x = np.array([0.0, 1e-300, -1e-9, 1e300, -1e17, np.inf, -np.inf, np.nan])
+    assert sine(x)[:3].tolist() == x[:3].tolist()
+    assert (np.abs([sine(x)[:5], cosine(x)[:5]]) <= 1.0).all()
+    assert np.isnan([sine(x)[5:], cosine(x)[5:]]).all()

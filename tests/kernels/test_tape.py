@@ -48,7 +48,7 @@ def test_a_known_model_is_rolled_out_in_one_call_under_a_feedback_within_bounds(
     function = casadi.Function("successor", [x, u], [casadi.vertcat(*system.successor(x, u))])
     model = KnownModel(CasadiFunction(function), 4, 1)
     planned, gains = rng.normal(size=(2, H, 4)), rng.normal(size=(2, H, 1, 4))
-    limits = np.array([-6.0]), np.array([6.0]), np.array([-3.0]), np.array([3.0]), np.array([0.5])
+    limits = *(np.full((H, 1), limit) for limit in (-6.0, 6.0, -3.0, 3.0)), np.array([0.5])
     feedback = Feedback(planned, rng.uniform(-4, 4, (2, H, 1)), gains, *limits)
     starts, gust = rng.normal(size=(2, 4)), np.array([0.0, 0.1, 0.0, 0.0])
     states, inputs = RollOut(model)(starts, feedback, gust)

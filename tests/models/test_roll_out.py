@@ -52,8 +52,8 @@ def test_a_roll_out_obeys_the_model_and_the_feedback_within_its_bounds(kind):
     )
     bounds = [np.array(side) for side in ([-0.8, -np.inf], [0.9, np.inf], [-np.inf, -0.7], [np.inf, 0.6])]
     last, disturbance = np.array([0.1, 0.2]), 0.1 * random.normal(size=n)
-    start = random.normal(size=(T, n))
-    states, applied = RollOut(model)(start, Feedback(planned, inputs, gains[None], *bounds, last), disturbance)
+    start, limits = random.normal(size=(T, n)), [np.tile(bound, (H, 1)) for bound in bounds]
+    states, applied = RollOut(model)(start, Feedback(planned, inputs, gains[None], *limits, last), disturbance)
     assert (states[:, 0] == start).all()
     for t in range(T):
         before = last
@@ -72,7 +72,7 @@ def test_plans_may_have_gains_of_their_own():
         random.normal(size=(2, 4, 2)),
         random.normal(size=(2, 4, 2, 3)),
     )
-    free = [np.full(2, side) for side in (-np.inf, np.inf, -np.inf, np.inf)]
+    free = [np.full((4, 2), side) for side in (-np.inf, np.inf, -np.inf, np.inf)]
     rest = (*free, np.zeros(2))
     both = RollOut(model)(planned[:, 0], Feedback(planned, inputs, gains, *rest))
     for t in range(2):
