@@ -277,13 +277,13 @@ def play_script(entry: Path, robot: str) -> float:
 class Parts(NamedTuple):
     """What a pilot is made of."""
 
-    controller: GPMPC  #: takes one program a decision, from a plan
+    controller: GPMPC  #: improves a plan from decision to decision
     planner: GPMPC  #: takes several
     guesses: list[Array | None]  #: to start from: the straight line, the drift, kicks
     criterion: Callable[[Decision, Reference], float]  #: predicted time below the line, more where the end is off [s]
 
 
-def make_parts(model: Any, horizon: int = 40, programs: int = 20, wild: bool = True) -> Parts:
+def make_parts(model: Any, horizon: int = 40, programs: int = 20, wild: bool = True, kept: int = 1) -> Parts:
     """Makes the parts of a pilot.
 
     Args:
@@ -291,6 +291,7 @@ def make_parts(model: Any, horizon: int = 40, programs: int = 20, wild: bool = T
         horizon: Stages of 20 ms.
         programs: Of each start.
         wild: Whether starts with kicks are taken besides the straight line and the drift.
+        kept: Programs of a decision from a plan.
     """
     Q, R = np.diag([10.0, 0.1, 10.0, 0.1]), np.array([[0.01]])
     upright = model.linearize(np.zeros((1, 4)), np.zeros((1, 1)), False)
@@ -312,7 +313,7 @@ def make_parts(model: Any, horizon: int = 40, programs: int = 20, wild: bool = T
             kick = np.zeros((horizon, 1))
             kick[: horizon // 6], kick[horizon // 6 : horizon // 3] = sign * TORQUE, -sign * TORQUE
             guesses.append(kick)
-    return Parts(make(1), make(programs), guesses, time_below)
+    return Parts(make(kept), make(programs), guesses, time_below)
 
 
 def pilot(model: Any, robot: str, gain: float = 1.0, **settings: Any) -> Pilot:
@@ -533,11 +534,14 @@ def _play_in_real_time(model: Any, robot: str, kind: str, draw: int) -> dict[str
 
 
 def _real_time_pilot(model: Any, robot: str, kind: str) -> Any:
-    """The real-time pilot of a model; that of a residual model searches with its fitted body."""
+    """The real-time pilot of a model; that of a residual model searches with its fitted body.
+
+    A plan that took its start's time has not converged yet: with one program a decision half of them are lost.
+    """
     from gpmpc.experiments.realaigym_real_time import real_time_pilot
 
     quick = KnownModel(model.nominal, 4, 1) if kind == "residual" else model
-    return real_time_pilot(make_parts(model, programs=10), JOINTS[robot], quick)
+    return real_time_pilot(make_parts(model, kept=5), JOINTS[robot], quick)
 
 
 def table(robot: str, rows: list[dict[str, Any]]) -> str:

@@ -2,11 +2,12 @@
 
 Every decision and every search is timed (processor time, all threads), and acts as much simulated time later. One core
 gives torques every 2 ms and decides every 20 ms; a second one searches from where the pendulum is expected at the
-search's end. Until a plan is known there is no torque; then the remaining searches look for a better one that starts
-from that plan, which meanwhile flies by its feedback alone, and from then on it is improved every 20 ms.
+search's end. Until a plan is known the actuated joint is braked; then the other starts are searched for a better one,
+while the plan flies and is improved every 20 ms. One that leads nowhere is dropped, since it would be flown faster and
+faster.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from math import ceil, inf
 from time import process_time
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gpmpc._kernels.gp_rollout import Feedback
 from gpmpc.experiments.realaigym import INPUT, PLAN, REPLAN, TORQUE, Array, Parts, state_of
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import RollOut
@@ -21,7 +23,8 @@ from gpmpc.mpc import GPMPC, ControlLoop, Decision, ManyStarts, Reference
 from gpmpc.mpc._policy import Command
 
 TICKS = round(PLAN / INPUT)  # inputs in a plan's time step
-GOOD = 0.4  # predicted time below the line up to which a plan is not compared with those of other searches [s]
+BRAKE = 0.3  # torque against the actuated joint's rate without a plan [N m s/rad]
+GOOD = 1.0  # predicted time below the line up to which a plan is not compared with those of other starts [s]
 
 
 class Flight(NamedTuple):
@@ -39,20 +42,22 @@ class RealTimePilot:
     """Flies the best plan that is known, and knows a plan only after the time that it took.
 
     Attributes:
-        step: Takes one program a decision.
-        searches: Taken one after the other, again and again while there is no plan.
+        step: Takes a few programs a decision.
+        search: Its starts are taken one after the other, again and again while there is no plan.
         criterion: Of plans: predicted time below the line [s].
-        model: Predicts where a search begins.
+        model: Predicts where a search begins, without a plan.
         joint: With the motor: 0, 1.
         lead: Time from a search's call to its first state, in time steps of the plan.
+        share: Of the lead, after which no further start is taken.
     """
 
     step: GPMPC
-    searches: Sequence[ManyStarts]
+    search: ManyStarts
     criterion: Callable[[Decision, Reference], float]
     model: Any
     joint: int
-    lead: int = 6
+    lead: int = 3
+    share: float = 0.5
     seconds: list[float] = field(default_factory=list)  #: of each decision [s]
     searched: list[float] = field(default_factory=list)  #: of each search [s]
     between: list[float] = field(default_factory=list)  #: of each torque [s]
@@ -61,10 +66,13 @@ class RealTimePilot:
     _found: Flight | None = None
     _last: float = -1.0
     _count: int = 0
-    _turn: int = 0
+    _turn: int = 0  #: starts taken since there was a plan worth following
 
     def __post_init__(self) -> None:
-        self._passive = RollOut(self.model)
+        self._roll_out, H = RollOut(self.model), self.lead
+        limit, free = np.full((H, 1), TORQUE), np.full((H, 1), np.inf)
+        gains = np.tile(-BRAKE * np.eye(4)[1 + 2 * self.joint], (1, H, 1, 1))
+        self._brake = Feedback(np.zeros((1, H, 4)), np.zeros((1, H, 1)), gains, -limit, limit, -free, free, np.zeros(1))
 
     def torques(self, x: Any, t: float) -> Array:
         """The torques of both joints (2,) at a state in the league's order and a time [s]."""
@@ -73,51 +81,61 @@ class RealTimePilot:
             self._flight = self._decided = self._found = None
             self._count = self._turn = 0
         self._last, now = t, self._count
-        if self._found is not None and now >= self._found.known:
-            better = self._flight is None or self._found.value < self._value(self._flight, self._found.start) - PLAN
-            if better and self._found.value < inf:
-                self._flight = self._found
-            self._found = None
         if self._decided is not None and now >= self._decided.known:
-            if self._decided.value < inf:
+            if self._decided.value > REPLAN:
+                self._flight, self._turn = None, 0
+            else:
                 self._flight = self._decided
-                self._turn = 0 if self._flight.value > REPLAN else self._turn
             self._decided = None
-        begin, torque = process_time(), 0.0
+        if self._found is not None and now >= self._found.known:
+            flown = REPLAN if self._flight is None else self._value(self._flight, self._found.start) - PLAN
+            if self._found.value < flown:
+                self._flight, self._decided = self._found, None
+            self._found = None
+        begin, torque = process_time(), -BRAKE * float(state[1 + 2 * self.joint])
         if self._flight is not None:
             torque = self._flight.loop.input_between(state, (now - self._flight.start) / TICKS)[0]
         self.between.append(process_time() - begin)
-        if now % TICKS == 0 and self._found is None and self._decided is None:
-            flight = self._flight
-            lost = flight is None or flight.value > REPLAN
-            if flight is not None and lost and (now - flight.start) // TICKS + self.lead >= len(flight.plan.inputs):
-                self._flight = flight = None  # a search needs to know where the flight will be
-            compared = self._turn >= len(self.searches) or (flight is not None and flight.value <= GOOD)
-            if flight is None or lost or not (compared or now < flight.known + TICKS):
-                self._found = self._search(state, now, flight)
-            elif now > flight.start:
-                self._decided = self._decide(state, now, flight)
+        if now % TICKS == 0:
+            self._think(state, now)
         self._count += 1
         out = np.zeros(2)
         out[self.joint] = np.clip(torque, -TORQUE, TORQUE)
         return out
 
+    def _think(self, state: Array, now: int) -> None:
+        """Lets both cores begin what they are free for: a decision, and a search where the flight is not good."""
+        flight = self._flight
+        if flight is not None and self._decided is None and now > flight.start:
+            self._decided = self._decide(state, now, flight)
+        if self._found is None and (flight is None or (flight.value > GOOD and self._turn < len(self.search))):
+            self._found = self._search(state, now, flight)
+
     def _value(self, flight: Flight, start: int) -> float:
         """The criterion of what is left of a flight from a time on."""
-        means = flight.plan.means[min((start - flight.start) // TICKS, len(flight.plan.means) - 2) :]
+        means = flight.plan.means[min(max(0, start - flight.start) // TICKS, len(flight.plan.means) - 2) :]
         return self.criterion(replace(flight.plan, means=means), _goal(means))
 
     def _search(self, state: Array, now: int, flight: Flight | None) -> Flight:
+        """The best plan of as many starts as the time allows, from where the pendulum will be then."""
         begin = process_time()
         if flight is None:
-            expected = self._passive.open_loop(state[None], np.zeros((1, self.lead, 1)))[0, -1]
+            expected = self._roll_out(state[None], self._brake)[0][0, -1]
         else:
             means = flight.plan.means
             expected = means[min((now - flight.start) // TICKS + self.lead, len(means) - 1)]
-        search = self.searches[self._turn % len(self.searches)]
-        self._turn += 1
-        plan = search.control(Gaussian.certain(expected), Reference(np.zeros(4)))
-        return self._timed(plan, begin, now, now + self.lead * TICKS, self.searched)
+        expected = expected if np.isfinite(expected).all() else state
+        start = Gaussian.certain(expected), Reference(np.zeros(4))
+        best, lowest, first = None, inf, self._turn % len(self.search)
+        for plan, value in self.search.plans(*start, first=first):
+            self._turn += 1
+            if best is None or value < lowest:
+                best, lowest = plan, value
+            if lowest <= GOOD or process_time() - begin > self.share * self.lead * PLAN:
+                break
+        assert best is not None
+        found = self._timed(best, begin, now, now + self.lead * TICKS, self.searched)
+        return found if found.known == found.start else found._replace(value=inf)  # too late to begin with
 
     def _decide(self, state: Array, now: int, flight: Flight) -> Flight:
         begin, passed = process_time(), (now - flight.start) // TICKS
@@ -141,11 +159,11 @@ class RealTimePilot:
 def real_time_pilot(parts: Parts, joint: int, quick: Any) -> RealTimePilot:
     """Makes a real-time pilot that searches with a model that is quick, and decides with that of its parts."""
     planner = parts.planner.with_model(quick)
-    searches = [ManyStarts(planner, planner, [guess], (2, 3), parts.criterion) for guess in parts.guesses]
-    made = RealTimePilot(parts.controller, searches, parts.criterion, quick, joint)
+    search = ManyStarts(planner, planner, parts.guesses, (2, 3), parts.criterion)
+    made = RealTimePilot(parts.controller, search, parts.criterion, quick, joint)
     for k in range((made.lead + 4) * TICKS):  # compiles everything before the clock counts
         made.torques(np.array([np.pi, 0.2, 0.0, 0.0]), INPUT * k)
-    return RealTimePilot(parts.controller, searches, parts.criterion, quick, joint)
+    return RealTimePilot(parts.controller, search, parts.criterion, quick, joint)
 
 
 def _later(part: Array, stages: int) -> Array:

@@ -1,8 +1,8 @@
 """Eight float64 numbers at once, for loops that LLVM's vectoriser cuts badly: short, triangular, or with several sums.
 
 A value of type ``Lanes`` is a vector register of 512 bits, or two or four smaller ones where the processor has no such.
-``+``, ``-``, ``*`` and ``/`` work entry by entry, also with a float. A product that is added to something is rounded once
-where the processor can. Everything here is for compiled code only; arrays are contiguous and float64, and only
+``+``, ``-``, ``*`` and ``/`` work entry by entry, also with a float. A product that is added to something is rounded
+once where the processor can. Everything here is for compiled code only; arrays are contiguous and float64, and only
 ``load_some`` looks at their length.
 """
 

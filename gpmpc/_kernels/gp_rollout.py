@@ -81,7 +81,13 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
     (T, H, m), n, d, k_dim = inputs.shape, start.shape[1], len(columns), len(offset)
     work = aligned_rows(2, 8 + d + len(chosen) + k_dim)
     memory = aligned_rows(2 * n + m + tape.work + 5, 8)  # eight roll-outs side by side, for the tape
-    at, value, point, known, places = work[0], work[1], memory[: n + m], memory[n + m : -tape.work - 5], memory[2 * n + m :]
+    at, value, point, known, places = (
+        work[0],
+        work[1],
+        memory[: n + m],
+        memory[n + m : -tape.work - 5],
+        memory[2 * n + m :],
+    )
     memory[: 2 * n + m] = 0.0
     for t in range(T):
         copy(start[t], states[t, 0])

@@ -276,7 +276,7 @@ class PredictionModel:
             yield plan, after[t]
 
     def without_derivatives(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
-        """The prediction at a plan whose points lead to ``after`` (H, n), with the derivatives of another one, ``at``."""
+        """The prediction at a plan whose points lead to ``after`` (H, n), with the derivatives of ``at``."""
         rows = self.constraints.at(plan, plan.covariances, self.points, request.parameters, request.kappas)
         stages, cost = at.stages._replace(next=after), self.costs.at(plan, request.parameters)
         return Prediction(plan, stages, plan.covariances, rows, cost)

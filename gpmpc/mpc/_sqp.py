@@ -123,7 +123,7 @@ class Globalization:
     def _trials(
         self, at: Prediction, plan: Plan, proposed: Plan, feedback: Array, far: bool
     ) -> Iterator[tuple[float, Prediction]]:
-        """Shares of the step to a proposed plan, and the predictions at the plan that obeys the dynamics and at its own.
+        """Shares of the step to a proposed plan; predictions at the plan that obeys the dynamics and at the plan there.
 
         Far from a solution the first of these leads further; and it comes first where moments are linearised, since
         they overshoot. Near one, a plan is linearised at once: it will be taken.

@@ -5,9 +5,10 @@ disturbance, sequential programs are started from every pair of a goal and a gue
 plan that a criterion likes best is followed from then on.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import islice, product
 from math import inf
 from time import perf_counter
 from typing import Any
@@ -99,14 +100,32 @@ class ManyStarts:
             if best.applicable and lowest <= self.limit:
                 return best
         begin, last = perf_counter(), None if previous is None else replace(previous, solution=None)
-        for goal, guess in self._candidates(belief.mean.numpy(), reference):
-            if lowest < inf and self.budget is not None and perf_counter() - begin > self.budget:
-                break
-            decision, value = self._try(self.planner, belief, goal, last, parameters, *guess)
+        for decision, value in self.plans(belief, reference, last, parameters):
             if best is None or value < lowest:
                 best, lowest = decision, value
+            if lowest < inf and self.budget is not None and perf_counter() - begin > self.budget:
+                break
         assert best is not None
         return best
+
+    def plans(
+        self,
+        belief: Gaussian,
+        reference: Reference,
+        previous: Decision | None = None,
+        parameters: Any = None,
+        first: int = 0,
+    ) -> Iterator[tuple[Decision, float]]:
+        """The decisions of all starts from the ``first`` on, each with its criterion: infinite if not applicable.
+
+        They are made one by one, for those who compare them in their own time. There are ``len(self)`` starts.
+        """
+        candidates = self._candidates(belief.mean.numpy(), reference.over(self.horizon))
+        for goal, guess in islice(candidates, first, None):
+            yield self._try(self.planner, belief, goal, previous, parameters, *guess)
+
+    def __len__(self) -> int:
+        return len(self.guesses) * math.prod(self.turns)
 
     def gains(self, decision: Decision) -> Array:
         """Those of ``controller``."""

@@ -40,47 +40,52 @@ def leagues(robot, torque_of, count, delay=0, response=1.0, noise=0.0):
     return np.array(states), np.array(asked)
 
 
-@pytest.mark.parametrize(("cost", "begins"), [(0.01, 60), (0.3, 150)])
-def test_a_plan_acts_after_the_time_that_its_search_took(cost, begins, monkeypatch):
-    clock = iter(cost * np.arange(1_000_000))
-    model = KnownModel(casadi_model(double_pendulum("shoulder")), 4, 1)
-    who = real_time_pilot(make_parts(model, horizon=20, programs=3, wild=False), 0, model)
-    monkeypatch.setattr(realaigym_real_time, "process_time", lambda: next(clock))
-    x, torques = np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), []
-    for k in range(begins + 40):
-        torques.append(who.torques(x, INPUT * k)[0])
-    assert np.flatnonzero(torques)[0] == begins
-    assert np.allclose(who.searched, cost)
-    assert np.allclose(who.seconds, cost)
-    assert len(who.seconds) > 0
-    who.torques(x, 5.0)  # the league had taken it away: no plan, no torque
-    assert who.torques(x, 5.0 + INPUT)[0] == 0
+def timed_pilot(monkeypatch, start, decision, value=0.1):
+    """A pilot whose clock says that every start and every decision takes a time, and every plan has a value."""
+    clock = [0.0]
 
+    def slowed(function, seconds):
+        def call(*arguments, **named):
+            clock[0] += seconds
+            return function(*arguments, **named)
 
-def test_a_late_decision_leaves_the_last_plan_flying_until_it_is_known(monkeypatch):
-    model = KnownModel(casadi_model(double_pendulum("shoulder")), 4, 1)
-    who = real_time_pilot(make_parts(model, horizon=20, programs=3, wild=False), 0, model)
-    clock = iter(0.029 * np.arange(1_000_000))  # 15 inputs
-    monkeypatch.setattr(realaigym_real_time, "process_time", lambda: next(clock))
-    decided = []
-    for k in range(200):
-        who.torques(np.array([np.pi + 0.01, 0.0, 0.0, 0.0]), INPUT * k)
-        decided.append(len(who.seconds))
-    assert np.flatnonzero(np.diff(decided)).tolist() == [69, 89, 109, 129, 149, 169, 189]  # every second period of 10
+        return call
 
-
-@pytest.mark.parametrize(("value", "rate", "searches"), [(0.1, 0.0, 1), (1.0, 0.0, 2), (np.inf, 10.0, 5)])
-def test_other_searches_are_for_plans_that_are_not_good_and_go_on_one_after_the_other_without_a_plan(
-    value, rate, searches, monkeypatch
-):
     model = KnownModel(casadi_model(double_pendulum("shoulder")), 4, 1)
     parts = make_parts(model, horizon=20, programs=3, wild=False)._replace(criterion=lambda plan, goal: value)
     who = real_time_pilot(parts, 0, model)
-    clock = iter(0.119 * np.arange(1_000_000))
-    monkeypatch.setattr(realaigym_real_time, "process_time", lambda: next(clock))
-    x = np.array([np.pi + 0.1, 0.0, rate, 0.0])
-    torques = [who.torques(x, INPUT * k)[0] for k in range(300)]
-    assert len(who.searched) == searches  # there are two
+    monkeypatch.setattr(realaigym_real_time, "process_time", lambda: clock[0])
+    monkeypatch.setattr(who.search, "_try", slowed(who.search._try, start))
+    monkeypatch.setattr(who.step, "control", slowed(who.step.control, decision))
+    return who
+
+
+@pytest.mark.parametrize(("start", "begins"), [(0.01, 30), (0.05, 30), (0.07, None)])
+def test_a_plan_acts_after_the_time_that_its_search_has_and_never_if_that_is_too_short(start, begins, monkeypatch):
+    who = timed_pilot(monkeypatch, start, 0.001)
+    torques = [who.torques(np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), INPUT * k)[0] for k in range(60)]
+    assert not np.any(torques[:begins])
+    assert begins is None or all(torques[begins:])
+    assert np.allclose(who.searched, start)
+    assert np.allclose(who.seconds, 0.001)
+    assert (len(who.seconds) > 0) == (begins is not None)
+    who.torques(np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), 5.0)  # the league had taken it away: no plan, only the brake
+    assert who.torques(np.array([np.pi + 0.1, 0.0, 2.0, 0.0]), 5.0 + INPUT)[0] == pytest.approx(-0.6)
+
+
+def test_a_late_decision_leaves_the_last_plan_flying_until_it_is_known(monkeypatch):
+    who, decided = timed_pilot(monkeypatch, 0.01, 0.029), []  # 15 inputs
+    for k in range(150):
+        who.torques(np.array([np.pi + 0.01, 0.0, 0.0, 0.0]), INPUT * k)
+        decided.append(len(who.seconds))
+    assert np.flatnonzero(np.diff(decided)).tolist() == [39, 59, 79, 99, 119, 139]  # every second period of 10
+
+
+@pytest.mark.parametrize(("value", "searches"), [(0.1, 1), (1.5, 12), (10.0, 20)])
+def test_all_starts_are_taken_for_a_plan_that_is_not_good_and_again_and_again_without_one(value, searches, monkeypatch):
+    who = timed_pilot(monkeypatch, 0.05, 0.001, value)
+    torques = [who.torques(np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), INPUT * k)[0] for k in range(600)]
+    assert len(who.searched) == searches  # of one start each, and there are twelve
     assert (len(who.seconds) > 0) == np.any(torques) == (value < 5)
 
 
