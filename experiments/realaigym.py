@@ -31,6 +31,7 @@ import torch
 from scipy.optimize import least_squares
 
 from gpmpc._files import write_whole
+from gpmpc._provenance import provenance
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.gp import GPPosterior, Trainer, Transitions, informative_points, load_metadata, standardize
 from gpmpc.models import Affine, CasadiFunction, Features, KnownModel, ResidualModel, RollOut, load_model, save_model
@@ -268,7 +269,8 @@ def play_script(entry: Path, robot: str) -> float:
         raise SettingError("simulator", f"board=script needs the repository, not only its package: {INSTALL}")
     results = where / "data" / beside(entry, "").name
     (results / "sim_swingup.csv").unlink(missing_ok=True)  # the script would score it again
-    paths = [str(entry.parent.resolve()), *filter(None, [os.environ.get("PYTHONPATH")])]
+    given = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
+    paths = [str(Path(path).resolve()) for path in (entry.parent, *given)]  # the script runs in its own folder
     command = [sys.executable, "calculate_leaderboard_score.py", entry.name]
     subprocess.run(command, cwd=where, env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)}, check=True)
     return float(pandas.read_csv(results / "leaderboard_entry.csv")["RealAI Score"].iloc[0])
@@ -499,12 +501,18 @@ def board(
         model = read_model(robot, kind, beside(entry, ".safetensors"))
         for draw in draws:
             if not any(row["draw"] == draw for row in played):
-                played.append({"robot": robot, "model": kind, "seed": seed, "draw": draw})
+                played.append({"robot": robot, "model": kind, "seed": seed, "draw": draw, "version": _version()})
                 played[-1] |= _play_in_real_time(model, robot, kind, draw) if real_time else _play(model, robot, draw)
                 write_whole(store, json.dumps(played, indent=1))
             rows += [row for row in played if row["draw"] == draw]
             _say("  " + "  ".join(f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()))
     return rows
+
+
+def _version() -> str:
+    """What plays: the commit of the source checkout, or the version of the installed package."""
+    made = provenance()
+    return made["versions"]["gpmpc"] if made["git"] is None else made["git"]["commit"]
 
 
 def _play(model: Any, robot: str, draw: int) -> dict[str, Any]:
@@ -597,6 +605,9 @@ def main(arguments: list[str]) -> int:
         if given["board"] == "simulation":
             rows = board(robot, kind, seeds, [100 + i for i in range(draws)], folder, given["time"] == "real")
             _say(table(robot, rows))
+            others = sum(row.get("version") != _version() for row in rows)
+            if others:
+                _say(f"{others} of {len(rows)} draws were kept from another version of gpmpc ({folder})")
             return 0
         for seed in seeds:
             entry = write_entry(robot, kind, seed, folder)

@@ -168,7 +168,8 @@ def test_the_leagues_script_flies_the_file_that_was_written(monkeypatch, tmp_pat
     script.mkdir(parents=True)
     (script / "calculate_leaderboard_score.py").write_text(SCRIPT)
     root = Path(realaigym.__file__).parents[1]
-    monkeypatch.setenv("PYTHONPATH", f"{source}:{root}")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", f"src/python:{root}")
     monkeypatch.setattr(sys, "path", [str(source), *sys.path])
     torque = play_script(write_entry("pendubot", "true", 0, tmp_path / "kept"), "pendubot")
     assert 0 < torque <= 6.0  # the shoulder is driven back upright
@@ -192,6 +193,20 @@ def test_draws_that_were_played_are_read_and_not_played_again(monkeypatch, tmp_p
     assert again[:2] == first
     assert [row["score"] for row in again] == [0.1, 0.101, 0.102]
     assert again[0]["search"] == 500.0
+    assert again[0]["version"]
+
+
+def test_draws_of_another_version_are_counted(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(realaigym, "find_spec", lambda name: name)
+    monkeypatch.setattr(
+        realaigym, "_play", lambda model, robot, draw: dict.fromkeys(("score", "search", "median", "p99"), 0.5)
+    )
+    command = ["robot=acrobot", "model=true", "draws=1", f"folder={tmp_path}"]
+    assert main(command) == 0
+    monkeypatch.setattr(realaigym, "_version", lambda: "another")
+    assert main([command[0], command[1], "draws=2", command[3]]) == 0
+    counted = [line for line in capsys.readouterr().out.splitlines() if "another version" in line]
+    assert counted == [f"1 of 2 draws were kept from another version of gpmpc ({tmp_path})"]
 
 
 @pytest.mark.parametrize(
