@@ -243,7 +243,7 @@ def play_robustness(entry: Path, robot: str, kind: str, size: int) -> str:
     path = beside(entry, ".safetensors")
     model = read_model(robot, kind, path)
     fine = fine_model(robot, None if kind == "true" else load_metadata(path)["metadata"]["body"])
-    who = Watchful(_real_time_pilot(model, robot, kind), RollOut(fine), JOINTS[robot])
+    who = Watchful(_real_time_pilot(model, robot), RollOut(fine), JOINTS[robot])
     store = beside(entry, f"_robustness_{size}.json")
     found = robustness(league_controller(AbstractController, who), robot, size, store)
     shares = {part: float(np.mean(successes)) for part, successes in found.items()}
@@ -280,7 +280,7 @@ class Parts(NamedTuple):
     """What a pilot is made of."""
 
     controller: GPMPC  #: improves a plan from decision to decision
-    planner: GPMPC  #: takes several
+    planner: GPMPC  #: takes several programs a start, with the fitted body alone where there is one
     guesses: list[Array | None]  #: to start from: the straight line, the drift, kicks
     criterion: Callable[[Decision, Reference], float]  #: predicted time below the line, more where the end is off [s]
 
@@ -315,7 +315,9 @@ def make_parts(model: Any, horizon: int = 40, programs: int = 20, wild: bool = T
             kick = np.zeros((horizon, 1))
             kick[: horizon // 6], kick[horizon // 6 : horizon // 3] = sign * TORQUE, -sign * TORQUE
             guesses.append(kick)
-    return Parts(make(kept), make(programs), guesses, time_below)
+    nominal = getattr(model, "nominal", None)
+    quick = model if getattr(nominal, "tape", None) is None else KnownModel(nominal, 4, 1)
+    return Parts(make(kept), make(programs).with_model(quick), guesses, time_below)
 
 
 def pilot(model: Any, robot: str, gain: float = 1.0, **settings: Any) -> Pilot:
@@ -502,7 +504,7 @@ def board(
         for draw in draws:
             if not any(row["draw"] == draw for row in played):
                 played.append({"robot": robot, "model": kind, "seed": seed, "draw": draw, "version": _version()})
-                played[-1] |= _play_in_real_time(model, robot, kind, draw) if real_time else _play(model, robot, draw)
+                played[-1] |= _play_in_real_time(model, robot, draw) if real_time else _play(model, robot, draw)
                 write_whole(store, json.dumps(played, indent=1))
             rows += [row for row in played if row["draw"] == draw]
             _say("  " + "  ".join(f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()))
@@ -527,8 +529,8 @@ def _play(model: Any, robot: str, draw: int) -> dict[str, Any]:
     }
 
 
-def _play_in_real_time(model: Any, robot: str, kind: str, draw: int) -> dict[str, Any]:
-    who = _real_time_pilot(model, robot, kind)
+def _play_in_real_time(model: Any, robot: str, draw: int) -> dict[str, Any]:
+    who = _real_time_pilot(model, robot)
     found, ms, between = play(who, robot, draw), 1e3 * np.array(who.seconds), 1e3 * np.array(who.between)
     return {
         "score": found.score,
@@ -541,15 +543,14 @@ def _play_in_real_time(model: Any, robot: str, kind: str, draw: int) -> dict[str
     }
 
 
-def _real_time_pilot(model: Any, robot: str, kind: str) -> Any:
-    """The real-time pilot of a model; that of a residual model searches with its fitted body.
+def _real_time_pilot(model: Any, robot: str) -> Any:
+    """The pilot of a model in real time.
 
     A plan that took its start's time has not converged yet: with one program a decision half of them are lost.
     """
     from gpmpc.experiments.realaigym_real_time import real_time_pilot
 
-    quick = KnownModel(model.nominal, 4, 1) if kind == "residual" else model
-    return real_time_pilot(make_parts(model, kept=5), JOINTS[robot], quick)
+    return real_time_pilot(make_parts(model, kept=5), JOINTS[robot])
 
 
 def table(robot: str, rows: list[dict[str, Any]]) -> str:

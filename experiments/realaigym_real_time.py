@@ -45,7 +45,6 @@ class RealTimePilot:
         step: Takes a few programs a decision.
         search: Its starts are taken one after the other, again and again while there is no plan.
         criterion: Of plans: predicted time below the line [s].
-        model: Predicts where a search begins, without a plan.
         joint: With the motor: 0, 1.
         lead: Time from a search's call to its first state, in time steps of the plan.
         share: Of the lead, after which no further start is taken.
@@ -54,7 +53,6 @@ class RealTimePilot:
     step: GPMPC
     search: ManyStarts
     criterion: Callable[[Decision, Reference], float]
-    model: Any
     joint: int
     lead: int = 3
     share: float = 0.5
@@ -69,7 +67,7 @@ class RealTimePilot:
     _turn: int = 0  #: starts taken since there was a plan worth following
 
     def __post_init__(self) -> None:
-        self._roll_out, H = RollOut(self.model), self.lead
+        self._roll_out, H = RollOut(self.search.planner.prediction.model), self.lead
         limit, free = np.full((H, 1), TORQUE), np.full((H, 1), np.inf)
         gains = np.tile(-BRAKE * np.eye(4)[1 + 2 * self.joint], (1, H, 1, 1))
         self._brake = Feedback(np.zeros((1, H, 4)), np.zeros((1, H, 1)), gains, -limit, limit, -free, free, np.zeros(1))
@@ -156,14 +154,13 @@ class RealTimePilot:
         return Flight(loop, plan, value, start, max(start, done) if value < inf else done)
 
 
-def real_time_pilot(parts: Parts, joint: int, quick: Any) -> RealTimePilot:
-    """Makes a real-time pilot that searches with a model that is quick, and decides with that of its parts."""
-    planner = parts.planner.with_model(quick)
-    search = ManyStarts(planner, planner, parts.guesses, (2, 3), parts.criterion)
-    made = RealTimePilot(parts.controller, search, parts.criterion, quick, joint)
+def real_time_pilot(parts: Parts, joint: int) -> RealTimePilot:
+    """Makes a real-time pilot from parts."""
+    search = ManyStarts(parts.planner, parts.planner, parts.guesses, (2, 3), parts.criterion)
+    made = RealTimePilot(parts.controller, search, parts.criterion, joint)
     for k in range((made.lead + 4) * TICKS):  # compiles everything before the clock counts
         made.torques(np.array([np.pi, 0.2, 0.0, 0.0]), INPUT * k)
-    return RealTimePilot(parts.controller, search, parts.criterion, quick, joint)
+    return RealTimePilot(parts.controller, search, parts.criterion, joint)
 
 
 def _later(part: Array, stages: int) -> Array:

@@ -39,7 +39,7 @@ _TORCH_FAILURE = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImport
 FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, _TORCH_FAILURE)  # no finite numbers
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 _HALVINGS = 10  # of a step at most
-_TOGETHER = 8  # shares of a step that are compared in one call
+_TOGETHER = 1, 3, 8  # shares of a step are compared in one call each up to these
 _ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
 _NOISE = 1e-10  # the square of an offset that a model with that round-off need not get below
 _SMALL = 1e-3  # share of an input's size whose cost counts where the cost itself vanishes
@@ -130,7 +130,7 @@ class Globalization:
         """
         model, request, shares = self._model, self._request, 2.0 ** -np.arange(_HALVINGS + 1)
         if far and model.evaluates:  # without derivatives
-            for together in np.split(shares, [_TOGETHER]):
+            for together in np.split(shares, _TOGETHER):
                 towards = [_between(plan, proposed, share) for share in together]
                 found = model.trials(towards, at, feedback, request)
                 for share, trial in zip(np.repeat(together, 2), found, strict=True):

@@ -53,7 +53,7 @@ def timed_pilot(monkeypatch, start, decision, value=0.1):
 
     model = KnownModel(casadi_model(double_pendulum("shoulder")), 4, 1)
     parts = make_parts(model, horizon=20, programs=3, wild=False)._replace(criterion=lambda plan, goal: value)
-    who = real_time_pilot(parts, 0, model)
+    who = real_time_pilot(parts, 0)
     monkeypatch.setattr(realaigym_real_time, "process_time", lambda: clock[0])
     monkeypatch.setattr(who.search, "_try", slowed(who.search._try, start))
     monkeypatch.setattr(who.step, "control", slowed(who.step.control, decision))
