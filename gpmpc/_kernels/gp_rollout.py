@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gpmpc._compiled import compiled, njit_noalloc
 from gpmpc._kernels._packed import Array, GPArrays
-from gpmpc._kernels._simd import exp, load, total, use_widest_registers, zeros
+from gpmpc._kernels._simd import exp, load, store, total, use_widest_registers, zeros
 from gpmpc._kernels.linalg import aligned_rows, copy, dot
 from gpmpc._kernels.tape import Tape, run_tape
 
@@ -51,17 +51,28 @@ class Feedback(NamedTuple):
 
 
 @njit_noalloc
-def _mean(points, log_signal, D, weights, at):
-    """The latent mean sum_j beta_j sf2 exp(-1/2 sum_d D_d (x~_j - x~)_d^2) of one GP."""
+def _write_means(f, offset, at, memory, means):
+    """Writes the means offset + sum_j beta_j sf2 exp(-1/2 sum_d D_d (x~_j - x~)_d^2) of GPs at one point.
+
+    ``memory`` is lent to work in: eight numbers for each dimension and each GP.
+    """
     use_widest_registers()
-    sums = zeros()
-    for j in range(0, len(weights), 8):
-        exponent = zeros() + log_signal
-        for d in range(len(points)):
-            difference = load(points[d], j) - at[d]
-            exponent = exponent - (0.5 * D[d]) * (difference * difference)
-        sums = sums + exp(exponent) * load(weights, j)
-    return total(sums)
+    (dimensions, count), outputs = f.points.shape, len(offset)
+    points, weights, D, first = f.points.reshape(-1), f.weights.reshape(-1), f.inverse_squares, 8 * dimensions
+    for a in range(outputs):
+        store(memory, first + 8 * a, zeros())
+    for j in range(0, count, 8):
+        for d in range(dimensions):
+            difference = load(points, d * count + j) - at[d]
+            store(memory, 8 * d, difference * difference)
+        for a in range(outputs):
+            exponent = zeros() + f.log_signal[a]
+            for d in range(dimensions):
+                exponent = exponent - (0.5 * D[a, d]) * load(memory, 8 * d)
+            place = first + 8 * a
+            store(memory, place, load(memory, place) + exp(exponent) * load(weights, a * count + j))
+    for a in range(outputs):
+        means[a] = offset[a] + total(load(memory, first + 8 * a))
 
 
 @compiled
@@ -80,14 +91,9 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
     f, offset, A, G, c, B, columns, kinds, chosen, tape = model
     (T, H, m), n, d, k_dim = inputs.shape, start.shape[1], len(columns), len(offset)
     work = aligned_rows(2, 8 + d + len(chosen) + k_dim)
+    at, value, sums = work[0], work[1], aligned_rows(d + len(chosen) + k_dim, 8).reshape(-1)
     memory = aligned_rows(2 * n + m + tape.work + 5, 8)  # eight roll-outs side by side, for the tape
-    at, value, point, known, places = (
-        work[0],
-        work[1],
-        memory[: n + m],
-        memory[n + m : -tape.work - 5],
-        memory[2 * n + m :],
-    )
+    point, known, places = memory[: n + m], memory[n + m : 2 * n + m], memory[2 * n + m :]
     memory[: 2 * n + m] = 0.0
     for t in range(T):
         copy(start[t], states[t, 0])
@@ -116,8 +122,8 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
                     at[i] = math.sin(z) if kinds[i] == SINE else math.cos(z) if kinds[i] == COSINE else z
                 for i in range(len(chosen)):
                     at[d + i] = u[chosen[i]]
-                for a in range(k_dim):
-                    value[a] = offset[a] + _mean(f.points, f.log_signal[a], f.inverse_squares[a], f.weights[a], at)
+                if k_dim > 0:
+                    _write_means(f, offset, at, sums, value)
                 for i in range(n):
                     added = known[i, t - first] + c[i] + disturbance[i]
                     after[i] = added + dot(A[i], x, n) + dot(G[i], u, m) + dot(B[i], value, k_dim)
