@@ -16,7 +16,7 @@ from gpmpc._compiled import call_unchecked
 from gpmpc._kernels._gp_moments import CROSS, JACOBIAN, VALUE, evaluate_moments
 from gpmpc._kernels._gp_point import expand_points, linearize_points
 from gpmpc._kernels._packed import Array, GPArrays, Packed, pack
-from gpmpc._kernels._window import replace_point
+from gpmpc._kernels._window import Window
 from gpmpc.exceptions import ShapeError
 
 __all__ = [
@@ -24,12 +24,12 @@ __all__ = [
     "GPArrays",
     "Moments",
     "Packed",
+    "Window",
     "linearize",
     "moments",
     "moments_with_jacobian",
     "pack",
     "point_with_jacobian",
-    "replace_point",
 ]
 
 
@@ -70,7 +70,7 @@ class Moments(NamedTuple):
 
 
 def linearize(
-    packed: Packed, x: Array, u: Array, covariance: bool, offset: Array, adds_state: bool
+    packed: Packed | Window, x: Array, u: Array, covariance: bool, offset: Array, adds_state: bool
 ) -> tuple[Array, Array, Array, Array | None]:
     """Linearises k GPs at K points in one call.
 

@@ -54,7 +54,7 @@ def linearize_points(gp, columns, outer, x, u, memory, out):
 
     Args:
         gp: ``GPArrays``.
-        columns: L_a by columns (k, N, N); not read where no covariance is wanted.
+        columns: L_a by columns (k, N, N), or with more behind; not read where no covariance is wanted.
         outer: The prior means (k,), and whether the state is added to the prediction.
         x: States (K, n).
         u: Inputs (K, m).
@@ -68,7 +68,8 @@ def linearize_points(gp, columns, outer, x, u, memory, out):
     skip = (-(memory.ctypes.data >> 3)) % 8  # rows start on cache lines
     memory = memory[skip : skip + (len(memory) - 8) // padded * padded].reshape(-1, padded)
     offsets, squares, weighted = memory[:d], memory[d : 2 * d], memory[2 * d]
-    blocks = (len(x) + 3) // 4 * 4 if len(covariance) > 0 else 0  # points, padded, whose k_a are kept
+    K = len(covariance)
+    blocks = (K + 3) // 4 * 4 if K > 1 else K  # points whose k_a are kept, padded
     for h in range(len(x)):
         _write_offsets(gp.points, x[h], u[h], offsets, squares)
         for a in range(outputs):
@@ -93,7 +94,7 @@ def linearize_points(gp, columns, outer, x, u, memory, out):
             signal = np.exp(gp.log_signal[a])
             for first in range(0, blocks, 16):  # these and the columns of L stay in the first cache together
                 totals[:16] = 0.0
-                reduce_variances(columns[a], kept[first : first + 16], totals)
+                reduce_variances(columns[a], gp.size, kept[first : first + 16], totals)
                 for h in range(first, min(first + 16, len(x))):
                     covariance[h, a, a] = max(signal - totals[h - first], 0.0)
 

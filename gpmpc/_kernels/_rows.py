@@ -119,18 +119,18 @@ def reduce_variance(triangle, q, solved):
 
 
 @njit_noalloc
-def reduce_variances(columns, q, totals):
+def reduce_variances(columns, size, q, totals):
     """Adds |L^-1 q_h|^2 of the rows of q, a multiple of four of them, to ``totals``; q is overwritten.
 
-    Forward substitution that reads L, of which ``columns[j]`` is column j, once and four columns at a time.
+    Forward substitution that reads L, of which ``columns[j]`` begins with column j, once and four columns at a time.
     """
     use_widest_registers()
-    size, j = len(columns), 0
+    j = 0
     while j + 4 <= size:
         c0, c1, c2, c3 = columns[j], columns[j + 1], columns[j + 2], columns[j + 3]
         at = max(0, size - (size - j - 4 + 7) // 8 * 8)  # whole registers; what comes before j + 4 is done with
         d0, d1, d2, d3 = c0[at:], c1[at:], c2[at:], c3[at:]
-        for h in range(0, len(q), 4):
+        for h in range(0, len(q) // 4 * 4, 4):
             r0, r1, r2, r3 = q[h, at:size], q[h + 1, at:size], q[h + 2, at:size], q[h + 3, at:size]
             e0, e1, e2, e3 = _solve_four(c0, c1, c2, c3, j, q[h])
             f0, f1, f2, f3 = _solve_four(c0, c1, c2, c3, j, q[h + 1])
@@ -146,6 +146,12 @@ def reduce_variances(columns, q, totals):
                 r1[i] -= f0 * x0 + f1 * x1 + f2 * x2 + f3 * x3
                 r2[i] -= g0 * x0 + g1 * x1 + g2 * x2 + g3 * x3
                 r3[i] -= h0 * x0 + h1 * x1 + h2 * x2 + h3 * x3
+        for h in range(len(q) // 4 * 4, len(q)):
+            r0 = q[h, at:size]
+            e0, e1, e2, e3 = _solve_four(c0, c1, c2, c3, j, q[h])
+            totals[h] += e0 * e0 + e1 * e1 + e2 * e2 + e3 * e3
+            for i in range(len(r0)):
+                r0[i] -= e0 * d0[i] + e1 * d1[i] + e2 * d2[i] + e3 * d3[i]
         j += 4
     while j < size:
         column = columns[j]

@@ -11,7 +11,6 @@ Length-scales and signal variances are the model's: the plant may differ by a sh
 was seen lately d is zero, and with one point it is the estimate of a constant disturbance.
 """
 
-from copy import copy
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, cast
@@ -21,11 +20,12 @@ import torch
 from torch import Tensor
 
 from gpmpc._dynamics import Array, DynamicsModel, Linearized, linearize, to_array
-from gpmpc._kernels import GPArrays, Packed, replace_point
+from gpmpc._kernels import Window
 from gpmpc._kernels import linearize as linearize_gps
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import GPPosterior
+from gpmpc.gp import GPPosterior, SlidingWindow
+from gpmpc.gp._online import least_informative
 from gpmpc.models import Features
 from gpmpc.models._wrapper import Wrapper
 
@@ -41,6 +41,7 @@ class ChangedModel(Wrapper):
     model: DynamicsModel  #: f: a ``GPPosterior`` of next states, or a ``ResidualModel``
     share: float = 0.1  #: by how much the plant may differ, as a share of what was learned
     memory: float = 5000.0  #: length-scale of time in the kernel [steps]
+    window: SlidingWindow = SlidingWindow(40)  #: how many points of d there are at most; a tenth of them goes at once
     time: float = 0.0  #: t of all predictions [steps]
 
     def __post_init__(self) -> None:
@@ -73,13 +74,12 @@ class ChangedModel(Wrapper):
         return B, np.asarray(np.linalg.pinv(B), dtype=np.float64), to_array(self.gp.noise_variance)
 
     @cached_property
-    def change(self) -> tuple[Packed, Array]:
-        """d: GPs over (phi, u, t) for the compiled kernels, and their targets (k, N); without points at first."""
-        gp, nothing = self.gp, np.zeros((self.gp.output_dim, 0))
+    def change(self) -> tuple[Window, Window | None]:
+        """d: GPs over (phi, u, t), without points at first; and those without the points that go next, in the making."""
+        gp = self.gp
         scales = np.column_stack([to_array(gp.lengthscales), np.full(gp.output_dim, self.memory)])
-        signal = np.log(self.share**2 * to_array(gp.signal_variance))
-        arrays = GPArrays(np.zeros((scales.shape[1], 0)), scales**-2.0, signal, nothing, 0)
-        return Packed(arrays, nothing[:, None, :0].repeat(0, axis=1), gp.state_dim, gp.input_dim + 1), nothing
+        signal = self.share**2 * to_array(gp.signal_variance)
+        return Window.empty(scales, signal, gp.state_dim, self.window.points), None
 
     def __len__(self) -> int:
         return self.change[0].arrays.size
@@ -89,8 +89,8 @@ class ChangedModel(Wrapper):
         return self._replaced(time=self.time + steps)
 
     def _replaced(self, **changes: Any) -> "ChangedModel":
-        other = copy(self)
-        other.__dict__.update(changes)
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__ | changes)
         return other
 
     def error(self, state: Array, input: Array, next_state: Array) -> tuple[Array, Array, Array]:
@@ -101,26 +101,39 @@ class ChangedModel(Wrapper):
         variance = ((reach @ cast(Array, alone.covariance)[0]) * reach).sum(1)
         return np.concatenate([z[0], v[0], [self.time]]), reach @ (next_state - alone.mean[0]), variance
 
-    def with_point(self, point: Array, target: Array, noise: Array, drop: int = -1) -> "ChangedModel":
-        """The model with a further point (phi, u, t) of the change; see ``gpmpc._kernels.replace_point``."""
-        return self._replaced(change=replace_point(*self.change, point, target, noise, drop))
+    def with_point(self, point: Array, target: Array, noise: Array) -> "ChangedModel":
+        """The model with a further point (phi, u, t) (d,) of the change, its target (k,) and its noise's variance (k,).
+
+        Raises SettingError where the noise is too small.
+        """
+        (now, coming), new, most = self.change, (point, target, noise), self.window.points
+        gone = max(1, most // 5)
+        step = len(self) - (most - gone)  # the last before a tenth goes is number ``gone``
+        if step > 0 and coming is None:
+            oldest = self.window.remove == "oldest"
+            coming = now.without(range(gone) if oldest else least_informative(self.posterior, gone))
+        if coming is not None and step == gone:
+            now, coming = coming, None
+        elif coming is not None:  # rows are as much work as their number's square: all steps have the same share
+            coming = coming.append(*new, rows=int((most - gone) * (step / gone) ** (1 / 3)))
+        return self._replaced(change=(now.append(*new), coming))
 
     def last_innovation(self) -> tuple[Array, Array]:
         """Error and variance (k,) of the prediction of the last point of the change by those before, with its noise.
 
-        With L the factor and beta the weights, L_NN^2 is the variance, and beta_N L_NN^2 the error.
+        With L the factor and v = L^-1 y, L_NN^2 is the variance, and v_N L_NN the error.
         """
-        change, last = self.change[0], len(self) - 1
-        variance = change.cholesky[:, last, last] ** 2
-        return change.arrays.weights[:, last] * variance, variance
+        last = self.change[0].columns[:, len(self) - 1]
+        return last[:, -1] * last[:, len(self) - 1], last[:, len(self) - 1] ** 2
 
     @property
     def posterior(self) -> GPPosterior:
         """The GPs of d as tensors."""
-        (packed, targets), gp = self.change, self.gp
-        arrays, size = packed.arrays, len(self)
-        parts = arrays.points[:, :size].T, targets.T, arrays.inverse_squares**-0.5, np.exp(arrays.log_signal)
-        rest = self.arrays[2], np.zeros(len(targets)), packed.cholesky, arrays.weights[:, :size]
+        gp, now, size = self.gp, self.change[0], len(self)
+        arrays, (d, k) = now.arrays, (len(now.arrays.points), now.output_dim)
+        parts = arrays.points[:, :size].T, now.data[d : d + k, :size].T, arrays.inverse_squares**-0.5
+        factor = now.columns[:, :size, :size].transpose(0, 2, 1)
+        rest = np.exp(arrays.log_signal), self.arrays[2], np.zeros(k), factor, arrays.weights[:, :size]
         names = [field.name for field in fields(GPPosterior)]
         given: dict[str, Any] = dict(zip(names, map(torch.from_numpy, parts + rest), strict=False))
         return GPPosterior(**given, input_dim=gp.input_dim + 1, predicts="value")
@@ -146,13 +159,13 @@ class ChangedModel(Wrapper):
 
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
         """Linearises at K points (K, n), (K, m), the model and its change each by a method of their own."""
-        found, (change, targets) = linearize(self.model, states, inputs, covariance), self.change
+        found, change = linearize(self.model, states, inputs, covariance), self.change[0]
         if not len(self):
             return found
         z, v, slope = self.features.linearize(states, inputs)
         at = np.empty((len(v), v.shape[1] + 1))
         at[:, :-1], at[:, -1] = v, self.time
-        mean, by_state, by_input, variance = linearize_gps(change, z, at, covariance, np.zeros(len(targets)), False)
+        mean, by_state, by_input, variance = linearize_gps(change, z, at, covariance, np.zeros(change.output_dim), False)
         by_state, by_input = self.features.chain(by_state, by_input[..., :-1], slope)
         B, V = self.arrays[0], found.covariance
         V = None if V is None or variance is None else V + B @ variance @ B.T

@@ -25,7 +25,6 @@ from gpmpc._dynamics import Array, to_array
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import SlidingWindow
-from gpmpc.gp._online import least_informative
 from gpmpc.learning._change import ChangedModel
 from gpmpc.mpc import Decision, Reference
 from gpmpc.mpc._controller import check_method
@@ -87,14 +86,12 @@ class OnlineLearning:
         found = replace(learned, model=model.later(1.0), state=state, error=error, spread=spread)
         if len(spread) < _FEW:
             return found
-        noise, drop = model.arrays[2] * noise_ratio(spread, len(error)), -1
-        if len(model) == self.points:
-            drop = 0 if self.remove == "oldest" else least_informative(model.posterior, 1)[0]
-        larger, alone = model.with_point(point, error, noise, drop), noise + latent
+        noise = model.arrays[2] * noise_ratio(spread, len(error))
+        larger, alone = model.with_point(point, error, noise), noise + latent
         missed, variance = larger.last_innovation()
         variance = variance + latent
         lead = log_density(missed, variance) - log_density(error, alone)
-        leads = np.append(learned.leads, np.clip(lead, -_LARGEST, _LARGEST))[-self.window :]
+        leads = np.append(learned.leads, max(-_LARGEST, min(lead, _LARGEST)))[-self.window :]
         total = float(leads.sum())
         active = total >= 0 if learned.active else total > self.margin
         squares = missed**2 / variance if learned.active else error**2 / alone
@@ -125,7 +122,8 @@ class LearningController:
         self.controller, self.learning = controller, OnlineLearning() if learning is None else learning
         self.problem, self.horizon = controller.problem, controller.horizon
         self.initial_input = controller.initial_input
-        self._model = ChangedModel(controller.prediction.model, self.learning.share, self.learning.memory)
+        window = SlidingWindow(self.learning.points, self.learning.remove)
+        self._model = ChangedModel(controller.prediction.model, self.learning.share, self.learning.memory, window)
 
     def control(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None

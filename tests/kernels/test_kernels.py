@@ -263,7 +263,7 @@ def test_variances_at_several_points_are_reduced_as_each_alone(size):
 
     @numba.njit
     def together(columns, rows, totals):
-        reduce_variances(columns, rows, totals)
+        reduce_variances(columns, len(columns), rows, totals)
 
     expected, totals = [alone(mine.precision.inverse_cholesky[1], row) for row in q], np.zeros(8)
     together(mine.columns[1], q, totals)
