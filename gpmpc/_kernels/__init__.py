@@ -88,7 +88,7 @@ def linearize(
     Raises:
         ShapeError: x or u do not fit the model.
     """
-    K, k, n, m = len(x), packed.output_dim, packed.state_dim, packed.input_dim
+    K, k, n, m = len(x), len(packed.arrays.weights), packed.state_dim, packed.input_dim
     if x.shape != (K, n) or u.shape != (K, m):
         raise ShapeError(f"the model takes states (K, {n}) and inputs (K, {m}); got {x.shape} and {u.shape}")
     x, u = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(u, dtype=np.float64)

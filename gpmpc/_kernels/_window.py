@@ -13,15 +13,15 @@ L33+ L33+' = L33 L33' + l l' (Gill, Golub, Murray and Saunders, 1974; Osborne, 2
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from gpmpc._compiled import call_unchecked, compiled, njit_inner
+from gpmpc._compiled import call_unchecked, compiled
 from gpmpc._kernels._gp_point import _write_kernel
 from gpmpc._kernels._packed import COLUMNS, Array, GPArrays, aligned
-from gpmpc._kernels._simd import load, store, total, use_widest_registers, zeros
-from gpmpc._kernels.linalg import aligned_rows, dot
+from gpmpc._kernels._simd import load, store, use_widest_registers
+from gpmpc._kernels.linalg import aligned_rows, four_dots
 from gpmpc.exceptions import SettingError
 
 
@@ -30,9 +30,10 @@ class Window:
     """k GPs over N points, as ``linearize`` takes them; begin with ``Window.empty``."""
 
     arrays: GPArrays  #: what predictions of the mean read
-    data: Array  #: of the points x~ (d,), their targets (k,), the variances of their noise (k,) and beta (k,): (d + 3 k, P)
-    columns: Array  #: L by columns, and v at their ends (k, C, more than C); what is beyond N belongs to later windows
+    data: Array  #: of the points: x~ (d,), targets (k,), variances of their noise (k,) and beta (k,): (d + 3 k, P)
+    columns: Array  #: L by columns, each with 1 / L_jj and v_j at its end (k, C, C + 8); C > N is for later windows
     state_dim: int  #: n
+    input_dim: int  #: m
     rows: int = 0  #: of L that there are, N where the GPs are to predict
     _free: list[None] = field(default_factory=lambda: [None])  #: has an item until a later window writes to ``columns``
 
@@ -42,23 +43,13 @@ class Window:
         k, d = lengthscales.shape
         data = np.zeros((d + 3 * k, 0))
         arrays = GPArrays(data[:d], lengthscales**-2.0, np.log(signal_variance), data[:k], 0)
-        return cls(arrays, data, _no_columns(k, capacity), state_dim)
-
-    @property
-    def output_dim(self) -> int:
-        """Number of outputs, k."""
-        return len(self.columns)
-
-    @property
-    def input_dim(self) -> int:
-        """Number of inputs, m."""
-        return len(self.arrays.points) - self.state_dim
+        return cls(arrays, data, _no_columns(k, capacity), state_dim, d - state_dim)
 
     def without(self, gone: Sequence[int]) -> "Window":
         """The GPs without some points, and as yet without a row of the factor."""
-        kept = np.delete(np.arange(self.arrays.size), gone)
-        data, columns = np.ascontiguousarray(self.data[:, kept]), _no_columns(*self.columns.shape[:2])
-        return Window(self.arrays._replace(size=len(kept)), data, columns, self.state_dim)
+        data = np.ascontiguousarray(np.delete(self.data[:, : self.arrays.size], gone, axis=1))
+        arrays, columns = self.arrays._replace(size=data.shape[1]), _no_columns(*self.columns.shape[:2])
+        return Window(arrays, data, columns, self.state_dim, self.input_dim)
 
     def append(self, point: Array, target: Array, noise: Array, rows: int | None = None) -> "Window":
         """The GPs with a further point (d,), its target (k,) and the variance of its noise (k,).
@@ -78,12 +69,12 @@ class Window:
         rows, new = N if rows is None else rows, np.concatenate([point, target, noise])
         if not call_unchecked(_append, self.data, new, data, arrays, columns, self.rows, rows):
             raise SettingError("noise", "is too small beside the signal: a kernel matrix is not positive definite")
-        return Window(arrays, data, columns, self.state_dim, rows)
+        return Window(arrays, data, columns, self.state_dim, self.input_dim, rows)
 
 
 def _no_columns(outputs: int, capacity: int) -> Array:
-    width = -(-capacity // COLUMNS) * COLUMNS + 8
-    return aligned((outputs * capacity, width)).reshape(outputs, capacity, width)
+    capacity = -(-capacity // COLUMNS) * COLUMNS
+    return aligned((outputs * capacity, capacity + 8)).reshape(outputs, capacity, capacity + 8)
 
 
 @compiled
@@ -94,83 +85,60 @@ def _append(before, new, data, gps, columns, first, last):
     for c in range(len(new)):
         data[c, : N - 1], data[c, N - 1 :] = before[c, : N - 1], new[c]
     memory = aligned_rows(d + 2, P)
-    squares, q, weighted = memory[:d], memory[d], memory[d + 1]
+    squares, q, sums = memory[:d], memory[d], memory[d + 1]
     for a in range(k):
-        factor, weights, targets, noises = columns[a], gps.weights[a], data[d + a], data[d + k + a]
+        factor, targets, noises, beta = columns[a], data[d + a], data[d + k + a], gps.weights[a]
         for i in range(first, last):
             size = i // 8 * 8 + 8
             for c in range(d):
                 point, square, at = gps.points[c], squares[c], gps.points[c, i]
                 for j in range(size):
                     square[j] = (point[j] - at) * (point[j] - at)
-            _write_kernel(gps.log_signal[a], gps.inverse_squares[a], squares, weights, q[:size], weighted)
+            _write_kernel(gps.log_signal[a], gps.inverse_squares[a], squares, beta, q[:size], sums)
             rest, y = q[i] + noises[i], targets[i]
-            whole = i // 4 * 4
-            for j in range(0, whole, 4):
+            for j in range(0, i, 4):  # columns from i on have zeros yet
                 c0, c1, c2, c3 = factor[j], factor[j + 1], factor[j + 2], factor[j + 3]
                 w0 = q[j] * c0[-2]
                 w1 = (q[j + 1] - w0 * c0[j + 1]) * c1[-2]
                 w2 = (q[j + 2] - w0 * c0[j + 2] - w1 * c1[j + 2]) * c2[-2]
                 w3 = (q[j + 3] - w0 * c0[j + 3] - w1 * c1[j + 3] - w2 * c2[j + 3]) * c3[-2]
                 for m in range((j + 4) // 8 * 8, size, 8):
-                    store(q, m, load(q, m) - (w0 * load(c0, m) + w1 * load(c1, m) + w2 * load(c2, m) + w3 * load(c3, m)))
+                    known = w0 * load(c0, m) + w1 * load(c1, m) + w2 * load(c2, m) + w3 * load(c3, m)
+                    store(q, m, load(q, m) - known)
                 rest -= w0 * w0 + w1 * w1 + w2 * w2 + w3 * w3
                 y -= w0 * c0[-1] + w1 * c1[-1] + w2 * c2[-1] + w3 * c3[-1]
                 c0[i], c1[i], c2[i], c3[i] = w0, w1, w2, w3
-            for j in range(whole, i):
-                column = factor[j]
-                w = q[j] * column[-2]
-                for m in range(j + 1, i):
-                    q[m] -= w * column[m]
-                rest -= w * w
-                y -= w * column[-1]
-                column[i] = w
             if not rest > 0.0:
                 return False
             root = np.sqrt(rest)
             factor[i, i], factor[i, -2], factor[i, -1] = root, 1.0 / root, y / root
-        j = N if last == N else 0
-        while j > 0:  # L' weights = v
-            if j % 4 > 0:
-                j -= 1
-                weights[j] = (factor[j, -1] - dot(factor[j, j + 1 :], weights[j + 1 :], N - j - 1)) * factor[j, -2]
-                continue
-            j -= 4
+        for j in range((N - 1) // 4 * 4, -1 if last == N else N, -4):  # L' beta = v
             c0, c1, c2, c3 = factor[j], factor[j + 1], factor[j + 2], factor[j + 3]
-            s0 = s1 = s2 = s3 = zeros()
-            for m in range((j + 4) // 8 * 8, N, 8):
-                known = load(weights, m)
-                s0, s1, s2, s3 = s0 + load(c0, m) * known, s1 + load(c1, m) * known, s2 + load(c2, m) * known, s3 + load(c3, m) * known
-            w3 = (c3[-1] - total(s3)) * c3[-2]
-            w2 = (c2[-1] - total(s2) - c2[j + 3] * w3) * c2[-2]
-            w1 = (c1[-1] - total(s1) - c1[j + 3] * w3 - c1[j + 2] * w2) * c1[-2]
-            w0 = (c0[-1] - total(s0) - c0[j + 3] * w3 - c0[j + 2] * w2 - c0[j + 1] * w1) * c0[-2]
-            weights[j], weights[j + 1], weights[j + 2], weights[j + 3] = w0, w1, w2, w3
+            four_dots((c0[j + 4 :], c1[j + 4 :], c2[j + 4 :], c3[j + 4 :]), beta[j + 4 :], N - j - 4, sums)
+            w3 = (c3[-1] - sums[3]) * c3[-2]
+            w2 = (c2[-1] - sums[2] - c2[j + 3] * w3) * c2[-2]
+            w1 = (c1[-1] - sums[1] - c1[j + 3] * w3 - c1[j + 2] * w2) * c1[-2]
+            w0 = (c0[-1] - sums[0] - c0[j + 3] * w3 - c0[j + 2] * w2 - c0[j + 1] * w1) * c0[-2]
+            beta[j], beta[j + 1], beta[j + 2], beta[j + 3] = w0, w1, w2, w3
     return True
 
 
 @compiled
 def drop_point(columns, gone, after):
     """Writes the columns of factors (k, N - 1, N - 1) without a point, from those with it (k, N, N)."""
-    moved = np.empty(len(after[0]))
+    size = len(after[0])
+    moved = np.empty(size)
     for a in range(len(after)):
-        _drop(columns[a], gone, after[a], moved, len(moved))
-
-
-@njit_inner
-def _drop(columns, gone, after, moved, size):
-    """Writes the first columns (size, size) without a point; ``moved`` (size,) is lent to work in."""
-    if gone < size:
-        moved[gone:size] = columns[gone, gone + 1 :]
-    for j in range(size):
-        row = after[j]
-        row[:j] = 0.0
-        if j < gone:
-            row[j:gone], row[gone:size] = columns[j, j:gone], columns[j, gone + 1 : size + 1]
-            continue
-        old = columns[j + 1]
-        radius = np.hypot(old[j + 1], moved[j])
-        c, s = old[j + 1] / radius, moved[j] / radius
-        for i in range(j, size):
-            entry, rest = old[i + 1], moved[i]
-            row[i], moved[i] = c * entry + s * rest, c * rest - s * entry
+        moved[gone:] = columns[a, gone, gone + 1 :]
+        for j in range(size):
+            row = after[a, j]
+            row[:j] = 0.0
+            if j < gone:
+                row[j:gone], row[gone:] = columns[a, j, j:gone], columns[a, j, gone + 1 :]
+                continue
+            old = columns[a, j + 1]
+            radius = np.hypot(old[j + 1], moved[j])
+            c, s = old[j + 1] / radius, moved[j] / radius
+            for i in range(j, size):
+                entry, rest = old[i + 1], moved[i]
+                row[i], moved[i] = c * entry + s * rest, c * rest - s * entry

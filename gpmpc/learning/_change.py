@@ -13,7 +13,7 @@ was seen lately d is zero, and with one point it is the estimate of a constant d
 
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from gpmpc._kernels import Window
 from gpmpc._kernels import linearize as linearize_gps
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import GPPosterior, SlidingWindow
+from gpmpc.gp import GPPosterior
 from gpmpc.gp._online import least_informative
 from gpmpc.models import Features
 from gpmpc.models._wrapper import Wrapper
@@ -41,7 +41,8 @@ class ChangedModel(Wrapper):
     model: DynamicsModel  #: f: a ``GPPosterior`` of next states, or a ``ResidualModel``
     share: float = 0.1  #: by how much the plant may differ, as a share of what was learned
     memory: float = 5000.0  #: length-scale of time in the kernel [steps]
-    window: SlidingWindow = SlidingWindow(40)  #: how many points of d there are at most; a tenth of them goes at once
+    points: int = 40  #: of d, at most; where there would be more, a fifth goes
+    remove: Literal["oldest", "least_informative"] = "oldest"  #: which
     time: float = 0.0  #: t of all predictions [steps]
 
     def __post_init__(self) -> None:
@@ -75,11 +76,11 @@ class ChangedModel(Wrapper):
 
     @cached_property
     def change(self) -> tuple[Window, Window | None]:
-        """d: GPs over (phi, u, t), without points at first; and those without the points that go next, in the making."""
+        """d: GPs over (phi, u, t), at first without points; and in the making those without the points that go next."""
         gp = self.gp
         scales = np.column_stack([to_array(gp.lengthscales), np.full(gp.output_dim, self.memory)])
         signal = self.share**2 * to_array(gp.signal_variance)
-        return Window.empty(scales, signal, gp.state_dim, self.window.points), None
+        return Window.empty(scales, signal, gp.state_dim, self.points), None
 
     def __len__(self) -> int:
         return self.change[0].arrays.size
@@ -106,11 +107,11 @@ class ChangedModel(Wrapper):
 
         Raises SettingError where the noise is too small.
         """
-        (now, coming), new, most = self.change, (point, target, noise), self.window.points
+        (now, coming), new, most = self.change, (point, target, noise), self.points
         gone = max(1, most // 5)
-        step = len(self) - (most - gone)  # the last before a tenth goes is number ``gone``
+        step = len(self) - (most - gone)  # of ``gone`` in which the factor without them is made
         if step > 0 and coming is None:
-            oldest = self.window.remove == "oldest"
+            oldest = self.remove == "oldest"
             coming = now.without(range(gone) if oldest else least_informative(self.posterior, gone))
         if coming is not None and step == gone:
             now, coming = coming, None
@@ -124,13 +125,14 @@ class ChangedModel(Wrapper):
         With L the factor and v = L^-1 y, L_NN^2 is the variance, and v_N L_NN the error.
         """
         last = self.change[0].columns[:, len(self) - 1]
-        return last[:, -1] * last[:, len(self) - 1], last[:, len(self) - 1] ** 2
+        root = last[:, len(self) - 1]
+        return last[:, -1] * root, root**2
 
     @property
     def posterior(self) -> GPPosterior:
         """The GPs of d as tensors."""
         gp, now, size = self.gp, self.change[0], len(self)
-        arrays, (d, k) = now.arrays, (len(now.arrays.points), now.output_dim)
+        arrays, (k, d) = now.arrays, now.arrays.inverse_squares.shape
         parts = arrays.points[:, :size].T, now.data[d : d + k, :size].T, arrays.inverse_squares**-0.5
         factor = now.columns[:, :size, :size].transpose(0, 2, 1)
         rest = np.exp(arrays.log_signal), self.arrays[2], np.zeros(k), factor, arrays.weights[:, :size]
@@ -165,7 +167,8 @@ class ChangedModel(Wrapper):
         z, v, slope = self.features.linearize(states, inputs)
         at = np.empty((len(v), v.shape[1] + 1))
         at[:, :-1], at[:, -1] = v, self.time
-        mean, by_state, by_input, variance = linearize_gps(change, z, at, covariance, np.zeros(change.output_dim), False)
+        offset = np.zeros(self.gp.output_dim)
+        mean, by_state, by_input, variance = linearize_gps(change, z, at, covariance, offset, False)
         by_state, by_input = self.features.chain(by_state, by_input[..., :-1], slope)
         B, V = self.arrays[0], found.covariance
         V = None if V is None or variance is None else V + B @ variance @ B.T

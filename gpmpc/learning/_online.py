@@ -1,8 +1,8 @@
 """Learns while flying: every step teaches a GP of the change, and a check decides whether it may steer.
 
 A ``LearningController`` plans with the model that was learned before, or with it and its change (``ChangedModel``).
-Each step of the flight becomes a point of the change, whether that is used or not; the oldest point, or the one that
-explains least, makes room. Both predict the step before they see it, and
+Each step of the flight becomes a point of the change, whether that is used or not; the oldest points, or those that
+explain least, make room. Both predict the step before they see it, and
 
 * the change is **used** once its predictions have won: their log densities, summed over a window of steps, exceed those
   of the model alone by a margin;
@@ -60,8 +60,8 @@ class OnlineLearning:
         SettingError: A number out of range, or an unknown rule.
     """
 
-    points: int = 40  #: of the change, at most
-    #: which goes where there are more: ``"oldest"`` or ``"least_informative"``; see ``SlidingWindow``
+    points: int = 40  #: of the change, at most; where there would be more, a fifth goes
+    #: which go: ``"oldest"`` or ``"least_informative"``; see ``SlidingWindow``
     remove: Literal["oldest", "least_informative"] = "oldest"
     share: float = 0.1  #: by how much the plant may differ, as a share of what was learned
     memory: float = 5000.0  #: length-scale of time in the kernel [steps]
@@ -83,9 +83,9 @@ class OnlineLearning:
         moved = float(((error - learned.error) ** 2 / model.arrays[2]).mean()) / 2.0
         if np.isfinite(moved):
             spread = np.append(spread, moved)[-_MANY:]
-        found = replace(learned, model=model.later(1.0), state=state, error=error, spread=spread)
+        found: dict[str, Any] = {"state": state, "error": error, "spread": spread}
         if len(spread) < _FEW:
-            return found
+            return replace(learned, model=model.later(1.0), **found)
         noise = model.arrays[2] * noise_ratio(spread, len(error))
         larger, alone = model.with_point(point, error, noise), noise + latent
         missed, variance = larger.last_innovation()
@@ -99,7 +99,7 @@ class OnlineLearning:
             active, leads = True, leads[:0]
             larger = replace(model).with_point(point, error, noise)
         version = learned.version + (active or learned.active)
-        return replace(found, model=larger.later(1.0), leads=leads, active=active, version=version)
+        return replace(learned, model=larger.later(1.0), leads=leads, active=active, version=version, **found)
 
 
 class LearningController:
@@ -122,8 +122,8 @@ class LearningController:
         self.controller, self.learning = controller, OnlineLearning() if learning is None else learning
         self.problem, self.horizon = controller.problem, controller.horizon
         self.initial_input = controller.initial_input
-        window = SlidingWindow(self.learning.points, self.learning.remove)
-        self._model = ChangedModel(controller.prediction.model, self.learning.share, self.learning.memory, window)
+        known, model = self.learning, controller.prediction.model
+        self._model = ChangedModel(model, known.share, known.memory, known.points, known.remove)
 
     def control(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
