@@ -6,6 +6,7 @@ Each plant is learned from 200 of its rows and sent to set points beyond a bound
 
 - the pendulum of ``benchmarks.estimation`` (angle), its noise Gaussian, of heavy tails (Student's t, 3 degrees of
   freedom) or an AR(1) process (correlation 0.6), of equal variance;
+- the same pendulum, whose noise grows with its rate, sent from side to side every second at a bounded rate;
 - gymnasium's InvertedPendulum-v5, its noise Gaussian: the cart is sent from side to side every 25 steps, and the angle
   of the pole is bounded to both sides, which bounds how fast the cart speeds up and brakes;
 - the quadrotor of ``gpmpc/systems/quadrotor.xml`` in MuJoCo and RotorPy's Hummingbird (``pip install rotorpy``; see
@@ -13,7 +14,8 @@ Each plant is learned from 200 of its rows and sent to set points beyond a bound
   in a wind that changes as an AR(1) process of 1 s. Attitude, rotors and wind are not among the states, which are the
   three velocities.
 
-Compared: the noise that the GP learned by its evidence; the one estimated from all rows; the latter with an adaptive
+Compared: the noise that the GP learned by its evidence; the one estimated from all rows; a noise that varies with state
+and input where these rows show that it does (``estimate_varying_noise``); the constant one with an adaptive
 conformal tube that begins with a Gaussian's quantiles, counts the predictions that touch the bound, and aims so low
 that the upper limit of all decisions is allowed (at a rate of 0.02 for the Hummingbird, whose errors on the log are
 four times those at the bound: at the default for 1 %, 0.002, the flights end before it is as near); and the true noise
@@ -42,7 +44,7 @@ from scipy.stats import beta, t
 from benchmarks.estimation import HORIZON, LIMIT, NOISE, pendulum, random_motion
 from benchmarks.hummingbird import compiled_hummingbird
 from benchmarks.timing import RESULTS, write_results
-from gpmpc.estimation import AdaptiveTube, ConformalTube, estimate_process_noise
+from gpmpc.estimation import AdaptiveTube, ConformalTube, estimate_process_noise, estimate_varying_noise
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.models import Affine, ResidualModel
@@ -50,7 +52,7 @@ from gpmpc.mpc import GPMPC, Box, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.systems.gymnasium_ import gymnasium_system
 
-WAYS = ("learned noise", "estimated noise", "estimated noise, adaptive", "true noise")
+WAYS = ("learned noise", "estimated noise", "varying noise", "estimated noise, adaptive", "true noise")
 ALLOWED, ROWS, SCORES = (10.0, 5.0, 1.0), 600, 399
 RATE = 0.4  # of velocity commands, from one to the next [m/s]
 QUADROTOR = Path(__file__).parents[1] / "gpmpc" / "systems" / "quadrotor.xml"
@@ -122,6 +124,26 @@ def pendulum_plant(kind: str) -> Plant:
         successor, noise, lambda: np.array([0.5, 0.0]), log, goal=[0.9, 0.0], bound=(0, 0.6),
         weights=([10.0, 0.1], [1e-2]), limits=[LIMIT], noise=NOISE, angles=[0], stages=[1],
         quantile=heavy if kind == "heavy tails" else normal,
+    )  # fmt: skip
+
+
+def pendulum_of_rate() -> Plant:
+    """The pendulum with a noise that grows with its rate: at the bound it is larger than on average."""
+
+    def successor(x: Array, u: Array, w: Array) -> Array:
+        return pendulum(x, u) + w * math.hypot(0.5, x[1])
+
+    def noise(steps: int, rng: np.random.Generator) -> Array:
+        return correlated(steps, rng, 0.0, NOISE)
+
+    def log() -> tuple[Array, Array, Array]:
+        inputs = 0.17 * random_motion(2 * ROWS, 0)[1]
+        return logged(successor, np.zeros(2), inputs, noise(2 * ROWS, np.random.default_rng(1)))
+
+    return Plant(
+        successor, noise, lambda: np.zeros(2), log, goal=[0.9, 0.0], bound=(1, 2.5), sides=(1, -1), turn=20,
+        weights=([10.0, 0.1], [1e-2]), limits=[LIMIT], noise=NOISE * math.hypot(0.5, 2.5), angles=[0], stages=[1],
+        quantile=NormalDist().inv_cdf, steps=4000, share=0.2,
     )  # fmt: skip
 
 
@@ -226,6 +248,7 @@ PLANTS = {
     "pendulum, Gaussian": lambda: pendulum_plant("Gaussian"),
     "pendulum, heavy tails": lambda: pendulum_plant("heavy tails"),
     "pendulum, AR(1)": lambda: pendulum_plant("AR(1)"),
+    "pendulum, of its rate": pendulum_of_rate,
     "cart-pole": cart_pole,
     "MuJoCo quadrotor": mujoco_quadrotor,
     "Hummingbird": hummingbird,
@@ -320,10 +343,11 @@ def main() -> None:
         nominal = Affine.identity(rows.state_dim, rows.input_dim)
         learned = ResidualModel.train(nominal, picked, angles=plant.angles, trainer=Trainer(restarts=1))
         estimated = replace(learned, noise=torch.diag(estimate_process_noise(learned, rows).variance))
+        varying = estimate_varying_noise(learned, rows).model if "varying noise" in arguments.ways else estimated
         for way, allowed in itertools.product(arguments.ways, arguments.allowed):
             eta = 1 - allowed / 100
             quantile = None if "adaptive" in way else NormalDist().inv_cdf(eta)
-            model = learned if way == "learned noise" else estimated
+            model = {"learned noise": learned, "varying noise": varying}.get(way, estimated)
             if way == "true noise" and plant.noise is not None and plant.quantile is not None:
                 model = replace(learned, noise=torch.diag(torch.tensor(plant.noise**2)))
                 quantile = plant.quantile(eta)

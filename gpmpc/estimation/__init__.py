@@ -6,6 +6,7 @@ from gpmpc.estimation._delay import DelayEstimate, estimate_delay
 from gpmpc.estimation._kalman import FilterRun, KalmanFilter, LateMeasurements, Update, smooth
 from gpmpc.estimation._measurement import Measurement
 from gpmpc.estimation._noise import ProcessNoise, estimate_process_noise, with_process_noise
+from gpmpc.estimation._varying_noise import VaryingNoise, estimate_varying_noise
 
 __all__ = [
     "AdaptiveTube",
@@ -18,9 +19,11 @@ __all__ = [
     "Measurement",
     "ProcessNoise",
     "Update",
+    "VaryingNoise",
     "autocorrelation",
     "estimate_delay",
     "estimate_process_noise",
+    "estimate_varying_noise",
     "estimation_errors",
     "normalized_errors",
     "smooth",

@@ -30,7 +30,6 @@ class ProcessNoise:
     variance: Tensor  #: sigma^2 of a step (k,)
     correlation: Tensor  #: rho, of the noise of a step with the next's (k,); NaN where rows are in no order of time
     rows: int  #: how many rows it was estimated from
-    effective: Tensor  #: how many independent rows these are worth, N (1 - rho^2) / (1 + rho^2) (k,)
 
     @property
     def long_run_variance(self) -> Tensor:
@@ -51,16 +50,7 @@ def estimate_process_noise(model: Any, transitions: Transitions, block: int = 20
         ShapeError: The transitions have other dimensions.
         DataError: There are fewer than ten rows.
     """
-    check_transitions(transitions)
-    if (transitions.state_dim, transitions.input_dim) != (model.state_dim, model.input_dim):
-        raise ShapeError(
-            f"the model has {model.state_dim} states and {model.input_dim} inputs; "
-            f"got transitions with {transitions.state_dim} and {transitions.input_dim}"
-        )
-    if len(transitions) < 10:
-        raise DataError(f"a noise needs ten rows or more; got {len(transitions)}")
-    check_number("block", block, least=1, whole=True)
-    errors, latent = _residuals(model, transitions, block)
+    errors, latent = residuals(model, transitions, block)
     variance = (errors.square() - latent).mean(0)
     floor = 0.01 * errors.square().mean(0)  # a variance of the latent function that is too large leaves something
     successive = (transitions.next_states[:-1] - transitions.states[1:]).abs().amax(1) <= 1e-12 + 1e-9 * (
@@ -70,9 +60,7 @@ def estimate_process_noise(model: Any, transitions: Transitions, block: int = 20
     if int(successive.sum()) >= 10:
         first, second = errors[:-1][successive], errors[1:][successive]
         rho = (first * second).sum(0) / (first.square().sum(0) * second.square().sum(0)).sqrt()
-    known = rho.nan_to_num(0.0)
-    effective = len(errors) * (1 - known**2) / (1 + known**2)
-    return ProcessNoise(torch.maximum(variance, floor), rho, len(errors), effective)
+    return ProcessNoise(torch.maximum(variance, floor), rho, len(errors))
 
 
 def with_process_noise(posterior: GPPosterior, noise: ProcessNoise | Tensor) -> GPPosterior:
@@ -91,20 +79,17 @@ def with_process_noise(posterior: GPPosterior, noise: ProcessNoise | Tensor) -> 
         raise UnsupportedModel("the noise of a GPPosterior of observed rows can be replaced; train a sparse one again")
     if variance.shape != posterior.noise_variance.shape:
         raise ShapeError(f"variances must be ({posterior.output_dim},); got {tuple(variance.shape)}")
-    return GPPosterior.from_hyperparameters(
-        posterior.features,
-        posterior.targets,
-        posterior.lengthscales,
-        posterior.signal_variance,
-        variance.to(posterior.weights),
-        posterior.input_dim,
-        posterior.predicts,
-        posterior.offset,
-    )
+    p = posterior
+    kernel = p.lengthscales, p.signal_variance, variance.to(p.weights)
+    return GPPosterior.from_hyperparameters(p.features, p.targets, *kernel, p.input_dim, p.predicts, p.offset)
 
 
-def _residuals(model: Any, transitions: Transitions, block: int) -> tuple[Tensor, Tensor]:
-    """Errors of the predicted outputs (N, k), and the variances of the latent functions (N, k) at the rows."""
+def residuals(model: Any, transitions: Transitions, block: int) -> tuple[Tensor, Tensor]:
+    """Errors of the predicted outputs (N, k), and the variances of the latent functions (N, k) at the rows, checked."""
+    check_transitions(transitions, model)
+    if len(transitions) < 10:
+        raise DataError(f"a noise needs ten rows or more; got {len(transitions)}")
+    check_number("block", block, least=1, whole=True)
     to = {"dtype": model.dtype, "device": model.device}
     x, u, after = (t.to(**to) for t in (transitions.states, transitions.inputs, transitions.next_states))
     belief = model.predict(x, u)

@@ -112,14 +112,8 @@ def targets_of(posterior: GPPosterior, transitions: Transitions) -> Tensor:
         ShapeError: The transitions have other dimensions.
         UnsupportedModel: The GPs predict values, which transitions do not hold.
     """
-    check_transitions(transitions)
-    targets = transitions.targets(posterior.predicts)
-    if (transitions.state_dim, transitions.input_dim) != (posterior.state_dim, posterior.input_dim):
-        raise ShapeError(
-            f"the model has {posterior.state_dim} states and {posterior.input_dim} inputs; "
-            f"got transitions with {transitions.state_dim} and {transitions.input_dim}"
-        )
-    return targets
+    check_transitions(transitions, posterior)
+    return transitions.targets(posterior.predicts)
 
 
 @dataclass(frozen=True)

@@ -188,10 +188,14 @@ class Transitions:
         return _with_path(path, x, u, after) if next_states else _with_path(path, x[:-1], u[:-1], after[1:])
 
 
-def check_transitions(transitions: Any) -> None:
-    """Raises ``SettingError`` unless these are transitions."""
+def check_transitions(transitions: Any, model: Any = None) -> None:
+    """Raises ``SettingError`` unless these are transitions, ``ShapeError`` unless a model has their dimensions."""
     if not isinstance(transitions, Transitions):
         raise SettingError("transitions", f"must be Transitions(...); got {type(transitions).__name__}")
+    n, m = transitions.state_dim, transitions.input_dim
+    if model is not None and (n, m) != (model.state_dim, model.input_dim):
+        own = f"{model.state_dim} states and {model.input_dim} inputs"
+        raise ShapeError(f"the model has {own}; got transitions with {n} and {m}")
 
 
 def _real(values: Any) -> Tensor:

@@ -141,11 +141,6 @@ class ChangedModel(Wrapper):
         return GPPosterior(**given, input_dim=gp.input_dim + 1, predicts="value")
 
     @property
-    def state_dim(self) -> int:
-        """Number of states, n."""
-        return self.model.state_dim
-
-    @property
     def noise_covariance(self) -> Tensor:
         """Of the observations (n, n)."""
         return self.model.noise_covariance

@@ -4,6 +4,7 @@ from gpmpc._dynamics import DynamicsModel, Linearized, linearize, linearize_by_a
 from gpmpc.models._delay import DelayedModel
 from gpmpc.models._disturbance import DisturbedModel
 from gpmpc.models._features import Features, Lags
+from gpmpc.models._noisy import NoisyModel
 from gpmpc.models._nominal import Affine, CasadiFunction, KnownModel
 from gpmpc.models._residual import ResidualModel
 from gpmpc.models._roll_out import RollOut
@@ -19,6 +20,7 @@ __all__ = [
     "KnownModel",
     "Lags",
     "Linearized",
+    "NoisyModel",
     "ResidualModel",
     "RollOut",
     "linearize",

@@ -125,11 +125,7 @@ class ResidualModel:
         Raises:
             ShapeError: The transitions have other dimensions.
         """
-        if (transitions.state_dim, transitions.input_dim) != (self.state_dim, self.input_dim):
-            raise ShapeError(
-                f"the model has {self.state_dim} states and {self.input_dim} inputs; "
-                f"got transitions with {transitions.state_dim} and {transitions.input_dim}"
-            )
+        check_transitions(transitions, self)
         points = _residuals(self.nominal, self.B, self.features, transitions, like=self.residual.weights)
         add = append_points if window is None else window.append
         return replace(self, residual=add(self.residual, *points))

@@ -30,6 +30,7 @@ from gpmpc.gp import GPPosterior, load_metadata
 from gpmpc.gp._storage import posterior_of_parts, posterior_parts, read_model, write_model
 from gpmpc.models._delay import DelayedModel
 from gpmpc.models._disturbance import DisturbedModel
+from gpmpc.models._noisy import NoisyModel
 from gpmpc.models._nominal import Affine, CasadiFunction
 from gpmpc.models._residual import ResidualModel
 
@@ -38,7 +39,8 @@ def save_model(model: Any, path: str | Path, metadata: Mapping[str, Any] | None 
     """Writes a model of this package to one file, in one piece or not at all.
 
     Args:
-        model: A ``GPPosterior``, ``ResidualModel``, ``DelayedModel`` or ``DisturbedModel``, on any device.
+        model: A ``GPPosterior``, ``ResidualModel``, ``DelayedModel``, ``DisturbedModel`` or ``NoisyModel``, on any
+            device.
         path: The file; ``.safetensors`` by convention.
         metadata: Stored in the header, such as names and units; what JSON can hold.
 
@@ -68,7 +70,7 @@ def load_model(path: str | Path) -> Any:
 def _parts(path: Path, model: Any) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """The header, with its kind, and the tensors of a model."""
     kind = type(model).__name__
-    if type(model) not in (GPPosterior, ResidualModel, DelayedModel, DisturbedModel):
+    if type(model) not in (GPPosterior, ResidualModel, DelayedModel, DisturbedModel, NoisyModel):
         raise UnsupportedModel(f"only {', '.join(_BUILD)} can be saved; got {kind}")
     if isinstance(model, GPPosterior):
         described, tensors = posterior_parts(path, model)
@@ -82,6 +84,10 @@ def _parts(path: Path, model: Any) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if isinstance(model, DisturbedModel):
         numbers: dict[str, Any] = {"std": list(map(float, model.std)), "decay": list(map(float, model.decay or ()))}
         return header | numbers, tensors | {"effect": model.effect}
+    if isinstance(model, NoisyModel):
+        log_noise, more = _parts(path, model.log_noise)
+        own = {f"log_noise/{key}": value for key, value in more.items()}
+        return header | {"log_noise": log_noise, "outputs": list(map(int, model.outputs))}, tensors | own
     header["input_dim"] = model.input_dim
     header |= {key: [int(i) for i in getattr(model, key)] for key in ("states", "inputs", "angles")}
     if isinstance(model.nominal, Affine):
@@ -133,6 +139,9 @@ _BUILD: dict[str, Callable[[Path, Any, Mapping[str, Tensor]], Any]] = {
         _inner(path, "model", header, tensors)[0], header["delay"]
     ),
     "DisturbedModel": _build_disturbed,
+    "NoisyModel": lambda path, header, tensors: NoisyModel(
+        _inner(path, "model", header, tensors)[0], _inner(path, "log_noise", header, tensors)[0], header["outputs"]
+    ),
 }
 
 

@@ -1,4 +1,4 @@
-"""What models around another model, with further states, have in common."""
+"""What models around another model have in common."""
 
 from dataclasses import fields, replace
 from functools import cached_property
@@ -13,14 +13,14 @@ from gpmpc.gaussian import Gaussian
 
 
 class Wrapper:
-    """A model with the inputs, the type and the device of the model that it holds, and with further states."""
+    """A model with the states, the inputs, the type and the device of the model that it holds."""
 
     model: DynamicsModel  #: the model that is wrapped
 
     @property
     def state_dim(self) -> int:
-        """Number of states, the further ones included."""
-        raise NotImplementedError
+        """Number of states, n; with further ones where there are some."""
+        return self.model.state_dim
 
     @property
     def input_dim(self) -> int:
