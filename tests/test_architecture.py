@@ -90,8 +90,8 @@ HOUSE = House(ROOT)
 @pytest.mark.parametrize(
     ("what", "count", "most"),
     [
-        ("lines of gpmpc/", HOUSE.lines, 29_025),
-        ("public functions and classes", len(HOUSE.public_names + HOUSE.exported_names), 276),
+        ("lines of gpmpc/", HOUSE.lines, 29_231),
+        ("public functions and classes", len(HOUSE.public_names + HOUSE.exported_names), 279),
         ("functions with more than 10 arguments", len(HOUSE.functions_above(10)), 0),
         ("files of mpc/", HOUSE.mpc_files, 13),
         ("circles of rooms", len(HOUSE.room_circles), 0),
