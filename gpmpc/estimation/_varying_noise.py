@@ -51,10 +51,8 @@ def estimate_varying_noise(
 ) -> VaryingNoise:
     """Learns how the noise of a model's outputs depends on state and input, where the data show that it does.
 
-    The mean of the model stays as it is.
-
     Args:
-        model: Predicts next states, as for ``estimate_process_noise``.
+        model: As for ``estimate_process_noise``; the mean of its next states stays.
         transitions: All rows, in their order of time; a few hundred at least.
         block: Rows that are left out and held out together: more than errors are correlated over.
         seed: Of the rows that are searched.
@@ -120,10 +118,7 @@ def _responses(g: Tensor, squares: Tensor, latent: Tensor) -> Tensor:
 
 
 def _prior(theta: np.ndarray, log_std: np.ndarray) -> tuple[float, np.ndarray]:
-    """Minus the log density, and its gradient, of what is known of g: its noise, and that it is no noise itself.
-
-    Log sf - log(sf / sn) is that of log chi^2_1 within 5 %; length-scales are not much shorter than the data's spread.
-    """
+    """Asks, with its gradient, for the noise of log chi^2_1 within 5 %, and no length-scale far below the spread."""
     noise = (theta[-2] - theta[-1] - math.log(CHI2_LOG[1]) / 2) / 0.05
     short = np.minimum(theta[:-2] - log_std, 0.0) / 0.3
     return (noise**2 + (short**2).sum()) / 2, np.append(short / 0.3, [noise / 0.05, -noise / 0.05])

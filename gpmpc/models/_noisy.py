@@ -9,7 +9,7 @@ states and inputs, and it is averaged over a belief by the propagators that eval
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -72,10 +72,9 @@ class NoisyModel(Wrapper):
         found = linearize(self.model, states, inputs, covariance)
         if found.covariance is None:
             return found
-        g, V = self.log_noise.linearize(states, inputs), found.covariance + to_array(self._constant)
-        assert g.covariance is not None
-        at = np.array(self.outputs)
-        V[:, at, at] += np.exp(g.mean + g.covariance.diagonal(axis1=1, axis2=2) / 2)
+        g, at = self.log_noise.linearize(states, inputs), list(self.outputs)
+        V = found.covariance + to_array(self._constant)
+        V[:, at, at] += np.exp(g.mean + np.einsum("kii->ki", cast(Array, g.covariance)) / 2)
         return found._replace(covariance=V)
 
     def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "NoisyModel":
