@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -74,31 +74,35 @@ class DynamicsModel(Protocol):
         ...
 
 
-def linearize(model: DynamicsModel, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
-    """Linearises a model at K points: by its method ``linearize``, or by autograd where it has none.
+class TensorModel:
+    """A model whose tensors have the type and are on the device of its attribute ``_part``."""
 
-    Args:
-        model: Has ``linearize``, or at least ``predict``.
-        states: (K, n), float64.
-        inputs: (K, m), float64.
-        covariance: Whether the covariances are computed.
+    _part: Any
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of every tensor."""
+        return self._part.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Of every tensor."""
+        return self._part.device
+
+
+def linearize(model: DynamicsModel, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    """Linearises a model at K points x (K, n), u (K, m), with the covariances there unless they are not wanted.
+
+    By its method ``linearize``, or, where it has none but ``predict``, by autograd.
     """
-    method = getattr(model, "linearize", None)
-    if method is None:
-        return linearize_by_autograd(model, states, inputs, covariance)
+    method = getattr(model, "linearize", partial(linearize_by_autograd, model))
     return method(states, inputs, covariance)
 
 
 def linearize_by_autograd(model: Any, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
-    """Linearises any model that has ``predict``, by one evaluation of all K points and torch autograd.
+    """``linearize`` by one evaluation of all K points and torch autograd, for any model that has ``predict``.
 
-    It is slower than a closed form, which is logged once a class.
-
-    Args:
-        model: With ``predict``, ``dtype`` and ``device``; arguments and results are converted.
-        states: (K, n).
-        inputs: (K, m).
-        covariance: Whether the covariances are returned.
+    The model needs ``dtype`` and ``device`` besides. It is slower than a closed form, which is logged once a class.
     """
     _log_slow(type(model).__name__)
     belief, A, B = predict_by_autograd(model, *tensors_for(model, states, inputs))
@@ -126,15 +130,8 @@ def batched_jacobian(
 ) -> tuple[tuple[Tensor, ...], list[Tensor]]:
     """Evaluates a function and its first value's Jacobians, by one reverse pass of torch autograd over the batch.
 
-    Where the derivative of an operation cannot be vectorised over the outputs, each output takes a pass of its own.
-    The Jacobians can be differentiated again.
-
-    Args:
-        function: Of the arguments, batch element by batch element; the first value is (*batch, k).
-        arguments: Each (*batch, d_i).
-
-    Returns:
-        The values, and d value / d argument (*batch, k, d_i) for each argument.
+    The function takes arguments (*batch, d_i), batch element by batch element, and its first value is (*batch, k); the
+    Jacobians are (*batch, k, d_i), and can be differentiated again.
     """
     again = torch.is_grad_enabled() and any(argument.requires_grad for argument in arguments)
     with torch.inference_mode(False), torch.enable_grad():
@@ -165,7 +162,7 @@ def predict_with_jacobian(model: Any, state: Tensor, input: Tensor) -> tuple[Gau
     By the model's ``linearize`` where torch follows nothing; else by its own method of this name, which torch can
     differentiate and transform further, or by autograd.
     """
-    if hasattr(model, "linearize") and (arrays := _constant_arrays(state, input)) is not None:
+    if hasattr(model, "linearize") and (arrays := constant_arrays(state, input)) is not None:
         check_query(model, state, input)
         batch, count = state.shape[:-1], state.shape[:-1].numel()
         flat = (np.ascontiguousarray(a, dtype=np.float64).reshape(count, a.shape[-1]) for a in arrays)
@@ -187,8 +184,8 @@ def predict_by_autograd(model: Any, state: Tensor, input: Tensor) -> tuple[Gauss
     return Gaussian(mean, covariance), A, B
 
 
-def _constant_arrays(*tensors: Tensor) -> list[Array] | None:
-    """Tensors in host memory as arrays; None where autograd or a function transform follows one of them."""
+def constant_arrays(*tensors: Tensor) -> list[Array] | None:
+    """Tensors as arrays; None where one is on another device, or autograd or a function transform follows it."""
     try:
         arrays = [tensor.numpy() for tensor in tensors]
     except (RuntimeError, TypeError):
@@ -202,9 +199,8 @@ def check_next_states(model: Any) -> tuple[int, int]:
     if not hasattr(model, "predict"):
         raise SettingError("model", f"must be a DynamicsModel, such as GPPosterior; got {type(model).__name__}")
     if model.output_dim != model.state_dim:
-        raise SettingError(
-            "model", f"must predict the next state; got {model.state_dim} states and {model.output_dim} outputs"
-        )
+        got = f"{model.state_dim} states and {model.output_dim} outputs"
+        raise SettingError("model", f"must predict the next state; got {got}")
     return model.state_dim, model.input_dim
 
 
@@ -223,9 +219,8 @@ def check_query(model: Any, state: Tensor, input: Tensor) -> None:
         )
     for name, value in (("state", state), ("input", input)):
         if value.dtype != model.dtype or value.device != model.device:
-            raise SettingError(
-                name, f"must be {model.dtype} on {model.device} like the model; got {value.dtype} on {value.device}"
-            )
+            got = f"{value.dtype} on {value.device}"
+            raise SettingError(name, f"must be {model.dtype} on {model.device} like the model; got {got}")
 
 
 def check_destination(device: Any, dtype: Any) -> None:

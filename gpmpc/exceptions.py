@@ -6,6 +6,7 @@ the way back from a worker process (its constructor's arguments are its ``args``
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 
@@ -107,6 +108,12 @@ def check_number(
     kind = "a whole number" if whole else "a number"
     limit = f" above {above}" if above is not None else f", {least} or more" if least is not None else ""
     raise SettingError(key, f"must be {kind}{limit}{' ' + unit if unit else ''}; got {value!r}")
+
+
+def check_choice(key: str, value: Any, choices: Sequence[str]) -> None:
+    """Raises ``SettingError`` unless a setting is one of several words."""
+    if value not in choices:
+        raise SettingError(key, f"must be one of {', '.join(map(repr, choices))}; got {value!r}")
 
 
 def check_numbers(key: str, values: Any, length: int, **limits: Any) -> None:

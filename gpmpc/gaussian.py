@@ -73,14 +73,10 @@ class Gaussian:
 
 
 def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """The symmetric positive semidefinite matrix nearest to a given one in the Frobenius norm (Higham, 1988).
+    """The symmetric positive semidefinite matrices (*batch, n, n) nearest in the Frobenius norm (Higham, 1988).
 
-    Args:
-        covariance: (*batch, n, n).
-
-    Returns:
-        The projection (*batch, n, n), and how far below zero the smallest eigenvalue was (*batch,); zero where the
-        symmetrised matrix was positive semidefinite already, which is then returned unchanged.
+    The second result is how far below zero the smallest eigenvalue was (*batch,); zero where the symmetrised matrix was
+    positive semidefinite already, which is then returned unchanged.
     """
     symmetric = (covariance + covariance.mT) / 2
     if _plain(symmetric) and not bool(torch.linalg.cholesky_ex(symmetric).info.any()):  # the usual case, cheaply
@@ -95,18 +91,12 @@ def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def square_root(covariance: Tensor) -> Tensor:
-    """The symmetric positive semidefinite root R of a covariance, R R = Sigma, with its derivative.
+    """The symmetric positive semidefinite root R of a covariance (*batch, n, n), R R = Sigma, with its derivative.
 
     The derivative solves the Sylvester equation dR R + R dR = dSigma in the eigenbasis U of R: in it, entry ij of dR is
     that of dSigma over r_i + r_j (Cao, Lai and Alam, 2017, section 4.1, need it for A). Autograd through the
     eigendecomposition would divide by differences of eigenvalues instead. Where r_i + r_j = 0 the derivative does not
-    exist and is taken as zero; second derivatives are not provided.
-
-    Args:
-        covariance: (*batch, n, n), symmetric; eigenvalues below zero count as zero.
-
-    Returns:
-        R (*batch, n, n).
+    exist and is taken as zero; second derivatives are not provided. Eigenvalues of Sigma below zero count as zero.
     """
     constant = covariance.detach()
     eigenvalues, U = torch.linalg.eigh((constant + constant.mT) / 2)
@@ -119,13 +109,7 @@ def square_root(covariance: Tensor) -> Tensor:
 def square_root_differential(r: Tensor, U: Tensor, change: Tensor) -> Tensor:
     """The change dR of the symmetric root R = U diag(r) U' for changes dSigma of R R, from dR R + R dR = dSigma.
 
-    Args:
-        r: Eigenvalues of R (*batch, n).
-        U: Eigenvectors of R (*batch, n, n).
-        change: dSigma, as many as wanted along the last dimension (*batch, n, n, j).
-
-    Returns:
-        dR (*batch, n, n, j); zero where r_i + r_j is.
+    r is (*batch, n), U (*batch, n, n), dSigma and dR (*batch, n, n, j), j as many as wanted; zero where r_i + r_j is.
     """
     total = (r[..., :, None] + r[..., None, :])[..., None]
     rotated = _congruent(U.mT, change)
@@ -135,10 +119,9 @@ def square_root_differential(r: Tensor, U: Tensor, change: Tensor) -> Tensor:
 
 def _congruent(U: Tensor, matrices: Tensor) -> Tensor:
     """U X U' for symmetric X, as many as wanted along the last dimension (*batch, n, n, j)."""
+    shape = matrices.shape[-2:]
     half = U @ matrices.flatten(-2)  # its rows are of U X, one X beside the other
-    return (U @ half.unflatten(-1, matrices.shape[-2:]).transpose(-3, -2).flatten(-2)).unflatten(
-        -1, matrices.shape[-2:]
-    )
+    return (U @ half.unflatten(-1, shape).transpose(-3, -2).flatten(-2)).unflatten(-1, shape)
 
 
 def _plain(value: Tensor) -> bool:

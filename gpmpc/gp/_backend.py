@@ -8,14 +8,14 @@ the same numbers; ``backend`` forces one of them.
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, check_choice
 
 _Backend = Literal["auto", "compiled", "torch"]
 
@@ -29,8 +29,7 @@ def backend(choice: _Backend) -> Iterator[None]:
     Raises:
         SettingError: Another word; within the block, ``"compiled"`` where only torch can evaluate.
     """
-    if choice not in ("auto", "compiled", "torch"):
-        raise SettingError("backend", f"must be 'auto', 'compiled' or 'torch'; got {choice!r}")
+    check_choice("backend", choice, get_args(_Backend))
     token = _chosen.set(choice)
     try:
         yield

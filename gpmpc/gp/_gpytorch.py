@@ -28,12 +28,7 @@ def exact_inference() -> Iterator[None]:
 
 
 class BatchExactGP(gpytorch.models.ExactGP):
-    """Independent zero-mean SE-ARD GPs, one per output, over the same inputs.
-
-    Args:
-        features: x~ (N, d).
-        targets: (N, n).
-    """
+    """Independent zero-mean SE-ARD GPs over the same inputs (N, d), one for each column of the targets (N, n)."""
 
     def __init__(self, features: Tensor, targets: Tensor):
         batch, d = torch.Size([targets.shape[1]]), features.shape[1]
@@ -76,23 +71,15 @@ def _log_parameter() -> Positive:
 
 
 def members(model: Any, likelihood: Any = None) -> list[tuple[Any, Any]]:
-    """Trained exact GPs with their likelihoods, from one model, an ``IndependentModelList`` or a sequence.
-
-    Raises:
-        UnsupportedModel: One is no single-task ``ExactGP`` with a ``GaussianLikelihood``, or carries transforms.
-        ShapeError: There is more than one batch dimension, or another number of likelihoods.
-        SettingError: One is not in float64.
-    """
-    models = list(model.models) if hasattr(model, "models") else list(model) if isinstance(model, Sequence) else [model]
-    likelihoods = getattr(likelihood, "likelihoods", likelihood)
-    likelihoods = list(likelihoods) if isinstance(likelihoods, Sequence | torch.nn.ModuleList) else [likelihoods]
+    """Trained exact GPs with their likelihoods, from one model, an ``IndependentModelList`` or a sequence; checked."""
+    given: list[Any] = [getattr(model, "models", model), getattr(likelihood, "likelihoods", likelihood)]
+    models, likelihoods = (list(x) if isinstance(x, Sequence | torch.nn.ModuleList) else [x] for x in given)
     if len(likelihoods) == 1:
         likelihoods *= len(models)
     if len(likelihoods) != len(models):
         raise ShapeError(f"each model needs one likelihood; got {len(models)} models and {len(likelihoods)}")
-    pairs = [
-        (m, getattr(m, "likelihood", None) if own is None else own) for m, own in zip(models, likelihoods, strict=True)
-    ]
+    owners = zip(models, likelihoods, strict=True)
+    pairs: list[Any] = [(one, getattr(one, "likelihood", None) if own is None else own) for one, own in owners]
     for one, own in pairs:
         if not isinstance(one, gpytorch.models.ExactGP) or one.train_inputs is None:
             raise UnsupportedModel(f"only ExactGP models with training data can be frozen; got {type(one).__name__}")

@@ -17,12 +17,13 @@ import gpytorch
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import Array, Linearized, check_destination, check_query, linearize_by_autograd
+from gpmpc._dynamics import Array, Linearized, TensorModel, check_destination, check_query, linearize_by_autograd
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp._gpytorch import exact_inference, members
-from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
+from gpmpc.gp._kernel import Hyperparameters, Predicts, check_columns
 from gpmpc.gp._posterior import GPPosterior
+from gpmpc.gp._scaling import Scaling, identity
 from gpmpc.gp._sparse import Method, sparse_posterior
 
 
@@ -47,8 +48,7 @@ def from_gpytorch(
         ShapeError: The models of a list have other training inputs or inducing points, or there is more than one batch
             dimension.
     """
-    rows: dict[str, list[Tensor]] = {"targets": [], "lengthscales": []}
-    rows |= {"signal_variance": [], "noise_variance": [], "offset": []}
+    rows: list[tuple[Tensor, ...]] = []  # targets, length-scales, signal and noise variance, offset
     data: Any = None
     inducing: list[Tensor] = []
     for one, own in members(model, likelihood):
@@ -71,24 +71,22 @@ def from_gpytorch(
         if not isinstance(one.mean_module, gpytorch.means.ConstantMean | gpytorch.means.ZeroMean):
             raise UnsupportedModel(f"the mean must be zero or constant; got {type(one.mean_module).__name__}")
         k, d = len(outputs), data.shape[1]
-        rows["targets"].append(outputs)
-        rows["lengthscales"].append(kernel.lengthscale.reshape(-1, kernel.lengthscale.shape[-1]).expand(k, d))
         constant = getattr(one.mean_module, "constant", torch.zeros((), dtype=torch.float64))
-        for name, value in (("signal_variance", scale), ("noise_variance", own.noise), ("offset", constant)):
-            rows[name].append(value.reshape(-1).expand(k).to(targets.device))
-    joined = {name: torch.cat(values).detach().clone() for name, values in rows.items()}
-    features, targets = data.detach().clone(), joined.pop("targets").T.contiguous()
-    offset, kernel = joined.pop("offset"), Hyperparameters(**joined)
+        numbers = (value.reshape(-1).expand(k).to(targets.device) for value in (scale, own.noise, constant))
+        rows.append((outputs, kernel.lengthscale.reshape(-1, kernel.lengthscale.shape[-1]).expand(k, d), *numbers))
+    targets, *kernel, offset = (torch.cat(values).detach().clone() for values in zip(*rows, strict=True))
+    features, targets, hyperparameters = data.detach().clone(), targets.T.contiguous(), Hyperparameters(*kernel)
     if not inducing:
-        return GPPosterior.from_hyperparameters(features, targets, *kernel, input_dim, predicts, offset)
+        return GPPosterior.from_hyperparameters(features, targets, *hyperparameters, input_dim, predicts, offset)
     if len(inducing) not in (1, targets.shape[1]) or any(not torch.equal(Z, inducing[0]) for Z in inducing):
         raise ShapeError("all outputs must be sparse, with the same inducing points (M, d); got different ones")
     method: Method = "fitc" if gpytorch.settings.sgpr_diagonal_correction.on() else "sgpr"
-    return sparse_posterior(inducing[0].clone(), features, targets, kernel, input_dim, predicts, offset, method)
+    given = inducing[0].clone(), features, targets - offset, hyperparameters, input_dim, predicts, method
+    return sparse_posterior(*given).unscaled(identity(features), Scaling(offset, torch.ones_like(offset)))
 
 
 @dataclass(frozen=True)
-class KernelPosterior:
+class KernelPosterior(TensorModel):
     """Exact GPs with any kernels of GPyTorch, frozen; build it with ``from_gpytorch``.
 
     It works with every propagation but ``MomentMatching``, which has a closed form for the SE-ARD kernel only.
@@ -97,6 +95,8 @@ class KernelPosterior:
     parts: tuple["_Part", ...]  #: one a GPyTorch model, each with one output or a batch of them
     input_dim: int  #: m, how many of the last features are controls
     predicts: Predicts  #: what the targets mean
+
+    _part = property(lambda self: self.parts[0].cholesky)
 
     @classmethod
     def from_gpytorch(
@@ -109,18 +109,12 @@ class KernelPosterior:
             ShapeError: The numbers of features differ, or do not go with the numbers of outputs and controls.
             SettingError: The model is not in float64, or its kernel matrix is not positive definite.
         """
-        if predicts not in PREDICTS:
-            raise SettingError("predicts", f"must be one of {', '.join(map(repr, PREDICTS))}; got {predicts!r}")
-        parts = tuple(_Part.of(one, own) for one, own in members(model, likelihood))
-        k, widths = sum(part.outputs for part in parts), sorted({part.features.shape[-1] for part in parts})
+        found = cls(tuple(_Part.of(one, own) for one, own in members(model, likelihood)), input_dim, predicts)
+        widths = sorted({part.features.shape[-1] for part in found.parts})
         if len(widths) > 1:
             raise ShapeError(f"all models must have the same number of features; got {widths}")
-        if not 0 <= input_dim < widths[0] or (predicts != "value" and widths[0] != k + input_dim):
-            raise ShapeError(
-                f"the models must have n + m features, one state an output and {input_dim} controls; "
-                f"got {widths[0]} features and {k} outputs"
-            )
-        return cls(parts, input_dim, predicts)
+        check_columns("the models' features", widths[0], found.output_dim, input_dim, predicts)
+        return found
 
     @property
     def state_dim(self) -> int:
@@ -130,17 +124,7 @@ class KernelPosterior:
     @property
     def output_dim(self) -> int:
         """Number of outputs, k."""
-        return sum(part.outputs for part in self.parts)
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Of every tensor."""
-        return self.parts[0].cholesky.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Of every tensor."""
-        return self.parts[0].cholesky.device
+        return sum(len(part.noise) for part in self.parts)
 
     @property
     def noise_covariance(self) -> Tensor:
@@ -198,10 +182,6 @@ class _Part:
             weights = torch.cholesky_solve((targets - prior.mean)[..., None], cholesky)[..., 0]
         return cls(copied, features, cholesky, weights, noise)
 
-    @property
-    def outputs(self) -> int:
-        return len(self.noise)
-
     def predict(self, query: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance (B, k) at (B, d)."""
         size = self.features.shape[-2]
@@ -214,7 +194,7 @@ class _Part:
         explained = torch.linalg.solve_triangular(self.cholesky, k, upper=False).square().sum(-2)
         mean = prior.mean[..., size:] + (self.weights[..., None] * k).sum(-2)
         variance = (own - explained).clamp_min(0)
-        return mean.reshape(self.outputs, -1).mT, variance.reshape(self.outputs, -1).mT
+        return mean.reshape(len(self.noise), -1).mT, variance.reshape(len(self.noise), -1).mT
 
     def to(self, device: Any, dtype: torch.dtype | None) -> "_Part":
         tensors = (t.to(device=device, dtype=dtype) for t in (self.features, self.cholesky, self.weights, self.noise))

@@ -4,7 +4,7 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor, float64, int32, isfinite, linalg, nonzero, zeros
 
-from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
+from gpmpc.exceptions import DataError, SettingError, ShapeError, check_choice, check_number
 from gpmpc.gaussian import check_tensors
 
 Predicts = Literal["next_state", "difference", "value"]
@@ -24,8 +24,7 @@ def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_v
     if len(others) <= _FEW:
         squares = (points[:, None] - others).square() @ lengthscales.mT**-2  # (N, M, k)
         return signal_variance[:, None, None] * (squares.movedim(-1, 0) / -2).exp()
-    shape = (len(lengthscales), len(points), len(others))
-    total = zeros(shape, dtype=points.dtype, device=points.device)
+    total = zeros(len(lengthscales), len(points), len(others), dtype=points.dtype, device=points.device)
     for ours, theirs, scale in zip(points.T, others.T, lengthscales.T, strict=True):
         total.addcmul_((ours[:, None] - theirs).square(), scale[:, None, None] ** -2)
     return signal_variance[:, None, None] * (total / -2).exp()
@@ -87,11 +86,6 @@ def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> 
     """Raises unless the arguments of ``GPPosterior.from_hyperparameters`` belong together; its docstring has the rules.
 
     The features come first, under any name; before training there are only they and the targets.
-
-    Raises:
-        ShapeError: The shapes do not belong together, or there is no row.
-        SettingError: A hyperparameter is not positive, or a dtype, a device or ``predicts`` is another one.
-        DataError: An entry is not finite.
     """
     check_tensors(**given)
     (first, inputs), targets = next(iter(given.items())), given["targets"]
@@ -112,17 +106,21 @@ def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> 
             raise SettingError(name, f"must be on the device of {first}, {inputs.device}; got {value.device}")
         if not bool(isfinite(value).all()):
             raise DataError(f"{name} must be finite; got {value[~isfinite(value)][0]}")
-    if predicts not in PREDICTS:
-        raise SettingError("predicts", f"must be one of {', '.join(map(repr, PREDICTS))}; got {predicts!r}")
-    check_number("input_dim", input_dim, least=0, whole=True)
-    if input_dim >= d or (predicts != "value" and d != k + input_dim):
-        raise ShapeError(
-            f"{first} must have n + m columns, one state an output and {input_dim} controls; "
-            f"got {d} columns and {k} outputs"
-        )
+    check_columns(first, d, k, input_dim, predicts)
     for name in ("lengthscales", "signal_variance", "noise_variance"):
         if name in given and not bool((given[name] > 0).all()):
             raise SettingError(name, f"must be positive; got {given[name].tolist()}")
+
+
+def check_columns(name: str, d: int, k: int, input_dim: int, predicts: str) -> None:
+    """Raises unless d columns are the states and controls of k GPs that predict what they are said to."""
+    check_choice("predicts", predicts, PREDICTS)
+    check_number("input_dim", input_dim, least=0, whole=True)
+    if input_dim >= d or (predicts != "value" and d != k + input_dim):
+        raise ShapeError(
+            f"{name} must have n + m columns, one state an output and {input_dim} controls; "
+            f"got {d} columns and {k} outputs"
+        )
 
 
 class Hyperparameters(NamedTuple):

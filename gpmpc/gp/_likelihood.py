@@ -23,12 +23,8 @@ _BLOCK = 256  # columns at a time: a block and its mirror image fit the cache
 class NegativeLogMarginalLikelihood:
     """Evaluates the closed form: value and gradient (d + 2,) at theta; infinite where K is not positive definite.
 
-    Of many points everything is kept in one N x N array, 200 MB at N = 5000. One call at a time: it is this object's.
-
-    Args:
-        features: x~ (N, d).
-        targets: y (N,).
-        in_place: Whether one array is used; by default from 400 points on, where that is faster.
+    The features are (N, d), the targets (N,). ``in_place`` keeps everything in one N x N array, 200 MB at N = 5000; by
+    default from 400 points on, where that is faster. One call at a time: the array is this object's.
     """
 
     def __init__(self, features: np.ndarray, targets: np.ndarray, in_place: bool | None = None):

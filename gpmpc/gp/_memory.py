@@ -44,9 +44,7 @@ def _left(folder: Path) -> int | None:
     try:
         limit = int((folder / "memory.max").read_text())  # "max" where there is none
         used = int((folder / "memory.current").read_text())
-        droppable = [
-            line for line in (folder / "memory.stat").read_text().splitlines() if line[:14] == "inactive_file "
-        ]
-        return limit - used + sum(int(line.split()[1]) for line in droppable)
-    except (OSError, ValueError, IndexError):
+        kinds = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+        return limit - used + int(kinds.get("inactive_file", 0))
+    except (OSError, ValueError):
         return None

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._kernels._window import drop_point
-from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel, check_number
+from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel, check_choice, check_number
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._kernel import check_positive_definite, kernel_matrix
 from gpmpc.gp._posterior import GPPosterior
@@ -83,8 +83,7 @@ def remove_points(posterior: GPPosterior, indices: Sequence[int] | Tensor) -> GP
     removed = _indices(indices, size)
     if not removed:
         return posterior
-    chosen = set(removed)
-    kept = torch.tensor([i for i in range(size) if i not in chosen], device=posterior.device)
+    kept = torch.tensor(sorted(set(range(size)).difference(removed)), device=posterior.device)
     if not len(kept):
         raise DataError(f"a posterior needs at least one point; removing {len(removed)} of {size} leaves none")
     if posterior.device.type != "cpu" or posterior.cholesky.requires_grad or len(removed) > _MANY * size:
@@ -99,19 +98,13 @@ def remove_points(posterior: GPPosterior, indices: Sequence[int] | Tensor) -> GP
             drop_point(before, index, columns)
         cholesky = torch.from_numpy(columns).mT
     targets = posterior.targets[kept]
-    right = (targets - posterior.offset).mT[..., None]
-    half = torch.linalg.solve_triangular(cholesky, right, upper=False)
+    half = torch.linalg.solve_triangular(cholesky, (targets - posterior.offset).mT[..., None], upper=False)
     weights = torch.linalg.solve_triangular(cholesky.mT, half, upper=True)[..., 0]
     return replace(posterior, features=posterior.features[kept], targets=targets, cholesky=cholesky, weights=weights)
 
 
 def targets_of(posterior: GPPosterior, transitions: Transitions) -> Tensor:
-    """The targets that a posterior's GPs have for transitions: next states, or differences (N, n).
-
-    Raises:
-        ShapeError: The transitions have other dimensions.
-        UnsupportedModel: The GPs predict values, which transitions do not hold.
-    """
+    """The targets (N, n) that a posterior's GPs have for transitions; errors are those of ``append_transitions``."""
     check_transitions(transitions, posterior)
     return transitions.targets(posterior.predicts)
 
@@ -133,8 +126,7 @@ class SlidingWindow:
 
     def __post_init__(self) -> None:
         check_number("points", self.points, least=1, whole=True)
-        if self.remove not in ("oldest", "least_informative"):
-            raise SettingError("remove", f"must be 'oldest' or 'least_informative'; got {self.remove!r}")
+        check_choice("remove", self.remove, ("oldest", "least_informative"))
 
     def __call__(self, posterior: GPPosterior, transitions: Transitions) -> GPPosterior:
         """The posterior with the transitions, held to ``points`` points; errors are those of ``append_transitions``."""

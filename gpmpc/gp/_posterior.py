@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import Array, Linearized, check_destination, check_query, tensors_for, to_array
+from gpmpc._dynamics import Array, Linearized, TensorModel, check_destination, check_query, tensors_for, to_array
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp._backend import host_arrays
-from gpmpc.gp._kernel import Predicts, check_posterior, factorize
+from gpmpc.gp._kernel import Hyperparameters, Predicts, check_posterior, factorize
 from gpmpc.gp._scaling import Scaling
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class AffineForm(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class GPPosterior:
+class GPPosterior(TensorModel):
     """Exact GPs, one per output, over the same N points; a training, ``from_hyperparameters`` or a file makes them."""
 
     features: Tensor  #: x~ = (x, u) of the training points (N, n + m)
@@ -57,6 +57,8 @@ class GPPosterior:
     weights: Tensor  #: beta = (K + sn2 I)^-1 (y - offset) (k, N)
     input_dim: int  #: m, how many of the last features are certain inputs (controls)
     predicts: Predicts  #: what the targets mean
+
+    _part = property(lambda self: self.features)
 
     @classmethod
     def from_hyperparameters(
@@ -91,29 +93,18 @@ class GPPosterior:
         """
         check_tensors(targets=targets)
         offset = torch.zeros_like(targets[:1].flatten()) if offset is None else offset
-        given = {
-            "inputs": inputs,
-            "targets": targets,
-            "lengthscales": lengthscales,
-            "signal_variance": signal_variance,
-            "noise_variance": noise_variance,
-            "offset": offset,
-        }
+        kernel = Hyperparameters(lengthscales, signal_variance, noise_variance)
+        given = {"inputs": inputs, "targets": targets, **kernel._asdict(), "offset": offset}
         check_posterior(given, input_dim, predicts)
-        inputs, targets, lengthscales, signal_variance, noise_variance, offset = (v.clone() for v in given.values())
-        cholesky = factorize(inputs, lengthscales, signal_variance, noise_variance)
+        inputs, targets, offset = inputs.clone(), targets.clone(), offset.clone()
+        kernel = Hyperparameters(*(value.clone() for value in kernel))
+        cholesky = factorize(inputs, *kernel)
         rights = (targets - offset).mT[..., None]  # one after another: torch copies the factors it is given
         weights = torch.stack([torch.cholesky_solve(b, L)[:, 0] for b, L in zip(rights, cholesky, strict=True)])
-        hyperparameters = (lengthscales, signal_variance, noise_variance, offset)
-        return cls(inputs, targets, *hyperparameters, cholesky, weights, input_dim, predicts)
+        return cls(inputs, targets, *kernel, offset, cholesky, weights, input_dim, predicts)
 
     def unscaled(self, features: Scaling, targets: Scaling) -> "GPPosterior":
-        """Converts GPs that were trained on scaled data to physical units.
-
-        Args:
-            features: The scaling of x~ = (x, u), (n + m,).
-            targets: The scaling of the targets (k,).
-        """
+        """Converts GPs that were trained on scaled features x~ (n + m,) and targets (k,) to physical units."""
         return replace(
             self,
             features=features.restore(self.features),
@@ -135,16 +126,6 @@ class GPPosterior:
     def output_dim(self) -> int:
         """Number of outputs, k."""
         return self.targets.shape[1]
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Of every tensor."""
-        return self.features.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Of every tensor."""
-        return self.features.device
 
     def __len__(self) -> int:
         return len(self.features)

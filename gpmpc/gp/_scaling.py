@@ -55,14 +55,10 @@ def centre(columns: Tensor, names: Sequence[str] = ()) -> Scaling:
 def standardize(columns: Tensor, names: Sequence[str], resolution: float = 0.0) -> Scaling:
     """Maps columns (N, d) to mean zero and standard deviation one; a constant column to zero.
 
-    Args:
-        columns: (N, d).
-        names: Names of the d columns, for the log.
-        resolution: A column whose range is at most this, in the units of the data, counts as constant.
+    A column whose range is at most ``resolution``, in the units of the data, counts as constant; the log names it.
     """
     constant = _constant(columns, names, resolution)
-    deviation = columns.std(dim=0, correction=0)
-    return Scaling(columns.mean(dim=0), torch.where(constant, 1.0, deviation))
+    return Scaling(columns.mean(dim=0), torch.where(constant, 1.0, columns.std(dim=0, correction=0)))
 
 
 def min_max(
@@ -70,13 +66,8 @@ def min_max(
 ) -> Scaling:
     """Maps the range of each column (N, d) onto [low, high]; a constant column to the middle.
 
-    Args:
-        columns: (N, d).
-        names: Names of the d columns, for the log.
-        low: Where the smallest value goes.
-        high: Where the largest value goes.
-        resolution: A column whose range is at most this, in the units of the data, counts as constant. Without it,
-            a solver's round-off in a channel at rest would be blown up to the full interval.
+    A column whose range is at most ``resolution``, in the units of the data, counts as constant, and the log names it.
+    Without it, a solver's round-off in a channel at rest would be blown up to the full interval.
 
     Raises:
         SettingError: low is not below high.
@@ -87,9 +78,8 @@ def min_max(
     smallest, largest = columns.min(dim=0).values, columns.max(dim=0).values
     # A constant column keeps its unit, so that what little it moves stays as little.
     factor = torch.where(constant, 1.0, (largest - smallest) / (high - low))
-    middle = (low + high) / 2
-    offset = torch.where(constant, (smallest + largest) / 2 - middle, smallest - low * factor)
-    return Scaling(offset, factor)
+    middle = (smallest + largest) / 2 - (low + high) / 2
+    return Scaling(torch.where(constant, middle, smallest - low * factor), factor)
 
 
 def _constant(columns: Tensor, names: Sequence[str], resolution: float) -> Tensor:

@@ -25,13 +25,13 @@ any N. A jitter on Kzz makes u = f(Z) + noise; the bound stays one.
 
 import math
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.exceptions import SettingError, ShapeError, check_choice, check_number
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
 from gpmpc.gp._posterior import GPPosterior
@@ -58,39 +58,32 @@ def sparse_posterior(
     hyperparameters: Hyperparameters,
     input_dim: int,
     predicts: Predicts = "next_state",
-    offset: Tensor | None = None,
     method: Method = "sgpr",
     jitter: float | None = None,
 ) -> GPPosterior:
-    """Freezes a sparse GP to M pseudo-observations.
+    """Freezes a sparse GP with prior mean zero to M pseudo-observations; errors as of ``from_hyperparameters``.
 
     Args:
         inducing: Z (M, d), shared by all outputs.
-        features: x~ (N, d), float64 like all that follows.
+        features: x~ (N, d).
         targets: (N, k).
         hyperparameters: Of the k GPs.
         input_dim: m, how many of the last features are controls.
         predicts: What the targets mean.
-        offset: Constant prior means (k,); zero by default.
         method: ``"sgpr"`` or ``"fitc"``.
-        jitter: Added to the diagonal of Kzz, in units of sf2; by default only where it is needed.
-
-    Raises:
-        ShapeError: The shapes do not belong together.
-        SettingError: Kzz is not positive definite, or what ``GPPosterior.from_hyperparameters`` refuses.
-        DataError: An entry is not finite.
+        jitter: Added to the diagonal of Kzz, in units of sf2; by default only where it is needed. ``SettingError``
+            where Kzz is not positive definite.
     """
     if jitter is not None:
         check_number("jitter", jitter, least=0)
-    check_method(method)
+    check_choice("method", method, get_args(Method))
     check_tensors(inducing=inducing, features=features, targets=targets)
-    offset = torch.zeros_like(targets[0]) if offset is None else offset
     if inducing.dim() != 2 or inducing.shape[1:] != features.shape[1:] or not len(inducing):
         raise ShapeError(f"inducing must be (M, {features.shape[-1]}), M > 0; got {tuple(inducing.shape)}")
     if len(features) != len(targets):
         raise ShapeError(f"features and targets need the same number of rows; got {len(features)} and {len(targets)}")
     # Of one row, for its checks of everything else; the data themselves are checked by their sum.
-    shell = GPPosterior.from_hyperparameters(features[:1], targets[:1], *hyperparameters, input_dim, predicts, offset)
+    shell = GPPosterior.from_hyperparameters(features[:1], targets[:1], *hyperparameters, input_dim, predicts)
     for name, value in (("inducing", inducing), ("features", features), ("targets", targets)):
         if value.dtype != torch.float64 or not bool(torch.isfinite(value).all()):
             raise SettingError(name, "must be finite and in float64")
@@ -100,7 +93,7 @@ def sparse_posterior(
         if jitter is not None:
             raise
         Lz = inducing_factor(inducing, hyperparameters, JITTER)
-    sums = data_sums(Lz, inducing, features, targets - offset, hyperparameters, method)
+    sums = data_sums(Lz, inducing, features, targets, hyperparameters, method)
     # Ascending: the largest rows of what is factorised come first, as QR needs.
     b, U = torch.linalg.eigh(sums.gram)
     b = b.clamp_min(_UNINFORMED)
@@ -108,14 +101,8 @@ def sparse_posterior(
     cholesky = (upper * upper.diagonal(dim1=-2, dim2=-1).sign()[..., None]).mT.contiguous()
     projections = U.mT @ sums.projections[..., None]
     weights = torch.linalg.solve_triangular(Lz.mT, U @ (projections / (1 + b)[..., None]), upper=True)
-    pseudo_targets = (cholesky @ (cholesky.mT @ weights))[..., 0].mT + offset
+    pseudo_targets = (cholesky @ (cholesky.mT @ weights))[..., 0].mT
     return replace(shell, features=inducing.clone(), targets=pseudo_targets, cholesky=cholesky, weights=weights[..., 0])
-
-
-def check_method(method: str) -> None:
-    """Raises ``SettingError`` unless a method is known."""
-    if method not in ("sgpr", "fitc"):
-        raise SettingError("method", f"must be 'sgpr' or 'fitc'; got {method!r}")
 
 
 def collapsed_bound(
@@ -133,7 +120,7 @@ def collapsed_bound(
     Raises:
         SettingError: Kzz is not positive definite, or the method is unknown.
     """
-    check_method(method)
+    check_choice("method", method, get_args(Method))
     bounds = []
     for a in range(targets.shape[1]):
         kernel = hyperparameters.output(a)

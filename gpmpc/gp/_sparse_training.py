@@ -12,18 +12,19 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from gpmpc.exceptions import SettingError, TrainingError, check_number
+from gpmpc.exceptions import SettingError, TrainingError, check_choice, check_number
 from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
 from gpmpc.gp._likelihood import FAILED
 from gpmpc.gp._scaling import Scaling, centre, identity
 from gpmpc.gp._search import column_std, log_hyperparameters, restored_theta, search_box, training_data
-from gpmpc.gp._sparse import JITTER, Method, check_method, collapsed_bound, data_sums, inducing_factor, sparse_posterior
+from gpmpc.gp._sparse import JITTER, Method, collapsed_bound, data_sums, inducing_factor, sparse_posterior
 from gpmpc.gp._training import Trainer, Training
 from gpmpc.gp._transitions import Transitions, check_transitions
 
@@ -61,7 +62,7 @@ class SparseTrainer:
             check_number(key, getattr(self, key), least=1, whole=True)
         check_number("iterations", self.iterations, least=0, whole=True)
         check_number("jitter", self.jitter, least=0)
-        check_method(self.method)
+        check_choice("method", self.method, get_args(Method))
         replace(self._exact(), scaling=self.scaling)  # which checks the others
 
     def __call__(self, transitions: Transitions, seed: int = 0) -> Training:
@@ -91,8 +92,7 @@ class SparseTrainer:
         chosen = np.random.default_rng(seed).permutation(len(x))[: self.subset]
         exact = self._exact().fit(features[chosen], y[chosen], input_dim, "value", seed)
         theta = log_hyperparameters(exact.posterior, feature_scaling, identity(y))
-        kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
-        Z = x[informative_points(x, kernel, self.inducing)]
+        Z = x[informative_points(x, Hyperparameters.from_theta(torch.from_numpy(theta)), self.inducing)]
         text = "sparse training: %d inducing points chosen among %d after %.1f s"
         _log.info(text, len(Z), len(x), time.perf_counter() - begin)
         bound = _Bound(self, x, y, torch.from_numpy(column_std(features.numpy())) / feature_scaling.factor, len(Z))
@@ -139,10 +139,8 @@ class SparseTrainer:
     def _check_learned(self, gains: np.ndarray, exact_gains: np.ndarray, parameters: int) -> None:
         """Raises, or warns in the log, where the GPs are no better than noise alone.
 
-        Args:
-            gains: Log evidence over that of noise alone (k,).
-            exact_gains: The same of the exact GPs of the subset.
-            parameters: Of an output; a gain below their number is none (Akaike, 1974).
+        Gains are log evidence over that of noise alone (k,), ``exact_gains`` those of the exact GPs of the subset; one
+        below the number of an output's parameters is none (Akaike, 1974).
         """
         nothing = [a for a, gain in enumerate(gains) if -np.inf < gain < parameters]
         failed = [a for a in nothing if exact_gains[a] > parameters]

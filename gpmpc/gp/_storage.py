@@ -81,7 +81,6 @@ def posterior_parts(path: Path, posterior: GPPosterior) -> tuple[dict[str, Any],
         "points": len(posterior),
     }
     tensors = {f.name: v for f in fields(posterior) if isinstance(v := getattr(posterior, f.name), Tensor)}
-    _check_types(tensors)
     posterior_of_parts(path, header, tensors)
     return header, tensors
 
@@ -118,7 +117,9 @@ def write_model(
     path: Path, kind: str, header: dict, tensors: dict[str, Tensor], metadata: Mapping[str, Any] | None = None
 ) -> None:
     """Writes a model file of a kind, in one piece or not at all."""
-    _check_types(tensors)
+    for name, value in tensors.items():
+        if value.dtype not in _DTYPES:
+            raise SettingError(name, f"must be one of {', '.join(_DTYPES.values())} to be saved; got {value.dtype}")
     tensors = {name: value.detach() for name, value in tensors.items()}
     arrays = {name: _packed(name, value).cpu().contiguous().numpy() for name, value in tensors.items()}
     header = {
@@ -127,7 +128,9 @@ def write_model(
         "kind": kind,
         "kernel": "SE-ARD",
         **header,
-        "memory_order": {name: _order(value) for name, value in tensors.items()},
+        "memory_order": {  # of the dimensions, from the outermost to the innermost
+            name: sorted(range(value.dim()), key=value.stride, reverse=True) for name, value in tensors.items()
+        },
         "versions": versions(("gpmpc", "torch", "gpytorch", "numpy")),
         "created": now(),
         "metadata": dict(metadata or {}),
@@ -140,11 +143,7 @@ def write_model(
 
 
 def read_model(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Reads the header and the tensors of a model file of a kind, in host memory.
-
-    Raises:
-        DataError: The file is damaged, of another kind or of a newer format.
-    """
+    """Reads the header and the tensors of a model file of a kind, in host memory; errors are of ``load_posterior``."""
     header, arrays = _content(path, kind)
     _checked_header(path, kind, header)
     if header.get("kind") != kind:
@@ -198,24 +197,12 @@ def _line(error: Exception) -> str:
 
 
 def _checksum(header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
-    found = hashlib.sha256(
-        json.dumps({key: value for key, value in header.items() if key != "checksum"}, sort_keys=True).encode()
-    )
+    said = {key: value for key, value in header.items() if key != "checksum"}
+    found = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
     for name in sorted(arrays):
         found.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
         found.update(arrays[name].data if arrays[name].size else b"")
     return found.hexdigest()
-
-
-def _check_types(tensors: Mapping[str, Tensor]) -> None:
-    for name, value in tensors.items():
-        if value.dtype not in _DTYPES:
-            raise SettingError(name, f"must be one of {', '.join(_DTYPES.values())} to be saved; got {value.dtype}")
-
-
-def _order(value: Tensor) -> list[int]:
-    """The dimensions of a tensor from the outermost to the innermost in memory."""
-    return sorted(range(value.dim()), key=value.stride, reverse=True)
 
 
 def _packed(name: str, value: Tensor) -> Tensor:
@@ -230,19 +217,15 @@ def _restored(name: str, stored: np.ndarray, order: list[int]) -> Tensor:
     """The tensor of an array, lying in memory as it did when it was saved."""
     if stored.dtype.name not in _DTYPES.values():
         raise ValueError(f"{name} must be of type {' or '.join(_DTYPES.values())}; got {stored.dtype}")
-    triangular = name.endswith("cholesky")
-    size = math.isqrt(2 * stored.shape[-1]) if triangular else 0
-    shape = (len(stored), size, size) if triangular else stored.shape
-    if sorted(order) != list(range(len(shape))) or (
-        triangular and stored.shape != (len(stored), size * (size + 1) // 2)
-    ):
-        raise ValueError(f"{name} of shape {stored.shape} cannot lie in the order {order}")
-    inverse = sorted(range(len(shape)), key=order.__getitem__)
-    array = np.zeros([shape[d] for d in order], stored.dtype).transpose(inverse)  # pages that nobody writes are free
-    if triangular:
-        for row in range(size):
-            start = row * (row + 1) // 2
-            array[:, row, : row + 1] = stored[:, start : start + row + 1]
-    else:
+    shape, triangular, size = stored.shape, name.endswith("cholesky"), math.isqrt(2 * stored.shape[-1])
+    whole = (len(stored), size, size) if triangular else shape
+    if sorted(order) != list(range(len(whole))) or (triangular and shape != (len(stored), size * (size + 1) // 2)):
+        raise ValueError(f"{name} of shape {shape} cannot lie in the order {order}")
+    inverse = sorted(range(len(whole)), key=order.__getitem__)
+    array = np.zeros([whole[d] for d in order], stored.dtype).transpose(inverse)  # pages that nobody writes are free
+    if not triangular:
         array[...] = stored
+    for row in range(size if triangular else 0):
+        start = row * (row + 1) // 2
+        array[:, row, : row + 1] = stored[:, start : start + row + 1]
     return torch.from_numpy(array)

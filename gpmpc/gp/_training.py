@@ -16,7 +16,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from gpmpc.exceptions import DataError, SettingError, TrainingError, UnsupportedModel, check_number
+from gpmpc.exceptions import DataError, SettingError, TrainingError, UnsupportedModel, check_choice, check_number
 from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
 from gpmpc.gp._likelihood import FAILED
 from gpmpc.gp._memory import GIB, available_memory
@@ -81,8 +81,7 @@ class Trainer:
     signal_to_noise_limit: float = 1e4
 
     def __post_init__(self) -> None:
-        if self.predicts not in PREDICTS:
-            raise SettingError("predicts", f"must be one of {', '.join(map(repr, PREDICTS))}; got {self.predicts!r}")
+        check_choice("predicts", self.predicts, PREDICTS)
         check_number("restarts", self.restarts, least=0, whole=True)
         if self.subset is not None:
             check_number("subset", self.subset, least=1, whole=True)
@@ -101,12 +100,8 @@ class Trainer:
     def refit(self, posterior: GPPosterior, transitions: Transitions | None = None, seed: int = 0) -> Training:
         """Trains on the points a posterior holds, and on new ones, from its hyperparameters on.
 
-        With ``restarts=0`` only from them on. The prior mean is that of this trainer's scaling, as in any training.
-
-        Args:
-            posterior: What was learned so far; what it predicts and its number of inputs stay.
-            transitions: Seen besides, if given.
-            seed: Of the random starts.
+        With ``restarts=0`` only from them on. The prior mean is that of this trainer's scaling, as in any training;
+        what the posterior predicts and its number of inputs stay.
 
         Raises:
             UnsupportedModel: It is no ``GPPosterior``, or stands on a sparse model's pseudo-observations.

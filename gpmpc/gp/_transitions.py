@@ -6,7 +6,7 @@ published their data, and are finite float64 of matching shapes; errors name fil
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,18 +58,13 @@ class Transitions:
                 "states, inputs and next_states must have the same number of rows; "
                 f"got {len(self.states)}, {len(self.inputs)} and {len(self.next_states)}"
             )
-        if self.states.shape[1] != self.next_states.shape[1]:
-            raise ShapeError(
-                "states and next_states must have the same number of columns; "
-                f"got {self.states.shape[1]} and {self.next_states.shape[1]}"
-            )
-        if len(self.states) == 0:
+        if (n := self.states.shape[1]) != (found := self.next_states.shape[1]):
+            raise ShapeError(f"states and next_states must have the same number of columns; got {n} and {found}")
+        if not len(self.states):
             raise DataError("transitions need at least one row; got none")
         for name in _NAMES:
-            bad = torch.nonzero(~torch.isfinite(getattr(self, name)))
-            if len(bad):
-                row, column = bad[0].tolist()
-                value = float(getattr(self, name)[row, column])
+            for row, column in torch.nonzero(~torch.isfinite(values := getattr(self, name)))[:1].tolist():
+                value = float(values[row, column])
                 raise DataError(f"{name} must be finite; got {value} in row {row + 1}, column {column + 1}")
 
     def __len__(self) -> int:
@@ -171,10 +166,12 @@ class Transitions:
                 raise SettingError(key, f"must be a list of column names; got {single}{names!r}")
         path = existing_file(path, _EXPECTED)
         text = _text(path)
-        header = text.partition("\n")[0]
-        reader = csv.reader(io.StringIO(text), delimiter=max(",;\t", key=header.count))
-        lines = _lines(path, reader)
-        names = [name.strip() for name in next(lines, (1, []))[1]]
+        reader = csv.reader(io.StringIO(text), delimiter=max(",;\t", key=text.partition("\n")[0].count))
+        try:
+            (_, header), *lines = [(reader.line_num, fields) for fields in reader] or [(1, [])]
+        except csv.Error as error:
+            raise DataError(f"{path}: row {reader.line_num} cannot be read ({error})") from error
+        names = [name.strip() for name in header]
         wanted = [*states, *inputs, *(next_states or ())]
         for name in wanted:
             if names.count(name) != 1:
@@ -182,20 +179,19 @@ class Transitions:
                 raise DataError(f"{path}: column {name!r} {problem}; the header has {', '.join(names) or 'no columns'}")
         places = {name: names.index(name) for name in wanted}
         table = _table(path, lines, places, len(names), f"{len(names)} as in the header", least=1 if next_states else 2)
-        x, u, after = (
-            table[:, [list(places).index(name) for name in part]] for part in (states, inputs, next_states or states)
-        )
+        parts = (states, inputs, next_states or states)
+        x, u, after = (table[:, [list(places).index(name) for name in part]] for part in parts)
         return _with_path(path, x, u, after) if next_states else _with_path(path, x[:-1], u[:-1], after[1:])
 
 
 def check_transitions(transitions: Any, model: Any = None) -> None:
-    """Raises ``SettingError`` unless these are transitions, ``ShapeError`` unless a model has their dimensions."""
+    """Raises unless these are transitions, of as many states and inputs as a model, where one is given, has."""
     if not isinstance(transitions, Transitions):
         raise SettingError("transitions", f"must be Transitions(...); got {type(transitions).__name__}")
     n, m = transitions.state_dim, transitions.input_dim
     if model is not None and (n, m) != (model.state_dim, model.input_dim):
-        own = f"{model.state_dim} states and {model.input_dim} inputs"
-        raise ShapeError(f"the model has {own}; got transitions with {n} and {m}")
+        rule = f"the model has {model.state_dim} states and {model.input_dim} inputs"
+        raise ShapeError(f"{rule}; got transitions with {n} and {m}")
 
 
 def _real(values: Any) -> Tensor:
@@ -215,14 +211,6 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: not a readable text file ({error})") from error
-
-
-def _lines(path: Path, reader: Any) -> Iterator[tuple[int, list[str]]]:
-    try:
-        for fields in reader:
-            yield reader.line_num, fields
-    except csv.Error as error:
-        raise DataError(f"{path}: row {reader.line_num} cannot be read ({error})") from error
 
 
 def _table(

@@ -16,27 +16,13 @@ import casadi
 import numpy as np
 import torch
 
-from gpmpc._kernels.tape import (
-    ADD,
-    ATAN2,
-    CONST,
-    CONSTPOW,
-    DIV,
-    FMAX,
-    FMIN,
-    INPUT,
-    MUL,
-    OPERATIONS,
-    OUTPUT,
-    POW,
-    SUB,
-    Tape,
-)
+from gpmpc._kernels import tape as tapes
 from gpmpc.exceptions import DataError, UnsupportedModel
 from gpmpc.gp._posterior import GPPosterior
 
 Array = np.ndarray
-_BINARY = (ADD, SUB, MUL, DIV, POW, CONSTPOW, FMIN, FMAX, ATAN2)
+_BINARY = {tapes.ADD, tapes.SUB, tapes.MUL, tapes.DIV, tapes.POW}
+_BINARY |= {tapes.CONSTPOW, tapes.FMIN, tapes.FMAX, tapes.ATAN2}
 
 
 def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
@@ -123,8 +109,7 @@ def _moments(gp: GPPosterior, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, ca
         eye = torch.eye(size, dtype=torch.float64)
         inverse = torch.linalg.solve_triangular(gp.cholesky[a].detach().double().cpu(), eye, upper=False)
         entries = casadi.DM(lower, inverse.numpy().T[np.triu_indices(size)])
-        explained = casadi.sumsqr(entries @ column)
-        variance.append(casadi.fmax(0, float(gp.signal_variance[a]) - explained))
+        variance.append(casadi.fmax(0, float(gp.signal_variance[a]) - casadi.sumsqr(entries @ column)))
     return mean, casadi.vertcat(*variance)
 
 
@@ -132,7 +117,7 @@ def _numbers(tensor: torch.Tensor) -> casadi.DM:
     return casadi.DM(tensor.detach().double().cpu().numpy())
 
 
-def tape_of(function: casadi.Function) -> Tape | None:
+def tape_of(function: casadi.Function) -> tapes.Tape | None:
     """Reads the operations of a CasADi function of dense vectors; None where there are others than a tape has.
 
     The value is taken column by column, the arguments one after the other.
@@ -148,50 +133,40 @@ def tape_of(function: casadi.Function) -> Tape | None:
     code = np.zeros((function.n_instructions(), 4), dtype=np.int64)
     constants = np.zeros(len(code))
     for k, row in enumerate(code):
-        row[0], inputs, outputs = (
-            function.instruction_id(k),
-            function.instruction_input(k),
-            function.instruction_output(k),
-        )
-        if row[0] not in OPERATIONS:
+        row[0] = function.instruction_id(k)
+        inputs, outputs = function.instruction_input(k), function.instruction_output(k)
+        if row[0] not in tapes.OPERATIONS:
             return None
-        row[1] = places[outputs[1]] if row[0] == OUTPUT else outputs[0]
-        if row[0] == INPUT:
+        row[1] = places[outputs[1]] if row[0] == tapes.OUTPUT else outputs[0]
+        if row[0] == tapes.INPUT:
             row[2] = first[inputs[0]] + inputs[1]
-        elif row[0] == CONST:
+        elif row[0] == tapes.CONST:
             constants[k] = function.instruction_constant(k)
         else:
             row[2 : 2 + len(inputs)] = inputs
             row[3] = inputs[-1]
-    return Tape(code, constants, function.sz_w(), function.numel_out(0))
+    return tapes.Tape(code, constants, function.sz_w(), function.numel_out(0))
 
 
 def function_of_tape(code: Array, constants: Array, sizes: Sequence[int], shape: tuple[int, int]) -> casadi.Function:
-    """Writes a tape as a CasADi function again: the inverse of ``tape_of``.
+    """Writes a tape, of arguments and a value of these sizes, as a CasADi function again: the inverse of ``tape_of``.
 
-    Args:
-        code: Of the tape (K, 4).
-        constants: Of the tape (K,).
-        sizes: Of the arguments.
-        shape: Rows and columns of the value.
-
-    Raises:
-        DataError: The operations are no tape's.
+    Raises ``DataError`` where code (K, 4) and constants (K,) are no tape's.
     """
     arguments = [casadi.SX.sym(f"argument{i}", size) for i, size in enumerate(sizes)]
     z, value = casadi.vertcat(*arguments), casadi.SX(shape[0] * shape[1], 1)
     work: dict[int, Any] = {}
     try:
         for (operation, to, first, last), constant in zip(code.astype(int).tolist(), constants.tolist(), strict=True):
-            if operation == OUTPUT:
+            if operation == tapes.OUTPUT:
                 value[to] = work[first]
-            elif operation == INPUT:
+            elif operation == tapes.INPUT:
                 work[to] = z[first]
-            elif operation == CONST:
+            elif operation == tapes.CONST:
                 work[to] = casadi.SX(constant)
             elif operation in _BINARY:
                 work[to] = casadi.SX.binary(operation, work[first], work[last])
-            elif operation in OPERATIONS:
+            elif operation in tapes.OPERATIONS:
                 work[to] = casadi.SX.unary(operation, work[first])
             else:
                 raise DataError(f"there is no operation {operation}")

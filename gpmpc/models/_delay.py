@@ -66,11 +66,7 @@ class DelayedModel(LinearWrapper):
         return Z, acting[:, D * m :], L, moved[:, D * m :]
 
     def augmented(self, belief: Gaussian, inputs: Any) -> Gaussian:
-        """The belief over z, from one over x and the inputs on their way.
-
-        Args:
-            belief: Over x: mean (*batch, n).
-            inputs: u_{k-D} .. u_{k-1} (D, m), the oldest first.
+        """The belief over z, from one over x (*batch, n) and the inputs u_{k-D} .. u_{k-1} (D, m), the oldest first.
 
         Raises:
             ShapeError: Another number of inputs.
@@ -89,12 +85,9 @@ class DelayedModel(LinearWrapper):
         return self.pending if self._share == 1 else self.pending - 1
 
     def ahead(self, propagator: Any, belief: Gaussian, inputs: Any) -> Gaussian:
-        """The belief over the state of ``remaining`` after the inputs that are on their way.
+        """The belief over the state of ``remaining`` after the inputs u_{k-D} .. u_{k-1} (D, m), the oldest first.
 
-        Args:
-            propagator: How the belief moves, with the process noise or without.
-            belief: Over x now.
-            inputs: u_{k-D} .. u_{k-1} (D, m), the oldest first.
+        The propagator moves the belief over x, which is that of now, with the process noise or without.
 
         Raises:
             ShapeError: Another number of inputs.

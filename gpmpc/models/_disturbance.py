@@ -79,15 +79,10 @@ class DisturbedModel(LinearWrapper):
         return np.zeros((m, k)), np.eye(m), L, np.zeros((k, m))
 
     def augmented(self, belief: Gaussian, std: Sequence[float] | None = None) -> Gaussian:
-        """The belief over (x, d) before anything was estimated: d is zero, and independent of x.
+        """The belief over (x, d), from one over x (*batch, n), before anything was estimated: d is zero, independent.
 
-        Args:
-            belief: Over x: mean (*batch, n).
-            std: Prior standard deviations of d (q,); by default those that an AR(1) process has in the long run. A
-                constant has none: they must be given.
-
-        Raises:
-            SettingError: There is a constant, and no prior.
+        Prior standard deviations of d (q,) are by default those that an AR(1) process has in the long run. A constant
+        has none: without them it raises ``SettingError``.
         """
         if std is None:
             if any(abs(phi) == 1 for phi in self._decays):

@@ -34,9 +34,8 @@ class Features:
     input_dim: int  #: m
 
     def __post_init__(self) -> None:
-        chosen = {"states": self.state_dim, "inputs": self.input_dim, "angles": self.state_dim}
-        for key, count in chosen.items():
-            indices = getattr(self, key)
+        for key in ("states", "inputs", "angles"):
+            indices, count = getattr(self, key), self.input_dim if key == "inputs" else self.state_dim
             whole = all(isinstance(i, int) and not isinstance(i, bool) for i in indices)
             if not whole or any(not 0 <= i < count for i in indices) or len(set(indices)) != len(indices):
                 raise SettingError(key, f"must be different indices from 0 to {count - 1}; got {list(indices)}")

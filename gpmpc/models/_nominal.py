@@ -178,18 +178,13 @@ class CasadiFunction:
 
 
 def linearize_function(function: Callable[..., Tensor], model: Any, *arguments: Array) -> tuple[Array, ...]:
-    """Value and derivatives by each argument of a batched function at K points.
+    """Value and derivatives by each argument of a batched function at K points, arguments (K, d_i).
 
     By the function's own method ``linearize``, such as that of ``Affine`` and ``CasadiFunction``; else by one batched
-    call of torch autograd.
-
-    Args:
-        function: Of tensors (*batch, d_i), to (*batch, k) or (*batch, n, k).
-        model: Its type and device are those of the tensors that the function takes.
-        arguments: Each (K, d_i).
+    call of torch autograd, with tensors of the model's type on its device: from (*batch, d_i) to (*batch, k) or
+    (*batch, n, k).
     """
-    method = getattr(function, "linearize", None)
-    if method is not None:
+    if (method := getattr(function, "linearize", None)) is not None:
         return method(*arguments)
     shape: list[torch.Size] = []
 

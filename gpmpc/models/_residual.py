@@ -15,7 +15,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import Array, Linearized, check_destination, check_query, tensors_for, to_array
+from gpmpc._dynamics import Array, Linearized, TensorModel, check_destination, check_query, tensors_for, to_array
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp import GPPosterior, SlidingWindow, Trainer, Training, Transitions, append_points
@@ -29,7 +29,7 @@ Effect = Tensor | Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
-class ResidualModel:
+class ResidualModel(TensorModel):
     """A nominal model and a GP on its residual.
 
     Raises:
@@ -50,28 +50,28 @@ class ResidualModel:
     #: covariance of the observations (n, n); by default that of d's, B diag(sn2) B', which needs a constant B
     noise: Tensor | None = None
 
+    _part = property(lambda self: self.residual)
+
     def __post_init__(self) -> None:
-        gp = self.residual
-        if not callable(self.B):
-            check_tensors(B=self.B)
+        gp, nominal = self.residual, self.nominal
+        parts: dict[str, tuple[Any, tuple[int, ...]]] = {}
         if getattr(gp, "predicts", None) != "value":
             raise SettingError("residual", f"must be a GP with predicts='value'; got {getattr(gp, 'predicts', gp)!r}")
-        if callable(self.B):
-            if self.noise is None:
-                raise SettingError("noise", "must be given (n, n) where B is a function of the state; got None")
-        elif self.B.dim() != 2 or self.B.shape[1] != gp.output_dim:
-            raise ShapeError(f"B must be (n, {gp.output_dim}); got {tuple(self.B.shape)}")
+        if not callable(self.B):
+            check_tensors(B=self.B)
+            parts["B"] = self.B, (len(self.B) if self.B.dim() else 0, gp.output_dim)
+        elif self.noise is None:
+            raise SettingError("noise", "must be given (n, n) where B is a function of the state; got None")
         if (self.features.dim, len(self.inputs)) != (gp.state_dim, gp.input_dim):
             raise ShapeError(
                 f"the residual has {gp.state_dim} states and {gp.input_dim} inputs; "
                 f"got {self.features.dim} and {len(self.inputs)} selected"
             )
-        n, m, nominal = self.state_dim, self.input_dim, self.nominal
+        n, m = self.state_dim, self.input_dim
         if isinstance(nominal, CasadiFunction):
             nominal.check_sizes((n, m), (n, 1))
         if isinstance(self.B, CasadiFunction):
             self.B.check_sizes((n,), (n, gp.output_dim))
-        parts = {} if callable(self.B) else {"B": (self.B, tuple(self.B.shape))}
         if self.noise is not None:
             check_tensors(noise=self.noise)
             parts["noise"] = (self.noise, (n, n))
@@ -147,16 +147,6 @@ class ResidualModel:
         return self.state_dim
 
     @property
-    def dtype(self) -> torch.dtype:
-        """Of the residual GP."""
-        return self.residual.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Of the residual GP."""
-        return self.residual.device
-
-    @property
     def noise_covariance(self) -> Tensor:
         """Of the observations (n, n)."""
         if self.noise is None and not callable(self.B):
@@ -178,8 +168,7 @@ class ResidualModel:
         with torch.no_grad():
             known, B = to_array(_nominal(self.nominal, x, u)), to_array(_effect(self.B, x))
         features, selected, _ = self.features.linearize(states, inputs)
-        d = self.residual.linearize(features, selected, False).mean
-        return known + (B @ d[..., None])[..., 0]
+        return known + (B @ self.residual.linearize(features, selected, False).mean[..., None])[..., 0]
 
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
         """Linearises the model at K points (K, n), (K, m), by the chain rule around the GP's own ``linearize``.

@@ -166,9 +166,7 @@ def _import_path(key: str, function: Any) -> dict[str, Any]:
         kind, source = "dataclass", type(function)
         parameters = {field.name: getattr(function, field.name) for field in fields(function) if field.init}
     module, name = getattr(source, "__module__", ""), getattr(source, "__qualname__", "")
-    found: Any = None
-    if module and module != "__main__" and name:
-        found = _imported(module, name)
+    found = _imported(module, name) if module and module != "__main__" and name else None
     if found is None or found is not source or any(isinstance(value, Tensor) for value in parameters.values()):
         raise UnsupportedModel(
             f"{key} is code that a file cannot name: {function!r}. It can be saved as a function of a module, a "
@@ -190,9 +188,8 @@ def _function(header: Mapping[str, Any], tensors: Mapping[str, Tensor], key: str
     kind, parameters = entry["kind"], entry["parameters"]
     module, _, name = entry["path"].partition(":")
     source: Any = _imported(module, name)
-    right = is_dataclass(source) and isinstance(source, type)
-    if kind != "dataclass":
-        right = type(source) is FunctionType
+    is_class = is_dataclass(source) and isinstance(source, type)
+    right = is_class if kind == "dataclass" else type(source) is FunctionType
     if not right or kind not in ("function", "partial", "dataclass", "casadi") or not isinstance(parameters, dict):
         raise DataError(f"{key} {entry['path']!r} is no {kind} that can be imported here")
     call: Any = source

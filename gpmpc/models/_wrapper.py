@@ -8,14 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import Array, DynamicsModel, Linearized, check_query, linearize, tensors_for
+from gpmpc._dynamics import Array, DynamicsModel, Linearized, TensorModel, check_query, linearize, tensors_for
 from gpmpc.gaussian import Gaussian
 
 
-class Wrapper:
+class Wrapper(TensorModel):
     """A model with the states, the inputs, the type and the device of the model that it holds."""
 
     model: DynamicsModel  #: the model that is wrapped
+    _part = property(lambda self: self.model)
 
     @property
     def state_dim(self) -> int:
@@ -31,16 +32,6 @@ class Wrapper:
     def output_dim(self) -> int:
         """Number of outputs: the next state."""
         return self.state_dim
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Of the model that is wrapped."""
-        return self.model.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Of the model that is wrapped."""
-        return self.model.device
 
 
 class LinearWrapper(Wrapper):

@@ -177,11 +177,7 @@ class Request(NamedTuple):
         """Validates the arguments of ``Controller.control`` for H stages of a problem.
 
         ``initial_input`` is taken for the previous one where there is no decision before; of one that is not applicable
-        only ``input`` counts: what was applied. For ``plan`` see ``GPMPC.control``.
-
-        Raises:
-            ShapeError: Belief, reference or plan have other dimensions than the problem and the horizon.
-            DataError: Reference or plan are not finite.
+        only ``input`` counts: what was applied. For ``plan``, and the errors, see ``GPMPC.control``.
         """
         if not (isinstance(belief, Gaussian) and isinstance(reference, Reference)):
             raise ShapeError(
@@ -226,16 +222,9 @@ class Request(NamedTuple):
 
     def failed_decision(self, status: Status, iterations: int = 0, timing: Timing | None = None) -> Decision:
         """The decision of a step without a usable solve: the initial guess, and no prediction."""
-        H, n = self.references.states.shape
-        return Decision(
-            input=self.initial_guess[0],
-            inputs=self.initial_guess,
-            means=np.full((H + 1, n), np.nan),
-            covariances=np.full((H + 1, n, n), np.nan),
-            status=status,
-            iterations=iterations,
-            timing=timing or Timing(),
-        )
+        (H, n), inputs = self.references.states.shape, self.initial_guess
+        unknown = np.full((H + 1, n), np.nan), np.full((H + 1, n, n), np.nan)
+        return Decision(inputs[0], inputs, *unknown, status, iterations, timing or Timing())
 
 
 def check_method(key: str, value: object, method: str, example: str) -> None:
@@ -280,9 +269,9 @@ def read_parameters(parameters: Any, horizon: int) -> Array:
 
 
 def full_turns(difference: Array, angles: Sequence[int]) -> Array:
-    """Returns the full turns (n,) in a difference of states, zero where they are no angles."""
+    """Returns the full turns (..., n) in differences of states, zero where they are no angles."""
     turns, index = np.zeros_like(difference), list(angles)
-    turns[index] = 2.0 * np.pi * np.round(difference[index] / (2.0 * np.pi))
+    turns[..., index] = 2.0 * np.pi * np.round(difference[..., index] / (2.0 * np.pi))
     return turns
 
 
@@ -304,9 +293,7 @@ def _unwrapped(states: Array, state: Array, previous: Decision | None, angles: S
     if previous is not None:
         plan[1:] = np.concatenate([previous.means[2:], previous.means[-1:]])
         plan[1:] += full_turns(state - previous.means[1], angles)
-    moved, index = states.copy(), list(angles)
-    moved[:, index] += 2.0 * np.pi * np.round((plan[:, index] - states[:, index]) / (2.0 * np.pi))
-    return moved
+    return states + full_turns(plan - states, angles)
 
 
 @compiled(locked=True)

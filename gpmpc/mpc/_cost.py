@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.exceptions import DataError, SettingError, ShapeError, check_choice
 from gpmpc.models._nominal import CasadiFunction, linearize_function
 
 Array = np.ndarray
@@ -46,18 +46,12 @@ class Tracking:
         terminal = Q.reshape(-1, n, n)[-1] if self.terminal is None else _weight("terminal", self.terminal)
         if terminal.shape != (n, n):
             raise SettingError("terminal", f"must be a weight of {n} states; got {len(terminal)}")
-        if self.penalized not in PENALIZED:
-            raise SettingError("penalized", f"must be one of {', '.join(map(repr, PENALIZED))}; got {self.penalized!r}")
+        check_choice("penalized", self.penalized, PENALIZED)
         angles = tuple(self.angles or ())
         if not all(isinstance(index, int) and 0 <= index < n for index in angles):
             raise SettingError("angles", f"must be indices of {n} states; got {self.angles!r}")
         for key, value in (("Q", Q), ("R", R), ("terminal", terminal), ("angles", angles)):
             object.__setattr__(self, key, value)
-
-    @property
-    def largest_weight(self) -> float:
-        """The largest eigenvalue of all weights."""
-        return float(max(np.linalg.eigvalsh(weight).max() for weight in (self.Q, self.terminal, self.R)))
 
     def by_stage(self, horizon: int) -> tuple[Array, Array]:
         """Returns the weights of x_1 .. x_H (H, n, n), the last one the terminal one, and of v_0 .. v_{H-1} (H, m, m).
@@ -117,12 +111,9 @@ class FunctionNotFinite(DataError):
 def expand_function(
     name: str, function: Any, count: int, states: Array, inputs: Array, parameters: Array | None
 ) -> tuple[Array, Array, Array]:
-    """Returns a function's values (H, count) along a plan, (H, d, n) and (H, d, m) its derivatives.
+    """Returns a function's values (H, count) along a plan, and its derivatives (H, count, n) and (H, count, m).
 
-    Raises:
-        SettingError: It takes parameters, and there are none.
-        ShapeError: It gives another shape.
-        FunctionNotFinite: A value or a derivative is not finite.
+    Raises ``FunctionNotFinite`` where one is not.
     """
     least, most = _arguments(function)
     arguments = [states, inputs] if parameters is None else [states, inputs, parameters]

@@ -2,8 +2,7 @@
 
 A failed iterate is never applied and never handed on: the next call gets the last plan that was applicable, shifted as
 if it had been made one step ago, with what was really applied as its first input. A plan that is used up holds its last
-input. Whatever is applied is finite and within the box and the rates of the controller's problem, even where the status
-of a decision says otherwise: inputs beyond a bound by rounding are put onto it, others count as failed.
+input. Inputs beyond a bound by rounding are put onto it; others count as failed, whatever the status of a decision.
 """
 
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ import numpy as np
 import torch
 from scipy.interpolate import krogh_interpolate
 
-from gpmpc.exceptions import SettingError, ShapeError, SolverFailure, check_number
+from gpmpc.exceptions import SettingError, ShapeError, SolverFailure, check_choice, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._controller import Controller, Decision, Reference, Timing, full_turns
 from gpmpc.mpc.problem import Problem
@@ -55,25 +54,16 @@ def command(
     parameters: Any = None,
     plan: Any = None,
 ) -> Command:
-    """Decides one step's input by a controller, or by the policy where it has none.
+    """Decides one step's input by a controller where the belief is finite, or by the policy where that has none.
 
-    Args:
-        controller: Called where the belief is finite.
-        belief: Of the state (n,).
-        reference: Over the controller's horizon, or a set point.
-        last: The command of the step before; None at the first.
-        on_failure: ``"previous_plan"`` goes on along the last applicable plan, ``"hold"`` keeps the last input applied,
-            ``"raise"`` stops. Before the first such plan, the first two take the reference's own input if there is
-            one, else the controller's initial input, within its input and rate bounds.
-        step: Number of the step, for the message.
-        parameters: Of the controller's outputs and smooth constraints, where it has any.
-        plan: For the controller to start from in the place of the last one; see ``GPMPC.control``.
+    ``"previous_plan"`` goes on along the last applicable plan, ``"hold"`` keeps the last input applied, ``"raise"``
+    stops. Before the first such plan, the first two take the reference's own input if there is one, else the
+    controller's initial input, within its input and rate bounds. ``last`` is the command of the step before, None at
+    the first; ``step`` is for the message; for parameters and plan see ``ControlLoop.input``.
 
     Raises:
-        SettingError: No such policy.
         SolverFailure: The policy is ``"raise"``, or there is nothing to fall back on.
     """
-    check_policy(on_failure)
     previous, reference = None if last is None else last.plan, reference.over(controller.horizon)
     known = {key: value for key, value in (("parameters", parameters), ("plan", plan)) if value is not None}
     decision = controller.control(belief, reference, previous, **known) if _is_finite(belief) else None
@@ -92,7 +82,6 @@ def commands(
 
     A controller with ``control_many`` is called once for all of them.
     """
-    check_policy(on_failure)
     finite = [t for t, belief in enumerate(beliefs) if _is_finite(belief)]
     plans = [None if command is None else command.plan for command in last]
     many = getattr(controller, "control_many", None)
@@ -208,9 +197,7 @@ def _state_along(states: np.ndarray, time: float) -> np.ndarray:
 
 def check_policy(on_failure: str) -> None:
     """Raises ``SettingError`` unless there is such a policy."""
-    if on_failure not in get_args(OnFailure):
-        policies = ", ".join(map(repr, get_args(OnFailure)))
-        raise SettingError("on_failure", f"must be one of {policies}; got {on_failure!r}")
+    check_choice("on_failure", on_failure, get_args(OnFailure))
 
 
 def _is_finite(belief: Gaussian) -> bool:
@@ -230,8 +217,7 @@ def _conclude(
     reason = status.advice
     if decision is not None and decision.applicable:
         fits = _has_right_shape(controller, decision, last)
-        checked = _admit(controller, decision, last) if fits else None
-        if checked is not None:
+        if fits and (checked := _admit(controller, decision, last)) is not None:
             return Command(checked.input, status, checked, checked)
         reason = f"its plan, {status.name}, is not finite or out of its bounds or shape; its input: {decision.input}"
         status = Status.NUMERICAL_TROUBLE
@@ -239,15 +225,12 @@ def _conclude(
     if on_failure == "raise":
         raise SolverFailure(step, reason)
     if last is not None and last.plan is not None and last.plan.applicable:
-        plan = last.plan
-        rows = plan.inputs, plan.means, plan.covariances
+        rows = (plan := last.plan).inputs, plan.means, plan.covariances
         inputs, means, covariances = (np.concatenate([part[1:], part[-1:]]) for part in rows)
         first = last.input if on_failure == "hold" else inputs[0]
-        shifted = _admit(
-            controller, replace(_with_first(plan, inputs, first), means=means, covariances=covariances), last
-        )
-        if shifted is not None:
-            return Command(shifted.input, status, decision, shifted)
+        shifted = replace(_with_first(plan, inputs, first), means=means, covariances=covariances)
+        if (admitted := _admit(controller, shifted, last)) is not None:
+            return Command(admitted.input, status, decision, admitted)
     known = getattr(controller, "initial_input", None) if reference.inputs is None else reference.inputs[0]
     if known is None or not np.isfinite(known).all():
         raise SolverFailure(step, f"{reason} (no earlier plan and no reference input to fall back on)")

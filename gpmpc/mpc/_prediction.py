@@ -19,9 +19,8 @@ Covariances of ``zero_order`` are predicted under a feedback u = u_k - K (x - mu
 
     Sigma_{k+1} = (A_k - B_k K) Sigma_k (A_k - B_k K)' + V_k
 
-because without it the uncertainty grows over a long horizon until no input satisfies the bounds, while the next solves
-will see the next states and correct what went wrong (Hewing, Kabzan and Zeilinger, 2020). K is the gain of the
-finite-horizon LQR at the first stage. It is part of the covariances only: the bounds of the inputs hold for u_k.
+because the next solves will see the next states and correct what went wrong (Hewing, Kabzan and Zeilinger, 2020). K is
+the gain of the finite-horizon LQR at the first stage, of the covariances only: the bounds of the inputs hold for u_k.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,7 +34,7 @@ from gpmpc._compiled import call_unchecked, compiled
 from gpmpc._dynamics import DynamicsModel, check_next_states, linearize
 from gpmpc._kernels.gp_rollout import Feedback
 from gpmpc._kernels.linalg import copy_matrix, product
-from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.exceptions import SettingError, ShapeError, check_choice, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import RollOut
 from gpmpc.mpc._controller import (
@@ -92,10 +91,8 @@ class PredictionSettings:
     rolled_out: bool = False
 
     def __post_init__(self) -> None:
-        for key, possible in (("form", FORMS), ("covariance", COVARIANCES)):
-            if getattr(self, key) not in possible:
-                names = ", ".join(map(repr, possible))
-                raise SettingError(key, f"must be one of {names}; got {getattr(self, key)!r}")
+        check_choice("form", self.form, FORMS)
+        check_choice("covariance", self.covariance, COVARIANCES)
         for key in ("feedback", "rolled_out"):
             if not isinstance(getattr(self, key), bool):
                 raise SettingError(key, f"must be true or false; got {getattr(self, key)!r}")
@@ -233,7 +230,7 @@ class PredictionModel:
         covariances, mode = plan.covariances, self.linearizer.covariance
         cost = self.costs.at(plan, request.parameters)
         if mode == "zero_order":
-            covariances, K = np.empty_like(covariances), self.gain(stages, cost)
+            covariances, K = np.empty_like(covariances), self.gains(stages.A[:1], stages.B[:1], cost)[0]
             call_unchecked(_predict_covariances, *stages[:2], stages.V, request.covariance, K, covariances)
         elif self.settings.form == "velocity" and mode != "none":
             covariances = np.repeat(self.linearizer.moments(stages.next, covariances)[1], self.horizon + 1, axis=0)
@@ -312,10 +309,6 @@ class PredictionModel:
         gains = feedback if len(feedback) else -self.gains(*prediction.stages[:2], prediction.cost)
         return np.ascontiguousarray(gains[:, :, : self.problem.state_dim])
 
-    def gain(self, stages: Stages, cost: QuadraticCost) -> Array:
-        """K (m, n) of the feedback u = u_k - K (x - mu_k) at the first stage; zero without feedback."""
-        return self.gains(stages.A[:1], stages.B[:1], cost)[0]
-
     def gains(self, A: Array, B: Array, cost: QuadraticCost) -> Array:
         """K_0 .. K_{H-1} (H, m, n) of the feedback u = u_k - K_k (x - mu_k), weighed as at the first stage; or zero."""
         (m, n), Z = (self.problem.input_dim, self.problem.state_dim), cost.squares
@@ -331,8 +324,8 @@ class PredictionModel:
         """Sigma_1 .. Sigma_H (H, n, n) along a first guess, linearised at its points."""
         stages = self._at_points(means[:-1], inputs, np.zeros((self.horizon, *request.covariance.shape)))
         covariances = np.empty((self.horizon + 1, *request.covariance.shape))
-        gain = self.gain(stages, self.costs.quadratic)
-        _predict_covariances(stages.A, stages.B, stages.V, request.covariance, gain, covariances)
+        K = self.gains(stages.A[:1], stages.B[:1], self.costs.quadratic)[0]
+        _predict_covariances(stages.A, stages.B, stages.V, request.covariance, K, covariances)
         return covariances[1:]
 
     def _disturbance(self, request: Request) -> Array:

@@ -95,8 +95,8 @@ class ManyStarts:
             angles = self.problem.cost.angles
             belief = replace(belief, mean=belief.mean - torch.as_tensor(full_turns(state - previous.means[1], angles)))
             goal = _moved(reference, full_turns(previous.means[-1] - reference.states[-1], angles))
-            shifted = (np.concatenate([part[1:], part[-1:]]) for part in (previous.means, previous.inputs))
-            best, lowest = self._try(self.controller, belief, goal, previous, parameters, *shifted)
+            shifted = tuple(np.concatenate([part[1:], part[-1:]]) for part in (previous.inputs, previous.means))
+            best, lowest = self._try(self.controller, belief, goal, previous, parameters, shifted)
             if best.applicable and lowest <= self.limit:
                 return best
         begin, last = perf_counter(), None if previous is None else replace(previous, solution=None)
@@ -122,7 +122,7 @@ class ManyStarts:
         """
         candidates = self._candidates(belief.mean.numpy(), reference.over(self.horizon))
         for goal, guess in islice(candidates, first, None):
-            yield self._try(self.planner, belief, goal, previous, parameters, *guess)
+            yield self._try(self.planner, belief, goal, previous, parameters, guess)
 
     def __len__(self) -> int:
         return len(self.guesses) * math.prod(self.turns)
@@ -137,31 +137,22 @@ class ManyStarts:
         references = References(np.asarray(reference.states[1:]), wanted, decision.inputs[0])
         return evaluate_cost(self._weights, decision.means, decision.inputs, references, 1.0)
 
-    def _try(
-        self,
-        controller: GPMPC,
-        belief: Gaussian,
-        goal: Reference,
-        previous: Decision | None,
-        parameters: Any,
-        states: Array,
-        inputs: Array,
-    ) -> tuple[Decision, float]:
-        """A decision from a guess, and its criterion: infinite where it is not applicable."""
-        decision = controller.control(belief, goal, previous, parameters, (inputs, states))
+    def _try(self, controller: GPMPC, belief: Gaussian, goal: Reference, *more: Any) -> tuple[Decision, float]:
+        """A controller's decision on its arguments, and its criterion: infinite where it is not applicable."""
+        decision = controller.control(belief, goal, *more)
         value = self.criterion(decision, goal) if decision.applicable else inf
         return decision, value if np.isfinite(value) else inf
 
     def _candidates(self, state: Array, reference: Reference) -> Iterator[tuple[Reference, tuple[Array, Array]]]:
-        """Goals and guesses, guess by guess, the nearest goals first."""
+        """Goals and guesses, inputs and states, guess by guess, the nearest goals first."""
         goals, H = list(self._goals(state, reference)), self.horizon
         for guess, goal in product(self.guesses, goals):
             if guess is None:
                 shares, targets = np.linspace(1.0, 0.0, H + 1)[:, None], goal.states
-                yield goal, (targets + shares * (state - targets[0]), np.tile(self.initial_input, (H, 1)))
+                yield goal, (np.tile(self.initial_input, (H, 1)), targets + shares * (state - targets[0]))
             else:
                 states = self._rolled_out.open_loop(state[None], np.asarray(guess, dtype=float)[None])[0]
-                yield goal, (states if np.isfinite(states).all() else np.tile(state, (H + 1, 1)), guess)
+                yield goal, (guess, states if np.isfinite(states).all() else np.tile(state, (H + 1, 1)))
 
     def _goals(self, state: Array, reference: Reference) -> Iterator[Reference]:
         angles, moves = list(self.problem.cost.angles), []

@@ -100,16 +100,9 @@ class NMPC:
         inputs = found["x"][H * n : H * (n + m)].reshape(H, m)
         status = _STATUSES.get(stats["return_status"], Status.NUMERICAL_TROUBLE)
         violation = np.max([np.maximum(lower[key] - at, at - upper[key]).max() for key, at in found.items()])
-        return Decision(
-            input=inputs[0],
-            inputs=inputs,
-            means=means,
-            covariances=np.zeros((H + 1, n, n)),
-            status=status,
-            iterations=stats["iter_count"],
-            timing=Timing(0.0, 0.0, perf_counter() - start),
-            suboptimal=status not in (Status.SOLVED, Status.INFEASIBLE) and bool(violation <= FEASIBLE),
-        )
+        suboptimal = status not in (Status.SOLVED, Status.INFEASIBLE) and bool(violation <= FEASIBLE)
+        ended = status, stats["iter_count"], Timing(solve=perf_counter() - start)
+        return Decision(inputs[0], inputs, means, np.zeros((H + 1, n, n)), *ended, suboptimal=suboptimal)
 
 
 class LQR:
@@ -159,16 +152,11 @@ class LQR:
             x, last = A @ x + B @ u + offset, u
             states.append(x)
             inputs.append(u)
-        finite = bool(np.isfinite(states).all() and np.isfinite(inputs).all())
-        return Decision(
-            input=inputs[0],
-            inputs=np.array(inputs),
-            means=np.array(states),
-            covariances=np.zeros((self.horizon + 1, len(x), len(x))),
-            status=Status.SOLVED if finite else Status.NUMERICAL_TROUBLE,
-            iterations=self.horizon,
-            timing=Timing(modelled - began, 0.0, perf_counter() - modelled),
-        )
+        means, inputs = np.array(states), np.array(inputs)
+        finite = np.isfinite(means).all() and np.isfinite(inputs).all()
+        status = Status.SOLVED if finite else Status.NUMERICAL_TROUBLE
+        timing = Timing(modelled - began, 0.0, perf_counter() - modelled)
+        return Decision(inputs[0], inputs, means, np.zeros((*means.shape, len(x))), status, self.horizon, timing)
 
 
 class StateFormMPC:
@@ -210,8 +198,7 @@ class StateFormMPC:
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
-            plan = self.prediction.initial_guess(request)
-            prediction = self.prediction.linearize(plan, request)
+            prediction = self.prediction.linearize(self.prediction.initial_guess(request), request)
             if not all(np.isfinite(part).all() for part in prediction.stages):
                 raise DataError("the stages are not finite")
         except FAILURES:
@@ -270,17 +257,10 @@ def _build(
         g.append(np.array([lower, upper]).reshape(2, -1))
         unknowns.append(casadi.vec(slack))
         box.append(np.tile([[0.0], [np.inf]], H * len(soft)))
-    nlp = {
-        "x": casadi.vertcat(*unknowns),
-        "p": casadi.vertcat(x0, last, casadi.vec(r), casadi.vec(wanted)),
-        "f": cost,
-        "g": casadi.vertcat(*constraints),
-    }
-    options: dict[str, Any] = {
-        "print_time": False,
-        "show_eval_warnings": False,
-        "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 500, "bound_relax_factor": 0.0},
-    }
+    nlp = {"x": casadi.vertcat(*unknowns), "f": cost, "g": casadi.vertcat(*constraints)}
+    nlp["p"] = casadi.vertcat(x0, last, casadi.vec(r), casadi.vec(wanted))
+    ipopt = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 500, "bound_relax_factor": 0.0}
+    options: dict[str, Any] = {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
     bounds = [{"x": np.hstack(box)[side], "g": np.hstack(g)[side]} for side in (0, 1)]
     return casadi.nlpsol("nmpc", "ipopt", nlp, options), bounds
 

@@ -77,9 +77,8 @@ class GPMPC:
         check_number("iterations", iterations, least=1, whole=True)
         check_number("tolerance", tolerance, above=0)
         if iterations > 1 and prediction.form != "trajectory":
-            raise SettingError(
-                "iterations", f"form {prediction.form!r} is one quadratic program, so 1; got {iterations}"
-            )
+            rule = f"form {prediction.form!r} is one quadratic program, so 1"
+            raise SettingError("iterations", f"{rule}; got {iterations}")
         self.initial_input, self.problem, self.horizon = self.prediction.initial_input, problem, horizon
         self.iterations, self.tolerance = iterations, tolerance
         self.solver = DualActiveSet() if solver is None else solver
@@ -90,10 +89,8 @@ class GPMPC:
         self._hard = np.where(np.isinf(self.prediction.constraints.prices), np.inf, 0.0)  # prices: of hard rows alone
         self._prices = self.prediction.constraints.all_prices(self._rates)
         if self._prices is not None and not isinstance(self.solver, DualActiveSet):
-            got = (
-                f"soft constraints need DualActiveSet (penalty=None makes them hard); got {type(self.solver).__name__}"
-            )
-            raise SettingError("solver", got)
+            rule = "soft constraints need DualActiveSet (penalty=None makes them hard)"
+            raise SettingError("solver", f"{rule}; got {type(self.solver).__name__}")
 
     def control(
         self,
@@ -144,7 +141,9 @@ class GPMPC:
             clock.lap("solve")
             count, status = count + 1, solution.status
             if _is_usable(program, solution, prediction.plan):
-                proposed = self._proposed(prediction, program, solution, request)
+                at = prediction.stages, prediction.plan.states[0], program.feedback, request.references.previous_input
+                inputs, states = call_unchecked(expand, *at, np.ascontiguousarray(solution.x, dtype=np.float64))
+                proposed = Plan(states, inputs, prediction.covariances)
                 solved_at = prediction, program.feedback
                 if search is None:  # the real-time iteration takes the whole step
                     prediction = prediction._replace(plan=proposed)
@@ -258,15 +257,6 @@ class GPMPC:
         fits = warm is not None and warm.arrays[2].shape == program.G.shape
         return self.solver.solve(QuadraticProgram.from_stacked(*program[:5]), warm if fits else None)
 
-    def _proposed(
-        self, prediction: Prediction, program: CondensedProgram, solution: QPSolution, request: Request
-    ) -> Plan:
-        """The plan of a program's solution: its inputs, and the states that the stages lead to."""
-        at = prediction.stages, prediction.plan.states[0], program.feedback
-        unknowns = np.ascontiguousarray(solution.x, dtype=np.float64)
-        inputs, states = call_unchecked(expand, *at, request.references.previous_input, unknowns)
-        return Plan(states, inputs, prediction.covariances)
-
 
 def _status_of(error: Exception) -> Status:
     return Status.FUNCTION_NOT_FINITE if isinstance(error, FunctionNotFinite) else Status.NUMERICAL_TROUBLE
@@ -297,9 +287,8 @@ def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> b
     """Whether a program was solved, or its solver stopped at a limit at a feasible point no worse than the plan."""
     if solution.status.solved:
         return True
-    if solution.status not in (Status.ITERATION_LIMIT, Status.TIME_LIMIT) or not np.isfinite(solution.x).all():
-        return False
-    if not _violation(solution) <= FEASIBLE:
+    stopped = solution.status in (Status.ITERATION_LIMIT, Status.TIME_LIMIT) and np.isfinite(solution.x).all()
+    if not (stopped and _violation(solution) <= FEASIBLE):
         return False
     other = solution._replace(x=0.0 * solution.x if len(program.feedback) else plan.inputs.ravel())
     return solution.objective <= other.objective or _violation(other) > FEASIBLE

@@ -283,5 +283,5 @@ class Problem:
         """Returns the price of violating a constraint, infinite for a hard one."""
         if constraint.penalty != "exact":
             return math.inf if constraint.penalty is None else float(constraint.penalty)
-        weights = [self.cost.largest_weight, *(np.linalg.eigvalsh(part.weight).max() for part in self.outputs)]
-        return _EXACT * float(max(weights))
+        weights = self.cost.Q, self.cost.terminal, self.cost.R, *(part.weight for part in self.outputs)
+        return _EXACT * float(max(np.linalg.eigvalsh(weight).max() for weight in weights))

@@ -1,7 +1,7 @@
 """Gaussian beliefs pushed through learned models, and the local models that control needs of that."""
 
 from gpmpc.propagation._linearization import Linearization, MeanEquivalence
-from gpmpc.propagation._local_model import LocalModel, linearize, rollout
+from gpmpc.propagation._local_model import linearize, rollout
 from gpmpc.propagation._moment_matching import MomentMatching, best_propagator
 from gpmpc.propagation._monte_carlo import MonteCarlo
 from gpmpc.propagation._propagator import Propagation, Propagator
@@ -10,7 +10,6 @@ from gpmpc.propagation._unscented import Unscented
 
 __all__ = [
     "Linearization",
-    "LocalModel",
     "MeanEquivalence",
     "MomentMatching",
     "MonteCarlo",

@@ -17,7 +17,7 @@ from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.gp._backend import host_arrays
-from gpmpc.propagation._propagator import Propagation, Propagator, checked_input, projected
+from gpmpc.propagation._propagator import NoisyPropagator, Propagation, checked_input
 from gpmpc.propagation._sensitivity import Sensitivity
 
 
@@ -70,18 +70,10 @@ def _by_torch(model: GPPosterior, state: Tensor, input: Tensor) -> list[Tensor]:
     return [weighted.sum(-1), variance, *parts]
 
 
-class Linearization(Propagator):
-    """First order.
+class Linearization(NoisyPropagator):
+    """First order; ``process_noise=True`` adds the model's noise covariance."""
 
-    Args:
-        process_noise: Adds the model's noise covariance.
-    """
-
-    first_order = True
-    """Mean, derivatives and variance of the model at the belief's mean are all that it takes."""
-
-    def __init__(self, process_noise: bool = False):
-        self.process_noise = process_noise
+    first_order = True  #: mean, derivatives and variance of the model at the belief's mean are all that it takes
 
     def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``."""
@@ -94,8 +86,7 @@ class Linearization(Propagator):
     ) -> tuple[Propagation, Sensitivity] | None:
         """``propagate`` with all derivatives in closed form; None where the model has none."""
         input = checked_input(model, belief, input)
-        expansion = expand(model, belief.mean, input)
-        if expansion is None:
+        if (expansion := expand(model, belief.mean, input)) is None:
             return None
         A = expansion.A
         AS = A @ belief.covariance
@@ -114,33 +105,24 @@ class Linearization(Propagator):
 
     def _propagation(self, model: Any, belief: Gaussian, at_mean: Gaussian, A: Tensor) -> Propagation:
         S = belief.covariance
-        moments = at_mean.mean, at_mean.covariance + A @ S @ A.mT, S @ A.mT
-        return projected(moments, model.noise_covariance if self.process_noise else None)
+        return self._projected(model, at_mean.mean, at_mean.covariance + A @ S @ A.mT, S @ A.mT)
 
 
-class MeanEquivalence(Propagator):
-    """The prediction at the belief's mean: the uncertainty of the state is dropped.
-
-    Args:
-        process_noise: Adds the model's noise covariance.
-    """
-
-    def __init__(self, process_noise: bool = False):
-        self.process_noise = process_noise
+class MeanEquivalence(NoisyPropagator):
+    """The prediction at the belief's mean, as ``Linearization`` but without the uncertainty of the state."""
 
     def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``. State and next state come out uncorrelated."""
         moved = model.predict(belief.mean, checked_input(model, belief, input))
         cross = torch.zeros_like(belief.mean[..., :, None].expand(*belief.mean.shape, moved.dim))
-        return projected((moved.mean, moved.covariance, cross), model.noise_covariance if self.process_noise else None)
+        return self._projected(model, moved.mean, moved.covariance, cross)
 
     def differentiate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity] | None:
         """``propagate`` with all derivatives in closed form; None where the model has none."""
         certain = Gaussian(belief.mean, torch.zeros_like(belief.covariance))
-        found = Linearization(process_noise=self.process_noise).differentiate(model, certain, input)
-        if found is None:
+        if (found := Linearization(self.process_noise).differentiate(model, certain, input)) is None:
             return None
         moved, d = found
         return moved, replace(d, covariance_by_covariance=torch.zeros_like(d.covariance_by_covariance))

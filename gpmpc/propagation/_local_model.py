@@ -50,13 +50,8 @@ def square_roots(covariances: Array) -> tuple[Array, Array, Array]:
 def linearize(propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None) -> LocalModel:
     """Linearises the next belief at a belief and an input, or along a plan when both have a leading dimension H.
 
-    A local model is a constant: no gradient flows through it, and torch's function transforms do not apply.
-
-    Args:
-        propagator: How the belief moves.
-        model: A ``DynamicsModel``.
-        belief: Mean (*batch, n), covariance (*batch, n, n).
-        input: (*batch, m); may be left out where m = 0.
+    A local model is a constant: no gradient flows through it, and torch's function transforms do not apply. Arguments
+    are those of ``differentiate``.
     """
     belief = Gaussian(belief.mean.detach(), belief.covariance.detach())
     input = belief.mean[..., :0] if input is None else input.detach()
@@ -93,11 +88,7 @@ def _congruence(U: Array, X: Array) -> Array:
 def rollout(propagator: Propagator, model: Any, belief: Gaussian, inputs: Tensor) -> Gaussian:
     """The beliefs at steps 1 to H: mean (*batch, H, n), covariance (*batch, H, n, n).
 
-    Args:
-        propagator: How the belief moves.
-        model: A ``DynamicsModel``.
-        belief: At step 0 (*batch).
-        inputs: (*batch, H, m); an autonomous model takes (*batch, H, 0).
+    From a belief at step 0 (*batch) and inputs (*batch, H, m); an autonomous model takes (*batch, H, 0).
     """
     check_tensors(inputs=inputs)
     if inputs.dim() < 2 or not inputs.shape[-2]:
@@ -106,6 +97,5 @@ def rollout(propagator: Propagator, model: Any, belief: Gaussian, inputs: Tensor
     for control in inputs.unbind(-2):
         belief = propagator(model, belief, control)
         beliefs.append(belief)
-    return Gaussian(
-        torch.stack([b.mean for b in beliefs], dim=-2), torch.stack([b.covariance for b in beliefs], dim=-3)
-    )
+    covariance = torch.stack([b.covariance for b in beliefs], dim=-3)
+    return Gaussian(torch.stack([b.mean for b in beliefs], dim=-2), covariance)

@@ -54,7 +54,10 @@ class _OutputTerms(NamedTuple):
 def moments(
     model: GPPosterior, belief: Gaussian, input: Tensor, diagonal: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """M (*batch, k), V (*batch, k, k) and J = E[df/dx] (*batch, k, n) of the latent functions f; the module's text."""
+    """M (*batch, k), V (*batch, k, k) and J = E[df/dx] (*batch, k, n) of the latent functions f; the module's text.
+
+    ``diagonal`` leaves the covariances between outputs at zero.
+    """
     at = belief.mean[..., None, :], belief.covariance[..., None, :, :], input[..., None, :]
     terms, pairs = _output_terms(model, slice(None), *at), _chunks(model, belief, diagonal)
     weighted = model.weights * terms.q
@@ -66,18 +69,10 @@ def moments(
 def moments_with_jacobian(
     model: GPPosterior, belief: Gaussian, input: Tensor, diagonal: bool = False, cross: bool = True
 ) -> Latent:
-    """The moments of f at x ~ N(mu, S), and their derivatives by mu, S and u.
-
-    Args:
-        model: The GPs.
-        belief: Over the states that they depend on (*batch).
-        input: (*batch, m).
-        diagonal: Leaves the covariances between outputs at zero.
-        cross: Adds the derivatives of J.
-    """
+    """The moments of f at x ~ N(mu, S), and their derivatives by mu, S and u; ``cross`` adds those of J."""
     n, axis = model.state_dim, belief.mean.dim() - 1
     at = belief.mean[..., None, :], belief.covariance[..., None, :, :], input[..., None, :]
-    terms = _output_terms(model, slice(None), *at)
+    terms, pairs = _output_terms(model, slice(None), *at), _chunks(model, belief, diagonal)
     w = terms.z @ terms.G  # dlog q_ai / dmu
     c = (model.features[:, n:] - input[..., None, :])[..., None, :, :] * model.lengthscales[:, None, n:] ** -2
     A = terms.G.mT * model.lengthscales[:, None, :n] ** -2  # G' D, symmetric
@@ -90,7 +85,6 @@ def moments_with_jacobian(
         third = third - J[..., :, None, None] * A[..., None, :, :]
         third = third - A[..., :, :, None] * J[..., None, None, :] - A[..., :, None, :] * J[..., None, :, None]
         dJ = third / 2, once.mT @ c
-    pairs = _chunks(model, belief, diagonal)
     with torch.inference_mode(False):
         parts = [_pair_entries_with_gradient(model, ab, at, axis) for ab in pairs]
     V, dV_dmu, dV_dS, dV_du = (_symmetric_from_pairs(part, pairs, axis) for part in zip(*parts, strict=True))

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from gpmpc.exceptions import check_number
 from gpmpc.gaussian import Gaussian, square_root
-from gpmpc.propagation._propagator import Propagation, Propagator, checked_input, projected
+from gpmpc.propagation._propagator import NoisyPropagator, Propagation, checked_input
 
 _CHUNK = 1000  # samples predicted at once: bounds the memory at about chunk * N * outputs numbers
 
 
-class MonteCarlo(Propagator):
+class MonteCarlo(NoisyPropagator):
     """Sampling; the same seed gives the same samples at every call.
 
     Args:
@@ -32,7 +32,8 @@ class MonteCarlo(Propagator):
     def __init__(self, samples: int = 10_000, seed: int = 0, process_noise: bool = False):
         check_number("samples", samples, least=2, whole=True)
         check_number("seed", seed, least=0, whole=True)
-        self.samples, self.seed, self.process_noise = samples, seed, process_noise
+        super().__init__(process_noise)
+        self.samples, self.seed = samples, seed
 
     def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``."""
@@ -51,4 +52,4 @@ class MonteCarlo(Propagator):
         centred = states - mean[..., None, :]
         covariance = centred.mT @ centred / (self.samples - 1) + spread / self.samples
         cross = (steps - steps.mean(-2, keepdim=True)).mT @ centred / (self.samples - 1)
-        return projected((mean, covariance, cross), model.noise_covariance if self.process_noise else None)
+        return self._projected(model, mean, covariance, cross)

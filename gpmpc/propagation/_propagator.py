@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import check_query
+from gpmpc._dynamics import check_query, constant_arrays
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian, check_tensors, nearest_positive_semidefinite
 
@@ -51,17 +51,22 @@ class Propagator(Protocol):
         return self.propagate(model, belief, input).belief
 
 
-def projected(
-    moments: tuple[Tensor, Tensor, Tensor], process_noise: Tensor | None, diagonal: bool = False
-) -> Propagation:
-    """Adds the process noise, if any, to mean, covariance and Cov[x, x+], and projects the covariance."""
-    mean, covariance, cross = moments
-    if process_noise is not None:
-        covariance = covariance + process_noise
-    if diagonal:
-        covariance = torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1))
-    covariance, deficit = nearest_positive_semidefinite(covariance)
-    return Propagation(Gaussian(mean, covariance), cross, deficit)
+class NoisyPropagator(Propagator):
+    """A propagator that adds the model's noise covariance to the predicted one where it is asked to."""
+
+    diagonal = False  #: whether only the diagonal of the predicted covariance is kept
+
+    def __init__(self, process_noise: bool = False):
+        self.process_noise = process_noise
+
+    def _projected(self, model: Any, mean: Tensor, covariance: Tensor, cross: Tensor) -> Propagation:
+        """Adds the process noise, if any, and projects the covariance; ``cross`` is Cov[x, x+]."""
+        if self.process_noise:
+            covariance = covariance + model.noise_covariance
+        if self.diagonal:
+            covariance = torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1))
+        covariance, deficit = nearest_positive_semidefinite(covariance)
+        return Propagation(Gaussian(mean, covariance), cross, deficit)
 
 
 def checked_input(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
@@ -78,9 +83,7 @@ def checked_input(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
     check_query(model, belief.mean, input)
     if belief.covariance.dtype != belief.mean.dtype or belief.covariance.device != belief.mean.device:
         raise SettingError("belief", "mean and covariance must have the same dtype and device")
-    try:
-        arrays = belief.mean.numpy(), belief.covariance.numpy(), input.numpy()
-    except (RuntimeError, TypeError):  # part of a graph, inside a transform, or on another device
+    if (arrays := constant_arrays(belief.mean, belief.covariance, input)) is None:
         return input
     for name, array in zip(("the belief's mean", "the belief's covariance", "the input"), arrays, strict=True):
         if not np.isfinite(array).all():
@@ -90,8 +93,7 @@ def checked_input(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
 
 
 def _check_semidefinite(covariance: np.ndarray) -> None:
-    largest = np.abs(covariance).max(initial=0.0)
-    if not largest:
+    if not (largest := np.abs(covariance).max(initial=0.0)):
         return
     round_off = np.finfo(covariance.dtype).eps ** 0.5 * largest
     gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max()

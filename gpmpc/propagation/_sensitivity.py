@@ -73,8 +73,7 @@ def by_autograd(
     batch = belief.mean.shape[:-1]
 
     def step(mean: Tensor, covariance: Tensor, control: Tensor) -> tuple[Tensor, ...]:
-        at = Gaussian(mean, covariance.unflatten(-1, (n, n)))
-        out = propagator.propagate(model, at, control)
+        out = propagator.propagate(model, Gaussian(mean, covariance.unflatten(-1, (n, n))), control)
         entries = torch.cat([out.belief.mean, out.belief.covariance[..., rows, columns]], dim=-1)
         return entries, out.belief.mean, out.belief.covariance, out.cross_covariance, out.deficit
 
@@ -85,14 +84,7 @@ def by_autograd(
     by_covariance = (by_covariance + by_covariance.mT) / 2
     whole = torch.zeros(k, k, dtype=torch.long, device=rows.device)
     whole[rows, columns] = whole[columns, rows] = torch.arange(len(rows), device=rows.device) + k
-    mean_parts = [part[..., :k, :] for part in (by_mean, by_input)]
-    covariance_parts = [part[..., whole.flatten(), :].unflatten(-2, (k, k)) for part in (by_mean, by_input)]
-    sensitivity = Sensitivity(
-        mean_parts[0],
-        by_covariance[..., :k, :, :],
-        mean_parts[1],
-        covariance_parts[0],
-        by_covariance[..., whole.flatten(), :, :].unflatten(-3, (k, k)),
-        covariance_parts[1],
-    )
-    return Propagation(Gaussian(values[1], values[2]), values[3], values[4]), sensitivity
+    of_mean = by_mean[..., :k, :], by_covariance[..., :k, :, :], by_input[..., :k, :]
+    of_covariance = by_mean[..., whole, :], by_covariance[..., whole, :, :], by_input[..., whole, :]
+    moved = Propagation(Gaussian(values[1], values[2]), values[3], values[4])
+    return moved, Sensitivity(*of_mean, *of_covariance)

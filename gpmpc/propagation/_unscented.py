@@ -15,11 +15,11 @@ from torch import Tensor
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian, square_root, square_root_differential
 from gpmpc.propagation._linearization import expand
-from gpmpc.propagation._propagator import Propagation, Propagator, checked_input, projected
+from gpmpc.propagation._propagator import NoisyPropagator, Propagation, checked_input
 from gpmpc.propagation._sensitivity import Sensitivity
 
 
-class Unscented(Propagator):
+class Unscented(NoisyPropagator):
     """The unscented transform.
 
     Args:
@@ -36,7 +36,8 @@ class Unscented(Propagator):
         check_number("alpha", alpha, above=0)
         check_number("beta", beta)
         check_number("kappa", kappa)
-        self.alpha, self.beta, self.kappa, self.process_noise = alpha, beta, kappa, process_noise
+        super().__init__(process_noise)
+        self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
     def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``."""
@@ -55,8 +56,7 @@ class Unscented(Propagator):
         r, U = torch.linalg.eigh(belief.covariance)
         r = r.clamp_min(0).sqrt()
         steps, points, controls = self._points(belief, U @ (r[..., :, None] * U.mT), input)
-        expansion = expand(model, points, controls)
-        if expansion is None:
+        if (expansion := expand(model, points, controls)) is None:
             return None
         of_mean, of_covariance = self._weights(belief)
 
@@ -115,7 +115,4 @@ class Unscented(Propagator):
         centred = moved.mean - mean[..., None, :]
         covariance = centred.mT @ (of_covariance[:, None] * centred)
         covariance = covariance + (of_mean[:, None, None] * moved.covariance).sum(-3)
-        return projected(
-            (mean, covariance, steps.mT @ (of_mean[1] * centred)),
-            model.noise_covariance if self.process_noise else None,
-        )
+        return self._projected(model, mean, covariance, steps.mT @ (of_mean[1] * centred))

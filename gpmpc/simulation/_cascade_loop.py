@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.exceptions import ShapeError, check_choice, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, Reference
 from gpmpc.mpc._policy import Command, OnFailure, check_policy, command
@@ -43,18 +43,15 @@ class Cascade:
 
     def __post_init__(self) -> None:
         check_number("ratio", self.ratio, least=1, whole=True)
-        if self.attitude not in ATTITUDES:
-            raise SettingError("attitude", f"must be one of {', '.join(ATTITUDES)}; got {self.attitude!r}")
+        check_choice("attitude", self.attitude, ATTITUDES)
         check_number("response_time", self.response_time, above=0, unit="[s]")
 
     def attitude_reference(self, planned: np.ndarray, angles: np.ndarray, phase: int) -> Reference:
         """What the inner controller is to follow over its horizon, with no moments as the inputs that belong to it.
 
-        Args:
-            planned: The outer plan's inputs from the current outer step on (H, 3); the inner horizon looks beyond the
-                first where it reaches the next outer step, and holds the last.
-            angles: Roll, pitch and yaw now (3,) [rad]; yaw is to be zero.
-            phase: Inner steps since the outer step began.
+        It is asked ``phase`` inner steps after the outer step began, at roll, pitch and yaw (3,) [rad]; yaw is to be
+        zero. ``planned`` are the outer plan's inputs from that step on (H, 3): the inner horizon looks beyond the first
+        where it reaches the next outer step, and holds the last.
         """
         ahead = phase + np.arange(self.inner.horizon + 1)
         direction = planned[np.minimum(ahead // self.ratio, len(planned) - 1)]
@@ -88,20 +85,12 @@ def cascade_loop(
     seed: int = 0,
     on_step: Callable[[Literal["outer", "inner"], Step], None] | None = None,
 ) -> CascadeRollout:
-    """Flies a cascade; what is not named here is as in ``closed_loop``.
+    """Flies a cascade over K outer ``steps``; arguments are those of ``closed_loop``, at two rates.
 
-    Args:
-        plant: The twelve states at the inner rate, such as ``gpmpc.systems.coupled()``.
-        cascade: The controllers.
-        references: Of the outer loop: states x, vx, y, vy, z, vz (steps + horizon, 6) or more, one an outer step; as a
-            ``Reference`` with the inputs that belong to them.
-        initial: The state (12,), or the ``Gaussian`` that it is drawn from.
-        steps: K, outer steps.
-        noise: On states, measurements and inputs, every inner step.
-        disturbances: What the controllers do not know of.
-        on_failure: Of either controller.
-        seed: Of all random numbers.
-        on_step: Called with the loop and its step: of the outer one as it begins, of the inner one as it ends.
+    The ``plant`` has the twelve states at the inner rate, such as ``gpmpc.systems.coupled()``; ``initial`` is a state
+    (12,) or a ``Gaussian``. ``references`` are of the outer loop, states x, vx, y, vy, z, vz (steps + horizon, 6) or
+    more, one an outer step. Noise acts every inner step. ``on_step`` is called with the loop and its step: of the outer
+    one as it begins, of the inner one as it ends.
 
     Raises:
         ShapeError: The plant has other states, or references are too few.

@@ -105,23 +105,15 @@ def closed_loops(
     on_failure: OnFailure = "raise",
     chunk: int | None = None,
 ) -> list[Trial]:
-    """Flies a controller on a plant with many seeds at once; what is not named here is as in ``closed_loop``.
+    """Flies a controller on a plant with many seeds at once; arguments are those of ``closed_loop``, and two more.
 
-    Args:
-        plant: What is steered; its right-hand side is evaluated on arrays, an entry a trial.
-        controller: Of all trials; a ``GPMPC`` decides for them together, any other one by one.
-        references: Of all trials.
-        initial: The state (n,), or the ``Gaussian`` that every trial's is drawn from.
-        steps: K.
-        seeds: One a trial; a number stands for 0 .. seeds - 1.
-        noise: On states, measurements and inputs.
-        disturbances: What the controller does not know of.
-        on_failure: With ``"raise"`` a trial whose solve fails ends, and the others fly on.
-        chunk: How many trials fly at a time; as many as the controller has a gigabyte for by default.
+    ``seeds`` are one a trial; a number stands for 0 .. seeds - 1. ``chunk`` says how many trials fly at a time, by
+    default as many as the controller has a gigabyte for. The plant's right-hand side is evaluated on arrays, an entry a
+    trial; a ``GPMPC`` decides for all trials together, any other controller one by one.
 
     Returns:
-        One ``Trial`` a seed, in their order; those whose solve failed or whose plant diverged have an error instead of
-        a ``Rollout``.
+        One ``Trial`` a seed, in their order; those whose solve failed (with ``on_failure="raise"``) or whose plant
+        diverged have an error instead of a ``Rollout``, and the others fly on.
 
     Raises:
         SettingError: No seeds or equal ones; a model loop, in which a seed changes nothing; or no ``chunk`` where the

@@ -109,15 +109,7 @@ def fly(
 
 
 class History:
-    """Collects the steps of one loop for its ``Rollout``.
-
-    Args:
-        simulator: What is flown.
-        references: Of the steps, and of the end where there are so many.
-        time_step: [s].
-        states: Which of the simulator's states these are.
-        on_step: Called with every step.
-    """
+    """Collects the steps of one loop, of some of the simulator's ``states``, for its ``Rollout``."""
 
     def __init__(
         self,

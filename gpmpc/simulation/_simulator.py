@@ -190,20 +190,10 @@ class Noise:
 
 
 class PlantSimulator:
-    """Simulates a plant with disturbances and noise.
+    """Simulates a plant with noise and disturbances, each of which changes what the one before left.
 
-    Args:
-        plant: What the controller believes in, and what is there where no disturbance says otherwise.
-        initial: The state (n,), or a belief that it is drawn from; None where the plant is a simulator, which then
-            starts an episode.
-        disturbances: Each changes the plant, and the measurement, that the one before left.
-        noise: On states, measurements and inputs.
-        seed: Of all random numbers.
-
-    Raises:
-        ShapeError: State or noise do not fit the plant.
-        SettingError: The seed is no whole number, the state is not finite, or plant, noise or disturbances are of
-            another kind.
+    ``initial`` is a state (n,), or a belief that it is drawn from; None where the plant is a simulator, which then
+    starts an episode.
     """
 
     def __init__(self, plant: Plant, initial: Any, disturbances: Any = (), noise: Noise | None = None, seed: int = 0):
@@ -231,10 +221,10 @@ class PlantSimulator:
             if not getattr(dynamics, "stateful", False):
                 raise SettingError("initial", "must be a state; a simulator alone starts by itself")
             initial = dynamics.reset(seed)
-        belief = initial if isinstance(initial, Gaussian) else None
-        self.mean, self.covariance = _check_state(initial if belief is None else belief.mean, n), np.zeros((n, n))
-        if belief is not None:
-            covariance = np.asarray(belief.covariance, dtype=float)
+        drawn = isinstance(initial, Gaussian)
+        self.mean, self.covariance = _check_state(initial.mean if drawn else initial, n), np.zeros((n, n))
+        if drawn:
+            covariance = np.asarray(initial.covariance, dtype=float)
             self.mean = self._streams["initial"].multivariate_normal(self.mean, covariance)
         self._disturbed_plant(0.0)  # a disturbance that does not fit is found before the first step
 
@@ -252,9 +242,8 @@ class PlantSimulator:
         return plant
 
     def _applied_input(self, input: Array) -> Array:
-        m = len(self.plant.dynamics.input_names)
-        if np.shape(input) != (m,):
-            raise ShapeError(f"the plant takes inputs of shape ({m},); got {np.shape(input)}")
+        if np.shape(input) != (shape := (len(self.plant.dynamics.input_names),)):
+            raise ShapeError(f"the plant takes inputs of shape {shape}; got {np.shape(input)}")
         return self._add_noise("input", input)
 
     def _arrive(self, state: Array, applied: Array) -> Array | Diverged:
@@ -281,11 +270,11 @@ class ModelSimulator:
     def __init__(self, loop: ModelLoop, initial: Any):
         self.loop, self._steps = loop, 0
         model, n = loop.model, loop.model.state_dim
-        mean, covariance = initial, loop.initial_std**2 * torch.eye(n, dtype=model.dtype)
+        to: Any = {"device": model.device, "dtype": model.dtype}
+        mean, covariance = initial, loop.initial_std**2 * torch.eye(n, **to)
         if isinstance(initial, Gaussian):
             mean, covariance = initial.mean, initial.covariance
-        mean = torch.as_tensor(_check_state(mean, n))
-        self._belief = Gaussian(mean.to(model.device, model.dtype), covariance.to(model.device, model.dtype))
+        self._belief = Gaussian(torch.as_tensor(_check_state(mean, n), **to), covariance.to(**to))
 
     @property
     def mean(self) -> Array:
@@ -303,8 +292,7 @@ class ModelSimulator:
 
     def step(self, input: Array) -> Array | Diverged:
         """Carries the belief one step on; returns the input, or why it cannot go on."""
-        like = self._belief.mean
-        control = torch.as_tensor(np.asarray(input, dtype=float)).to(like.device, like.dtype)
+        control = torch.as_tensor(np.asarray(input, dtype=float)).to(self._belief.mean)
         belief = self.loop.propagator(self.loop.model, self._belief, control)
         if not bool(torch.isfinite(belief.mean).all() and torch.isfinite(belief.covariance).all()):
             return Diverged(self._steps, f"the model's belief is not finite any more; its mean is {belief.mean}")

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.exceptions import SettingError, check_number, check_numbers
+from gpmpc.exceptions import check_choice, check_number, check_numbers
 from gpmpc.systems._system import GRAVITY, System, cos, sin
 from gpmpc.trajectories import Trajectory
 
@@ -220,23 +220,13 @@ def attitude_for_thrust_direction(
     """Roll and pitch that point the thrust along (ux, uy) at a yaw psi; Cao, Lai and Alam (2017), eq. (2) inverted.
 
     Turned by -psi, eq. (2) is that of psi = 0, where ux = cos(phi) sin(theta) and uy = -sin(phi) give phi = -asin(uy)
-    and theta = asin(ux / cos(phi)). The authors' data hold theta = sign(phi) asin(ux) instead. Arguments outside
-    [-1, 1] saturate.
+    and theta = asin(ux / cos(phi)). The authors' data hold theta = sign(phi) asin(ux) instead, which the convention
+    ``"paper"`` takes in the place of ``"exact"``.
 
-    Args:
-        ux: Thrust direction along x, any shape [-].
-        uy: Thrust direction along y, same shape [-].
-        psi: [rad]
-        convention: ``"exact"``, or ``"paper"`` for the authors' formula.
-
-    Returns:
-        Roll and pitch [rad], stacked along a new last axis of length 2.
-
-    Raises:
-        SettingError: The convention is neither of the two.
+    ux and uy [-] are of one shape, and saturate at 1 and -1; psi is in [rad]. The result is roll and pitch [rad], along
+    a new last axis of length 2. ``SettingError`` where the convention is neither of the two.
     """
-    if convention not in ATTITUDES:
-        raise SettingError("attitude", f"must be 'paper' or 'exact'; got {convention!r}")
+    check_choice("attitude", convention, ATTITUDES)
     ux, uy = ux * np.cos(psi) + uy * np.sin(psi), uy * np.cos(psi) - ux * np.sin(psi)
     phi = -np.arcsin(np.clip(uy, -1, 1))
     if convention == "paper":

@@ -49,8 +49,7 @@ class Simulator:
         state, input = numbers(x, u)
         if state.ndim != 1:
             raise SettingError("plant", "a simulator takes one step at a time; take closed_loop for each seed")
-        moved = self._now is None or not np.array_equal(state, self._now)
-        if moved and not self._set(state):
+        if (self._now is None or not np.array_equal(state, self._now)) and not self._set(state):
             what = "this simulator cannot be set to a state"
             raise SettingError("system", f"{what}: it takes no process noise and starts where it starts")
         self._now, self.ended = self._step(input)

@@ -100,12 +100,8 @@ class System:
         self._set("units", {name: self.units.get(name, UNKNOWN) for name in (*states, *inputs)})
         if not self.tracked:
             self._set("tracked", [name for name in states if self.units[name] == self.units[states[0]]])
-        for key, names in {
-            "angles": self.angles,
-            "tracked": self.tracked,
-            "rates": self.rates,
-            "pose": self.pose.values(),
-        }.items():
+        named = {"angles": self.angles, "tracked": self.tracked, "rates": self.rates, "pose": self.pose.values()}
+        for key, names in named.items():
             for name in names:
                 if name not in states:
                     raise SettingError(key, f"must name states, {', '.join(states)}; got {name!r}")
@@ -175,8 +171,7 @@ class System:
         """
         if hasattr(self.dynamics, "successor"):
             return list(self._check_length("successor", self.dynamics.successor(x, u)))
-        f, h = self.dynamics.derivative, self.time_step / self.substeps
-        n = len(self.dynamics.state_names)
+        f, h, n = self.dynamics.derivative, self.time_step / self.substeps, len(self.dynamics.state_names)
         x = [x[i] for i in range(n)]
         for _ in range(self.substeps):
             k1 = self._check_length("derivative", f(x, u))
@@ -209,9 +204,8 @@ class System:
         return states
 
     def _check_length(self, method: str, entries: Any) -> Any:
-        n = len(self.dynamics.state_names)
-        if not hasattr(entries, "__len__") or len(entries) != n:
-            got = f"{len(entries)}" if hasattr(entries, "__len__") else type(entries).__name__
+        got = len(entries) if hasattr(entries, "__len__") else type(entries).__name__
+        if got != (n := len(self.dynamics.state_names)):
             raise ShapeError(f"{method} must give {n} entries, one for each of state_names; got {got}")
         return entries
 
@@ -287,8 +281,7 @@ def _floats(key: str, values: Any, length: int) -> tuple[float, ...]:
     absent = {"input_lower": -inf, "input_upper": inf}.get(key)
     values = values.tolist() if isinstance(values, np.ndarray) else values
     if absent is not None and hasattr(values, "__len__"):
-        given = [0.0 if value is None or value == absent else value for value in values]
-        check_numbers(key, given, length)
+        check_numbers(key, [0.0 if value is None or value == absent else value for value in values], length)
         return tuple(absent if value is None else float(value) for value in values)
     check_numbers(key, values, length)
     return tuple(float(value) for value in values)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from math import pi
 from typing import Any, Literal
 
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc.exceptions import check_choice, check_number
 from gpmpc.systems._system import GRAVITY, System, cos, exp, sin
 
 
@@ -144,8 +144,7 @@ class DoublePendulum:
         for key in ("masses", "centres", "inertias"):
             for value in getattr(self, key):
                 check_number(key, value, above=0)
-        if self.actuated not in ("elbow", "shoulder"):
-            raise SettingError("actuated", f"must be 'elbow' or 'shoulder'; got {self.actuated!r}")
+        check_choice("actuated", self.actuated, ("elbow", "shoulder"))
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (shoulder, shoulder_rate, elbow, elbow_rate) [rad/s, rad/s^2]."""

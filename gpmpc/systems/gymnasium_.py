@@ -110,14 +110,10 @@ def gymnasium_system(
 
 
 def make_environment(system: System | str, **settings: Any) -> Any:
-    """Makes a gymnasium environment of a system whose observation is the state.
+    """Makes a gymnasium environment of a system, or of one of this package's by name and settings.
 
-    The reward is minus the squared distance of the tracked states from the goal; an episode ends where they are farther
-    from it than at the start, and than ``System.lost``.
-
-    Args:
-        system: Or the name of one of this package's.
-        settings: Of the one that is named.
+    The observation is the state. The reward is minus the squared distance of the tracked states from the goal; an
+    episode ends where they are farther from it than at the start, and than ``System.lost``.
     """
     gymnasium = library("gymnasium")
     flown: System = getattr(systems, system)(**settings) if isinstance(system, str) else system

@@ -250,7 +250,7 @@ def test_models_that_cannot_be_frozen_are_refused_with_the_reason(make, error, m
 
 
 def test_numbers_that_do_not_go_together_are_refused():
-    with pytest.raises(ShapeError, match="1 controls; got 3 features and 1 outputs"):
+    with pytest.raises(ShapeError, match="features must have n .* 1 controls; got 3 columns and 1 outputs"):
         KernelPosterior.from_gpytorch(one_output(10, MaternKernel()), input_dim=1)
     with pytest.raises(ShapeError, match="each model needs one likelihood; got 1 models and 2"):
         KernelPosterior.from_gpytorch(one_output(10, RBFKernel()), [GaussianLikelihood()] * 2, input_dim=1)

@@ -12,6 +12,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import (
     GPPosterior,
     Hyperparameters,
+    Scaling,
     SparseTrainer,
     Trainer,
     Transitions,
@@ -134,7 +135,9 @@ def posterior(by=0.0, targets_by=0.0, sparse=False, predicts="next_state"):
     }
     if sparse:
         hyperparameters = Hyperparameters(*(kernel.pop(name) for name in Hyperparameters._fields))
-        return sparse_posterior(x[:10] + by, x + by, y + targets_by, hyperparameters, **kernel)
+        offset = kernel.pop("offset")
+        gp = sparse_posterior(x[:10] + by, x + by, y + targets_by - offset, hyperparameters, **kernel)
+        return gp.unscaled(identity(x), Scaling(offset, torch.ones_like(offset)))
     return GPPosterior.from_hyperparameters(x + by, y + targets_by, **kernel)
 
 

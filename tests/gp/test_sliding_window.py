@@ -113,7 +113,7 @@ def test_a_batch_larger_than_the_window_is_cut_and_the_log_says_so(rule, caplog)
 def test_misuse_is_refused_with_the_rule():
     with pytest.raises(SettingError, match="points: must be a whole number, 1 or more; got 0"):
         SlidingWindow(0)
-    with pytest.raises(SettingError, match="'oldest' or 'least_informative'; got 'random'"):
+    with pytest.raises(SettingError, match="'oldest', 'least_informative'; got 'random'"):
         SlidingWindow(5, "random")
     with pytest.raises(ShapeError, match="2 states and 1 inputs; got transitions with 1 and 1"):
         SlidingWindow(5)(

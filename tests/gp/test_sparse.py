@@ -74,9 +74,9 @@ def test_with_every_point_as_inducing_point_it_is_the_exact_gp(method):
     offset, query = torch.tensor([0.5, -1.0]), problem(40, seed=1)[0]
     more = settings | {"input_dim": 1, "predicts": "value", "offset": offset}
     exact = GPPosterior.from_hyperparameters(x, y, **more).predict(query[:, :2], query[:, 2:])
-    frozen = sparse_posterior(x, x, y, Hyperparameters(**settings), 1, "value", offset, method)
+    frozen = sparse_posterior(x, x, y - offset, Hyperparameters(**settings), 1, "value", method)
     sparse = frozen.predict(query[:, :2], query[:, 2:])
-    assert torch.allclose(sparse.mean, exact.mean, rtol=0, atol=1e-8)
+    assert torch.allclose(sparse.mean + offset, exact.mean, rtol=0, atol=1e-8)
     assert torch.allclose(sparse.variance, exact.variance, rtol=0, atol=1e-8)
 
 
@@ -206,7 +206,7 @@ def test_fewer_points_than_inducing_points_are_all_taken():
     ("setting", "message"),
     [
         ({"inducing": 0}, "inducing: must be a whole number, 1 or more; got 0"),
-        ({"method": "dtc"}, "'sgpr' or 'fitc'; got 'dtc'"),
+        ({"method": "dtc"}, "'sgpr', 'fitc'; got 'dtc'"),
         ({"jitter": -1.0}, "jitter: must be a number, 0 or more; got -1.0"),
         ({"predicts": "delta"}, "'next_state', 'difference', 'value'; got 'delta'"),
         ({"scaling": "standardize"}, "scaling: must be a function such as standardize"),
@@ -224,7 +224,7 @@ def test_misuse_of_the_trainer_is_refused_with_the_rule(setting, message):
         ({"inducing": torch.zeros(4, 2)}, ShapeError, r"inducing must be \(M, 3\), M > 0; got \(4, 2\)"),
         ({"features": [[0.0] * 3] * 10}, SettingError, "features: must be a torch tensor; got list"),
         ({"targets": torch.zeros(9, 2)}, ShapeError, "same number of rows; got 10 and 9"),
-        ({"method": "dtc"}, SettingError, "'sgpr' or 'fitc'; got 'dtc'"),
+        ({"method": "dtc"}, SettingError, "'sgpr', 'fitc'; got 'dtc'"),
         ({"features": torch.full((10, 3), torch.nan)}, DataError, "inputs must be finite; got nan"),
         ({"noise_variance": torch.zeros(2)}, SettingError, "noise_variance: must be positive"),
     ],
@@ -239,7 +239,7 @@ def test_misuse_is_refused_with_the_rule(change, error, message):
 
 def test_the_bound_itself_refuses_a_method_that_it_does_not_know():
     z, one = torch.zeros(1, 2, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
-    with pytest.raises(SettingError, match="method: must be 'sgpr' or 'fitc'; got 'foo'"):
+    with pytest.raises(SettingError, match="method: must be one of 'sgpr', 'fitc'; got 'foo'"):
         collapsed_bound(z, z, z[:, :1], Hyperparameters(torch.ones_like(z), one, one), "foo")
 
 

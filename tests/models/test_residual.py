@@ -160,7 +160,7 @@ def test_any_trainer_learns_residuals_and_nothing_else_does():
         ({"states": [2, 3]}, SettingError, r"states: must be different indices from 0 to 2; got \[2, 3\]"),
         ({"inputs": [2]}, SettingError, r"inputs: must be different indices from 0 to 1; got \[2\]"),
         ({"states": [1, 1]}, SettingError, r"different indices from 0 to 2; got \[1, 1\]"),
-        ({"B": torch.ones(3, 3)}, ShapeError, r"B must be \(n, 2\); got \(3, 3\)"),
+        ({"B": torch.ones(3, 3)}, ShapeError, r"B must have shape \(3, 2\); got \(3, 3\)"),
         ({"residual": GPPosterior(**(vars(gp()) | {"predicts": "difference"}))}, SettingError, "predicts='value'"),
     ],
 )

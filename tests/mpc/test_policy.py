@@ -3,7 +3,7 @@ import pytest
 
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import Decision, Reference, Timing
+from gpmpc.mpc import ControlLoop, Decision, Reference, Timing
 from gpmpc.mpc._policy import command
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.status import Status
@@ -100,7 +100,7 @@ def test_raise_stops_at_the_step():
 
 def test_a_misspelt_policy_is_refused():
     with pytest.raises(SettingError, match="on_failure: must be one of 'previous_plan', 'hold', 'raise'; got 'held'"):
-        run(Planner(), 1, "held")
+        ControlLoop(Planner(), "held")
 
 
 def test_before_the_first_plan_the_reference_input_is_applied_within_the_bounds_and_told_to_the_controller():

@@ -117,7 +117,7 @@ def test_the_evaluation_can_be_forced_and_refuses_what_it_cannot_do():
     for mine, other in zip(compiled[1:], by_torch[1:], strict=True):
         assert torch.allclose(mine, other, rtol=1e-12, atol=1e-13)
     assert torch.allclose(compiled[0].covariance, by_torch[0].covariance, atol=1e-13)
-    with pytest.raises(SettingError, match="must be 'auto', 'compiled' or 'torch'; got 'numba'"), backend("numba"):
+    with pytest.raises(SettingError, match="must be one of 'auto', 'compiled', 'torch'; got 'numba'"), backend("numba"):
         pass
 
 

@@ -105,7 +105,7 @@ def test_the_papers_attitude_has_its_slip_and_saturates():
         (lambda: System(Rotational(), substeps=0), "substeps: must be a whole number, 1 or more; got 0"),
         (
             lambda: attitude_for_thrust_direction(np.zeros(1), np.zeros(1), convention="papper"),
-            "'paper' or 'exact'; got 'papper'",
+            "'paper', 'exact'; got 'papper'",
         ),
     ],
 )
