@@ -1,67 +1,18 @@
-"""The commands, and what is common to all: options, help, and one line with exit code 2 for a user's mistake.
-
-Heavy libraries are imported inside the tasks, so help and completion stay quick.
-"""
+"""Runs a command: options common to all, help, and one line with exit code 2 for a user's mistake."""
 
 import argparse
+import os
 import sys
 
 from omegaconf import OmegaConf
 
 import gpmpc
-from gpmpc.cli import _completion as completion
-from gpmpc.cli import _learn as learn
-from gpmpc.cli import _log as log
-from gpmpc.cli import _new as new
-from gpmpc.cli import _reports as reports
-from gpmpc.cli import _run as run
-from gpmpc.cli import _study as study
-from gpmpc.cli._settings import Command, Result, compose, explain, help_text, model_file, nearest, settings
-from gpmpc.cli._sweep import TUNE, sweep, tune
+from gpmpc.cli._commands import COMMANDS, Command, Result, call
+from gpmpc.cli._settings import compose, explain, help_text, model_file, nearest, settings
 from gpmpc.cli._terminal import print_error, redirected_output
 from gpmpc.exceptions import GpmpcError
+from gpmpc.parallel import THREADS
 
-
-def _version(given: argparse.Namespace) -> Result:
-    """Prints what a report of a bug needs: versions, the BLAS library, the processor."""
-    from gpmpc._provenance import environment
-
-    data = environment()
-    print("\n".join(f"{name:10}{value}" for name, value in data.items()))
-    return Result(data)
-
-
-def _show_usage(given: argparse.Namespace) -> Result:
-    lines = "\n".join(f"  {name:12}{command.summary}" for name, command in COMMANDS.items())
-    print(_USAGE.format(version=gpmpc.__version__, commands=lines), end="")
-    return Result()
-
-
-COMMANDS: dict[str, Command] = {
-    "run": run.COMMAND,
-    "tune": TUNE,
-    "tables": study.TABLES,
-    "figures": study.FIGURES,
-    "quality": study.QUALITY,
-    "new": new.COMMAND,
-    "report": reports.REPORT,
-    "plot": reports.PLOT,
-    "calibrate": reports.CALIBRATE,
-    "learn": learn.COMMAND,
-    "log": log.COMMAND,
-    "warmup": study.WARMUP,
-    "completion": Command(
-        "Prints a script that completes commands, settings and files at TAB",
-        lambda given: completion.completion(given, COMMANDS),
-        add_arguments=completion.add_arguments,
-    ),
-    "version": Command("Prints the versions of what computes, and the processor", _version),
-    "help": Command(
-        "Explains a command",
-        _show_usage,
-        add_arguments=lambda parser: parser.add_argument("name", metavar="COMMAND", nargs="?"),
-    ),
-}
 _FLAGS = ("--json", "--quiet", "--debug")
 _USAGE = """gpmpc {version}: Gaussian process model predictive control
 
@@ -79,7 +30,24 @@ eval "$(gpmpc completion bash)" completes at TAB; zsh likewise; fish: gpmpc comp
 """
 
 
+def version(given: argparse.Namespace) -> Result:
+    """Prints what a report of a bug needs: versions, the BLAS library, the processor."""
+    from gpmpc._provenance import environment
+
+    data = environment()
+    print("\n".join(f"{name:10}{value}" for name, value in data.items()))
+    return Result(data)
+
+
+def show_usage(given: argparse.Namespace) -> Result:
+    """Lists the commands."""
+    lines = "\n".join(f"  {name:12}{command.summary}" for name, command in COMMANDS.items())
+    print(_USAGE.format(version=gpmpc.__version__, commands=lines), end="")
+    return Result()
+
+
 def main() -> None:
+    """Runs the command line."""
     flags, arguments = {*_FLAGS} & {*sys.argv[1:]}, [each for each in sys.argv[1:] if each not in _FLAGS]
     with redirected_output("error" if "--json" in flags else "nowhere" if "--quiet" in flags else "output"):
         result = _run(arguments, debug="--debug" in flags)
@@ -108,7 +76,7 @@ def _run(arguments: list[str], debug: bool) -> Result:
         if unknown:
             hint = f"; gpmpc {name} --help lists what there is"
             raise GpmpcError(f"unknown option {unknown[0]!r}{nearest(unknown[0], parser.values)}{hint}")
-        return _with_settings(name, command, given) if command.settings else command.task(given)
+        return _with_settings(name, command, given) if command.settings else call(command.task, given)
     except KeyboardInterrupt:
         resumed = command is not None and command.settings and (name != "run" or "-m" in rest or "--multirun" in rest)
         raise KeyboardInterrupt(*["the same command goes on where it stopped"] * bool(resumed)) from None
@@ -130,10 +98,12 @@ def _with_settings(name: str, command: Command, given: argparse.Namespace) -> Re
             return Result()
         if swept and given.cfg:
             raise GpmpcError("--cfg: shows the settings of one run; leave out -m, and give each setting one value")
-        if swept:
-            return tune(given, config_name) if name == "tune" else sweep(given, config_name)
+        if swept:  # before the libraries load, here and in the processes started from here
+            os.environ |= dict.fromkeys(THREADS, "1")
+            given.config_name = config_name
+            return call(command.task if name == "tune" else "_sweep.sweep", given)
         config = compose(config_name, given.overrides)
         if given.cfg:
             print(OmegaConf.to_yaml(config), end="")
             return Result(OmegaConf.to_container(config))
-        return command.task(config)
+        return call(command.task, config)

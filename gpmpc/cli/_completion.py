@@ -4,11 +4,11 @@ import argparse
 import glob
 import os
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any
 
-from gpmpc.cli._settings import Parser, Result, group_options, setting_names, settings
+from gpmpc.cli._commands import COMMANDS, Result
+from gpmpc.cli._settings import group_options, setting_names, settings
 from gpmpc.exceptions import GpmpcError
 
 _SCRIPTS = {
@@ -34,17 +34,10 @@ compdef _gpmpc gpmpc
 }
 
 
-def add_arguments(parser: Parser) -> None:
-    parser.add_argument(
-        "shell", nargs="?", choices=[*_SCRIPTS], help='for its profile: eval "$(gpmpc completion bash)"'
-    )
-    parser.add_argument("--line", metavar="LINE", help="print what may come next after this beginning of a line")
-
-
-def completion(given: argparse.Namespace, commands: Mapping[str, Any]) -> Result:
+def completion(given: argparse.Namespace) -> Result:
     """Prints a shell's script, or what may come next."""
     if given.line is not None:
-        found = candidates(given.line, commands)
+        found = candidates(given.line)
     elif given.shell:
         found = [_SCRIPTS[given.shell].rstrip()]
     else:
@@ -53,7 +46,7 @@ def completion(given: argparse.Namespace, commands: Mapping[str, Any]) -> Result
     return Result(found)
 
 
-def candidates(line: str, commands: Mapping[str, Any]) -> list[str]:
+def candidates(line: str) -> list[str]:
     """Returns the words that the last word of a line, up to the cursor, may become."""
     try:
         words = shlex.split(line)
@@ -63,23 +56,23 @@ def candidates(line: str, commands: Mapping[str, Any]) -> list[str]:
         words.append("")
     _, *middle, word = words if len(words) > 1 else ["gpmpc", *words]
     if not middle or middle == ["help"]:
-        found: Sequence[str] = [*commands]
-    elif middle[0] not in commands:
+        found: Sequence[str] = [*COMMANDS]
+    elif middle[0] not in COMMANDS:
         found = []
     else:
-        found = _after(middle[0], middle[1:], word, commands[middle[0]])
+        found = _after(middle[0], middle[1:], word)
     return [each for each in found if each.startswith(word)]
 
 
-def _after(name: str, before: Sequence[str], word: str, command: Any) -> Sequence[str]:
+def _after(name: str, before: Sequence[str], word: str) -> Sequence[str]:
     """Returns what may stand behind a command and the words before the last one."""
-    values = command.parser(name).values
+    values = COMMANDS[name].parser(name).values
     if before and values.get(before[-1]) is not None:
         return values[before[-1]] or _files(word)
     if word.startswith("-"):
         return [option for option in (*values, "--json", "--quiet", "--debug") if option.startswith("--")]
-    if command.settings:
-        return _settings(command.settings, before, word)
+    if COMMANDS[name].settings:
+        return _settings(COMMANDS[name].settings, before, word)
     places = [key for key in values if not key.startswith("-")]
     place = sum(not each.startswith("-") for each in before)
     return (values[places[place]] if place < len(places) else None) or _files(word)

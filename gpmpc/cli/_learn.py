@@ -4,42 +4,28 @@ import argparse
 import json
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import pandas as pd
+from rich.console import Console
+
+from gpmpc import logs
 from gpmpc._files import write_whole
-from gpmpc.cli._settings import Command, Parser, Result, write_files, writing
-
-if TYPE_CHECKING:
-    from gpmpc.logs import Judgement, Learned, Log
-    from gpmpc.studies._document import Document
+from gpmpc._provenance import provenance
+from gpmpc.cli._commands import Result
+from gpmpc.cli._settings import write_files, writing
+from gpmpc.logs import Judgement, Learned, Log
+from gpmpc.plotting import judgement_figure, png
+from gpmpc.studies._document import Document, Table, number, terminal
+from gpmpc.studies.study import fingerprint
 
 _MODEL = "model.safetensors"
 
 
-def _add_arguments(parser: Parser) -> None:
-    parser.add_argument("mapping", type=Path, help="a YAML file that says what the columns mean")
-    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="logs: CSV, Parquet, npz, MCAP, ULog")
-    parser.add_argument("--held-out", nargs="+", metavar="RUN", default=[], help="runs to judge it on (a fifth of all)")
-    text = "folder for the model, its report and its card (learned)"
-    parser.add_argument("--to", type=Path, metavar="DIR", default=Path("learned"), help=text)
-    parser.add_argument("--points", type=int, default=300, help="training rows of a GP, at most (300)")
-    parser.add_argument("--steps", type=int, default=50, help="longest prediction it is judged by (50)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of all random choices (0)")
-    text = "a model to plan with: without the feedback of the controller that flew, without delayed inputs"
-    parser.add_argument("--for-control", action="store_true", help=text)
-    parser.add_argument("--partial", action="store_true", help="read unfinished files as far as they are whole")
-
-
-def _learn(given: argparse.Namespace) -> Result:
+def learn(given: argparse.Namespace) -> Result:
     """Learns from logs, judges on held-out runs, and writes model, report and card; goes on where it stopped."""
-    from rich.console import Console
-
-    from gpmpc.logs import judge, learn, read_log, save_learned
-    from gpmpc.studies._document import terminal
-    from gpmpc.studies.study import fingerprint
-
     console, folder = Console(soft_wrap=True, highlight=False, markup=False), given.to
-    log = read_log(given.files, given.mapping, given.partial)
+    log = logs.read_log(given.files, given.mapping, given.partial)
     console.print(repr(log))
     for finding in log.findings:
         console.print(f"  {finding.run}: {finding.kind}: {finding.text}")
@@ -55,11 +41,11 @@ def _learn(given: argparse.Namespace) -> Result:
                 status.update(stage)
                 console.print(f"  {stage}")
 
-            learned = learn(train, given.points, given.steps, given.seed, show, memory, given.for_control)
+            learned = logs.learn(train, given.points, given.steps, given.seed, show, memory, given.for_control)
             status.update("judging on held-out runs")
             steps = sorted({step for step in (1, 10, 50) if step <= given.steps} | {given.steps})
-            judgement = judge(learned, held_out, train, steps)
-        save_learned(learned, folder / _MODEL)
+            judgement = logs.judge(learned, held_out, train, steps)
+        logs.save_learned(learned, folder / _MODEL)
         document = _report(learned, judgement, train, held_out)
         card = _card(learned, judgement, train, held_out).markdown()
         write_files(folder, document.files("report") | {"report.html": document.html(), "card.md": card}, "to")
@@ -70,7 +56,7 @@ def _learn(given: argparse.Namespace) -> Result:
     return Result({"folder": str(folder), "losses": judgement.losses, "rows": document.data.to_dict("records")})
 
 
-def _split(log: "Log", held_out: list[str]) -> tuple["Log", "Log"]:
+def _split(log: Log, held_out: list[str]) -> tuple[Log, Log]:
     if held_out:
         return log.split(held_out)
     names = [run.name for run in sorted(log.runs, key=len)]
@@ -93,11 +79,8 @@ class _FileMemory(dict[str, Any]):
         write_whole(self._path, json.dumps({"fingerprint": self._fingerprint, "stages": self}))
 
 
-def _report(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Log") -> "Document":
+def _report(learned: Learned, judgement: Judgement, train: Log, held_out: Log) -> Document:
     """Makes the report: errors beside the baselines, coverage and width, and every candidate."""
-    from gpmpc.plotting import judgement_figure, png
-    from gpmpc.studies._document import Document, Table, number
-
     groups = [f"{group} [{unit}]" for group, unit in zip(judgement.groups, judgement.units, strict=True)]
     errors, intervals = [], []
     for k, step in enumerate(judgement.steps):
@@ -133,13 +116,8 @@ def _report(learned: "Learned", judgement: "Judgement", train: "Log", held_out: 
     )
 
 
-def _card(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "Log") -> "Document":
+def _card(learned: Learned, judgement: Judgement, train: Log, held_out: Log) -> Document:
     """Makes the model card: data, ranges, what was left out, what is learned and why, and what must not be trusted."""
-    import pandas as pd
-
-    from gpmpc._provenance import provenance
-    from gpmpc.studies._document import Document, Table
-
     names, outputs = [*train.space.names, *train.input_names], learned.model.kinematics.output_names
     # An affine map has many parameters, and no standard errors.
     parameters = [row for row in learned.fit.to_rows() if row[2] == row[2]]
@@ -176,10 +154,3 @@ def _card(learned: "Learned", judgement: "Judgement", train: "Log", held_out: "L
         pd.DataFrame(),
         lists={"Outputs": learns, "What must not be trusted": doubts, "Left out of the data": left_out or ["nothing"]},
     )
-
-
-COMMAND = Command(
-    "Learns a model from logs, judges it on held-out runs, and writes it with a report and a card",
-    _learn,
-    add_arguments=_add_arguments,
-)

@@ -3,34 +3,25 @@
 import argparse
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from gpmpc.cli._settings import Command, Parser, Result, writing
+import numpy as np
+import pandas as pd
+from rich.console import Console
+
+from gpmpc._files import write_whole
+from gpmpc.cli._commands import Result
+from gpmpc.cli._settings import writing
 from gpmpc.exceptions import GpmpcError, SettingError
-
-if TYPE_CHECKING:
-    from gpmpc.recording import Run
+from gpmpc.recording import Run, layout, read_run, recover
+from gpmpc.studies._document import Document, Table, plain_text, terminal
 
 CUT = "unfinished or damaged; this is what could be read"
 _ENDINGS = {"recover": (".mcap",), "export": (".csv", ".parquet"), "layout": (".json",), "inspect": (".html",)}
 _SUFFIXES = {"recover": ".recovered.mcap", "export": ".csv", "layout": ".layout.json", "inspect": ".inspection.html"}
 
 
-def _add_arguments(parser: Parser) -> None:
-    what = "info: channels, times, how the solves ended; recover: what is whole in an unfinished file, as a new one; "
-    what += "export: the steps as a table, a row each; layout: for Foxglove or Lichtblick, fitting the recording; "
-    what += "inspect: rates, gaps, repeated values, noise, delays and excitation of any log, on one page"
-    parser.add_argument("action", choices=["info", *_ENDINGS], help=what)
-    parser.add_argument("file", type=Path, help="an MCAP file, finished or not; inspect: any log")
-    endings = ".recovered.mcap, .csv (or .parquet), .layout.json, .inspection.html"
-    parser.add_argument("output", type=Path, nargs="?", help=f"where it goes; FILE with {endings}")
-    parser.add_argument("--mapping", type=Path, help="inspect: a YAML file that says what the columns mean")
-
-
 def log(given: argparse.Namespace) -> Result:
     """Does what was asked for with a recording."""
-    from gpmpc.recording import layout, read_run, recover
-
     action, file = given.action, given.file
     if action == "info":
         if given.output:
@@ -58,11 +49,6 @@ def log(given: argparse.Namespace) -> Result:
 
 
 def _info(file: Path) -> Result:
-    from rich.console import Console
-
-    from gpmpc.recording import read_run
-    from gpmpc.studies._document import Table, plain_text, terminal
-
     run, console = read_run(file), Console()
     facts = _facts(run)
     hint = "" if "recovered" in run.metadata else " (gpmpc log recover makes it readable for other tools)"
@@ -84,10 +70,8 @@ def _info(file: Path) -> Result:
     return Result({"finished": run.finished, "channels": counts, **facts, "metadata": dict(run.metadata)})
 
 
-def _facts(run: "Run") -> dict[str, str]:
+def _facts(run: Run) -> dict[str, str]:
     """The numbers of a run in words."""
-    import numpy as np
-
     units = run.metadata.get("units", {})
     names = [("states", "state", run.state_names), ("inputs", "input", run.input_names)]
     facts = {title: ", ".join(f"{n} [{units.get(f'{g}.{n}', '?')}]" for n in group) for title, g, group in names}
@@ -105,7 +89,7 @@ def _facts(run: "Run") -> dict[str, str]:
     return facts
 
 
-def _table_file(run: "Run", ending: str) -> bytes:
+def _table_file(run: Run, ending: str) -> bytes:
     """Returns the steps as CSV, or as Parquet."""
     frame, data = run.to_pandas(), io.BytesIO()
     frame.attrs = {}  # pandas would store them, as text that others do not read
@@ -120,12 +104,8 @@ def _table_file(run: "Run", ending: str) -> bytes:
 
 
 def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:
-    import pandas as pd
-    from rich.console import Console
-
-    from gpmpc.logs import LogMapping, inspect_log
+    from gpmpc.logs import LogMapping, inspect_log  # loads torch, which what is above does without
     from gpmpc.plotting import inspection_figure, png
-    from gpmpc.studies._document import Document, Table, terminal
 
     mapping = LogMapping.load(mapping_file) if mapping_file else None
     found = inspect_log(file, mapping)
@@ -157,14 +137,5 @@ def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:
 
 
 def _write(output: Path, content: str | bytes) -> None:
-    from gpmpc._files import write_whole
-
     with writing(output, "output"):
         write_whole(output, content)
-
-
-COMMAND = Command(
-    "Shows, rescues or exports a recording, writes its Foxglove layout, inspects logs",
-    log,
-    add_arguments=_add_arguments,
-)

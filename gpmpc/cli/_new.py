@@ -5,7 +5,8 @@ import keyword
 import re
 from pathlib import Path
 
-from gpmpc.cli._settings import Command, Parser, Result, write_files
+from gpmpc.cli._commands import Result
+from gpmpc.cli._settings import write_files
 from gpmpc.exceptions import SettingError
 
 _TEMPLATES = Path(__file__).with_name("project")  # its files, named and written for a system called NAME
@@ -17,12 +18,7 @@ _FILES = {
 }
 
 
-def _add_arguments(parser: Parser) -> None:
-    parser.add_argument("name", metavar="NAME", help="of the system: letters, digits and _, a letter first")
-    parser.add_argument("--to", type=Path, metavar="DIR", help="an empty folder, or one to be made (NAME)")
-
-
-def _new(given: argparse.Namespace) -> Result:
+def new(given: argparse.Namespace) -> Result:
     """Writes the project, and prints how it is run."""
     name, folder = given.name, given.to or Path(given.name)
     if not name.isidentifier() or keyword.iskeyword(name) or not name.isascii() or name.startswith("_"):
@@ -38,8 +34,3 @@ def _new(given: argparse.Namespace) -> Result:
     print(write_files(folder, files, "to") + "\n")
     print(f"cd {folder}\n{run}\n{run} -m 'seed=range(5)' data.size=50,100,200\npython fly.py\npytest")
     return Result({"folder": str(folder), "files": written, "command": run})
-
-
-COMMAND = Command(
-    "Writes a project of your own: a system, its settings, a script and a test", _new, add_arguments=_add_arguments
-)

@@ -12,25 +12,30 @@ from dataclasses import replace
 from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import InstantiationException
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
 
+from gpmpc._compiling import report_compilation
 from gpmpc._provenance import flattened
-from gpmpc.cli._settings import Command, Result, folder_of, one_line, writing
+from gpmpc.cli._commands import Result
+from gpmpc.cli._settings import folder_of, one_line, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
-
-if TYPE_CHECKING:
-    from gpmpc.recording import McapRecorder
-    from gpmpc.studies._run_folder import RunFolder
-    from gpmpc.studies.flight import Experiment
-    from gpmpc.systems import System
-
+from gpmpc.logs import SavedModel
+from gpmpc.recording import McapRecorder, RecordedSystem
+from gpmpc.simulation import Noise
+from gpmpc.studies._document import terminal
+from gpmpc.studies._run_folder import RECORDING, RunFolder, folder_name, record
+from gpmpc.studies.flight import Experiment, metrics, run_trial, summary
+from gpmpc.studies.study import one_thread
+from gpmpc.systems import System
 
 ASIDE = ("launcher", "folder", "live", "tracker")  # settings that a result does not depend on
 _GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver", "learning")
@@ -40,14 +45,8 @@ _LOST = 3  # exit code of a run that is finished, and whose flight was lost
 _LONGEST = 6000  # characters of a parameter that MLflow takes
 
 
-def _run(config: DictConfig) -> Result:
+def run(config: DictConfig) -> Result:
     """Flies, prints the results and where they are kept; the task behind ``conf/run.yaml``."""
-    from rich.console import Console
-
-    from gpmpc._compiling import report_compilation
-    from gpmpc.studies._document import terminal
-    from gpmpc.studies.flight import summary
-
     console = Console()
     with console.status("flying"), report_compilation():
         experiment_of(config)  # what a user can get wrong is found before anything is written
@@ -63,9 +62,6 @@ def _run(config: DictConfig) -> Result:
 
 def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
     """Flies one run; an error is kept in its folder and returned as ``error``."""
-    from gpmpc.studies._run_folder import RunFolder, folder_name, record
-    from gpmpc.studies.study import one_thread
-
     overrides = choices(HydraConfig.get().overrides.task)
     folder = RunFolder(folder_of(config.folder) / folder_name(overrides))
     outcome = {"folder": str(folder.path), "skipped": False}
@@ -99,11 +95,8 @@ def _was_interrupted(error: BaseException | None) -> bool:
     return error is not None
 
 
-def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
+def _fly(experiment: Experiment, folder: RunFolder, config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
     """Trains, flies and records; returns the metrics."""
-    from gpmpc.studies._run_folder import RECORDING
-    from gpmpc.studies.flight import metrics, run_trial
-
     if config.recorder != "mcap":
         return metrics(experiment, run_trial(experiment))
     episodes = range(1, 1 + getattr(experiment.learning, "episodes", 0))
@@ -128,10 +121,8 @@ def _fly(experiment: "Experiment", folder: "RunFolder", config: DictConfig, abou
 
 
 def _recorder(
-    experiment: "Experiment", path: Path, config: DictConfig, about: dict, controller: Any, training: Any
-) -> "McapRecorder":
-    from gpmpc.recording import McapRecorder, RecordedSystem
-
+    experiment: Experiment, path: Path, config: DictConfig, about: dict, controller: Any, training: Any
+) -> McapRecorder:
     flown, bounds = experiment.system, [side[0] for side in controller.problem.inputs.by_stage(controller.horizon)]
     metadata = {
         "seed": experiment.seed,
@@ -145,14 +136,8 @@ def _recorder(
     return McapRecorder(path, RecordedSystem.of(flown, bounds), config=text, metadata=metadata, live=config.live)
 
 
-def experiment_of(config: DictConfig) -> "Experiment":
+def experiment_of(config: DictConfig) -> Experiment:
     """Makes the objects that the settings describe."""
-    from hydra.utils import instantiate
-
-    from gpmpc.logs import SavedModel
-    from gpmpc.simulation import Noise
-    from gpmpc.studies.flight import Experiment
-
     config = DictConfig(plain_data(config))
     _check(config)
     system = _system_of(config.system)
@@ -224,12 +209,8 @@ def _fill(config: DictConfig, **values: Any) -> None:
             config[key] = list(numbers)
 
 
-def _system_of(settings: Any) -> "System":
+def _system_of(settings: Any) -> System:
     """Makes the system that the settings ``system`` describe."""
-    from hydra.utils import instantiate
-
-    from gpmpc.systems import System
-
     system = instantiate(settings, _convert_="all")
     if not isinstance(system, System):
         what = "_target_ must name a function that returns a gpmpc.systems.System"
@@ -260,14 +241,6 @@ def choices(overrides: Sequence[str]) -> list[str]:
         if key not in ASIDE and not key.lstrip("+~").startswith(("hydra.", "hydra/")):
             found[key] = key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"
     return sorted(found.values())
-
-
-COMMAND = Command(
-    "Trains a model, flies with it, records; with -m a sweep of many flights",
-    _run,
-    "run",
-    lambda parser: parser.add_argument("--multirun", "-m", action="store_true"),
-)
 
 
 def log_to_mlflow(folder: Path, result: Mapping[str, Any]) -> None:

@@ -4,20 +4,23 @@ import argparse
 import time
 from dataclasses import replace
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
 
+from gpmpc._compiling import report_compilation
+from gpmpc._provenance import provenance
+from gpmpc.cli._commands import Result
 from gpmpc.cli._run import experiment_of, plain_data, plain_settings
-from gpmpc.cli._settings import Command, Result, compose, folder_of, settings, write_files, writing
+from gpmpc.cli._settings import compose, folder_of, settings, write_files, writing
 from gpmpc.cli._terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
-
-if TYPE_CHECKING:
-    from gpmpc.studies.study import Study
-
+from gpmpc.studies._document import json_text, terminal
+from gpmpc.studies.flight import run_trial
+from gpmpc.studies.study import Study, TrialStore, run_study
 
 _ONE, _SEVERAL = ("data", "excited", "undithered", "model", "flying"), ("trajectory", "subsystem")
 _SHOWN_ERRORS = 10
@@ -25,12 +28,8 @@ _FLOWN = ("controller=convex", "controller=paper", "controller=nonlinear", "cont
 _SHORT = ("data.samples=12", "model.restarts=0", "steps=2", "horizon=3")
 
 
-def _run(config: DictConfig) -> Result:
+def study(config: DictConfig) -> Result:
     """Runs what is missing of a study, writes its documents and prints its tables."""
-    from gpmpc._provenance import provenance
-    from gpmpc.studies._document import json_text, terminal
-    from gpmpc.studies.study import TrialStore, run_study
-
     settings, console = plain_data(config), logging_console()
     study, folder = _study(config, settings), folder_of(settings["folder"])
     with progress_bar(console) as progress:
@@ -61,7 +60,7 @@ def _run(config: DictConfig) -> Result:
     return Result(data | {"folder": str(folder)}, 1 if failed and wrong else 0)
 
 
-def _study(config: DictConfig, settings: dict[str, Any]) -> "Study":
+def _study(config: DictConfig, settings: dict[str, Any]) -> Study:
     """Makes the study that the settings describe; what a user can get wrong is found here."""
     for key in (*_ONE, *_SEVERAL):
         if key in config and not config[key]:
@@ -76,18 +75,8 @@ def _study(config: DictConfig, settings: dict[str, Any]) -> "Study":
     return module.from_settings({"trajectory": {}} | made, settings, flight)
 
 
-TABLES = Command("Computes Tables 1 and 2 of Cao, Lai and Alam (2017) beside the printed ones", _run, "tables")
-FIGURES = Command("Flies figures 2 to 4 and section 5.2, and the same with the plant in the loop", _run, "figures")
-QUALITY = Command("Measures closed-loop cost over the time of a decision, for every controller", _run, "quality")
-
-
-def _warmup(given: argparse.Namespace) -> Result:
+def warmup(given: argparse.Namespace) -> Result:
     """Flies two steps with every controller on a learned model, and prints how long that took."""
-    from rich.console import Console
-
-    from gpmpc._compiling import report_compilation
-    from gpmpc.studies.flight import run_trial
-
     console, began = Console(), time.perf_counter()
     with progress_bar(console) as bar, report_compilation(), settings():
         task = bar.add_task("", total=len(_FLOWN))
@@ -98,6 +87,3 @@ def _warmup(given: argparse.Namespace) -> Result:
     seconds = round(time.perf_counter() - began, 3)
     console.print(f"ready after {seconds:.1f} s")
     return Result({"seconds": seconds})
-
-
-WARMUP = Command("Compiles the numerical kernels now, instead of at the first flight", _warmup)
