@@ -61,7 +61,7 @@ def _pooled(group: list[dict]) -> dict[str, Any]:
     numbers |= {"total_min": float(totals.min()), "total_max": float(totals.max())}
     numbers |= {"input_excess": max(excesses, default=None)}
     numbers |= {"failed_steps": sum(len(record["failures"]) for record in good)}
-    numbers |= {"ms_median": 1e3 * times.median, "ms_p95": 1e3 * times.p95, "ms_max": 1e3 * times.largest}
+    numbers |= {"ms_median": 1e3 * times["median"], "ms_p95": 1e3 * times["p95"], "ms_max": 1e3 * times["largest"]}
     numbers |= {"seconds": float(np.median([sum(record["seconds"]) for record in good]))}
     for key, names in (("violations", columns[-5:-3]), ("at_bound", columns[-3:-1])):
         if key in good[0]:

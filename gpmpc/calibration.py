@@ -12,6 +12,7 @@ than the count, the more so the larger k. Intervals of a coverage count those th
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -61,12 +62,9 @@ class Recording:
     def chained(cls, transitions: Transitions) -> list["Recording"]:
         """Finds the runs in transitions: one goes on while a row's next state is the following row's state."""
         goes_on = (transitions.next_states[:-1] == transitions.states[1:]).all(dim=1).tolist()
-        ends = [k + 1 for k, same in enumerate(goes_on) if not same] + [len(transitions)]
-        runs = [slice(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True)]
-        return [
-            cls(torch.cat([transitions.states[run], transitions.next_states[run][-1:]]), transitions.inputs[run])
-            for run in runs
-        ]
+        ends = [0, *(k + 1 for k, same in enumerate(goes_on) if not same), len(transitions)]
+        runs = [transitions[begin:end] for begin, end in pairwise(ends)]
+        return [cls(torch.cat([run.states, run.next_states[-1:]]), run.inputs) for run in runs]
 
 
 @dataclass(frozen=True)
@@ -97,12 +95,9 @@ class Calibration:
         import pandas
 
         n = len(self.names)
-        table: dict[str, Any] = {
-            "step": [k + 1 for k in range(self.horizon) for _ in range(n)],
-            "state": self.names * self.horizon,
-        }
-        table |= {"samples": self.samples.repeat_interleave(n), "rmse": self.rmse.ravel(), "nlpd": self.nlpd.ravel()}
-        table["width"] = self.width.ravel()
+        steps, samples = (t.repeat_interleave(n) for t in (torch.arange(1, self.horizon + 1), self.samples))
+        table: dict[str, Any] = {"step": steps, "state": self.names * self.horizon, "samples": samples}
+        table |= {key: getattr(self, key).ravel() for key in ("rmse", "nlpd", "width")}
         table |= {f"coverage_{level:g}": self.coverage[..., j].ravel() for j, level in enumerate(self.levels)}
         return pandas.DataFrame(table)
 
@@ -192,11 +187,9 @@ def _check(
     if not recordings:
         raise ShapeError("at least one recording is needed; got none")
     for recording in recordings:
-        if (recording.states.shape[1], recording.inputs.shape[1]) != (n, m):
-            raise ShapeError(
-                f"the model has {n} states and {m} inputs; got a recording with {recording.states.shape[1]} and "
-                f"{recording.inputs.shape[1]}"
-            )
+        states, inputs = recording.states.shape[1], recording.inputs.shape[1]
+        if (states, inputs) != (n, m):
+            raise ShapeError(f"the model has {n} states and {m} inputs; got a recording with {states} and {inputs}")
     longest = max(len(recording) for recording in recordings)
     if horizon > longest:
         raise SettingError("horizon", f"must be at most {longest} steps, the longest recording; got {horizon}")

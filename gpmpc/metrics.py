@@ -156,9 +156,8 @@ def violation_rate(
     """
     values, lower, upper = (np.asarray(a, dtype=float) for a in (values, lower, upper))
     if values.ndim != 2 or not len(values) or lower.shape != values.shape[1:] or upper.shape != values.shape[1:]:
-        raise ShapeError(
-            f"values must be (K, d) with bounds (d,), K of 1 or more; got {values.shape}, {lower.shape}, {upper.shape}"
-        )
+        got = f"{values.shape}, {lower.shape}, {upper.shape}"
+        raise ShapeError(f"values must be (K, d) with bounds (d,), K of 1 or more; got {got}")
     if (lower > upper).any():
         j = int(np.argmax(lower > upper))
         raise SettingError("lower, upper", f"must not cross; entry {j} has {lower[j]:g} above {upper[j]:g}")
@@ -178,21 +177,12 @@ def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple
     return float(low), float(high)
 
 
-@dataclass(frozen=True)
-class _TimeQuantiles:
-    """Of wall times [s]."""
-
-    median: float  # [s]
-    p95: float  # [s]
-    p99: float  # [s]
-    largest: float  # [s]
-
-
-def time_quantiles(seconds: np.ndarray) -> _TimeQuantiles:
-    """Computes median, 95 % and 99 % quantile, and the largest of wall times (K,) [s]."""
+def time_quantiles(seconds: np.ndarray) -> dict[str, float]:
+    """Computes "median", "p95" and "p99" (95 % and 99 % quantile), and the "largest" of wall times (K,) [s]."""
     if np.ndim(seconds) != 1 or not len(seconds):
         raise ShapeError(f"seconds must be (K,), K of 1 or more; got {np.shape(seconds)}")
-    return _TimeQuantiles(*np.quantile(seconds, [0.5, 0.95, 0.99, 1.0]).tolist())
+    quantiles = np.quantile(seconds, [0.5, 0.95, 0.99, 1.0]).tolist()
+    return dict(zip(("median", "p95", "p99", "largest"), quantiles, strict=True))
 
 
 def tracking_cost(

@@ -51,10 +51,8 @@ class Elliptical:
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., 3) [m] at times (...) [s]."""
         t = np.asarray(time, dtype=float)
-        angle = self.rate * t
-        return np.stack(
-            [self.radius_x * np.sin(angle), self.radius_y * np.cos(angle), self.start_z + self.climb_rate * t], axis=-1
-        )
+        x, y = self.radius_x * np.sin(self.rate * t), self.radius_y * np.cos(self.rate * t)
+        return np.stack([x, y, self.start_z + self.climb_rate * t], axis=-1)
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
         """Velocities (..., 3) [m/s] at times (...) [s]."""
@@ -153,7 +151,7 @@ class Step:
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., d) at times (...) [s]."""
         reached = np.asarray(time, dtype=float)[..., None] >= self.at
-        return np.where(reached, np.asarray(self.after, dtype=float), np.asarray(self.before, dtype=float))
+        return np.where(reached, np.array(self.after, float), np.array(self.before, float))
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
         """Zero (..., d): the jump has no velocity."""
@@ -190,12 +188,12 @@ class Waypoints:
 
     def __post_init__(self) -> None:
         _check_positions("positions", self.positions)
-        times = np.asarray(self.times, dtype=float)
-        if len(times) < 2 or len(times) != len(self.positions):
+        count, positions = len(self.times), len(self.positions)
+        if count < 2 or count != positions:
             raise SettingError(
-                "times", f"must be two or more, one a position; got {len(times)} times, {len(self.positions)} positions"
+                "times", f"must be two or more, one a position; got {count} times, {positions} positions"
             )
-        if not np.all(np.diff(times) > 0):
+        if not np.all(np.diff(np.asarray(self.times, dtype=float)) > 0):
             raise SettingError("times", f"must be strictly increasing [s]; got {list(self.times)}")
 
     @cached_property

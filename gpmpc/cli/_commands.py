@@ -40,13 +40,10 @@ def _argument(*names: str, **settings: Any) -> _Argument:
     return names, settings
 
 
-_CFG = _argument("--cfg", action="store_true")
-_OF_SETTINGS = (
-    _argument("-h", "--help", action="store_true"),
-    _CFG,
-    _argument("--config-name"),
-    _argument("--config-dir"),
-)
+_FLAG: dict[str, Any] = {"action": "store_true"}
+_FOLDER: dict[str, Any] = {"type": Path, "metavar": "DIR"}
+_OF_SETTINGS = [_argument("-h", "--help", **_FLAG), _argument("--cfg", **_FLAG)]
+_OF_SETTINGS += [_argument("--config-name"), _argument("--config-dir"), _argument("overrides", nargs="*")]
 
 
 class Command(NamedTuple):
@@ -63,8 +60,7 @@ class Command(NamedTuple):
         """Returns the parser of what follows the command's name."""
         description = f"gpmpc {name}: {self.summary[0].lower()}{self.summary[1:]}."
         parser = Parser(prog=f"gpmpc {name}", description=description, add_help=not self.settings)
-        of_settings = (*_OF_SETTINGS, _argument("overrides", nargs="*")) if self.settings else ()
-        for names, settings in (*self.arguments, *of_settings):
+        for names, settings in (*self.arguments, *(_OF_SETTINGS if self.settings else ())):
             parser.add_argument(*names, **settings)
         return parser
 
@@ -81,13 +77,16 @@ _LOG = (
     "export: the steps as a table, a row each; layout: for Foxglove or Lichtblick, fitting the recording; "
     "inspect: rates, gaps, repeated values, noise, delays and excitation of any log, on one page"
 )
+_OUTPUT = "where it goes; FILE with .recovered.mcap, .csv (or .parquet), .layout.json, .inspection.html"
+_FOR_CONTROL = "a model to plan with: without the feedback of the controller that flew, without delayed inputs"
+_SHELL = 'for its profile: eval "$(gpmpc completion bash)"'
 _GROUPS = "choices that make two groups, such as controller=lqr controller=convex: a paired test over the seeds"
 COMMANDS = {
     "run": Command(
         "Trains a model, flies with it, records; with -m a sweep of many flights",
         "_run.run",
         "run",
-        [_argument("--multirun", "-m", action="store_true")],
+        [_argument("--multirun", "-m", **_FLAG)],
     ),
     "tune": Command(
         "Searches settings for the least closed-loop cost",
@@ -109,7 +108,7 @@ COMMANDS = {
         "_new.new",
         arguments=[
             _argument("name", metavar="NAME", help="of the system: letters, digits and _, a letter first"),
-            _argument("--to", type=Path, metavar="DIR", help="an empty folder, or one to be made (NAME)"),
+            _argument("--to", **_FOLDER, help="an empty folder, or one to be made (NAME)"),
         ],
     ),
     "report": Command(
@@ -117,13 +116,8 @@ COMMANDS = {
         "_report.report",
         arguments=[
             _argument("tree", type=Path, metavar="OUTPUTS", help="a folder with runs anywhere below it"),
-            _argument("--to", type=Path, metavar="DIR", help="where the documents go (OUTPUTS/report)"),
-            _argument(
-                "--compare",
-                nargs=2,
-                metavar=("A", "B"),
-                help=_GROUPS,
-            ),
+            _argument("--to", **_FOLDER, help="where the documents go (OUTPUTS/report)"),
+            _argument("--compare", nargs=2, metavar=("A", "B"), help=_GROUPS),
         ],
     ),
     "plot": Command(
@@ -131,10 +125,10 @@ COMMANDS = {
         "_flights.plot",
         arguments=[
             _argument("run", type=Path, metavar="RUN", help=_RUN),
-            _argument("--to", type=Path, metavar="DIR", help="where the figures go (RUN/figures)"),
+            _argument("--to", **_FOLDER, help="where the figures go (RUN/figures)"),
             _argument("--format", choices=("png", "pdf", "svg"), default="png", help="of the figures (png)"),
-            _argument("--no-animation", action="store_true", help="figures only: they take a second"),
-            _argument("--film", action="store_true", help="a system of MuJoCo: the animation as MuJoCo renders it"),
+            _argument("--no-animation", **_FLAG, help="figures only: they take a second"),
+            _argument("--film", **_FLAG, help="a system of MuJoCo: the animation as MuJoCo renders it"),
         ],
     ),
     "calibrate": Command(
@@ -144,7 +138,7 @@ COMMANDS = {
             _argument("run", type=Path, metavar="RUN", help="a run's folder or recording; its model is learned again"),
             _argument("flights", type=Path, nargs="*", metavar="FLIGHT", help=f"what is predicted (RUN): {_RUN}"),
             _argument("--steps", type=int, default=50, help="length of the longest prediction (50)"),
-            _argument("--to", type=Path, metavar="DIR", help="where all goes (RUN/calibration)"),
+            _argument("--to", **_FOLDER, help="where all goes (RUN/calibration)"),
         ],
     ),
     "learn": Command(
@@ -156,20 +150,15 @@ COMMANDS = {
             _argument("--held-out", nargs="+", metavar="RUN", default=[], help="runs to judge it on (a fifth of all)"),
             _argument(
                 "--to",
-                type=Path,
-                metavar="DIR",
+                **_FOLDER,
                 default=Path("learned"),
                 help="folder for the model, its report and its card (learned)",
             ),
             _argument("--points", type=int, default=300, help="training rows of a GP, at most (300)"),
             _argument("--steps", type=int, default=50, help="longest prediction it is judged by (50)"),
             _argument("--seed", type=int, default=0, help="seed of all random choices (0)"),
-            _argument(
-                "--for-control",
-                action="store_true",
-                help="a model to plan with: without the feedback of the controller that flew, without delayed inputs",
-            ),
-            _argument("--partial", action="store_true", help="read unfinished files as far as they are whole"),
+            _argument("--for-control", **_FLAG, help=_FOR_CONTROL),
+            _argument("--partial", **_FLAG, help="read unfinished files as far as they are whole"),
         ],
     ),
     "log": Command(
@@ -178,12 +167,7 @@ COMMANDS = {
         arguments=[
             _argument("action", choices=["info", "recover", "export", "layout", "inspect"], help=_LOG),
             _argument("file", type=Path, help="an MCAP file, finished or not; inspect: any log"),
-            _argument(
-                "output",
-                type=Path,
-                nargs="?",
-                help="where it goes; FILE with .recovered.mcap, .csv (or .parquet), .layout.json, .inspection.html",
-            ),
+            _argument("output", type=Path, nargs="?", help=_OUTPUT),
             _argument("--mapping", type=Path, help="inspect: a YAML file that says what the columns mean"),
         ],
     ),
@@ -192,12 +176,7 @@ COMMANDS = {
         "Prints a script that completes commands, settings and files at TAB",
         "_completion.completion",
         arguments=[
-            _argument(
-                "shell",
-                nargs="?",
-                choices=["bash", "zsh", "fish"],
-                help='for its profile: eval "$(gpmpc completion bash)"',
-            ),
+            _argument("shell", nargs="?", choices=["bash", "zsh", "fish"], help=_SHELL),
             _argument("--line", metavar="LINE", help="print what may come next after this beginning of a line"),
         ],
     ),

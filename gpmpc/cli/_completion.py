@@ -6,32 +6,13 @@ import os
 import shlex
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 
 from gpmpc.cli._commands import COMMANDS, Result
 from gpmpc.cli._settings import group_options, setting_names, settings
 from gpmpc.exceptions import GpmpcError
 
-_SCRIPTS = {
-    "bash": r"""_gpmpc() {
-    local IFS=$'\n' word=${COMP_LINE:0:COMP_POINT} before
-    COMPREPLY=($(gpmpc completion --line "$word" 2>/dev/null))
-    word=${word##*[[:space:]]} before=${word%"${word##*[=:]}"}  # bash replaces what stands behind these signs only
-    COMPREPLY=("${COMPREPLY[@]#"$before"}")
-    [[ ${#COMPREPLY[@]} == 1 && ${COMPREPLY[0]} == *[=/.] ]] && compopt -o nospace
-}
-complete -F _gpmpc gpmpc
-""",
-    "zsh": r"""(( $+functions[compdef] )) || { autoload -Uz compinit && compinit -u }
-_gpmpc() {
-    local -a found=("${(@f)$(gpmpc completion --line "$LBUFFER" 2>/dev/null)}")
-    compadd -Q -S '' -- ${(M)found:#*[=/.]}
-    compadd -Q -- ${found:#*[=/.]}
-}
-compdef _gpmpc gpmpc
-""",
-    "fish": """complete -c gpmpc -f -a '(gpmpc completion --line (commandline -cp | string collect) 2>/dev/null)'
-""",
-}
+_SCRIPTS = Path(__file__).with_name("completion")  # a file a shell
 
 
 def completion(given: argparse.Namespace) -> Result:
@@ -39,9 +20,9 @@ def completion(given: argparse.Namespace) -> Result:
     if given.line is not None:
         found = candidates(given.line)
     elif given.shell:
-        found = [_SCRIPTS[given.shell].rstrip()]
+        found = [(_SCRIPTS / f"{given.shell}.txt").read_text(encoding="utf-8").rstrip()]
     else:
-        raise GpmpcError(f"completion: name a shell: {', '.join(_SCRIPTS)}")
+        raise GpmpcError("completion: name a shell: bash, zsh, fish")
     print("\n".join(found))
     return Result(found)
 

@@ -71,20 +71,17 @@ def settings(own: str | None = None) -> Iterator[None]:
     if here not in sys.path:
         sys.path.append(here)
     if own is not None:
-        _search_also(Path(own))
+        folder = Path(own)
+        if not folder.is_dir():
+            raise SettingError("--config-dir", f"{folder}: no such folder")
+
+        class OwnFolder(SearchPathPlugin):
+            def manipulate_search_path(self, search_path: Any) -> None:
+                search_path.append("command-line", f"file://{folder.absolute()}")
+
+        Plugins.instance().register(OwnFolder)
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder())):
         yield
-
-
-def _search_also(folder: Path) -> None:
-    if not folder.is_dir():
-        raise SettingError("--config-dir", f"{folder}: no such folder")
-
-    class OwnFolder(SearchPathPlugin):
-        def manipulate_search_path(self, search_path: Any) -> None:
-            search_path.append("command-line", f"file://{folder.absolute()}")
-
-    Plugins.instance().register(OwnFolder)
 
 
 def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:

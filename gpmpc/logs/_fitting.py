@@ -79,10 +79,8 @@ def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = ST
     def residuals(theta: Array) -> Array:
         """Of parameter vectors (T, P): (T, W, steps, e)."""
         count = max(MEMORY_ROWS // len(cut), 1)
-        parts = [
-            rollout_errors(cut, model.rollout(cut, steps, theta[i : i + count]), at) / scale
-            for i in range(0, len(theta), count)
-        ]
+        batches = (theta[i : i + count] for i in range(0, len(theta), count))
+        parts = [rollout_errors(cut, model.rollout(cut, steps, batch), at) / scale for batch in batches]
         return np.nan_to_num(np.concatenate(parts), nan=1e6, posinf=1e6, neginf=-1e6)
 
     def jacobian(theta: Array) -> Array:
@@ -94,21 +92,14 @@ def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = ST
         first = residuals(theta0[None])[0]
         if not (np.abs(first) < 1e6).all():
             raise DataError("the rollouts at theta0 are not finite: begin nearer, or with fewer steps")
+        options: dict[str, Any] = {"loss": "soft_l1", "x_scale": "jac", "max_nfev": EVALUATIONS}
         found = least_squares(
-            lambda theta: residuals(theta[None])[0].ravel(),
-            theta0,
-            jacobian,
-            loss="soft_l1",
-            x_scale="jac",
-            max_nfev=EVALUATIONS,
-            xtol=1e-4,
-            ftol=1e-4,
+            lambda theta: residuals(theta[None])[0].ravel(), theta0, jacobian, xtol=1e-4, ftol=1e-4, **options
         )
     start_cost = float((np.sqrt(1 + first**2) - 1).sum() / first.size)
     errors = _standard_errors(found.x, jacobian(found.x), residuals(found.x[None])[0])
-    return NominalFit(
-        replace(model, theta=found.x), errors, float(found.cost / first.size), start_cost, found.nfev + found.njev
-    )
+    fitted, cost = replace(model, theta=found.x), float(found.cost / first.size)
+    return NominalFit(fitted, errors, cost, start_cost, found.nfev + found.njev)
 
 
 def _still_error(windows: Windows, at: np.ndarray) -> Array:
@@ -229,7 +220,7 @@ def _responses(model: LogModel, windows: Windows, steps: Sequence[int]) -> Array
             if constant == 0:
                 total = np.square(G).sum(axis=0)
             else:  # sum over i, j of rho^|i - j| G_i G_j, in one pass
-                rho, tail, total = np.exp(-windows.time_step / constant), np.zeros_like(G[0]), np.zeros_like(G[0])
+                rho, (tail, total) = np.exp(-windows.time_step / constant), np.zeros((2, *G[0].shape))
                 for g in G:
                     total += g * (g + 2 * tail)
                     tail = rho * (tail + g)
@@ -249,10 +240,8 @@ def _linearized(model: LogModel, windows: Windows, steps: int) -> tuple[Array, A
     d = model.disturbance(windows)[:, None]
     y = model.outputs(x, u, c) + d
     after = kinematics.step(x, y, dt)
-    A, B = [], []
-    for direction in np.eye(space.error_dim):
-        moved = space.displace(x, DIFFERENCE * direction)
-        A.append(space.difference(kinematics.step(moved, model.outputs(moved, u, c) + d, dt), after) / DIFFERENCE)
-    for direction in np.eye(y.shape[-1]):
-        B.append(space.difference(kinematics.step(x, y + DIFFERENCE * direction, dt), after) / DIFFERENCE)
-    return np.stack(A, axis=-1), np.stack(B, axis=-1)
+    displaced = (space.displace(x, h) for h in DIFFERENCE * np.eye(space.error_dim))
+    by_state = [kinematics.step(moved, model.outputs(moved, u, c) + d, dt) for moved in displaced]
+    by_output = [kinematics.step(x, y + h, dt) for h in DIFFERENCE * np.eye(y.shape[-1])]
+    A, B = (np.stack([space.difference(m, after) / DIFFERENCE for m in moved], -1) for moved in (by_state, by_output))
+    return A, B

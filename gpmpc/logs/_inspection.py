@@ -48,16 +48,15 @@ class Channel:
     @property
     def remark(self) -> str:
         """What to beware of, in words."""
-        remarks = []
+        remark = ""
         if self.std == 0:
-            remarks.append("never changes")
+            remark = "never changes"
         elif self.repeated > 0.5:
-            remarks.append(f"a new value every {1 / max(1 - self.repeated, 1e-9):.1f} rows")
+            remark = f"a new value every {1 / max(1 - self.repeated, 1e-9):.1f} rows"
         elif self.smoothness > 0.3:
-            remarks.append("smoothed: its errors hang together over rows")
-        if self.missing:
-            remarks.append(f"{self.missing:.1%} missing")
-        return ", ".join(remarks)
+            remark = "smoothed: its errors hang together over rows"
+        missing = f"{self.missing:.1%} missing" if self.missing else ""
+        return ", ".join(filter(None, (remark, missing)))
 
 
 @dataclass(frozen=True)
@@ -97,12 +96,10 @@ class Inspection:
             found += [f"stamps{where} jitter by {jitter:.0%} of the time step: state a rate"] if jitter > 0.1 else []
         found += [f"{channel.name}: {channel.remark}" for channel in self.channels if channel.remark]
         for delay in self.delays:
-            if abs(delay.rows) >= 1 or delay.range[1] - delay.range[0] > 2:
-                low, high = delay.range
-                found.append(
-                    f"{delay.second} comes {delay.rows:g} rows after {delay.first} ({low:g} to {high:g}; "
-                    f"{delay.agreement:.0%} of the blocks agree)"
-                )
+            low, high = delay.range
+            if abs(delay.rows) >= 1 or high - low > 2:
+                agree = f"{low:g} to {high:g}; {delay.agreement:.0%} of the blocks agree"
+                found.append(f"{delay.second} comes {delay.rows:g} rows after {delay.first} ({agree})")
         found += [
             f"{name} follows the states ({share:.0%} of its variance): its own effect cannot be learned"
             for name, share in self.follows.items()
@@ -122,8 +119,8 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspecti
         DataError: The file cannot be read, or no column holds the time.
     """
     topics = {signal.topic for signal in mapping.signals} if mapping else ()
-    streams, channels, gaps, delays, tables = read_streams(path, topics), [], [], [], []
-    rows = 0
+    streams = read_streams(path, topics)
+    channels, gaps, delays, tables, rows = [], [], [], [], 0
     for topic, table in streams.items():
         time_name, time = _time(path, table, mapping)
         stamps = ordered_stamps(time, f"{path}{f', {topic}' if topic else ''}")
@@ -133,17 +130,14 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspecti
         step = float(np.median(steps))
         wide = np.flatnonzero(steps > 1.5 * step)
         gaps += [(float(stamps.time[i]), float(stamps.time[i + 1])) for i in wide]
-        longest = float(steps[wide].max()) if len(wide) else 0.0
+        longest = float(steps[wide].max(initial=0))
         jitter = float(steps[steps <= 1.5 * step].std() / step)
         tables.append((topic, len(table), 1 / step, jitter, len(wide), longest, stamps.repeated, stamps.backwards))
         wanted = {c for s in mapping.signals if s.topic == topic for c in s.columns} if mapping else None
         names = [c for c in table.select_dtypes("number").columns if c != time_name and (wanted is None or c in wanted)]
-        found = [
-            _channel(f"{topic}.{name}" if topic else str(name), stamps.time, table[name].to_numpy(float)[stamps.rows])
-            for name in names
-        ]
-        delays += _delays([channel.name for channel in found], table[names].to_numpy(float)[stamps.rows])
-        channels += found
+        titles, values = [f"{topic}.{n}" if topic else str(n) for n in names], table[names].to_numpy(float)[stamps.rows]
+        channels += [_channel(name, stamps.time, column) for name, column in zip(titles, values.T, strict=True)]
+        delays += _delays(titles, values)
         rows += len(table)
     size = f"{Path(path).name}: {rows} rows, {len(channels)} channels"
     delays = sorted(delays, key=lambda delay: -abs(delay.correlation))[:PAIRS]
@@ -160,11 +154,11 @@ def _time(path: str | Path, table: pd.DataFrame, mapping: LogMapping | None) -> 
 
 
 def _channel(name: str, time: Array, values: Array) -> Channel:
-    present = np.isfinite(values)
+    known = values[np.isfinite(values)]
     stride = max(len(values) // DRAWN, 1)
-    known = values[present]
+    line, missing = (time[::stride], values[::stride]), 1 - len(known) / len(values)
     if not len(known):
-        return Channel(name, time[::stride], values[::stride], 1.0, 0.0, 0, np.nan, np.nan, 0.0, 0.0, 0.0)
+        return Channel(name, *line, missing, 0.0, 0, np.nan, np.nan, 0.0, 0.0, 0.0)
     same = np.diff(known) == 0
     changes = np.flatnonzero(np.r_[True, ~same, True])
     second = np.diff(known, 2)
@@ -172,19 +166,9 @@ def _channel(name: str, time: Array, values: Array) -> Channel:
     noise = 1.4826 * float(np.median(np.abs(second - np.median(second)))) / np.sqrt(6) if len(second) else 0.0
     power = float(second @ second)
     smoothness = float(second[1:] @ second[:-1]) / power if power > 0 else 0.0
-    return Channel(
-        name,
-        time[::stride],
-        values[::stride],
-        1 - float(present.mean()),
-        float(same.mean()) if len(same) else 0.0,
-        int(np.diff(changes).max()),
-        float(known.min()),
-        float(known.max()),
-        float(known.std()),
-        noise,
-        smoothness,
-    )
+    repeated, longest = float(same.mean()) if len(same) else 0.0, int(np.diff(changes).max())
+    low, high, std = float(known.min()), float(known.max()), float(known.std())
+    return Channel(name, *line, missing, repeated, longest, low, high, std, noise, smoothness)
 
 
 def _delays(names: list[str], values: Array) -> list[Delay]:
@@ -193,8 +177,7 @@ def _delays(names: list[str], values: Array) -> list[Delay]:
     if length < 4 * REACH:
         return []
     starts = np.unique(np.linspace(0, len(values) - length, BLOCKS).astype(int))
-    blocks = np.stack([values[a : a + length] for a in starts])  # (b, rows, c)
-    steps = np.nan_to_num(np.diff(blocks, axis=1))
+    steps = np.nan_to_num(np.diff([values[a : a + length] for a in starts], axis=1))  # (b, rows, c)
     steps = steps - steps.mean(axis=1, keepdims=True)
     norms = np.linalg.norm(steps, axis=1)
     usable = np.flatnonzero((norms > 0).all(axis=0))
@@ -213,11 +196,9 @@ def _delays(names: list[str], values: Array) -> list[Delay]:
             # A slow oscillation is correlated with any other at some delay; a delay has a sharp peak.
             if abs(correlation) >= CORRELATED and around.max() < 0.8 * abs(correlation):
                 lags = peak[:, j] - REACH
-                delay = float(np.median(lags))
+                delay, reach = float(np.median(lags)), (float(lags.min()), float(lags.max()))
                 agreement = float((np.abs(lags - delay) <= 1).mean())
-                first, second = names[int(usable[i])], names[int(usable[i + 1 + j])]
-                reach = float(lags.min()), float(lags.max())
-                found.append(Delay(first, second, delay, reach, agreement, correlation))
+                found.append(Delay(names[usable[i]], names[usable[i + 1 + j]], delay, reach, agreement, correlation))
     return found
 
 

@@ -56,16 +56,14 @@ class Judgement:
 
     def to_pandas(self) -> pd.DataFrame:
         """A row a predictor, step and group."""
+        low, high = np.moveaxis(self.coverage_interval, -1, 0)
+        own = {"coverage": self.coverage, "coverage_low": low, "coverage_high": high, "width": self.width}
         rows = []
         for name, mean in self.mean.items():
-            for (k, g), error in np.ndenumerate(mean):
+            numbers = {"mean_error": mean, "rmse": self.rmse[name]} | (own if name == "model" else {})
+            for k, g in np.ndindex(mean.shape):
                 row = {"predictor": name, "step": self.steps[k], "group": self.groups[g], "unit": self.units[g]}
-                row |= {"mean_error": error, "rmse": self.rmse[name][k, g]}
-                if name == "model":
-                    low, high = self.coverage_interval[k, g]
-                    row |= {"coverage": self.coverage[k, g], "coverage_low": low, "coverage_high": high}
-                    row |= {"width": self.width[k, g]}
-                rows.append(row)
+                rows.append(row | {key: values[k, g] for key, values in numbers.items()})
         return pd.DataFrame(rows)
 
 
@@ -82,10 +80,10 @@ def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = ST
         DataError: No piece of the held-out log is long enough.
     """
     model, space, kinematics = learned.model, held_out.space, learned.model.kinematics
-    past = max(model.past, PAST)
-    stride = choose_stride(held_out, max(steps) + past, WINDOWS)
-    cut = held_out.windows(max(steps), past, stride)
-    start, longest = cut.states[:, past], max(steps)
+    past, longest = max(model.past, PAST), max(steps)
+    stride = choose_stride(held_out, longest + past, WINDOWS)
+    cut = held_out.windows(longest, past, stride)
+    start = cut.states[:, past]
     seen = train.windows(longest, PAST, choose_stride(train, longest + PAST, RIDGE_WINDOWS))
     own = rollout_errors(cut, model.rollout(cut), steps)
     with np.errstate(over="ignore", invalid="ignore"):

@@ -73,10 +73,8 @@ class StateSpace:
             one, other = a[..., at], b[..., at]
             if group.kind == "quaternion":
                 parts.append(rotation_vector(quaternion_product(quaternion_inverse(other), one)))
-            elif group.kind == "angle":
-                parts.append(wrap(one - other))
             else:
-                parts.append(one - other)
+                parts.append(wrap(one - other) if group.kind == "angle" else one - other)
         return np.concatenate(np.broadcast_arrays(*parts) if len(parts) == 1 else parts, axis=-1)
 
     def displace(self, state: Array, error: Array) -> Array:
@@ -109,15 +107,10 @@ def quaternion_product(a: Array, b: Array) -> Array:
     """Computes the Hamilton product (..., 4) of quaternions (x, y, z, w)."""
     ax, ay, az, aw = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
     bx, by, bz, bw = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
-    return np.stack(
-        [
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ],
-        axis=-1,
-    )
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by - ax * bz + ay * bw + az * bx
+    z = aw * bz + ax * by - ay * bx + az * bw
+    return np.stack([x, y, z, aw * bw - ax * bx - ay * by - az * bz], axis=-1)
 
 
 def quaternion_inverse(q: Array) -> Array:

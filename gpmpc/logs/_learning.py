@@ -8,7 +8,6 @@ rollouts as well.
 import warnings
 from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,6 +26,7 @@ from gpmpc.logs._rollouts import (
     AffineNominal,
     LogModel,
     MultirotorNominal,
+    Nominal,
     OutputGP,
     Still,
     choose_stride,
@@ -119,9 +119,7 @@ def learn(
     name, structure, options = _structures(kinematics, log)
     if for_control:
         options = {words: grow for words, grow in options.items() if words not in (FEEDBACK, LATE_INPUTS)}
-    candidates: list[Candidate] = []
-    best = 0
-    models: list[Any] = []
+    candidates, models, best = [], [], 0
     for words, grow in [("", lambda model: model), *options.items()]:
         trial = grow(structure)
         if trial is None:
@@ -138,28 +136,27 @@ def learn(
             best, models, name, structure = len(candidates) - 1, fitted, trial_name, trial
     choice: dict[str, int] = {}
     for group, outputs in kinematics.output_groups.items():
-        base = models
+        base = [(model, train) for model, (train, _) in zip(models, folds.parts, strict=True)]
         for average in AVERAGES:
-            grown = partial(_with_gp, outputs=outputs, average=average, points=points, seed=seed)
             averages = {**choice, group: average}.items()
             words = f"{name}, GP on {' and '.join(f'{of} (averaged over {rows})' for of, rows in averages)}"
             progress(words)
             trained: list[LogModel] = []
             if words not in memory:
-                trained = [grown(m, train) for m, (train, _) in zip(base, folds.parts, strict=True)]
+                trained = _with_gps(base, outputs, average, points, seed)
                 memory[words] = folds.judge(words, trained).errors.tolist()
             candidates.append(Candidate(words, np.array(memory[words])))
             if _is_better(candidates[-1], candidates[best]):
-                models = trained or [grown(m, train) for m, (train, _) in zip(base, folds.parts, strict=True)]
+                models = trained or _with_gps(base, outputs, average, points, seed)
                 best, choice[group] = len(candidates) - 1, average
     progress(f"chosen: {candidates[best].name}")
+    candidates[best] = replace(candidates[best], chosen=True)
     progress("noise from the errors of held-out rollouts")
     noise = fit_noise(models, [held_out for _, held_out in folds.parts], steps)
     progress("the chosen structure, fitted to all runs")
     fit = _fit(structure, models[0], log, steps)
     groups = kinematics.output_groups
     gps = tuple(_train(fit.model, log, groups[group], average, points, seed) for group, average in choice.items())
-    candidates[best] = replace(candidates[best], chosen=True)
     values = np.concatenate([np.hstack([run.states, run.inputs]) for run in log])
     return Learned(
         model=replace(fit.model, gps=gps),
@@ -185,34 +182,30 @@ def _is_better(candidate: Candidate, incumbent: Candidate) -> bool:
 def _structures(kinematics: Kinematics, log: Log) -> tuple[str, LogModel, dict[str, Grow]]:
     """The simplest model, and what may be added to it one after the other; None where an addition makes no sense."""
     o = len(kinematics.output_names)
-    none, nothing = (0,) * o, np.empty(0)
+
+    def simplest(nominal: Nominal) -> LogModel:
+        return LogModel(kinematics, nominal, np.empty(0), (0,) * o)
+
+    options: dict[str, Grow]
     if log.mapping.model != "rigid_body":
-        affine = AffineNominal(kinematics, o)
-        return (
-            "increments",
-            LogModel(kinematics, Still(o), nothing, none),
-            {
-                "least squares": lambda model: replace(model, nominal=affine),
-                "disturbance": lambda model: replace(model, history=(PAST,) * o),
-            },
-        )
+        options = {
+            "least squares": lambda model: replace(model, nominal=AffineNominal(kinematics, o)),
+            "disturbance": lambda model: replace(model, history=(PAST,) * o),
+        }
+        return "increments", simplest(Still(o)), options
+    options = {
+        "force disturbance": lambda model: replace(model, history=(PAST,) * 3 + (0,) * 3),
+        "motor torque": lambda model: replace(model, nominal=replace(model.nominal, torque=True)),
+        FEEDBACK: lambda model: replace(model, nominal=replace(model.nominal, feedback=True)),
+        LATE_INPUTS: lambda model: replace(model, lag=LATE) if model.nominal.torque else None,
+        "torque disturbance": lambda model: (
+            replace(model, history=model.history[:3] + (PAST,) * 3) if model.nominal.torque else None
+        ),
+    }
     volts = bool(log.context_names) and log.mapping.of("context")[0].unit in ("V", "mV")
     voltage = float(np.median(np.concatenate([run.context[:, 0] for run in log]))) if volts else 0.0
     thrusts = all(signal.unit == "N" for signal in log.mapping.of("inputs"))
-    plain = MultirotorNominal(len(log.input_names), voltage=voltage, thrusts=thrusts)
-    return (
-        "rigid body",
-        LogModel(kinematics, plain, nothing, none),
-        {
-            "force disturbance": lambda model: replace(model, history=(PAST,) * 3 + (0,) * 3),
-            "motor torque": lambda model: replace(model, nominal=replace(model.nominal, torque=True)),
-            FEEDBACK: lambda model: replace(model, nominal=replace(model.nominal, feedback=True)),
-            LATE_INPUTS: lambda model: replace(model, lag=LATE) if model.nominal.torque else None,
-            "torque disturbance": lambda model: (
-                replace(model, history=(*model.history[:3], PAST, PAST, PAST)) if model.nominal.torque else None
-            ),
-        },
-    )
+    return "rigid body", simplest(MultirotorNominal(len(log.input_names), voltage=voltage, thrusts=thrusts)), options
 
 
 def _split(log: Log, count: int) -> list[tuple[Log, Log]]:
@@ -221,8 +214,7 @@ def _split(log: Log, count: int) -> list[tuple[Log, Log]]:
         halves = log.split_by_time(0.5)
         log = replace(log, runs=tuple(half.runs[0] for half in halves))
     names = [run.name for run in sorted(log.runs, key=len)]
-    groups = [names[i::count] for i in range(count)]
-    return [log.split(group) for group in groups]
+    return [log.split(names[i::count]) for i in range(count)]
 
 
 def _fit(structure: LogModel, simpler: LogModel, log: Log, steps: int) -> NominalFit:
@@ -243,8 +235,10 @@ def _with_parameters(structure: LogModel, theta: Sequence[float]) -> LogModel:
     return replace(structure, theta=np.array(theta, dtype=float))
 
 
-def _with_gp(model: LogModel, log: Log, outputs: tuple[int, ...], average: int, points: int, seed: int) -> LogModel:
-    return replace(model, gps=(*model.gps, _train(model, log, outputs, average, points, seed)))
+def _with_gps(
+    base: Sequence[tuple[LogModel, Log]], outputs: tuple[int, ...], average: int, points: int, seed: int
+) -> list[LogModel]:
+    return [replace(m, gps=(*m.gps, _train(m, log, outputs, average, points, seed))) for m, log in base]
 
 
 def _train(model: LogModel, log: Log, outputs: tuple[int, ...], average: int, points: int, seed: int) -> OutputGP:

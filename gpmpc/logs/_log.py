@@ -18,12 +18,13 @@ from gpmpc.calibration import Recording
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gp import Transitions
 from gpmpc.logs._kinematics import Array, StateSpace, quaternion_inverse, quaternion_product, rotate, rotation_vector
-from gpmpc.logs._mapping import LogMapping, Signal
+from gpmpc.logs._mapping import LogMapping
 
 SPAN = 4  # rows on each side of a finite difference: above the noise of one row
 SLOPES = (0.5, 2.0)  # of a signal over the derivative that it should be
 FIT = 0.7  # correlation from which a slope says something
 MOST_ROWS = 20_000
+_RIGID_BODY = [("vector", 3), ("quaternion", 3), ("vector", 3), ("vector", 3)]
 _HINTS = ((180 / np.pi, "degrees instead of radians"), (np.pi / 180, "radians instead of degrees"))
 
 
@@ -35,6 +36,15 @@ class Finding:
     run: str
     count: int  # rows, or gaps
     text: str
+
+
+class Findings(list[Finding]):
+    """What was noticed so far."""
+
+    def note(self, kind: str, run: str, count: Any, text: str) -> None:
+        """Adds a finding, unless there was none."""
+        if count:
+            self.append(Finding(kind, run, int(count), text))
 
 
 @dataclass(frozen=True)
@@ -58,16 +68,13 @@ class LogRun:
 
     def starts(self, past: int, ahead: int, stride: int = 1) -> np.ndarray:
         """Lists the rows that have ``past`` rows before and ``ahead`` after them in their own piece."""
-        starts = [np.arange(begin + past, end - ahead, stride) for begin, end in self.pieces]
-        return np.concatenate(starts).astype(int)
+        return np.concatenate([np.arange(begin + past, end - ahead, stride) for begin, end in self.pieces]).astype(int)
 
     def part(self, begin: int, end: int, name: str) -> "LogRun":
         """The rows from ``begin`` to before ``end`` as a run of its own."""
-        inner = tuple(b - begin for b in self.begins if begin < b < end)
-        time, states, inputs, context = (
-            getattr(self, key)[begin:end] for key in ("time", "states", "inputs", "context")
-        )
-        return LogRun(f"{self.name}, {name}", time, states, inputs, context, begins=(0, *inner))
+        arrays = (array[begin:end] for array in (self.time, self.states, self.inputs, self.context))
+        begins = (0, *(b - begin for b in self.begins if begin < b < end))
+        return LogRun(f"{self.name}, {name}", *arrays, begins=begins)
 
 
 @dataclass(frozen=True)
@@ -207,13 +214,18 @@ def check_plausible(runs: Sequence[LogRun], step: float, mapping: LogMapping) ->
         raise DataError(f"no input changes in {rows} rows: the system is at rest, and nothing can be learned of it")
     if mapping.model != "rigid_body":
         return
-    rigid_body_signals(mapping)
+    signals = mapping.of("states")
+    if [(s.group.kind, s.group.error_dim) for s in signals] != _RIGID_BODY:
+        raise DataError(
+            "a rigid body's states are position (3), attitude (quaternion or Euler angles), velocity (3) and angular "
+            f"rate (3), in this order; the mapping has {', '.join(s.name for s in signals)}"
+        )
     before, now, after = (_rows(runs, shift) for shift in (-SPAN, 0, SPAN))
     if len(now) < 50:
         return
     at, time = mapping.space.columns, 2 * SPAN * step
     _, q, v, w = (now[:, columns] for columns in at)
-    names, frames = zip(*((signal.name, signal.frame) for signal in mapping.of("states")), strict=True)
+    names, frames = zip(*((signal.name, signal.frame) for signal in signals), strict=True)
     speed = (after[:, at[0]] - before[:, at[0]]) / time
     _compare(v if frames[2] != "body" else rotate(q, v), speed, names[2], f"the derivative of {names[0]}")
     turn = quaternion_product(quaternion_inverse(before[:, at[1]]), after[:, at[1]])
@@ -223,21 +235,8 @@ def check_plausible(runs: Sequence[LogRun], step: float, mapping: LogMapping) ->
     _compare(w, found, names[3], f"the derivative of {names[1]}", other, frames[3] or "body")
 
 
-def rigid_body_signals(mapping: LogMapping) -> tuple[Signal, ...]:
-    """Position, attitude, velocity and rate of a rigid body; ``DataError`` where they are others."""
-    signals = mapping.of("states")
-    shapes = [(s.group.kind, s.group.error_dim) for s in signals]
-    if shapes != [("vector", 3), ("quaternion", 3), ("vector", 3), ("vector", 3)]:
-        raise DataError(
-            "a rigid body's states are position (3), attitude (quaternion or Euler angles), velocity (3) and angular "
-            f"rate (3), in this order; the mapping has {', '.join(s.name for s in signals)}"
-        )
-    return signals
-
-
 def _rows(runs: Sequence[LogRun], shift: int) -> Array:
-    rows = [run.states[run.starts(SPAN, SPAN) + shift] for run in runs]
-    states = np.concatenate(rows)
+    states = np.concatenate([run.states[run.starts(SPAN, SPAN) + shift] for run in runs])
     return states[:: max(len(states) // MOST_ROWS, 1)]
 
 

@@ -148,11 +148,10 @@ class LogMapping:
         """The columns of one role in the order that they come out in, with what was done to their values."""
         found = []
         for signal in self.of(role):
-            names, turned = signal.columns, signal.kind == "euler"
+            turned = signal.kind == "euler"
+            names = signal.group.entries if turned else signal.columns
             if signal.kind == "quaternion" and signal.order == "wxyz":
                 names = (*names[1:], names[0])
-            elif turned:
-                names = signal.group.entries
             factor = signal.scale * UNITS.get(signal.unit, ("", 1.0))[1]
             turned_frame = {"m/s": "body", "rad/s": "world"}.get(signal.group.unit)
             other = self.model == "rigid_body" and signal.frame == turned_frame

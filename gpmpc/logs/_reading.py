@@ -19,7 +19,7 @@ from gpmpc.logs._kinematics import (
     rotation_quaternion,
     rotation_vector,
 )
-from gpmpc.logs._log import Finding, Log, LogRun, check_plausible
+from gpmpc.logs._log import Findings, Log, LogRun, check_plausible
 from gpmpc.logs._mapping import ROLES, TIME_UNITS, UNITS, LogMapping, Signal
 from gpmpc.logs._readers import STAMP, Streams, read_streams
 
@@ -61,8 +61,7 @@ def read_log(
     files = [files] if isinstance(files, str | Path) else list(files)
     if not files:
         raise DataError("no log file was given")
-    findings: list[Finding] = []
-    tables: list[_Table] = []
+    findings, tables = Findings(), []
     for file in map(Path, files):
         streams = read_streams(file, {signal.topic for signal in mapping.signals}, partial)
         name = file.name.removesuffix(".gz").rsplit(".", 1)[0]
@@ -105,7 +104,7 @@ def _split_runs(file: Path, name: str, streams: Streams, mapping: LogMapping) ->
     return [(f"{name}:{run}", {"": part}) for run, part in table.groupby(mapping.run, sort=False)]
 
 
-def _tabulate(file: Path, name: str, streams: Streams, mapping: LogMapping, findings: list[Finding]) -> _Table:
+def _tabulate(file: Path, name: str, streams: Streams, mapping: LogMapping, findings: Findings) -> _Table:
     """Puts the signals of a run on one grid of times, in the units and conventions of ``gpmpc.logs``."""
     stamps, tables = {}, {}
     for topic in dict.fromkeys(signal.topic for signal in mapping.signals):
@@ -114,8 +113,7 @@ def _tabulate(file: Path, name: str, streams: Streams, mapping: LogMapping, find
         stamps[topic] = found = ordered_stamps(_time(label, table, mapping), label)
         tables[topic] = table.iloc[found.rows]
         for kind, count in (("repeated stamp", found.repeated), ("stamp runs backwards", found.backwards)):
-            if count:
-                findings.append(Finding(kind, name, count, f"{count} rows{f' of {topic}' if topic else ''}: left out"))
+            findings.note(kind, name, count, f"{count} rows{f' of {topic}' if topic else ''}: left out")
     samples = {s.role + s.name: _values(file, tables[s.topic], s, name, findings) for s in mapping.signals}
     outside = {topic: _outside(file, table, mapping) for topic, table in tables.items()}
     if mapping.rate is None:
@@ -170,7 +168,7 @@ def _numbers(label: str, table: pd.DataFrame, column: str) -> Array:
     return numbers
 
 
-def _values(file: Path, table: pd.DataFrame, signal: Signal, run: str, findings: list[Finding]) -> Array:
+def _values(file: Path, table: pd.DataFrame, signal: Signal, run: str, findings: Findings) -> Array:
     """A signal (K, c) in the units and conventions of ``gpmpc.logs``; NaN where it is missing."""
     missing = [column for column in signal.columns if column not in table]
     if missing:
@@ -178,10 +176,8 @@ def _values(file: Path, table: pd.DataFrame, signal: Signal, run: str, findings:
         raise DataError(f"{file}: column {missing[0]!r}{where} is missing; there are {_some(table)}")
     values = np.column_stack([_numbers(str(file), table, column) for column in signal.columns]) * signal.scale
     values[~np.isfinite(values)] = np.nan
-    absent = np.asarray(np.isnan(values).any(axis=1))
-    if absent.any():
-        text = f"{int(absent.sum())} rows of {signal.name} without a value: left out"
-        findings.append(Finding("missing value", run, int(absent.sum()), text))
+    absent = np.isnan(values).any(axis=1).sum()
+    findings.note("missing value", run, absent, f"{absent} rows of {signal.name} without a value: left out")
     if signal.kind == "quaternion":
         return _quaternions(file, values, signal, run, findings)
     values *= UNITS.get(signal.unit, ("", 1.0))[1]
@@ -191,7 +187,7 @@ def _values(file: Path, table: pd.DataFrame, signal: Signal, run: str, findings:
     return quaternion_from_euler(values) if signal.kind == "euler" else values
 
 
-def _quaternions(file: Path, values: Array, signal: Signal, run: str, findings: list[Finding]) -> Array:
+def _quaternions(file: Path, values: Array, signal: Signal, run: str, findings: Findings) -> Array:
     """Unit quaternions (x, y, z, w) whose sign does not flip."""
     if signal.order == "wxyz":
         values = values[:, [1, 2, 3, 0]]
@@ -202,13 +198,9 @@ def _quaternions(file: Path, values: Array, signal: Signal, run: str, findings: 
         raise DataError(f"{file}: {signal.name} in row {row + 1} has norm {norms[row]:.4g}; expected unit quaternions")
     values = values / norms[:, None]
     present = np.flatnonzero(np.isfinite(norms))
-    dots = np.einsum("ij,ij->i", values[present[1:]], values[present[:-1]])
-    flips = dots < 0
-    if flips.any():
-        findings.append(
-            Finding("quaternion flips its sign", run, int(flips.sum()), f"{flips.sum()} times: turned back")
-        )
-        values[present[1:]] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+    flips = np.einsum("ij,ij->i", values[present[1:]], values[present[:-1]]) < 0
+    findings.note("quaternion flips its sign", run, flips.sum(), f"{flips.sum()} times: turned back")
+    values[present[1:]] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
     return values
 
 
@@ -226,24 +218,22 @@ def _outside(file: Path, table: pd.DataFrame, mapping: LogMapping) -> np.ndarray
 def _spread(tables: Sequence[_Table]) -> Array:
     """Usual spread of each state (n,) over all runs: half of the range of 80 % of the rows."""
     states = np.concatenate([table.values["states"] for table in tables])
-    with np.errstate(invalid="ignore"):
-        present = states[np.isfinite(states).all(axis=1)]
+    present = states[np.isfinite(states).all(axis=1)]
     if not len(present):
         raise DataError("no row has a value of every state")
     low, high = np.quantile(present, [0.1, 0.9], axis=0)
     return (high - low) / 2
 
 
-def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping, findings: list[Finding]) -> LogRun | None:
+def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping, findings: Findings) -> LogRun | None:
     """Leaves out what cannot be used, and marks where a new piece begins; None where nothing is left."""
     states, inputs, context = (table.values[role] for role in ROLES)
     usable = np.ones(len(table.time), dtype=bool)
 
     def leave_out(rows: np.ndarray, kind: str, text: str) -> None:
-        count = int((rows & usable).sum())
-        if count:
-            findings.append(Finding(kind, table.name, count, f"{count} of {len(rows)} rows {text}: left out"))
-            usable[rows] = False
+        count = (rows & usable).sum()
+        findings.note(kind, table.name, count, f"{count} of {len(rows)} rows {text}: left out")
+        usable[rows] = False
 
     leave_out(table.outside, "outside of keep", "outside the ranges of keep")
     if mapping.rest == "drop":
@@ -263,21 +253,17 @@ def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping, fi
             leave_out(same, "held value", f"where {signal.name} repeats the row before")
     rows = np.flatnonzero(usable)
     if len(rows) < 2:
-        findings.append(Finding("nothing left", table.name, len(table.time), "no row can be used: the run is left out"))
+        findings.note("nothing left", table.name, len(table.time), "no row can be used: the run is left out")
         return None
-    gaps = np.diff(table.time[rows]) > (mapping.max_gap if mapping.max_gap and not mapping.rate else 1.5 * step)
+    times = np.diff(table.time[rows])
+    gaps = times > (mapping.max_gap if mapping.max_gap and not mapping.rate else 1.5 * step)
     inner = gaps & (np.diff(rows) == 1)
-    if inner.any():
-        longest = float(np.diff(table.time[rows])[inner].max())
-        findings.append(
-            Finding("gap", table.name, int(inner.sum()), f"{inner.sum()} gaps, up to {longest:.3g} s: boundaries")
-        )
-    breaks = gaps | (np.diff(rows) > 1) | table.breaks[rows[1:]]
-    early = np.diff(table.time[rows]) < 0.5 * step
-    if early.any():
-        text = f"{int(early.sum())} rows less than half a time step after the row before: boundaries (state a rate)"
-        findings.append(Finding("jitter", table.name, int(early.sum()), text))
-        breaks |= early
+    longest = float(times[inner].max(initial=0))
+    findings.note("gap", table.name, inner.sum(), f"{inner.sum()} gaps, up to {longest:.3g} s: boundaries")
+    early = times < 0.5 * step
+    text = f"{early.sum()} rows less than half a time step after the row before: boundaries (state a rate)"
+    findings.note("jitter", table.name, early.sum(), text)
+    breaks = gaps | (np.diff(rows) > 1) | table.breaks[rows[1:]] | early
     begins = (0, *(np.flatnonzero(breaks) + 1).tolist())
     return LogRun(table.name, table.time[rows], states[rows], inputs[rows], context[rows], begins)
 
@@ -332,15 +318,13 @@ def resample(time: Array, values: Array, grid: Array, rule: str, max_gap: float)
     """
     present = np.isfinite(values).all(axis=1)
     time, values = time[present], values[present]
-    if len(time) == 0:
+    if not len(time):
         return np.full((len(grid), values.shape[1]), np.nan)
     at = np.searchsorted(time, grid + RESOLUTION, side="right") - 1
     before, after = np.clip(at, 0, None), np.clip(at + 1, None, len(time) - 1)
     lag, span = grid - time[before], time[after] - time[before]
-    exact = (at >= 0) & (lag <= RESOLUTION)
     if rule == "hold":
-        usable = (at >= 0) & (lag <= max_gap)
-        found = values[before]
+        usable, found = (at >= 0) & (lag <= max_gap), values[before]
     else:
         share = np.divide(lag, span, out=np.zeros_like(lag), where=span > 0)[:, None]
         one, other = values[before], values[after]
@@ -349,5 +333,5 @@ def resample(time: Array, values: Array, grid: Array, rule: str, max_gap: float)
             found = quaternion_product(one, rotation_quaternion(share * turn))
         else:
             found = one + share * (other - one)
-        usable = exact | ((at >= 0) & (at < len(time) - 1) & (span <= max_gap))
+        usable = (at >= 0) & ((lag <= RESOLUTION) | ((at < len(time) - 1) & (span <= max_gap)))
     return np.where(usable[:, None], found, np.nan)

@@ -179,11 +179,11 @@ class LogModel:
     def disturbance(self, windows: Windows, theta: Any = None) -> Array:
         """Estimates the disturbances at the starts of windows (..., W, o) from the rows before."""
         total = np.zeros((len(windows), len(self.history)))
+        expand = None if theta is None else [np.asarray(p)[..., None] for p in theta]
         for rows in sorted({h for h in self.history if h}):
             at = slice(windows.past - rows, windows.past)
             x = windows.states[:, windows.past - rows : windows.past + 1]
             u = windows.inputs[:, at.start - self.lag : at.stop - self.lag]
-            expand = None if theta is None else [np.asarray(p)[..., None] for p in theta]
             said = self.outputs(x[:, :-1], u, windows.context[:, at], expand).mean(axis=-2)
             seen = self.kinematics.outputs(x[:, :-1], x[:, 1:], windows.time_step).mean(axis=-2)
             total = total + np.where(np.array(self.history) == rows, seen - said, 0.0)

@@ -6,7 +6,7 @@ controller's own estimate.
 """
 
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -83,11 +83,8 @@ def _learned(path: Path, header: dict[str, Any], tensors: dict[str, Tensor]) -> 
     space = StateSpace(tuple(groups))
     kinematics: Kinematics = RigidBody(space) if header["kinematics"] == "RigidBody" else Increments(space)
     name, settings = header["nominal"]
-    nominal: Nominal
-    if name == "MultirotorNominal":
-        nominal = MultirotorNominal(**settings)
-    else:
-        nominal = AffineNominal(kinematics, **settings) if name == "AffineNominal" else Still(**settings)
+    kinds = {"MultirotorNominal": MultirotorNominal, "AffineNominal": partial(AffineNominal, kinematics)}
+    nominal: Nominal = kinds.get(name, Still)(**settings)
     gps = []
     for i, (outputs, described) in enumerate(header["gps"]):
         own = {key.removeprefix(f"gp{i}/"): value for key, value in tensors.items() if key.startswith(f"gp{i}/")}
@@ -189,9 +186,8 @@ class LogDynamics:
         z, y = np.ascontiguousarray(model.kinematics.features(x, u, nothing)), model.outputs(x, u, nothing)
         V = np.zeros((K, y.shape[1], y.shape[1]))
         for gp in model.gps:
-            V[np.ix_(range(K), gp.outputs, gp.outputs)] += np.asarray(
-                gp.posterior.linearize(z, nothing, True).covariance
-            )
+            learned: Any = gp.posterior.linearize(z, nothing, True).covariance
+            V[np.ix_(range(K), gp.outputs, gp.outputs)] += learned
         B = self._by_outputs(x, y)
         return B @ V @ B.mT
 

@@ -22,7 +22,6 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
-from gpmpc.recording import _messages
 from gpmpc.status import Status
 from gpmpc.step import Step
 
@@ -221,8 +220,8 @@ class Encoder:
 
     def __init__(self, system: RecordedSystem):
         self._states, self._inputs, self._time_step = system.state_names, system.input_names, system.time_step
-        self._schema = FileDescriptorSet(file=[_messages.descriptor(self._states, self._inputs)]).SerializeToString()
-        own = _messages.message_classes(_messages.descriptor(self._states, self._inputs, "bytes"))
+        self._schema = FileDescriptorSet(file=[descriptor(self._states, self._inputs)]).SerializeToString()
+        own = message_classes(descriptor(self._states, self._inputs, "bytes"))
         self._step, self._plan, self._qp = (own[TOPICS[topic]] for topic in (STEP, PLAN, QP))
         bounds = () if system.input_bounds is None else np.array(system.input_bounds, dtype=float)
         self._bounds = {f"input_{side}": self._input(b) for side, b in zip(("lower", "upper"), bounds, strict=False)}

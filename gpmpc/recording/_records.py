@@ -90,7 +90,8 @@ def _sound_records(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
                 for record in _parsed(head + content):
                     counts[type(record)] += 1
                     if isinstance(record, Statistics):
-                        whole = whole and _counts_all(record, counts)
+                        said = record.message_count, record.attachment_count, record.metadata_count, record.chunk_count
+                        whole = whole and said == tuple(counts[k] for k in (Message, Attachment, Metadata, Chunk))
                     elif isinstance(record, Chunk):
                         for inner in _parsed(_unfolded(record)):
                             counts[type(inner)] += 1
@@ -113,11 +114,6 @@ def _sound_records(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
 
 def _agrees(stored: bytes, computed: int) -> bool:
     return struct.unpack("<I", stored)[0] in (0, computed)  # 0: there is no checksum
-
-
-def _counts_all(said: Statistics, counts: Counter[type]) -> bool:
-    expected = (said.message_count, said.attachment_count, said.metadata_count, said.chunk_count)
-    return expected == tuple(counts[kind] for kind in (Message, Attachment, Metadata, Chunk))
 
 
 class _Bounded(BytesIO):

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from html import escape
 from itertools import zip_longest
+from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
@@ -31,21 +32,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
 _POWER = re.compile(r"(?<![\w.])(-?\d(?:\.\d+)?)e(-?\d+)(?![\w.])")
 _FOLDED = 10  # lines that a page shows without being asked
 _LONGEST = 60  # characters of a label in a figure
-_STYLE = """
-:root { color-scheme: light; }
-body { font: 15px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-width: 75rem; margin: 2rem auto;
-  padding: 0 1rem; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .3rem .7rem; text-align: right; vertical-align: top; border-bottom: 1px solid #e4e4e4; }
-th { border-bottom: 2px solid #1f4e79; vertical-align: bottom; } td:first-child, th:first-child { text-align: left; }
-td, td small { white-space: nowrap; } td small { display: block; color: #666; }
-.wide { overflow-x: auto; margin: 1rem 0; }
-.figures { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(20rem, 100%), 1fr)); gap: 1rem;
-  align-items: start; margin-bottom: 1rem; } .figures img { width: 100%; max-width: 32rem; }
-code, pre { background: #f5f5f5; padding: .1rem .3rem; overflow-wrap: anywhere; white-space: pre-wrap; }
-pre { padding: .6rem; } li { overflow-wrap: anywhere; }
-@media (max-width: 40rem) { th, td { padding: .3rem .4rem; } ul { padding-left: 1.2rem; } }
-"""
+_STYLE = Path(__file__).with_name("document.css")
 
 
 class Table(NamedTuple):
@@ -143,7 +130,7 @@ class Document:
             items = "".join(f'<li><a href="{to}/">{text}</a></li>' for to, text in quoted)
             parts.append(f"<h2>Runs</h2>{_folded('folders', self.links, f'<ul>{items}</ul>')}")
         head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-        head += f"<title>{escape(self.title)}</title><style>{_STYLE}</style>"
+        head += f"<title>{escape(self.title)}</title><style>\n{_STYLE.read_text(encoding='utf-8')}</style>"
         return f"<!doctype html>\n<html lang=en><head>{head}</head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
 
 

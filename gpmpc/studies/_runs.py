@@ -34,16 +34,14 @@ class _Measure(NamedTuple):
     wall_time: bool = False  #: whether it depends on what else the machine did meanwhile
 
 
-def _outside(result: Mapping[str, Any]) -> float | None:
-    return max((100 * rate["rate"] for rate in result["violations"].values()), default=None)
-
-
 MEASURES = {
     "rmse": _Measure("RMSE [{unit}]", lambda r: r["rmse"]["total"]),
-    "outside": _Measure("steps outside bounds [%]", _outside, logarithmic=False),
-    "failed": _Measure(
-        "failed solves [%]", lambda r: 100 * sum(r["failures"].values()) / r["steps"], logarithmic=False
+    "outside": _Measure(
+        "steps outside bounds [%]",
+        lambda r: max((100 * v["rate"] for v in r["violations"].values()), default=None),
+        False,
     ),
+    "failed": _Measure("failed solves [%]", lambda r: 100 * sum(r["failures"].values()) / r["steps"], False),
     "decision": _Measure("decision, median [ms]", lambda r: 1e3 * r["times"]["total"]["median"], wall_time=True),
     "training": _Measure("training [s]", lambda r: r["times"]["training"], wall_time=True),
 }

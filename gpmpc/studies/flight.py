@@ -32,7 +32,7 @@ from gpmpc.propagation import Propagator, best_propagator
 from gpmpc.simulation import Disturbance, ModelLoop, Noise, Rollout, Step, closed_loop, rehearse
 from gpmpc.simulation._simulator import PlantSimulator
 from gpmpc.studies._document import Table
-from gpmpc.studies.study import random_rows
+from gpmpc.studies.study import derived_seed, random_rows
 from gpmpc.systems import System
 from gpmpc.trajectories import Trajectory
 
@@ -97,10 +97,10 @@ class Experiment:
         self.references(1)
         problem = getattr(self.controller, "keywords", {}).get("problem")
         shape = len(system.state_names), len(system.input_names)
-        if problem is not None and (problem.state_dim, problem.input_dim) != shape:
-            weighed = f"weighs {problem.state_dim} states and {problem.input_dim} inputs"
-            raise SettingError("controller.problem", f"{weighed}; {system.name} has {shape[0]} and {shape[1]}")
         if problem is not None:
+            if (problem.state_dim, problem.input_dim) != shape:
+                weighed = f"weighs {problem.state_dim} states and {problem.input_dim} inputs"
+                raise SettingError("controller.problem", f"{weighed}; {system.name} has {shape[0]} and {shape[1]}")
             start = self.references(1)[0] if plant.start is None else plant.start
             problem.check_start(np.asarray(start, dtype=float), np.asarray(plant.initial_input, dtype=float))
         if self.learns and self.model is None and hasattr(self.data, "check"):
@@ -193,8 +193,8 @@ def run_trial(experiment: Experiment, prepare: Prepare | None = None) -> Flown:
         training = experiment.learn(data, experiment.seed)
         if isinstance(experiment.learning, EpisodicLearning):
             for k in range(experiment.learning.episodes):
-                seed = int(np.random.SeedSequence([experiment.seed, k]).generate_state(1)[0])
-                before.append(_fly(replace(experiment, seed=seed), prepare, training.posterior, training))
+                again = replace(experiment, seed=derived_seed(experiment.seed, k))
+                before.append(_fly(again, prepare, training.posterior, training))
                 data = experiment.learning.with_flight(data, before[-1].rollout)
                 if k + 1 < experiment.learning.episodes:
                     training = experiment.learn(data, experiment.seed)
@@ -235,19 +235,9 @@ def _fly(
     start = None if getattr(plant.dynamics, "stateful", False) else start
     rehearse(system, controller, reference, start)
     on_step = None if prepare is None else prepare(controller, training)
+    how = {key: getattr(experiment, key) for key in ("noise", "disturbances", "on_failure", "seed")}
     try:
-        rollout = closed_loop(
-            system,
-            controller,
-            reference,
-            start,
-            experiment.steps,
-            noise=experiment.noise,
-            disturbances=experiment.disturbances,
-            on_failure=experiment.on_failure,
-            seed=experiment.seed,
-            on_step=on_step,
-        )
+        rollout = closed_loop(system, controller, reference, start, experiment.steps, **how, on_step=on_step)
     except Diverged as error:
         if error.flown is None:
             raise
@@ -264,7 +254,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     rollout, problem, training = flown.rollout, flown.controller.problem, flown.training
     system, horizon = experiment.system, flown.controller.horizon
     error, total = _tracking_error(experiment, flown), _error(experiment, flown)
-    rmse: dict[str, Any] = dict(zip(system.tracked, map(float, error.axes), strict=True)) | {"total": total}
+    rmse: dict[str, Any] = dict(zip(system.tracked, error.axes.tolist(), strict=True)) | {"total": total}
     episodes = [one if np.isfinite(one := _error(experiment, each)) else None for each in flown.before]
     violations = {"inputs": violation_rate(rollout.inputs, *(side[0] for side in problem.inputs.by_stage(horizon)))}
     if boxes := [bounds.by_stage(horizon) for bounds in problem.constraints if isinstance(bounds, Box)]:
@@ -288,7 +278,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         "training": learned,
         "episodes": episodes,
         "times": {"training": None if training is None else training.seconds}
-        | {stage: asdict(time_quantiles(np.array([getattr(t, stage) for t in rollout.timings]))) for stage in _STAGES},
+        | {stage: time_quantiles(np.array([getattr(t, stage) for t in rollout.timings])) for stage in _STAGES},
     }
 
 
@@ -297,15 +287,13 @@ def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
     system, rollout, found = experiment.system, flown.rollout, []
     unit, axes, angles = system.unit, system.tracked_indices, system.angle_indices
     if loss := find_loss(rollout.states, rollout.references, axes, system.lost, angles):
-        far = f"{loss.distance:.3g} {unit} from its reference, more than {loss.limit:.3g} {unit}"
-        found.append((loss.step, far))
+        found.append((loss.step, f"{loss.distance:.3g} {unit} from its reference, more than {loss.limit:.3g} {unit}"))
     if flown.diverged is not None:
         found.append((flown.diverged.step, " ".join(str(flown.diverged).split())))
     if not found:
         return None
-    step = found[0][0]
-    reasons = "; ".join(reason for _, reason in found)
-    return {"step": step, "time": round(step * flown.rollout.time_step, 9), "reason": reasons}
+    step, reasons = found[0][0], "; ".join(reason for _, reason in found)
+    return {"step": step, "time": round(step * rollout.time_step, 9), "reason": reasons}
 
 
 def summary(result: Mapping[str, Any]) -> Table:

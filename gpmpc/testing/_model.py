@@ -100,10 +100,8 @@ def _check_linearize(model: DynamicsModel, x: Tensor, u: Tensor, exact: float, n
         require_close(promise, torch.from_numpy(getattr(means, name)), got, exact)
     one = model.linearize(states[1:2], inputs[1:2])
     for name in shapes:
-        promise = f"linearize: K points are the loop over them ({name})"
-        require_close(
-            promise, torch.from_numpy(getattr(one, name)[0]), torch.from_numpy(getattr(found, name)[1]), exact
-        )
+        alone, among = torch.from_numpy(getattr(one, name)[0]), torch.from_numpy(getattr(found, name)[1])
+        require_close(f"linearize: K points are the loop over them ({name})", alone, among, exact)
 
 
 def _check_belief(name: str, model: DynamicsModel, belief: Gaussian, batch: tuple[int, ...]) -> None:

@@ -220,9 +220,8 @@ def _check_monte_carlo(case: _Case) -> None:
         off = (draws.mean(0) - claim).abs()
         worst = float((off / (error + 1e-9 * draws.abs().max() + 1e-300)).max())
         promise = f"an exact method's {name} agrees with {_DRAWS} draws of Monte Carlo"
-        require(
-            worst < 5, promise, f"it is {worst:.1f} standard errors away:\n{claim.tolist()} is off by {off.tolist()}"
-        )
+        text = f"it is {worst:.1f} standard errors away:\n{claim.tolist()} is off by {off.tolist()}"
+        require(worst < 5, promise, text)
 
 
 def _check_first_order_correlation(case: _Case) -> None:
