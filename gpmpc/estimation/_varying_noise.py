@@ -82,7 +82,8 @@ def estimate_varying_noise(
         g = start
         for _ in range(ITERATIONS):
             at = g.predict(*x.split([x.shape[1] - m, m], dim=1)).mean
-            g = sparse_posterior(Z, x, _responses(at, s, v), scored, m, "value", mean)
+            about_zero = sparse_posterior(Z, x, _responses(at, s, v) - mean, scored, m, "value")
+            g = replace(about_zero, offset=mean, targets=about_zero.targets + mean)
         return g, mean
 
     gains = torch.zeros_like(errors)

@@ -124,8 +124,8 @@ class PredictionModel:
         self.propagator, self.problem, self.horizon = propagator, problem, horizon
         self.settings, self.points = settings, horizon if settings.form == "trajectory" else 1
         self._set_model(model)
-        limits = *problem.inputs.by_stage(horizon), *problem.input_rates.by_stage(horizon)
-        self._limits = [np.ascontiguousarray(limit) for limit in limits]
+        (low, high), (down, up) = (box.by_stage(horizon) for box in (problem.inputs, problem.input_rates))
+        self._limits = low, high, down, up
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         self.costs = StageCosts(problem, horizon, self.linearizer)
 

@@ -128,12 +128,12 @@ class Globalization:
         Far from a solution the first of these leads further; and it comes first where moments are linearised, since
         they overshoot. Near one, a plan is linearised at once: it will be taken.
         """
-        model, request, shares = self._model, self._request, 2.0 ** -np.arange(_HALVINGS + 1)
+        model, request, shares = self._model, self._request, [2.0**-k for k in range(_HALVINGS + 1)]
         if far and model.evaluates:  # without derivatives
             for together in np.split(shares, _TOGETHER):
                 towards = [_between(plan, proposed, share) for share in together]
                 found = model.trials(towards, at, feedback, request)
-                for share, trial in zip(np.repeat(together, 2), found, strict=True):
+                for share, trial in zip(np.repeat(together, 2).tolist(), found, strict=True):
                     try:
                         yield share, model.without_derivatives(*trial, at, request)
                     except FAILURES:  # it may lead the model out of its numbers
