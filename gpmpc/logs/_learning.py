@@ -119,7 +119,9 @@ def learn(
     name, structure, options = _structures(kinematics, log)
     if for_control:
         options = {words: grow for words, grow in options.items() if words not in (FEEDBACK, LATE_INPUTS)}
-    candidates, models, best = [], [], 0
+    candidates: list[Candidate] = []
+    models: list[LogModel] = []
+    best = 0
     for words, grow in [("", lambda model: model), *options.items()]:
         trial = grow(structure)
         if trial is None:

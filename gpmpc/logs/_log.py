@@ -72,8 +72,8 @@ class LogRun:
 
     def part(self, begin: int, end: int, name: str) -> "LogRun":
         """The rows from ``begin`` to before ``end`` as a run of its own."""
-        arrays = (array[begin:end] for array in (self.time, self.states, self.inputs, self.context))
-        begins = (0, *(b - begin for b in self.begins if begin < b < end))
+        rows, begins = slice(begin, end), (0, *(b - begin for b in self.begins if begin < b < end))
+        arrays = self.time[rows], self.states[rows], self.inputs[rows], self.context[rows]
         return LogRun(f"{self.name}, {name}", *arrays, begins=begins)
 
 

@@ -83,7 +83,10 @@ def _learned(path: Path, header: dict[str, Any], tensors: dict[str, Tensor]) -> 
     space = StateSpace(tuple(groups))
     kinematics: Kinematics = RigidBody(space) if header["kinematics"] == "RigidBody" else Increments(space)
     name, settings = header["nominal"]
-    kinds = {"MultirotorNominal": MultirotorNominal, "AffineNominal": partial(AffineNominal, kinematics)}
+    kinds: dict[str, Any] = {
+        "MultirotorNominal": MultirotorNominal,
+        "AffineNominal": partial(AffineNominal, kinematics),
+    }
     nominal: Nominal = kinds.get(name, Still)(**settings)
     gps = []
     for i, (outputs, described) in enumerate(header["gps"]):
