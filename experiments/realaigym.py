@@ -21,6 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
+from shutil import which
 from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
@@ -267,6 +268,10 @@ def play_script(entry: Path, robot: str) -> float:
     where = Path(str(found and found.origin)).resolve().parents[3] / "leaderboard" / robot / "simulation_v3"
     if not where.is_dir():
         raise SettingError("simulator", f"board=script needs the repository, not only its package: {INSTALL}")
+    if which("ffmpeg") is None:
+        raise SettingError(
+            "simulator", "board=script needs ffmpeg on PATH: the league's script draws a video"
+        )
     results = where / "data" / beside(entry, "").name
     (results / "sim_swingup.csv").unlink(missing_ok=True)  # the script would score it again
     given = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))

@@ -171,7 +171,12 @@ def test_the_leagues_script_flies_the_file_that_was_written(monkeypatch, tmp_pat
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", f"src/python:{root}")
     monkeypatch.setattr(sys, "path", [str(source), *sys.path])
-    torque = play_script(write_entry("pendubot", "true", 0, tmp_path / "kept"), "pendubot")
+    entry = write_entry("pendubot", "true", 0, tmp_path / "kept")
+    monkeypatch.setattr(realaigym, "which", lambda program: None)
+    with pytest.raises(SettingError, match="board=script needs ffmpeg on PATH"):
+        play_script(entry, "pendubot")
+    monkeypatch.setattr(realaigym, "which", lambda program: program)
+    torque = play_script(entry, "pendubot")
     assert 0 < torque <= 6.0  # the shoulder is driven back upright
     shutil.rmtree(script)
     with pytest.raises(SettingError, match="board=script needs the repository, not only its package: the league's"):
