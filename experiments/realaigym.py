@@ -269,9 +269,7 @@ def play_script(entry: Path, robot: str) -> float:
     if not where.is_dir():
         raise SettingError("simulator", f"board=script needs the repository, not only its package: {INSTALL}")
     if which("ffmpeg") is None:
-        raise SettingError(
-            "simulator", "board=script needs ffmpeg on PATH: the league's script draws a video"
-        )
+        raise SettingError("simulator", "board=script needs ffmpeg on PATH: the league's script draws a video")
     results = where / "data" / beside(entry, "").name
     (results / "sim_swingup.csv").unlink(missing_ok=True)  # the script would score it again
     given = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))

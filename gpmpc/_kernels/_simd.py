@@ -281,7 +281,7 @@ def sine(x, quarters=0.0):
     n = n + quarters
     half = _floor_of_half(n)  # an odd n takes the cosine of r, and an odd half of it is negative
     odd, negative = n - half * 2.0, half - _floor_of_half(half) * 2.0
-    return (s * (1.0 - odd) + c * odd) * (1.0 - negative * 2.0)
+    return clip((s * (1.0 - odd) + c * odd) * (1.0 - negative * 2.0), -1.0, 1.0)
 
 
 @inline_njit

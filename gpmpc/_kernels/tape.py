@@ -130,21 +130,27 @@ def _operate(operation, a, b, work, free):
 
 
 @njit_noalloc
+def _over(a, b):
+    """The quotient, infinite or NaN for b = 0, where Python raises an error."""
+    return a / b if b != 0.0 else a * np.inf
+
+
+@njit_noalloc
 def _operate_rarely(operation, a, b):
     """``_operate`` for all other operations."""
     if operation == INV:
-        return 1.0 / a, -1.0 / (a * a), 0.0
+        return _over(1.0, a), _over(-1.0, a * a), 0.0
     if operation == EXP:
         value = math.exp(a)
         return value, value, 0.0
     if operation == LOG:
-        return math.log(a) if a > 0.0 else np.nan, 1.0 / a, 0.0
+        return math.log(a) if a > 0.0 else np.nan, _over(1.0, a), 0.0
     if operation in (POW, CONSTPOW):
         value = a**b
         return value, b * a ** (b - 1.0), math.log(a) * value if operation == POW and a > 0.0 else 0.0
     if operation == SQRT:
         root = math.sqrt(a) if a >= 0.0 else np.nan
-        return root, 0.5 / root, 0.0
+        return root, _over(0.5, root), 0.0
     if operation == TAN:
         value = math.tan(a)
         return value, 1.0 + value * value, 0.0
@@ -152,7 +158,7 @@ def _operate_rarely(operation, a, b):
         return math.atan(a), 1.0 / (1.0 + a * a), 0.0
     if operation == ATAN2:
         squares = a * a + b * b
-        return math.atan2(a, b), b / squares, -a / squares
+        return math.atan2(a, b), _over(b, squares), _over(-a, squares)
     if operation == TANH:
         value = math.tanh(a)
         return value, 1.0 - value * value, 0.0

@@ -43,7 +43,12 @@ class NoisyModel(Wrapper):
 
     def __post_init__(self) -> None:
         n, m = check_next_states(self.model)
-        g, outputs = self.log_noise, list(self.outputs)
+        g = self.log_noise
+        if not hasattr(g, "predicts"):
+            raise SettingError("log_noise", f"must be a GPPosterior; got {type(g).__name__}")
+        if isinstance(self.outputs, int) or not all(type(i) is int for i in self.outputs or [None]):
+            raise SettingError("outputs", f"must be a list of whole numbers; got {self.outputs!r}")
+        outputs = list(self.outputs)
         if g.predicts != "value" or g.dtype != self.dtype or g.device != self.device:
             got = f"{g.predicts!r}, {g.dtype} on {g.device}"
             raise SettingError("log_noise", f"must predict 'value', {self.dtype} on {self.device}; got {got}")

@@ -37,9 +37,10 @@ class RollOut:
         """Returns states (T, H + 1, n) and inputs (T, H, m) from x_0 (T, n) on; a disturbance (n,) is added at each."""
         (T, H, m), n = feedback.inputs.shape, start.shape[1]
         states, inputs = np.empty((T, H + 1, n)), np.empty((T, H, m))
-        added = np.zeros(n) if disturbance is None else disturbance
+        start = np.ascontiguousarray(start, dtype=float)
+        added = np.zeros(n) if disturbance is None else np.ascontiguousarray(disturbance, dtype=float)
         if self._gps is not None:
-            call_unchecked(roll_out_gps, self._gps, feedback, np.ascontiguousarray(start), added, states, inputs)
+            call_unchecked(roll_out_gps, self._gps, feedback, start, added, states, inputs)
             return states, inputs
         gains = np.broadcast_to(feedback.gains, (T, *feedback.gains.shape[1:]))
         states[:, 0], last = start, feedback.previous_input
@@ -54,7 +55,9 @@ class RollOut:
         """Returns the states (T, H + 1, n) that inputs (T, H, m) lead to from x_0 (T, n), without bounds."""
         (T, H, m), n = inputs.shape, start.shape[1]
         gains, free = np.zeros((1, H, m, n)), np.full((H, m), np.inf)
-        law = Feedback(np.zeros((T, H, n)), np.ascontiguousarray(inputs), gains, -free, free, -free, free, np.zeros(m))
+        law = Feedback(
+            np.zeros((T, H, n)), np.ascontiguousarray(inputs, dtype=float), gains, -free, free, -free, free, np.zeros(m)
+        )
         return self(start, law, disturbance)[0]
 
 

@@ -23,7 +23,7 @@ because the next solves will see the next states and correct what went wrong (He
 the gain of the finite-horizon LQR at the first stage, of the covariances only: the bounds of the inputs hold for u_k.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -254,23 +254,28 @@ class PredictionModel:
         """Whether plans are compared without derivatives: where the means are all that is predicted."""
         return self.linearizer.covariance == "none"
 
-    def trials(
+    def obeying(
         self, towards: Sequence[Plan], at: Prediction, feedback: Array, request: Request
-    ) -> Iterator[tuple[Plan, Array]]:
-        """For each plan the one that obeys the dynamics under a feedback towards it, see ``roll_out``, and then itself.
+    ) -> list[tuple[Plan, Array]]:
+        """The plans that obey the dynamics under a feedback towards others, see ``roll_out``, in one call.
 
-        With where the dynamics lead from their points (H, n). All plans are rolled out in one call.
+        With where the dynamics lead from their points (H, n).
         """
-        (T, H), gains = (len(towards), self.horizon), self._towards(at, feedback)[None]
         states, inputs = (np.stack(parts) for parts in list(zip(*towards, strict=True))[:2])
+        gains = self._towards(at, feedback)[None]
         law = Feedback(states, inputs, gains, *self._limits, request.references.previous_input)
-        rolled, after = self._roll_out(states[:, 0], law, request.disturbance), None
-        for t, plan in enumerate(towards):
-            yield Plan(rolled[0][t], rolled[1][t], plan.covariances), rolled[0][t, 1:]
-            if after is None:
-                points = states[:, :-1].reshape(T * H, -1), inputs.reshape(T * H, 1, -1), request.disturbance
-                after = np.ascontiguousarray(self._roll_out.open_loop(*points)[:, 1]).reshape(T, H, -1)
-            yield plan, after[t]
+        rolled = self._roll_out(states[:, 0], law, request.disturbance)
+        plans = [Plan(x, u, plan.covariances) for x, u, plan in zip(*rolled, towards, strict=True)]
+        return [(plan, plan.states[1:]) for plan in plans]
+
+    def leading(self, plans: Sequence[Plan], request: Request) -> list[tuple[Plan, Array]]:
+        """The plans, and where the dynamics lead from their points (H, n), in one call."""
+        states, inputs = (
+            np.concatenate(parts) for parts in zip(*[(p.states[:-1], p.inputs) for p in plans], strict=True)
+        )
+        after = self._roll_out.open_loop(states, inputs[:, None], request.disturbance)[:, 1]
+        parts = np.ascontiguousarray(after).reshape(len(plans), self.horizon, -1)
+        return list(zip(plans, parts, strict=True))
 
     def without_derivatives(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
         """The prediction at a plan whose points lead to ``after`` (H, n), with the derivatives of ``at``."""

@@ -17,7 +17,7 @@ matched beliefs, damped BFGS updates put it into the program (Nocedal and Wright
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import product
 
 import numpy as np
@@ -132,12 +132,16 @@ class Globalization:
         if far and model.evaluates:  # without derivatives
             for together in np.split(shares, _TOGETHER):
                 towards = [_between(plan, proposed, share) for share in together]
-                found = model.trials(towards, at, feedback, request)
-                for share, trial in zip(np.repeat(together, 2).tolist(), found, strict=True):
-                    try:
-                        yield share, model.without_derivatives(*trial, at, request)
-                    except FAILURES:  # it may lead the model out of its numbers
-                        continue
+                rolled, direct = _each(lambda plans: model.obeying(plans, at, feedback, request), towards), []
+                for t, share in enumerate(together.tolist()):
+                    for found in (rolled, direct):
+                        if found is direct and not direct:
+                            direct += _each(lambda plans: model.leading(plans, request), towards)
+                        try:
+                            for there, after in found[t]:
+                                yield share, model.without_derivatives(there, after, at, request)
+                        except FAILURES:
+                            continue
             return
         for share, first in product(shares, (True, False)):
             towards = _between(plan, proposed, share)
@@ -146,8 +150,16 @@ class Globalization:
                     yield share, model.roll_out(towards, at, feedback, request)
                 else:
                     yield share, model.linearize(model.canonical(towards), request)
-            except FAILURES:
+            except FAILURES:  # a trial plan may lead the model out of its numbers
                 continue
+
+
+def _each(predict: Callable[[list[Plan]], list], plans: list[Plan]) -> list[list]:
+    """What is predicted of plans together, each in a list of its own, which is empty where the model fails."""
+    try:
+        return [[found] for found in predict(plans)]
+    except FAILURES:  # one of them spoils the others
+        return [[]] if len(plans) == 1 else [_each(predict, [plan])[0] for plan in plans]
 
 
 def _between(plan: Plan, other: Plan, share: float) -> Plan:

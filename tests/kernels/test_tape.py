@@ -60,3 +60,28 @@ def test_a_known_model_is_rolled_out_in_one_call_under_a_feedback_within_bounds(
             assert inputs[t, k, 0] == pytest.approx(last, rel=1e-9, abs=1e-12)
             state = step(system, state, inputs[t, k]) + gust
             assert np.allclose(states[t, k + 1], state, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 3, 8, 9])
+def test_roll_outs_of_functions_without_a_value_at_zero_are_those_of_the_function(count, rng):
+    x, u = casadi.SX.sym("x", 2), casadi.SX.sym("u", 1)
+    after = casadi.vertcat(
+        x[0] + 0.1 * (u[0] - casadi.sqrt(x[0])), x[1] + 0.1 * casadi.log(x[0]) / casadi.atan2(x[0], x[1])
+    )
+    function = casadi.Function("f", [x, u], [after])
+    starts, inputs = rng.uniform(1, 2, (count, 2)), rng.uniform(0.5, 1, (count, 5, 1))
+    states = RollOut(KnownModel(CasadiFunction(function), 2, 1)).open_loop(starts, inputs)
+    for t in range(count):
+        for k in range(5):
+            assert np.allclose(states[t, k + 1], function(states[t, k], inputs[t, k]).full()[:, 0], rtol=1e-12)
+
+
+def test_a_function_without_a_finite_derivative_has_an_infinite_one_and_no_error():
+    function = CasadiFunction(
+        casadi.Function("f", [X], [casadi.vertcat(casadi.sqrt(X[0]), 1 / X[1], casadi.log(X[2]))])
+    )
+    values, slopes = function.linearize(np.array([[0.0, 2.0, 1.0], [4.0, 0.0, 1.0]]))
+    assert values.tolist() == [[0.0, 0.5, 0.0], [2.0, np.inf, 0.0]]
+    assert slopes[0, 0, 0] == np.inf
+    assert slopes[1, 1, 1] == -np.inf
+    assert slopes[1, 0, 0] == 0.25

@@ -7,6 +7,8 @@ import torch
 
 from benchmarks.kkt import Instance, kkt_residual
 from benchmarks.pendulums import pendulum_gp
+from gpmpc._dynamics import Linearized
+from gpmpc.exceptions import DataError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend
 from gpmpc.mpc import Decision, PredictionSettings, Reference, Timing
@@ -234,3 +236,33 @@ def test_from_no_plan_at_all_few_programs_reach_a_kkt_point_at_any_horizon(quadr
     assert decision.status is Status.SOLVED
     residual = kkt_residual(quadrotor, problem, Instance(belief, Reference(references), HOVER), decision.inputs)
     assert residual < 1e-5
+
+
+class Table:
+    """A pendulum-like model that is known for |x_i| <= 6 only."""
+
+    state_dim, input_dim, output_dim, dtype, device = 2, 1, 2, torch.float64, torch.device("cpu")
+    noise_covariance = torch.zeros(2, 2, dtype=torch.float64)
+
+    def predict(self, state, input):
+        raise NotImplementedError
+
+    def linearize(self, states, inputs, covariance=True):
+        if (np.abs(states) > 6).any():
+            raise DataError("beyond the table")
+        x, v = states.T
+        mean = np.stack([x + 0.1 * v, v + 0.1 * (3 * np.sin(x) * v + inputs[:, 0])], axis=1)
+        A, B = np.tile(np.eye(2), (len(x), 1, 1)), np.tile([[0.0], [0.1]], (len(x), 1, 1))
+        A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = 0.1, 0.3 * np.cos(x) * v, 1 + 0.3 * np.sin(x)
+        return Linearized(mean, A, B, np.zeros((len(x), 2, 2)) if covariance else None)
+
+
+@pytest.mark.parametrize("start", [[-3.0, 2.0], [1.0, 5.0], [4.0, 4.0]])
+def test_a_step_that_leads_the_model_out_of_its_numbers_is_shortened(start):
+    problem = Problem(Tracking([10.0, 0.1], [0.01]), inputs=Box([-20.0], [20.0]))
+    controller = GPMPC(
+        Table(), Linearization(), problem, 20, [0.0], PredictionSettings(covariance="none"), iterations=15
+    )
+    decision = controller.control(Gaussian.certain(np.array(start)), Reference(np.zeros((21, 2))))
+    assert decision.applicable
+    assert decision.iterations > 4
