@@ -46,8 +46,9 @@ class NoisyModel(Wrapper):
         g = self.log_noise
         if not hasattr(g, "predicts"):
             raise SettingError("log_noise", f"must be a GPPosterior; got {type(g).__name__}")
-        if isinstance(self.outputs, int) or not all(type(i) is int for i in self.outputs or [None]):
-            raise SettingError("outputs", f"must be a list of whole numbers; got {self.outputs!r}")
+        given: Any = self.outputs
+        if not hasattr(given, "__len__") or not given or not all(type(i) is int for i in given):
+            raise SettingError("outputs", f"must be a list of whole numbers; got {given!r}")
         outputs = list(self.outputs)
         if g.predicts != "value" or g.dtype != self.dtype or g.device != self.device:
             got = f"{g.predicts!r}, {g.dtype} on {g.device}"

@@ -132,7 +132,8 @@ class Globalization:
         if far and model.evaluates:  # without derivatives
             for together in np.split(shares, _TOGETHER):
                 towards = [_between(plan, proposed, share) for share in together]
-                rolled, direct = _each(lambda plans: model.obeying(plans, at, feedback, request), towards), []
+                rolled = _each(lambda plans: model.obeying(plans, at, feedback, request), towards)
+                direct: list[list] = []
                 for t, share in enumerate(together.tolist()):
                     for found in (rolled, direct):
                         if found is direct and not direct:

@@ -136,3 +136,9 @@ def test_misuse_is_refused():
         NoisyModel(model, gp(1, "value"), [2])
     with pytest.raises(ShapeError, match=r"must have 2 states, 1 inputs and 1 outputs; got \(2, 1, 2\)"):
         NoisyModel(model, gp(2, "value"), [1])
+
+
+@pytest.mark.parametrize("outputs", [[1.0], [True], None, 1, []])
+def test_outputs_that_are_no_whole_numbers_are_refused(outputs):
+    with pytest.raises(SettingError, match="outputs: must be a list of whole numbers"):
+        NoisyModel(MODELS["difference"], gp(1, "value"), outputs)
