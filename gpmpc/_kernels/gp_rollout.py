@@ -113,8 +113,6 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
                     point[n + i, t - first] = u[i]
                 for i in range(n):
                     point[i, t - first] = x[i]
-            for i in range(n + m):  # what is not needed follows the last: elsewhere a tape may have no value
-                point[i, len(together) :] = point[i, len(together) - 1]
             if tape.size > 0:
                 run_tape(tape, point, places, known)
             for t in together:

@@ -21,8 +21,6 @@ from gpmpc.exceptions import DataError, UnsupportedModel
 from gpmpc.gp._posterior import GPPosterior
 
 Array = np.ndarray
-_BINARY = {tapes.ADD, tapes.SUB, tapes.MUL, tapes.DIV, tapes.POW}
-_BINARY |= {tapes.CONSTPOW, tapes.FMIN, tapes.FMAX, tapes.ATAN2}
 
 
 def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
@@ -164,7 +162,7 @@ def function_of_tape(code: Array, constants: Array, sizes: Sequence[int], shape:
                 work[to] = z[first]
             elif operation == tapes.CONST:
                 work[to] = casadi.SX(constant)
-            elif operation in _BINARY:
+            elif operation in tapes.TWO_OPERANDS:
                 work[to] = casadi.SX.binary(operation, work[first], work[last])
             elif operation in tapes.OPERATIONS:
                 work[to] = casadi.SX.unary(operation, work[first])
