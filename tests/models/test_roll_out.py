@@ -79,3 +79,11 @@ def test_plans_may_have_gains_of_their_own():
         one = Feedback(planned[t : t + 1], inputs[t : t + 1], gains[t : t + 1], *rest)
         for found, alone in zip(both, RollOut(model)(planned[t : t + 1, 0], one), strict=True):
             assert np.array_equal(found[t], alone[0])
+
+
+def test_starts_of_whole_numbers_and_strided_disturbances_are_taken_as_they_are():
+    roll_out, inputs = RollOut(MODELS["differences"]()), np.zeros((1, 3, 2))
+    wide = np.arange(9.0).reshape(3, 3) / 10
+    expected = roll_out.open_loop(np.array([[1.0, 0.0, 1.0]]), inputs, wide[:, 0].copy())
+    for start in (np.array([[1, 0, 1]]), np.array([[1.0, 0.0, 1.0]])):
+        assert np.array_equal(roll_out.open_loop(start, inputs, wide[:, 0]), expected)

@@ -12,6 +12,7 @@ from gpmpc.exceptions import DataError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend
 from gpmpc.mpc import Decision, PredictionSettings, Reference, Timing
+from gpmpc.mpc._sqp import _each
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
@@ -266,3 +267,13 @@ def test_a_step_that_leads_the_model_out_of_its_numbers_is_shortened(start):
     decision = controller.control(Gaussian.certain(np.array(start)), Reference(np.zeros((21, 2))))
     assert decision.applicable
     assert decision.iterations > 4
+
+
+def test_a_plan_that_a_model_cannot_predict_leaves_those_beside_it():
+    def predict(plans):
+        if 0 in plans:
+            raise DataError("beyond the table")
+        return [1 / plan for plan in plans]
+
+    assert _each(predict, [2, 0, 4]) == [[0.5], [], [0.25]]
+    assert _each(predict, [4, 2]) == [[0.25], [0.5]]

@@ -238,3 +238,13 @@ def test_a_plan_that_cannot_be_improved_is_searched_for_anew():
     state, reference = Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros(2))
     first = many.control(state, reference)
     assert many.control(state, reference, first).applicable
+
+
+def test_plans_are_made_start_by_start_from_any_start_on():
+    many, question = pendulums(3), (Gaussian.certain(np.array([np.pi, 0.3])), Reference(np.zeros(2)))
+    every = list(many.plans(*question))
+    assert len(every) == len(many)
+    later = list(many.plans(*question, first=2))
+    assert len({tuple(plan.inputs[:, 0]) for plan, _ in every}) > 2
+    assert [value for _, value in later] == [value for _, value in every[2:]]
+    assert all(np.array_equal(a.inputs, b.inputs) for (a, _), (b, _) in zip(later, every[2:], strict=True))
