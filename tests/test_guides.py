@@ -59,8 +59,8 @@ def test_the_loops_of_the_guides_reach_their_goals(path, page):
     assert abs(names.get("away", 0.5) - 0.5) < 0.02
 
 
-def test_many_starts_swing_the_cart_pole_of_the_leagues_page_up(page):
-    names, _ = page("docs/league.md")
+def test_many_starts_swing_the_cart_pole_of_the_guide_up(page):
+    names, _ = page("docs/guide_loop.md")
     angle = names["state"][2]
     assert abs(angle - 2 * np.pi * np.round(angle / (2 * np.pi))) < 0.2
 
