@@ -63,10 +63,13 @@ INSTALL = (
     "put its src/python on PYTHONPATH, and pip install dill tabulate lxml filterpy pyyaml sympy"
 )
 PLAN, INPUT = 0.02, 0.002  # time steps of plans and of torques [s]
+TICKS = round(PLAN / INPUT)  # inputs in a plan's time step
 TORQUE, LINE, DURATION = 6.0, 0.45, 60.0  # limit [N m], height to be above [m], length of a test [s]
 LENGTHS = 0.2, 0.3  # [m]
 WILD = 25.0, 38.0  # rates beyond which transitions are not learned from [rad/s]
 REPLAN = 5.0  # predicted time below the line above which a plan is given up [s]
+BRAKE = 0.3  # torque against the actuated joint's rate without a plan [N m s/rad]
+PAUSE = 10  # plans' time steps that the joint is braked for after a search that found no way up
 
 
 def state_of(x: Any) -> Array:
@@ -77,6 +80,13 @@ def state_of(x: Any) -> Array:
 def heights(states: Array) -> Array:
     """Height of the tip (...,) over the shoulder [m]."""
     return LENGTHS[0] * np.cos(states[..., 0]) + LENGTHS[1] * np.cos(states[..., 0] + states[..., 2])
+
+
+def upright(states: Array) -> Reference:
+    """Upright over the horizon of a plan (H + 1, n), in the turns that are nearest to its end."""
+    goal = np.zeros_like(states)
+    goal[:, [0, 2]] = 2 * np.pi * np.round(states[-1, [0, 2]] / (2 * np.pi))
+    return Reference(goal)
 
 
 def casadi_model(system: System) -> CasadiFunction:
@@ -125,6 +135,9 @@ def _with_parameters(robot: str, values: Array) -> System:
 class Pilot:
     """Flies a plan at 50 Hz and its feedback at 500 Hz, and searches anew when the league takes the pendulum away.
 
+    Where no start leads up, the motor brakes its joint before the next search: flown on, such plans spin the links
+    faster and faster, beyond what a model was learned from.
+
     Attributes:
         controller: Of plans.
         joint: With the motor: 0, 1.
@@ -140,27 +153,42 @@ class Pilot:
     searched: list[bool] = field(default_factory=list)
     _loop: ControlLoop | None = None
     _last: float = -1.0
-    _count: int = 0
+    _count: int = 0  #: inputs since the last decision
+    _held: float = 0.0  #: torque of the last decision [N m]
+    _pause: int = 0  #: decisions that are left to brake
 
     def torques(self, x: Any, t: float) -> Array:
         """The torques of both joints (2,) at a state in the league's order and a time [s]."""
-        lost, state = self._loop is None or abs(t - self._last) > 1.5 * INPUT, state_of(x)
-        if lost:
-            self._loop, self._count = ControlLoop(self.controller), 0
-        share, self._last = self._count * INPUT / PLAN, t
+        state = state_of(x)
+        if abs(t - self._last) > 1.5 * INPUT:
+            self._loop, self._count, self._pause = None, 0, 0
+        self._last, torque = t, self._held
         if self._count == 0:
-            begin = perf_counter()
-            torque = self._loop.input(state, Reference(np.zeros(4)))
-            self.seconds.append(perf_counter() - begin)
-            self.searched.append(lost)
-        else:
-            torque = self._loop.last.input
-            if self.gain > 0:
-                torque = torque + self.gain * (self._loop.input_between(state, share) - torque)
-        self._count = (self._count + 1) % round(PLAN / INPUT)
+            torque = self._held = self._decide(state)
+        elif self._loop is not None and self.gain > 0:
+            between = float(self._loop.input_between(state, self._count * INPUT / PLAN)[0])
+            torque += self.gain * (between - torque)
+        self._count = (self._count + 1) % TICKS
         out = np.zeros(2)
-        out[self.joint] = np.clip(torque[0], -TORQUE, TORQUE)
+        out[self.joint] = np.clip(torque, -TORQUE, TORQUE)
         return out
+
+    def _decide(self, state: Array) -> float:
+        """The torque of the next plan, or one that brakes."""
+        brake = -BRAKE * float(state[1 + 2 * self.joint])
+        if self._pause > 0:
+            self._pause -= 1
+            return brake
+        begin, without = perf_counter(), self._loop is None
+        loop = ControlLoop(self.controller) if self._loop is None else self._loop
+        torque, plan = float(loop.input(state, Reference(np.zeros(4)))[0]), loop.last.decision
+        self.seconds.append(perf_counter() - begin)
+        self.searched.append(without)
+        if not plan.applicable or self.controller.criterion(plan, upright(plan.means)) > REPLAN:
+            self._loop, self._pause = None, PAUSE - 1
+            return brake
+        self._loop = loop
+        return torque
 
 
 class Flies(Protocol):
@@ -299,8 +327,8 @@ def make_parts(model: Any, horizon: int = 40, programs: int = 20, wild: bool = T
         kept: Programs of a decision from a plan.
     """
     Q, R = np.diag([10.0, 0.1, 10.0, 0.1]), np.array([[0.01]])
-    upright = model.linearize(np.zeros((1, 4)), np.zeros((1, 1)), False)
-    P = _cost_to_go(upright.A[0], upright.B[0], Q, R)
+    still = model.linearize(np.zeros((1, 4)), np.zeros((1, 1)), False)
+    P = _cost_to_go(still.A[0], still.B[0], Q, R)
     problem = Problem(Tracking(Q, R, 10.0 * P, penalized="inputs", angles=(0, 2)), inputs=Box([-TORQUE], [TORQUE]))
 
     def time_below(decision: Decision, reference: Reference) -> float:

@@ -16,14 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpmpc._kernels.gp_rollout import Feedback
-from gpmpc.experiments.realaigym import INPUT, PLAN, REPLAN, TORQUE, Array, Parts, state_of
+from gpmpc.experiments.realaigym import BRAKE, INPUT, PLAN, REPLAN, TICKS, TORQUE, Array, Parts, state_of, upright
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import RollOut
 from gpmpc.mpc import GPMPC, ControlLoop, Decision, ManyStarts, Reference
 from gpmpc.mpc._policy import Command
 
-TICKS = round(PLAN / INPUT)  # inputs in a plan's time step
-BRAKE = 0.3  # torque against the actuated joint's rate without a plan [N m s/rad]
 GOOD = 1.0  # predicted time below the line up to which a plan is not compared with those of other starts [s]
 
 
@@ -112,7 +110,7 @@ class RealTimePilot:
     def _value(self, flight: Flight, start: int) -> float:
         """The criterion of what is left of a flight from a time on."""
         means = flight.plan.means[min(max(0, start - flight.start) // TICKS, len(flight.plan.means) - 2) :]
-        return self.criterion(replace(flight.plan, means=means), _goal(means))
+        return self.criterion(replace(flight.plan, means=means), upright(means))
 
     def _search(self, state: Array, now: int, flight: Flight | None) -> Flight:
         """The best plan of as many starts as the time allows, from where the pendulum will be then."""
@@ -139,7 +137,7 @@ class RealTimePilot:
         begin, passed = process_time(), (now - flight.start) // TICKS
         inputs, states = (_later(part, passed) for part in (flight.plan.inputs, flight.plan.means))
         previous = flight.plan if passed == 1 else None
-        plan = self.step.control(Gaussian.certain(state), _goal(states), previous, None, (inputs, states))
+        plan = self.step.control(Gaussian.certain(state), upright(states), previous, None, (inputs, states))
         return self._timed(plan, begin, now, now, self.seconds)
 
     def _timed(self, plan: Decision, begin: float, now: int, start: int, times: list[float]) -> Flight:
@@ -148,7 +146,7 @@ class RealTimePilot:
         if plan.applicable:
             loop.last = Command(plan.input, plan.status, plan, plan)
             loop.input_between(plan.means[0], 0.0)  # its gains
-            value = self.criterion(plan, _goal(plan.means))
+            value = self.criterion(plan, upright(plan.means))
         times.append(process_time() - begin)
         done = now + max(1, ceil(times[-1] / INPUT))
         return Flight(loop, plan, value, start, max(start, done) if value < inf else done)
@@ -167,10 +165,3 @@ def _later(part: Array, stages: int) -> Array:
     """Inputs or states from a later stage on, the last one repeated."""
     stages = min(stages, len(part) - 1)
     return np.concatenate([part[stages:], np.repeat(part[-1:], stages, axis=0)])
-
-
-def _goal(states: Array) -> Reference:
-    """Upright over the horizon of a plan (H + 1, n), in the turns that are nearest to its end."""
-    upright = np.zeros_like(states)
-    upright[:, [0, 2]] = 2 * np.pi * np.round(states[-1, [0, 2]] / (2 * np.pi))
-    return Reference(upright)

@@ -12,6 +12,11 @@ from gpmpc.exceptions import SettingError
 from gpmpc.experiments import realaigym
 from gpmpc.experiments.realaigym import (
     ACTUATED,
+    BRAKE,
+    PAUSE,
+    REPLAN,
+    TICKS,
+    TORQUE,
     Play,
     board,
     casadi_model,
@@ -49,7 +54,7 @@ def true_model(robot):
 @pytest.mark.parametrize(("robot", "joint"), [("acrobot", 1), ("pendubot", 0)])
 def test_a_controller_in_the_leagues_interface_plans_at_50_hz_and_drives_one_joint(robot, joint):
     who = pilot(true_model(robot), robot, horizon=25, programs=3, wild=False)
-    controller, rhs, x = league_controller(Interface, who), right_hand_side(), np.array([0.2, -0.1, 0.0, 0.5])
+    controller, rhs, x = league_controller(Interface, who), right_hand_side(), np.array([3.15, -0.02, 0.0, 0.1])
     torques = []
     for k in range(40):
         torques.append(controller.get_control_output(x, 0.002 * k))
@@ -62,6 +67,16 @@ def test_a_controller_in_the_leagues_interface_plans_at_50_hz_and_drives_one_joi
     assert len(set(torques[:10, joint])) > 1  # the feedback between plans
     controller.get_control_output(x, 0.5)  # the league had taken it away: a new search
     assert who.searched == [True, False, False, False, True]
+
+
+def test_where_no_plan_leads_up_the_motor_brakes_its_joint_for_a_while_before_the_next_search(monkeypatch):
+    who = pilot(true_model("acrobot"), "acrobot", horizon=10, programs=1, wild=False)
+    monkeypatch.setattr(who.controller, "criterion", lambda plan, reference: REPLAN + 1.0)
+    torques = np.array([who.torques([0.1, 0.2, 3.0, 2.0 + k], 0.002 * k) for k in range(2 * PAUSE * TICKS)])
+    assert not torques[:, 0].any()
+    held = -BRAKE * (2.0 + TICKS * (np.arange(2 * PAUSE * TICKS) // TICKS))
+    assert torques[:, 1] == pytest.approx(np.clip(held, -TORQUE, TORQUE))
+    assert who.searched == [True, True]
 
 
 def test_hanging_is_below_and_upright_above_the_line():
