@@ -34,7 +34,7 @@ from scipy.optimize import least_squares
 from gpmpc._files import write_whole
 from gpmpc._provenance import provenance
 from gpmpc.exceptions import GpmpcError, SettingError
-from gpmpc.gp import GPPosterior, Trainer, Transitions, informative_points, load_metadata, standardize
+from gpmpc.gp import Trainer, Transitions, informative_points, load_metadata, standardize
 from gpmpc.models import Affine, CasadiFunction, Features, KnownModel, ResidualModel, RollOut, load_model, save_model
 from gpmpc.mpc import (
     GPMPC,
@@ -481,9 +481,9 @@ def transitions(records: list[Play], robot: str, spread: float = 0.05) -> Transi
 
 
 def learn(data: Transitions, nominal: Any, before: Any = None, points: int = 700) -> ResidualModel:
-    """Learns what a nominal model misses, from the most informative transitions.
+    """Learns what a nominal model misses from the most informative transitions.
 
-    The hyperparameters are trained on half of them, from those of the model ``before`` on.
+    The hyperparameters are trained from those of the model ``before`` on.
     """
     scales = torch.tensor([1.5, 1.5, 9.0, 1.5, 1.5, 9.0, 9.0], dtype=torch.float64)  # sine, cosine, rate, ..., torque
     trainer = Trainer(
@@ -494,10 +494,7 @@ def learn(data: Transitions, nominal: Any, before: Any = None, points: int = 700
     one, noise = torch.ones(1, dtype=torch.float64), torch.full((1,), 1e-8, dtype=torch.float64)
     rows = informative_points(seen[0], (scales[None], one, noise), points)
     features, targets = (part[rows] for part in seen)
-    half, start = points // 2, None if before is None else before.residual
-    found = trainer.fit(features[:half], targets[:half], 1, start=start).posterior
-    kernel = found.lengthscales, found.signal_variance, found.noise_variance
-    posterior = GPPosterior.from_hyperparameters(features, targets, *kernel, 1, "value", found.offset)
+    posterior = trainer.fit(features, targets, 1, start=None if before is None else before.residual).posterior
     return ResidualModel(nominal, posterior, torch.eye(4, dtype=torch.float64), range(4), [0], 1, (0, 2))
 
 
