@@ -38,7 +38,7 @@ Array = np.ndarray
 _TORCH_FAILURE = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
 FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, _TORCH_FAILURE)  # no finite numbers
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
-_HALVINGS = 10  # of a step at most
+_SHARES = [2.0**-k for k in range(11)]  # of a step
 _TOGETHER = 1, 3, 8  # shares of a step are compared in one call each up to these
 _ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
 _NOISE = 1e-10  # the square of an offset that a model with that round-off need not get below
@@ -104,7 +104,7 @@ class Globalization:
         if settled or size <= self._tolerance or size * slower <= self._tolerance * (1.0 - slower):
             return at._replace(plan=proposed), Status.SOLVED
         slope = promised - curvature - merit
-        far = size > _NEAR
+        far = size > _NEAR and not self._request.continues
         for length, trial in self._trials(at, plan, proposed, program.feedback, far):
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
             rows = trial.rows if self._model.constraints.smooth else at.rows._replace(E=trial.rows.E)
@@ -126,11 +126,11 @@ class Globalization:
         """Shares of the step to a proposed plan; predictions at the plan that obeys the dynamics and at the plan there.
 
         Far from a solution the first of these leads further; and it comes first where moments are linearised, since
-        they overshoot. Near one, a plan is linearised at once: it will be taken.
+        they overshoot. Near one, and from the last decision's plan on, a plan is linearised at once: it will be taken.
         """
-        model, request, shares = self._model, self._request, [2.0**-k for k in range(_HALVINGS + 1)]
+        model, request = self._model, self._request
         if far and model.evaluates:  # without derivatives
-            for together in np.split(shares, _TOGETHER):
+            for together in np.split(_SHARES, _TOGETHER):
                 towards = [_between(plan, proposed, share) for share in together]
                 rolled = _each(lambda plans: model.obeying(plans, at, feedback, request), towards)
                 direct: list[list] = []
@@ -144,7 +144,7 @@ class Globalization:
                         except FAILURES:
                             continue
             return
-        for share, first in product(shares, (True, False)):
+        for share, first in product(_SHARES, (True, False)):
             towards = _between(plan, proposed, share)
             try:
                 if first is (far or not model.linearizer.at_points):
