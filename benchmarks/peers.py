@@ -9,8 +9,8 @@ instance per call, in one process on one thread; times are processor time.
 
 * ``converged``: a KKT point of the nonlinear problem on the GPs' mean. Every plan is judged by one function
   (``benchmarks.kkt``); solvers stop by tests of their own, whose tolerances are the loosest powers of ten that brought
-  nine plans of ten within ``ACCURACY``; the share that is within is printed. *Warm* solvers start from their own last solution,
-  shifted where the library allows it, *cold* ones from the last input and the reference.
+  nine plans of ten within ``ACCURACY``; the share that is within is printed. *Warm* solvers start from their own last
+  solution, shifted where the library allows it, *cold* ones from the last input and the reference.
 * ``one program``: one quadratic program per step from the last plan (real-time iteration), with our QP solver and DAQP.
 
 ``times ours`` is the median ratio of paired calls to ours called right after itself, as in a loop that does nothing
