@@ -11,6 +11,7 @@ theta = (log length-scales, log sf, log(sf / sn)), in a wide box around the data
 """
 
 import logging
+import math
 import time
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -75,6 +76,11 @@ class SearchProblem(NamedTuple):
     rows: np.ndarray | None  # the subset that the search begins with; None for all points from the start
     std: np.ndarray  # of the inputs (d,), see ``column_std``
     constant: np.ndarray  # which inputs are (d,)
+    deadline: float = math.inf  # on ``time.perf_counter``'s clock, from which on the best found so far is taken [s]
+
+    def is_late(self) -> bool:
+        """Whether the deadline has passed."""
+        return time.perf_counter() >= self.deadline
 
 
 class SearchResult(NamedTuple):
@@ -98,7 +104,11 @@ def find_hyperparameters(problem: SearchProblem, settings: Any) -> SearchResult:
     box = search_box(log_inputs, log_output, settings.signal_to_noise_limit)
 
     search = _Search(problem, slice(None) if problem.rows is None else problem.rows, box, settings)
-    ends = [search(start, _EXPLORATION) for start in starts]
+    ends: list[tuple[np.ndarray, float]] = []
+    for start in starts:
+        ends.append(search(start, _EXPLORATION))
+        if problem.is_late() and ends[-1][1] < FAILED:
+            break
     finalists = sorted(ends, key=lambda end: end[1])[:_FINALISTS]
     theta, value = min((search(end, _ITERATIONS) for end, _ in finalists), key=lambda end: end[1])
     evaluations = search.evaluations
@@ -108,7 +118,8 @@ def find_hyperparameters(problem: SearchProblem, settings: Any) -> SearchResult:
         evaluations += search.evaluations
     # Nothing can be learned about an input that never moved, and nothing is: it drops out of the kernel.
     theta[:-2][problem.constant] = log_inputs[problem.constant] + np.log(IGNORED)
-    return SearchResult(theta, value, [end[1] for end in ends], evaluations, time.perf_counter() - begin)
+    explored = [end[1] for end in ends] + [math.nan] * (len(starts) - len(ends))
+    return SearchResult(theta, value, explored, evaluations, time.perf_counter() - begin)
 
 
 def search_box(log_inputs: np.ndarray, log_output: float, signal_to_noise_limit: float) -> tuple[np.ndarray, ...]:
@@ -135,9 +146,14 @@ class _Search:
             jac=True,
             method="L-BFGS-B",
             bounds=np.column_stack(self.box),
+            callback=self._look_at_clock,
             options={"ftol": self.settings.tolerance, "gtol": 1e-6, "maxiter": iterations, "maxfun": 5 * iterations},
         )
         return outcome.x, float(outcome.fun)
+
+    def _look_at_clock(self, _: np.ndarray) -> None:
+        if self.problem.is_late():
+            raise StopIteration  # which ends scipy's search where it is
 
     def _objective(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
         """Negative log marginal likelihood plus penalty, and the gradient."""

@@ -50,7 +50,8 @@ class Training:
     #: on the log marginal likelihood, in scaled units
     objective: np.ndarray
     #: of an exact training, the objective where the exploration from every start ended (k, restarts + 1), over the
-    #: subset if there is one; of a sparse training, where the search over the bound began (k, 1)
+    #: subset if there is one, NaN for starts that a time limit left out; of a sparse training, where the search over
+    #: the bound began (k, 1)
     explored: np.ndarray
     evaluations: int  #: of the likelihood or of the bound, all starts and outputs together
     seconds: float  #: wall time [s]
@@ -79,6 +80,9 @@ class Trainer:
     #: the box holds sf / sn within this factor of one. Moment matching needs sf2 / sn2 below about 1e10 in double
     #: precision
     signal_to_noise_limit: float = 1e4
+    #: wall time of a training [s], in equal parts for the outputs, after which the best found so far is taken: what
+    #: that is depends on the machine. None lets every search converge
+    time_limit: float | None = None
 
     def __post_init__(self) -> None:
         check_choice("predicts", self.predicts, PREDICTS)
@@ -90,6 +94,8 @@ class Trainer:
                 raise SettingError(key, f"must be a function such as {example} of gpmpc.gp; got {value!r}")
         check_number("tolerance", self.tolerance, above=0)
         check_number("signal_to_noise_limit", self.signal_to_noise_limit, above=1)
+        if self.time_limit is not None:
+            check_number("time_limit", self.time_limit, above=0, unit="[s]")
 
     def __call__(self, transitions: Transitions, seed: int = 0, start: GPPosterior | None = None) -> Training:
         """Trains on transitions; see ``fit``."""
@@ -168,9 +174,12 @@ class Trainer:
         found, constant = [], constant_columns(features.numpy())
         for a in range(outputs):
             name = f"output {a + 1} of {outputs}"
-            problem = SearchProblem(name, x, y[:, a], first[a], perturbations[a], rows, std, constant)
+            deadline = np.inf if self.time_limit is None else begin + self.time_limit * (a + 1) / outputs
+            problem = SearchProblem(name, x, y[:, a], first[a], perturbations[a], rows, std, constant, deadline)
             with threadpool_limits(1 if size < _ONE_THREAD else None, user_api="blas"):
                 found.append(find_hyperparameters(problem, self))
+            if problem.is_late():
+                _log.info("training: %s: stopped by time_limit=%g s", name, self.time_limit)
             if size > _MANY:
                 _log.info("training: %s: %d evaluations, %.1f s", name, found[-1].evaluations, found[-1].seconds)
         failed = [a for a, one in enumerate(found) if one.objective >= FAILED]

@@ -1,5 +1,7 @@
 import logging
 import re
+from itertools import count
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from gpmpc.gp import (
     SparseTrainer,
     Trainer,
     Transitions,
+    _search,
     _training,
     identity,
     standardize,
@@ -179,6 +182,7 @@ def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(
         ({"predicts": "delta"}, "'next_state', 'difference', 'value'; got 'delta'"),
         ({"signal_to_noise_limit": 1.0}, "signal_to_noise_limit: must be a number above 1; got 1.0"),
         ({"tolerance": 0.0}, "tolerance: must be a number above 0; got 0.0"),
+        ({"time_limit": 0.0}, r"time_limit: must be a number above 0 \[s\]; got 0.0"),
     ],
 )
 def test_misuse_is_refused_with_the_rule(setting, message):
@@ -288,3 +292,37 @@ def test_a_training_of_many_points_tells_of_every_output_what_it_took(caplog, mo
     with caplog.at_level(logging.INFO, "gpmpc"):
         train(data, restarts=0)
     assert not caplog.records
+
+
+def test_a_time_limit_ends_every_outputs_search_with_the_best_found_so_far(caplog, monkeypatch):
+    data, ticks = pendulum(40), count()
+    converged = train(data)
+    clock = SimpleNamespace(perf_counter=lambda: float(next(ticks)))  # a second a look
+    for module in (_search, _training):
+        monkeypatch.setattr(module, "time", clock)
+    with caplog.at_level(logging.INFO, "gpmpc"):
+        stopped = train(data, time_limit=40.0)
+    assert [r.message for r in caplog.records if "stopped" in r.message] == [
+        "training: output 1 of 2: stopped by time_limit=40 s",
+        "training: output 2 of 2: stopped by time_limit=40 s",
+    ]
+    assert 10 < stopped.evaluations < 0.3 * converged.evaluations
+    assert (stopped.objective > converged.objective).all()
+    assert (stopped.objective <= stopped.explored[:, 0]).all()
+    assert np.isnan(stopped.explored[:, 1:]).all()
+    ample = train(data, time_limit=1e6)
+    assert np.array_equal(ample.theta, converged.theta)
+
+
+def test_a_time_limit_waits_for_a_start_that_succeeds(monkeypatch):
+    data, calls = pendulum(20), count()
+    good = _search.NegativeLogMarginalLikelihood.__call__
+
+    def first_fails(self, theta):
+        return (np.nan, np.zeros_like(theta)) if next(calls) < 1 else good(self, theta)
+
+    monkeypatch.setattr(_search.NegativeLogMarginalLikelihood, "__call__", first_fails)
+    found = train(data, time_limit=1e-9)
+    assert found.explored[0, 0] >= _search.FAILED > found.explored[0, 1]
+    assert np.isnan(found.explored[0, 2:]).all()
+    assert np.isnan(found.explored[1, 1:]).all()
