@@ -107,10 +107,11 @@ def find_hyperparameters(problem: SearchProblem, settings: Any) -> SearchResult:
     ends: list[tuple[np.ndarray, float]] = []
     for start in starts:
         ends.append(search(start, _EXPLORATION))
-        if problem.is_late() and ends[-1][1] < FAILED:
+        if problem.is_late() and min(end[1] for end in ends) < FAILED:
             break
-    finalists = sorted(ends, key=lambda end: end[1])[:_FINALISTS]
-    theta, value = min((search(end, _ITERATIONS) for end, _ in finalists), key=lambda end: end[1])
+    best = sorted(ends, key=lambda end: end[1])[:_FINALISTS]
+    finalists = best if problem.is_late() else [search(end, _ITERATIONS) for end, _ in best]
+    theta, value = min(finalists, key=lambda end: end[1])
     evaluations = search.evaluations
     if problem.rows is not None:
         search = _Search(problem, slice(None), box, settings)

@@ -81,7 +81,7 @@ class Trainer:
     #: precision
     signal_to_noise_limit: float = 1e4
     #: wall time of a training [s], in equal parts for the outputs, after which the best found so far is taken: what
-    #: that is depends on the machine. None lets every search converge
+    #: that is depends on the machine. One iteration over all points is made in any case. None: no limit
     time_limit: float | None = None
 
     def __post_init__(self) -> None:
@@ -179,7 +179,7 @@ class Trainer:
             with threadpool_limits(1 if size < _ONE_THREAD else None, user_api="blas"):
                 found.append(find_hyperparameters(problem, self))
             if problem.is_late():
-                _log.info("training: %s: stopped by time_limit=%g s", name, self.time_limit)
+                _log.info("training: %s: its share of time_limit=%g s is over", name, self.time_limit)
             if size > _MANY:
                 _log.info("training: %s: %d evaluations, %.1f s", name, found[-1].evaluations, found[-1].seconds)
         failed = [a for a, one in enumerate(found) if one.objective >= FAILED]

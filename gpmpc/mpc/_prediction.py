@@ -163,7 +163,8 @@ class PredictionModel:
         if plan is not None and request.states is None and request.finite:  # those that the inputs lead to
             start = request.state[None], request.initial_guess[None], request.disturbance
             states = self._roll_out.open_loop(*start)[0]
-            request = request._replace(states=states if np.isfinite(states).all() else None)
+            known = np.isfinite(states).all()
+            request = request._replace(states=states if known else np.tile(request.state, (H + 1, 1)))
         return request
 
     def initial_guess(self, request: Request) -> Plan:

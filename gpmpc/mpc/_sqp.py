@@ -96,7 +96,7 @@ class Globalization:
         terms, stages = (self._references, prices, self._row_price), (at.stages.A, at.stages.next)
         found = call_unchecked(_assess, at.cost, terms, self._defect_prices, stages, at.rows, plan, proposed, z)
         cost, curvature, promised, largest, merit, self._defect_prices = found
-        size = max(math.sqrt(curvature / (cost + self._smallest)), largest)
+        size, first = max(math.sqrt(curvature / (cost + self._smallest)), largest), math.isinf(self._size)
         self._size, self._rate = size, size / self._size if math.isfinite(self._size) else 1.0
         self._creeps = self._creeps or (self._rate > _CREEP and size < _NEAR)
         slower = max(self._rate, last_rate)  # the solution is better than the plan by about the slower of two rates
@@ -104,7 +104,7 @@ class Globalization:
         if settled or size <= self._tolerance or size * slower <= self._tolerance * (1.0 - slower):
             return at._replace(plan=proposed), Status.SOLVED
         slope = promised - curvature - merit
-        far = size > _NEAR and not self._request.continues
+        far = size > _NEAR and not (first and self._request.continues)
         for length, trial in self._trials(at, plan, proposed, program.feedback, far):
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
             rows = trial.rows if self._model.constraints.smooth else at.rows._replace(E=trial.rows.E)
@@ -126,7 +126,8 @@ class Globalization:
         """Shares of the step to a proposed plan; predictions at the plan that obeys the dynamics and at the plan there.
 
         Far from a solution the first of these leads further; and it comes first where moments are linearised, since
-        they overshoot. Near one, and from the last decision's plan on, a plan is linearised at once: it will be taken.
+        they overshoot. Means are linearised at once near a solution, as a first step from the last plan is taken to
+        be: the plan there will be taken.
         """
         model, request = self._model, self._request
         if far and model.evaluates:  # without derivatives

@@ -52,7 +52,7 @@ def timed_pilot(monkeypatch, start, decision, value=0.1):
         return call
 
     model = KnownModel(casadi_model(double_pendulum("shoulder")), 4, 1)
-    parts = make_parts(model, horizon=20, programs=3, wild=False)._replace(criterion=lambda plan, goal: value)
+    parts = make_parts(model, 0.1, horizon=20, programs=3, wild=False)._replace(criterion=lambda plan, goal: value)
     who = real_time_pilot(parts, 0)
     monkeypatch.setattr(realaigym_real_time, "process_time", lambda: clock[0])
     monkeypatch.setattr(who.search, "_try", slowed(who.search._try, start))

@@ -302,9 +302,9 @@ def test_a_time_limit_ends_every_outputs_search_with_the_best_found_so_far(caplo
         monkeypatch.setattr(module, "time", clock)
     with caplog.at_level(logging.INFO, "gpmpc"):
         stopped = train(data, time_limit=40.0)
-    assert [r.message for r in caplog.records if "stopped" in r.message] == [
-        "training: output 1 of 2: stopped by time_limit=40 s",
-        "training: output 2 of 2: stopped by time_limit=40 s",
+    assert [r.message for r in caplog.records if "over" in r.message] == [
+        "training: output 1 of 2: its share of time_limit=40 s is over",
+        "training: output 2 of 2: its share of time_limit=40 s is over",
     ]
     assert 10 < stopped.evaluations < 0.3 * converged.evaluations
     assert (stopped.objective > converged.objective).all()
@@ -314,15 +314,26 @@ def test_a_time_limit_ends_every_outputs_search_with_the_best_found_so_far(caplo
     assert np.array_equal(ample.theta, converged.theta)
 
 
-def test_a_time_limit_waits_for_a_start_that_succeeds(monkeypatch):
-    data, calls = pendulum(20), count()
-    good = _search.NegativeLogMarginalLikelihood.__call__
+@pytest.mark.parametrize(("failing", "late_after", "explored"), [(0, 0, 2), (1, 0, 1), (1, 2, 2)])
+def test_a_time_limit_waits_for_one_start_that_succeeds(monkeypatch, failing, late_after, explored):
+    starts, search = count(), _search._Search.__call__
 
-    def first_fails(self, theta):
-        return (np.nan, np.zeros_like(theta)) if next(calls) < 1 else good(self, theta)
+    def one_fails(self, start, iterations):
+        number = next(starts)
+        monkeypatch.setattr(self.problem.__class__, "is_late", lambda problem: number + 1 >= late_after)
+        return (start, 2 * _search.FAILED) if number == failing else search(self, start, iterations)
 
-    monkeypatch.setattr(_search.NegativeLogMarginalLikelihood, "__call__", first_fails)
-    found = train(data, time_limit=1e-9)
-    assert found.explored[0, 0] >= _search.FAILED > found.explored[0, 1]
-    assert np.isnan(found.explored[0, 2:]).all()
-    assert np.isnan(found.explored[1, 1:]).all()
+    monkeypatch.setattr(_search._Search, "__call__", one_fails)
+    found = train(pendulum(20), time_limit=60.0)
+    assert np.isfinite(found.explored[0]).tolist() == [True] * explored + [False] * (4 - explored)
+    assert (found.explored[0] >= _search.FAILED).tolist() == [k == failing and k < explored for k in range(4)]
+
+
+def test_a_time_limit_leaves_an_iteration_over_all_points():
+    data = pendulum(60, noise=1e-2)
+    found, converged = train(data, subset=20, time_limit=1e-9), train(data, subset=20)
+    assert np.isnan(found.explored[:, 1:]).all()
+    first = train(data[np.sort(np.random.default_rng(0).permutation(60)[:20]).tolist()], time_limit=1e-9)
+    assert (found.objective > converged.objective).all()
+    assert (found.objective - first.objective != 0).all()
+    assert len(found.posterior) == 60

@@ -1,6 +1,7 @@
 from dataclasses import replace
 from time import perf_counter
 
+import casadi
 import numpy as np
 import pytest
 import torch
@@ -11,6 +12,7 @@ from gpmpc._dynamics import Linearized
 from gpmpc.exceptions import DataError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend
+from gpmpc.models import CasadiFunction, KnownModel
 from gpmpc.mpc import Decision, PredictionSettings, Reference, Timing
 from gpmpc.mpc._sqp import _each
 from gpmpc.mpc.gp_mpc import GPMPC
@@ -277,3 +279,37 @@ def test_a_plan_that_a_model_cannot_predict_leaves_those_beside_it():
 
     assert _each(predict, [2, 0, 4]) == [[0.5], [], [0.25]]
     assert _each(predict, [4, 2]) == [[0.25], [0.5]]
+
+
+def test_the_first_step_from_the_last_plan_needs_no_roll_out_and_ends_where_others_do(quadrotor, monkeypatch):
+    problem = Problem(Tracking([1.0] * 6, [1.0] * 3), **BOX)
+    settings = PredictionSettings(covariance="none")
+    controller = GPMPC(quadrotor, Linearization(), problem, 10, HOVER, settings, iterations=20)
+    obeying, rolled = controller.prediction.obeying, []
+    monkeypatch.setattr(controller.prediction, "obeying", lambda *given: rolled.append(1) or obeying(*given))
+    reference, moved = Reference(np.tile([0.5, 0.0] * 3, (11, 1))), Gaussian.certain(np.array([-0.3, 0.2] * 3))
+    last = controller.control(Gaussian.certain(np.zeros(6)), reference)
+    assert rolled
+    rolled.clear()
+    warm = controller.control(moved, reference, last)
+    assert not rolled
+    given = controller.control(moved, reference, last, plan=(last.inputs, last.means))
+    assert rolled
+    assert (last.status, warm.status, given.status) == (Status.SOLVED,) * 3
+    assert np.allclose(warm.inputs, given.inputs, atol=1e-4)
+
+
+def test_inputs_that_lead_a_model_out_of_its_numbers_begin_a_plan_at_the_state():
+    x, u = casadi.SX.sym("x"), casadi.SX.sym("u")
+    runaway = KnownModel(CasadiFunction(casadi.Function("f", [x, u], [x + 0.1 * (x**3 + u)])), 1, 1)
+    problem = Problem(Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-99.0], [99.0]))
+    settings = PredictionSettings(covariance="none")
+    controller = GPMPC(runaway, Linearization(), problem, 12, [0.0], settings, iterations=30)
+    belief, reference = Gaussian.certain(np.array([0.5])), Reference(np.zeros((13, 1)))
+    last = controller.control(belief, reference)
+    request = controller.prediction.read(belief, reference, last, plan=np.full((12, 1), 50.0))
+    assert not request.continues
+    assert controller.prediction.initial_guess(request).states.ravel().tolist() == [0.5] * 13
+    decision = controller.control(belief, reference, last, plan=np.full((12, 1), 50.0))
+    assert decision.status is Status.SOLVED
+    assert np.allclose(decision.inputs, last.inputs, atol=1e-4)
