@@ -333,6 +333,7 @@ def _kill_and_wait_for_the_pipe(command, cwd, begun, ended_by):
     parent = subprocess.Popen(
         command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
         env=os.environ | {"PYTHONPATH": path},
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),  # which nohup sets to be ignored
     )  # fmt: skip
     try:
         deadline = time.monotonic() + SECONDS
