@@ -171,7 +171,8 @@ class PredictionModel:
         """The plan handed over, or the last plan, shifted by a stage.
 
         Without one it is a line from the state to the last reference along the others, and its inputs are the previous
-        one, or the reference's where R weighs deviations. Inputs handed over without states lead to those of the model.
+        one, or the reference's where R weighs deviations. Inputs handed over alone lead to the model's states;
+        where these are not finite, the plan's are x_0.
 
         Covariances are those of the last plan, unshifted: they depend on the time since the last measurement.
         """
