@@ -13,9 +13,9 @@ instance per call, in one process on one thread; times are processor time.
   solution, shifted where the library allows it, *cold* ones from the last input and the reference.
 * ``one program``: one quadratic program per step from the last plan (real-time iteration), with our QP solver and DAQP.
 
-``times ours`` is the median ratio of paired calls to ours called right after itself, as in a loop that does nothing
-else; ``times ours, evicted`` to ours called right after a peer that has filled the caches. Writes
-``outputs/benchmarks/peers.json`` and ``peers.md``.
+Every solver solves ten instances in a row, then the next one the same ten. ``times ours`` is the median ratio of paired
+calls after the first of each ten, as in a loop of its own; ``times ours, evicted`` that of the first ones, which find
+the caches as another solver left them. Writes ``outputs/benchmarks/peers.json`` and ``peers.md``.
 """
 
 import argparse
@@ -49,10 +49,10 @@ from gpmpc.status import Status
 TRAJECTORY, STEPS = "lorenz", 150
 ACCURACY = 1e-5  # of the common KKT residual
 IPOPT, SQP, FATROP, SLSQP, OURS = 1e-7, 1e-4, 1e-7, 1e-12, 1e-3  # tolerances of the solvers' own tests
-MIN_ROUNDS = 6  # where a solver takes seconds
+IN_A_ROW = 10
+MIN_ROUNDS = 2  # where a solver takes seconds
 SLOW_ABOVE = 10  # horizon above which SLSQP is left out: minutes
-EVICTED = "gpmpc, iterated, evicted"
-LOOP = "gpmpc, iterated"
+OWN = "gpmpc, iterated"
 
 Solve = Callable[[Instance, Any], Any]
 """From an instance and the last solution (None at first) to a solution, which has ``inputs`` (H, m)."""
@@ -76,7 +76,7 @@ def main() -> None:
         instances = record_instances(gp, task, horizon, STEPS)
         tables = {("converged", start): converged(gp, task, horizon) for start in arguments.starts}
         if horizon in arguments.alone:
-            tables = {key: {LOOP: cases[LOOP]} for key, cases in tables.items()}
+            tables = {key: {OWN: cases[OWN]} for key, cases in tables.items()}
         elif horizon <= SLOW_ABOVE:
             tables["converged by torch", "warm"] = slow(gp, task, horizon)
         tables["one program", "warm"] = one_program(gp, task, horizon)
@@ -117,8 +117,7 @@ def converged(gp: GPPosterior, task: Problem, horizon: int) -> Cases:
         return peer_do_mpc.DoMpc(gp, task, horizon, IPOPT)
 
     cases: Cases = {
-        EVICTED: ours,
-        LOOP: ours,
+        OWN: ours,
         "CasADi, IPOPT, exact Hessian": lambda: Casadi(gp, task, horizon, "ipopt", IPOPT),
         "CasADi, IPOPT, Gauss-Newton": lambda: Casadi(gp, task, horizon, "ipopt, gauss-newton", IPOPT),
         "CasADi, sqpmethod + HPIPM": lambda: Casadi(gp, task, horizon, "sqpmethod", SQP),
@@ -132,7 +131,7 @@ def slow(gp: GPPosterior, task: Problem, horizon: int) -> Cases:
     """Builds what takes seconds, with ours beside it."""
     ours = converged(gp, task, horizon)
     return {
-        LOOP: ours[LOOP],
+        OWN: ours[OWN],
         "GPyTorch autograd, SLSQP": lambda: GPyTorchSlsqp(gp, task, horizon, SLSQP),
     }
 
@@ -197,31 +196,27 @@ def measure(
 ) -> list[dict]:
     """Times the solvers in turns and judges their plans."""
     runs = {name: Run(make(), instances, cold) for name, make in cases.items() if make is not None}
-    times = time_interleaved(runs, seconds, min_rounds=MIN_ROUNDS)
+    taken = time_interleaved(runs, seconds, min_rounds=MIN_ROUNDS, in_a_row=IN_A_ROW)
+    first, later = ({name: times.split(IN_A_ROW)[part] for name, times in taken.items()} for part in (0, 1))
     rows = []
     for name, make in cases.items():
         if make is None:
             rows.append({"what": name, "note": peer_do_mpc.MISSING})
             continue
         residuals = [kkt_residual(gp, task, instances[k], plan) for k, plan in runs[name].plans[WARM_UP_CALLS:]]
-        row = {"what": name} | times[name].summary() | {"times_ours": times[name].over(times[_ours(name, times)])}
+        ours = OWN if OWN in cases else name.removesuffix(", DAQP inside")  # or its own controller
+        row = {"what": name} | later[name].summary() | {"evicted": 1e3 * first[name].median}
+        row |= {"times_ours": later[name].over(later[ours]), "times_ours_evicted": first[name].over(first[ours])}
         row |= {"kkt": float(np.median(residuals)), "kkt_worst": float(max(residuals))}
         row["within"] = float((np.array(residuals) <= ACCURACY).mean())
-        if EVICTED in times:
-            row["times_ours_evicted"] = times[name].over(times[EVICTED])
         rows.append(row)
     return rows
-
-
-def _ours(name: str, cases: Mapping[str, Any]) -> str:
-    """Whom a case is compared with: the one solver of ours, or its own controller with our QP solver in it."""
-    return LOOP if LOOP in cases else name.removesuffix(", DAQP inside")
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Formats the rows of one comparison."""
     columns = {
-        "what": "", "median": "ms, median", "p99": "99 %", "times_ours": "times ours",
+        "what": "", "median": "ms, median", "p99": "99 %", "evicted": "evicted", "times_ours": "times ours",
         "times_ours_evicted": "times ours, evicted", "kkt": "KKT, median", "kkt_worst": "worst",
         "within": f"within {ACCURACY:g}", "samples": "calls", "note": "note",
     }  # fmt: skip

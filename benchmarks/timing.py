@@ -44,6 +44,11 @@ class Times:
         """[s]."""
         return float(np.median(self.seconds))
 
+    def split(self, in_a_row: int) -> tuple["Times", "Times"]:
+        """The first calls of each turn of ``in_a_row`` calls, and those after them."""
+        turns = self.seconds.reshape(-1, in_a_row)
+        return Times(turns[:, 0]), Times(turns[:, 1:].ravel())
+
     def over(self, reference: "Times") -> float:
         """Median ratio to another case, call by call of one interleaved timing."""
         calls = min(len(self.seconds), len(reference.seconds))
@@ -61,8 +66,9 @@ def time_interleaved(
     min_rounds: int = 5,
     max_rounds: int = 1000,
     flushed: bool = False,
+    in_a_row: int = 1,
 ) -> dict[str, Times]:
-    """Calls every case once a round and times every call.
+    """Lets every case take a turn in each round, and times every call.
 
     Args:
         cases: Calls by name.
@@ -70,6 +76,7 @@ def time_interleaved(
         min_rounds: Rounds at least, whatever the time.
         max_rounds: Rounds at most.
         flushed: Whether the caches are emptied before every call.
+        in_a_row: Calls of a turn: with one, all find the caches as another case left them.
 
     Raises:
         SettingError: Fewer than one round, or no time.
@@ -87,7 +94,7 @@ def time_interleaved(
     for count in range(max(min_rounds, max_rounds)):
         if count >= min_rounds and spent >= seconds:
             break
-        for name, call in cases.items():
+        for name, call in [turn for turn in cases.items() for _ in range(in_a_row)]:
             if flushed:
                 buffer += 1.0
             began = time.thread_time_ns()

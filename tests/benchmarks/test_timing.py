@@ -25,6 +25,16 @@ def test_cases_alternate():
     assert {name: len(taken.seconds) for name, taken in times.items()} == {"a": 4, "b": 4}
 
 
+def test_a_turn_is_several_calls_of_which_the_first_is_told_from_the_others():
+    order = []
+    cases = {"a": lambda: order.append("a"), "b": lambda: order.append("b")}
+    times = time_interleaved(cases, 1e-9, min_rounds=2, in_a_row=3)
+    assert order[4:] == ["a", "a", "a", "b", "b", "b"] * 2
+    assert len(times["a"].seconds) == 6
+    first, later = Times(np.arange(6.0)).split(3)
+    assert (first.seconds.tolist(), later.seconds.tolist()) == ([0.0, 3.0], [1.0, 2.0, 4.0, 5.0])
+
+
 def test_processor_time_is_counted_and_sleep_is_not():
     times = time_interleaved({"busy": lambda: busy(2e-3), "idle": lambda: time.sleep(2e-3)}, 1e-9, min_rounds=5)
     assert np.all(times["busy"].seconds > 1.9e-3)
