@@ -9,7 +9,7 @@ cannot give them is skipped, with the reason.
 import json
 import math
 import shlex
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ from gpmpc.studies._document import plain_text
 from gpmpc.studies._run_folder import ERROR, METRICS, PLAN, folder_name
 
 SEED = "seed"
+STATES = ("finished", "failed", "missing", "skipped")
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError)  # of a file
 
 Choices = dict[str, str]
@@ -49,32 +50,38 @@ MEASURES = {
 
 @dataclass(frozen=True)
 class Run:
-    """One run of a tree."""
+    """One run of a tree, or one that a sweep asked for; what was not read is empty."""
 
-    folder: Path  #: where it is
     choices: Choices  #: what was asked for, by key
-    settings: Mapping[str, Any]  #: all of them, by dotted key
-    numbers: Mapping[str, float | None] = field(default_factory=dict)  #: by measure; empty where the run failed
+    state: str  #: "finished", "failed", "missing" (there is nothing of it) or "skipped" (it cannot be read)
+    folder: Path = Path()  #: where it is
+    settings: Mapping[str, Any] = field(default_factory=dict)  #: all of them, by dotted key
+    numbers: Mapping[str, float | None] = field(default_factory=dict)  #: by measure, of a finished run
     unit: str = ""  #: of its errors
     lost: str | None = None  #: since when and why the flight was lost; None where it was not
-    error: str | None = None  #: why the run failed; None where it did not
+    error: str = ""  #: why the run failed
     #: what made it: "date", "commit" and "machine", where it says so
     origin: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Cell:
     """All runs of one combination."""
 
     values: tuple[str, ...]  #: of the varied settings, in the order of ``Report.variables``
-    runs: dict[str, Run] = field(default_factory=dict)  #: those that finished, by seed
-    failed: dict[str, Run] = field(default_factory=dict)  #: those that failed, by seed
-    missing: tuple[str, ...] = ()  #: seeds asked for of which there is nothing
-    skipped: tuple[str, ...] = ()  #: seeds asked for of which there is something that cannot be read
+    runs: Mapping[str, Run]  #: by seed
+
+    def of(self, *states: str) -> list[Run]:
+        """Returns the runs of some states, by seed."""
+        return [run for run in self.runs.values() if run.state in states]
+
+    def seeds(self, *states: str) -> list[str]:
+        """Returns the seeds of the runs of some states."""
+        return [seed for seed, run in self.runs.items() if run.state in states]
 
     def numbers(self, measure: str) -> list[float]:
         """Returns one measure of all runs that have it, by seed."""
-        return [value for run in self.runs.values() if (value := run.numbers[measure]) is not None]
+        return [value for run in self.runs.values() if (value := run.numbers.get(measure)) is not None]
 
     @property
     def lost(self) -> list[Run]:
@@ -95,7 +102,7 @@ class Report:
     @property
     def runs(self) -> list[Run]:
         """Every run that finished or failed, cell by cell."""
-        return [run for cell in self.cells for run in (*cell.runs.values(), *cell.failed.values())]
+        return [run for cell in self.cells for run in cell.of("finished", "failed")]
 
     def measures(self) -> list[str]:
         """Returns those of which any run has a number."""
@@ -103,7 +110,7 @@ class Report:
 
     def label(self, measure: str) -> str:
         """Returns a measure's name with its unit; with both units where the runs are of both subsystems."""
-        units = {run.unit for cell in self.cells for run in cell.runs.values()}
+        units = {run.unit for run in self.runs if run.unit}
         return MEASURES[measure].label.format(unit=" or ".join(sorted(units)) or "m")
 
     def base_settings(self) -> list[str]:
@@ -119,7 +126,7 @@ class Report:
         """
         commands = []
         for cell in self.cells:
-            if seeds := sorted([*cell.missing, *cell.failed], key=in_order):
+            if seeds := cell.seeds("missing", "failed"):
                 chosen = [*self.constants.items(), *zip(self.variables, cell.values, strict=True)]
                 settings = _spelled({key: value for key, value in chosen if value != "default"})
                 sweep = [f"{SEED}={','.join(seeds)}", f"folder={self.tree}"]
@@ -134,44 +141,10 @@ def read_report(tree: str | Path) -> Report:
         DataError: There is no such folder, or no run in it that can be read.
     """
     tree = Path(tree)
-    runs, plans, unread, skipped = _read(tree)
-    keys = list(dict.fromkeys([*(key for chosen in [*(run.choices for run in runs), *plans] for key in chosen), SEED]))
-    filled = [{key: run.choices.get(key) or _setting(run.settings, key) for key in keys} for run in runs]
-    found = {frozenset(run.choices.items()): choices for run, choices in zip(runs, filled, strict=True)}
-    planned = [found.get(frozenset(plan.items())) or _as_others(plan, keys, runs) for plan in plans]
-    values = {key: {choices[key] for choices in [*filled, *planned]} for key in keys if key != SEED}
-    varied = tuple(sorted(key for key in values if len(values[key]) > 1))
-    cells: dict[tuple[str, ...], Cell] = {}
-    names = [folder_name(_spelled(plan)) for plan in plans]
-    kinds = ["skipped" if name in unread else "missing" for name in names]
-    flown = [(choices, run, "") for choices, run in zip(filled, runs, strict=True)]
-    asked = [(choices, None, kind) for choices, kind in zip(planned, kinds, strict=True)]
-    for choices, run, kind in sorted([*flown, *asked], key=lambda each: in_order(each[0][SEED])):
-        where, seed = tuple(choices[key] for key in varied), choices[SEED]
-        cell = cells.setdefault(where, Cell(where))
-        if run is not None:
-            (cell.runs if run.error is None else cell.failed)[seed] = run
-        elif seed not in (*cell.runs, *cell.failed, *cell.skipped, *cell.missing):  # runs of a seed come before plans
-            setattr(cell, kind, (*getattr(cell, kind), seed))
-    rows = sorted(cells, key=lambda values: [in_order(value) for value in values])
-    single = {key: value for key, those in values.items() if len(those) == 1 for value in those if value != "default"}
-    return Report(tree, varied, single, tuple(cells[row] for row in rows), tuple(skipped))
-
-
-def in_order(value: str) -> tuple[int, float, str]:
-    """Returns a key that sorts numbers by their size, then words."""
-    try:
-        return 0, float(value), value
-    except ValueError:
-        return 1, 0.0, value
-
-
-def _read(tree: Path) -> tuple[list[Run], list[Choices], set[str], list[str]]:
-    """Returns every run, finished or failed, what sweeps asked for, names of unread folders, and the reasons."""
     if not tree.is_dir():
         raise DataError(f"{tree}: no such folder")
-    results = {path.parent: path for name in (ERROR, METRICS) for path in sorted(tree.rglob(name))}
     runs, plans, unread, skipped = [], [], set(), []
+    results = {path.parent: path for name in (ERROR, METRICS) for path in sorted(tree.rglob(name))}
     for path in [*results.values(), *sorted(tree.rglob(f"{PLAN}*.json"))]:
         planned = path.name.startswith(PLAN)
         try:
@@ -187,30 +160,58 @@ def _read(tree: Path) -> tuple[list[Run], list[Choices], set[str], list[str]]:
             unread.add(path.parent.name)
     if not runs:
         raise DataError(skipped[0] if skipped else f"{tree}: holds no run, finished or failed")
-    return runs, plans, unread, skipped
+    there = {frozenset(run.choices.items()) for run in runs}
+    absent = [plan for plan in plans if frozenset(plan.items()) not in there]
+    states = ["skipped" if folder_name(_spelled(plan)) in unread else "missing" for plan in absent]
+    variables, constants, cells = _cells([*runs, *map(Run, absent, states)])
+    return Report(tree, variables, constants, cells, tuple(skipped))
+
+
+def _cells(runs: list[Run]) -> tuple[tuple[str, ...], Choices, tuple[Cell, ...]]:
+    """Returns what was varied, what was not, and the runs by what was varied; a run that is there comes first."""
+    keys = dict.fromkeys([*(key for run in runs for key in run.choices), SEED])
+    # A run that did not choose had a setting; of one that is not there it is that of the others.
+    usual = {
+        key: next((_setting(run, key) for run in runs if run.settings and key not in run.choices), "") for key in keys
+    }
+    filled = [
+        {key: run.choices.get(key) or _setting(run, key) or usual[key] or "default" for key in keys} for run in runs
+    ]
+    values = {key: {choices[key] for choices in filled} for key in keys if key != SEED}
+    variables = tuple(sorted(key for key in values if len(values[key]) > 1))
+    cells: dict[tuple[str, ...], dict[str, Run]] = {}
+    for choices, run in sorted(zip(filled, runs, strict=True), key=lambda each: in_order(each[0][SEED])):
+        cell = cells.setdefault(tuple(choices[key] for key in variables), {})
+        if run.state == "finished" or choices[SEED] not in cell:
+            cell[choices[SEED]] = run
+    rows = sorted(cells, key=lambda row: [in_order(value) for value in row])
+    single = {key: value for key, those in values.items() if len(those) == 1 for value in those if value != "default"}
+    return variables, single, tuple(Cell(row, cells[row]) for row in rows)
+
+
+def in_order(value: str) -> tuple[int, float, str]:
+    """Returns a key that sorts numbers by their size, then words."""
+    try:
+        return 0, float(value), value
+    except ValueError:
+        return 1, 0.0, value
 
 
 def _run(path: Path, content: Mapping[str, Any]) -> Run:
+    """Returns a run that finished or failed, from its result."""
     choices, settings, origin = _parsed(content["choices"]), content["settings"], _origin(content)
     if not isinstance(settings, Mapping) or not isinstance(settings.get("options", {}), Mapping):
         raise TypeError("settings and their options are not by name")
-    settings = flattened(settings)
+    about: Any = {"folder": path.parent, "settings": flattened(settings), "origin": origin}
     if path.name == ERROR:
-        return Run(path.parent, choices, settings, error=plain_text(content["error"]), origin=origin)
-    numbers, lost = {name: _number(name, content) for name in MEASURES}, content.get("lost")
+        return Run(choices, "failed", **about, error=plain_text(content["error"]))
+    numbers, lost = {name: measure.of(content) for name, measure in MEASURES.items()}, content.get("lost")
+    for name, value in numbers.items():
+        if value is not None and (type(value) not in (int, float) or not math.isfinite(value)):
+            raise ValueError(f"{name}: must be a finite number; got {value!r:.80}")
     if lost:
         lost = plain_text(", ".join(f"{k} {v}" for k, v in lost.items()) if isinstance(lost, Mapping) else str(lost))
-    return Run(path.parent, choices, settings, numbers, plain_text(content["unit"]), lost or None, origin=origin)
-
-
-def _number(name: str, content: Mapping[str, Any]) -> float | None:
-    try:
-        value = MEASURES[name].of(content)
-    except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise ValueError(f"{name}: {error}") from error
-    if value is not None and (type(value) not in (int, float) or not math.isfinite(value)):
-        raise ValueError(f"{name}: must be a finite number; got {value!r:.80}")
-    return None if value is None else float(value)
+    return Run(choices, "finished", **about, numbers=numbers, unit=plain_text(content["unit"]), lost=lost or None)
 
 
 def _origin(content: Mapping[str, Any]) -> dict[str, str]:
@@ -218,8 +219,8 @@ def _origin(content: Mapping[str, Any]) -> dict[str, str]:
     about = content.get("provenance") or {}
     git, machine, versions = about.get("git") or {}, about.get("machine") or {}, about.get("versions") or {}
     commit = f"{git['commit'][:10]}{', changed' if git.get('dirty') else ''}" if git else versions.get("gpmpc")
-    named = {"date": about.get("created"), "commit": commit}
-    named["machine"] = ", ".join(f"{value} cores" if key == "cores" else str(value) for key, value in machine.items())
+    made = ", ".join(f"{value} cores" if key == "cores" else str(value) for key, value in machine.items())
+    named = {"date": about.get("created"), "commit": commit, "machine": made}
     return {key: plain_text(str(value)) for key, value in named.items() if value}
 
 
@@ -234,20 +235,10 @@ def _spelled(choices: Choices) -> list[str]:
     return [f"{key}={value}" if value else key for key, value in choices.items()]
 
 
-def _as_others(choices: Choices, keys: Iterable[str], runs: Sequence[Run]) -> Choices:
-    """Fills up the choices of a run that is not there from the most alike run that did not choose a key either."""
-    filled = {}
-    for key in keys:
-        others = [run for run in runs if key not in run.choices]
-        alike = max(others, key=lambda run: len(choices.items() & run.choices.items()), default=None)
-        filled[key] = choices.get(key) or ("default" if alike is None else _setting(alike.settings, key))
-    return filled
-
-
-def _setting(settings: Mapping[str, Any], key: str) -> str:
-    """Returns the value that a run had which did not choose; "default" where the settings do not tell."""
-    value = settings.get(f"options.{key}")
-    value = settings.get(key, "default") if value is None else value
+def _setting(run: Run, key: str) -> str:
+    """Returns the value that a run had which did not choose; empty where its settings do not tell."""
+    value = run.settings.get(f"options.{key}")
+    value = run.settings.get(key, "") if value is None else value
     if isinstance(value, bool) or value is None:
         return json.dumps(value)
-    return plain_text(str(value)) if isinstance(value, int | float | str) else "default"
+    return plain_text(str(value)) if isinstance(value, int | float | str) else ""

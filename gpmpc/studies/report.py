@@ -26,36 +26,27 @@ from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable, png
 from gpmpc.studies._document import MISSING, Document, Table, figure_label, plain_text, with_range
 from gpmpc.studies._run_folder import LONGEST_NAME
-from gpmpc.studies._runs import MEASURES, SEED, Cell, Report, in_order, read_report
+from gpmpc.studies._runs import MEASURES, SEED, STATES, Cell, Report, in_order, read_report
 
 __all__ = ["Comparison", "Report", "compare", "notes", "read_report", "report_document", "sentences", "terminal_table"]
 
 _DRAWN = ("rmse", "failed", "decision")  # a figure each
 _SHORT = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
-_PARTS = ("q25", "median", "q75")
 _MOST_LINES = 8  # in a figure; what is varied besides is pooled
 _LEGEND = "Median [first to third quartile] over the seeds. In figures, every run is a dot."
 _LEVEL = 0.05
 _FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
 
 
-def report_document(
-    report: Report,
-    comparison: Sequence[str] = (),
-    folder: Path | None = None,
-    images: Mapping[str, bytes] | None = None,
-) -> Document:
+def report_document(report: Report, comparison: Sequence[str] = (), folder: Path | None = None) -> Document:
     """Returns everything that is written of a report; what is zero everywhere is left out of the LaTeX table.
 
     Args:
         report: All runs.
         comparison: Lines about two groups of them.
         folder: Where it goes, for the links to the runs; by default ``report`` in the tree.
-        images: Figures by file name; by default they are drawn.
     """
     constants = ", ".join(f"{key}={value}" for key, value in report.constants.items())
-    lists = {"Comparison": list(comparison), **notes(report), "Made": _made(report)}
-    code = {"To fill the gaps": report.commands(), "Settings of all runs": report.base_settings()}
     start = (folder or report.tree / "report").resolve()
     return Document(
         plain_text(report.tree.resolve().name),
@@ -63,9 +54,9 @@ def report_document(
         _numbers(report),
         lead=f"{_counts(report)}." + (f" All of them: {constants}." if constants else ""),
         notes=[_LEGEND],
-        lists={heading: items for heading, items in lists.items() if items},
-        code={heading: lines for heading, lines in code.items() if lines},
-        images=_figures(report) if images is None else images,
+        lists={"Comparison": comparison, **notes(report), "Made": _made(report)},
+        code={"To fill the gaps": report.commands(), "Settings of all runs": report.base_settings()},
+        images=_figures(report),
         links={
             plain_text(str(run.folder.relative_to(report.tree))): os.path.relpath(run.folder.resolve(), start)
             for run in report.runs
@@ -76,21 +67,20 @@ def report_document(
 
 def _made(report: Report) -> list[str]:
     """Returns when, from which source and on which machines the runs were made."""
-
-    def every(key: str) -> list[str]:
-        return sorted({run.origin[key] for run in report.runs if key in run.origin})
-
-    dates = " to ".join(dict.fromkeys([*every("date")[:1], *every("date")[-1:]]))
-    shown = {"Runs made": dates, "Commit": "; ".join(every("commit")), "Machine": "; ".join(every("machine"))}
+    made = {
+        key: sorted({run.origin[key] for run in report.runs if key in run.origin})
+        for key in ("date", "commit", "machine")
+    }
+    dates = " to ".join(dict.fromkeys([*made["date"][:1], *made["date"][-1:]]))
+    shown = {"Runs made": dates, "Commit": "; ".join(made["commit"]), "Machine": "; ".join(made["machine"])}
     shown |= {"Report made": now(), "Tree": str(report.tree.resolve())}
     return [f"{key}: {plain_text(value)}" for key, value in shown.items() if value]
 
 
 def _counts(report: Report) -> str:
     """Returns how many runs there are, by how they ended."""
-    finished, lost, failed, missing = (
-        sum(len(getattr(cell, kind)) for cell in report.cells) for kind in ("runs", "lost", "failed", "missing")
-    )
+    finished, failed, missing = (sum(len(cell.of(state)) for cell in report.cells) for state in STATES[:3])
+    lost = sum(len(cell.lost) for cell in report.cells)
     text = f"{finished} finished in {len(report.cells)} cells, {failed} failed, {missing} missing"
     text += f", {len(report.skipped)} skipped" if report.skipped else ""
     return text + (f"; of those finished, {lost} lost" if lost else "")
@@ -107,40 +97,45 @@ def terminal_table(report: Report) -> Table:
 
 def notes(report: Report) -> dict[str, list[str]]:
     """Returns what has to be known of single runs, by kind: their folders and the reasons."""
+    failed, lost = (
+        [run for run in report.runs if run.state == "failed"],
+        [run for cell in report.cells for run in cell.lost],
+    )
     found = {
-        "Failed": [(run.folder.name, run.error) for cell in report.cells for run in cell.failed.values()],
-        "Lost": [(run.folder.name, run.lost) for cell in report.cells for run in cell.lost],
+        "Failed": [f"{plain_text(run.folder.name)}: {run.error}" for run in failed],
+        "Lost": [f"{plain_text(run.folder.name)}: {run.lost}" for run in lost],
+        "Skipped": list(report.skipped),
     }
-    each = {kind: [f"{plain_text(folder)}: {why}" for folder, why in runs] for kind, runs in found.items()}
-    return {kind: lines for kind, lines in (each | {"Skipped": list(report.skipped)}).items() if lines}
+    return {kind: lines for kind, lines in found.items() if lines}
 
 
 def _table(report: Report, measures: Iterable[str]) -> Table:
     rows, header = [], [*(report.variables or ("runs",)), "seeds"]
     for cell in report.cells:
-        named = {"lost": cell.lost, "failed": cell.failed, "missing": cell.missing, "skipped": cell.skipped}
-        seeds = [str(len(cell.runs)), *(f"{len(group)} {word}" for word, group in named.items() if group)]
+        counts = {"lost": cell.lost} | {state: cell.of(state) for state in STATES[1:]}
+        seeds = [str(len(cell.of("finished"))), *(f"{len(runs)} {word}" for word, runs in counts.items() if runs)]
         quartiles = [_quartiles(cell.numbers(name)) for name in measures]
-        texts = [MISSING if of is None else with_range(*of) for of in quartiles]
-        rows.append([*(cell.values if report.variables else ("all",)), "\n".join(seeds), *texts])
+        texts = [with_range(*of) if of else MISSING for of in quartiles]
+        rows.append([*(cell.values or ("all",)), "\n".join(seeds), *texts])
     return Table([*header, *map(report.label, measures)], rows)
 
 
 def _numbers(report: Report) -> pd.DataFrame:
     rows = []
     for cell in report.cells:
+        counts = {state: len(cell.of(state)) for state in STATES}
         row: dict[str, Any] = dict(zip(report.variables, cell.values, strict=True))
-        for word in ("finished", "lost", "failed", "missing", "skipped"):
-            row[word] = len(cell.runs if word == "finished" else getattr(cell, word))
+        row |= {"finished": counts.pop("finished"), "lost": len(cell.lost)} | counts
         for measure in report.measures():
-            names = [f"{measure}_{part} [{report.label(measure).rpartition(' [')[2]}" for part in _PARTS]
-            row |= dict.fromkeys(names) | dict(zip(names, _quartiles(cell.numbers(measure)) or (), strict=False))
+            unit = report.label(measure).rpartition(" [")[2]
+            quartiles = _quartiles(cell.numbers(measure)) or [None] * 3
+            row |= {f"{measure}_{part} [{unit}": q for part, q in zip(("q25", "median", "q75"), quartiles, strict=True)}
         rows.append(row)
     return pd.DataFrame(rows, dtype=object)
 
 
-def _quartiles(values: Sequence[float]) -> list[float] | None:
-    return np.quantile(values, [0.25, 0.5, 0.75]).tolist() if values else None
+def _quartiles(values: Sequence[float]) -> list[float]:
+    return np.quantile(values, [0.25, 0.5, 0.75]).tolist() if values else []
 
 
 def _telling(report: Report) -> list[str]:
@@ -188,7 +183,6 @@ class Comparison:
     measure: str
     medians: tuple[float, float]  # of A and of B, over the pairs
     quartiles: tuple[float, float, float]  # of A - B over the pairs
-    means: tuple[float, float]  # of A and of B
     difference: float  # mean of A - B over the pairs
     interval: tuple[float, float]  # of that mean, 95 %, by Student's t
     wilcoxon: float  # two-sided p-value of the signed-rank test
@@ -227,11 +221,13 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         raise SettingError("compare", "errors in m and in rad have no common mean; add subsystem=... to both groups")
     comparisons = []
     for measure in (name for name in report.measures() if not MEASURES[name].wall_time):
-        numbers = (
-            {others: {seed: run.numbers[measure] for seed, run in runs.items()} for others, runs in group.items()}
+        first, second = (
+            pd.DataFrame(
+                {others: {seed: run.numbers[measure] for seed, run in runs.items()} for others, runs in group.items()},
+                dtype=float,
+            ).T
             for group in groups
         )
-        first, second = (pd.DataFrame.from_dict(each, orient="index", dtype=float) for each in numbers)
         first, second = first.align(second)  # a row a combination of the other settings, a column a seed
         left_out, both = [], first.notna() & second.notna()
         while both.size and not both.to_numpy().all():  # what lacks the largest share of its runs is left out
@@ -241,8 +237,8 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
             both = both.drop(left_out[-1], axis=axis)
         a_mean, b_mean = (side.loc[both.index, both.columns].mean(axis=0).to_numpy() for side in (first, second))
         if len(a_mean) >= 2:
-            seeds = sorted((n for n in left_out if n.startswith(f"{SEED}=")), key=lambda name: in_order(name[5:]))
-            comparisons.append(_test(measure, a_mean, b_mean, (*(n for n in left_out if n not in seeds), *seeds)))
+            left_out.sort(key=lambda name: (name.startswith(f"{SEED}="), in_order(name.removeprefix(f"{SEED}="))))
+            comparisons.append(_test(measure, a_mean, b_mean, tuple(left_out)))
     if not comparisons:
         raise DataError(f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common")
     return comparisons
@@ -265,7 +261,7 @@ def _runs_of(report: Report, key: str, text: str) -> dict[str, Mapping]:
         chosen = dict(zip(report.variables, cell.values, strict=True))
         if group.items() <= chosen.items():
             others = ", ".join(f"{name}={value}" for name, value in chosen.items() if name not in group)
-            found[others] = {f"{SEED}={seed}": run for seed, run in cell.runs.items()}
+            found[others] = {f"{SEED}={seed}": run for seed, run in cell.runs.items() if run.state == "finished"}
     return found
 
 
@@ -282,7 +278,6 @@ def _test(measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...])
         measure=measure,
         medians=(float(np.median(a)), float(np.median(b))),
         quartiles=tuple(np.quantile(d, [0.25, 0.5, 0.75])),
-        means=(a.mean(), b.mean()),
         difference=mean,
         interval=interval,
         wilcoxon=wilcoxon,

@@ -44,8 +44,8 @@ def test_cells_are_made_of_what_was_varied_and_seeds_fill_them(tree):
     assert found.variables == ("controller",)
     convex, lqr = found.cells
     assert (convex.values, lqr.values) == (("convex",), ("lqr",))
-    assert list(convex.runs) == [str(seed) for seed in range(8)]
-    assert (list(lqr.failed), lqr.missing) == (["6"], ("7",))
+    assert convex.seeds("finished") == list(convex.runs) == [str(seed) for seed in range(8)]
+    assert (lqr.seeds("failed"), lqr.seeds("missing")) == (["6"], ["7"])
     assert np.mean(convex.numbers("failed")) == pytest.approx(2.5)
     assert np.allclose(np.array(lqr.numbers("rmse")) / convex.numbers("rmse")[:6], 1.2)
 
@@ -60,7 +60,7 @@ def test_without_a_sweep_nothing_is_missing(tmp_path):
         settings = SETTINGS | {"seed": seed, "horizon": horizon, "options": {"controller": controller}}
         made_up_run(tmp_path, choices, settings, result=metrics_of(0.1))
     found = report(tmp_path)
-    assert [(len(cell.runs), cell.missing) for cell in found.cells] == [(1, ())] * 4
+    assert [(len(cell.of("finished")), cell.seeds("missing")) for cell in found.cells] == [(1, [])] * 4
     assert found.commands() == []
 
 
@@ -71,8 +71,8 @@ def test_single_runs_beside_a_sweep_add_nothing_to_what_it_asked_for(tmp_path):
     plan(tmp_path, [chosen(controller, seed)[0] for controller in ("lqr", "nmpc") for seed in range(4)])
     found = report(tmp_path)
     assert found.variables == ("controller", "horizon")
-    gaps = {cell.values: cell.missing for cell in found.cells if cell.missing}
-    assert gaps == {("lqr", "10"): ("3",), ("nmpc", "10"): ("0", "1", "2", "3")}
+    gaps = {cell.values: missing for cell in found.cells if (missing := cell.seeds("missing"))}
+    assert gaps == {("lqr", "10"): ["3"], ("nmpc", "10"): ["0", "1", "2", "3"]}
 
 
 def test_a_run_that_did_not_choose_counts_with_the_setting_that_it_had(tmp_path):
@@ -110,7 +110,7 @@ def test_a_run_that_cannot_be_read_is_named_and_the_others_are_reported(tree):
     broken = tree / folder_name(chosen("lqr", 0)[0]) / METRICS
     broken.write_text('{"choices": ')
     found = report(tree)
-    assert [len(cell.runs) for cell in found.cells] == [7, 5]
+    assert [len(cell.of("finished")) for cell in found.cells] == [7, 5]
     assert len(found.skipped) == 2
     for path, reason in ((old, "it lacks 'unit'"), (broken, "JSONDecodeError")):
         assert any(line.startswith(f"{path}: is not what a run writes") and reason in line for line in found.skipped)
@@ -129,8 +129,8 @@ def test_a_run_that_cannot_be_read_is_not_missing_and_no_command_flies_over_it(t
     (tmp_path / folder_name(chosen("lqr", 1)[0]) / METRICS).write_text('{"choices": ')
     found = report(tmp_path)
     convex, lqr = found.cells
-    assert (convex.skipped, convex.missing) == ((), ())
-    assert (list(lqr.runs), lqr.skipped, lqr.missing) == (["0", "2"], ("1",), ("3",))
+    assert convex.seeds("skipped", "missing") == []
+    assert [lqr.seeds(state) for state in ("finished", "skipped", "missing")] == [["0", "2"], ["1"], ["3"]]
     assert found.commands() == [f"gpmpc run -m controller=lqr seed=3 folder={tmp_path}"]
     written = documents(found)
     assert "6 finished in 2 cells, 0 failed, 1 missing, 1 skipped" in written["report.md"]
@@ -147,7 +147,7 @@ def test_a_folder_that_belongs_to_no_cell_fills_none(tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / METRICS).write_text("")
     convex, _ = report(tmp_path).cells
-    assert (convex.missing, convex.skipped) == (("0",), ())
+    assert (convex.seeds("missing"), convex.seeds("skipped")) == (["0"], [])
 
 
 def test_a_line_of_the_latex_table_never_begins_with_a_bracket(tmp_path):
@@ -189,7 +189,7 @@ def test_every_seed_is_an_average_over_the_same_and_what_is_left_out_is_named(tm
     rmse = compare(found, "controller=lqr", "controller=convex")[0]
     assert rmse.left_out == ("horizon=10", "seed=7")
     assert rmse.pairs == 7
-    assert rmse.means == pytest.approx((0.31, 0.3))  # of the horizons 1 and 5 for every seed
+    assert rmse.medians == pytest.approx((0.31, 0.3))  # of the horizons 1 and 5 for every seed
     assert "lacks runs of it: horizon=10; seed=7." in sentences(found, [rmse], "a", "b")[0]
     assert compare(found, "horizon=1", "horizon=5")[0].left_out == ("seed=7",)
     alone = compare(found, "controller=convex,horizon=1", "controller=convex,horizon=5")[0]
@@ -267,7 +267,7 @@ def test_a_thousand_runs_are_put_together_quickly_and_in_little_memory(tmp_path)
     documents(found)
     seconds, (_, peak) = time.process_time() - start, tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert sum(len(cell.runs) for cell in found.cells) == 1000
+    assert sum(len(cell.of("finished")) for cell in found.cells) == 1000
     assert len(found.cells) == 20
     assert seconds < 20
     assert peak < 1e9

@@ -5,6 +5,7 @@ import io
 import json
 import re
 from itertools import product
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -20,9 +21,14 @@ from tests.studies.made_up import SETTINGS, add, chosen, documents, made_up_run,
 RESULT = ("rmse", "steps", "failures", "violations", "times", "unit")  # what a failed run need not have
 
 
+def undrawn(found, *comparison):
+    with patch.object(reporting, "_figures", return_value={}):
+        return report_document(found, *comparison)
+
+
 def written_of(found):
     """Markdown, HTML, CSV and LaTeX without the figures, which take their time."""
-    document = report_document(found, images={})
+    document = undrawn(found)
     return {"md": document.markdown(), "html": document.html(), "csv": document.csv(), "tex": document.tex()}
 
 
@@ -83,7 +89,7 @@ def test_one_damaged_run_is_skipped_with_its_reason_and_takes_no_other_with_it(d
     reads_it = name == ERROR and set(DAMAGE.get(damage, ())) & {*RESULT}
     assert len(found.skipped) == (0 if reads_it else 1)
     assert all(line.startswith(f"{folder / name}: is not what a run writes: ") for line in found.skipped)
-    assert sum(len(cell.runs) for cell in found.cells) == 2
+    assert sum(len(cell.of("finished")) for cell in found.cells) == 2
     for text in (*written_of(found).values(), shown(found)):
         assert "0.1" in text
 
@@ -209,7 +215,7 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
     damaged.write_text("{")
     plan(tree, [chosen(controller, seed, horizon=10)[0] for controller in ("convex", "lqr") for seed in range(4)])
     found = report(tree)
-    document = report_document(found, ["a line"], images={})
+    document = undrawn(found, ["a line"])
     head, made, tail = re.split(r"## Made\n\n(.*?)(?=## To)", document.markdown(), flags=re.DOTALL)
     assert head == (
         "# tree\n\n4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost."
@@ -332,7 +338,7 @@ def test_a_comparison_is_told_with_every_number(tmp_path):
     compared = compare(found, "controller=lqr", "controller=convex")
     rmse, outside, failed = compared
     assert [each.measure for each in compared] == ["rmse", "outside", "failed"]
-    assert (rmse.medians, rmse.quartiles, rmse.means) == ((6.0, 4.0), (0.75, 2.0, 3.5), (43 / 7, 29 / 7))
+    assert (rmse.medians, rmse.quartiles, rmse.difference) == ((6.0, 4.0), (0.75, 2.0, 3.5), 2)
     assert rmse.rank_biserial == pytest.approx((28 - 2 * 3) / 28)  # -1.5 has the third rank of 1 to 7
     assert (outside.difference, outside.standardised, outside.rank_biserial, outside.interval) == (0, 0, 0, (0, 0))
     assert (failed.difference, failed.interval, failed.standardised) == (-10, (-10, -10), -np.inf)
