@@ -34,7 +34,7 @@ from gpmpc.plotting import png
 from gpmpc.plotting._style import BLACK, COLOURS, DASHED, make_figure, plain_numbers, styled
 from gpmpc.studies._document import MISSING, Document, Table, number
 from gpmpc.studies.flight import Experiment, run_trial
-from gpmpc.studies.study import Trial, check_workers, fingerprint, read_model, trained_model
+from gpmpc.studies.study import Trial, fingerprint, read_model, trained_model
 from gpmpc.trajectories import Trajectory
 
 ROOMS = ("gp", "models", "propagation", "kernels", "qp", "mpc", "simulation", "datasets", "systems")
@@ -145,7 +145,7 @@ class Quality:
             check_number("horizons", horizon, least=1, whole=True)
         check_number("steps", self.steps, least=1, whole=True)
         check_number("seeds", self.seeds, least=1, whole=True)
-        check_workers(self.workers)
+        check_number("workers", 1 if self.workers is None else self.workers, least=1, whole=True)
         for key, chosen in (("trajectory", self.trajectories), ("families", self.experiments)):
             if not chosen:
                 raise SettingError(key, "choose at least one")

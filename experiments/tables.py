@@ -39,7 +39,7 @@ from gpmpc.plotting._style import VERMILION, legend_below, make_figure, styled
 from gpmpc.plotting._sweeps import draw_quartiles
 from gpmpc.propagation import MomentMatching
 from gpmpc.studies._document import MISSING, Document, Table, number, with_range
-from gpmpc.studies.study import Trial, check_workers, derived_seed, fingerprint, random_rows
+from gpmpc.studies.study import Trial, derived_seed, fingerprint, random_rows
 from gpmpc.trajectories import Trajectory
 
 CODE = ("gaussian.py", "metrics.py", "gp/*.py", "models/*.py", "propagation/*.py", "kernels/*.py", __file__)
@@ -100,7 +100,7 @@ class Tables:
         object.__setattr__(self, "sizes", tuple(dict.fromkeys(sizes)))
         check_number("draws", self.draws, least=1, whole=True)
         check_number("seed", self.seed, least=0, whole=True)
-        check_workers(self.workers)
+        check_number("workers", 1 if self.workers is None else self.workers, least=1, whole=True)
         check_number("state_std", self.state_std, least=0)
         object.__setattr__(self, "subsystems", check_subsystems("subsystem", self.subsystems))
         if not self.trajectories:
@@ -131,7 +131,7 @@ class Tables:
                         table = {"elliptical": 1, "lorenz": 2}.get(trajectory)
                         labels = {"table": table, "trajectory": trajectory, "subsystem": subsystem, "size": size}
                         name = fingerprint(settings, *arrays, code=CODE)
-                        trials.append(Trial(labels | {"draw": draw}, fit, seed, name, work=size))
+                        trials.append(Trial(labels | {"draw": draw}, fit, seed, name))
         return trials
 
     def _scaled(self, trajectory: str, name: str) -> tuple[Transitions, Scaling, tuple[int, ...]]:
