@@ -12,7 +12,7 @@ import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from gpmpc._provenance import flattened
 from gpmpc.exceptions import DataError
@@ -26,25 +26,16 @@ _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticE
 Choices = dict[str, str]
 
 
-class _Measure(NamedTuple):
-    """One number of a run."""
-
-    label: str  #: with its unit; ``{unit}`` stands for that of the runs' positions or angles
-    of: Callable[[Mapping[str, Any]], float | None]  #: from a run's result to the number; None where the run has none
-    logarithmic: bool = True  #: how it is drawn
-    wall_time: bool = False  #: whether it depends on what else the machine did meanwhile
-
-
-MEASURES = {
-    "rmse": _Measure("RMSE [{unit}]", lambda r: r["rmse"]["total"]),
-    "outside": _Measure(
+# Label with its unit, where {unit} stands for that of the runs' positions or angles, and the number of a run's result.
+MEASURES: dict[str, tuple[str, Callable[[Mapping[str, Any]], float | None]]] = {
+    "rmse": ("RMSE [{unit}]", lambda r: r["rmse"]["total"]),
+    "outside": (
         "steps outside bounds [%]",
         lambda r: max((100 * v["rate"] for v in r["violations"].values()), default=None),
-        False,
     ),
-    "failed": _Measure("failed solves [%]", lambda r: 100 * sum(r["failures"].values()) / r["steps"], False),
-    "decision": _Measure("decision, median [ms]", lambda r: 1e3 * r["times"]["total"]["median"], wall_time=True),
-    "training": _Measure("training [s]", lambda r: r["times"]["training"], wall_time=True),
+    "failed": ("failed solves [%]", lambda r: 100 * sum(r["failures"].values()) / r["steps"]),
+    "decision": ("decision, median [ms]", lambda r: 1e3 * r["times"]["total"]["median"]),
+    "training": ("training [s]", lambda r: r["times"]["training"]),
 }
 
 
@@ -111,7 +102,7 @@ class Report:
     def label(self, measure: str) -> str:
         """Returns a measure's name with its unit; with both units where the runs are of both subsystems."""
         units = {run.unit for run in self.runs if run.unit}
-        return MEASURES[measure].label.format(unit=" or ".join(sorted(units)) or "m")
+        return MEASURES[measure][0].format(unit=" or ".join(sorted(units)) or "m")
 
     def base_settings(self) -> list[str]:
         """Returns the settings that all runs share, one ``key: value`` each."""
@@ -205,7 +196,7 @@ def _run(path: Path, content: Mapping[str, Any]) -> Run:
     about: Any = {"folder": path.parent, "settings": flattened(settings), "origin": origin}
     if path.name == ERROR:
         return Run(choices, "failed", **about, error=plain_text(content["error"]))
-    numbers, lost = {name: measure.of(content) for name, measure in MEASURES.items()}, content.get("lost")
+    numbers, lost = {name: of(content) for name, (_, of) in MEASURES.items()}, content.get("lost")
     for name, value in numbers.items():
         if value is not None and (type(value) not in (int, float) or not math.isfinite(value)):
             raise ValueError(f"{name}: must be a finite number; got {value!r:.80}")

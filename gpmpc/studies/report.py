@@ -1,13 +1,10 @@
 """Shows a tree of runs: a row a cell, figures over what was varied, what failed or is missing, whether two differ.
 
-Two groups of runs are compared seed by seed. Runs of one seed share their training rows and their noise, so they are
-compared in pairs: what else was varied is averaged within a seed first, and a seed counts once. So that every seed is
-an average over the same, seeds and other settings of which one of the groups lacks runs are left out, and named. The
-signed-rank test (Wilcoxon, 1945) decides: it asks only that the differences are spread symmetrically; Student's t-test
-beside it asks for normal ones. With fewer than six pairs nothing can make the first one significant at 5 %. Where the
-seed decides nothing (all rows, one start, no noise) its runs are copies of one: a difference that never varies is
-undecided. Wall times are not compared: one group is flown after the other, and what the machine did meanwhile is no
-property of either.
+Two groups of runs are compared seed by seed: runs of one seed share their training rows and their noise. What else was
+varied is averaged within a seed first, so that a seed counts once, and over the same for every seed. The signed-rank
+test (Wilcoxon, 1945) decides, which asks only that the differences are spread symmetrically; Student's t-test beside it
+asks for normal ones. Wall times are not compared: one group is flown after the other, and what the machine did
+meanwhile is no property of either.
 """
 
 import os
@@ -26,11 +23,12 @@ from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable, png
 from gpmpc.studies._document import MISSING, Document, Table, figure_label, plain_text, with_range
 from gpmpc.studies._run_folder import LONGEST_NAME
-from gpmpc.studies._runs import MEASURES, SEED, STATES, Cell, Report, in_order, read_report
+from gpmpc.studies._runs import SEED, STATES, Cell, Report, in_order, read_report
 
 __all__ = ["Comparison", "Report", "compare", "notes", "read_report", "report_document", "sentences", "terminal_table"]
 
-_DRAWN = ("rmse", "failed", "decision")  # a figure each
+_DRAWN = {"rmse": True, "failed": False, "decision": True}  # a figure each, and whether it may be logarithmic
+_WALL_TIMES = ("decision", "training")
 _SHORT = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
 _MOST_LINES = 8  # in a figure; what is varied besides is pooled
 _LEGEND = "Median [first to third quartile] over the seeds. In figures, every run is a dot."
@@ -157,7 +155,7 @@ def _figures(report: Report) -> dict[str, bytes]:
                     at[cell.values[index]] += cell.numbers(name)
                 series.append(Series(figure_label(label), [*at.values()]))
             title, label, *ticks = map(figure_label, (variable, report.label(name), *positions))
-            figure = over_variable(title, ticks, label, series, MEASURES[name].logarithmic)
+            figure = over_variable(title, ticks, label, series, _DRAWN[name])
             file = re.sub(r"[^\w.+-]", "-", f"{name}-over-{variable}"[:LONGEST_NAME], flags=re.ASCII)
             drawn[f"{file}.png" if f"{file}.png" not in drawn else f"{file}-{index}.png"] = png(figure)
     return drawn
@@ -220,7 +218,7 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
     if len({run.unit for group in groups for runs in group.values() for run in runs.values()}) > 1:
         raise SettingError("compare", "errors in m and in rad have no common mean; add subsystem=... to both groups")
     comparisons = []
-    for measure in (name for name in report.measures() if not MEASURES[name].wall_time):
+    for measure in (name for name in report.measures() if name not in _WALL_TIMES):
         first, second = (
             pd.DataFrame(
                 {others: {seed: run.numbers[measure] for seed, run in runs.items()} for others, runs in group.items()},
