@@ -10,9 +10,12 @@ import json
 import math
 import shlex
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from gpmpc._provenance import flattened
 from gpmpc.exceptions import DataError
@@ -20,10 +23,10 @@ from gpmpc.studies._document import plain_text
 from gpmpc.studies._run_folder import ERROR, METRICS, PLAN, folder_name
 
 SEED = "seed"
-STATES = ("finished", "failed", "missing", "skipped")
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError)  # of a file
 
 Choices = dict[str, str]
+Row = dict[str, Any]  # of a cell
 
 
 # Label with its unit, where {unit} stands for that of the runs' positions or angles, and the number of a run's result.
@@ -39,74 +42,40 @@ MEASURES: dict[str, tuple[str, Callable[[Mapping[str, Any]], float | None]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Run:
-    """One run of a tree, or one that a sweep asked for; what was not read is empty."""
-
-    choices: Choices  #: what was asked for, by key
-    state: str  #: "finished", "failed", "missing" (there is nothing of it) or "skipped" (it cannot be read)
-    folder: Path = Path()  #: where it is
-    settings: Mapping[str, Any] = field(default_factory=dict)  #: all of them, by dotted key
-    numbers: Mapping[str, float | None] = field(default_factory=dict)  #: by measure, of a finished run
-    unit: str = ""  #: of its errors
-    lost: str | None = None  #: since when and why the flight was lost; None where it was not
-    error: str = ""  #: why the run failed
-    #: what made it: "date", "commit" and "machine", where it says so
-    origin: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Cell:
-    """All runs of one combination."""
-
-    values: tuple[str, ...]  #: of the varied settings, in the order of ``Report.variables``
-    runs: Mapping[str, Run]  #: by seed
-
-    def of(self, *states: str) -> list[Run]:
-        """Returns the runs of some states, by seed."""
-        return [run for run in self.runs.values() if run.state in states]
-
-    def seeds(self, *states: str) -> list[str]:
-        """Returns the seeds of the runs of some states."""
-        return [seed for seed, run in self.runs.items() if run.state in states]
-
-    def numbers(self, measure: str) -> list[float]:
-        """Returns one measure of all runs that have it, by seed."""
-        return [value for run in self.runs.values() if (value := run.numbers.get(measure)) is not None]
-
-    @property
-    def lost(self) -> list[Run]:
-        """Runs that finished, and whose flight was lost."""
-        return [run for run in self.runs.values() if run.lost is not None]
+_ABSENT = {"folder": None, "unit": "", "settings": {}, "origin": {}, "lost": "", "error": ""} | dict.fromkeys(MEASURES)
 
 
 @dataclass(frozen=True)
 class Report:
-    """A tree of runs."""
+    """A tree of runs.
+
+    ``runs`` has a row for every run that is there or was asked for, cell by cell and seed by seed. Its columns are
+    ``cell``, the position in ``cells``; ``seed``, a text; ``state``: "finished", "failed", "missing" (there is nothing
+    of it) or "skipped" (it cannot be read); the measures, NaN where the run has none; ``lost`` and ``error``, since
+    when and why; ``folder``; ``unit`` of the errors; ``settings`` by dotted key; ``origin``: date, commit and machine.
+    """
 
     tree: Path  #: where it is
     variables: tuple[str, ...]  #: settings that were varied, without the seed
     constants: Choices  #: what was asked for of all runs alike
-    cells: tuple[Cell, ...]  #: in the order of their values
+    cells: tuple[tuple[str, ...], ...]  #: values of the variables, in order
+    runs: pd.DataFrame  #: see above
     skipped: tuple[str, ...] = ()  #: what could not be read of it, with the reason, one line each
 
-    @property
-    def runs(self) -> list[Run]:
-        """Every run that finished or failed, cell by cell."""
-        return [run for cell in self.cells for run in cell.of("finished", "failed")]
+    @cached_property
+    def there(self) -> list[Any]:
+        """Every run that finished or failed; columns are attributes."""
+        return [*self.runs[self.runs.folder.notna()].itertuples()]
 
-    def measures(self) -> list[str]:
-        """Returns those of which any run has a number."""
-        return [name for name in MEASURES if any(cell.numbers(name) for cell in self.cells)]
-
-    def label(self, measure: str) -> str:
-        """Returns a measure's name with its unit; with both units where the runs are of both subsystems."""
-        units = {run.unit for run in self.runs if run.unit}
-        return MEASURES[measure][0].format(unit=" or ".join(sorted(units)) or "m")
+    @cached_property
+    def measures(self) -> dict[str, str]:
+        """The measures that any run has, and what each is called, with both units where runs are of both subsystems."""
+        known, unit = self.runs[[*MEASURES]].notna().any(), " or ".join(sorted({*self.runs.unit} - {""})) or "m"
+        return {name: label.format(unit=unit) for name, (label, _) in MEASURES.items() if known[name]}
 
     def base_settings(self) -> list[str]:
         """Returns the settings that all runs share, one ``key: value`` each."""
-        first, *others = self.runs
+        first, *others = self.there
         shared = (item for item in first.settings.items() if all(item in run.settings.items() for run in others))
         return [plain_text(f"{key}: {json.dumps(value)}") for key, value in shared]
 
@@ -116,12 +85,11 @@ class Report:
         Skipped runs are not among them: a run is not flown over what lies in its folder.
         """
         commands = []
-        for cell in self.cells:
-            if seeds := cell.seeds("missing", "failed"):
-                chosen = [*self.constants.items(), *zip(self.variables, cell.values, strict=True)]
-                settings = _spelled({key: value for key, value in chosen if value != "default"})
-                sweep = [f"{SEED}={','.join(seeds)}", f"folder={self.tree}"]
-                commands.append(plain_text(shlex.join(["gpmpc", "run", "-m", *settings, *sweep])))
+        for cell, runs in self.runs[self.runs.state.isin(("missing", "failed"))].groupby("cell"):
+            chosen = self.constants | dict(zip(self.variables, self.cells[cell], strict=True))
+            settings = _spelled({key: value for key, value in chosen.items() if value != "default"})
+            sweep = [f"{SEED}={','.join(runs.seed)}", f"folder={self.tree}"]
+            commands.append(plain_text(shlex.join(["gpmpc", "run", "-m", *settings, *sweep])))
         return commands
 
 
@@ -141,9 +109,9 @@ def read_report(tree: str | Path) -> Report:
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
             if planned:
-                plans += [_parsed(choices) for choices in content["runs"]]
+                plans += map(_parsed, content["runs"])
             else:
-                runs.append(_run(path, content))
+                runs.append((_parsed(content["choices"]), _run(path, content)))
         except _DAMAGE as error:
             lacking = f"it lacks {error}; of an older version?"
             reason = lacking if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
@@ -151,33 +119,41 @@ def read_report(tree: str | Path) -> Report:
             unread.add(path.parent.name)
     if not runs:
         raise DataError(skipped[0] if skipped else f"{tree}: holds no run, finished or failed")
-    there = {frozenset(run.choices.items()) for run in runs}
-    absent = [plan for plan in plans if frozenset(plan.items()) not in there]
-    states = ["skipped" if folder_name(_spelled(plan)) in unread else "missing" for plan in absent]
-    variables, constants, cells = _cells([*runs, *map(Run, absent, states)])
-    return Report(tree, variables, constants, cells, tuple(skipped))
+    there = {frozenset(choices.items()) for choices, _ in runs}
+    for plan in plans:
+        if frozenset(plan.items()) not in there:
+            state = "skipped" if folder_name(_spelled(plan)) in unread else "missing"
+            runs.append((plan, _ABSENT | {"state": state}))
+    return Report(tree, *_cells(runs), tuple(skipped))
 
 
-def _cells(runs: list[Run]) -> tuple[tuple[str, ...], Choices, tuple[Cell, ...]]:
-    """Returns what was varied, what was not, and the runs by what was varied; a run that is there comes first."""
-    keys = dict.fromkeys([*(key for run in runs for key in run.choices), SEED])
+def _cells(
+    runs: list[tuple[Choices, Row]],
+) -> tuple[tuple[str, ...], Choices, tuple[tuple[str, ...], ...], pd.DataFrame]:
+    """Returns what was varied, what was not, the combinations that there are, and the runs by combination and seed."""
+    keys = dict.fromkeys([*(key for choices, _ in runs for key in choices), SEED])
     # A run that did not choose had a setting; of one that is not there it is that of the others.
     usual = {
-        key: next((_setting(run, key) for run in runs if run.settings and key not in run.choices), "") for key in keys
+        key: [_setting(run, key) for choices, run in runs if run["settings"] and key not in choices] for key in keys
     }
-    filled = [
-        {key: run.choices.get(key) or _setting(run, key) or usual[key] or "default" for key in keys} for run in runs
-    ]
+    filled = []
+    for choices, run in runs:
+        guesses = {key: _setting(run, key) or next(iter(usual[key]), "") or "default" for key in keys}
+        filled.append({key: choices.get(key) or guess for key, guess in guesses.items()})
     values = {key: {choices[key] for choices in filled} for key in keys if key != SEED}
     variables = tuple(sorted(key for key in values if len(values[key]) > 1))
-    cells: dict[tuple[str, ...], dict[str, Run]] = {}
-    for choices, run in sorted(zip(filled, runs, strict=True), key=lambda each: in_order(each[0][SEED])):
-        cell = cells.setdefault(tuple(choices[key] for key in variables), {})
-        if run.state == "finished" or choices[SEED] not in cell:
-            cell[choices[SEED]] = run
-    rows = sorted(cells, key=lambda row: [in_order(value) for value in row])
-    single = {key: value for key, those in values.items() if len(those) == 1 for value in those if value != "default"}
-    return variables, single, tuple(Cell(row, cells[row]) for row in rows)
+    constants = {key: value for key, (value, *more) in values.items() if not more and value != "default"}
+    found: dict[tuple[tuple[str, ...], str], Row] = {}
+    for choices, (_, run) in zip(filled, runs, strict=True):
+        place = tuple(choices[key] for key in variables), choices[SEED]
+        if run["state"] == "finished" or place not in found:  # what is there comes first
+            found[place] = run
+    cells = tuple(sorted({values for values, _ in found}, key=lambda values: [*map(in_order, values)]))
+    number = {values: i for i, values in enumerate(cells)}
+    order = sorted(found, key=lambda place: (number[place[0]], in_order(place[1])))
+    rows = [found[values, seed] | {"cell": number[values], "seed": seed} for values, seed in order]
+    types = dict.fromkeys(MEASURES, float) | {"cell": int}
+    return variables, constants, cells, pd.DataFrame(rows, dtype=object).astype(types)
 
 
 def in_order(value: str) -> tuple[int, float, str]:
@@ -188,21 +164,21 @@ def in_order(value: str) -> tuple[int, float, str]:
         return 1, 0.0, value
 
 
-def _run(path: Path, content: Mapping[str, Any]) -> Run:
+def _run(path: Path, content: Mapping[str, Any]) -> Row:
     """Returns a run that finished or failed, from its result."""
-    choices, settings, origin = _parsed(content["choices"]), content["settings"], _origin(content)
+    settings = content["settings"]
     if not isinstance(settings, Mapping) or not isinstance(settings.get("options", {}), Mapping):
         raise TypeError("settings and their options are not by name")
-    about: Any = {"folder": path.parent, "settings": flattened(settings), "origin": origin}
+    run = _ABSENT | {"folder": path.parent, "settings": flattened(settings), "origin": _origin(content)}
     if path.name == ERROR:
-        return Run(choices, "failed", **about, error=plain_text(content["error"]))
-    numbers, lost = {name: of(content) for name, (_, of) in MEASURES.items()}, content.get("lost")
+        return run | {"state": "failed", "error": plain_text(content["error"])}
+    numbers = {name: of(content) for name, (_, of) in MEASURES.items()}
     for name, value in numbers.items():
         if value is not None and (type(value) not in (int, float) or not math.isfinite(value)):
             raise ValueError(f"{name}: must be a finite number; got {value!r:.80}")
-    if lost:
-        lost = plain_text(", ".join(f"{k} {v}" for k, v in lost.items()) if isinstance(lost, Mapping) else str(lost))
-    return Run(choices, "finished", **about, numbers=numbers, unit=plain_text(content["unit"]), lost=lost or None)
+    lost = content.get("lost") or ""
+    lost = plain_text(", ".join(f"{k} {v}" for k, v in lost.items()) if isinstance(lost, Mapping) else str(lost))
+    return run | numbers | {"state": "finished", "lost": lost, "unit": plain_text(content["unit"])}
 
 
 def _origin(content: Mapping[str, Any]) -> dict[str, str]:
@@ -226,10 +202,11 @@ def _spelled(choices: Choices) -> list[str]:
     return [f"{key}={value}" if value else key for key, value in choices.items()]
 
 
-def _setting(run: Run, key: str) -> str:
+def _setting(run: Row, key: str) -> str:
     """Returns the value that a run had which did not choose; empty where its settings do not tell."""
-    value = run.settings.get(f"options.{key}")
-    value = run.settings.get(key, "") if value is None else value
+    settings = run["settings"]
+    value = settings.get(f"options.{key}")
+    value = settings.get(key, "") if value is None else value
     if isinstance(value, bool) or value is None:
         return json.dumps(value)
     return plain_text(str(value)) if isinstance(value, int | float | str) else ""

@@ -9,10 +9,9 @@ meanwhile is no property of either.
 
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,13 +22,14 @@ from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable, png
 from gpmpc.studies._document import MISSING, Document, Table, figure_label, plain_text, with_range
 from gpmpc.studies._run_folder import LONGEST_NAME
-from gpmpc.studies._runs import SEED, STATES, Cell, Report, in_order, read_report
+from gpmpc.studies._runs import SEED, Report, in_order, read_report
 
 __all__ = ["Comparison", "Report", "compare", "notes", "read_report", "report_document", "sentences", "terminal_table"]
 
 _DRAWN = {"rmse": True, "failed": False, "decision": True}  # a figure each, and whether it may be logarithmic
 _WALL_TIMES = ("decision", "training")
 _SHORT = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
+_PARTS = ("q25", "median", "q75")
 _MOST_LINES = 8  # in a figure; what is varied besides is pooled
 _LEGEND = "Median [first to third quartile] over the seeds. In figures, every run is a dot."
 _LEVEL = 0.05
@@ -48,7 +48,7 @@ def report_document(report: Report, comparison: Sequence[str] = (), folder: Path
     start = (folder or report.tree / "report").resolve()
     return Document(
         plain_text(report.tree.resolve().name),
-        [_table(report, report.measures())],
+        [_table(report, [*report.measures])],
         _numbers(report),
         lead=f"{_counts(report)}." + (f" All of them: {constants}." if constants else ""),
         notes=[_LEGEND],
@@ -57,7 +57,7 @@ def report_document(report: Report, comparison: Sequence[str] = (), folder: Path
         images=_figures(report),
         links={
             plain_text(str(run.folder.relative_to(report.tree))): os.path.relpath(run.folder.resolve(), start)
-            for run in report.runs
+            for run in report.there
         },
         latex=[_table(report, _telling(report))],
     )
@@ -66,7 +66,7 @@ def report_document(report: Report, comparison: Sequence[str] = (), folder: Path
 def _made(report: Report) -> list[str]:
     """Returns when, from which source and on which machines the runs were made."""
     made = {
-        key: sorted({run.origin[key] for run in report.runs if key in run.origin})
+        key: sorted({run.origin[key] for run in report.there if key in run.origin})
         for key in ("date", "commit", "machine")
     }
     dates = " to ".join(dict.fromkeys([*made["date"][:1], *made["date"][-1:]]))
@@ -75,101 +75,100 @@ def _made(report: Report) -> list[str]:
     return [f"{key}: {plain_text(value)}" for key, value in shown.items() if value]
 
 
+def _states(report: Report) -> pd.DataFrame:
+    """Returns how many runs of every cell finished, were lost, failed, are missing and were skipped."""
+    runs = report.runs
+    counts = pd.crosstab(runs.cell, runs.state).reindex(
+        columns=["finished", "failed", "missing", "skipped"], fill_value=0
+    )
+    counts.insert(1, "lost", (runs.lost != "").groupby(runs.cell).sum())
+    return counts
+
+
 def _counts(report: Report) -> str:
     """Returns how many runs there are, by how they ended."""
-    finished, failed, missing = (sum(len(cell.of(state)) for cell in report.cells) for state in STATES[:3])
-    lost = sum(len(cell.lost) for cell in report.cells)
-    text = f"{finished} finished in {len(report.cells)} cells, {failed} failed, {missing} missing"
+    count = _states(report).sum()
+    text = f"{count.finished} finished in {len(report.cells)} cells, {count.failed} failed, {count.missing} missing"
     text += f", {len(report.skipped)} skipped" if report.skipped else ""
-    return text + (f"; of those finished, {lost} lost" if lost else "")
+    return text + (f"; of those finished, {count.lost} lost" if count.lost else "")
 
 
 def terminal_table(report: Report) -> Table:
     """Returns the table with short headers: median, and the quartiles below it; what is zero everywhere is left out."""
-    shown = {name: short for name, short in _SHORT.items() if name in _telling(report)}
-    units = (report.label(name).rpartition(" [")[2] for name in shown)
+    shown = [name for name in _telling(report) if name in _SHORT]
     header = [name.replace(".", ".\n") for name in report.variables or ("runs",)]
-    header += ["seeds", *(f"{short}\n[{unit}" for short, unit in zip(shown.values(), units, strict=True))]
+    header += ["seeds", *(f"{_SHORT[name]}\n[{report.measures[name].rpartition(' [')[2]}" for name in shown)]
     return Table(header, _table(report, shown).rows, _counts(report))
 
 
 def notes(report: Report) -> dict[str, list[str]]:
     """Returns what has to be known of single runs, by kind: their folders and the reasons."""
-    failed, lost = (
-        [run for run in report.runs if run.state == "failed"],
-        [run for cell in report.cells for run in cell.lost],
-    )
     found = {
-        "Failed": [f"{plain_text(run.folder.name)}: {run.error}" for run in failed],
-        "Lost": [f"{plain_text(run.folder.name)}: {run.lost}" for run in lost],
+        "Failed": [f"{plain_text(run.folder.name)}: {run.error}" for run in report.there if run.error],
+        "Lost": [f"{plain_text(run.folder.name)}: {run.lost}" for run in report.there if run.lost],
         "Skipped": list(report.skipped),
     }
     return {kind: lines for kind, lines in found.items() if lines}
 
 
-def _table(report: Report, measures: Iterable[str]) -> Table:
-    rows, header = [], [*(report.variables or ("runs",)), "seeds"]
-    for cell in report.cells:
-        counts = {"lost": cell.lost} | {state: cell.of(state) for state in STATES[1:]}
-        seeds = [str(len(cell.of("finished"))), *(f"{len(runs)} {word}" for word, runs in counts.items() if runs)]
-        quartiles = [_quartiles(cell.numbers(name)) for name in measures]
-        texts = [with_range(*of) if of else MISSING for of in quartiles]
-        rows.append([*(cell.values or ("all",)), "\n".join(seeds), *texts])
-    return Table([*header, *map(report.label, measures)], rows)
+def _quartiles(report: Report, measures: Sequence[str]) -> np.ndarray:
+    """Returns first quartile, median and third (cells, measures, 3) over the seeds; NaN where no run has a number."""
+    found = report.runs.groupby("cell")[[*measures]].quantile([0.25, 0.5, 0.75])
+    return found.to_numpy().reshape(len(report.cells), 3, -1).swapaxes(1, 2)
+
+
+def _table(report: Report, measures: Sequence[str]) -> Table:
+    rows = []
+    counts = _states(report).to_dict("records")
+    for values, count, quartiles in zip(report.cells, counts, _quartiles(report, measures), strict=True):
+        seeds = [str(count.pop("finished")), *(f"{number} {word}" for word, number in count.items() if number)]
+        texts = [MISSING if np.isnan(of).any() else with_range(*of) for of in quartiles]
+        rows.append([*(values or ("all",)), "\n".join(seeds), *texts])
+    labels = [report.measures[name] for name in measures]
+    return Table([*(report.variables or ("runs",)), "seeds", *labels], rows)
 
 
 def _numbers(report: Report) -> pd.DataFrame:
-    rows = []
-    for cell in report.cells:
-        counts = {state: len(cell.of(state)) for state in STATES}
-        row: dict[str, Any] = dict(zip(report.variables, cell.values, strict=True))
-        row |= {"finished": counts.pop("finished"), "lost": len(cell.lost)} | counts
-        for measure in report.measures():
-            unit = report.label(measure).rpartition(" [")[2]
-            quartiles = _quartiles(cell.numbers(measure)) or [None] * 3
-            row |= {f"{measure}_{part} [{unit}": q for part, q in zip(("q25", "median", "q75"), quartiles, strict=True)}
-        rows.append(row)
-    return pd.DataFrame(rows, dtype=object)
-
-
-def _quartiles(values: Sequence[float]) -> list[float]:
-    return np.quantile(values, [0.25, 0.5, 0.75]).tolist() if values else []
+    values = pd.DataFrame(report.cells, columns=[*report.variables], dtype=object)
+    names = [
+        f"{name}_{part} [{label.rpartition(' [')[2]}" for name, label in report.measures.items() for part in _PARTS
+    ]
+    quartiles = _quartiles(report, [*report.measures]).reshape(len(report.cells), -1)
+    found = pd.concat([values, _states(report), pd.DataFrame(quartiles, columns=names)], axis=1).astype(object)
+    return found.where(found.notna(), None)
 
 
 def _telling(report: Report) -> list[str]:
     """Returns the measures that are not zero everywhere."""
-    return [name for name in report.measures() if any(any(cell.numbers(name)) for cell in report.cells)]
+    return [name for name in report.measures if report.runs[name].max() > 0]
 
 
 def _figures(report: Report) -> dict[str, bytes]:
     """Draws one figure (PNG) a varied setting and measure, by file name."""
     drawn: dict[str, bytes] = {}
     for index, variable in enumerate(report.variables):
-        positions = sorted({cell.values[index] for cell in report.cells}, key=in_order)
-        lines = _lines(report, index)
-        for name in (name for name in _DRAWN if name in _telling(report)):
-            series = []
+        positions = sorted({values[index] for values in report.cells}, key=in_order)
+        at, lines = report.runs.cell.map(lambda cell, i=index: report.cells[cell][i]), _lines(report, index)
+        for name in (name for name in _telling(report) if name in _DRAWN):
+            numbers, series = report.runs[name].dropna(), []
             for label, cells in lines.items():
-                at: dict[str, list[float]] = {position: [] for position in positions}
-                for cell in cells:
-                    at[cell.values[index]] += cell.numbers(name)
-                series.append(Series(figure_label(label), [*at.values()]))
-            title, label, *ticks = map(figure_label, (variable, report.label(name), *positions))
+                of = numbers[report.runs.cell.isin(cells)]
+                series.append(Series(figure_label(label), [of[at == position].tolist() for position in positions]))
+            title, label, *ticks = map(figure_label, (variable, report.measures[name], *positions))
             figure = over_variable(title, ticks, label, series, _DRAWN[name])
             file = re.sub(r"[^\w.+-]", "-", f"{name}-over-{variable}"[:LONGEST_NAME], flags=re.ASCII)
             drawn[f"{file}.png" if f"{file}.png" not in drawn else f"{file}-{index}.png"] = png(figure)
     return drawn
 
 
-def _lines(report: Report, index: int) -> dict[str, list[Cell]]:
+def _lines(report: Report, index: int) -> dict[str, list[int]]:
     """Groups cells by what else was varied; by one setting only where all together were too many lines."""
     others = [i for i in range(len(report.variables)) if i != index]
-    distinct = {i: {cell.values[i] for cell in report.cells} for i in others}
-    while len({tuple(cell.values[i] for i in others) for cell in report.cells}) > _MOST_LINES:
-        others.remove(max(others, key=lambda i: len(distinct[i])))
-    lines: dict[str, list[Cell]] = {}
-    for cell in report.cells:
-        label = ", ".join(f"{report.variables[i]}={cell.values[i]}" for i in others)
+    while len({tuple(values[i] for i in others) for values in report.cells}) > _MOST_LINES:
+        others.remove(max(others, key=lambda i: len({values[i] for values in report.cells})))
+    lines: dict[str, list[int]] = {}
+    for cell, values in enumerate(report.cells):
+        label = ", ".join(f"{report.variables[i]}={values[i]}" for i in others)
         lines.setdefault(label or "all", []).append(cell)
     return lines
 
@@ -215,17 +214,11 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         DataError: The groups have no two seeds in common.
     """
     groups = [_runs_of(report, key, text) for key, text in (("A", a), ("B", b))]
-    if len({run.unit for group in groups for runs in group.values() for run in runs.values()}) > 1:
+    if len({*pd.concat(groups).unit}) > 1:
         raise SettingError("compare", "errors in m and in rad have no common mean; add subsystem=... to both groups")
     comparisons = []
-    for measure in (name for name in report.measures() if name not in _WALL_TIMES):
-        first, second = (
-            pd.DataFrame(
-                {others: {seed: run.numbers[measure] for seed, run in runs.items()} for others, runs in group.items()},
-                dtype=float,
-            ).T
-            for group in groups
-        )
+    for measure in (name for name in report.measures if name not in _WALL_TIMES):
+        first, second = (group.pivot(index="others", columns="seed", values=measure) for group in groups)
         first, second = first.align(second)  # a row a combination of the other settings, a column a seed
         left_out, both = [], first.notna() & second.notna()
         while both.size and not both.to_numpy().all():  # what lacks the largest share of its runs is left out
@@ -242,25 +235,25 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
     return comparisons
 
 
-def _runs_of(report: Report, key: str, text: str) -> dict[str, Mapping]:
-    """Returns the runs of a group by its other settings, and in each by seed."""
+def _runs_of(report: Report, key: str, text: str) -> pd.DataFrame:
+    """Returns the finished runs of a group, with ``others``, what else was varied, and seeds as they are chosen."""
     group = {}
     for choice in text.split(","):
         name, _, value = choice.partition("=")
         if name not in report.variables:
             varied = ", ".join(report.variables) or "nothing"
             raise SettingError(f"compare {key}", f"must choose among what was varied, {varied}; got {choice!r}")
-        values = dict.fromkeys(cell.values[report.variables.index(name)] for cell in report.cells)
-        if value not in values:
-            raise SettingError(f"compare {key}", f"{name} was varied over {', '.join(values)}; got {value!r}")
+        known = dict.fromkeys(values[report.variables.index(name)] for values in report.cells)
+        if value not in known:
+            raise SettingError(f"compare {key}", f"{name} was varied over {', '.join(known)}; got {value!r}")
         group[name] = value
-    found: dict[str, Mapping] = {}
-    for cell in report.cells:
-        chosen = dict(zip(report.variables, cell.values, strict=True))
+    others = {}
+    for cell, values in enumerate(report.cells):
+        chosen = dict(zip(report.variables, values, strict=True))
         if group.items() <= chosen.items():
-            others = ", ".join(f"{name}={value}" for name, value in chosen.items() if name not in group)
-            found[others] = {f"{SEED}={seed}": run for seed, run in cell.runs.items() if run.state == "finished"}
-    return found
+            others[cell] = ", ".join(f"{name}={value}" for name, value in chosen.items() if name not in group)
+    runs = report.runs[(report.runs.state == "finished") & report.runs.cell.isin(others)]
+    return runs.assign(others=runs.cell.map(others), seed=f"{SEED}=" + runs.seed)
 
 
 def _test(measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...]) -> Comparison:
@@ -296,7 +289,7 @@ def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str)
     lines = [head]
     for c in comparisons:
         low, median, high = c.quartiles
-        line = f"{report.label(c.measure)}: {c.verdict}. Medians {c.medians[0]:.4g} and {c.medians[1]:.4g}; "
+        line = f"{report.measures[c.measure]}: {c.verdict}. Medians {c.medians[0]:.4g} and {c.medians[1]:.4g}; "
         line += f"differences {median:.3g} [{low:.3g}, {high:.3g}]"
         if c.interval[0] != c.interval[1]:
             line += f"; Wilcoxon signed-rank p = {c.wilcoxon:.3g}, rank-biserial {c.rank_biserial:.2f}; mean "
