@@ -1,7 +1,7 @@
 """Writes results as text for a terminal, Markdown, CSV, LaTeX, HTML and JSON.
 
-Names and messages that a user chose stand in the results. They are text in every format: no HTML or link in Markdown,
-no command in LaTeX, no formula in a spreadsheet, no control sequence in a terminal.
+What a user chose is text in every format: no HTML or link in Markdown, no command in LaTeX, no formula in a
+spreadsheet, no control sequence in a terminal.
 """
 
 import json

@@ -113,8 +113,9 @@ def notes(report: Report) -> dict[str, list[str]]:
 
 def _quartiles(report: Report, measures: Sequence[str]) -> np.ndarray:
     """Returns first quartile, median and third (cells, measures, 3) over the seeds; NaN where no run has a number."""
-    found = report.runs.groupby("cell")[[*measures]].quantile([0.25, 0.5, 0.75])
-    return found.to_numpy().reshape(len(report.cells), 3, -1).swapaxes(1, 2)
+    numbers = [runs[name].dropna() for _, runs in report.runs.groupby("cell") for name in measures]
+    found = [np.quantile(of, [0.25, 0.5, 0.75]) if len(of) else np.full(3, np.nan) for of in numbers]
+    return np.reshape(found, (len(report.cells), -1, 3))
 
 
 def _table(report: Report, measures: Sequence[str]) -> Table:
