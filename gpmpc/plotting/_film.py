@@ -52,7 +52,8 @@ def film(run: "Run", system: "System", path: str | Path, frames: int = 100, enla
         raise SettingError("film", f"{what} ({error})") from error
     try:
         scene = _Scene(mujoco, run, system.dynamics, enlarged)
-        figure = Figure(figsize=(_WIDTH / 80, _HEIGHT / 80), layout="none")  # the picture fills it
+        figure = Figure(figsize=(_WIDTH / 80, _HEIGHT / 80))
+        figure.set_layout_engine("none")  # the picture fills it
         FigureCanvasAgg(figure)
         image = figure.add_axes((0, 0, 1, 1)).imshow(scene.render(0), aspect="auto")
         image.axes.set_axis_off()
