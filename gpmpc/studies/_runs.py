@@ -109,7 +109,7 @@ def read_report(tree: str | Path) -> Report:
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
             if planned:
-                plans += map(_parsed, content["runs"])
+                plans += [_parsed(choices) for choices in content["runs"]]
             else:
                 runs.append((_parsed(content["choices"]), _run(path, content)))
         except _DAMAGE as error:
