@@ -38,7 +38,6 @@ from gpmpc.simulation import ModelLoop, Noise, Rollout, closed_loop, rehearse
 from gpmpc.studies._document import Document, Table
 from gpmpc.studies.study import (
     Trial,
-    check_workers,
     derived_seed,
     fingerprint,
     random_rows,
@@ -221,7 +220,7 @@ class Figures:
             check_number(key, getattr(self, key), least=least, whole=True)
         check_number("trials", self.number, least=1, whole=True)
         check_number("noise", self.noise, least=0)
-        check_workers(self.workers)
+        check_number("workers", 1 if self.workers is None else self.workers, least=1, whole=True)
         for key, chosen in (("rows", self.rows), ("trajectory", self.trajectories)):
             if not chosen:
                 raise SettingError(key, "choose at least one")
@@ -254,7 +253,8 @@ class Figures:
         """Returns every flight, its GPs trained; trained ones are kept in ``folder``.
 
         Raises:
-            DataError: The data cannot be read, or are fewer than are asked for.
+            DataError: The data cannot be read.
+            SettingError: The data are fewer than are asked for.
             TrainingError: GPs could not be trained.
         """
         for _, row, trajectory, subsystem in self._flown:  # what the data do not hold is found before any training

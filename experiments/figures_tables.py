@@ -1,16 +1,20 @@
 """Tables and figures of the flights: figures 2 to 4 in the paper's layout, and its times beside ours."""
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from gpmpc.metrics import binomial_interval, time_quantiles
-from gpmpc.plotting import Curve, over_settings, png, tracking
+from gpmpc.plotting import png
+from gpmpc.plotting._style import COLOURS, DASHED, DASHES, legend_below, make_figure, styled
 from gpmpc.studies._document import MISSING, Document, Table, number
 
 ERRORS = ("x - reference [m]", "y - reference [m]", "z - reference [m], downwards")
@@ -150,6 +154,87 @@ def timing(rows: pd.DataFrame) -> list[list[str]]:
                 ratio = f"{row.seconds / convex.seconds:.2f}"
                 lines.append([f"ratio: {row.name} / {convex.name}", trajectory, ratio, f"{paper:.2f}", ""])
     return lines
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line in each panel of a group."""
+
+    label: str  # in the legend
+    at: np.ndarray  # where the values lie on the horizontal axis (K,)
+    values: np.ndarray  # A column a panel (K, p)
+    wanted: np.ndarray | None = None  # what they were to be (K or more, p); None where there is nothing
+    bounds: Sequence[Sequence[float]] | None = None  # lower and upper, an entry a panel; None without
+    interval: np.ndarray | None = None  # lower and upper end of what is doubtful of the first column (K, 2)
+
+
+@styled
+def tracking(groups: Sequence[tuple[Sequence[str], Sequence[Curve]]], title: str = "") -> Figure:
+    """Values over the time steps, a row of panels a group and a panel a column; references grey, bounds dotted."""
+    columns = max(len(labels) for labels, _ in groups)
+    figure, axes = make_figure(4.0 * columns, 2.7 * len(groups) + 0.7, len(groups), columns, title, sharex=True)
+    for row, (labels, curves) in zip(axes, groups, strict=True):
+        wanted = next((c.wanted for c in curves if c.wanted is not None), None)
+        bounds = next((c.bounds for c in curves if c.bounds is not None), ())
+        for j, (axis, label) in enumerate(zip(row, labels, strict=False)):
+            reach = [c.values[:, j] for c in curves]
+            if wanted is not None:
+                axis.plot(wanted[: len(curves[0].at), j], color="0.75", linewidth=3.5, label="reference")
+                reach.append(wanted[:, j])
+            low, high = min(v.min() for v in reach), max(v.max() for v in reach)
+            near = 0.4 * max(high - low, 1e-6)
+            for bound in (side[j] for side in bounds):
+                if low - near <= bound <= high + near:  # one that is far away would only flatten the curves
+                    axis.axhline(bound, color="0.25", linestyle=":", linewidth=1.2, label="bound")
+            for curve, colour, dash in zip(curves, COLOURS, DASHES, strict=False):
+                line = {"color": colour, "linestyle": dash, "linewidth": 1.3, "label": curve.label}
+                axis.plot(curve.at, curve.values[:, j], **line)
+            axis.set_ylabel(label)
+    for axis in axes[-1]:
+        axis.set_xlabel("time step k")
+    legend_below(figure, axes.flat)
+    return figure
+
+
+@styled
+def over_settings(
+    panels: Mapping[str, Sequence[Curve]],
+    label: str,
+    logarithmic: bool = False,
+    diagonal: bool = False,
+    title: str = "",
+) -> Figure:
+    """One measure over a setting, a panel a title, with intervals; logarithmic, or with the diagonal drawn in."""
+    columns, rows = min(2, len(panels)), -(-len(panels) // 2)
+    figure, axes = make_figure(4.8 * columns, 3.5 * rows + 0.8 * (rows > 1), rows, columns, title)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    for axis, (heading, curves) in zip(axes.flat, panels.items(), strict=False):
+        axis.set(title=heading, xlabel=label)
+        for i, curve in enumerate(curves):
+            colour, dash, value = COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)], curve.values[:, 0]
+            line = {"color": colour, "markersize": 4, "label": curve.label}
+            if curve.interval is None:
+                axis.plot(curve.at, value, marker="o", linestyle=dash, linewidth=1.3, **line)
+            else:
+                aside = 0.012 * (i - (len(curves) - 1) / 2) * float(curve.at.max())  # intervals beside each other
+                axis.errorbar(curve.at + aside, value, np.abs(curve.interval.T - value), fmt="o-", capsize=3, **line)
+        if logarithmic:
+            axis.set_xscale("log")
+            reach = np.concatenate([curve.values[:, 0] for curve in curves])
+            if reach.max() > 10 * reach.min() > 0:
+                axis.set_yscale("log")
+            else:
+                axis.set_ylim(0, 1.08 * reach.max())
+            ticks = sorted({int(a) for curve in curves for a in curve.at})
+            axis.set_xticks(ticks, [str(t) for t in ticks])
+            axis.xaxis.set_minor_locator(NullLocator())
+        if diagonal:
+            end = max(float(curve.at.max()) for curve in curves)
+            axis.plot([0, end], [0, end], color="0.4", linestyle=DASHED, linewidth=1, label="what is allowed")
+            axis.set_ylim(bottom=0)
+    legend_below(figure, axes.flat)
+    return figure
 
 
 def _images(rows: pd.DataFrame, records: Sequence[dict]) -> dict[str, bytes]:

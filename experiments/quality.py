@@ -21,21 +21,31 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import NullLocator
 
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.metrics import tracking_cost, tracking_error
 from gpmpc.mpc import Controller, Decision, Reference
-from gpmpc.plotting import png, quality
+from gpmpc.plotting import png
+from gpmpc.plotting._style import BLACK, COLOURS, DASHED, make_figure, plain_numbers, styled
 from gpmpc.studies._document import MISSING, Document, Table, number
 from gpmpc.studies.flight import Experiment, run_trial
-from gpmpc.studies.study import Trial, check_workers, fingerprint, read_model, trained_model
+from gpmpc.studies.study import Trial, fingerprint, read_model, trained_model
 from gpmpc.trajectories import Trajectory
 
 ROOMS = ("gp", "models", "propagation", "kernels", "qp", "mpc", "simulation", "datasets", "systems")
 CODE = ("gaussian.py", *(f"{room}/*.py" for room in ROOMS), __file__)
 LOST = 5.0  # [m] from the reference, some hundred times what is usual: nothing to compare costs with
 SAME = 1e-3  # difference of two costs below which the seeds' noise hides it: it buys no time
+CURVES = 5  # in the figure
+MARKERS = ("o", "^", "s", "D", "v", "P", "X")
+OTHERS, FRONT = "0.75", "0.35"  # greys
+TICKS = (-1, 0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # [%]
+LINEAR = 1.0  # [%] of cost up to which the axis is linear
 LEGEND = (
     "cost: of the states and of the inputs' increments, over that of NMPC on the true model at the longest horizon, "
     "geometric mean over the trajectories. ms: processor time of a decision. front: no other controller on a learned "
@@ -135,7 +145,7 @@ class Quality:
             check_number("horizons", horizon, least=1, whole=True)
         check_number("steps", self.steps, least=1, whole=True)
         check_number("seeds", self.seeds, least=1, whole=True)
-        check_workers(self.workers)
+        check_number("workers", 1 if self.workers is None else self.workers, least=1, whole=True)
         for key, chosen in (("trajectory", self.trajectories), ("families", self.experiments)):
             if not chosen:
                 raise SettingError(key, "choose at least one")
@@ -230,8 +240,8 @@ class Quality:
             [_table(rows)],
             pd.DataFrame(rows, dtype=object),
             notes=[LEGEND],
-            lists={"Lost": lost} if lost else {},
-            images={"quality.png": png(quality(rows), dpi=130)},
+            lists={"Lost": lost},
+            images={"quality.png": png(front_figure(rows), dpi=130)},
         )
 
 
@@ -343,3 +353,90 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
             figures = ["lost", *[MISSING] * 3]
         lines.append([row["what"], str(row["H"]), *figures, "●" if row["front"] else ""])
     return Table(["gpmpc run", "H", "cost", "ms: median", "99 %", "failed", "front"], lines, "Quality over time")
+
+
+@styled
+def front_figure(rows: Sequence[Mapping]) -> Figure:
+    """Cost above NMPC on the true model over milliseconds a decision, with the front of the best.
+
+    A curve is one choice of settings at growing horizons: of each controller the one of least cost, of at most five
+    controllers. All others are grey dots. The members of the front are numbered, and named by what is typed after
+    ``gpmpc run``.
+
+    Args:
+        rows: Of the quality study; lost ones are counted in the corner.
+    """
+    flown = [{**row, "excess": 100 * (row["cost"] - 1)} for row in rows if row["lost"] is None]
+    markers = {horizon: MARKERS[i % len(MARKERS)] for i, horizon in enumerate(sorted({row["H"] for row in rows}))}
+    figure, ((axis,),) = make_figure(9.0, 6.2)  # at 100 dots an inch as wide as a README
+    axis.set_title(f"gpmpc quality: {len({row['what'] for row in rows})} choices of settings over the horizon")
+    axis.axhline(0, color=BLACK, linewidth=0.8, linestyle=DASHED, zorder=1)
+    for row in flown:
+        axis.plot(row["median"], row["excess"], markers[row["H"]], color=OTHERS, markersize=4, zorder=2)
+    plain: dict[str, Any] = {"linestyle": "none", "markersize": 5.5}
+    handles = []
+    for (what, line), colour in zip(_curves(flown).items(), COLOURS, strict=False):
+        axis.plot([row["median"] for row in line], [row["excess"] for row in line], color=colour, zorder=3)
+        for row in line:
+            axis.plot(row["median"], row["excess"], markers[row["H"]], color=colour, markersize=6, zorder=3)
+        handles.append(Line2D([], [], color=colour, marker="o", markersize=5.5, label=what))
+    handles.append(Line2D([], [], color=OTHERS, marker="o", **plain, label="other settings"))
+    handles.append(Line2D([], [], color=FRONT, linewidth=1.4, label="front: none is better and faster"))
+    handles += [Line2D([], [], color="0.4", marker=kind, **plain, label=f"H = {H}") for H, kind in markers.items()]
+    _scales(axis, flown)
+    _front(axis, sorted((row for row in flown if row["front"]), key=lambda row: (row["median"], -row["cost"])))
+    figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8.5)
+    if lost := len(rows) - len(flown):
+        axis.text(0.99, 0.98, f"lost: {lost}", transform=axis.transAxes, ha="right", va="top", color=FRONT)
+    return figure
+
+
+def _curves(rows: Sequence[Mapping]) -> dict[str, list[Mapping]]:
+    """Of each controller the settings of least cost, the fastest of those equal to 0.1 %; at most ``CURVES``."""
+    lines: dict[str, list[Mapping]] = {}
+    for row in sorted(rows, key=lambda row: row["H"]):
+        lines.setdefault(row["what"], []).append(row)
+
+    def merit(what: str) -> tuple[float, float]:
+        cost = min(round(row["cost"], 3) for row in lines[what])
+        return cost, min(row["median"] for row in lines[what] if round(row["cost"], 3) == cost)
+
+    best: dict[str, str] = {}
+    for what in sorted(lines, key=merit):
+        best.setdefault(what.split()[0], what)
+    return {what: lines[what] for what in list(best.values())[:CURVES]}
+
+
+def _scales(axis: Axes, rows: Sequence[Mapping]) -> None:
+    axis.set_xscale("log")
+    axis.set_yscale("symlog", linthresh=LINEAR, linscale=0.4)
+    axis.set_xlabel("median time of a decision [ms], one thread")
+    axis.set_ylabel("closed-loop cost above NMPC on the true model")
+    plain_numbers(axis.xaxis, few=True)
+    values, times = [row["excess"] for row in rows] or [0.0], [row["median"] for row in rows] or [1.0]
+    low, high = min(values), max(values)
+    reach = [tick for tick in TICKS if low * 1.5 - 1 <= tick <= high * 1.5 + 1]
+    axis.set_yticks(reach, [f"{tick:+d} %" if tick else "0" for tick in reach])
+    axis.yaxis.set_minor_locator(NullLocator())
+    axis.set_ylim(min(1.5 * low, 0) - 0.4, 1.7 * max(high, LINEAR))
+    axis.set_xlim(min(times) / 1.7, max(times) * 1.6)
+
+
+def _front(axis: Axes, members: Sequence[Mapping]) -> None:
+    """Draws a stair that nobody is below of; its members are numbered, and named under the axis."""
+    if not members:
+        return
+    x, y = [row["median"] for row in members], [row["excess"] for row in members]
+    right, top = axis.get_xlim()[1], axis.get_ylim()[1]
+    stair: Any = {"color": FRONT, "linewidth": 1.4, "zorder": 1.5, "drawstyle": "steps-post"}
+    axis.plot([x[0], *x, right], [top, *y, y[-1]], **stair)
+    axis.set_xlim(right=right)
+    axis.set_ylim(top=top)
+    for i, place in enumerate(zip(x, y, strict=True), 1):
+        axis.plot(*place, "o", markersize=11, markerfacecolor="none", markeredgecolor=FRONT, markeredgewidth=1.2)
+        beside: Any = {"textcoords": "offset points", "ha": "right", "va": "center", "weight": "bold"}
+        axis.annotate(str(i), place, (-9 - 9 * (i % 2), -9), **beside)  # nobody is below and left of it
+    names = [f"{i}  {row['what']} horizon={row['H']}" for i, row in enumerate(members, 1)]
+    handles = [Line2D([], [], linestyle="none", label=name) for name in names]
+    font: Any = {"family": "monospace", "size": 8.5}
+    axis.figure.legend(handles=handles, loc="outside lower left", handlelength=0, prop=font)

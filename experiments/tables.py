@@ -24,6 +24,8 @@ from zlib import crc32
 import numpy as np
 import pandas as pd
 import torch
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 from torch import Tensor
 
 from gpmpc.datasets import DataSource
@@ -32,10 +34,12 @@ from gpmpc.experiments.subsystems import SCALINGS, SYSTEMS, check_subsystems
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Scaling, Training, Transitions
 from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
-from gpmpc.plotting import error_over_size, png
+from gpmpc.plotting import Series, png
+from gpmpc.plotting._style import VERMILION, legend_below, make_figure, styled
+from gpmpc.plotting._sweeps import draw_quartiles
 from gpmpc.propagation import MomentMatching
 from gpmpc.studies._document import MISSING, Document, Table, number, with_range
-from gpmpc.studies.study import Trial, check_workers, derived_seed, fingerprint, random_rows
+from gpmpc.studies.study import Trial, derived_seed, fingerprint, random_rows
 from gpmpc.trajectories import Trajectory
 
 CODE = ("gaussian.py", "metrics.py", "gp/*.py", "models/*.py", "propagation/*.py", "kernels/*.py", __file__)
@@ -96,7 +100,7 @@ class Tables:
         object.__setattr__(self, "sizes", tuple(dict.fromkeys(sizes)))
         check_number("draws", self.draws, least=1, whole=True)
         check_number("seed", self.seed, least=0, whole=True)
-        check_workers(self.workers)
+        check_number("workers", 1 if self.workers is None else self.workers, least=1, whole=True)
         check_number("state_std", self.state_std, least=0)
         object.__setattr__(self, "subsystems", check_subsystems("subsystem", self.subsystems))
         if not self.trajectories:
@@ -127,7 +131,7 @@ class Tables:
                         table = {"elliptical": 1, "lorenz": 2}.get(trajectory)
                         labels = {"table": table, "trajectory": trajectory, "subsystem": subsystem, "size": size}
                         name = fingerprint(settings, *arrays, code=CODE)
-                        trials.append(Trial(labels | {"draw": draw}, fit, seed, name, work=size))
+                        trials.append(Trial(labels | {"draw": draw}, fit, seed, name))
         return trials
 
     def _scaled(self, trajectory: str, name: str) -> tuple[Transitions, Scaling, tuple[int, ...]]:
@@ -199,7 +203,7 @@ class Tables:
             pd.DataFrame([_numbers(row) for row in rows], dtype=object),
             notes=[*LEGEND, self.data.note],
             lists={"Outside our range": differences(rows) or ["Nothing."]},
-            images={"tables.png": _figure(records)},
+            images={"tables.png": png(_figure(records))},
             latex=tables,
         )
 
@@ -384,8 +388,9 @@ def _numbers(row: Row) -> dict[str, Any]:
     return numbers
 
 
-def _figure(records: Sequence[dict]) -> bytes:
-    """Draws the test MSE over the training size, one panel a trajectory and subsystem (PNG)."""
+@styled
+def _figure(records: Sequence[dict]) -> Figure:
+    """Draws the test MSE over the training size beside the paper's, a panel a trajectory and subsystem."""
     panels: dict[str, tuple[dict, dict]] = {}  # our errors and the paper's, by size
     for record in records:
         name = record["trajectory"], record["subsystem"]
@@ -394,7 +399,26 @@ def _figure(records: Sequence[dict]) -> bytes:
             ours.setdefault(record["size"], []).append(record["test_mse"])
         if printed := paper_figures().get((*name, record["size"])):
             paper[record["size"]] = float(printed["test_mse"])
-    return png(error_over_size(panels, "test MSE", "Tables 1 and 2: error of held-out predictions"))
+    columns, rows = min(2, len(panels)), -(-len(panels) // 2)
+    title, height = "Tables 1 and 2: error of held-out predictions", 3.4 * rows + 0.8 * (rows > 1)
+    figure, axes = make_figure(4.6 * columns, height, rows, columns, title)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    for axis, (heading, (errors, paper)) in zip(axes.flat, panels.items(), strict=False):
+        sizes = sorted(errors)
+        axis.set(title=heading, xlabel="training points N")
+        if not sizes:  # every fit failed
+            axis.set_axis_off()
+            continue
+        draws = Series("our draws, with their quartiles", [errors[size] for size in sizes])
+        draw_quartiles(axis, [draws], [str(size) for size in sizes])
+        if known := {size: paper[size] for size in sizes if size in paper}:
+            axis.plot([*known], [*known.values()], "o", color=VERMILION, markersize=6, zorder=3, label="paper")
+        axis.set_yscale("log")
+        axis.yaxis.set_minor_locator(NullLocator())
+    legend_below(figure, axes.flat)
+    figure.supylabel("test MSE")
+    return figure
 
 
 def _digits(value: Decimal) -> str:

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gpmpc.plotting._animation import PLAN, _scene
+from gpmpc.plotting._animation import _scene
+from gpmpc.plotting._style import PLAN
 from gpmpc.recording import read_run
 from tests.recording.runs import record_run
 

@@ -1,6 +1,7 @@
 """``gpmpc plot``: draws recorded flights, a run's or every one below a folder."""
 
 import argparse
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,6 @@ from gpmpc.cli._settings import settings, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, RecordingError
 from gpmpc.plotting import animate, film, inputs_figure, timing_figure, tracking_figure
-from gpmpc.plotting._animation import ffmpeg_exists
 from gpmpc.recording import Run, read_run
 from gpmpc.studies._run_folder import RECORDING
 
@@ -60,7 +60,7 @@ def _plot(given: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]
         for name, figure in figures.items():
             figure.savefig(folder / f"{name}.{given.format}", dpi=150)
             written.append(f"{name}.{given.format}")
-        for ending in ("gif", *["mp4"] * ffmpeg_exists()) if animated else ():
+        for ending in ("gif", *["mp4"] * bool(shutil.which("ffmpeg"))) if animated else ():
             draw(run, path=folder / f"flight.{ending}")
             written.append(f"flight.{ending}")
     note = "" if run.finished else f"; {len(run.times)} steps: the recording is {CUT}"

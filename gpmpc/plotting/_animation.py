@@ -5,7 +5,6 @@ the predicted positions. These are often far smaller than the plan is long; they
 is written into the picture.
 """
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +17,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from gpmpc.exceptions import UnsupportedModel
-from gpmpc.plotting._recorded import FLOWN, REFERENCE, TUBE
-from gpmpc.plotting._style import DASHED, GREEN, styled
+from gpmpc.plotting._style import DASHED, FLOWN, PLAN, REFERENCE, TUBE, styled
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
@@ -27,7 +25,6 @@ if TYPE_CHECKING:
 _FRAMES, _RATE = 150, 15  # at most so many, steps are left out evenly; frames a second
 _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _VISIBLE = 0.06  # an ellipse's half axis, as a share of the view, from which on it is large enough
-PLAN = GREEN
 
 
 def animate(run: "Run", path: str | Path) -> None:
@@ -43,25 +40,18 @@ def animate(run: "Run", path: str | Path) -> None:
 
 
 def save_animation(
-    figure: Figure, draw: Callable[[int], list], steps: int, path: str | Path, frames: int = _FRAMES
+    figure: Figure, draw: Callable[[int], None], steps: int, path: str | Path, frames: int = _FRAMES
 ) -> None:
     """Writes a figure that is drawn anew for evenly chosen steps, as ``animate``."""
     shown = np.unique(np.linspace(0, steps - 1, min(frames, steps)).astype(int))
-    animation = FuncAnimation(figure, draw, frames=shown, blit=False, cache_frame_data=False)
     writer = FFMpegWriter(fps=_RATE) if Path(path).suffix == ".mp4" else PillowWriter(fps=_RATE)
-    animation.save(str(path), writer=writer, dpi=80)
-
-
-def ffmpeg_exists() -> bool:
-    """Whether an MP4 can be written."""
-    return shutil.which("ffmpeg") is not None
+    FuncAnimation(figure, draw, frames=shown, blit=False, cache_frame_data=False).save(str(path), writer, dpi=80)
 
 
 @styled
-def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
+def _scene(run: "Run") -> tuple[Figure, Callable[[int], None]]:
     """The figure, and the function of a step's number that draws it."""
-    plane = [run.pose["x"], run.pose["y"]]
-    up = run.pose["z"]
+    plane, up = [run.pose["x"], run.pose["y"]], run.pose["z"]
     sign, axis_name = (-1, "-z") if run.metadata.get("frames", {}).get("z axis") != "up" else (1, "z")
     states, references, plans = run.states[:, plane], run.references[:, plane], run.plan_means[:, :, plane]
     covariances = run.plan_covariances[:, :, plane][..., plane]
@@ -102,7 +92,7 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
     clock = figure.suptitle(" ", fontsize="medium")
     tubes: list = []
 
-    def draw(k: int) -> list:
+    def draw(k: int) -> None:
         for lines, points in ((trails, states[: k + 1]), (ahead, plans[k]), (dots, states[k : k + 1])):
             for line in lines:
                 line.set_data(*points.T)
@@ -113,11 +103,15 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
         while tubes:
             tubes.pop().remove()
         if spread.any():
-            tubes.append(near.add_collection(_ellipses(stages, spread, factor, near.transData)))
+            squared, directions = np.linalg.eigh(spread)
+            minor, major = 4 * factor * np.sqrt(squared.clip(0)).T  # whole axes of the 2-sigma ellipses
+            angles = np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1]))
+            look = {"facecolors": TUBE, "edgecolors": FLOWN, "alpha": 0.45, "linewidths": 0.6, "zorder": 1}
+            where: Any = {"units": "xy", "offsets": stages, "transOffset": near.transData}
+            tubes.append(near.add_collection(EllipseCollection(major, minor, angles, **where, **look)))
         distance = 100 * np.linalg.norm((run.states - run.references)[k, [*plane, up]])
         failed = "; solve failed" if run.failed[k] else ""
         clock.set_text(f"{run.times[k]:.4g} s: {distance:.1f} cm from the reference{failed}")
-        return []
 
     draw(0)
     figure.draw_without_rendering()
@@ -127,12 +121,3 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], list]]:
 
 def _look_at(axis: Axes, centre: np.ndarray, half: float) -> None:
     axis.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))
-
-
-def _ellipses(means: np.ndarray, covariances: np.ndarray, factor: int, transform) -> EllipseCollection:
-    """Ellipses of two standard deviations around the planned positions, enlarged by a factor."""
-    values, vectors = np.linalg.eigh(covariances)
-    axes = 4 * factor * np.sqrt(values.clip(0))  # whole axes of the 2-sigma ellipse
-    angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-    look = {"facecolors": TUBE, "edgecolors": FLOWN, "alpha": 0.45, "linewidths": 0.6, "zorder": 1}
-    return EllipseCollection(axes[:, 1], axes[:, 0], angles, units="xy", offsets=means, transOffset=transform, **look)

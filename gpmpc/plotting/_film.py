@@ -12,8 +12,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from gpmpc.exceptions import SettingError, UnsupportedModel
-from gpmpc.plotting._animation import PLAN, save_animation
-from gpmpc.plotting._recorded import FLOWN, REFERENCE
+from gpmpc.plotting._animation import save_animation
+from gpmpc.plotting._style import FLOWN, PLAN, REFERENCE
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
@@ -62,10 +62,9 @@ def film(run: "Run", system: "System", path: str | Path, frames: int = 100, enla
         for i, (name, color) in enumerate(legend):
             figure.text(0.02, 0.02 + 0.04 * i, name, color=color, weight="bold")
 
-        def draw(k: int) -> list:
+        def draw(k: int) -> None:
             image.set_data(scene.render(k))
             clock.set_text(f"{run.times[k]:.2f} s")
-            return []
 
         save_animation(figure, draw, len(run.times), path, frames)
         scene.rendering.free()
@@ -107,26 +106,22 @@ class _Scene:
     def _draw_paths(self, k: int) -> None:
         """Adds the reference, what was flown before step k, and the plan with its tube."""
         run = self.run
-        self._line(self.thinned, REFERENCE)
-        self._line(run.states[max(0, k - 200) : k + 1, self.axes], FLOWN)
         plan, covariances = run.plan_means[k][:, self.axes], run.plan_covariances[k][:, self.axes][..., self.axes]
         finite = np.isfinite(plan).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
-        self._line(plan[finite], PLAN)
+        capsule, ellipsoid = self.mujoco.mjtGeom.mjGEOM_CAPSULE, self.mujoco.mjtGeom.mjGEOM_ELLIPSOID
+        flown = run.states[max(0, k - 200) : k + 1, self.axes]
+        for points, color in ((self.thinned, REFERENCE), (flown, FLOWN), (plan[finite], PLAN)):
+            for begin, end in pairwise(points):
+                if geom := self._add(capsule, np.zeros(3), np.zeros(3), np.eye(3), to_rgba(color)):
+                    self.mujoco.mjv_connector(geom, capsule, 0.008, begin, end)
         for mean, covariance in zip(plan[finite], covariances[finite], strict=True):
             squared, turn = np.linalg.eigh(covariance)
             turn[:, 0] *= np.sign(np.linalg.det(turn))
             axes = np.maximum(2 * self.enlarged * np.sqrt(np.maximum(squared, 0)), 1e-3)
-            self._add(self.mujoco.mjtGeom.mjGEOM_ELLIPSOID, axes, mean, turn, to_rgba(PLAN, 0.15))
-
-    def _line(self, points: Array, color: str) -> None:
-        capsule = self.mujoco.mjtGeom.mjGEOM_CAPSULE
-        for begin, end in pairwise(points):
-            geom = self._add(capsule, np.zeros(3), np.zeros(3), np.eye(3), to_rgba(color))
-            if geom is not None:
-                self.mujoco.mjv_connector(geom, capsule, 0.008, begin, end)
+            self._add(ellipsoid, axes, mean, turn, to_rgba(PLAN, 0.15))
 
     def _add(self, kind: Any, size: Array, place: Array, turn: Array, color: Any) -> Any:
-        """A shape more; None where the scene is full."""
+        """Adds a shape; None where the scene is full."""
         if self.scene.ngeom == self.scene.maxgeom:
             return None
         geom = self.scene.geoms[self.scene.ngeom]

@@ -5,11 +5,12 @@ colours, so that a black and white print can be read.
 """
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
@@ -18,24 +19,27 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 BLUE, VERMILION, GREEN, _PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
 ORANGE, SKY, BLACK, GREY = "#e69f00", "#56b4e9", "#000000", "0.45"
 COLOURS = (BLUE, VERMILION, GREEN, _PURPLE, ORANGE, SKY, BLACK, GREY)
+FLOWN, REFERENCE, TUBE, PLAN = BLUE, VERMILION, SKY, GREEN
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.6)), (0, (6, 2, 1.2, 2)), (0, (3, 3)), (0, (8, 2)))
-DASHED = (0, (4, 3))  # of references and bounds
-_NAMES = {
-    "z": "z, downwards",
-    "phi": "roll",
-    "theta": "pitch",
-    "psi": "yaw",
-    "U1": "thrust U1",
-    "ux": "direction ux",
-    "uy": "direction uy",
-}
+DASHED: Any = (0, (4, 3))  # of references and bounds
+_NAMES = {"phi": "roll", "theta": "pitch", "psi": "yaw", "U1": "thrust U1", "ux": "direction ux", "uy": "direction uy"}
 
 styled = mpl.rc_context(fname=Path(__file__).with_name("gpmpc.mplstyle"))  # a decorator of what makes a figure
 
 
+def make_figure(
+    width: float, height: float, rows: int = 1, columns: int = 1, title: str = "", **options: Any
+) -> tuple[Figure, np.ndarray]:
+    """Returns a figure of some inches and its axes (rows, columns)."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    if title:
+        figure.suptitle(title)
+    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+
+
 def name_of(name: str, unit: str = "", z_down: bool = True) -> str:
     """Returns the full name of a state or input with its unit, such as ``z, downwards [m]``."""
-    full = name if name == "z" and not z_down else _NAMES.get(name, name)
+    full = "z, downwards" if name == "z" and z_down else _NAMES.get(name, name)
     return f"{full} [{unit}]" if unit not in ("", "1", "?") else full
 
 
@@ -52,18 +56,13 @@ def plain_numbers(axis: Axis, few: bool) -> None:
 
 
 def legend_below(figure: Figure, axes: Iterable[Axes]) -> None:
-    """Puts one legend for all axes below them, each label once, in as many columns as the width holds."""
+    """Puts one legend for all axes below them, each label once, in as many columns as the figure's width holds."""
     found = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    add_legend(figure, list(found.values()), list(found))
-
-
-def add_legend(figure: Figure, handles: Sequence[Any], labels: Sequence[str], **options: Any) -> None:
-    """Puts a legend below all axes, in as many columns as the figure's width holds."""
-    if labels:
+    if found:
         characters = 11.0 * figure.get_figwidth()  # that fit into a line
-        labels = [clipped(label, int(characters) - 6) for label in labels]
+        labels = [clipped(label, int(characters) - 6) for label in found]
         columns = max(1, min(len(labels), int(characters / (max(map(len, labels)) + 6))))
-        figure.legend(handles, labels, loc="outside lower center", ncols=columns, **options)
+        figure.legend([*found.values()], labels, loc="outside lower center", ncols=columns)
 
 
 def png(figure: Figure, dpi: int = 150) -> bytes:

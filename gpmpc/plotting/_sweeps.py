@@ -1,4 +1,4 @@
-"""Draws the results of a sweep's runs over a variable."""
+"""Draws the results of a sweep's runs over a variable, and the costs of a search."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from gpmpc.plotting._style import COLOURS, add_legend, clipped, plain_numbers, styled
+from gpmpc.plotting._style import COLOURS, clipped, legend_below, make_figure, plain_numbers, styled
 
 
 @dataclass(frozen=True)
@@ -34,24 +34,22 @@ def over_variable(
         lines: What else was varied, a line each; those without a number are left out.
         logarithmic: Whether the axis is, where the values span enough for it.
     """
-    drawn = [line for line in lines if any(line.values)]
-    figure = Figure(figsize=(4.8, 3.4 + 0.11 * len(drawn)), layout="constrained")
-    axis = figure.subplots()
+    drawn = sum(any(line.values) for line in lines)
+    figure, ((axis,),) = make_figure(4.8, 3.4 + 0.11 * drawn)
     draw_quartiles(axis, lines, positions)
     axis.set_title(label, fontsize="medium")
     axis.set_xlabel(clipped(title, 50))
     if max(map(len, positions)) * len(positions) > 40:
         axis.tick_params(axis="x", labelrotation=30)
     values = [v for line in lines for group in line.values for v in group]
-    if logarithmic and values and min(values) > 0 and max(values) > 3 * min(values):
+    low, high = min(values, default=0), max(values, default=0)
+    if logarithmic and low > 0 and high > 3 * low:
         axis.set_yscale("log")
-        plain_numbers(axis.yaxis, few=max(values) < 30 * min(values))
-    elif not values or max(values) <= 0:
-        axis.set_ylim(0, 1)
-    elif min(values) >= 0:
-        axis.set_ylim(0, 1.06 * max(values))
-    if len(drawn) > 1:
-        add_legend(figure, *axis.get_legend_handles_labels())
+        plain_numbers(axis.yaxis, few=high < 30 * low)
+    elif low >= 0:
+        axis.set_ylim(0, 1.06 * high or 1)
+    if drawn > 1:
+        legend_below(figure, [axis])
     return figure
 
 
@@ -76,8 +74,8 @@ def draw_quartiles(axis: Axes, lines: Sequence[Series], positions: Sequence[str]
         style: Any = {"color": colour, "marker": "o", "markersize": 4, "linestyle": "none" if numbers is None else "-"}
         axis.errorbar(place(middles[known]), middle, np.array([middle - low, high - middle]), label=line.label, **style)
         for x, group in zip(middles, line.values, strict=True):
-            aside = [0.3 * width * ((j + 0.5) / len(group) * 2 - 1) for j in range(len(group))]
-            axis.plot(place(x + np.array(aside)), group, ".", color=colour, alpha=0.45, markersize=5, mew=0)
+            aside = 0.3 * width * ((np.arange(len(group)) + 0.5) / max(len(group), 1) * 2 - 1)
+            axis.plot(place(x + aside), group, ".", color=colour, alpha=0.45, markersize=5, mew=0)
     if wide:
         axis.set_xscale("log")
     axis.set_xticks(place(at), [clipped(position, 24) for position in positions])
@@ -87,6 +85,7 @@ def draw_quartiles(axis: Axes, lines: Sequence[Series], positions: Sequence[str]
 
 
 def _numbers(positions: Sequence[str]) -> np.ndarray | None:
+    """Returns the positions as distinct finite numbers; None where they are none."""
     try:
         numbers = np.array([float(position) for position in positions])
     except ValueError:
@@ -103,27 +102,25 @@ def search_figure(costs: Sequence[float], importances: Mapping[str, float], unch
         importances: Shares by setting, the most first; may be empty.
         unchanged: Cost of the settings without the search; None leaves it out.
     """
-    figure = Figure(figsize=(4.4 + 4.0 * bool(importances), 3.4), layout="constrained")
-    axes = figure.subplots(1, 1 + bool(importances), squeeze=False)[0]
+    figure, ((axis, *bars),) = make_figure(4.4 + 4.0 * bool(importances), 3.4, columns=1 + bool(importances))
     values = np.array(costs)
     finite, best = np.isfinite(values), np.minimum.accumulate(values)
-    axes[0].plot(np.flatnonzero(finite), values[finite], ".", color=COLOURS[0], alpha=0.6, label="candidate")
+    axis.plot(np.flatnonzero(finite), values[finite], ".", color=COLOURS[0], alpha=0.6, label="candidate")
     known = np.isfinite(best)
-    axes[0].step(np.flatnonzero(known), best[known], color=COLOURS[1], where="post", label="best so far")
-    if not finite.all():
-        edge = axes[0].get_xaxis_transform()
-        lost = np.flatnonzero(~finite)
-        axes[0].plot(lost, np.full(len(lost), 0.98), "x", color="0.5", transform=edge, label="lost or failed")
+    axis.step(np.flatnonzero(known), best[known], color=COLOURS[1], where="post", label="best so far")
+    if len(lost := np.flatnonzero(~finite)):
+        top = {"transform": axis.get_xaxis_transform(), "color": "0.5", "label": "lost or failed"}
+        axis.plot(lost, np.full(len(lost), 0.98), "x", **top)
     if unchanged is not None:
-        axes[0].axhline(unchanged, color="0.4", linestyle="--", label="settings as they are")
+        axis.axhline(unchanged, color="0.4", linestyle="--", label="settings as they are")
     if finite.any() and values[finite].min() > 0:
-        axes[0].set_yscale("log")
-    axes[0].set(xlabel="candidate", ylabel="closed-loop cost per step")
-    axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
-    add_legend(figure, *axes[0].get_legend_handles_labels())
-    if importances:
-        names = [*importances][::-1]
-        bars = axes[1].barh(names, [100 * importances[name] for name in names], color=COLOURS[0], height=0.5)
-        axes[1].bar_label(bars, fmt="%.0f %%", padding=3)
-        axes[1].set(xlabel="importance [%]", xlim=(0, 115))
+        axis.set_yscale("log")
+    axis.set(xlabel="candidate", ylabel="closed-loop cost per step")
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    legend_below(figure, [axis])
+    for beside in bars:
+        names, shares = [clipped(name, 60) for name in importances], [100 * share for share in importances.values()]
+        drawn = beside.barh(names[::-1], shares[::-1], color=COLOURS[0], height=0.5)
+        beside.bar_label(drawn, fmt="%.0f %%", padding=3)
+        beside.set(xlabel="importance [%]", xlim=(0, 115))
     return figure

@@ -1,7 +1,7 @@
 """Writes results as text for a terminal, Markdown, CSV, LaTeX, HTML and JSON.
 
-Names and messages that a user chose stand in the results. They are text in every format: no HTML or link in Markdown,
-no command in LaTeX, no formula in a spreadsheet, no control sequence in a terminal.
+What a user chose is text in every format: no HTML or link in Markdown, no command in LaTeX, no formula in a
+spreadsheet, no control sequence in a terminal.
 """
 
 import json
@@ -31,7 +31,6 @@ _LATEX = str.maketrans(
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
 _POWER = re.compile(r"(?<![\w.])(-?\d(?:\.\d+)?)e(-?\d+)(?![\w.])")
 _FOLDED = 10  # lines that a page shows without being asked
-_LONGEST = 60  # characters of a label in a figure
 _STYLE = Path(__file__).with_name("document.css")
 
 
@@ -57,7 +56,7 @@ class Document:
     data: pd.DataFrame  # one row a row of the tables, as numbers, for CSV
     lead: str = ""  # paragraph above the tables
     notes: Sequence[str] = ()  # paragraphs below the tables
-    lists: Mapping[str, Sequence[str]] = field(default_factory=dict)  # items by their heading
+    lists: Mapping[str, Sequence[str]] = field(default_factory=dict)  # items by their heading; empty ones are left out
     code: Mapping[str, Sequence[str]] = field(default_factory=dict)  # lines that are typed or data, by their heading
     images: Mapping[str, bytes] = field(default_factory=dict)  # PNG files by name
     links: Mapping[str, str] = field(default_factory=dict)  # addresses by their text, for HTML, folded
@@ -81,9 +80,9 @@ class Document:
             out += [head, f"|{' --- |' * len(table.header)}", *rows, ""]
         out += [line for note in self.notes for line in (_markdown(note), "")]
         out += [line for name in self.images for line in (f"![{name}]({name})", "")]
-        for heading, items in self.lists.items():
+        for heading, items in _filled(self.lists):
             out += [f"## {heading}", "", *(f"- {_markdown(item)}" for item in items), ""]
-        for heading, lines in self.code.items():
+        for heading, lines in _filled(self.code):
             out += [f"## {heading}", "", "```", *lines, "```", ""]
         return "\n".join(out)
 
@@ -120,9 +119,9 @@ class Document:
             whole = f"<table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table>"
             parts += [f"<h2>{escape(table.title)}</h2>"] * bool(table.title) + [f'<div class="wide">{whole}</div>']
         parts += [f"<p>{escape(note)}</p>" for note in self.notes]
-        for heading, items in self.lists.items():
+        for heading, items in _filled(self.lists):
             parts.append(f"<h2>{heading}</h2><ul>{''.join(f'<li>{escape(item)}</li>' for item in items)}</ul>")
-        for heading, lines in self.code.items():
+        for heading, lines in _filled(self.code):
             text = f"<pre>{escape(chr(10).join(lines))}</pre>"
             parts.append(f"<h2>{heading}</h2>{_folded('lines', lines, text) if len(lines) > _FOLDED else text}")
         if self.links:
@@ -165,8 +164,8 @@ def plain_text(text: object) -> str:
 
 
 def figure_label(text: str) -> str:
-    """Returns a text that is no formula in a figure and no wider than the figure."""
-    return (text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…").replace("$", r"\$")
+    """Returns a text that is no formula in a figure."""
+    return text.replace("$", r"\$")
 
 
 def _terminal_table(table: Table) -> TerminalTable:
@@ -219,6 +218,11 @@ def _html(text: str) -> str:
     """Escapes a cell; lines below its first are small."""
     first, *below = map(escape, text.split("\n"))
     return first + "".join(f"<small>{line}</small>" for line in below)
+
+
+def _filled(parts: Mapping[str, Sequence[str]]) -> list[tuple[str, Sequence[str]]]:
+    """Returns headings and what is below them, where there is something."""
+    return [(heading, lines) for heading, lines in parts.items() if lines]
 
 
 def _folded(what: str, items: Sized, text: str) -> str:

@@ -5,8 +5,8 @@
     metrics.json   the results; written last and in one piece: where it is, the run is finished
     error.json     why it failed, where it did
 
-Runs of a sweep share nothing but the tree of such folders, so any number of processes can work on one tree: who works
-on a folder holds a lock on it, which the system takes back from a process that dies.
+Any number of processes can work on one tree of such folders: who works on a folder holds a lock on it, which the system
+takes back from a process that dies.
 """
 
 import hashlib
@@ -79,13 +79,10 @@ class RunFolder:
 
     def fail(self, error: BaseException, about: Mapping[str, Any]) -> None:
         """Keeps why the run failed, with the traceback."""
-        content = {
-            **about,
-            "error": " ".join(str(error).split()) or type(error).__name__,
-            "kind": type(error).__name__,
-            "traceback": "".join(traceback.format_exception(error)),
-        }
-        write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")
+        kind = type(error).__name__
+        what = {"error": " ".join(str(error).split()) or kind, "kind": kind}
+        trace = "".join(traceback.format_exception(error))
+        write_whole(self.path / ERROR, json.dumps({**about, **what, "traceback": trace}, indent=1) + "\n")
 
     def result(self, settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Reads the result of the finished run."""
@@ -121,6 +118,5 @@ def folder_name(choices: Sequence[str]) -> str:
 def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Returns in words where two settings differ, the first three of their leaves; empty where they are equal."""
     a, b = flattened(then), flattened(now)
-    differing = [key for key in dict.fromkeys([*a, *b]) if a.get(key) != b.get(key)]
-    first = ", ".join(f"{key}: {a.get(key)!r} then, {b.get(key)!r} now" for key in differing[:3])
-    return first + (f", and {len(differing) - 3} more" if len(differing) > 3 else "")
+    differing = [f"{k}: {a.get(k)!r} then, {b.get(k)!r} now" for k in dict.fromkeys([*a, *b]) if a.get(k) != b.get(k)]
+    return ", ".join(differing[:3] + ([f"and {len(differing) - 3} more"] if len(differing) > 3 else []))

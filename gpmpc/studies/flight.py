@@ -73,8 +73,7 @@ class Experiment:
     model: DynamicsModel | None = None  #: trained before; None trains one where the controller needs it
 
     def __post_init__(self) -> None:
-        if self.size is not None:
-            check_number("data.size", self.size, least=1, whole=True)
+        check_number("data.size", 1 if self.size is None else self.size, least=1, whole=True)
         check_number("steps", self.steps, least=1, whole=True)
         check_number("seed", self.seed, least=0, whole=True)
         check_policy(self.on_failure)
@@ -94,14 +93,13 @@ class Experiment:
                 raise SettingError("disturbances", f"{what}; got {disturbance!r}")
         if self.loop == "plant":  # noise and disturbances that do not fit it are found before the training
             PlantSimulator(plant, plant.goal, self.disturbances, self.noise, self.seed)
-        self.references(1)
-        problem = getattr(self.controller, "keywords", {}).get("problem")
-        shape = len(system.state_names), len(system.input_names)
-        if problem is not None:
-            if (problem.state_dim, problem.input_dim) != shape:
+        first = self.references(1)[0]
+        if (problem := getattr(self.controller, "keywords", {}).get("problem")) is not None:
+            if (problem.state_dim, problem.input_dim) != self._dimensions:
                 weighed = f"weighs {problem.state_dim} states and {problem.input_dim} inputs"
-                raise SettingError("controller.problem", f"{weighed}; {system.name} has {shape[0]} and {shape[1]}")
-            start = self.references(1)[0] if plant.start is None else plant.start
+                has = "{} has {} and {}".format(system.name, *self._dimensions)
+                raise SettingError("controller.problem", f"{weighed}; {has}")
+            start = first if plant.start is None else plant.start
             problem.check_start(np.asarray(start, dtype=float), np.asarray(plant.initial_input, dtype=float))
         if self.learns and self.model is None and hasattr(self.data, "check"):
             self.data.check(system, self.trajectory)
@@ -109,7 +107,11 @@ class Experiment:
     @property
     def flown(self) -> System:
         """The plant: the system, unless another one was given."""
-        return self.system if self.plant is None else self.plant
+        return self.plant or self.system
+
+    @property
+    def _dimensions(self) -> tuple[int, int]:
+        return len(self.system.state_names), len(self.system.input_names)
 
     @property
     def learns(self) -> bool:
@@ -123,15 +125,11 @@ class Experiment:
             SettingError: More rows are asked for than there are.
             ShapeError: The data have other dimensions than the plant.
         """
-        system = self.system
-        data = self.data.transitions(system, self.trajectory, self.name)
-        expected = len(system.state_names), len(system.input_names)
-        if (data.state_dim, data.input_dim) != expected:
+        data = self.data.transitions(self.system, self.trajectory, self.name)
+        if (data.state_dim, data.input_dim) != self._dimensions:
             raise ShapeError(f"data and system must have the same dimensions; got {data.state_dim, data.input_dim}")
         size = len(data) if self.size is None else self.size
-        if size > len(data):
-            raise SettingError("data.size", f"must be at most {len(data)}, the rows of the data; got {size}")
-        return data[random_rows(len(data), size, self.seed)]
+        return data[random_rows(len(data), size, self.seed, "data.size")]
 
     def learn(self, transitions: Transitions, seed: int) -> Training:
         """Trains on transitions; see ``train``."""
@@ -150,14 +148,13 @@ class Experiment:
 
         It is what the model has learned of it; a controller that knows the plant knows its noise as well.
         """
-        n = len(self.system.state_names)
+        model, none = training.posterior if training else self.model, np.zeros(self._dimensions[0])
         if getattr(self.propagator, "process_noise", False) or self.loop == "model":
-            return np.zeros(n)
-        model = self.model if training is None else training.posterior
+            return none
         if model is not None and self.learns:
             return model.noise_covariance.diagonal().sqrt().numpy()
         noise = self.noise and self.noise.process
-        return np.zeros(n) if noise is None else np.array(noise, dtype=float)
+        return none if noise is None else np.array(noise, dtype=float)
 
 
 @dataclass(frozen=True)
@@ -198,20 +195,18 @@ def run_trial(experiment: Experiment, prepare: Prepare | None = None) -> Flown:
                 data = experiment.learning.with_flight(data, before[-1].rollout)
                 if k + 1 < experiment.learning.episodes:
                     training = experiment.learn(data, experiment.seed)
-            best = min(before, key=lambda flown: _error(experiment, flown))
-            training = best.training or training
+            training = min(before, key=lambda flown: _error(experiment, flown)).training or training
         model = training.posterior
     return replace(_fly(experiment, prepare, model, training), before=tuple(before))
 
 
-def _error(experiment: Experiment, flown: Flown) -> float:
-    """RMSE of a flight; infinite where it diverged."""
-    error = _tracking_error(experiment, flown).total
-    return error if flown.diverged is None and np.isfinite(error) else np.inf
+def _error(experiment: Experiment, flown: Flown, last: int = 0) -> float:
+    """RMSE of a flight, or of its last states alone; infinite where it diverged."""
+    error = _tracking_error(experiment, flown, last).total
+    return float(error) if flown.diverged is None and np.isfinite(error) else np.inf
 
 
 def _tracking_error(experiment: Experiment, flown: Flown, last: int = 0) -> Any:
-    """RMSE of a flight, or of its last states; 0 takes all."""
     system, rollout = experiment.system, flown.rollout
     states, references = rollout.states[-last:], rollout.references[-last:]
     return tracking_error(states, references, system.tracked_indices, system.angle_indices)
@@ -252,10 +247,9 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     diverged has no RMSE: None.
     """
     rollout, problem, training = flown.rollout, flown.controller.problem, flown.training
-    system, horizon = experiment.system, flown.controller.horizon
-    error, total = _tracking_error(experiment, flown), _error(experiment, flown)
-    rmse: dict[str, Any] = dict(zip(system.tracked, error.axes.tolist(), strict=True)) | {"total": total}
-    episodes = [one if np.isfinite(one := _error(experiment, each)) else None for each in flown.before]
+    system, horizon, total = experiment.system, flown.controller.horizon, _error(experiment, flown)
+    axes = _tracking_error(experiment, flown).axes.tolist()
+    rmse: dict[str, Any] = dict(zip(system.tracked, axes, strict=True)) | {"total": total}
     violations = {"inputs": violation_rate(rollout.inputs, *(side[0] for side in problem.inputs.by_stage(horizon)))}
     if boxes := [bounds.by_stage(horizon) for bounds in problem.constraints if isinstance(bounds, Box)]:
         lower, upper = np.max([box[0][0] for box in boxes], axis=0), np.min([box[1][0] for box in boxes], axis=0)
@@ -268,7 +262,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         "steps": len(rollout.inputs),
         "unit": system.unit,
         "rmse": rmse if np.isfinite(total) else dict.fromkeys(rmse),
-        "error_at_end": float(_tracking_error(experiment, flown, last=2).total) if np.isfinite(total) else None,
+        "error_at_end": _error(experiment, flown, last=2) if np.isfinite(total) else None,
         "lost": _lost(experiment, flown),
         "violations": {name: asdict(rate) | {"rate": rate.rate} for name, rate in violations.items()},
         "failures": dict(Counter(status.name for _, status in rollout.failures)),
@@ -276,7 +270,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         "suboptimal": dict(Counter(rollout.statuses[k].name for k in rollout.suboptimal)),
         "iterations": {"mean": float(rollout.iterations.mean()), "largest": int(rollout.iterations.max())},
         "training": learned,
-        "episodes": episodes,
+        "episodes": [error if np.isfinite(error := _error(experiment, each)) else None for each in flown.before],
         "times": {"training": None if training is None else training.seconds}
         | {stage: time_quantiles(np.array([getattr(t, stage) for t in rollout.timings])) for stage in _STAGES},
     }
@@ -297,39 +291,36 @@ def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
 
 
 def summary(result: Mapping[str, Any]) -> Table:
-    """Returns a run's metrics in words, a line each."""
+    """Returns a run's metrics in words, a line each; what there is nothing to say of has none."""
     settings, times, rmse, unit = result["settings"], result["times"], result["rmse"], result["unit"]
     options, (system, plant, model) = settings["options"], (settings.get(k) or {} for k in ("system", "plant", "model"))
     along = "" if options["trajectory"] == "goal" else f" along {options['trajectory']}"
-    lines = {"flight": f"{result['steps']} steps of {options['system']}{along} with {options['controller']}"}
-    if other := [f"{k} {v} (learned: {system.get(k)})" for k, v in plant.items() if v != system.get(k)]:
-        lines["flown with"] = ", ".join(other)
-    if path := model.get("path"):
-        lines["model"] = path
-    if training := result["training"]:
-        lines["learned from"] = f"{training['size']} rows of {options['data']} data, in {times['training']:.2f} s"
-    if known := settings.get("nominal"):
-        lines["known before"] = ", ".join(f"{k} {v}" for k, v in known.items())
-    if lost := result.get("lost"):
-        lines["lost"] = f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}"
+    training, lost, far = result["training"], result.get("lost"), result.get("far_from_data")
+    error, stopped = result.get("error_at_end"), _counted(result.get("suboptimal", {}))
     axes = ", ".join(f"{k} {v:.3g}" for k, v in rmse.items() if v is not None and k != "total")
-    lines[f"RMSE [{unit}]"] = "none: it diverged" if rmse["total"] is None else f"{rmse['total']:.3g}  ({axes})"
-    if (error := result.get("error_at_end")) is not None:
-        lines[f"at the end [{unit}]"] = f"{error:.3g}"
-    if episodes := result.get("episodes"):
-        lines["episodes before"] = ", ".join("diverged" if e is None else f"{e:.3g}" for e in episodes)
+    stages = ", ".join(f"{stage} {1e3 * times[stage]['median']:.3g}" for stage in _STAGES[:3])
+    median, most = (f"{1e3 * times['total'][key]:.3g}" for key in ("median", "p99"))
+    lines = {
+        "flight": f"{result['steps']} steps of {options['system']}{along} with {options['controller']}",
+        "flown with": ", ".join(f"{k} {v} (learned: {system.get(k)})" for k, v in plant.items() if v != system.get(k)),
+        "model": model.get("path"),
+        "learned from": training and f"{training['size']} rows of {options['data']} data, in {times['training']:.2f} s",
+        "known before": ", ".join(f"{k} {v}" for k, v in (settings.get("nominal") or {}).items()),
+        "lost": lost and f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}",
+        f"RMSE [{unit}]": "none: it diverged" if rmse["total"] is None else f"{rmse['total']:.3g}  ({axes})",
+        f"at the end [{unit}]": None if error is None else f"{error:.3g}",
+        "episodes before": ", ".join("diverged" if e is None else f"{e:.3g}" for e in result.get("episodes", ())),
+    }
     for name, rate in result["violations"].items():
         interval = f"{100 * rate['low']:.2g} to {100 * rate['high']:.2g} %"
         lines[f"bounds of {name}"] = f"{rate['violations']} of {rate['steps']} steps outside (95 %: {interval})"
-    lines["failed solves"] = _counted(result["failures"]) or "none"
-    if stopped := _counted(result.get("suboptimal", {})):
-        lines["stopped early"] = f"{stopped}: plans that were not optimal yet, applied"
-    if far := result.get("far_from_data"):
-        lines["far from the data"] = f"the plans of {far} steps: there the model knows little more than its prior"
-    stages = ", ".join(f"{stage} {1e3 * times[stage]['median']:.3g}" for stage in _STAGES[:3])
-    median, most = (f"{1e3 * times['total'][key]:.3g}" for key in ("median", "p99"))
-    lines["decision [ms]"] = f"median {median}  ({stages}), 99 % below {most}"
-    return Table(("", ""), [*lines.items()])
+    lines |= {
+        "failed solves": _counted(result["failures"]) or "none",
+        "stopped early": stopped and f"{stopped}: plans that were not optimal yet, applied",
+        "far from the data": far and f"the plans of {far} steps: there the model knows little more than its prior",
+        "decision [ms]": f"median {median}  ({stages}), 99 % below {most}",
+    }
+    return Table(("", ""), [(name, text) for name, text in lines.items() if text])
 
 
 def _counted(statuses: Mapping[str, int]) -> str:

@@ -1,21 +1,17 @@
 """Shows a tree of runs: a row a cell, figures over what was varied, what failed or is missing, whether two differ.
 
-Two groups of runs are compared seed by seed. Runs of one seed share their training rows and their noise, so they are
-compared in pairs: what else was varied is averaged within a seed first, and a seed counts once. So that every seed is
-an average over the same, seeds and other settings of which one of the groups lacks runs are left out, and named. The
-signed-rank test (Wilcoxon, 1945) decides: it asks only that the differences are spread symmetrically; Student's t-test
-beside it asks for normal ones. With fewer than six pairs nothing can make the first one significant at 5 %. Where the
-seed decides nothing (all rows, one start, no noise) its runs are copies of one: a difference that never varies is
-undecided. Wall times are not compared: one group is flown after the other, and what the machine did meanwhile is no
-property of either.
+Two groups of runs are compared seed by seed: runs of one seed share their training rows and their noise. What else was
+varied is averaged within a seed first, so that a seed counts once, and over the same for every seed. The signed-rank
+test (Wilcoxon, 1945) decides, which asks only that the differences are spread symmetrically; Student's t-test beside it
+asks for normal ones. Wall times are not compared: one group is flown after the other, and what the machine did
+meanwhile is no property of either.
 """
 
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,11 +22,12 @@ from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable, png
 from gpmpc.studies._document import MISSING, Document, Table, figure_label, plain_text, with_range
 from gpmpc.studies._run_folder import LONGEST_NAME
-from gpmpc.studies._runs import MEASURES, SEED, Cell, Report, in_order, read_report
+from gpmpc.studies._runs import SEED, Report, in_order, read_report
 
 __all__ = ["Comparison", "Report", "compare", "notes", "read_report", "report_document", "sentences", "terminal_table"]
 
-_DRAWN = ("rmse", "failed", "decision")  # a figure each
+_DRAWN = {"rmse": True, "failed": False, "decision": True}  # a figure each, and whether it may be logarithmic
+_WALL_TIMES = ("decision", "training")
 _SHORT = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
 _PARTS = ("q25", "median", "q75")
 _MOST_LINES = 8  # in a figure; what is varied besides is pooled
@@ -39,36 +36,28 @@ _LEVEL = 0.05
 _FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
 
 
-def report_document(
-    report: Report,
-    comparison: Sequence[str] = (),
-    folder: Path | None = None,
-    images: Mapping[str, bytes] | None = None,
-) -> Document:
+def report_document(report: Report, comparison: Sequence[str] = (), folder: Path | None = None) -> Document:
     """Returns everything that is written of a report; what is zero everywhere is left out of the LaTeX table.
 
     Args:
         report: All runs.
         comparison: Lines about two groups of them.
         folder: Where it goes, for the links to the runs; by default ``report`` in the tree.
-        images: Figures by file name; by default they are drawn.
     """
     constants = ", ".join(f"{key}={value}" for key, value in report.constants.items())
-    lists = {"Comparison": list(comparison), **notes(report), "Made": _made(report)}
-    code = {"To fill the gaps": report.commands(), "Settings of all runs": report.base_settings()}
     start = (folder or report.tree / "report").resolve()
     return Document(
         plain_text(report.tree.resolve().name),
-        [_table(report, report.measures())],
+        [_table(report, [*report.measures])],
         _numbers(report),
         lead=f"{_counts(report)}." + (f" All of them: {constants}." if constants else ""),
         notes=[_LEGEND],
-        lists={heading: items for heading, items in lists.items() if items},
-        code={heading: lines for heading, lines in code.items() if lines},
-        images=_figures(report) if images is None else images,
+        lists={"Comparison": comparison, **notes(report), "Made": _made(report)},
+        code={"To fill the gaps": report.commands(), "Settings of all runs": report.base_settings()},
+        images=_figures(report),
         links={
             plain_text(str(run.folder.relative_to(report.tree))): os.path.relpath(run.folder.resolve(), start)
-            for run in report.runs
+            for run in report.there
         },
         latex=[_table(report, _telling(report))],
     )
@@ -76,107 +65,111 @@ def report_document(
 
 def _made(report: Report) -> list[str]:
     """Returns when, from which source and on which machines the runs were made."""
-
-    def every(key: str) -> list[str]:
-        return sorted({run.origin[key] for run in report.runs if key in run.origin})
-
-    dates = " to ".join(dict.fromkeys([*every("date")[:1], *every("date")[-1:]]))
-    shown = {"Runs made": dates, "Commit": "; ".join(every("commit")), "Machine": "; ".join(every("machine"))}
+    made = {
+        key: sorted({run.origin[key] for run in report.there if key in run.origin})
+        for key in ("date", "commit", "machine")
+    }
+    dates = " to ".join(dict.fromkeys([*made["date"][:1], *made["date"][-1:]]))
+    shown = {"Runs made": dates, "Commit": "; ".join(made["commit"]), "Machine": "; ".join(made["machine"])}
     shown |= {"Report made": now(), "Tree": str(report.tree.resolve())}
     return [f"{key}: {plain_text(value)}" for key, value in shown.items() if value]
 
 
+def _states(report: Report) -> pd.DataFrame:
+    """Returns how many runs of every cell finished, were lost, failed, are missing and were skipped."""
+    runs = report.runs
+    counts = pd.crosstab(runs.cell, runs.state).reindex(
+        columns=["finished", "failed", "missing", "skipped"], fill_value=0
+    )
+    counts.insert(1, "lost", (runs.lost != "").groupby(runs.cell).sum())
+    return counts
+
+
 def _counts(report: Report) -> str:
     """Returns how many runs there are, by how they ended."""
-    finished, lost, failed, missing = (
-        sum(len(getattr(cell, kind)) for cell in report.cells) for kind in ("runs", "lost", "failed", "missing")
-    )
-    text = f"{finished} finished in {len(report.cells)} cells, {failed} failed, {missing} missing"
+    count = _states(report).sum()
+    text = f"{count.finished} finished in {len(report.cells)} cells, {count.failed} failed, {count.missing} missing"
     text += f", {len(report.skipped)} skipped" if report.skipped else ""
-    return text + (f"; of those finished, {lost} lost" if lost else "")
+    return text + (f"; of those finished, {count.lost} lost" if count.lost else "")
 
 
 def terminal_table(report: Report) -> Table:
     """Returns the table with short headers: median, and the quartiles below it; what is zero everywhere is left out."""
-    shown = {name: short for name, short in _SHORT.items() if name in _telling(report)}
-    units = (report.label(name).rpartition(" [")[2] for name in shown)
+    shown = [name for name in _telling(report) if name in _SHORT]
     header = [name.replace(".", ".\n") for name in report.variables or ("runs",)]
-    header += ["seeds", *(f"{short}\n[{unit}" for short, unit in zip(shown.values(), units, strict=True))]
+    header += ["seeds", *(f"{_SHORT[name]}\n[{report.measures[name].rpartition(' [')[2]}" for name in shown)]
     return Table(header, _table(report, shown).rows, _counts(report))
 
 
 def notes(report: Report) -> dict[str, list[str]]:
     """Returns what has to be known of single runs, by kind: their folders and the reasons."""
     found = {
-        "Failed": [(run.folder.name, run.error) for cell in report.cells for run in cell.failed.values()],
-        "Lost": [(run.folder.name, run.lost) for cell in report.cells for run in cell.lost],
+        "Failed": [f"{plain_text(run.folder.name)}: {run.error}" for run in report.there if run.error],
+        "Lost": [f"{plain_text(run.folder.name)}: {run.lost}" for run in report.there if run.lost],
+        "Skipped": list(report.skipped),
     }
-    each = {kind: [f"{plain_text(folder)}: {why}" for folder, why in runs] for kind, runs in found.items()}
-    return {kind: lines for kind, lines in (each | {"Skipped": list(report.skipped)}).items() if lines}
+    return {kind: lines for kind, lines in found.items() if lines}
 
 
-def _table(report: Report, measures: Iterable[str]) -> Table:
-    rows, header = [], [*(report.variables or ("runs",)), "seeds"]
-    for cell in report.cells:
-        named = {"lost": cell.lost, "failed": cell.failed, "missing": cell.missing, "skipped": cell.skipped}
-        seeds = [str(len(cell.runs)), *(f"{len(group)} {word}" for word, group in named.items() if group)]
-        quartiles = [_quartiles(cell.numbers(name)) for name in measures]
-        texts = [MISSING if of is None else with_range(*of) for of in quartiles]
-        rows.append([*(cell.values if report.variables else ("all",)), "\n".join(seeds), *texts])
-    return Table([*header, *map(report.label, measures)], rows)
+def _quartiles(report: Report, measures: Sequence[str]) -> np.ndarray:
+    """Returns first quartile, median and third (cells, measures, 3) over the seeds; NaN where no run has a number."""
+    numbers = [runs[name].dropna() for _, runs in report.runs.groupby("cell") for name in measures]
+    found = [np.quantile(of, [0.25, 0.5, 0.75]) if len(of) else np.full(3, np.nan) for of in numbers]
+    return np.reshape(found, (len(report.cells), -1, 3))
+
+
+def _table(report: Report, measures: Sequence[str]) -> Table:
+    rows = []
+    counts = _states(report).to_dict("records")
+    for values, count, quartiles in zip(report.cells, counts, _quartiles(report, measures), strict=True):
+        seeds = [str(count.pop("finished")), *(f"{number} {word}" for word, number in count.items() if number)]
+        texts = [MISSING if np.isnan(of).any() else with_range(*of) for of in quartiles]
+        rows.append([*(values or ("all",)), "\n".join(seeds), *texts])
+    labels = [report.measures[name] for name in measures]
+    return Table([*(report.variables or ("runs",)), "seeds", *labels], rows)
 
 
 def _numbers(report: Report) -> pd.DataFrame:
-    rows = []
-    for cell in report.cells:
-        row: dict[str, Any] = dict(zip(report.variables, cell.values, strict=True))
-        for word in ("finished", "lost", "failed", "missing", "skipped"):
-            row[word] = len(cell.runs if word == "finished" else getattr(cell, word))
-        for measure in report.measures():
-            names = [f"{measure}_{part} [{report.label(measure).rpartition(' [')[2]}" for part in _PARTS]
-            row |= dict.fromkeys(names) | dict(zip(names, _quartiles(cell.numbers(measure)) or (), strict=False))
-        rows.append(row)
-    return pd.DataFrame(rows, dtype=object)
-
-
-def _quartiles(values: Sequence[float]) -> list[float] | None:
-    return np.quantile(values, [0.25, 0.5, 0.75]).tolist() if values else None
+    values = pd.DataFrame(report.cells, columns=[*report.variables], dtype=object)
+    names = [
+        f"{name}_{part} [{label.rpartition(' [')[2]}" for name, label in report.measures.items() for part in _PARTS
+    ]
+    quartiles = _quartiles(report, [*report.measures]).reshape(len(report.cells), -1)
+    found = pd.concat([values, _states(report), pd.DataFrame(quartiles, columns=names)], axis=1).astype(object)
+    return found.where(found.notna(), None)
 
 
 def _telling(report: Report) -> list[str]:
     """Returns the measures that are not zero everywhere."""
-    return [name for name in report.measures() if any(any(cell.numbers(name)) for cell in report.cells)]
+    return [name for name in report.measures if report.runs[name].max() > 0]
 
 
 def _figures(report: Report) -> dict[str, bytes]:
     """Draws one figure (PNG) a varied setting and measure, by file name."""
     drawn: dict[str, bytes] = {}
     for index, variable in enumerate(report.variables):
-        positions = sorted({cell.values[index] for cell in report.cells}, key=in_order)
-        lines = _lines(report, index)
-        for name in (name for name in _DRAWN if name in _telling(report)):
-            series = []
+        positions = sorted({values[index] for values in report.cells}, key=in_order)
+        at, lines = report.runs.cell.map(lambda cell, i=index: report.cells[cell][i]), _lines(report, index)
+        for name in (name for name in _telling(report) if name in _DRAWN):
+            numbers, series = report.runs[name].dropna(), []
             for label, cells in lines.items():
-                at: dict[str, list[float]] = {position: [] for position in positions}
-                for cell in cells:
-                    at[cell.values[index]] += cell.numbers(name)
-                series.append(Series(figure_label(label), [*at.values()]))
-            title, label, *ticks = map(figure_label, (variable, report.label(name), *positions))
-            figure = over_variable(title, ticks, label, series, MEASURES[name].logarithmic)
+                of = numbers[report.runs.cell.isin(cells)]
+                series.append(Series(figure_label(label), [of[at == position].tolist() for position in positions]))
+            title, label, *ticks = map(figure_label, (variable, report.measures[name], *positions))
+            figure = over_variable(title, ticks, label, series, _DRAWN[name])
             file = re.sub(r"[^\w.+-]", "-", f"{name}-over-{variable}"[:LONGEST_NAME], flags=re.ASCII)
             drawn[f"{file}.png" if f"{file}.png" not in drawn else f"{file}-{index}.png"] = png(figure)
     return drawn
 
 
-def _lines(report: Report, index: int) -> dict[str, list[Cell]]:
+def _lines(report: Report, index: int) -> dict[str, list[int]]:
     """Groups cells by what else was varied; by one setting only where all together were too many lines."""
     others = [i for i in range(len(report.variables)) if i != index]
-    distinct = {i: {cell.values[i] for cell in report.cells} for i in others}
-    while len({tuple(cell.values[i] for i in others) for cell in report.cells}) > _MOST_LINES:
-        others.remove(max(others, key=lambda i: len(distinct[i])))
-    lines: dict[str, list[Cell]] = {}
-    for cell in report.cells:
-        label = ", ".join(f"{report.variables[i]}={cell.values[i]}" for i in others)
+    while len({tuple(values[i] for i in others) for values in report.cells}) > _MOST_LINES:
+        others.remove(max(others, key=lambda i: len({values[i] for values in report.cells})))
+    lines: dict[str, list[int]] = {}
+    for cell, values in enumerate(report.cells):
+        label = ", ".join(f"{report.variables[i]}={values[i]}" for i in others)
         lines.setdefault(label or "all", []).append(cell)
     return lines
 
@@ -188,7 +181,6 @@ class Comparison:
     measure: str
     medians: tuple[float, float]  # of A and of B, over the pairs
     quartiles: tuple[float, float, float]  # of A - B over the pairs
-    means: tuple[float, float]  # of A and of B
     difference: float  # mean of A - B over the pairs
     interval: tuple[float, float]  # of that mean, 95 %, by Student's t
     wilcoxon: float  # two-sided p-value of the signed-rank test
@@ -223,15 +215,11 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         DataError: The groups have no two seeds in common.
     """
     groups = [_runs_of(report, key, text) for key, text in (("A", a), ("B", b))]
-    if len({run.unit for group in groups for runs in group.values() for run in runs.values()}) > 1:
+    if len({*pd.concat(groups).unit}) > 1:
         raise SettingError("compare", "errors in m and in rad have no common mean; add subsystem=... to both groups")
     comparisons = []
-    for measure in (name for name in report.measures() if not MEASURES[name].wall_time):
-        numbers = (
-            {others: {seed: run.numbers[measure] for seed, run in runs.items()} for others, runs in group.items()}
-            for group in groups
-        )
-        first, second = (pd.DataFrame.from_dict(each, orient="index", dtype=float) for each in numbers)
+    for measure in (name for name in report.measures if name not in _WALL_TIMES):
+        first, second = (group.pivot(index="others", columns="seed", values=measure) for group in groups)
         first, second = first.align(second)  # a row a combination of the other settings, a column a seed
         left_out, both = [], first.notna() & second.notna()
         while both.size and not both.to_numpy().all():  # what lacks the largest share of its runs is left out
@@ -241,32 +229,32 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
             both = both.drop(left_out[-1], axis=axis)
         a_mean, b_mean = (side.loc[both.index, both.columns].mean(axis=0).to_numpy() for side in (first, second))
         if len(a_mean) >= 2:
-            seeds = sorted((n for n in left_out if n.startswith(f"{SEED}=")), key=lambda name: in_order(name[5:]))
-            comparisons.append(_test(measure, a_mean, b_mean, (*(n for n in left_out if n not in seeds), *seeds)))
+            left_out.sort(key=lambda name: (name.startswith(f"{SEED}="), in_order(name.removeprefix(f"{SEED}="))))
+            comparisons.append(_test(measure, a_mean, b_mean, tuple(left_out)))
     if not comparisons:
         raise DataError(f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common")
     return comparisons
 
 
-def _runs_of(report: Report, key: str, text: str) -> dict[str, Mapping]:
-    """Returns the runs of a group by its other settings, and in each by seed."""
+def _runs_of(report: Report, key: str, text: str) -> pd.DataFrame:
+    """Returns the finished runs of a group, with ``others``, what else was varied, and seeds as they are chosen."""
     group = {}
     for choice in text.split(","):
         name, _, value = choice.partition("=")
         if name not in report.variables:
             varied = ", ".join(report.variables) or "nothing"
             raise SettingError(f"compare {key}", f"must choose among what was varied, {varied}; got {choice!r}")
-        values = dict.fromkeys(cell.values[report.variables.index(name)] for cell in report.cells)
-        if value not in values:
-            raise SettingError(f"compare {key}", f"{name} was varied over {', '.join(values)}; got {value!r}")
+        known = dict.fromkeys(values[report.variables.index(name)] for values in report.cells)
+        if value not in known:
+            raise SettingError(f"compare {key}", f"{name} was varied over {', '.join(known)}; got {value!r}")
         group[name] = value
-    found: dict[str, Mapping] = {}
-    for cell in report.cells:
-        chosen = dict(zip(report.variables, cell.values, strict=True))
+    others = {}
+    for cell, values in enumerate(report.cells):
+        chosen = dict(zip(report.variables, values, strict=True))
         if group.items() <= chosen.items():
-            others = ", ".join(f"{name}={value}" for name, value in chosen.items() if name not in group)
-            found[others] = {f"{SEED}={seed}": run for seed, run in cell.runs.items()}
-    return found
+            others[cell] = ", ".join(f"{name}={value}" for name, value in chosen.items() if name not in group)
+    runs = report.runs[(report.runs.state == "finished") & report.runs.cell.isin(others)]
+    return runs.assign(others=runs.cell.map(others), seed=f"{SEED}=" + runs.seed)
 
 
 def _test(measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...]) -> Comparison:
@@ -282,7 +270,6 @@ def _test(measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...])
         measure=measure,
         medians=(float(np.median(a)), float(np.median(b))),
         quartiles=tuple(np.quantile(d, [0.25, 0.5, 0.75])),
-        means=(a.mean(), b.mean()),
         difference=mean,
         interval=interval,
         wilcoxon=wilcoxon,
@@ -303,7 +290,7 @@ def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str)
     lines = [head]
     for c in comparisons:
         low, median, high = c.quartiles
-        line = f"{report.label(c.measure)}: {c.verdict}. Medians {c.medians[0]:.4g} and {c.medians[1]:.4g}; "
+        line = f"{report.measures[c.measure]}: {c.verdict}. Medians {c.medians[0]:.4g} and {c.medians[1]:.4g}; "
         line += f"differences {median:.3g} [{low:.3g}, {high:.3g}]"
         if c.interval[0] != c.interval[1]:
             line += f"; Wilcoxon signed-rank p = {c.wilcoxon:.3g}, rank-biserial {c.rank_biserial:.2f}; mean "

@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 
 import gpmpc
 from gpmpc._compiling import report_compilation
-from gpmpc.exceptions import DataError, GpmpcError, check_number
+from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.gp import Training, Transitions
 from gpmpc.models import DynamicsModel, load_model, save_model
 from gpmpc.parallel import in_processes
@@ -38,7 +38,6 @@ class Trial:
     condition: Any  #: what ``run_trial`` needs of it; it can be pickled
     seed: int  #: of all random numbers
     fingerprint: str  #: names everything that the numbers of the record depend on
-    work: float = 0.0  #: trials of more work are started earlier, so that the last ones to run are short
 
 
 class Study(Protocol):
@@ -112,15 +111,14 @@ def run_study(
     Raises:
         GpmpcError: A worker process died.
     """
-    missing = {trial.fingerprint: trial for trial in trials if trial.fingerprint not in store.records}
+    missing = list({trial.fingerprint: trial for trial in trials if trial.fingerprint not in store.records}.values())
     for trial in trials:
-        if trial.fingerprint not in missing:
+        if trial.fingerprint in store.records:
             progress(store.records[trial.fingerprint])
-    order = sorted(missing.values(), key=lambda trial: -trial.work)
     try:
-        with closing(in_processes(partial(_record, run_trial), order, workers)) as finished:
+        with closing(in_processes(partial(_record, run_trial), missing, workers)) as finished:
             for index, record in finished:
-                store.append(order[index].fingerprint, record)
+                store.append(missing[index].fingerprint, record)
                 progress(record)
     except BrokenProcessPool as error:
         raise GpmpcError("a worker process died (out of memory?); the same command goes on where it stopped") from error
@@ -138,10 +136,16 @@ def _record(run_trial: Callable[[Trial], dict[str, Any]], trial: Trial) -> dict[
         return record | {"error": str(error)}
 
 
-def check_workers(workers: Any) -> None:
-    """Raises a ``SettingError`` unless ``workers`` is None or a positive number of processes."""
-    if workers is not None:
-        check_number("workers", workers, least=1, whole=True)
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keeps numerical libraries to one thread, so that sums have one order whatever the machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def derived_seed(*parts: int) -> int:
@@ -149,8 +153,19 @@ def derived_seed(*parts: int) -> int:
     return int(np.random.SeedSequence(parts).generate_state(1)[0])
 
 
+def random_rows(count: int, size: int, seed: int, key: str = "size") -> list[int]:
+    """Returns ``size`` of ``count`` rows, drawn at random and sorted; those of one seed are nested over sizes.
+
+    Raises:
+        SettingError: There are fewer rows than the setting ``key`` asks for.
+    """
+    if size > count:
+        raise SettingError(key, f"must be at most {count}, the rows of the data; got {size}")
+    return np.sort(np.random.default_rng(seed).permutation(count)[:size]).tolist()
+
+
 def fingerprint(settings: Any, *arrays: Any, code: Sequence[str] = ()) -> str:
-    """Returns a text that differs where settings, arrays or code differ.
+    """Returns a text that differs where settings, arrays or code differ: a record of other code is not reused.
 
     Args:
         settings: Plain data.
@@ -166,21 +181,9 @@ def fingerprint(settings: Any, *arrays: Any, code: Sequence[str] = ()) -> str:
 
 @cache
 def _source(pattern: str) -> bytes:
-    """Returns the source files of a pattern: a record of other code does not pass for finished."""
-    own = Path(pattern).is_absolute()
-    found = [Path(pattern)] if own else sorted(Path(gpmpc.__file__).parent.glob(pattern))
+    path = Path(pattern)
+    found = [path] if path.is_absolute() else sorted(Path(gpmpc.__file__).parent.glob(pattern))
     return b"".join(path.read_bytes() for path in found)
-
-
-def random_rows(count: int, size: int, seed: int) -> list[int]:
-    """Returns ``size`` of ``count`` rows, drawn at random and sorted; those of one seed are nested over sizes.
-
-    Raises:
-        DataError: There are fewer rows.
-    """
-    if size > count:
-        raise DataError(f"size: must be at most {count}, the transitions at hand; got {size}")
-    return np.sort(np.random.default_rng(seed).permutation(count)[:size]).tolist()
 
 
 def trained_model(train: Callable[..., Training], settings: Any, data: Transitions, seed: int, folder: Path) -> Path:
@@ -191,18 +194,6 @@ def trained_model(train: Callable[..., Training], settings: Any, data: Transitio
         with one_thread():
             save_model(train(data, seed=seed).posterior, path)
     return path
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Keeps numerical libraries to one thread, so that sums have one order whatever the machine."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1):
-            yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @lru_cache(maxsize=8)

@@ -54,30 +54,25 @@ class Search:
         except ImportError as error:
             raise GpmpcError("tune: needs Optuna: pip install 'gpmpc[tune]'") from error
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self._optuna, self._seed = optuna, seed
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)  # of this sampler and the importances
+        self._optuna, self._seed, kinds = optuna, seed, optuna.distributions
         self._study = optuna.create_study(direction="minimize")
-        self._space = {key: self._distribution(values) for key, values in space.items()}
+        self._space: dict[str, Any] = {}
+        for key, values in space.items():
+            if isinstance(values, Interval):
+                kind = kinds.IntDistribution if values.whole else kinds.FloatDistribution
+                self._space[key] = kind(values.low, values.high, log=values.logarithmic)
+            else:
+                self._space[key] = kinds.CategoricalDistribution([*values])
         self._asked: list[Any] = []
         self.candidates: list[dict[str, Any]] = []
         self.costs: list[float] = []
 
-    def _distribution(self, values: Interval | Sequence[str]) -> Any:
-        kinds = self._optuna.distributions
-        if not isinstance(values, Interval):
-            return kinds.CategoricalDistribution([*values])
-        if values.whole:
-            return kinds.IntDistribution(int(values.low), int(values.high), log=values.logarithmic)
-        return kinds.FloatDistribution(values.low, values.high, log=values.logarithmic)
-
     def ask(self, count: int) -> list[dict[str, Any]]:
         """Returns the next candidates, values by setting."""
-        for number_ in range(len(self.candidates), len(self.candidates) + count):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", self._optuna.exceptions.ExperimentalWarning)
-                sampler = self._optuna.samplers.TPESampler(
-                    seed=derived_seed(self._seed, number_), multivariate=True, constant_liar=True
-                )
-            self._study.sampler = sampler
+        for _ in range(count):
+            seed = derived_seed(self._seed, len(self.candidates))
+            self._study.sampler = self._optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
             self._asked.append(self._study.ask(self._space))
             self.candidates.append(dict(self._asked[-1].params))
         return self.candidates[-count:]
@@ -92,16 +87,14 @@ class Search:
     @property
     def best(self) -> int:
         """Number of the best candidate; the first of several."""
-        return min(range(len(self.costs)), key=self.costs.__getitem__)
+        return self.costs.index(min(self.costs))
 
     def importances(self) -> dict[str, float]:
         """Returns by setting how much it matters, the most first; nothing where too few candidates say so."""
         finite = [cost for cost in self.costs if math.isfinite(cost)]
         if len(finite) < _FEWEST or len(self._space) < 2 or min(finite) == max(finite):
             return {}
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", self._optuna.exceptions.ExperimentalWarning)
-            evaluator = self._optuna.importance.PedAnovaImportanceEvaluator()
+        evaluator = self._optuna.importance.PedAnovaImportanceEvaluator()
         return self._optuna.importance.get_param_importances(self._study, evaluator=evaluator)
 
     def document(self, base: float | None, command: str) -> Document:
@@ -111,20 +104,20 @@ class Search:
             base: Cost of the settings as they are without the search; None where that flight was lost.
             command: That flies the best candidate.
         """
-        order = sorted(range(len(self.costs)), key=lambda i: (self.costs[i], i))
         keys, matter = [*self._space], self.importances()
-        rows = [[str(i), _shown(self.costs[i]), *(_text(self.candidates[i][k]) for k in keys)] for i in order[:_SHOWN]]
+        data = [{"candidate": i, "cost": cost, **self.candidates[i]} for i, cost in enumerate(self.costs)]
+        best = sorted(data, key=lambda row: row["cost"])[:_SHOWN]
+        rows = [[str(row["candidate"]), _shown(row["cost"]), *(_text(row[key]) for key in keys)] for row in best]
         tables = [Table(["candidate", "cost", *keys], rows, "Best candidates")]
         if matter:
             share = [[key, f"{100 * value:.0f} %"] for key, value in matter.items()]
             tables.append(Table(["setting", "importance"], share, "What mattered"))
-        data = [{"candidate": i, "cost": self.costs[i], **self.candidates[i]} for i in range(len(self.costs))]
         labels = {figure_label(key): value for key, value in matter.items()}
         return Document(
             "Tuning",
             tables,
             pd.DataFrame(data, dtype=object),
-            lead=f"{len(self.costs)} candidates; cost of the best {_shown(self.costs[self.best])}, "
+            lead=f"{len(self.costs)} candidates; cost of the best {_shown(min(self.costs))}, "
             f"of the settings as they are {MISSING if base is None else number(base)}.",
             notes=[_LEGEND],
             code={"To fly the best one": [command]},

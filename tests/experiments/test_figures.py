@@ -100,7 +100,7 @@ def test_a_run_goes_on_where_it_stopped(finished):
             "subsystems: must be among translational, rotational; got 'rolling'",
         ),
         (["+rows.convex.settings.foo=1"], "settings.foo: controller convex takes no such setting"),
-        (["samples=15", "steps=3", "+rows.ours_convex.size=16"], "size: must be at most 15, the transitions at hand"),
+        (["samples=15", "steps=3", "+rows.ours_convex.size=16"], "size: must be at most 15, the rows of the data"),
     ],
 )
 def test_a_mistake_is_answered_in_one_line_before_anything_is_trained(tmp_path, arguments, message):

@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 
 from gpmpc.cli._run import experiment_of
 from gpmpc.exceptions import SettingError
-from gpmpc.experiments.quality import FAMILIES, TRUTH, Family, Quality, pareto_front
+from gpmpc.experiments.quality import FAMILIES, TRUTH, Family, Quality, front_figure, pareto_front
 from gpmpc.metrics import tracking_cost
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.plotting import quality
 from gpmpc.propagation import Linearization
 from gpmpc.studies.study import TrialStore, run_study
 from gpmpc.trajectories import Elliptical
@@ -143,7 +142,7 @@ def test_a_setting_out_of_its_range_is_refused(settings, message):
 
 
 def test_the_figure_names_the_members_of_the_front_and_counts_the_lost(rows):
-    figure = quality(list(rows.values()))
+    figure = front_figure(list(rows.values()))
     named = {text.get_text()[3:] for legend in figure.legends for text in legend.get_texts()}
     for row in rows.values():
         assert (f"{row['what']} horizon={row['H']}" in named) == row["front"]

@@ -25,6 +25,14 @@ from tests.studies.made_up import SETTINGS, add, chosen, documents, made_up_run,
 CONF = Path(__file__).resolve().parents[2] / "conf"
 
 
+def seeds(cell, state):
+    return [*cell.seed[cell.state == state]]
+
+
+def cells(found):
+    return [cell for _, cell in found.runs.groupby("cell")]
+
+
 @pytest.fixture
 def tree(tmp_path):
     """Two controllers, eight seeds, of which one failed and one is missing."""
@@ -42,12 +50,12 @@ def tree(tmp_path):
 def test_cells_are_made_of_what_was_varied_and_seeds_fill_them(tree):
     found = report(tree)
     assert found.variables == ("controller",)
-    convex, lqr = found.cells
-    assert (convex.values, lqr.values) == (("convex",), ("lqr",))
-    assert list(convex.runs) == [str(seed) for seed in range(8)]
-    assert (list(lqr.failed), lqr.missing) == (["6"], ("7",))
-    assert np.mean(convex.numbers("failed")) == pytest.approx(2.5)
-    assert np.allclose(np.array(lqr.numbers("rmse")) / convex.numbers("rmse")[:6], 1.2)
+    assert found.cells == (("convex",), ("lqr",))
+    convex, lqr = cells(found)
+    assert seeds(convex, "finished") == [*convex.seed] == [str(seed) for seed in range(8)]
+    assert (seeds(lqr, "failed"), seeds(lqr, "missing")) == (["6"], ["7"])
+    assert convex["failed"].mean() == pytest.approx(2.5)
+    assert np.allclose(np.array(lqr.rmse[:6]) / convex.rmse[:6], 1.2)
 
 
 def test_the_gaps_come_with_the_command_that_fills_them(tree):
@@ -60,7 +68,7 @@ def test_without_a_sweep_nothing_is_missing(tmp_path):
         settings = SETTINGS | {"seed": seed, "horizon": horizon, "options": {"controller": controller}}
         made_up_run(tmp_path, choices, settings, result=metrics_of(0.1))
     found = report(tmp_path)
-    assert [(len(cell.runs), cell.missing) for cell in found.cells] == [(1, ())] * 4
+    assert [[*cell.state] for cell in cells(found)] == [["finished"]] * 4
     assert found.commands() == []
 
 
@@ -71,8 +79,12 @@ def test_single_runs_beside_a_sweep_add_nothing_to_what_it_asked_for(tmp_path):
     plan(tmp_path, [chosen(controller, seed)[0] for controller in ("lqr", "nmpc") for seed in range(4)])
     found = report(tmp_path)
     assert found.variables == ("controller", "horizon")
-    gaps = {cell.values: cell.missing for cell in found.cells if cell.missing}
-    assert gaps == {("lqr", "10"): ("3",), ("nmpc", "10"): ("0", "1", "2", "3")}
+    gaps = {
+        values: missing
+        for values, cell in zip(found.cells, cells(found), strict=True)
+        if (missing := seeds(cell, "missing"))
+    }
+    assert gaps == {("lqr", "10"): ["3"], ("nmpc", "10"): ["0", "1", "2", "3"]}
 
 
 def test_a_run_that_did_not_choose_counts_with_the_setting_that_it_had(tmp_path):
@@ -80,16 +92,17 @@ def test_a_run_that_did_not_choose_counts_with_the_setting_that_it_had(tmp_path)
     made_up_run(tmp_path, ["horizon=5", "seed=1"], SETTINGS | {"seed": 1, "horizon": 5}, result=metrics_of(0.1))
     found = report(tmp_path)
     assert found.variables == ("horizon",)
-    assert [cell.values for cell in found.cells] == [("5",), ("10",)]  # numbers by their size
+    assert found.cells == (("5",), ("10",))  # numbers by their size
 
 
 def test_every_document_holds_the_same_numbers_and_the_page_stands_alone(tree):
     found = report(tree)
     written = documents(found)
     rows = list(csv.DictReader(io.StringIO(written["report.csv"])))
-    expected = np.median(found.cells[0].numbers("rmse"))
+    errors = cells(found)[0].rmse
+    expected = np.median(errors)
     assert float(rows[0]["rmse_median [m]"]) == expected
-    assert float(rows[0]["rmse_q25 [m]"]) == np.quantile(found.cells[0].numbers("rmse"), 0.25)
+    assert float(rows[0]["rmse_q25 [m]"]) == np.quantile(errors, 0.25)
     assert (rows[1]["failed"], rows[1]["missing"]) == ("1", "1")
     for name, seeds in (("report.md", "6, 1 failed, 1 missing"), ("report.html", "6<small>1 failed</small>")):
         for text in (f"{expected:.3g}", "no start led anywhere", seeds, "gpmpc run -m"):
@@ -110,7 +123,7 @@ def test_a_run_that_cannot_be_read_is_named_and_the_others_are_reported(tree):
     broken = tree / folder_name(chosen("lqr", 0)[0]) / METRICS
     broken.write_text('{"choices": ')
     found = report(tree)
-    assert [len(cell.runs) for cell in found.cells] == [7, 5]
+    assert [len(seeds(cell, "finished")) for cell in cells(found)] == [7, 5]
     assert len(found.skipped) == 2
     for path, reason in ((old, "it lacks 'unit'"), (broken, "JSONDecodeError")):
         assert any(line.startswith(f"{path}: is not what a run writes") and reason in line for line in found.skipped)
@@ -128,9 +141,9 @@ def test_a_run_that_cannot_be_read_is_not_missing_and_no_command_flies_over_it(t
     plan(tmp_path, [chosen(controller, seed)[0] for controller in ("convex", "lqr") for seed in range(4)])
     (tmp_path / folder_name(chosen("lqr", 1)[0]) / METRICS).write_text('{"choices": ')
     found = report(tmp_path)
-    convex, lqr = found.cells
-    assert (convex.skipped, convex.missing) == ((), ())
-    assert (list(lqr.runs), lqr.skipped, lqr.missing) == (["0", "2"], ("1",), ("3",))
+    convex, lqr = cells(found)
+    assert {*convex.state} == {"finished"}
+    assert [seeds(lqr, state) for state in ("finished", "skipped", "missing")] == [["0", "2"], ["1"], ["3"]]
     assert found.commands() == [f"gpmpc run -m controller=lqr seed=3 folder={tmp_path}"]
     written = documents(found)
     assert "6 finished in 2 cells, 0 failed, 1 missing, 1 skipped" in written["report.md"]
@@ -146,8 +159,8 @@ def test_a_folder_that_belongs_to_no_cell_fills_none(tmp_path):
     for name in ("elsewhere", "controller=convex,horizon=3,seed=0"):
         (tmp_path / name).mkdir()
         (tmp_path / name / METRICS).write_text("")
-    convex, _ = report(tmp_path).cells
-    assert (convex.missing, convex.skipped) == (("0",), ())
+    convex, _ = cells(report(tmp_path))
+    assert (seeds(convex, "missing"), seeds(convex, "skipped")) == (["0"], [])
 
 
 def test_a_line_of_the_latex_table_never_begins_with_a_bracket(tmp_path):
@@ -189,7 +202,7 @@ def test_every_seed_is_an_average_over_the_same_and_what_is_left_out_is_named(tm
     rmse = compare(found, "controller=lqr", "controller=convex")[0]
     assert rmse.left_out == ("horizon=10", "seed=7")
     assert rmse.pairs == 7
-    assert rmse.means == pytest.approx((0.31, 0.3))  # of the horizons 1 and 5 for every seed
+    assert rmse.medians == pytest.approx((0.31, 0.3))  # of the horizons 1 and 5 for every seed
     assert "lacks runs of it: horizon=10; seed=7." in sentences(found, [rmse], "a", "b")[0]
     assert compare(found, "horizon=1", "horizon=5")[0].left_out == ("seed=7",)
     alone = compare(found, "controller=convex,horizon=1", "controller=convex,horizon=5")[0]
@@ -267,7 +280,7 @@ def test_a_thousand_runs_are_put_together_quickly_and_in_little_memory(tmp_path)
     documents(found)
     seconds, (_, peak) = time.process_time() - start, tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert sum(len(cell.runs) for cell in found.cells) == 1000
+    assert sum(len(seeds(cell, "finished")) for cell in cells(found)) == 1000
     assert len(found.cells) == 20
     assert seconds < 20
     assert peak < 1e9
@@ -279,7 +292,7 @@ def test_a_page_says_what_made_the_runs_and_links_them(tree):
     found = report(tree)
     html = documents(found)["report.html"]
     links = re.findall(r'href="([^"]*)"', html)
-    assert len(links) == len(found.runs) == 16
+    assert len(links) == len(found.there) == 16
     assert all((tree / "report" / unquote(link)).resolve().is_dir() for link in links)
     made = provenance()
     for text in (made["created"][:10], made["machine"]["processor"], "Settings of all runs", "data.size: null"):

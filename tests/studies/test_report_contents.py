@@ -5,6 +5,7 @@ import io
 import json
 import re
 from itertools import product
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -20,9 +21,18 @@ from tests.studies.made_up import SETTINGS, add, chosen, documents, made_up_run,
 RESULT = ("rmse", "steps", "failures", "violations", "times", "unit")  # what a failed run need not have
 
 
+def states(found, state):
+    return (found.runs.state == state).sum()
+
+
+def undrawn(found, *comparison):
+    with patch.object(reporting, "_figures", return_value={}):
+        return report_document(found, *comparison)
+
+
 def written_of(found):
     """Markdown, HTML, CSV and LaTeX without the figures, which take their time."""
-    document = report_document(found, images={})
+    document = undrawn(found)
     return {"md": document.markdown(), "html": document.html(), "csv": document.csv(), "tex": document.tex()}
 
 
@@ -83,7 +93,7 @@ def test_one_damaged_run_is_skipped_with_its_reason_and_takes_no_other_with_it(d
     reads_it = name == ERROR and set(DAMAGE.get(damage, ())) & {*RESULT}
     assert len(found.skipped) == (0 if reads_it else 1)
     assert all(line.startswith(f"{folder / name}: is not what a run writes: ") for line in found.skipped)
-    assert sum(len(cell.runs) for cell in found.cells) == 2
+    assert states(found, "finished") == 2
     for text in (*written_of(found).values(), shown(found)):
         assert "0.1" in text
 
@@ -156,8 +166,8 @@ def test_a_flight_that_was_lost_is_called_so(tmp_path):
             result["rmse"] = dict.fromkeys(result["rmse"])
         made_up_run(tmp_path, *chosen("lqr", seed), result=result)
     found = report(tmp_path)
-    assert [len(cell.lost) for cell in found.cells] == [0, 2]
-    assert [len(cell.numbers("rmse")) for cell in found.cells] == [6, 5]
+    assert [(cell.lost != "").sum() for _, cell in found.runs.groupby("cell")] == [0, 2]
+    assert [*found.runs.groupby("cell").rmse.count()] == [6, 5]
     written = written_of(found)
     for text in (written["md"], written["html"]):
         for words in ("of those finished, 2 lost", "2 lost", "step 13, reason 14600 m away"):
@@ -191,7 +201,7 @@ def test_wall_times_are_not_compared(tmp_path):
         content["times"]["training"] = content["times"]["total"]["median"] = 1.0 + ("lqr" in path.parent.name)
         path.write_text(json.dumps(content))
     found = report(tree)
-    assert {"decision", "training"} <= set(found.measures())
+    assert {"decision", "training"} <= set(found.measures)
     compared = compare(found, "controller=lqr", "controller=convex")
     assert not {"decision", "training"} & {each.measure for each in compared}
     assert "Times are not compared" in sentences(found, compared, "a", "b")[0]
@@ -209,7 +219,7 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
     damaged.write_text("{")
     plan(tree, [chosen(controller, seed, horizon=10)[0] for controller in ("convex", "lqr") for seed in range(4)])
     found = report(tree)
-    document = report_document(found, ["a line"], images={})
+    document = undrawn(found, ["a line"])
     head, made, tail = re.split(r"## Made\n\n(.*?)(?=## To)", document.markdown(), flags=re.DOTALL)
     assert head == (
         "# tree\n\n4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost."
@@ -230,7 +240,7 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
         f"gpmpc run -m horizon=10 controller=lqr seed=1,3 folder={tree}\n```\n\n"
         "## Settings of all runs\n\n```\ndata.size: null\nhorizon: 10\n```\n"
     )
-    origins = [run.origin for run in found.runs]
+    origins = [run.origin for run in found.there]
     dates = sorted({origin["date"] for origin in origins})
     lines = [line.removeprefix("- ") for line in made.splitlines()]
     assert lines[0] == "Runs made: " + " to ".join(dict.fromkeys([dates[0], dates[-1]]))
@@ -267,7 +277,7 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
 )
 def test_where_a_run_comes_from_is_told_as_far_as_it_says_so(provenance, origin, tmp_path):
     made_up_run(tmp_path, *chosen("lqr", 0), result=metrics_of(0.1) | {"provenance": provenance})
-    (run,) = report(tmp_path).runs
+    (run,) = report(tmp_path).there
     assert run.origin == origin
 
 
@@ -332,7 +342,7 @@ def test_a_comparison_is_told_with_every_number(tmp_path):
     compared = compare(found, "controller=lqr", "controller=convex")
     rmse, outside, failed = compared
     assert [each.measure for each in compared] == ["rmse", "outside", "failed"]
-    assert (rmse.medians, rmse.quartiles, rmse.means) == ((6.0, 4.0), (0.75, 2.0, 3.5), (43 / 7, 29 / 7))
+    assert (rmse.medians, rmse.quartiles, rmse.difference) == ((6.0, 4.0), (0.75, 2.0, 3.5), 2)
     assert rmse.rank_biserial == pytest.approx((28 - 2 * 3) / 28)  # -1.5 has the third rank of 1 to 7
     assert (outside.difference, outside.standardised, outside.rank_biserial, outside.interval) == (0, 0, 0, (0, 0))
     assert (failed.difference, failed.interval, failed.standardised) == (-10, (-10, -10), -np.inf)
