@@ -20,7 +20,7 @@ from mcap.writer import CompressionType, Writer
 from gpmpc._files import whole_file
 from gpmpc.exceptions import GpmpcError, RecordingError, SettingError
 from gpmpc.recording import _messages
-from gpmpc.recording._messages import PLAN, QP, QP_ARRAYS, STEP, TIMING, TOPICS
+from gpmpc.recording._messages import FIELDS, PLAN, QP, QP_ARRAYS, RESIDUALS, STEP, TIMING, TOPICS
 from gpmpc.recording._records import CONFIG, RECOVERED, room, whole_records
 from gpmpc.status import Status
 
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 _STATUSES = tuple(Status)
-_GROUPS = {"references": "reference", "states": "state", "measured": "measured", "innovations": "innovation"}
-_GROUPS |= {"inputs": "input", "timings": "timing"}  # of ``Run``, and of a step's message
-_COLUMNS = {"times": ("time", float), "steps": ("k", int), "iterations": ("iterations", int)}
-_COLUMNS |= {"active_set_sizes": ("active_set_size", int), "gp_sizes": ("gp_size", int)}
-_COLUMNS |= {"gp_versions": ("gp_version", int), "failed": ("failed", bool), "novelties": ("novelty", float)}
+#: of ``Run``, by the field of a step's message
+_ATTRIBUTES = {"time": "times", "k": "steps", "reference": "references", "state": "states", "measured": "measured"}
+_ATTRIBUTES |= {"input": "inputs", "innovation": "innovations", "iterations": "iterations", "timing": "timings"}
+_ATTRIBUTES |= {"active_set_size": "active_set_sizes", "gp_size": "gp_sizes", "gp_version": "gp_versions"}
+_ATTRIBUTES |= {"failed": "failed", "novelty": "novelties"}
 
 
 class RecordedProblem(NamedTuple):
@@ -102,25 +102,18 @@ class Run:
         """The run as a table: a column (K,) per scalar field of ``gpmpc.Step``, in its order."""
         with np.errstate(invalid="ignore"):  # NaN says it
             std = np.sqrt(np.diagonal(self.belief_covariances, axis1=1, axis2=2))
-
-        def each(group: str, names: Sequence[str], values: Array) -> dict[str, Array]:
-            return {f"{group}.{name}": column for name, column in zip(names, values.T, strict=True)}
-
-        return (
-            {"time": self.times, "k": self.steps}
-            | each("reference", self.state_names, self.references)
-            | each("state", self.state_names, self.states)
-            | each("measured", self.state_names, self.measured)
-            | each("input", self.input_names, self.inputs)
-            | each("innovation", self.state_names, self.innovations)
-            | each("belief_std", self.state_names, std)
-            | {"status": np.array([status.name for status in self.statuses], dtype=object)}
-            | {"iterations": self.iterations, "active_set_size": self.active_set_sizes}
-            | each("timing", TIMING, self.timings)
-            | each("residuals", ("primal", "dual", "gap"), self.residuals.reshape(-1, 3))
-            | {"gp_size": self.gp_sizes, "gp_version": self.gp_versions}
-            | {"failed": self.failed, "novelty": self.novelties}
-        )
+        values: dict[str, Array] = {field: getattr(self, name) for field, name in _ATTRIBUTES.items()}
+        values |= {"belief_std": std, "residuals": self.residuals.reshape(-1, 3)}
+        values["status"] = np.array([status.name for status in self.statuses], dtype=object)
+        names = {"State": self.state_names, "Input": self.input_names, "Timing": TIMING, "": RESIDUALS}
+        found = {}
+        for field, kind in FIELDS["Step"].items():
+            if field in values and kind in names:
+                columns = zip(names[kind], values[field].T, strict=True)
+                found |= {f"{field}.{name}": column for name, column in columns}
+            elif field in values:
+                found[field] = values[field]
+        return found
 
     def to_pandas(self) -> "pandas.DataFrame":
         """Returns ``columns`` as a data frame, units in its ``attrs``."""
@@ -173,19 +166,12 @@ def read_run(path: str | Path) -> Run:
     schemas: dict[int, str] = {}
     channels: dict[int, Channel] = {}
     counts: Counter[int] = Counter()
-    messages: dict[str, list[Any]] = {STEP: [], PLAN: [], QP: []}
-    described: Any = None
+    found: dict[str, list[Message]] = {STEP: [], PLAN: [], QP: []}
     config, finished = "", False
     for record in whole_records(path):
         if isinstance(record, Message):
             counts[record.channel_id] += 1
-            topic = channels[record.channel_id].topic
-            if topic in messages:  # parsed at once, so that one that is damaged ends it before more are in memory
-                if described is None:  # another tool may have moved the metadata behind the messages
-                    everything = whole_records(path) if "run" not in metadata else ()
-                    behind = {more.name: more.metadata for more in everything if isinstance(more, Metadata)}
-                    described = _describe(path, metadata | behind)
-                messages[topic].append(_decode(path, topic, described[2], len(described[0]), record))
+            found.get(channels[record.channel_id].topic, []).append(record)
         elif isinstance(record, Schema):
             schemas[record.id] = record.name
         elif isinstance(record, Channel):
@@ -195,8 +181,15 @@ def read_run(path: str | Path) -> Run:
         elif isinstance(record, Attachment) and record.name == CONFIG:
             config = record.data.decode(errors="replace")
         finished = isinstance(record, Footer)
-    states, inputs, _ = described or _describe(path, metadata)
-    steps = messages[STEP]
+    about = metadata.get("run", {})
+    if not {"state_names", "input_names"} <= about.keys():
+        raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
+    try:
+        states, inputs = (_messages.check_names(key, about[key].split()) for key in ("state_names", "input_names"))
+        classes = _messages.message_classes(_messages.descriptor(states, inputs, "bytes"))
+    except SettingError as error:
+        raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
+    steps, plans, problems = (_decoded(path, topic, classes, len(states), found[topic]) for topic in found)
     return Run(
         path=path,
         finished=finished and RECOVERED not in metadata,
@@ -204,43 +197,34 @@ def read_run(path: str | Path) -> Run:
         input_names=inputs,
         statuses=tuple(_STATUSES[step.status] for step in steps),
         **_steps(steps, states, inputs),
-        **_plans(path, messages[PLAN], steps, states, inputs),
+        **_plans(path, plans, steps, states, inputs),
         channels={channel.topic: (counts[i], schemas.get(channel.schema_id, "")) for i, channel in channels.items()},
         metadata=metadata,
         config=config,
-        problems=dict(messages[QP]),
+        problems=dict(problems),
     )
 
 
-def _describe(path: Path, metadata: dict[str, dict[str, str]]) -> tuple[tuple[str, ...], tuple[str, ...], dict]:
-    """Finds the names of states and inputs, and builds the classes of the messages."""
-    about = metadata.get("run", {})
-    if not {"state_names", "input_names"} <= about.keys():
-        raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
-    try:
-        states, inputs = (_messages.check_names(key, about[key].split()) for key in ("state_names", "input_names"))
-        return states, inputs, _messages.message_classes(_messages.descriptor(states, inputs, "bytes"))
-    except SettingError as error:
-        raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
-
-
-def _decode(path: Path, topic: str, classes: dict[str, Any], n: int, record: Message) -> Any:
-    """Parses a message; of a quadratic program it returns its step's number k and itself."""
-    try:
-        message = classes[TOPICS[topic]].FromString(record.data)
-        if topic == QP:
-            return message.k, _problem(message)
-        if topic == PLAN:
-            _numbers(message, "covariances", len(message.stages), n, n)
-            if not message.stages:
-                raise ValueError("it has no stage")
-        else:
-            _numbers(message, "belief_covariance", n, n)
-            if not 0 <= message.status < len(_STATUSES):
-                raise ValueError(f"status {message.status} is unknown")
-        return message
-    except (DecodeError, ValueError) as error:
-        raise RecordingError(f"{path}: message {record.sequence} of {topic} is damaged: {error}") from error
+def _decoded(path: Path, topic: str, classes: dict[str, Any], n: int, records: list[Message]) -> list[Any]:
+    """Parses the messages of a topic; a quadratic program becomes its step's number k and itself."""
+    found: list[Any] = []
+    for record in records:
+        try:
+            message = classes[TOPICS[topic]].FromString(record.data)
+            if topic == QP:
+                message = message.k, _problem(message)
+            elif topic == PLAN:
+                _numbers(message, "covariances", len(message.stages), n, n)
+                if not message.stages:
+                    raise ValueError("it has no stage")
+            else:
+                _numbers(message, "belief_covariance", n, n)
+                if not 0 <= message.status < len(_STATUSES):
+                    raise ValueError(f"status {message.status} is unknown")
+        except (DecodeError, ValueError) as error:
+            raise RecordingError(f"{path}: message {record.sequence} of {topic} is damaged: {error}") from error
+        found.append(message)
+    return found
 
 
 def _numbers(message: Any, field: str, *shape: int) -> Array:
@@ -251,7 +235,7 @@ def _numbers(message: Any, field: str, *shape: int) -> Array:
     return np.frombuffer(data).reshape(shape)
 
 
-def _table(messages: Iterable[Any], names: tuple[str, ...]) -> Array:
+def _table(messages: Iterable[Any], names: Sequence[str]) -> Array:
     """Reads scalar fields of messages (K, names)."""
     return np.array([[getattr(message, name) for name in names] for message in messages]).reshape(-1, len(names))
 
@@ -262,11 +246,10 @@ def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dic
         bounds = _table([steps[0].input_lower, steps[0].input_upper], inputs)
     covariances = np.frombuffer(b"".join(step.belief_covariance for step in steps))
     found = {"input_bounds": bounds, "belief_covariances": covariances.reshape(-1, len(states), len(states))}
-    for name, (field, kind) in _COLUMNS.items():
-        found[name] = np.array([getattr(step, field) for step in steps], dtype=kind)
-    for name, field in _GROUPS.items():
-        names = {"input": inputs, "timing": TIMING}.get(field, states)
-        found[name] = _table((getattr(step, field) for step in steps), names)
+    names = {"State": states, "Input": inputs, "Timing": TIMING}
+    for field, name in _ATTRIBUTES.items():
+        kind, values = FIELDS["Step"][field], [getattr(step, field) for step in steps]
+        found[name] = _table(values, names[kind]) if kind in names else np.array(values, dtype=kind)
     return found
 
 
@@ -287,11 +270,11 @@ def _plans(path: Path, plans: list, steps: list, states: tuple[str, ...], inputs
     rows = {key: row for row, key in enumerate(_numbered(steps))}
     for key, plan in zip(_numbered(plans), plans, strict=True):
         if key in rows:  # else the step is lost
-            inside, of_inputs = (rows[key], slice(len(plan.stages))), (rows[key], slice(len(plan.stages) - 1))
-            arrays["plan_means"][inside] = _table((stage.mean for stage in plan.stages), states)
-            arrays["plan_stds"][inside] = _table((stage.std for stage in plan.stages), states)
-            arrays["plan_inputs"][of_inputs] = _table((stage.input for stage in plan.stages[:-1]), inputs)
-            arrays["plan_covariances"][inside] = _numbers(plan, "covariances", len(plan.stages), n, n)
+            row, H = rows[key], len(plan.stages) - 1
+            arrays["plan_means"][row, : H + 1] = _table((stage.mean for stage in plan.stages), states)
+            arrays["plan_stds"][row, : H + 1] = _table((stage.std for stage in plan.stages), states)
+            arrays["plan_inputs"][row, :H] = _table((stage.input for stage in plan.stages[:-1]), inputs)
+            arrays["plan_covariances"][row, : H + 1] = _numbers(plan, "covariances", H + 1, n, n)
     return arrays
 
 

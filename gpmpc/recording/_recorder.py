@@ -77,18 +77,13 @@ class McapRecorder:
         self._encoder = Encoder(system)
         self._waiting: list[StepCopy] = []
         self._bytes, self._steps, self._last = 0, 0, time.perf_counter()
-        self._error: str | None = None
-        self._failed = False
-        self._server: Any = None
+        self._error: str | None = None  # why no more steps are taken
+        self._failed, self._server = False, None
         self._sink = _Sink(self.path)
         self._context = context = foxglove.Context()  # its channels live as long as it does
-        options = MCAPWriteOptions(
-            profile="gpmpc",
-            chunk_size=None,  # ``_end_chunk`` ends them
-            disable_seeking=True,  # a chunk is written in one piece
-            compression_threads=0,
-            compression_level=1,
-        )
+        # ``_end_chunk`` ends chunks, and each is written in one piece.
+        options: Any = {"chunk_size": None, "disable_seeking": True, "compression_threads": 0, "compression_level": 1}
+        options = MCAPWriteOptions(profile="gpmpc", **options)
         self._writer = foxglove.open_mcap(self._sink, context=context, writer_options=options)
         described = {"run": about, "units": system.field_units, "frames": frames, "pose": dict(system.pose)}
         for name, pairs in described.items():
@@ -116,7 +111,7 @@ class McapRecorder:
         if self._error is not None:
             raise RecordingError(self._error)
         copy = StepCopy(step, gp_size, self._n, self._m, self._record_problems)
-        size = len(copy.data)
+        size = sum(array.nbytes for array in copy.arrays.values())
         if 4 * size > LARGEST:
             raise RecordingError(f"{self.path}: a step of {size} bytes is too large; at most {LARGEST // 4}")
         self._waiting.append(copy)
