@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from gpmpc.cli._commands import COMMANDS, Result
+from gpmpc.cli._command import COMMANDS, FLAGS, Result
 from gpmpc.cli._settings import group_options, setting_names, settings
 from gpmpc.exceptions import GpmpcError
 
@@ -47,11 +47,11 @@ def candidates(line: str) -> list[str]:
 
 def _after(name: str, before: Sequence[str], word: str) -> Sequence[str]:
     """Returns what may stand behind a command and the words before the last one."""
-    values = COMMANDS[name].parser(name).values
+    values = COMMANDS[name].values(name)
     if before and values.get(before[-1]) is not None:
         return values[before[-1]] or _files(word)
     if word.startswith("-"):
-        return [option for option in (*values, "--json", "--quiet", "--debug") if option.startswith("--")]
+        return [option for option in (*values, *FLAGS) if option.startswith("--")]
     if COMMANDS[name].settings:
         return _settings(COMMANDS[name].settings, before, word)
     places = [key for key in values if not key.startswith("-")]

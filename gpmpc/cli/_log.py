@@ -9,7 +9,7 @@ import pandas as pd
 from rich.console import Console
 
 from gpmpc._files import write_whole
-from gpmpc.cli._commands import Result
+from gpmpc.cli._command import Result
 from gpmpc.cli._settings import writing
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.recording import Run, layout, read_run, recover

@@ -24,7 +24,7 @@ from rich.console import Console
 
 from gpmpc._compiling import report_compilation
 from gpmpc._provenance import flattened
-from gpmpc.cli._commands import Result
+from gpmpc.cli._command import Result
 from gpmpc.cli._settings import folder_of, one_line, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
@@ -99,12 +99,19 @@ def _fly(experiment: Experiment, folder: RunFolder, config: DictConfig, about: d
     """Trains, flies and records; returns the metrics."""
     if config.recorder != "mcap":
         return metrics(experiment, run_trial(experiment))
+    system, text = experiment.system, OmegaConf.to_yaml(config, resolve=True)
+    known = {"seed": experiment.seed, "command": about["provenance"]["command"], "system": system.name}
+    known |= {"tracked": " ".join(system.tracked), "angles": " ".join(system.angles)}
     episodes = range(1, 1 + getattr(experiment.learning, "episodes", 0))
     paths = iter([folder.path / name for name in [*(f"episode_{k}.mcap" for k in episodes), RECORDING]])
     with ExitStack() as stack:
 
         def prepare(controller: Any, training: Any) -> Callable[[Any], None]:
-            recorder = stack.enter_context(_recorder(experiment, next(paths), config, about, controller, training))
+            bounds = [side[0] for side in controller.problem.inputs.by_stage(controller.horizon)]
+            noise = {"noise_std": " ".join(map(str, experiment.unplanned_noise(training).tolist()))}
+            recorded, settings = RecordedSystem.of(system, bounds), {"config": text, "live": config.live}
+            recorder = McapRecorder(next(paths), recorded, metadata=known | noise, **settings)
+            stack.enter_context(recorder)
             if recorder.address:
                 print(f"live view: open {recorder.address} in Foxglove or Lichtblick", file=sys.stderr, flush=True)
             gp_size, began = 0 if training is None else len(training.posterior), time.monotonic()
@@ -112,28 +119,12 @@ def _fly(experiment: Experiment, folder: RunFolder, config: DictConfig, about: d
             def on_step(step: Any) -> None:
                 recorder.record(step, gp_size)
                 if config.live:  # every step lasts as long as the plant's, so that a viewer can follow
-                    time.sleep(max(0.0, began + step.time + experiment.system.time_step - time.monotonic()))
+                    time.sleep(max(0.0, began + step.time + system.time_step - time.monotonic()))
 
             return on_step
 
         flown = run_trial(experiment, prepare)
     return metrics(experiment, flown)
-
-
-def _recorder(
-    experiment: Experiment, path: Path, config: DictConfig, about: dict, controller: Any, training: Any
-) -> McapRecorder:
-    flown, bounds = experiment.system, [side[0] for side in controller.problem.inputs.by_stage(controller.horizon)]
-    metadata = {
-        "seed": experiment.seed,
-        "command": about["provenance"]["command"],
-        "noise_std": " ".join(map(str, experiment.unplanned_noise(training).tolist())),
-        "system": flown.name,
-        "tracked": " ".join(flown.tracked),
-        "angles": " ".join(flown.angles),
-    }
-    text = OmegaConf.to_yaml(config, resolve=True)
-    return McapRecorder(path, RecordedSystem.of(flown, bounds), config=text, metadata=metadata, live=config.live)
 
 
 def experiment_of(config: DictConfig) -> Experiment:

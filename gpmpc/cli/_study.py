@@ -13,7 +13,7 @@ from rich.console import Console
 
 from gpmpc._compiling import report_compilation
 from gpmpc._provenance import provenance
-from gpmpc.cli._commands import Result
+from gpmpc.cli._command import Result
 from gpmpc.cli._run import experiment_of, plain_data, plain_settings
 from gpmpc.cli._settings import compose, folder_of, settings, write_files, writing
 from gpmpc.cli._terminal import logging_console, progress_bar

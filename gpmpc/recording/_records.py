@@ -1,9 +1,9 @@
 """Reads the records of an MCAP file that was cut off, damaged, or made by somebody else.
 
-MCAP's library parses each record from its own bytes alone, up to the first that does not fit into the file, a chunk whose
-checksum is wrong, or a reference to what was not declared. Metadata and attachments that are damaged are left out. A
-footer is yielded only if nothing is missing and every checksum of the file (of chunks, attachments, data and index) is
-right. Nothing is unfolded before it is known to be small.
+MCAP's library parses each record from its own bytes alone, up to the first that does not fit into the file, a chunk
+whose checksum is wrong, or a reference to what was not declared. Metadata and attachments that are damaged are left
+out. A footer is yielded only if nothing is missing and every checksum of the file (of chunks, attachments, data and
+index) is right. Nothing is unfolded before it is known to be small.
 """
 
 import struct
