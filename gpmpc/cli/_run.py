@@ -117,7 +117,7 @@ def _fly(experiment: Experiment, folder: RunFolder, config: DictConfig, about: d
             gp_size, began = 0 if training is None else len(training.posterior), time.monotonic()
 
             def on_step(step: Any) -> None:
-                recorder.record(step, gp_size)
+                recorder.record(replace(step, gp_size=step.gp_size or gp_size))
                 if config.live:  # every step lasts as long as the plant's, so that a viewer can follow
                     time.sleep(max(0.0, began + step.time + system.time_step - time.monotonic()))
 

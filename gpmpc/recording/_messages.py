@@ -35,28 +35,14 @@ POSITION, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "yaw")
 QP_ARRAYS = ("P", "q", "G", "lower", "upper", "softness", "x", "multipliers")
 
 FIELDS = {
-    "Step": {
-        "time": "double",
-        "k": "int64",
-        "reference": "State",
-        "state": "State",
-        "measured": "State",
-        "input": "Input",
-        "input_lower": "Input",
-        "input_upper": "Input",
-        "innovation": "State",
-        "belief_std": "State",
-        "belief_covariance": "repeated double",
-        "status": "Status",
-        "iterations": "int64",
-        "active_set_size": "int64",
-        "timing": "Timing",
-        "residuals": "",  # of the first edition; the reader computes them
-        "gp_size": "int64",
-        "gp_version": "int64",
-        "failed": "bool",
-        "novelty": "double",
-    },
+    "Step": {"time": "double", "k": "int64"}
+    | dict.fromkeys(("reference", "state", "measured"), "State")
+    | dict.fromkeys(("input", "input_lower", "input_upper"), "Input")
+    | dict.fromkeys(("innovation", "belief_std"), "State")
+    | {"belief_covariance": "repeated double", "status": "Status"}
+    | {"iterations": "int64", "active_set_size": "int64", "timing": "Timing"}
+    | {"residuals": ""}  # of the first edition; the reader computes them
+    | {"gp_size": "int64", "gp_version": "int64", "failed": "bool", "novelty": "double"},
     "Stage": {"time": "double", "mean": "State", "std": "State", "input": "Input"},
     "Plan": {"time": "double", "k": "int64", "stages": "repeated Stage", "covariances": "repeated double"},
     "QuadraticProgram": {"time": "double", "k": "int64", "variables": "int64", "rows": "int64"}
@@ -168,7 +154,7 @@ class StepCopy:
     ``ShapeError`` where an array does not fit n states and m inputs.
     """
 
-    def __init__(self, step: Step, gp_size: int | None, n: int, m: int, record_problem: bool):
+    def __init__(self, step: Step, n: int, m: int, record_problem: bool):
         decision = step.decision
         arrays: dict[str, Any] = {name: getattr(step, name) for name in (*_STATES, "input", "belief_covariance")}
         shapes: dict[str, tuple[int, ...]] = {
@@ -187,7 +173,7 @@ class StepCopy:
             elif record_problem and program is not None:
                 arrays |= {name: getattr(program, name) for name in QP_ARRAYS[:5]}
                 arrays["caps"] = np.full(len(program.lower), np.inf)
-        self.step, self.gp_size = step, step.gp_size or gp_size or 0
+        self.step = step
         self.arrays = {name: np.array(array, dtype=float) for name, array in arrays.items()}
         for name, shape in shapes.items():
             if self.arrays[name].shape != shape:
@@ -238,7 +224,7 @@ class Encoder:
             iterations=0 if decision is None else decision.iterations,
             active_set_size=0 if solution is None else np.count_nonzero(solution.active_set),
             timing=dict(zip(TIMING, (*times, sum(times)), strict=True)),
-            gp_size=copy.gp_size,
+            gp_size=step.gp_size,
             gp_version=step.gp_version,
             failed=step.failed,
             novelty=np.nan if decision is None else decision.novelty,

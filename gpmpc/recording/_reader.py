@@ -27,7 +27,7 @@ from gpmpc.status import Status
 if TYPE_CHECKING:
     import pandas
 
-    from gpmpc.qp import QPSolution, QPSolver
+    from gpmpc.qp import QPSolution
 
 Array = np.ndarray
 _STATUSES = tuple(Status)
@@ -124,13 +124,8 @@ class Run:
         return frame
 
 
-def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
-    """Solves the quadratic program of step k again; its minimiser is unique, so any exact solver finds the same plan.
-
-    Args:
-        run: A run recorded with its problems.
-        k: Number of the step.
-        solver: ``DualActiveSet()`` if omitted, which also takes soft rows.
+def replay(run: Run, k: int) -> "QPSolution":
+    """Solves the recorded quadratic program of step k again.
 
     Raises:
         RecordingError: The step or its problem is not in the recording, or it is no convex program.
@@ -140,17 +135,12 @@ def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
     recorded = run.problems.get(k)
     if recorded is None:
         raise RecordingError(f"{run.path}: holds no quadratic program of step {k}; it holds {len(run.problems)} others")
-    chosen = DualActiveSet() if solver is None else solver
     inverse, caps = recorded.softness[:, len(recorded.q) :]
     try:
         problem = QuadraticProgram.from_stacked(*recorded[:5])
         if inverse.any():
-            raise SettingError("solver", "takes no quadratic prices of rows")
-        if np.isinf(caps).all():
-            return chosen.solve(problem)
-        if not isinstance(chosen, DualActiveSet):
-            raise SettingError("solver", f"must be DualActiveSet for soft rows; got {type(chosen).__name__}")
-        return chosen.solve(problem, prices=caps)
+            raise RecordingError("its rows have quadratic prices, as in files of the first edition")
+        return DualActiveSet().solve(problem, prices=None if np.isinf(caps).all() else caps)
     except GpmpcError as error:
         raise RecordingError(f"{run.path}: step {k}: {error}") from error
 

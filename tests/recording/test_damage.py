@@ -23,7 +23,7 @@ BARE = 50  # what a process that reads recordings takes at least [MB]
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "run.mcap"
-    return path, runs.record_run(path, steps=20, config=20 * "seed: 7\n", start_time_ns=10**18)
+    return path, runs.record_run(path, steps=20, config=20 * "seed: 7\n")
 
 
 def check_study(path, seed, count):

@@ -115,7 +115,7 @@ def test_a_killed_run_loses_at_most_its_last_chunk(start, tmp_path):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "run.mcap"
-    runs.record_run(path, steps=20, config="seed: 7\n", start_time_ns=10**18)
+    runs.record_run(path, steps=20, config="seed: 7\n")
     return path
 
 
