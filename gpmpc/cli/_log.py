@@ -33,9 +33,10 @@ def log(given: argparse.Namespace) -> Result:
     if action == "inspect":
         return _inspect(file, output, given.mapping)
     if action == "recover":
-        found = recover(file, output)
-        note = f"{found.messages} messages over {found.seconds:g} s"
-        note += "; the recording was finished, nothing was missing" if found.finished else ""
+        run = recover(file, output)
+        seconds = np.ptp(run.times) if len(run.times) else 0.0
+        note = f"{sum(count for count, _ in run.channels.values())} messages over {seconds:g} s"
+        note += "; the recording was finished, nothing was missing" if run.finished else ""
     elif action == "layout":
         _write(output, layout(read_run(file)))
         note = f"open {file} in Foxglove or Lichtblick, then import it as a layout"

@@ -151,7 +151,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """Returns what a misspelt name stands for, as a question; of a name without dots the last parts are compared."""
     part = (lambda key: key) if "." in name else (lambda key: key.rpartition(".")[2])
     close = difflib.get_close_matches(name.lower(), {part(key).lower() for key in known}, n=1)
-    meant = [key for key in known if part(key).lower() in close]
+    meant = sorted((key for key in known if part(key).lower() in close), key=lambda key: key.count("."))
     meant = [key for key in meant if "." not in key] or meant[:3]
     return f" (did you mean {' or '.join(map(repr, meant))}?)" if meant else ""
 

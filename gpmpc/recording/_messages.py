@@ -217,7 +217,7 @@ class Encoder:
         message = self._step(
             **head,
             **{name: self._state(arrays[name]) for name in _STATES},
-            belief_std=self._state(_deviations(arrays["belief_covariance"])),
+            belief_std=self._state(deviations(arrays["belief_covariance"])),
             input=self._input(arrays["input"]),
             belief_covariance=arrays["belief_covariance"].tobytes(),
             status=_NUMBERS[copy.status],
@@ -232,7 +232,7 @@ class Encoder:
         )
         yield STEP, message.SerializeToString()
         if decision is not None:
-            means, stds = arrays["means"], _deviations(arrays["covariances"])
+            means, stds = arrays["means"], deviations(arrays["covariances"])
             plan = self._plan(covariances=arrays["covariances"].tobytes(), **head)
             inputs = [*({"input": self._input(values)} for values in arrays["inputs"]), {}]  # none at the last stage
             for i, (mean, std, given) in enumerate(zip(means, stds, inputs, strict=True)):
@@ -255,5 +255,6 @@ class Encoder:
         return dict(zip(self._inputs, values.tolist(), strict=True))
 
 
-def _deviations(covariances: Array) -> Array:
+def deviations(covariances: Array) -> Array:
+    """Returns the standard deviations (..., n) of covariances (..., n, n)."""
     return np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0))

@@ -7,7 +7,7 @@ belongs to the step of its number, wherever it stands.
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
@@ -70,7 +70,6 @@ class Run:
     belief_covariances: Array  # (K, n, n)
     plan_inputs: Array  # (K, H, m)
     plan_means: Array  # (K, H + 1, n)
-    plan_stds: Array  # (K, H + 1, n)
     plan_covariances: Array  # (K, H + 1, n, n)
     statuses: tuple[Status, ...]
     iterations: Array  # (K,)
@@ -92,6 +91,11 @@ class Run:
         return {axis: self.state_names.index(name) for axis, name in named if name in self.state_names}
 
     @cached_property
+    def plan_stds(self) -> Array:
+        """Standard deviations of the plans (K, H + 1, n)."""
+        return _messages.deviations(self.plan_covariances)
+
+    @cached_property
     def residuals(self) -> Array:
         """Primal and dual residual and duality gap of every recorded solution (K, 3); NaN without one."""
         nothing = (np.nan, np.nan, np.nan)
@@ -100,10 +104,9 @@ class Run:
     @cached_property
     def columns(self) -> dict[str, Array]:
         """The run as a table: a column (K,) per scalar field of ``gpmpc.Step``, in its order."""
-        with np.errstate(invalid="ignore"):  # NaN says it
-            std = np.sqrt(np.diagonal(self.belief_covariances, axis1=1, axis2=2))
         values: dict[str, Array] = {field: getattr(self, name) for field, name in _ATTRIBUTES.items()}
-        values |= {"belief_std": std, "residuals": self.residuals.reshape(-1, 3)}
+        values["belief_std"] = _messages.deviations(self.belief_covariances)
+        values["residuals"] = self.residuals.reshape(-1, 3)
         values["status"] = np.array([status.name for status in self.statuses], dtype=object)
         names = {"State": self.state_names, "Input": self.input_names, "Timing": TIMING, "": RESIDUALS}
         found = {}
@@ -253,16 +256,15 @@ def _numbered(messages: list) -> Iterator[tuple[int, int]]:
 
 def _plans(path: Path, plans: list, steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Array]:
     H, n, m = max((len(plan.stages) - 1 for plan in plans), default=0), len(states), len(inputs)
-    if (needed := 8 * len(steps) * (H + 1) * (n * n + 2 * n + m)) > room(path):
+    if (needed := 8 * len(steps) * (H + 1) * (n * n + n + m)) > room(path):
         raise RecordingError(f"{path}: a plan of {H} stages would make arrays of {needed / 1e6:.0f} MB with the others")
-    shapes = {"inputs": (H, m), "means": (H + 1, n), "stds": (H + 1, n), "covariances": (H + 1, n, n)}
+    shapes = {"inputs": (H, m), "means": (H + 1, n), "covariances": (H + 1, n, n)}
     arrays = {f"plan_{name}": np.full((len(steps), *shape), np.nan) for name, shape in shapes.items()}
     rows = {key: row for row, key in enumerate(_numbered(steps))}
     for key, plan in zip(_numbered(plans), plans, strict=True):
         if key in rows:  # else the step is lost
             row, H = rows[key], len(plan.stages) - 1
             arrays["plan_means"][row, : H + 1] = _table((stage.mean for stage in plan.stages), states)
-            arrays["plan_stds"][row, : H + 1] = _table((stage.std for stage in plan.stages), states)
             arrays["plan_inputs"][row, :H] = _table((stage.input for stage in plan.stages[:-1]), inputs)
             arrays["plan_covariances"][row, : H + 1] = _numbers(plan, "covariances", H + 1, n, n)
     return arrays
@@ -286,20 +288,12 @@ def _residuals(problem: RecordedProblem) -> tuple[float, float, float]:
     return solution._replace(caps=softness[1]).residuals()
 
 
-class Recovery(NamedTuple):
-    """What was found in a file."""
-
-    messages: int
-    seconds: float  # [s] between the first and the last of them
-    finished: bool  # the run had been recorded to its end; nothing was missing
-
-
-def recover(path: str | Path, output: str | Path) -> Recovery:
-    """Writes everything whole in a recording to a new file with index and footer, which says that it was recovered.
+def recover(path: str | Path, output: str | Path) -> Run:
+    """Writes everything whole in a recording to a new file with index and footer, and reads that.
 
     Args:
         path: A file that a crash left without footer; an MCAP reader takes it for empty.
-        output: The new file; it appears when it is complete and has been read once.
+        output: The new file, which says that it was recovered; it appears when it is complete and has been read.
 
     Raises:
         RecordingError: There is no run to recover, or the output cannot be written.
@@ -309,38 +303,36 @@ def recover(path: str | Path, output: str | Path) -> Recovery:
         if output.exists() and path.exists() and output.samefile(path):
             raise RecordingError(f"{output}: a file cannot be recovered into itself; name another output")
         with whole_file(output) as file:
-            times = _copy(path, file)
+            _copy(path, file)
             file.flush()
             try:
-                finished = read_run(file.name).finished
+                return replace(read_run(file.name), path=output)
             except RecordingError as error:
                 raise RecordingError(str(error).replace(file.name, str(path), 1)) from error
     except OSError as error:
         raise RecordingError(f"{output}: cannot be written: {error.strerror or error}") from error
-    return Recovery(len(times), (max(times) - min(times)) / 1e9 if times else 0.0, finished)
 
 
-def _copy(path: Path, file: BinaryIO) -> list[int]:
-    """Copies whole records; returns the time stamps of the messages [ns]."""
+def _copy(path: Path, file: BinaryIO) -> None:
+    """Copies whole records."""
     writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile="gpmpc", library="gpmpc")
-    schemas, channels, times, finished = {0: 0}, {}, [], False
+    schemas, channels, messages, finished = {}, {}, 0, False
     for record in whole_records(path):
         if isinstance(record, Schema) and record.id not in schemas:
             schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
         elif isinstance(record, Channel) and record.id not in channels:
-            about = (record.topic, record.message_encoding, schemas[record.schema_id], record.metadata)
+            about = (record.topic, record.message_encoding, schemas.get(record.schema_id, 0), record.metadata)
             channels[record.id] = writer.register_channel(*about)
         elif isinstance(record, Message):
             channel = channels[record.channel_id]
             writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
-            times.append(record.log_time)
+            messages += 1
         elif isinstance(record, Metadata):
             writer.add_metadata(record.name, record.metadata)
         elif isinstance(record, Attachment):
             writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
         finished = isinstance(record, Footer)
     if not finished:
-        writer.add_metadata(RECOVERED, {"messages": str(len(times))})
+        writer.add_metadata(RECOVERED, {"messages": str(messages)})
     writer.finish()
-    return times

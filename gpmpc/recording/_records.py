@@ -1,7 +1,7 @@
 """Reads the records of an MCAP file that was cut off, damaged, or made by somebody else.
 
 MCAP's library parses each record from its own bytes alone, up to the first that does not fit into the file, a chunk
-whose checksum is wrong, or a reference to what was not declared. Metadata and attachments that are damaged are left
+whose checksum is wrong, or a message of no channel. Metadata and attachments that are damaged are left
 out. A footer is yielded only if nothing is missing and every checksum of the file (of chunks, attachments, data and
 index) is right. Nothing is unfolded before it is known to be small.
 """
@@ -47,14 +47,11 @@ def whole_records(path: Path) -> Iterator[McapRecord]:
             if magic != MCAP0_MAGIC:
                 reason = "is empty: its recording was killed before it began" if not magic else "is not an MCAP file"
                 raise RecordingError(f"{path}: {reason}")
-            declared: dict[tuple[type, int], McapRecord | None] = {(Schema, 0): None}
+            channels = set()
             for record in _sound_records(file, path):
-                if isinstance(record, Message) and (Channel, record.channel_id) not in declared:
-                    return
-                if isinstance(record, Channel) and (Schema, record.schema_id) not in declared:
-                    return
-                new = isinstance(record, Schema | Channel)
-                if new and declared.setdefault((type(record), getattr(record, "id", 0)), record) != record:
+                if isinstance(record, Channel):
+                    channels.add(record.id)
+                elif isinstance(record, Message) and record.channel_id not in channels:
                     return
                 yield record
     except OSError as error:

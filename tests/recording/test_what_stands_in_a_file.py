@@ -214,7 +214,7 @@ def test_what_a_file_may_unfold_to_is_counted_to_the_byte(path, monkeypatch):
     with pytest.raises(RecordingError, match=r"run\.mcap: its chunks unfold to more than 0 MB"):
         list(_records.whole_records(path))
     rows, (H, n, m) = 2, (5, 6, 3)
-    needed = 8 * rows * (H + 1) * (n + n + n * n + m)  # of means, deviations, covariances and inputs
+    needed = 8 * rows * (H + 1) * (n + n * n + m)  # of means, covariances and inputs
     monkeypatch.undo()
     monkeypatch.setattr(_reader, "room", lambda _: needed)
     assert read_run(path).plan_means.shape == (rows, H + 1, n)
