@@ -51,11 +51,11 @@ class Command(NamedTuple):
     """One command."""
 
     summary: str  # for the list of all
-    #: module of ``gpmpc.cli`` and function in it, from the composed settings or the parsed arguments to a ``Result``;
-    #: imported when it runs, and with it the heavy libraries, so help and completion stay quick
-    task: str
-    settings: str = ""  # name of its file in ``conf/``; empty where it has arguments only
+    #: of ``gpmpc.cli``; its function of the command's name takes the composed settings or parsed arguments. Imported
+    #: when it runs, and with it the heavy libraries, so help and completion stay quick
+    module: str
     arguments: Sequence[tuple[tuple[str, ...], dict[str, Any]]] = ()  # what ``add_argument`` takes
+    settings: bool = False  # whether it has a file in ``conf/``
 
     def parser(self, name: str) -> argparse.ArgumentParser:
         """Returns the parser of what follows the command's name."""
@@ -75,9 +75,8 @@ class Command(NamedTuple):
         }
 
 
-def call(task: str, given: Any) -> Result:
-    """Calls a command's task."""
-    module, function = task.split(".")
+def call(module: str, function: str, given: Any) -> Result:
+    """Calls a function of a module of ``gpmpc.cli``."""
     return getattr(import_module(f"gpmpc.cli.{module}"), function)(given)
 
 
@@ -90,7 +89,7 @@ def version(given: argparse.Namespace) -> Result:
     return Result(data)
 
 
-def show_usage(given: argparse.Namespace) -> Result:
+def help(given: argparse.Namespace) -> Result:
     """Lists the commands."""
     lines = "\n".join(f"  {name:12}{command.summary}" for name, command in COMMANDS.items())
     print(_USAGE.format(version=gpmpc.__version__, commands=lines), end="")
@@ -126,12 +125,12 @@ def _run(arguments: list[str], debug: bool) -> Result:
         if unknown:
             hint = f"{nearest(unknown[0], command.values(name))}; gpmpc {name} --help lists what there is"
             raise GpmpcError(f"unknown option {unknown[0]!r}{hint}")
-        return _with_settings(name, command, given) if command.settings else call(command.task, given)
+        return _with_settings(name, command, given) if command.settings else call(command.module, name, given)
     except KeyboardInterrupt:
         resumed = command is not None and command.settings and (name != "run" or {"-m", "--multirun"} & {*rest})
         raise KeyboardInterrupt(*["the same command goes on where it stopped"] * bool(resumed)) from None
     except Exception as error:
-        message = None if debug else explain(error, command.settings if command else "")
+        message = None if debug else explain(error, name if command and command.settings else "")
         if message is None:
             raise
         print_error(message)
@@ -140,25 +139,22 @@ def _run(arguments: list[str], debug: bool) -> Result:
 
 def _with_settings(name: str, command: Command, given: argparse.Namespace) -> Result:
     """Composes the settings, and shows them or runs the command with them."""
-    given.config_name, swept = (
-        given.config_name or command.settings,
-        name == "tune" or getattr(given, "multirun", False),
-    )
+    given.config_name, swept = given.config_name or name, name == "tune" or getattr(given, "multirun", False)
     given.overrides = [choice for word in given.overrides for choice in model_file(word)]
     with settings(given.config_dir):
         if given.help:
-            print(help_text(command.settings))
+            print(help_text(name))
             return Result()
         if swept and given.cfg:
             raise GpmpcError("--cfg: shows the settings of one run; leave out -m, and give each setting one value")
         if swept:  # before the libraries load, here and in the processes started from here
             os.environ |= dict.fromkeys(THREADS, "1")
-            return call(command.task if name == "tune" else "_sweep.sweep", given)
+            return call(command.module, name, given) if name == "tune" else call("_sweep", "sweep", given)
         config = compose(given.config_name, given.overrides)
         if given.cfg:
             print(OmegaConf.to_yaml(config), end="")
             return Result(OmegaConf.to_container(config))
-        return call(command.task, config)
+        return call(command.module, name, config)
 
 
 def _argument(*names: str, **settings: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -227,47 +223,21 @@ _COMPLETION = [
     _argument("shell", nargs="?", choices=["bash", "zsh", "fish"], help=_SHELL),
     _argument("--line", metavar="LINE", help="print what may come next after this beginning of a line"),
 ]
+_SWEPT, _HELP = [_argument("--multirun", "-m", **_FLAG)], [_argument("name", metavar="COMMAND", nargs="?")]
 COMMANDS = {
-    "run": Command(
-        "Trains a model, flies with it, records; with -m a sweep of many flights",
-        "_run.run",
-        "run",
-        [_argument("--multirun", "-m", **_FLAG)],
-    ),
-    "tune": Command("Searches settings for the least closed-loop cost", "_tune.tune", "tune", _TUNE),
-    "tables": Command(
-        "Computes Tables 1 and 2 of Cao, Lai and Alam (2017) beside the printed ones", "_study.study", "tables"
-    ),
-    "figures": Command(
-        "Flies figures 2 to 4 and section 5.2, and the same with the plant in the loop", "_study.study", "figures"
-    ),
-    "quality": Command(
-        "Measures closed-loop cost over the time of a decision, for every controller", "_study.study", "quality"
-    ),
-    "new": Command("Writes a project of your own: a system, its settings, a script and a test", "_new.new", "", _NEW),
-    "report": Command(
-        "Tabulates all runs below a folder, with figures; compares two groups of them", "_flights.report", "", _REPORT
-    ),
-    "plot": Command("Draws recorded flights as figures and an animation", "_flights.plot", "", _PLOT),
-    "calibrate": Command(
-        "Predicts recorded flights with a run's model: its errors, and whether its intervals hold",
-        "_flights.calibrate",
-        "",
-        _CALIBRATE,
-    ),
-    "learn": Command(
-        "Learns a model from logs, judges it on held-out runs, and writes it with a report and a card",
-        "_learn.learn",
-        "",
-        _LEARN,
-    ),
-    "log": Command(
-        "Shows, rescues or exports a recording, writes its Foxglove layout, inspects logs", "_log.log", "", _LOGGED
-    ),
-    "warmup": Command("Compiles the numerical kernels now, instead of at the first flight", "_study.warmup"),
-    "completion": Command(
-        "Prints a script that completes commands, settings and files at TAB", "_completion.completion", "", _COMPLETION
-    ),
-    "version": Command("Prints the versions of what computes, and the processor", "_command.version"),
-    "help": Command("Explains a command", "_command.show_usage", "", [_argument("name", metavar="COMMAND", nargs="?")]),
+    "run": Command("Trains a model, flies with it, records; with -m a sweep of many flights", "_run", _SWEPT, True),
+    "tune": Command("Searches settings for the least closed-loop cost", "_tune", _TUNE, True),
+    "tables": Command("Computes Tables 1 and 2 of Cao, Lai and Alam (2017)", "_study", settings=True),
+    "figures": Command("Flies figures 2 to 4 and section 5.2, with the plant in the loop too", "_study", settings=True),
+    "quality": Command("Measures closed-loop cost over the time of a decision", "_study", settings=True),
+    "new": Command("Writes a project of your own: a system, its settings, a script and a test", "_new", _NEW),
+    "report": Command("Tabulates all runs below a folder; compares two groups of them", "_flights", _REPORT),
+    "plot": Command("Draws recorded flights as figures and an animation", "_flights", _PLOT),
+    "calibrate": Command("Predicts recorded flights with a run's model, and judges it", "_flights", _CALIBRATE),
+    "learn": Command("Learns a model from logs and judges it on held-out runs", "_learn", _LEARN),
+    "log": Command("Shows, rescues or exports a recording, writes its layout, inspects logs", "_log", _LOGGED),
+    "warmup": Command("Compiles the numerical kernels now, instead of at the first flight", "_study"),
+    "completion": Command("Prints a script that completes a line at TAB", "_completion", _COMPLETION),
+    "version": Command("Prints the versions of what computes, and the processor", "_command"),
+    "help": Command("Explains a command", "_command", _HELP),
 }

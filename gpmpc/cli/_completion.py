@@ -39,13 +39,13 @@ def candidates(line: str) -> list[str]:
 
 def _after(name: str, before: Sequence[str], word: str) -> Sequence[str]:
     """Returns what may stand behind a command and the words before the last one."""
-    command, values = COMMANDS[name], COMMANDS[name].values(name)
+    values = COMMANDS[name].values(name)
     if before and values.get(before[-1]) is not None:
         return values[before[-1]] or _files(word)
     if word.startswith("-"):
         return [option for option in (*values, *FLAGS) if option.startswith("--")]
-    if command.settings:
-        return _settings(command.settings, before, word)
+    if COMMANDS[name].settings:
+        return _settings(name, before, word)
     places = [choices for key, choices in values.items() if not key.startswith("-")]
     return (places[len(before)] if len(before) < len(places) else None) or _files(word)
 

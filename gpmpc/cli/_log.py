@@ -1,7 +1,6 @@
 """``gpmpc log``: what is in a recording, rescue an unfinished one, its steps as a table, a layout to look at it."""
 
 import argparse
-import io
 from pathlib import Path
 
 import numpy as np
@@ -90,18 +89,16 @@ def _facts(run: Run) -> dict[str, str]:
     return facts
 
 
-def _table_file(run: Run, ending: str) -> bytes:
+def _table_file(run: Run, ending: str) -> str | bytes:
     """Returns the steps as CSV, or as Parquet."""
-    frame, data = run.to_pandas(), io.BytesIO()
+    frame = run.to_pandas()
     frame.attrs = {}  # pandas would store them, as text that others do not read
     if ending == ".csv":
-        frame.to_csv(data, index=False, lineterminator="\n", na_rep="nan")
-    else:
-        try:
-            frame.to_parquet(data, index=False)
-        except ImportError as error:
-            raise GpmpcError("Parquet needs pyarrow: pip install 'gpmpc[report]'") from error
-    return data.getvalue()
+        return frame.to_csv(index=False, lineterminator="\n", na_rep="nan")
+    try:
+        return frame.to_parquet(index=False)
+    except ImportError as error:
+        raise GpmpcError("Parquet needs pyarrow: pip install 'gpmpc[report]'") from error
 
 
 def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:
