@@ -1,8 +1,7 @@
 """``gpmpc tune``: searches settings for the least closed-loop cost of flights.
 
-A search is written as a sweep: settings with several values, or an interval, are searched, all others stay. It has no
-memory but the folders of its runs: the same command proposes the same candidates, and those that are finished are not
-flown again.
+A search is written as a sweep, and has no memory but the folders of its runs: the same command proposes the same
+candidates, and those that are finished are not flown again.
 """
 
 import math

@@ -1,7 +1,6 @@
 """Reads recorded runs as arrays, solves a recorded quadratic program again, and rescues unfinished files.
 
-A message whose checksum is right may still come from another program, so the sizes of its arrays are checked. A plan
-belongs to the step of its number, wherever it stands.
+A message whose checksum is right may come from another program, so the sizes of its arrays are checked.
 """
 
 import math

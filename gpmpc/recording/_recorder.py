@@ -1,10 +1,7 @@
 """Records every step of a run in a file that explains itself and survives a crash, and shows it live.
 
-``record`` keeps a copy of the step, some ten microseconds; at every ``CHUNK`` bytes or ``INTERVAL`` seconds the steps
-kept are serialised and written as one compressed chunk. A run killed at any moment loses at most that last chunk.
-
-Before the first step the file holds where it comes from (commit, versions, host, command, the caller's metadata), the
-resolved configuration, units and frames, flushed to the disk. An unfinished file has no footer; see ``recover``.
+``record`` copies the step; the copies that wait are serialised and written as one compressed chunk, and a run killed at
+any moment loses at most that one. Where the file comes from is on the disk before the first step.
 """
 
 import contextlib
