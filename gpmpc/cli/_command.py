@@ -61,18 +61,17 @@ class Command(NamedTuple):
         """Returns the parser of what follows the command's name."""
         description = f"gpmpc {name}: {self.summary[0].lower()}{self.summary[1:]}."
         parser = _Parser(prog=f"gpmpc {name}", description=description, add_help=not self.settings)
-        for names, how in (*self.arguments, *(_OF_SETTINGS if self.settings else ())):
+        for names, how in self.arguments:
             parser.add_argument(*names, **how)
         return parser
 
-    def values(self, name: str) -> dict[str, list[str] | None]:
-        """Returns the choices of every option and argument by name: empty for any value, None for a flag."""
-        actions = self.parser(name)._actions
-        return {
-            key: None if action.nargs == 0 else [*(action.choices or ())]
-            for action in actions
-            for key in action.option_strings or [action.dest]
-        }
+    @property
+    def values(self) -> dict[str, list[str] | None]:
+        """The choices of every option and argument by name: empty for any value, None for a flag."""
+        found: dict[str, list[str] | None] = {"-h": None, "--help": None}
+        for names, how in self.arguments:
+            found |= dict.fromkeys(names, None if "action" in how else [*how.get("choices", ())])
+        return found
 
 
 def call(module: str, function: str, given: Any) -> Result:
@@ -123,7 +122,7 @@ def _run(arguments: list[str], debug: bool) -> Result:
             raise GpmpcError(known)
         given, unknown = command.parser(name).parse_known_intermixed_args(rest)
         if unknown:
-            hint = f"{nearest(unknown[0], command.values(name))}; gpmpc {name} --help lists what there is"
+            hint = f"{nearest(unknown[0], command.values)}; gpmpc {name} --help lists what there is"
             raise GpmpcError(f"unknown option {unknown[0]!r}{hint}")
         return _with_settings(name, command, given) if command.settings else call(command.module, name, given)
     except KeyboardInterrupt:
@@ -180,6 +179,7 @@ _FOR_CONTROL = "a model to plan with: without the feedback of the controller tha
 _SHELL = 'for its profile: eval "$(gpmpc completion bash)"'
 _GROUPS = "choices that make two groups, such as controller=lqr controller=convex: a paired test over the seeds"
 _TUNE = [_argument(name, type=int, default=n) for name, n in (("--trials", 40), ("--batch", 4), ("--seeds", 1))]
+_TUNE += _OF_SETTINGS
 _NEW = [
     _argument("name", metavar="NAME", help="of the system: letters, digits and _, a letter first"),
     _folder("an empty folder, or one to be made (NAME)"),
@@ -223,13 +223,15 @@ _COMPLETION = [
     _argument("shell", nargs="?", choices=["bash", "zsh", "fish"], help=_SHELL),
     _argument("--line", metavar="LINE", help="print what may come next after this beginning of a line"),
 ]
-_SWEPT, _HELP = [_argument("--multirun", "-m", **_FLAG)], [_argument("name", metavar="COMMAND", nargs="?")]
+_RUN, _HELP = [_argument("--multirun", "-m", **_FLAG), *_OF_SETTINGS], [_argument("name", metavar="COMMAND", nargs="?")]
 COMMANDS = {
-    "run": Command("Trains a model, flies with it, records; with -m a sweep of many flights", "_run", _SWEPT, True),
+    "run": Command("Trains a model, flies with it, records; with -m a sweep of many flights", "_run", _RUN, True),
     "tune": Command("Searches settings for the least closed-loop cost", "_tune", _TUNE, True),
-    "tables": Command("Computes Tables 1 and 2 of Cao, Lai and Alam (2017)", "_study", settings=True),
-    "figures": Command("Flies figures 2 to 4 and section 5.2, with the plant in the loop too", "_study", settings=True),
-    "quality": Command("Measures closed-loop cost over the time of a decision", "_study", settings=True),
+    "tables": Command("Computes Tables 1 and 2 of Cao, Lai and Alam (2017)", "_study", _OF_SETTINGS, True),
+    "figures": Command(
+        "Flies figures 2 to 4 and section 5.2, also with the plant in the loop", "_study", _OF_SETTINGS, True
+    ),
+    "quality": Command("Measures closed-loop cost over the time of a decision", "_study", _OF_SETTINGS, True),
     "new": Command("Writes a project of your own: a system, its settings, a script and a test", "_new", _NEW),
     "report": Command("Tabulates all runs below a folder; compares two groups of them", "_flights", _REPORT),
     "plot": Command("Draws recorded flights as figures and an animation", "_flights", _PLOT),

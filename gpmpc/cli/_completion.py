@@ -39,7 +39,7 @@ def candidates(line: str) -> list[str]:
 
 def _after(name: str, before: Sequence[str], word: str) -> Sequence[str]:
     """Returns what may stand behind a command and the words before the last one."""
-    values = COMMANDS[name].values(name)
+    values = COMMANDS[name].values
     if before and values.get(before[-1]) is not None:
         return values[before[-1]] or _files(word)
     if word.startswith("-"):
