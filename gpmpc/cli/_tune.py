@@ -18,7 +18,7 @@ from gpmpc.cli._command import Result
 from gpmpc.cli._run import choices, experiment_of
 from gpmpc.cli._settings import without_hydra, write_files
 from gpmpc.cli._sweep import Job, Sweep
-from gpmpc.exceptions import GpmpcError, RecordingError, SettingError, check_number
+from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.metrics import tracking_cost
 from gpmpc.recording import read_run
 from gpmpc.studies._document import terminal
@@ -81,8 +81,6 @@ def _space(overrides: Sequence[str]) -> tuple[dict[str, Interval | Sequence[str]
         key, value = override.get_key_element(), cast(Any, override.value())
         if key in ("seed", "folder", "launcher") and override.is_sweep_override():
             raise SettingError(key, "cannot be searched; seeds are many by --seeds")
-        if override.is_delete():
-            raise SettingError(key, "cannot be left out here; write a file of your own and give --config-name")
         if not override.is_sweep_override():
             fixed.append(override.input_line)
         elif override.is_interval_sweep():
@@ -119,9 +117,5 @@ def _cost(job: Job, controller: Mapping[str, Any]) -> float:
     """Returns the cost of a run with the weights of a controller; infinite where it was lost or failed."""
     if not job.folder.finished or job.folder.result().get("lost"):
         return math.inf
-    try:
-        run = read_run(job.folder.path / RECORDING)
-    except RecordingError:
-        return math.inf
-    Q, R, before = controller["problem"].cost.Q, controller["problem"].cost.R, controller["initial_input"]
-    return tracking_cost(Q, R, run.states, run.references, run.inputs[:-1], before)
+    run, cost = read_run(job.folder.path / RECORDING), controller["problem"].cost
+    return tracking_cost(cost.Q, cost.R, run.states, run.references, run.inputs[:-1], controller["initial_input"])
