@@ -3,12 +3,11 @@
 import argparse
 import glob
 import os
-import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from gpmpc.cli._commands import COMMANDS, Result
+from gpmpc.cli._command import COMMANDS, FLAGS, Result
 from gpmpc.cli._settings import group_options, setting_names, settings
 from gpmpc.exceptions import GpmpcError
 
@@ -29,43 +28,34 @@ def completion(given: argparse.Namespace) -> Result:
 
 def candidates(line: str) -> list[str]:
     """Returns the words that the last word of a line, up to the cursor, may become."""
-    try:
-        words = shlex.split(line)
-    except ValueError:  # inside of quotes
-        return []
-    if not line or line[-1].isspace():
-        words.append("")
-    _, *middle, word = words if len(words) > 1 else ["gpmpc", *words]
-    if not middle or middle == ["help"]:
+    words = [*line.split(), *[""] * line.endswith(" ")][1:] or [""]
+    name, before, word = words[0], words[1:-1], words[-1]
+    if len(words) == 1 or (name == "help" and not before):
         found: Sequence[str] = [*COMMANDS]
-    elif middle[0] not in COMMANDS:
-        found = []
     else:
-        found = _after(middle[0], middle[1:], word)
+        found = _after(name, before, word) if name in COMMANDS else []
     return [each for each in found if each.startswith(word)]
 
 
 def _after(name: str, before: Sequence[str], word: str) -> Sequence[str]:
     """Returns what may stand behind a command and the words before the last one."""
-    values = COMMANDS[name].parser(name).values
+    values = COMMANDS[name].values
     if before and values.get(before[-1]) is not None:
         return values[before[-1]] or _files(word)
     if word.startswith("-"):
-        return [option for option in (*values, "--json", "--quiet", "--debug") if option.startswith("--")]
+        return [option for option in (*values, *FLAGS) if option.startswith("--")]
     if COMMANDS[name].settings:
-        return _settings(COMMANDS[name].settings, before, word)
-    places = [key for key in values if not key.startswith("-")]
-    place = sum(not each.startswith("-") for each in before)
-    return (values[places[place]] if place < len(places) else None) or _files(word)
+        return _settings(name, before, word)
+    places = [choices for key, choices in values.items() if not key.startswith("-")]
+    return (places[len(before)] if len(before) < len(places) else None) or _files(word)
 
 
 def _settings(name: str, before: Sequence[str], word: str) -> list[str]:
     """Returns settings, one level at a time, or the options of a group; of a sweep, behind the last comma."""
-    chosen = [each for each in before if "=" in each]
     with settings():
         groups, names = group_options(name), setting_names(name)
         with suppress(Exception):  # what was typed before may be no setting yet, or a sweep
-            names = setting_names(name, chosen)
+            names = setting_names(name, [each for each in before if "=" in each])
     key, equals, value = word.partition("=")
     if equals:
         if key == "folder" or key.endswith(".folder"):

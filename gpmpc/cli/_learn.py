@@ -12,7 +12,7 @@ from rich.console import Console
 from gpmpc import logs
 from gpmpc._files import write_whole
 from gpmpc._provenance import provenance
-from gpmpc.cli._commands import Result
+from gpmpc.cli._command import Result
 from gpmpc.cli._settings import write_files, writing
 from gpmpc.logs import Judgement, Learned, Log
 from gpmpc.plotting import judgement_figure, png
@@ -24,7 +24,7 @@ _MODEL = "model.safetensors"
 
 def learn(given: argparse.Namespace) -> Result:
     """Learns from logs, judges on held-out runs, and writes model, report and card; goes on where it stopped."""
-    console, folder = Console(soft_wrap=True, highlight=False, markup=False), given.to
+    console, folder = Console(soft_wrap=True, highlight=False, markup=False), given.to or Path("learned")
     log = logs.read_log(given.files, given.mapping, given.partial)
     console.print(repr(log))
     for finding in log.findings:

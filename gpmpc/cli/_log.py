@@ -1,7 +1,6 @@
 """``gpmpc log``: what is in a recording, rescue an unfinished one, its steps as a table, a layout to look at it."""
 
 import argparse
-import io
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ import pandas as pd
 from rich.console import Console
 
 from gpmpc._files import write_whole
-from gpmpc.cli._commands import Result
+from gpmpc.cli._command import Result
 from gpmpc.cli._settings import writing
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.recording import Run, layout, read_run, recover
@@ -33,9 +32,10 @@ def log(given: argparse.Namespace) -> Result:
     if action == "inspect":
         return _inspect(file, output, given.mapping)
     if action == "recover":
-        found = recover(file, output)
-        note = f"{found.messages} messages over {found.seconds:g} s"
-        note += "; the recording was finished, nothing was missing" if found.finished else ""
+        run = recover(file, output)
+        seconds = np.ptp(run.times) if len(run.times) else 0.0
+        note = f"{sum(count for count, _ in run.channels.values())} messages over {seconds:g} s"
+        note += "; the recording was finished, nothing was missing" if run.finished else ""
     elif action == "layout":
         _write(output, layout(read_run(file)))
         note = f"open {file} in Foxglove or Lichtblick, then import it as a layout"
@@ -89,18 +89,16 @@ def _facts(run: Run) -> dict[str, str]:
     return facts
 
 
-def _table_file(run: Run, ending: str) -> bytes:
+def _table_file(run: Run, ending: str) -> str | bytes:
     """Returns the steps as CSV, or as Parquet."""
-    frame, data = run.to_pandas(), io.BytesIO()
+    frame = run.to_pandas()
     frame.attrs = {}  # pandas would store them, as text that others do not read
     if ending == ".csv":
-        frame.to_csv(data, index=False, lineterminator="\n", na_rep="nan")
-    else:
-        try:
-            frame.to_parquet(data, index=False)
-        except ImportError as error:
-            raise GpmpcError("Parquet needs pyarrow: pip install 'gpmpc[report]'") from error
-    return data.getvalue()
+        return frame.to_csv(index=False, lineterminator="\n", na_rep="nan")
+    try:
+        return frame.to_parquet(index=False)
+    except ImportError as error:
+        raise GpmpcError("Parquet needs pyarrow: pip install 'gpmpc[report]'") from error
 
 
 def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:

@@ -5,7 +5,7 @@ import keyword
 import re
 from pathlib import Path
 
-from gpmpc.cli._commands import Result
+from gpmpc.cli._command import Result
 from gpmpc.cli._settings import write_files
 from gpmpc.exceptions import SettingError
 

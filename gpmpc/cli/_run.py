@@ -1,8 +1,5 @@
 """``gpmpc run``: one flight, from its settings to its folder; ``gpmpc run -m`` (``sweep``) flies many of them."""
 
-import math
-import os
-import re
 import shlex
 import sys
 import time
@@ -10,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from hashlib import sha256
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from gpmpc._compiling import report_compilation
-from gpmpc._provenance import flattened
-from gpmpc.cli._commands import Result
+from gpmpc.cli._command import Result
 from gpmpc.cli._settings import folder_of, one_line, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
@@ -37,12 +32,11 @@ from gpmpc.studies.flight import Experiment, metrics, run_trial, summary
 from gpmpc.studies.study import one_thread
 from gpmpc.systems import System
 
-ASIDE = ("launcher", "folder", "live", "tracker")  # settings that a result does not depend on
+_ASIDE = ("launcher", "folder", "live")  # settings that a result does not depend on
 _GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver", "learning")
 _MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
-_CHOICES = {"recorder": ("mcap", "none"), "tracker": ("mlflow", "none"), "live": (True, False)}
+_CHOICES = {"recorder": ("mcap", "none"), "live": (True, False)}
 _LOST = 3  # exit code of a run that is finished, and whose flight was lost
-_LONGEST = 6000  # characters of a parameter that MLflow takes
 
 
 def run(config: DictConfig) -> Result:
@@ -80,11 +74,6 @@ def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
                 raise KeyboardInterrupt from error
             folder.fail(error, about)
             return outcome | {"error": one_line(error), "mistake": isinstance(error, _MISTAKES)}
-        if config.tracker == "mlflow":
-            try:
-                log_to_mlflow(folder.path, result)
-            except Exception as error:  # the run stays finished
-                print_error(f"{folder.path} is not in MLflow: {one_line(error)}")
     return outcome | {"result": result}
 
 
@@ -99,41 +88,32 @@ def _fly(experiment: Experiment, folder: RunFolder, config: DictConfig, about: d
     """Trains, flies and records; returns the metrics."""
     if config.recorder != "mcap":
         return metrics(experiment, run_trial(experiment))
+    system, text = experiment.system, OmegaConf.to_yaml(config, resolve=True)
+    known = {"seed": experiment.seed, "command": about["provenance"]["command"], "system": system.name}
+    known |= {"tracked": " ".join(system.tracked), "angles": " ".join(system.angles)}
     episodes = range(1, 1 + getattr(experiment.learning, "episodes", 0))
     paths = iter([folder.path / name for name in [*(f"episode_{k}.mcap" for k in episodes), RECORDING]])
     with ExitStack() as stack:
 
         def prepare(controller: Any, training: Any) -> Callable[[Any], None]:
-            recorder = stack.enter_context(_recorder(experiment, next(paths), config, about, controller, training))
+            bounds = [side[0] for side in controller.problem.inputs.by_stage(controller.horizon)]
+            noise = {"noise_std": " ".join(map(str, experiment.unplanned_noise(training).tolist()))}
+            recorded, settings = RecordedSystem.of(system, bounds), {"config": text, "live": config.live}
+            recorder = McapRecorder(next(paths), recorded, metadata=known | noise, **settings)
+            stack.enter_context(recorder)
             if recorder.address:
                 print(f"live view: open {recorder.address} in Foxglove or Lichtblick", file=sys.stderr, flush=True)
             gp_size, began = 0 if training is None else len(training.posterior), time.monotonic()
 
             def on_step(step: Any) -> None:
-                recorder.record(step, gp_size)
+                recorder.record(replace(step, gp_size=step.gp_size or gp_size))
                 if config.live:  # every step lasts as long as the plant's, so that a viewer can follow
-                    time.sleep(max(0.0, began + step.time + experiment.system.time_step - time.monotonic()))
+                    time.sleep(max(0.0, began + step.time + system.time_step - time.monotonic()))
 
             return on_step
 
         flown = run_trial(experiment, prepare)
     return metrics(experiment, flown)
-
-
-def _recorder(
-    experiment: Experiment, path: Path, config: DictConfig, about: dict, controller: Any, training: Any
-) -> McapRecorder:
-    flown, bounds = experiment.system, [side[0] for side in controller.problem.inputs.by_stage(controller.horizon)]
-    metadata = {
-        "seed": experiment.seed,
-        "command": about["provenance"]["command"],
-        "noise_std": " ".join(map(str, experiment.unplanned_noise(training).tolist())),
-        "system": flown.name,
-        "tracked": " ".join(flown.tracked),
-        "angles": " ".join(flown.angles),
-    }
-    text = OmegaConf.to_yaml(config, resolve=True)
-    return McapRecorder(path, RecordedSystem.of(flown, bounds), config=text, metadata=metadata, live=config.live)
 
 
 def experiment_of(config: DictConfig) -> Experiment:
@@ -191,8 +171,6 @@ def _check(config: DictConfig) -> None:
     for key, choices in _CHOICES.items():
         if config[key] not in (*choices, None):
             raise SettingError(key, f"must be {' or '.join(map(repr, choices))}; got {config[key]!r}")
-    if config.tracker == "mlflow" and find_spec("mlflow") is None:
-        raise SettingError("tracker", "needs MLflow: pip install mlflow")
     if config.live and config.recorder != "mcap":
         raise SettingError("live", f"needs recorder=mcap; got recorder={config.recorder}")
     for group in ("data", "trajectory", "system", "model", "controller"):
@@ -224,7 +202,7 @@ def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, A
     if path := settings["model"].get("path"):
         settings["model"]["sha256"] = sha256(Path(path).read_bytes()).hexdigest()
     options = {group: chosen.get(group) for group in _GROUPS}
-    return {key: value for key, value in settings.items() if key not in ASIDE} | {"options": options}
+    return {key: value for key, value in settings.items() if key not in _ASIDE} | {"options": options}
 
 
 def plain_data(config: DictConfig) -> dict[str, Any]:
@@ -238,28 +216,6 @@ def choices(overrides: Sequence[str]) -> list[str]:
     found = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
-        if key not in ASIDE and not key.lstrip("+~").startswith(("hydra.", "hydra/")):
+        if key not in _ASIDE and not key.lstrip("+~").startswith(("hydra.", "hydra/")):
             found[key] = key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"
     return sorted(found.values())
-
-
-def log_to_mlflow(folder: Path, result: Mapping[str, Any]) -> None:
-    """Writes a finished run to MLflow: settings as parameters, numbers as metrics, files as artifacts.
-
-    Where it goes is said as MLflow says it, by ``MLFLOW_TRACKING_URI`` and ``MLFLOW_EXPERIMENT_NAME``; else into the
-    experiment ``gpmpc`` of the default store.
-    """
-    import mlflow  # pyright: ignore[reportMissingImports]
-
-    def name(key: str) -> str:  # in letters that MLflow takes
-        return re.sub(r"[^\w\-. /]", "_", key, flags=re.ASCII)
-
-    found = flattened({key: value for key, value in result.items() if key not in ("settings", "provenance", "choices")})
-    numbers = {key: float(value) for key, value in found.items() if isinstance(value, int | float)}
-    settings = {name(key): str(value)[:_LONGEST] for key, value in flattened(result["settings"]).items()}
-    if "MLFLOW_EXPERIMENT_NAME" not in os.environ and "MLFLOW_EXPERIMENT_ID" not in os.environ:
-        mlflow.set_experiment("gpmpc")
-    with mlflow.start_run(run_name=folder.name):
-        mlflow.log_params(settings)
-        mlflow.log_metrics({name(key): value for key, value in numbers.items() if math.isfinite(value)})
-        mlflow.log_artifacts(str(folder))

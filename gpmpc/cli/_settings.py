@@ -135,7 +135,9 @@ def help_text(name: str) -> str:
 
 def explain(error: Exception, name: str) -> str | None:
     """Returns a user's mistake in one line; None where the error is not the user's."""
-    if isinstance(error, GpmpcError | HydraException | OmegaConfBaseException):
+    if own_error(error):
+        return one_line(error)
+    if isinstance(error, HydraException | OmegaConfBaseException):
         return _of_settings(error, name)
     if isinstance(error, OSError):
         return f"{error.filename}: {error.strerror}" if error.filename else str(error)
@@ -146,28 +148,20 @@ def explain(error: Exception, name: str) -> str | None:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Returns the name that a misspelt one stands for, as a question; by its last part where only that was typed."""
-    known, leaf = sorted(known, key=lambda key: key.count(".")), lambda key: key.rpartition(".")[2]
-    alone = "." not in name or leaf(name).lower() in {leaf(key).lower() for key in known}
-    for part in (leaf,) if alone else (str, leaf):
-        parts = {part(key).lower() for key in known}
-        if close := difflib.get_close_matches(part(name).lower(), parts, n=1):
-            meant = [key for key in known if part(key).lower() == close[0]]
-            if "." in name:
-                meant = difflib.get_close_matches(name, meant, n=1, cutoff=0.0)
-            meant = [key for key in meant if "." not in key] or meant
-            return f" (did you mean {' or '.join(map(repr, meant[:3]))}?)"
-    return ""
+    """Returns what a misspelt name stands for, as a question; of a name without dots the last parts are compared."""
+    part = (lambda key: key) if "." in name else (lambda key: key.rpartition(".")[2])
+    close = difflib.get_close_matches(name.lower(), {part(key).lower() for key in known}, n=1)
+    meant = sorted((key for key in known if part(key).lower() in close), key=lambda key: key.count("."))
+    meant = [key for key in meant if "." not in key] or meant[:3]
+    return f" (did you mean {' or '.join(map(repr, meant))}?)" if meant else ""
 
 
 def _of_settings(error: Exception, name: str) -> str:
-    if own_error(error):
-        return one_line(error)
+    """Returns an error of Hydra or OmegaConf in one line, in the words of this package where it is a common one."""
     text = str(error)
     if unknown := re.match(r"Could not override '([^']+)'", text):
         with settings():
-            known = setting_names(name)
-        return f"unknown setting {unknown[1]!r}{nearest(unknown[1], known)}"
+            return f"unknown setting {unknown[1]!r}{nearest(unknown[1], setting_names(name))}"
     option = re.search(r"Could not find '([^'/]+)/([^']+)'\s+Available options in '[^']+':\n((?:\t.*\n)+)", text)
     if option and (extra := _EXTRAS.get(option[2].removeprefix("launcher/"))):
         return f"launcher: this one is not installed: pip install 'gpmpc[{extra}]'"
@@ -176,10 +170,8 @@ def _of_settings(error: Exception, name: str) -> str:
         available = f"available are {', '.join(known)}{nearest(option[2], known)}"
         return f"{option[1]}: no such option {option[2]!r}; {available}"
     if isinstance(error, OverrideParseException):
-        if "=" not in error.override:
-            return f"{error.override!r}: a setting is written SETTING=VALUE"
-        quoted = "in single quotes where the value holds brackets, braces, commas or spaces"
-        return f"{error.override!r}: cannot be read; a setting is written SETTING=VALUE, {quoted}"
+        rule = f"{error.override!r}: cannot be read; a setting is written SETTING=VALUE"
+        return f"{rule}, in single quotes where the value holds brackets, braces, commas or spaces"
     if unlocated := re.match(r"Error locating target '([^']+)'", text):
         return f"_target_: no such class or function {unlocated[1]!r}"
     if isinstance(error, MissingMandatoryValue):

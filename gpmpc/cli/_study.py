@@ -13,7 +13,7 @@ from rich.console import Console
 
 from gpmpc._compiling import report_compilation
 from gpmpc._provenance import provenance
-from gpmpc.cli._commands import Result
+from gpmpc.cli._command import Result
 from gpmpc.cli._run import experiment_of, plain_data, plain_settings
 from gpmpc.cli._settings import compose, folder_of, settings, write_files, writing
 from gpmpc.cli._terminal import logging_console, progress_bar
@@ -58,6 +58,9 @@ def study(config: DictConfig) -> Result:
     console.out(*lines, sep="\n", highlight=False)
     wrong = len(failed) == len(records) or not study.lost_is_result
     return Result(data | {"folder": str(folder)}, 1 if failed and wrong else 0)
+
+
+tables = figures = quality = study
 
 
 def _study(config: DictConfig, settings: dict[str, Any]) -> Study:

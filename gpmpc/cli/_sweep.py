@@ -1,11 +1,9 @@
 """``gpmpc run -m``: many flights that may be stopped at any moment and go on later.
 
-Hydra composes every run's settings and its launcher plugins start the runs, on one machine or on a cluster; what is
-kept, and whether it is finished, is in the runs' folders alone. So a sweep is resumed by the same command: finished
-runs are not launched again, failed and unfinished ones are. A finished run passes for one that is asked for only if all
-its settings are the same; else the sweep is refused before anything is launched. The parent only looks at the folders
-to show how far it is. Several sweeps may share a tree: a run that another process works on is left to it, and looked at
-again at the end.
+Hydra composes every run's settings and its launcher plugins start the runs; what is kept, and whether it is finished,
+is in the runs' folders alone. So the same command resumes a sweep: only failed and unfinished runs are launched again.
+Where a finished run has other settings, the sweep is refused before anything is launched. Several sweeps may share a
+tree: a run that another process works on is left to it, and looked at again at the end.
 """
 
 import hashlib
@@ -30,7 +28,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from gpmpc._compiling import report_compilation
-from gpmpc.cli._commands import Result
+from gpmpc.cli._command import Result
 from gpmpc.cli._run import choices, experiment_of, plain_settings, run_one
 from gpmpc.cli._settings import folder_of, without_hydra, write_files
 from gpmpc.cli._terminal import print_error, progress_bar
@@ -118,13 +116,7 @@ class Sweep:
     @contextmanager
     def progress(self, jobs: Sequence[Job], total: int) -> Iterator[Callable[[str], None]]:
         """Shows one bar for many runs, which looks at their folders whenever it is drawn; yields what names it."""
-        done: set[int] = set()
-
-        def completed() -> int:
-            done.update(i for i, job in enumerate([*jobs]) if i not in done and job.done)
-            return len(done)
-
-        with progress_bar(self.console, completed) as bar:
+        with progress_bar(self.console, lambda: sum(job.done for job in [*jobs])) as bar:
             task = bar.add_task("flying", total=total)
             yield lambda text: bar.update(task, description=text)
 

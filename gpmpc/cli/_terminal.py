@@ -69,15 +69,12 @@ def redirected_output(to: str) -> Iterator[None]:
         return
     sys.stdout.flush()
     before = os.dup(1)
-    target = os.dup(2) if to == "error" else os.open(os.devnull, os.O_WRONLY)
-    os.dup2(target, 1)
+    os.dup2(2 if to == "error" else os.open(os.devnull, os.O_WRONLY), 1)
     try:
         yield
     finally:
         sys.stdout.flush()
         os.dup2(before, 1)
-        os.close(before)
-        os.close(target)
 
 
 def print_error(line: str) -> None:
@@ -97,10 +94,9 @@ def logging_console() -> "Console":
     def is_new(record: logging.LogRecord) -> bool:
         text, known = record.getMessage(), len(shown)
         shown.add(text)
-        return len(shown) > known
+        return len(shown) > known and record.name != _SEARCH
 
     handler = RichHandler(console=console, show_path=False, show_time=False, show_level=False)
-    handler.addFilter(lambda record: record.name != _SEARCH)
     handler.addFilter(is_new)
     log = logging.getLogger("gpmpc")
     log.setLevel(logging.INFO)

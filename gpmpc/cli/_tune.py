@@ -1,8 +1,7 @@
 """``gpmpc tune``: searches settings for the least closed-loop cost of flights.
 
-A search is written as a sweep: settings with several values, or an interval, are searched, all others stay. It has no
-memory but the folders of its runs: the same command proposes the same candidates, and those that are finished are not
-flown again.
+A search is written as a sweep, and has no memory but the folders of its runs: the same command proposes the same
+candidates, and those that are finished are not flown again.
 """
 
 import math
@@ -15,35 +14,32 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from gpmpc.cli._commands import Result
-from gpmpc.cli._run import ASIDE, experiment_of
-from gpmpc.cli._settings import group_options, without_hydra, write_files
+from gpmpc.cli._command import Result
+from gpmpc.cli._run import choices, experiment_of
+from gpmpc.cli._settings import without_hydra, write_files
 from gpmpc.cli._sweep import Job, Sweep
-from gpmpc.exceptions import GpmpcError, RecordingError, SettingError, check_number
+from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.metrics import tracking_cost
 from gpmpc.recording import read_run
 from gpmpc.studies._document import terminal
 from gpmpc.studies._run_folder import RECORDING
 from gpmpc.studies.tuning import Interval, Search
 
-_BEST = "best.yaml"
-
 
 def tune(given: Namespace) -> Result:
-    """Searches, and writes the candidates, a figure of what mattered and the best settings."""
+    """Searches, and writes the candidates, a figure of what mattered and the command that flies the best one."""
     for key in ("trials", "batch", "seeds"):
         check_number(f"--{key}", getattr(given, key), least=1, whole=True)
     space, fixed = _space(given.overrides)
-    console, runs = Console(), Sweep(given.config_name, fixed, Console())
-    if runs.config.recorder != "mcap":
-        raise SettingError("recorder", f"must be mcap: a flight's cost is read from it; got {runs.config.recorder}")
-    search, first = Search(space, runs.config.seed), runs.config.seed
-    base = without_hydra(runs.config)
-    if runs.config.steps < 2:
+    console = Console()
+    runs = Sweep(given.config_name, fixed, console)
+    base, first = without_hydra(runs.config), runs.config.seed
+    if base.recorder != "mcap":
+        raise SettingError("recorder", f"must be mcap: a flight's cost is read from it; got {base.recorder}")
+    if base.steps < 2:
         raise SettingError("steps", f"must be 2 or more: the cost counts from the second state on; got {base.steps}")
-    controller: Mapping[str, Any] = getattr(
-        experiment_of(base).controller, "keywords", {}
-    )  # whose weights the cost has, whatever is searched
+    search = Search(space, first)
+    controller: Any = experiment_of(base).controller  # whose weights the cost has, whatever is searched
 
     def jobs_of(candidate: Mapping[str, Any]) -> list[Job]:
         overrides = [*fixed, *_overrides(candidate, base)]
@@ -55,7 +51,7 @@ def tune(given: Namespace) -> Result:
         runs.check([*batch.values()])
         flying.extend(batch.values())
         runs.fly([*batch.values()])
-        return [sum(_cost(job, controller) for job in group) / given.seeds for group in groups]
+        return [sum(_cost(job, controller.keywords) for job in group) / given.seeds for group in groups]
 
     flying: list[Job] = []
     with runs.progress(flying, (given.trials + 1) * given.seeds) as describe:
@@ -65,14 +61,12 @@ def tune(given: Namespace) -> Result:
             describe(f"flying; least cost {search.costs[search.best]:.4g}")
     if not math.isfinite(search.costs[search.best]):
         raise GpmpcError(f"tune: every flight was lost or failed; see {runs.tree}")
-    best = [*fixed, *_overrides(search.candidates[search.best], base)]
-    command = shlex.join(["gpmpc", "run", "--config-dir", str(runs.tree), "--config-name", _BEST.removesuffix(".yaml")])
+    own = [] if given.config_name == "tune" else ["--config-name", given.config_name]
+    own += ["--config-dir", given.config_dir] if given.config_dir else []
+    best = choices([*fixed, *_overrides(search.candidates[search.best], base)])
+    command = shlex.join(["gpmpc", "run", *own, *best, f"folder={runs.tree / 'best'}"])
     document = search.document(unchanged if math.isfinite(unchanged) else None, command)
-    written = document.files("tuning") | {
-        "tuning.html": document.html(),
-        _BEST: _config(best, given.config_name, str(runs.tree / "best")),
-    }
-    where = write_files(runs.tree, written)
+    where = write_files(runs.tree, document.files("tuning") | {"tuning.html": document.html()})
     console.print(terminal(document.tables, document.lead))
     console.out(f"to fly the best one: {command}", where, sep="\n", highlight=False)
     data = {"folder": str(runs.tree), "best": search.candidates[search.best], "cost": search.costs[search.best]}
@@ -87,8 +81,6 @@ def _space(overrides: Sequence[str]) -> tuple[dict[str, Interval | Sequence[str]
         key, value = override.get_key_element(), cast(Any, override.value())
         if key in ("seed", "folder", "launcher") and override.is_sweep_override():
             raise SettingError(key, "cannot be searched; seeds are many by --seeds")
-        if override.is_delete():
-            raise SettingError(key, "cannot be left out here; write a file of your own and give --config-name")
         if not override.is_sweep_override():
             fixed.append(override.input_line)
         elif override.is_interval_sweep():
@@ -125,24 +117,5 @@ def _cost(job: Job, controller: Mapping[str, Any]) -> float:
     """Returns the cost of a run with the weights of a controller; infinite where it was lost or failed."""
     if not job.folder.finished or job.folder.result().get("lost"):
         return math.inf
-    try:
-        run = read_run(job.folder.path / RECORDING)
-    except RecordingError:
-        return math.inf
-    Q, R, before = controller["problem"].cost.Q, controller["problem"].cost.R, controller["initial_input"]
-    return tracking_cost(Q, R, run.states, run.references, run.inputs[:-1], before)
-
-
-def _config(overrides: Sequence[str], name: str, folder: str) -> str:
-    """Returns the settings as a file that ``gpmpc run --config-name`` takes; its runs go to ``folder``."""
-    name = "run" if name == "tune" else name
-    groups, own = group_options("run"), OmegaConf.create()
-    defaults: list[Any] = [name, "_self_"]
-    for override in OverridesParser.create().parse_overrides([*overrides]):
-        key = override.get_key_element().lstrip("+")
-        if key in groups and key not in ASIDE:
-            defaults.append({f"override /{key}": override.value()})
-        elif key not in (*ASIDE, "seed") and not key.startswith("hydra"):
-            OmegaConf.update(own, key, override.value(), force_add=True)
-    text = OmegaConf.to_yaml(OmegaConf.merge({"defaults": defaults}, own, {"folder": folder}))
-    return f"# The best settings that gpmpc tune found.\n{text}"
+    run, cost = read_run(job.folder.path / RECORDING), controller["problem"].cost
+    return tracking_cost(cost.Q, cost.R, run.states, run.references, run.inputs[:-1], controller["initial_input"])

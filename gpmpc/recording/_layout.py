@@ -1,11 +1,9 @@
-"""Makes a layout for Foxglove that fits a recording.
+"""Makes a layout for Foxglove that fits a recording: it names message paths, so it needs the recording's own names.
 
-A layout names message paths, so it is made from the names of the states and inputs that a recording holds. Its format
-is the one that Foxglove and its open fork Lichtblick (github.com/lichtblick-suite/lichtblick) export and import: a
-configuration by panel id (``Plot!...``, ``3D!...``; the type before the exclamation mark) and a tree of splits. Fields
-that one of them does not know are ignored: lines are dashed in Foxglove alone. Three things are easily got wrong: a
-panel's title is ``foxglovePanelTitle``; a legend at the top takes its size, 240 pixels, off the curves; and an index in
-the path of a plot has to count from the front (from the end, Lichtblick draws nothing).
+Its format is the one that Foxglove and its open fork Lichtblick (github.com/lichtblick-suite/lichtblick) export and
+import: a configuration by panel id and a tree of splits; fields that one of them does not know are ignored. Easily got
+wrong: a panel's title is ``foxglovePanelTitle``; a legend at the top takes its size, 240 pixels, off the curves; an
+index in the path of a plot counts from the front (Lichtblick draws nothing else).
 """
 
 import itertools

@@ -8,11 +8,9 @@ Packed ``repeated double`` has the wire format of ``bytes`` that hold the little
 reads and writes its messages with ``bytes`` in these places: a thousand numbers then cost one copy.
 """
 
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import foxglove
@@ -32,32 +30,19 @@ if TYPE_CHECKING:
 STEP, PLAN, QP = "/step", "/plan", "/qp"
 TOPICS = {STEP: "Step", PLAN: "Plan", QP: "QuadraticProgram"}
 TIMING = ("model", "build", "solve", "total")
+RESIDUALS = ("primal", "dual", "gap")
 POSITION, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "yaw")
 QP_ARRAYS = ("P", "q", "G", "lower", "upper", "softness", "x", "multipliers")
 
-_FIELDS = {
-    "Step": {
-        "time": "double",
-        "k": "int64",
-        "reference": "State",
-        "state": "State",
-        "measured": "State",
-        "input": "Input",
-        "input_lower": "Input",
-        "input_upper": "Input",
-        "innovation": "State",
-        "belief_std": "State",
-        "belief_covariance": "repeated double",
-        "status": "Status",
-        "iterations": "int64",
-        "active_set_size": "int64",
-        "timing": "Timing",
-        "residuals": "",  # of the first edition; the reader computes them
-        "gp_size": "int64",
-        "gp_version": "int64",
-        "failed": "bool",
-        "novelty": "double",
-    },
+FIELDS = {
+    "Step": {"time": "double", "k": "int64"}
+    | dict.fromkeys(("reference", "state", "measured"), "State")
+    | dict.fromkeys(("input", "input_lower", "input_upper"), "Input")
+    | dict.fromkeys(("innovation", "belief_std"), "State")
+    | {"belief_covariance": "repeated double", "status": "Status"}
+    | {"iterations": "int64", "active_set_size": "int64", "timing": "Timing"}
+    | {"residuals": ""}  # of the first edition; the reader computes them
+    | {"gp_size": "int64", "gp_version": "int64", "failed": "bool", "novelty": "double"},
     "Stage": {"time": "double", "mean": "State", "std": "State", "input": "Input"},
     "Plan": {"time": "double", "k": "int64", "stages": "repeated Stage", "covariances": "repeated double"},
     "QuadraticProgram": {"time": "double", "k": "int64", "variables": "int64", "rows": "int64"}
@@ -65,8 +50,7 @@ _FIELDS = {
 }
 _LARGEST = 1000  # states or inputs
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-_NAMES = ("reference", "state", "measured", "innovation", "input", "belief_covariance")
-_NAMES += ("inputs", "means", "covariances")
+_STATES = ("reference", "state", "measured", "innovation")  # arrays (n,) of a step
 
 
 @dataclass(frozen=True)
@@ -109,7 +93,7 @@ class RecordedSystem:
         """Units of the scalar fields by path, of ``Step`` and, after ``stages``, of ``Plan``; unknown ones are "?"."""
         found = {"time": "s", "stages.time": "s"} | {f"timing.{name}": "s" for name in TIMING}
         for message, prefix in (("Step", ""), ("Stage", "stages.")):
-            for key, kind in _FIELDS[message].items():
+            for key, kind in FIELDS[message].items():
                 names = {"State": self.state_names, "Input": self.input_names}.get(kind, ())
                 found |= {f"{prefix}{key}.{name}": self.units.get(name, "?") for name in names}
         return found
@@ -135,7 +119,7 @@ def descriptor(states: Sequence[str], inputs: Sequence[str], packed: str = "repe
     for number, value in enumerate(Status):
         status.value.add(name=value.name, number=number)
     groups = {"State": states, "Input": inputs, "Timing": TIMING}
-    for name, fields in ({k: dict.fromkeys(v, "double") for k, v in groups.items()} | _FIELDS).items():
+    for name, fields in ({k: dict.fromkeys(v, "double") for k, v in groups.items()} | FIELDS).items():
         message = file.message_type.add(name=name)
         for number, (key, kind) in enumerate(fields.items(), start=1):
             *repeated, kind = (packed if kind == "repeated double" else kind or "none").split()
@@ -143,7 +127,7 @@ def descriptor(states: Sequence[str], inputs: Sequence[str], packed: str = "repe
                 continue
             label = FieldDescriptorProto.LABEL_REPEATED if repeated else FieldDescriptorProto.LABEL_OPTIONAL
             added = message.field.add(name=key, number=number, label=label)
-            if kind in groups or kind in _FIELDS or kind == "Status":
+            if kind in groups or kind in FIELDS or kind == "Status":
                 added.type_name = f".gpmpc.{kind}"
                 kind = "enum" if kind == "Status" else "message"
             added.type = FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}")
@@ -161,52 +145,39 @@ def message_classes(file: FileDescriptorProto) -> dict[str, Any]:
 
 
 Array = np.ndarray
-_ndarray, _float64 = np.ndarray, np.dtype(np.float64)
 _NUMBERS = {status: number for number, status in enumerate(Status)}
 
 
 class StepCopy:
-    """A step whose arrays are copied into one piece of memory: a microsecond, where a copy each takes ten.
+    """A step with copies of its arrays by name: those of ``step`` itself may have changed since.
 
-    Of ``step`` the numbers hold; its arrays may have changed since. ``ShapeError`` where an array does not fit n states
-    and m inputs.
+    ``ShapeError`` where an array does not fit n states and m inputs.
     """
 
-    def __init__(self, step: Step, gp_size: int | None, n: int, m: int, record_problem: bool):
+    def __init__(self, step: Step, n: int, m: int, record_problem: bool):
         decision = step.decision
-        problem: tuple[Any, ...] = ()
-        arrays: list[Any] = [step.reference, step.state, step.measured, step.innovation]
-        arrays += [step.input, step.belief_covariance]
-        expected: list[tuple[int, ...]] = [(n,), (n,), (n,), (n,), (m,), (n, n)]
+        arrays: dict[str, Any] = {name: getattr(step, name) for name in (*_STATES, "input", "belief_covariance")}
+        shapes: dict[str, tuple[int, ...]] = {
+            **dict.fromkeys(_STATES, (n,)),
+            "input": (m,),
+            "belief_covariance": (n, n),
+        }
         if decision is not None:
             H, solution, program = len(decision.inputs), decision.solution, decision.problem
-            arrays += [decision.inputs, decision.means, decision.covariances]
-            expected += [(H, m), (H + 1, n), (H + 1, n, n)]
+            arrays |= {name: getattr(decision, name) for name in ("inputs", "means", "covariances")}
+            shapes |= {"inputs": (H, m), "means": (H + 1, n), "covariances": (H + 1, n, n)}
             if solution is not None:
-                arrays += [solution.x, solution.record]
-                problem = (*solution.arrays, _softness(solution.caps))
-            elif program is not None:
-                hard = np.full(len(program.lower), np.inf)
-                problem = (program.P, program.q, program.G, program.lower, program.upper, _softness(hard))
-            if record_problem:
-                arrays += problem
-        for i, array in enumerate(arrays):
-            if array.__class__ is not _ndarray or array.dtype is not _float64 or not array.flags.c_contiguous:
-                arrays[i] = np.ascontiguousarray(array, dtype=float)
-        self._shapes = [array.shape for array in arrays]
-        for name, shape, needed in zip(_NAMES, self._shapes, expected, strict=False):
-            if shape != needed:
-                raise ShapeError(f"step {step.k}: {name} must be {needed}; got {shape}")
-        self.step, self.gp_size, self.data = step, step.gp_size or gp_size or 0, b"".join(arrays)
-
-    @cached_property
-    def arrays(self) -> dict[str, Array]:
-        """Views of the copy by name: of the step, and where there are any of its plan, solution and program."""
-        solved = self.step.decision is not None and self.step.decision.solution is not None
-        names = [*_NAMES[: None if self.step.decision else 6], *(("x", "record") if solved else ()), *QP_ARRAYS[:6]]
-        numbers, ends = np.frombuffer(self.data), np.cumsum([math.prod(shape) for shape in self._shapes])
-        parts = zip(names, np.split(numbers, ends[:-1]), self._shapes, strict=False)  # without a program
-        return {name: part.reshape(shape) for name, part, shape in parts}
+                arrays |= {"x": solution.x, "record": solution.record}
+            if record_problem and solution is not None:
+                arrays |= {**dict(zip(QP_ARRAYS, solution.arrays, strict=False)), "caps": solution.caps}
+            elif record_problem and program is not None:
+                arrays |= {name: getattr(program, name) for name in QP_ARRAYS[:5]}
+                arrays["caps"] = np.full(len(program.lower), np.inf)
+        self.step = step
+        self.arrays = {name: np.array(array, dtype=float) for name, array in arrays.items()}
+        for name, shape in shapes.items():
+            if self.arrays[name].shape != shape:
+                raise ShapeError(f"step {step.k}: {name} must be {shape}; got {self.arrays[name].shape}")
 
     @property
     def status(self) -> Status:
@@ -238,22 +209,22 @@ class Encoder:
         """Yields topics and messages of a step."""
         step, decision, arrays = copy.step, copy.step.decision, copy.arrays
         head = {"time": step.time, "k": step.k}
-        timing, solution = (None, None) if decision is None else (decision.timing, decision.solution)
+        solution = decision and decision.solution
         if solution is not None:
             solution = solution._replace(x=arrays["x"], record=arrays["record"])
+        timing = decision and decision.timing
         times = (0.0, 0.0, 0.0) if timing is None else (timing.model, timing.build, timing.solve)
-        groups = {name: self._state(arrays[name]) for name in ("reference", "state", "measured", "innovation")}
         message = self._step(
             **head,
-            **groups,
-            belief_std=self._state(_deviations(arrays["belief_covariance"])),
+            **{name: self._state(arrays[name]) for name in _STATES},
+            belief_std=self._state(deviations(arrays["belief_covariance"])),
             input=self._input(arrays["input"]),
             belief_covariance=arrays["belief_covariance"].tobytes(),
             status=_NUMBERS[copy.status],
             iterations=0 if decision is None else decision.iterations,
             active_set_size=0 if solution is None else np.count_nonzero(solution.active_set),
             timing=dict(zip(TIMING, (*times, sum(times)), strict=True)),
-            gp_size=copy.gp_size,
+            gp_size=step.gp_size,
             gp_version=step.gp_version,
             failed=step.failed,
             novelty=np.nan if decision is None else decision.novelty,
@@ -261,7 +232,7 @@ class Encoder:
         )
         yield STEP, message.SerializeToString()
         if decision is not None:
-            means, stds = arrays["means"], _deviations(arrays["covariances"])
+            means, stds = arrays["means"], deviations(arrays["covariances"])
             plan = self._plan(covariances=arrays["covariances"].tobytes(), **head)
             inputs = [*({"input": self._input(values)} for values in arrays["inputs"]), {}]  # none at the last stage
             for i, (mean, std, given) in enumerate(zip(means, stds, inputs, strict=True)):
@@ -269,9 +240,11 @@ class Encoder:
                 plan.stages.add(time=time, mean=self._state(mean), std=self._state(std), **given)
             yield PLAN, plan.SerializeToString()
         if "P" in arrays:
+            caps = arrays["caps"]
+            found = arrays | {"softness": np.stack([np.zeros_like(caps), caps])}
             if solution is not None:
-                arrays = arrays | {"multipliers": solution.multipliers}
-            program = {name: np.array(arrays[name]).tobytes() for name in QP_ARRAYS if name in arrays}
+                found["multipliers"] = solution.multipliers
+            program = {name: found[name].tobytes() for name in QP_ARRAYS if name in found}
             size = {"variables": len(arrays["q"]), "rows": len(arrays["G"])}
             yield QP, self._qp(**size, **program, **head).SerializeToString()
 
@@ -282,12 +255,6 @@ class Encoder:
         return dict(zip(self._inputs, values.tolist(), strict=True))
 
 
-def _deviations(covariances: Array) -> Array:
+def deviations(covariances: Array) -> Array:
+    """Returns the standard deviations (..., n) of covariances (..., n, n)."""
     return np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0))
-
-
-def _softness(caps: Array) -> Array:
-    """Zeros and the largest sizes of the multipliers (2, M), as recordings hold them."""
-    rows = np.zeros((2, len(caps)))
-    rows[1] = caps
-    return rows

@@ -1,13 +1,12 @@
 """Reads recorded runs as arrays, solves a recorded quadratic program again, and rescues unfinished files.
 
-A message whose checksum is right may still come from another program, so the sizes of its arrays are checked. A plan
-belongs to the step of its number, wherever it stands.
+A message whose checksum is right may come from another program, so the sizes of its arrays are checked.
 """
 
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
@@ -20,22 +19,22 @@ from mcap.writer import CompressionType, Writer
 from gpmpc._files import whole_file
 from gpmpc.exceptions import GpmpcError, RecordingError, SettingError
 from gpmpc.recording import _messages
-from gpmpc.recording._messages import PLAN, QP, QP_ARRAYS, STEP, TIMING, TOPICS
+from gpmpc.recording._messages import FIELDS, PLAN, QP, QP_ARRAYS, RESIDUALS, STEP, TIMING, TOPICS
 from gpmpc.recording._records import CONFIG, RECOVERED, room, whole_records
 from gpmpc.status import Status
 
 if TYPE_CHECKING:
     import pandas
 
-    from gpmpc.qp import QPSolution, QPSolver
+    from gpmpc.qp import QPSolution
 
 Array = np.ndarray
 _STATUSES = tuple(Status)
-_GROUPS = {"references": "reference", "states": "state", "measured": "measured", "innovations": "innovation"}
-_GROUPS |= {"inputs": "input", "timings": "timing"}  # of ``Run``, and of a step's message
-_COLUMNS = {"times": ("time", float), "steps": ("k", int), "iterations": ("iterations", int)}
-_COLUMNS |= {"active_set_sizes": ("active_set_size", int), "gp_sizes": ("gp_size", int)}
-_COLUMNS |= {"gp_versions": ("gp_version", int), "failed": ("failed", bool), "novelties": ("novelty", float)}
+#: of ``Run``, by the field of a step's message
+_ATTRIBUTES = {"time": "times", "k": "steps", "reference": "references", "state": "states", "measured": "measured"}
+_ATTRIBUTES |= {"input": "inputs", "innovation": "innovations", "iterations": "iterations", "timing": "timings"}
+_ATTRIBUTES |= {"active_set_size": "active_set_sizes", "gp_size": "gp_sizes", "gp_version": "gp_versions"}
+_ATTRIBUTES |= {"failed": "failed", "novelty": "novelties"}
 
 
 class RecordedProblem(NamedTuple):
@@ -70,7 +69,6 @@ class Run:
     belief_covariances: Array  # (K, n, n)
     plan_inputs: Array  # (K, H, m)
     plan_means: Array  # (K, H + 1, n)
-    plan_stds: Array  # (K, H + 1, n)
     plan_covariances: Array  # (K, H + 1, n, n)
     statuses: tuple[Status, ...]
     iterations: Array  # (K,)
@@ -92,6 +90,11 @@ class Run:
         return {axis: self.state_names.index(name) for axis, name in named if name in self.state_names}
 
     @cached_property
+    def plan_stds(self) -> Array:
+        """Standard deviations of the plans (K, H + 1, n)."""
+        return _messages.deviations(self.plan_covariances)
+
+    @cached_property
     def residuals(self) -> Array:
         """Primal and dual residual and duality gap of every recorded solution (K, 3); NaN without one."""
         nothing = (np.nan, np.nan, np.nan)
@@ -100,27 +103,19 @@ class Run:
     @cached_property
     def columns(self) -> dict[str, Array]:
         """The run as a table: a column (K,) per scalar field of ``gpmpc.Step``, in its order."""
-        with np.errstate(invalid="ignore"):  # NaN says it
-            std = np.sqrt(np.diagonal(self.belief_covariances, axis1=1, axis2=2))
-
-        def each(group: str, names: Sequence[str], values: Array) -> dict[str, Array]:
-            return {f"{group}.{name}": column for name, column in zip(names, values.T, strict=True)}
-
-        return (
-            {"time": self.times, "k": self.steps}
-            | each("reference", self.state_names, self.references)
-            | each("state", self.state_names, self.states)
-            | each("measured", self.state_names, self.measured)
-            | each("input", self.input_names, self.inputs)
-            | each("innovation", self.state_names, self.innovations)
-            | each("belief_std", self.state_names, std)
-            | {"status": np.array([status.name for status in self.statuses], dtype=object)}
-            | {"iterations": self.iterations, "active_set_size": self.active_set_sizes}
-            | each("timing", TIMING, self.timings)
-            | each("residuals", ("primal", "dual", "gap"), self.residuals.reshape(-1, 3))
-            | {"gp_size": self.gp_sizes, "gp_version": self.gp_versions}
-            | {"failed": self.failed, "novelty": self.novelties}
-        )
+        values: dict[str, Array] = {field: getattr(self, name) for field, name in _ATTRIBUTES.items()}
+        values["belief_std"] = _messages.deviations(self.belief_covariances)
+        values["residuals"] = self.residuals.reshape(-1, 3)
+        values["status"] = np.array([status.name for status in self.statuses], dtype=object)
+        names = {"State": self.state_names, "Input": self.input_names, "Timing": TIMING, "": RESIDUALS}
+        found = {}
+        for field, kind in FIELDS["Step"].items():
+            if field in values and kind in names:
+                columns = zip(names[kind], values[field].T, strict=True)
+                found |= {f"{field}.{name}": column for name, column in columns}
+            elif field in values:
+                found[field] = values[field]
+        return found
 
     def to_pandas(self) -> "pandas.DataFrame":
         """Returns ``columns`` as a data frame, units in its ``attrs``."""
@@ -131,13 +126,8 @@ class Run:
         return frame
 
 
-def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
-    """Solves the quadratic program of step k again; its minimiser is unique, so any exact solver finds the same plan.
-
-    Args:
-        run: A run recorded with its problems.
-        k: Number of the step.
-        solver: ``DualActiveSet()`` if omitted, which also takes soft rows.
+def replay(run: Run, k: int) -> "QPSolution":
+    """Solves the recorded quadratic program of step k again.
 
     Raises:
         RecordingError: The step or its problem is not in the recording, or it is no convex program.
@@ -147,17 +137,12 @@ def replay(run: Run, k: int, solver: "QPSolver | None" = None) -> "QPSolution":
     recorded = run.problems.get(k)
     if recorded is None:
         raise RecordingError(f"{run.path}: holds no quadratic program of step {k}; it holds {len(run.problems)} others")
-    chosen = DualActiveSet() if solver is None else solver
     inverse, caps = recorded.softness[:, len(recorded.q) :]
     try:
         problem = QuadraticProgram.from_stacked(*recorded[:5])
         if inverse.any():
-            raise SettingError("solver", "takes no quadratic prices of rows")
-        if np.isinf(caps).all():
-            return chosen.solve(problem)
-        if not isinstance(chosen, DualActiveSet):
-            raise SettingError("solver", f"must be DualActiveSet for soft rows; got {type(chosen).__name__}")
-        return chosen.solve(problem, prices=caps)
+            raise RecordingError("its rows have quadratic prices, as in files of the first edition")
+        return DualActiveSet().solve(problem, prices=None if np.isinf(caps).all() else caps)
     except GpmpcError as error:
         raise RecordingError(f"{run.path}: step {k}: {error}") from error
 
@@ -173,19 +158,12 @@ def read_run(path: str | Path) -> Run:
     schemas: dict[int, str] = {}
     channels: dict[int, Channel] = {}
     counts: Counter[int] = Counter()
-    messages: dict[str, list[Any]] = {STEP: [], PLAN: [], QP: []}
-    described: Any = None
+    found: dict[str, list[Message]] = {STEP: [], PLAN: [], QP: []}
     config, finished = "", False
     for record in whole_records(path):
         if isinstance(record, Message):
             counts[record.channel_id] += 1
-            topic = channels[record.channel_id].topic
-            if topic in messages:  # parsed at once, so that one that is damaged ends it before more are in memory
-                if described is None:  # another tool may have moved the metadata behind the messages
-                    everything = whole_records(path) if "run" not in metadata else ()
-                    behind = {more.name: more.metadata for more in everything if isinstance(more, Metadata)}
-                    described = _describe(path, metadata | behind)
-                messages[topic].append(_decode(path, topic, described[2], len(described[0]), record))
+            found.get(channels[record.channel_id].topic, []).append(record)
         elif isinstance(record, Schema):
             schemas[record.id] = record.name
         elif isinstance(record, Channel):
@@ -195,8 +173,15 @@ def read_run(path: str | Path) -> Run:
         elif isinstance(record, Attachment) and record.name == CONFIG:
             config = record.data.decode(errors="replace")
         finished = isinstance(record, Footer)
-    states, inputs, _ = described or _describe(path, metadata)
-    steps = messages[STEP]
+    about = metadata.get("run", {})
+    if not {"state_names", "input_names"} <= about.keys():
+        raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
+    try:
+        states, inputs = (_messages.check_names(key, about[key].split()) for key in ("state_names", "input_names"))
+        classes = _messages.message_classes(_messages.descriptor(states, inputs, "bytes"))
+    except SettingError as error:
+        raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
+    steps, plans, problems = (_decoded(path, topic, classes, len(states), found[topic]) for topic in found)
     return Run(
         path=path,
         finished=finished and RECOVERED not in metadata,
@@ -204,43 +189,34 @@ def read_run(path: str | Path) -> Run:
         input_names=inputs,
         statuses=tuple(_STATUSES[step.status] for step in steps),
         **_steps(steps, states, inputs),
-        **_plans(path, messages[PLAN], steps, states, inputs),
+        **_plans(path, plans, steps, states, inputs),
         channels={channel.topic: (counts[i], schemas.get(channel.schema_id, "")) for i, channel in channels.items()},
         metadata=metadata,
         config=config,
-        problems=dict(messages[QP]),
+        problems=dict(problems),
     )
 
 
-def _describe(path: Path, metadata: dict[str, dict[str, str]]) -> tuple[tuple[str, ...], tuple[str, ...], dict]:
-    """Finds the names of states and inputs, and builds the classes of the messages."""
-    about = metadata.get("run", {})
-    if not {"state_names", "input_names"} <= about.keys():
-        raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
-    try:
-        states, inputs = (_messages.check_names(key, about[key].split()) for key in ("state_names", "input_names"))
-        return states, inputs, _messages.message_classes(_messages.descriptor(states, inputs, "bytes"))
-    except SettingError as error:
-        raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
-
-
-def _decode(path: Path, topic: str, classes: dict[str, Any], n: int, record: Message) -> Any:
-    """Parses a message; of a quadratic program it returns its step's number k and itself."""
-    try:
-        message = classes[TOPICS[topic]].FromString(record.data)
-        if topic == QP:
-            return message.k, _problem(message)
-        if topic == PLAN:
-            _numbers(message, "covariances", len(message.stages), n, n)
-            if not message.stages:
-                raise ValueError("it has no stage")
-        else:
-            _numbers(message, "belief_covariance", n, n)
-            if not 0 <= message.status < len(_STATUSES):
-                raise ValueError(f"status {message.status} is unknown")
-        return message
-    except (DecodeError, ValueError) as error:
-        raise RecordingError(f"{path}: message {record.sequence} of {topic} is damaged: {error}") from error
+def _decoded(path: Path, topic: str, classes: dict[str, Any], n: int, records: list[Message]) -> list[Any]:
+    """Parses the messages of a topic; a quadratic program becomes its step's number k and itself."""
+    found: list[Any] = []
+    for record in records:
+        try:
+            message = classes[TOPICS[topic]].FromString(record.data)
+            if topic == QP:
+                message = message.k, _problem(message)
+            elif topic == PLAN:
+                _numbers(message, "covariances", len(message.stages), n, n)
+                if not message.stages:
+                    raise ValueError("it has no stage")
+            else:
+                _numbers(message, "belief_covariance", n, n)
+                if not 0 <= message.status < len(_STATUSES):
+                    raise ValueError(f"status {message.status} is unknown")
+        except (DecodeError, ValueError) as error:
+            raise RecordingError(f"{path}: message {record.sequence} of {topic} is damaged: {error}") from error
+        found.append(message)
+    return found
 
 
 def _numbers(message: Any, field: str, *shape: int) -> Array:
@@ -251,7 +227,7 @@ def _numbers(message: Any, field: str, *shape: int) -> Array:
     return np.frombuffer(data).reshape(shape)
 
 
-def _table(messages: Iterable[Any], names: tuple[str, ...]) -> Array:
+def _table(messages: Iterable[Any], names: Sequence[str]) -> Array:
     """Reads scalar fields of messages (K, names)."""
     return np.array([[getattr(message, name) for name in names] for message in messages]).reshape(-1, len(names))
 
@@ -262,11 +238,10 @@ def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dic
         bounds = _table([steps[0].input_lower, steps[0].input_upper], inputs)
     covariances = np.frombuffer(b"".join(step.belief_covariance for step in steps))
     found = {"input_bounds": bounds, "belief_covariances": covariances.reshape(-1, len(states), len(states))}
-    for name, (field, kind) in _COLUMNS.items():
-        found[name] = np.array([getattr(step, field) for step in steps], dtype=kind)
-    for name, field in _GROUPS.items():
-        names = {"input": inputs, "timing": TIMING}.get(field, states)
-        found[name] = _table((getattr(step, field) for step in steps), names)
+    names = {"State": states, "Input": inputs, "Timing": TIMING}
+    for field, name in _ATTRIBUTES.items():
+        kind, values = FIELDS["Step"][field], [getattr(step, field) for step in steps]
+        found[name] = _table(values, names[kind]) if kind in names else np.array(values, dtype=kind)
     return found
 
 
@@ -280,18 +255,17 @@ def _numbered(messages: list) -> Iterator[tuple[int, int]]:
 
 def _plans(path: Path, plans: list, steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Array]:
     H, n, m = max((len(plan.stages) - 1 for plan in plans), default=0), len(states), len(inputs)
-    if (needed := 8 * len(steps) * (H + 1) * (n * n + 2 * n + m)) > room(path):
+    if (needed := 8 * len(steps) * (H + 1) * (n * n + n + m)) > room(path):
         raise RecordingError(f"{path}: a plan of {H} stages would make arrays of {needed / 1e6:.0f} MB with the others")
-    shapes = {"inputs": (H, m), "means": (H + 1, n), "stds": (H + 1, n), "covariances": (H + 1, n, n)}
+    shapes = {"inputs": (H, m), "means": (H + 1, n), "covariances": (H + 1, n, n)}
     arrays = {f"plan_{name}": np.full((len(steps), *shape), np.nan) for name, shape in shapes.items()}
     rows = {key: row for row, key in enumerate(_numbered(steps))}
     for key, plan in zip(_numbered(plans), plans, strict=True):
         if key in rows:  # else the step is lost
-            inside, of_inputs = (rows[key], slice(len(plan.stages))), (rows[key], slice(len(plan.stages) - 1))
-            arrays["plan_means"][inside] = _table((stage.mean for stage in plan.stages), states)
-            arrays["plan_stds"][inside] = _table((stage.std for stage in plan.stages), states)
-            arrays["plan_inputs"][of_inputs] = _table((stage.input for stage in plan.stages[:-1]), inputs)
-            arrays["plan_covariances"][inside] = _numbers(plan, "covariances", len(plan.stages), n, n)
+            row, H = rows[key], len(plan.stages) - 1
+            arrays["plan_means"][row, : H + 1] = _table((stage.mean for stage in plan.stages), states)
+            arrays["plan_inputs"][row, :H] = _table((stage.input for stage in plan.stages[:-1]), inputs)
+            arrays["plan_covariances"][row, : H + 1] = _numbers(plan, "covariances", H + 1, n, n)
     return arrays
 
 
@@ -313,20 +287,12 @@ def _residuals(problem: RecordedProblem) -> tuple[float, float, float]:
     return solution._replace(caps=softness[1]).residuals()
 
 
-class Recovery(NamedTuple):
-    """What was found in a file."""
-
-    messages: int
-    seconds: float  # [s] between the first and the last of them
-    finished: bool  # the run had been recorded to its end; nothing was missing
-
-
-def recover(path: str | Path, output: str | Path) -> Recovery:
-    """Writes everything whole in a recording to a new file with index and footer, which says that it was recovered.
+def recover(path: str | Path, output: str | Path) -> Run:
+    """Writes everything whole in a recording to a new file with index and footer, and reads that.
 
     Args:
         path: A file that a crash left without footer; an MCAP reader takes it for empty.
-        output: The new file; it appears when it is complete and has been read once.
+        output: The new file, which says that it was recovered; it appears when it is complete and has been read.
 
     Raises:
         RecordingError: There is no run to recover, or the output cannot be written.
@@ -336,38 +302,36 @@ def recover(path: str | Path, output: str | Path) -> Recovery:
         if output.exists() and path.exists() and output.samefile(path):
             raise RecordingError(f"{output}: a file cannot be recovered into itself; name another output")
         with whole_file(output) as file:
-            times = _copy(path, file)
+            _copy(path, file)
             file.flush()
             try:
-                finished = read_run(file.name).finished
+                return replace(read_run(file.name), path=output)
             except RecordingError as error:
                 raise RecordingError(str(error).replace(file.name, str(path), 1)) from error
     except OSError as error:
         raise RecordingError(f"{output}: cannot be written: {error.strerror or error}") from error
-    return Recovery(len(times), (max(times) - min(times)) / 1e9 if times else 0.0, finished)
 
 
-def _copy(path: Path, file: BinaryIO) -> list[int]:
-    """Copies whole records; returns the time stamps of the messages [ns]."""
+def _copy(path: Path, file: BinaryIO) -> None:
+    """Copies whole records."""
     writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile="gpmpc", library="gpmpc")
-    schemas, channels, times, finished = {0: 0}, {}, [], False
+    schemas, channels, messages, finished = {}, {}, 0, False
     for record in whole_records(path):
         if isinstance(record, Schema) and record.id not in schemas:
             schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
         elif isinstance(record, Channel) and record.id not in channels:
-            about = (record.topic, record.message_encoding, schemas[record.schema_id], record.metadata)
+            about = (record.topic, record.message_encoding, schemas.get(record.schema_id, 0), record.metadata)
             channels[record.id] = writer.register_channel(*about)
         elif isinstance(record, Message):
             channel = channels[record.channel_id]
             writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
-            times.append(record.log_time)
+            messages += 1
         elif isinstance(record, Metadata):
             writer.add_metadata(record.name, record.metadata)
         elif isinstance(record, Attachment):
             writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
         finished = isinstance(record, Footer)
     if not finished:
-        writer.add_metadata(RECOVERED, {"messages": str(len(times))})
+        writer.add_metadata(RECOVERED, {"messages": str(messages)})
     writer.finish()
-    return times

@@ -1,10 +1,7 @@
 """Records every step of a run in a file that explains itself and survives a crash, and shows it live.
 
-``record`` keeps a copy of the step, some ten microseconds; at every ``CHUNK`` bytes or ``INTERVAL`` seconds the steps
-kept are serialised and written as one compressed chunk. A run killed at any moment loses at most that last chunk.
-
-Before the first step the file holds where it comes from (commit, versions, host, command, the caller's metadata), the
-resolved configuration, units and frames, flushed to the disk. An unfinished file has no footer; see ``recover``.
+``record`` copies the step; the copies that wait are serialised and written as one compressed chunk, and a run killed at
+any moment loses at most that one. Where the file comes from is on the disk before the first step.
 """
 
 import contextlib
@@ -41,7 +38,6 @@ class McapRecorder:
         system: What is recorded.
         config: The resolved configuration, as YAML text or as plain data (written as JSON, which is YAML).
         metadata: More to know of the run, such as its seed.
-        start_time_ns: Time stamp of the run's time 0 [ns since 1970]. With 0, equal runs give equal files.
         record_problems: Keep every step's quadratic program, so that it can be replayed.
         chunk_size: Numbers [bytes] that wait in memory at most, if more than one step does; what a killed run loses.
         live: Serve every step to viewers as well, at ``address``.
@@ -57,12 +53,10 @@ class McapRecorder:
         *,
         config: Mapping[str, Any] | str = "",
         metadata: Mapping[str, Any] | None = None,
-        start_time_ns: int = 0,
         record_problems: bool = True,
         chunk_size: int = 256 * 1024,
         live: bool = False,
     ):
-        check_number("start_time_ns", start_time_ns, least=0, whole=True, unit="[ns]")
         check_number("chunk_size", chunk_size, least=1, whole=True, unit="[bytes]")
         about = flattened(provenance() | {"host": platform.node()} | dict(metadata or {}))
         about = {key: str(value) for key, value in about.items()}
@@ -73,28 +67,23 @@ class McapRecorder:
         self.path = Path(path)
         self.address: str | None = None  #: where a viewer finds the live view, such as ``ws://127.0.0.1:8765``
         self._n, self._m = len(system.state_names), len(system.input_names)
-        self._start, self._record_problems, self._chunk_size = start_time_ns, record_problems, chunk_size
+        self._record_problems, self._chunk_size = record_problems, chunk_size
         self._encoder = Encoder(system)
         self._waiting: list[StepCopy] = []
-        self._bytes, self._steps, self._last = 0, 0, time.perf_counter()
-        self._error: str | None = None
-        self._failed = False
-        self._server: Any = None
+        self._bytes, self._steps = 0, 0
+        self._error: str | None = None  # why no more steps are taken
+        self._closed, self._server = False, None
         self._sink = _Sink(self.path)
         self._context = context = foxglove.Context()  # its channels live as long as it does
-        options = MCAPWriteOptions(
-            profile="gpmpc",
-            chunk_size=None,  # ``_end_chunk`` ends them
-            disable_seeking=True,  # a chunk is written in one piece
-            compression_threads=0,
-            compression_level=1,
-        )
+        # ``_end_chunk`` ends chunks, and each is written in one piece.
+        options: Any = {"chunk_size": None, "disable_seeking": True, "compression_threads": 0, "compression_level": 1}
+        options = MCAPWriteOptions(profile="gpmpc", **options)
         self._writer = foxglove.open_mcap(self._sink, context=context, writer_options=options)
         described = {"run": about, "units": system.field_units, "frames": frames, "pose": dict(system.pose)}
         for name, pairs in described.items():
             self._writer.write_metadata(name, pairs)
-        stamps = {"log_time": start_time_ns, "create_time": start_time_ns}
-        self._writer.attach(name=CONFIG, media_type="application/yaml", data=config.encode(), **stamps)
+        attached = {"media_type": "application/yaml", "log_time": 0, "create_time": 0}
+        self._writer.attach(name=CONFIG, data=config.encode(), **attached)
         self._writer.flush()
         self._save(sync=True)
         self._channels, self._log = self._encoder.channels(context), LogChannel("/log", context=context)
@@ -106,8 +95,8 @@ class McapRecorder:
                 self._server = foxglove.start_server(name=self.path.name, port=0, context=context)
             self.address = f"ws://127.0.0.1:{self._server.port}"
 
-    def record(self, step: Step, gp_size: int | None = None) -> None:
-        """Takes a copy of a step; ``gp_size`` transitions are in the model, where the step does not say.
+    def record(self, step: Step) -> None:
+        """Takes a copy of a step.
 
         Raises:
             ShapeError: An array does not fit the names of states and inputs.
@@ -115,8 +104,8 @@ class McapRecorder:
         """
         if self._error is not None:
             raise RecordingError(self._error)
-        copy = StepCopy(step, gp_size, self._n, self._m, self._record_problems)
-        size = len(copy.data)
+        copy = StepCopy(step, self._n, self._m, self._record_problems)
+        size = sum(array.nbytes for array in copy.arrays.values())
         if 4 * size > LARGEST:
             raise RecordingError(f"{self.path}: a step of {size} bytes is too large; at most {LARGEST // 4}")
         self._waiting.append(copy)
@@ -132,14 +121,15 @@ class McapRecorder:
         Raises:
             RecordingError: It could not be written; the file is left unfinished.
         """
-        if self._failed:
-            raise RecordingError(self._error)
-        if self._error is not None:
+        if self._closed:
             return
+        if self._error is not None:
+            raise RecordingError(self._error)
         self._end_chunk()
         self._writer.write_metadata("end", {"steps": str(self._steps), "outcome": outcome})
         self._writer.close()
         self._save(sync=True)
+        self._closed = True
         self._end("the recording is closed")
 
     def __enter__(self) -> "McapRecorder":
@@ -160,7 +150,7 @@ class McapRecorder:
     def _serialise(self) -> None:
         """Logs the steps that wait: into the open chunk, and to viewers."""
         for copy in self._waiting:
-            stamp = self._start + round(copy.step.time * 1e9)
+            stamp = round(copy.step.time * 1e9)
             for topic, message in self._encoder.encode(copy):
                 self._channels[topic].log(message, log_time=stamp)
             self._scene.log(copy, stamp)
@@ -175,7 +165,6 @@ class McapRecorder:
             self._sink.save(sync)
         except OSError as error:
             self._end(f"the recording stopped and is unfinished: {error.strerror}")
-            self._failed = True
             raise RecordingError(self._error) from error
         self._bytes, self._last = 0, time.perf_counter()
 
@@ -183,26 +172,26 @@ class McapRecorder:
         self._error = f"{self.path}: {reason}"
         if self._server is not None:
             self._server.stop()
-        self._sink.close()
+        os.close(self._sink.descriptor)  # other processes may write the file
 
 
 class _Sink:
-    """Collects what the library writes until it is saved in one piece.
+    """Collects what the library writes until it is saved, so that an error of the disk reaches the caller.
 
     (A writer that is not closed adds a footer when it is collected: what is never saved does no harm.)
     """
 
     def __init__(self, path: Path):
-        self._data, self._position, self._saved = bytearray(), 0, 0
+        self._data, self._position = bytearray(), 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
+            self.descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
-        if not lock_descriptor(self._descriptor, blocking=False):
-            os.close(self._descriptor)
+        if not lock_descriptor(self.descriptor, blocking=False):
+            os.close(self.descriptor)
             raise RecordingError(f"{path}: another process is recording to this file")
-        os.ftruncate(self._descriptor, 0)
+        os.ftruncate(self.descriptor, 0)
 
     def write(self, data: bytes | bytearray) -> int:
         """Takes all of the data."""
@@ -218,22 +207,12 @@ class _Sink:
         """Does nothing: see ``save``."""
 
     def save(self, sync: bool) -> None:
-        """Writes what was collected, and puts it on the disk if asked to; where that fails, nothing of it stays."""
+        """Writes what was collected, and puts it on the disk if asked to."""
         left, self._data = memoryview(self._data), bytearray()
-        size = len(left)
-        try:
-            while left:
-                left = left[os.write(self._descriptor, left) :]
-            if sync:
-                os.fsync(self._descriptor)
-        except OSError:
-            os.ftruncate(self._descriptor, self._saved)
-            raise
-        self._saved += size
-
-    def close(self) -> None:
-        """Lets other processes write the file."""
-        os.close(self._descriptor)
+        while left:
+            left = left[os.write(self.descriptor, left) :]
+        if sync:
+            os.fsync(self.descriptor)
 
 
 def _failure(copy: StepCopy, nanoseconds: int) -> Log:

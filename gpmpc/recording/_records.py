@@ -1,17 +1,13 @@
 """Reads the records of an MCAP file that was cut off, damaged, or made by somebody else.
 
-Records are parsed by MCAP's library, up to the first that does not fit into the file, a chunk whose checksum is wrong,
-or a reference to what was not declared. Metadata and attachments that are damaged are left out. A footer is yielded
-only if nothing is missing and every checksum of the file (of chunks, attachments, data and index) is right. (The
-library alone believes every length, unfolds whatever a chunk holds, and skips the checksums of attachments and index.)
-
-Nothing is unfolded before it is known to be small: a record or chunk has at most ``LARGEST`` bytes, and all of them
-together take at most ``room``.
+MCAP's library parses each record from its own bytes alone, up to the first that does not fit into the file, a chunk
+whose checksum is wrong, or a message of no channel. Metadata and attachments that are damaged are left
+out. A footer is yielded only if nothing is missing and every checksum of the file (of chunks, attachments, data and
+index) is right. Nothing is unfolded before it is known to be small.
 """
 
 import struct
 import zlib
-from collections import Counter
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
@@ -19,20 +15,20 @@ from typing import BinaryIO
 
 import lz4.frame
 import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema, Statistics
-from mcap.stream_reader import StreamReader
+from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from gpmpc.exceptions import RecordingError
 
 CONFIG, RECOVERED = "config.yaml", "recovered"  # an attachment; metadata of a file that holds what was left of another
-LARGEST = 32 * 2**20  # [bytes]
+LARGEST = 32 * 2**20  # of a record or an unfolded chunk [bytes]
 _ROOM, _RATIO = 64 * 2**20, 300  # [bytes], and bytes a byte of the file; runs are compressed 2 to 10 times
-_OBJECT = 2000  # [bytes] that a message takes besides its content
 _HEAD = struct.Struct("<BQ")  # kind and length
-_IN_DATA = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA}
+_KINDS = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.MESSAGE: Message, Opcode.CHUNK: Chunk}
+_KINDS |= {Opcode.ATTACHMENT: Attachment, Opcode.METADATA: Metadata}
 _BROKEN = (McapError, struct.error, UnicodeDecodeError, OverflowError, zstandard.ZstdError, RuntimeError)
 
 
@@ -51,14 +47,11 @@ def whole_records(path: Path) -> Iterator[McapRecord]:
             if magic != MCAP0_MAGIC:
                 reason = "is empty: its recording was killed before it began" if not magic else "is not an MCAP file"
                 raise RecordingError(f"{path}: {reason}")
-            declared: dict[tuple[type, int], McapRecord | None] = {(Schema, 0): None}
+            channels = set()
             for record in _sound_records(file, path):
-                if isinstance(record, Message) and (Channel, record.channel_id) not in declared:
-                    return
-                if isinstance(record, Channel) and (Schema, record.schema_id) not in declared:
-                    return
-                new = isinstance(record, Schema | Channel)
-                if new and declared.setdefault((type(record), getattr(record, "id", 0)), record) != record:
+                if isinstance(record, Channel):
+                    channels.add(record.id)
+                elif isinstance(record, Message) and record.channel_id not in channels:
                     return
                 yield record
     except OSError as error:
@@ -67,43 +60,32 @@ def whole_records(path: Path) -> Iterator[McapRecord]:
 
 def _sound_records(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
     """Yields the records behind the magic bytes, as far as lengths and checksums are right."""
-    left, size, checksum = room(path), path.stat().st_size, zlib.crc32(MCAP0_MAGIC)
-    counts: Counter[type] = Counter()
-    whole, in_data = True, True
-    while len(head := file.read(_HEAD.size)) == _HEAD.size:
-        kind, length = _HEAD.unpack(head)
-        if not kind or length > min(LARGEST, size - file.tell()):
-            return
-        content = file.read(length)
-        before, checksum = checksum, zlib.crc32(content, zlib.crc32(head, checksum))
+    left, size, checksum, whole, in_data = room(path), path.stat().st_size, zlib.crc32(MCAP0_MAGIC), True, True
+    while True:
+        kind = 0
         try:
-            if kind == Opcode.DATA_END:
-                whole = whole and _agrees(content[:4], before)
-                in_data, checksum = False, 0
-            elif kind == Opcode.FOOTER:
-                ends = file.read(len(MCAP0_MAGIC) + 1) == MCAP0_MAGIC
+            head, content = _frame(file, size)
+            kind, before, checksum = head[0], checksum, zlib.crc32(content, zlib.crc32(head, checksum))
+            if kind == Opcode.FOOTER:
                 index = zlib.crc32(content[:16], zlib.crc32(head, before))  # the last field is the checksum
-                if whole and ends and not in_data and _agrees(content[16:20], index):
+                if whole and not in_data and _agrees(content[16:20], index) and file.read(9) == MCAP0_MAGIC:
                     yield Footer(*struct.unpack("<QQI", content))
                 return
-            elif kind == Opcode.STATISTICS or (in_data and kind in _IN_DATA):  # schemas and channels are repeated
-                for record in _parsed(head + content):
-                    counts[type(record)] += 1
-                    if isinstance(record, Statistics):
-                        said = record.message_count, record.attachment_count, record.metadata_count, record.chunk_count
-                        whole = whole and said == tuple(counts[k] for k in (Message, Attachment, Metadata, Chunk))
-                    elif isinstance(record, Chunk):
-                        for inner in _parsed(_unfolded(record)):
-                            counts[type(inner)] += 1
-                            left -= _OBJECT + (len(inner.data) if isinstance(inner, Message | Schema) else 0)
-                            if left < 0:
-                                limit = f"{room(path) / 1e6:.0f} MB"
-                                raise RecordingError(f"{path}: its chunks unfold to more than {limit}")
-                            yield inner
-                    elif isinstance(record, Attachment) and not _agrees(content[-4:], zlib.crc32(content[:-4])):
-                        whole = False
-                    else:
-                        yield record
+            if kind == Opcode.DATA_END:
+                whole, in_data, checksum = whole and _agrees(content[:4], before), False, 0
+            elif in_data and kind in _KINDS:
+                record = _parsed(kind, content)
+                if not isinstance(record, Chunk):
+                    yield record
+                    continue
+                left -= record.uncompressed_size
+                if left < 0:
+                    raise RecordingError(f"{path}: its chunks unfold to more than {room(path) / 1e6:.0f} MB")
+                inside = BytesIO(_unfolded(record))
+                while inside.tell() < record.uncompressed_size:
+                    head, content = _frame(inside, record.uncompressed_size)
+                    if head[0] in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                        yield _parsed(head[0], content)
         except RecordingError:
             raise  # it is a RuntimeError, as broken records raise
         except _BROKEN:
@@ -112,30 +94,31 @@ def _sound_records(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
             whole = False
 
 
-def _agrees(stored: bytes, computed: int) -> bool:
-    return struct.unpack("<I", stored)[0] in (0, computed)  # 0: there is no checksum
+def _frame(stream: BinaryIO | BytesIO, end: int) -> tuple[bytes, bytes]:
+    """Reads the head and the content of a record that ends at ``end`` at the latest."""
+    head = stream.read(_HEAD.size)
+    kind, length = _HEAD.unpack(head)
+    if not kind or length > min(LARGEST, end - stream.tell()):
+        raise EndOfFile
+    return head, stream.read(length)
 
 
-class _Bounded(BytesIO):
-    """A stream whose ``read`` gives all of the length, or raises ``EndOfFile``; ``asked`` is the last length."""
+class _Content(ReadDataStream):
+    """The bytes of one record; what is not there cannot be read."""
 
-    asked = 0
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        self.asked = size or 0
-        if self.asked > len(self.getbuffer()) - self.tell():
+    def read(self, length: int) -> bytes:
+        data = super().read(length)
+        if len(data) != length:
             raise EndOfFile
-        return super().read(size)
+        return data
 
 
-def _parsed(data: bytes) -> Iterator[McapRecord]:
-    """Parses records that follow each other; those of an unknown kind are left out."""
-    stream = _Bounded(data)
-    try:
-        yield from StreamReader(stream, skip_magic=True, emit_chunks=True).records
-    except EndOfFile:
-        if stream.tell() < len(data) or stream.asked != 1:  # a record begins with one byte, its kind
-            raise
+def _parsed(kind: int, content: bytes) -> McapRecord:
+    """Parses a record, of an attachment only if its checksum is right."""
+    stream = _Content(BytesIO(content))
+    if kind == Opcode.ATTACHMENT and not _agrees(content[-4:], zlib.crc32(content[:-4])):
+        raise EndOfFile
+    return Message.read(stream, len(content)) if kind == Opcode.MESSAGE else _KINDS[Opcode(kind)].read(stream)
 
 
 def _unfolded(chunk: Chunk) -> bytes:
@@ -152,3 +135,7 @@ def _unfolded(chunk: Chunk) -> bytes:
     if len(data) != size or not _agrees(struct.pack("<I", chunk.uncompressed_crc), zlib.crc32(data)):
         raise EndOfFile
     return data
+
+
+def _agrees(stored: bytes, computed: int) -> bool:
+    return struct.unpack("<I", stored)[0] in (0, computed)  # 0: there is no checksum

@@ -1,11 +1,8 @@
 """Draws steps in space: where the vehicle is, where it should be, where it plans to go and how sure it is.
 
-``RecordedSystem.pose`` names the states of position and attitude; what has none is 0. The tube of a plan is one
-ellipsoid per stage, the 2-sigma surface of the predicted position. A viewer draws some thirty pictures a second, so no
-more are written.
-
-Viewers have their z axis pointing upwards: the frame ``display`` is the parent of the world frame, half a turn about x
-away where that one's points downwards, and is the one to look from.
+An axis that no state is, is 0. The tube of a plan is one ellipsoid per stage, the 2-sigma surface of the predicted
+position. A viewer draws some thirty pictures a second, so no more are written. Viewers have their z axis pointing
+upwards: the frame ``display``, to look from, is half a turn about x away from a world whose z axis points downwards.
 """
 
 from typing import Any

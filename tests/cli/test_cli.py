@@ -64,7 +64,7 @@ def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
         ),
         (["tables", "folder=null"], "folder: must be the path of a folder; got None"),
         (["tables", "data.rotational.Q=null"], "Q: must be a list of 6 numbers; got None"),
-        (["tables", "draws"], "'draws': a setting is written SETTING=VALUE"),
+        (["tables", "draws"], "'draws': cannot be read; a setting is written SETTING=VALUE"),
         (["tables", "folder="], "folder: must be the path of a folder; got ''"),
         (["tables", "seed="], "seed: must be a whole number"),
     ],

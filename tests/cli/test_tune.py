@@ -1,7 +1,8 @@
-"""``gpmpc tune`` as a user meets it: the best settings as a file that flies, resumption, and one line for a mistake."""
+"""``gpmpc tune`` as a user meets it: the command that flies the best one, resumption, one line for a mistake."""
 
 import json
 import re
+import shlex
 
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -34,14 +35,15 @@ def test_a_search_goes_on_where_it_stopped_and_its_best_settings_fly(tmp_path):
     assert (tmp_path / "tree" / "tuning.csv").read_text() == (tmp_path / "whole" / "tuning.csv").read_text()
     assert (found["best"], found["cost"]) == (whole["best"], whole["cost"])
     assert (tmp_path / "tree" / "tuning.png").read_bytes().startswith(b"\x89PNG")
-    arguments = ["--config-dir", "tree", "--config-name", "best"]
-    composed = json.loads(forked("run", "--cfg", *arguments, "--json", cwd=tmp_path).stdout)
+    program, *arguments = shlex.split(found["command"])
+    assert program == "gpmpc"
+    composed = json.loads(forked(*arguments, "--cfg", "--json", cwd=tmp_path).stdout)
     assert composed["steps"] == 4
     assert composed["horizon"] == found["best"]["horizon"]
     assert composed["controller"]["problem"]["cost"]["R"][1] == found["best"]["controller.problem.cost.R.1"]
     kind = {"convex": "GPMPC", "lqr": "LQR"}[found["best"]["controller"]]
     assert composed["controller"]["_target_"].endswith(f".{kind}")
-    again = forked("run", *arguments, "--json", "folder=again", cwd=tmp_path)
+    again = forked(*arguments, "--json", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     totals = [json.loads(path.read_text())["rmse"]["total"] for path in tmp_path.glob("tree/*/metrics.json")]
     assert json.loads(again.stdout)["rmse"]["total"] in totals

@@ -23,7 +23,7 @@ BARE = 50  # what a process that reads recordings takes at least [MB]
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "run.mcap"
-    return path, runs.record_run(path, steps=20, config=20 * "seed: 7\n", start_time_ns=10**18)
+    return path, runs.record_run(path, steps=20, config=20 * "seed: 7\n")
 
 
 def check_study(path, seed, count):
@@ -79,12 +79,9 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("data_checksum", [True, False])
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_file_of_which_a_record_is_lost_or_repeated_is_not_finished(recorded, tmp_path, change, data_checksum):
+def test_a_file_of_which_a_record_is_lost_or_repeated_is_not_finished(recorded, tmp_path, change):
     path, found = tmp_path / "changed.mcap", list(damage.records(recorded[0].read_bytes()[len(damage.MAGIC) :]))
-    if not data_checksum:  # then the numbers of messages, chunks, metadata and attachments in the index have to do
-        found = [(kind, bytes(4) if kind == damage.DATA_END else content) for kind, content in found]
     read_again = 0
     for i, (kind, _) in enumerate(found):
         if kind in (damage.CHUNK, damage.METADATA, damage.ATTACHMENT):

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from gpmpc.exceptions import RecordingError, SettingError, ShapeError
-from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
+from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.recording import RecordedSystem, _recorder, read_run, replay
 from gpmpc.status import Status
 from tests.recording import runs
@@ -123,8 +123,6 @@ def test_soft_rows_are_replayed_soft(tmp_path):
     np.testing.assert_allclose(run.residuals[0], solution.residuals(), atol=1e-15)
     hard = solution._replace(caps=np.full_like(solution.caps, np.inf))
     assert max(solution.residuals()) < 1e-6 < max(hard.residuals())
-    with pytest.raises(RecordingError, match="step 0: solver: must be DualActiveSet for soft rows"):
-        replay(run, 0, PrimalActiveSet())
 
 
 def test_a_run_without_problems_has_none_to_replay_and_to_judge(tmp_path):
@@ -362,7 +360,7 @@ def test_a_disk_that_is_full_from_the_start_is_reported_at_the_start(tmp_path):
     path = tmp_path / "run.mcap"
     with pytest.raises(RecordingError, match="unfinished: File too large"), disk_of(100):
         runs.recorder(path)
-    with pytest.raises(RecordingError, match="is empty"):
+    with pytest.raises(RecordingError, match="is not the recording of a run"):
         read_run(path)
 
 

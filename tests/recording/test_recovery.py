@@ -44,10 +44,14 @@ def whole_messages(data):
     return count
 
 
+def messages_of(run):
+    return sum(count for count, _ in run.channels.values())
+
+
 def check_recovered(path, output):
     expected = whole_messages(path.read_bytes())
     found = recover(path, output)
-    assert found.messages == expected
+    assert messages_of(found) == expected
     with output.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert len(list(reader.iter_messages())) == expected
@@ -115,7 +119,7 @@ def test_a_killed_run_loses_at_most_its_last_chunk(start, tmp_path):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "run.mcap"
-    runs.record_run(path, steps=20, config="seed: 7\n", start_time_ns=10**18)
+    runs.record_run(path, steps=20, config="seed: 7\n")
     return path
 
 
@@ -150,7 +154,7 @@ def test_a_damaged_chunk_ends_what_is_recovered(finished, tmp_path):
     data[chunks[-1].chunk_start_offset + 100] ^= 0xFF
     path, output = tmp_path / "damaged.mcap", tmp_path / "recovered.mcap"
     path.write_bytes(data)
-    assert 0 < recover(path, output).messages < recover(finished, tmp_path / "copy.mcap").messages
+    assert 0 < messages_of(recover(path, output)) < messages_of(recover(finished, tmp_path / "copy.mcap"))
     assert not read_run(path).finished
 
 
@@ -158,7 +162,7 @@ def test_a_finished_file_is_copied_with_nothing_lost(finished, tmp_path):
     output = tmp_path / "copy.mcap"
     found = recover(finished, output)
     assert found.finished
-    assert found.seconds == pytest.approx(1.9)
+    assert np.ptp(found.times) == pytest.approx(1.9)
     before, after = read_run(finished), read_run(output)
     np.testing.assert_array_equal(before.plan_means, after.plan_means)
     assert after.finished
