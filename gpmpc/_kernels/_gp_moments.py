@@ -51,8 +51,6 @@ from gpmpc._kernels.linalg import (
     symmetrize,
 )
 
-VALUE, JACOBIAN, CROSS = 0, 1, 2  # derivatives of nothing, of M and V, of J as well
-
 
 class _Belief(NamedTuple):
     """A belief, and the GPs with their points relative to its mean and input."""
@@ -106,10 +104,10 @@ class _Scratch(NamedTuple):
 
 
 @compiled
-def evaluate_moments(order, diagonal, gp, precision, mu, S, u, out):
+def evaluate_moments(derivatives, diagonal, gp, precision, mu, S, u, out):
     """Writes the arrays of ``gpmpc._kernels.Moments`` at mu (H, n), S (H, n, n) and u (H, m).
 
-    ``order`` is ``VALUE``, ``JACOBIAN`` or ``CROSS``; the arrays of ``out`` are full of zeros, or empty beyond that.
+    The arrays of ``out`` are full of zeros; those of derivatives are empty where these are not wanted.
     """
     use_widest_registers()
     (k, padded), n, m = gp.weights.shape, mu.shape[1], u.shape[1]
@@ -127,24 +125,23 @@ def evaluate_moments(order, diagonal, gp, precision, mu, S, u, out):
             _evaluate_output(belief, a, terms, scratch)
             out.M[h, a] = terms.M[a]
             multiply_transposed(terms.G[a], terms.first[a], out.J[h, a])
-            if order >= JACOBIAN:
+            if derivatives:
                 to, sums = (out.J[h, a], out.dM_dS[h, a], out.dM_du[h, a]), (terms.first[a], terms.second[a])
                 _differentiate_sum(terms.weighted[a], 1.0, belief, a, terms, sums, scratch, to)
-            if order == CROSS:
                 _differentiate_J(belief, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a])
         for a in range(k):
             reduction = reduce_variance(precision.inverse_cholesky[a], terms.q[a], scratch.row)
             out.V[h, a, a] = np.exp(gp.log_signal[a]) - reduction
-            if order >= JACOBIAN:
+            if derivatives:
                 to = out.dV_dmu[h, a, a], out.dV_dS[h, a, a], out.dV_du[h, a, a]
                 sums = terms.e_first[a], terms.e_second[a]
                 multiply(scratch.row, terms.q[a], scratch.row)  # (K_a + sn2_a I)^-1 q_a becomes e
                 terms.e[a] = _differentiate_sum(scratch.row, -2.0, belief, a, terms, sums, scratch, to)
             for b in range(a, a + 1 if diagonal else k):
-                P_sum = _evaluate_pair(belief, a, b, terms, pair, precision.centred[a], order >= JACOBIAN, scratch)
+                P_sum = _evaluate_pair(belief, a, b, terms, pair, precision.centred[a], derivatives, scratch)
                 out.V[h, a, b] += P_sum
                 out.V[h, b, a] = out.V[h, a, b]
-                if order >= JACOBIAN:
+                if derivatives:
                     to = out.dV_dmu[h, a, b], out.dV_dS[h, a, b], out.dV_du[h, a, b]
                     _differentiate_pair(belief, a, b, terms, pair, P_sum, scratch, to)
                     out.dV_dmu[h, b, a], out.dV_dS[h, b, a], out.dV_du[h, b, a] = to
