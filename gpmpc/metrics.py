@@ -31,14 +31,10 @@ def negative_log_predictive_density(mean: Tensor, variance: Tensor, observed: Te
 def interval_coverage(mean: Tensor, variance: Tensor, observed: Tensor, level: float = 0.95) -> float:
     """Computes the part of observations inside the central interval of a level; all (N, n). Ideal: the level."""
     _check_alike(mean=mean, variance=variance, observed=observed)
-    _check_level(level)
-    half_width = torch.special.ndtri(torch.tensor((1 + level) / 2, dtype=variance.dtype)) * variance.sqrt()
-    return float(((observed - mean).abs() <= half_width).double().mean())
-
-
-def _check_level(level: float) -> None:
     if not 0 < level < 1:
         raise SettingError("level", f"must lie between 0 and 1; got {level}")
+    half_width = torch.special.ndtri(torch.tensor((1 + level) / 2, dtype=variance.dtype)) * variance.sqrt()
+    return float(((observed - mean).abs() <= half_width).double().mean())
 
 
 def _check_alike(**given: Tensor) -> None:
@@ -139,10 +135,8 @@ class _ViolationRate:
         return self.violations / self.steps
 
 
-def violation_rate(
-    values: np.ndarray, lower: np.ndarray, upper: np.ndarray, level: float = 0.95, tolerance: float = 1e-9
-) -> _ViolationRate:
-    """Counts how often states or inputs were outside their bounds, with the interval of Clopper and Pearson (1934).
+def violation_rate(values: np.ndarray, lower: np.ndarray, upper: np.ndarray, tolerance: float = 1e-9) -> _ViolationRate:
+    """Counts how often states or inputs were outside their bounds, with the 95 % interval of ``binomial_interval``.
 
     The interval takes steps for independent. Those of one flight are not: pool several seeds, and read it as a lower
     limit of the doubt.
@@ -151,7 +145,6 @@ def violation_rate(
         values: One row a step (K, d).
         lower: (d,); -inf where there is none.
         upper: (d,); inf where there is none.
-        level: Of the interval, two-sided.
         tolerance: What a solver's round-off may be outside.
     """
     values, lower, upper = (np.asarray(a, dtype=float) for a in (values, lower, upper))
@@ -165,12 +158,11 @@ def violation_rate(
     inside = (values >= lower - tolerance) & (values <= upper + tolerance)
     violations = int((~inside.all(axis=1)).sum())
     outside = np.fmax.reduce(np.maximum(lower - values, values - upper), axis=None, initial=0.0)
-    return _ViolationRate(violations, len(values), float(outside), *binomial_interval(violations, len(values), level))
+    return _ViolationRate(violations, len(values), float(outside), *binomial_interval(violations, len(values)))
 
 
 def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
     """Computes the exact interval for a probability from ``successes`` of ``trials`` (Clopper and Pearson, 1934)."""
-    _check_level(level)
     if not 0 <= successes <= trials or trials < 1:
         raise SettingError("successes", f"must lie between 0 and trials, 1 or more; got {successes} of {trials}")
     low, high = stats.binomtest(successes, trials).proportion_ci(level, "exact")
