@@ -65,21 +65,11 @@ class Moments(NamedTuple):
 def linearize(
     packed: Packed | Window, x: Array, u: Array, covariance: bool, offset: Array, adds_state: bool
 ) -> tuple[Array, Array, Array, Array | None]:
-    """Linearises k GPs at K points in one call.
+    """Linearises k GPs with prior means ``offset`` (k,) at K states x (K, n) and inputs u (K, m).
 
-    Args:
-        packed: The GPs.
-        x: States (K, n), float64 like ``u``.
-        u: Inputs (K, m).
-        covariance: Whether the covariances are computed; they take most of the time.
-        offset: Constant prior means (k,).
-        adds_state: Whether the GPs predict differences x+ - x (k = n).
-
-    Returns:
-        Means (K, k), their derivatives by x (K, k, n) and by u (K, k, m), and covariances (K, k, k) or None.
-
-    Raises:
-        ShapeError: x or u do not fit the model.
+    ``adds_state`` says that they predict differences x+ - x (k = n). Returns means (K, k), their derivatives by x
+    (K, k, n) and by u (K, k, m), and covariances (K, k, k), which take most of the time, or None. Raises ShapeError
+    where x or u do not fit.
     """
     K, k, n, m = len(x), len(packed.arrays.weights), packed.state_dim, packed.input_dim
     if x.shape != (K, n) or u.shape != (K, m):
@@ -108,18 +98,10 @@ def point_with_jacobian(packed: Packed, x: Array, u: Array) -> Expansion:
 def moments(
     packed: Packed, mu: Array, S: Array, u: Array, diagonal: bool = False, derivatives: bool = False
 ) -> Moments:
-    """The exact moments of f at uncertain points.
+    """The exact moments of f, x ~ N(mu, S) with mu (H, n) and positive semidefinite S (H, n, n), at inputs u (H, m).
 
-    Args:
-        packed: The GPs.
-        mu: Means of the state (H, n).
-        S: Their covariances (H, n, n), symmetric and positive semidefinite.
-        u: Inputs (H, m).
-        diagonal: Leaves the covariances between outputs at zero.
-        derivatives: Whether all derivatives are computed; else their arrays are empty.
-
-    Raises:
-        ShapeError: mu, S or u do not fit the model.
+    ``diagonal`` leaves the covariances between outputs at zero; without ``derivatives`` their arrays are empty. Raises
+    ShapeError where mu, S or u do not fit.
     """
     mu, u = _points(packed, mu, u)
     S = np.array(S, dtype=np.float64, order="C")

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from gpmpc._kernels.linalg import aligned_rows
 from gpmpc.exceptions import ShapeError
 
 Array = NDArray[np.float64]
@@ -85,16 +86,8 @@ def pack(
 ) -> Packed:
     """Lays out exact SE-ARD GPs for the compiled kernels.
 
-    Args:
-        features: x~ = (x, u) of the training points (N, n + m).
-        lengthscales: l (k, n + m).
-        signal_variance: sf2 (k,).
-        cholesky: Lower factor L of K + sn2 I (k, N, N); kept, not copied.
-        weights: beta = (K + sn2 I)^-1 y (k, N).
-        state_dim: n.
-
-    Raises:
-        ShapeError: The shapes do not belong together.
+    From points x~ (N, n + m), l (k, n + m), sf2 (k,), the lower factor L of K + sn2 I (k, N, N), which is kept and not
+    copied, and beta = (K + sn2 I)^-1 y (k, N). Raises ShapeError where the shapes do not belong together.
     """
     (size, d), k = features.shape, len(weights)
     got = lengthscales.shape, signal_variance.shape, cholesky.shape, weights.shape
@@ -110,7 +103,6 @@ def pack(
 
 def aligned(shape: tuple[int, int]) -> Array:
     """Zeros whose rows start on cache lines where they are multiples of 8."""
-    size = shape[0] * shape[1]
-    memory = np.zeros(size + 8)
-    skip = -(memory.ctypes.data // memory.itemsize) % 8
-    return memory[skip : skip + size].reshape(shape)
+    rows = aligned_rows(*shape)
+    rows[:] = 0.0
+    return rows

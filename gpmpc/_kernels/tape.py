@@ -27,8 +27,8 @@ OPERATIONS = frozenset({*range(16), ATAN, FABS, FMIN, FMAX, INV, TANH, ATAN2, CO
 class Tape(NamedTuple):
     """A function of a vector z (d,)."""
 
-    #: operation, place of the result and places of up to two operands (K, 4). Of an ``INPUT`` the operand is an index
-    #: into z, of an ``OUTPUT`` the result is an index into the value
+    #: operation, place of the result (an index into the value of an ``OUTPUT``) and places of up to two operands (an
+    #: index into z of an ``INPUT``) (K, 4)
     code: NDArray[np.int64]
     constants: Array  #: of the operations ``CONST``, by row (K,)
     work: int  #: number of places
