@@ -57,11 +57,8 @@ def tracking_error(
 ) -> _TrackingError:
     """Computes how far a flight was from its references, the initial state left out: nobody steered there.
 
-    Args:
-        states: x[0] .. x[K] (K + 1, n), K of 1 or more.
-        references: r[0] .. r[K] (K + 1, n).
-        axes: Which states to look at, all in one unit.
-        angles: Those of them whose errors are taken within half a turn [rad].
+    States and references are (K + 1, n), K of 1 or more; ``axes`` are the states to look at, all in one unit, and
+    ``angles`` those of them whose errors are taken within half a turn [rad].
     """
     with np.errstate(over="ignore", invalid="ignore"):
         squares = np.square(_errors(states, references, axes, angles))[1:].mean(axis=0)
@@ -98,17 +95,8 @@ def find_loss(
     """Finds where a flight is farther from its reference than the reference ever goes from where the flight began.
 
     There the system would have been nearer had it never moved: it no longer follows. That holds for any system and any
-    units; a reference that hardly moves needs a ``least``, such as ``System.lost``.
-
-    Args:
-        states: x[0] .. x[K] (K + 1, n).
-        references: r[0] .. r[K] (K + 1, n).
-        axes: Which states to look at, all in one unit.
-        least: No flight is lost that is nearer than this.
-        angles: Those of them whose errors are taken within half a turn [rad].
-
-    Returns:
-        The first such step; None where there is none.
+    units; a reference that hardly moves needs a ``least``, such as ``System.lost``: no flight is lost that is nearer.
+    Arguments are those of ``tracking_error``. Returns the first such step, or None.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         distances = np.linalg.norm(_errors(states, references, axes, angles), axis=1)
@@ -139,13 +127,8 @@ def violation_rate(values: np.ndarray, lower: np.ndarray, upper: np.ndarray, tol
     """Counts how often states or inputs were outside their bounds, with the 95 % interval of ``binomial_interval``.
 
     The interval takes steps for independent. Those of one flight are not: pool several seeds, and read it as a lower
-    limit of the doubt.
-
-    Args:
-        values: One row a step (K, d).
-        lower: (d,); -inf where there is none.
-        upper: (d,); inf where there is none.
-        tolerance: What a solver's round-off may be outside.
+    limit of the doubt. Values are (K, d), one row a step, and bounds (d,), infinite where there is none; a solver's
+    round-off may be ``tolerance`` outside.
     """
     values, lower, upper = (np.asarray(a, dtype=float) for a in (values, lower, upper))
     if values.ndim != 2 or not len(values) or lower.shape != values.shape[1:] or upper.shape != values.shape[1:]:
@@ -187,13 +170,8 @@ def tracking_cost(
 ) -> float:
     """Computes the cost of a flight per step: 1/K (sum_k |x_k - r_k|^2_Q + sum_k |u_k - u_{k-1}|^2_R).
 
-    Args:
-        Q: Weights of the states (n, n).
-        R: Weights of the increments of the inputs (m, m).
-        states: x_0 .. x_K (K + 1, n); the initial one costs nothing.
-        references: r_0 .. r_K (K + 1, n).
-        inputs: u_0 .. u_{K-1} (K, m).
-        previous_input: u_{-1} (m,).
+    Q is (n, n) and R (m, m); states and references are (K + 1, n), of which the first cost nothing, inputs (K, m), and
+    the previous input u_{-1} (m,).
     """
     errors, increments = states[1:] - references[1:], np.diff(inputs, axis=0, prepend=np.atleast_2d(previous_input))
     cost = np.einsum("ki,ij,kj", errors, Q, errors) + np.einsum("ki,ij,kj", increments, R, increments)
