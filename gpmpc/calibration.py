@@ -135,24 +135,19 @@ def calibrate(
     n, like = model.state_dim, {"dtype": model.dtype, "device": model.device}
     noise, certain = model.noise_covariance.diagonal(), torch.zeros(n, n, **like)
 
-    # Every start by its recording and its time, those that last longest first: at each step the first few go on.
-    starts = [(r, t) for r, recording in enumerate(recordings) for t in range(len(recording))]
-    starts.sort(key=lambda start: start[1] - len(recordings[start[0]]))
     found: list[list[tuple[Tensor, ...]]] = [[] for _ in range(horizon)]
     with torch.no_grad():
-        for first in range(0, len(starts), CHUNK):
-            alive = starts[first : first + CHUNK]
-            mean = torch.stack([recordings[r].states[t] for r, t in alive]).to(**like)
-            belief = Gaussian(mean, certain.expand(len(alive), n, n))
-            for k in range(horizon):
-                alive = [(r, t) for r, t in alive if t + k < len(recordings[r])]
-                if not alive:
-                    break
-                count = len(alive)
-                inputs = torch.stack([recordings[r].inputs[t + k] for r, t in alive]).to(**like)
-                belief = propagator(model, Gaussian(belief.mean[:count], belief.covariance[:count]), inputs)
-                observed = torch.stack([recordings[r].states[t + k + 1] for r, t in alive])
-                found[k].append((belief.mean.double().cpu(), (belief.variance + noise).double().cpu(), observed))
+        for recording in recordings:
+            x, u, K = recording.states.to(**like), recording.inputs.to(**like), len(recording)
+            for first in range(0, K, CHUNK):
+                mean = x[first : min(first + CHUNK, K)]
+                belief = Gaussian(mean, certain.expand(len(mean), n, n))
+                for k in range(min(horizon, K - first)):
+                    last = min(first + CHUNK, K - k)  # from here on k + 1 steps would outlast the recording
+                    belief = Gaussian(belief.mean[: last - first], belief.covariance[: last - first])
+                    belief = propagator(model, belief, u[first + k : last + k])
+                    observed = recording.states[first + k + 1 : last + k + 1]
+                    found[k].append((belief.mean.double().cpu(), (belief.variance + noise).double().cpu(), observed))
     steps = [tuple(torch.cat(parts) for parts in zip(*step, strict=True)) for step in found]
     columns = [[[part[:, i : i + 1] for part in step] for i in range(n)] for step in steps]
 
@@ -178,13 +173,10 @@ def _check(
     n, m = model.state_dim, model.input_dim
     if model.output_dim != n:
         raise ShapeError(f"the model must predict its {n} states; it has {model.output_dim} outputs")
-    if not recordings:
-        raise ShapeError("at least one recording is needed; got none")
-    for recording in recordings:
-        states, inputs = recording.states.shape[1], recording.inputs.shape[1]
-        if (states, inputs) != (n, m):
-            raise ShapeError(f"the model has {n} states and {m} inputs; got a recording with {states} and {inputs}")
-    longest = max(len(recording) for recording in recordings)
+    sizes = {(recording.states.shape[1], recording.inputs.shape[1]) for recording in recordings}
+    if sizes != {(n, m)}:
+        raise ShapeError(f"recordings must have the model's {n} states and {m} inputs; got {sizes or 'no recording'}")
+    longest = max(map(len, recordings))
     if horizon > longest:
         raise SettingError("horizon", f"must be at most {longest} steps, the longest recording; got {horizon}")
     if len(names) != n:

@@ -194,11 +194,11 @@ def test_misuse_is_refused_with_the_rule():
         ({"horizon": 1, "levels": (95,)}, SettingError, r"levels: must be one or more between 0 and 1; got \(95,\)"),
         ({"horizon": 1, "levels": ()}, SettingError, r"one or more between 0 and 1; got \(\)"),
         ({"horizon": 1, "names": ["a"]}, ShapeError, "names must name 2 states; got 1"),
-        ({"horizon": 1, "recordings": []}, ShapeError, "at least one recording"),
+        ({"horizon": 1, "recordings": []}, ShapeError, "got no recording"),
         (
             {"horizon": 1, "recordings": Recording(torch.zeros(3, 1), torch.zeros(2, 1))},
             ShapeError,
-            "the model has 2 states and 1 inputs; got a recording with 1 and 1",
+            r"the model's 2 states and 1 inputs; got \{\(1, 1\)\}",
         ),
     ):
         with pytest.raises(error, match=message):
